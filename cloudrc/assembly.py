@@ -95,7 +95,7 @@ def start_mission(experiment: ResolvedExperiment, now_ns: int = 0) -> Teleop:
     from cloudrc.teleop.store import MissionRecord, Order
 
     teleop = Teleop(steered_in(experiment.world))
-    order = Order(build_plan(experiment), contact=bool(experiment.criteria.contact))
+    order = Order(build_plan(experiment), touch=experiment.mission.touch)
     teleop.start(now_ns, MissionRecord("m1", order, ONLY_MISSION))
     return teleop
 
@@ -281,8 +281,9 @@ def with_order(
         waypoints=waypoints,
         setpoints=DRIVE_FILE if order.plan.by_hand else None,
         carrot=carrot,
+        touch=order.touch,
     )
-    judged = {"contact": order.contact, "time_limit_s": order.plan.time_limit}
+    judged = {"time_limit_s": order.plan.time_limit}
     criteria = experiment.criteria.model_copy(update=judged)
     changed = {"mission": mission, "criteria": criteria, "description": description}
     return experiment.model_copy(update=changed)

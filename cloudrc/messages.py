@@ -172,6 +172,10 @@ class Command(NamedTuple):
         return self.plan[min(step, len(self.plan)) - 1]
 
 
+TOUCH_NAME_MAX = 64
+"""Largest size of the name of a body to touch [bytes in UTF-8]; a datagram has room for it."""
+
+
 class OperatorRequest(NamedTuple):
     """Request of the operator to the robot; cloud repeats it until telemetry shows its number."""
 
@@ -183,8 +187,8 @@ class OperatorRequest(NamedTuple):
     # Stamp of cloud's newest odometry when cloud forwarded the request [ns], world's clock.
     basis_stamp_ns: int = NEVER_NS
     epoch: int = 0  # session that teleop saw when it made the request, for cloud only; 0 for none
-    # Whether the mission has to touch the board, so that the board is no obstacle; for START only.
-    contact: bool = False
+    # Name of the body that the mission has to touch, which is no obstacle; "": none. START only.
+    touch: str = ""
 
 
 class Motion(NamedTuple):

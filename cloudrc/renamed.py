@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from functools import cache
+from typing import Any
 
 NEW_NAMES = {
     "pipe_touched": "obstacle_touched",
@@ -45,3 +46,39 @@ def with_new_names(text: str) -> str:
     for old, new in NEW_NAMES.items():
         text = text.replace(old, new)
     return text
+
+
+OLD_BODY = "board"
+"""The body that a mission with `criteria.contact: true` had to touch."""
+
+
+def touch(key: str, value: Any, *, told: bool) -> tuple[tuple[str, ...], Any]:
+    """Return path and value that replace the old key `contact...` of an experiment's criteria.
+
+    A wrong value stays wrong. Log the new key if the user has to be `told`.
+    """
+    path: tuple[str, ...] = ("mission", "touch", "speed_max_mps")
+    if key == "contact":
+        path, value = _touch_of(value)
+    if told:
+        shown = "null" if value is None else value
+        tell(f"criteria.{key}", f"{'.'.join(path)}={shown}")
+    return path, value
+
+
+def _touch_of(contact: Any) -> tuple[tuple[str, ...], Any]:
+    if contact is False:
+        return ("mission", "touch"), None
+    return ("mission", "touch", "body"), OLD_BODY if contact is True else contact
+
+
+def with_touch(order: dict[str, Any]) -> dict[str, Any]:
+    """Return an order from a journal of missions in the form that it has now."""
+    has_to_touch = order.pop("contact", False)
+    return order | {"touch": {"body": OLD_BODY}} if has_to_touch else order
+
+
+@cache
+def tell(old: str, new: str) -> None:
+    """Log once that what a user calls `old` is `new` now."""
+    logging.getLogger("cloudrc").warning("%s is %s now", old, new)

@@ -23,7 +23,7 @@ from pydantic import (
     field_validator,
 )
 
-from cloudrc import plugins
+from cloudrc import plugins, renamed
 from cloudrc.config import overrides, problems, shipped
 from cloudrc.config.document import Document, KeyPath, read_document, write_yaml
 from cloudrc.config.ground import put_on_ground
@@ -192,13 +192,12 @@ def load_experiment(
         _inline_mission(document)
     with _collect(found, ("link", "profile")):
         _inline_profile(document)
+    _renew_touch(document)
     overrides.apply_overrides(document, inner)
     _default(document, ("guard", "plan_max_s"), _plan_max(document))
     for key in overrides.KINDS:
         _default(document, ("cloud", key), getattr(Cloud(), key))
-    if ("mission", "setpoints") in inner and document.get("mission", "setpoints"):
-        for key in ("waypoints", "steps", "carrot"):  # the setpoints replace them
-            document.tree["mission"].pop(key, None)
+    _keep_setpoints(document, inner)
     if isinstance(names := document.get("report", "metrics"), str):  # one metric without a list
         document.tree["report"]["metrics"] = [names]
     found += _resolve_paths(document)
@@ -223,32 +222,26 @@ def _judge(
     """
     mission = experiment.mission
     scene = scene_of(experiment.world)
-    contact = experiment.criteria.contact
-    if contact is None:
-        contact = scene.board is not None and not (mission.steps or mission.setpoints)
     if not flown:
         robot, found = known_robot(experiment.world.robot), list[ConfigProblem]()
         with _collect(found, ("world", "tuning")):
             parameters(robot, experiment.world)
         mission = put_on_ground(mission, scene) if robot.planar else mission
-        found += _check_flown(mission, scene, contact, robot.planar)
+        found += _check_flown(mission, scene, robot.planar)
         problems.raise_problems(document, found, name)
-    criteria = experiment.criteria.model_copy(update={"contact": contact})
-    return experiment.model_copy(update={"criteria": criteria, "mission": mission})
+    return experiment.model_copy(update={"mission": mission})
 
 
-def _check_flown(
-    mission: MissionConfig, scene: Scene, contact: bool, planar: bool
-) -> list[ConfigProblem]:
+def _check_flown(mission: MissionConfig, scene: Scene, planar: bool) -> list[ConfigProblem]:
     """List the problems of a mission in a scene, with their paths in the experiment."""
 
     def check() -> list[ConfigProblem]:
-        if above := check_scene(scene, contact=contact, planar=planar):
+        if above := check_scene(scene, touch=mission.touched, planar=planar):
             return above
-        wrong = check_mission(mission, scene, contact=contact, planar=planar)
+        wrong = check_mission(mission, scene, planar=planar)
         return [problem._replace(path=("mission", *problem.path)) for problem in wrong]
 
-    return reuse(("mission", mission.model_dump_json(), repr(scene), contact, planar), check)
+    return reuse(("mission", mission.model_dump_json(), repr(scene), planar), check)
 
 
 def read_experiment(
@@ -358,6 +351,33 @@ def _inline_mission(document: Document) -> None:
         problems.validate(file, MissionConfig, name)
         document.tree["mission"] = file.tree
         document.sources |= {("mission", *key): source for key, source in file.sources.items()}
+
+
+def _keep_setpoints(document: Document, changes: Settings) -> None:
+    """Remove what setpoints replace if one of the `changes` gives them to the mission."""
+    if ("mission", "setpoints") not in changes or not document.get("mission", "setpoints"):
+        return
+    has_touch = any(path[:2] == ("mission", "touch") for path in changes)
+    for key in ("waypoints", "steps", "carrot", *([] if has_touch else ["touch"])):
+        document.tree["mission"].pop(key, None)
+
+
+def _renew_touch(document: Document) -> None:
+    """Turn what older files say in their criteria about a touch into the mission's `touch`."""
+    criteria, mission = document.get("criteria"), document.get("mission")
+    if not isinstance(criteria, dict) or not isinstance(mission, dict):
+        return
+    users = not _has_all_values(document)  # else cloudrc has written the file
+    for key in ("contact", "contact_speed_max_mps"):
+        if (given := criteria.pop(key, None)) is None:
+            continue
+        path, value = renamed.touch(key, given, told=users)
+        if path[-1] == "speed_max_mps" and not mission.get("touch"):
+            continue
+        source = document.source(("criteria", key))
+        if len(path) > 2 and not mission.get("touch"):
+            document.set_value(path[:2], {}, source)
+        document.set_value(path, value, source)
 
 
 def _inline_profile(document: Document) -> None:

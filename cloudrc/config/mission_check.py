@@ -2,8 +2,8 @@
 
 Each waypoint must be in the region in which the guard lets the robot fly. The robot must keep a
 distance from the obstacles at each waypoint, and on the straight path to the waypoint from the
-spawn point or from the previous waypoint. The board may be on this path if the mission has to touch
-it, as in the paper's mission.
+spawn point or from the previous waypoint. The body that the mission has to touch may be on this
+path, as in the paper's mission.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from cloudrc.geometry.placement import (
     find_overlapped,
     outside_fence,
 )
-from cloudrc.geometry.scene import BOARD, Pipe, Scene
+from cloudrc.geometry.scene import FLOOR, Pipe, Scene
 from cloudrc.messages import Vector
 
 _YAW = "the onboard controller holds yaw at 0, as the published one does; leave it out"
@@ -40,18 +40,14 @@ TOUCHING = 1e-3
 """Distance from an obstacle below which the robot touches it [m]; it covers rounding errors."""
 
 
-def check_scene(scene: Scene, *, contact: bool, planar: bool = False) -> list[ConfigProblem]:
-    """List the problems of a scene for missions that have to touch the board or not (`contact`).
+def check_scene(scene: Scene, *, touch: str | None, planar: bool = False) -> list[ConfigProblem]:
+    """List the problems of a scene for a mission that has to touch the body `touch`.
 
     Their paths are those of the experiment. A `planar` robot stays on the ground.
     """
     if problem := _check_fence(scene, planar=planar):
         return [problem]
-    names = body_names(scene)
-    if contact and names and BOARD not in names:
-        reason = f"the scene has no body named board to touch; {_named(names)}; name a body board"
-        return [ConfigProblem(("criteria", "contact"), "true", f"{reason}, or set it to false")]
-    known, spawn = obstacles(scene, contact=contact), np.array([scene.spawn])
+    known, spawn = obstacles(scene, touch=touch), np.array([scene.spawn])
     (hit,) = find_overlapped(known, spawn, np.zeros(1), TOUCHING)
     if hit < 0:
         return []
@@ -86,20 +82,34 @@ def _check_fence(scene: Scene, *, planar: bool) -> ConfigProblem | None:
     )
 
 
-def _named(names: Sequence[str]) -> str:
-    near = get_close_matches(BOARD, names, 1)
-    return f"the nearest name is {near[0]}" if near else f"it has {', '.join(names)}"
+def _check_touch(mission: MissionConfig, scene: Scene) -> ConfigProblem | None:
+    """Return the problem of a mission's touch, if it has one."""
+    body, names = mission.touched, body_names(scene)
+    if body is None:
+        return None
+    if mission.steps is not None:
+        return ConfigProblem(("touch",), "", "random steps lead to no body; set touch to null")
+    if body == FLOOR:
+        reason = "the robot stands on it; name another body, or set touch to null"
+    elif names is None or body in names:
+        return None
+    else:
+        others = [name for name in names if name != FLOOR]
+        near = get_close_matches(body, others, 1)
+        has = ", ".join(others[:_REPORTED]) or "none but floor"
+        known = f"the nearest name is {near[0]}" if near else f"its bodies: {has}"
+        reason = f"the scene {scene.name} has no such body; {known}; or set touch to null"
+    return ConfigProblem(("touch", "body"), body, reason)
 
 
 def check_mission(
-    mission: MissionConfig, scene: Scene, *, contact: bool, planar: bool = False
+    mission: MissionConfig, scene: Scene, *, planar: bool = False
 ) -> list[ConfigProblem]:
     """List the problems of a mission in a scene, each with its path inside the mission.
 
-    With `contact`, the mission has to touch the board, which is then no obstacle. A `planar` robot
-    stays on the ground, at the height of the spawn.
+    A `planar` robot stays on the ground, at the height of the spawn.
     """
-    if problem := _check_parts(mission):
+    if problem := _check_parts(mission) or _check_touch(mission, scene):
         return [problem]
     if planar and (problems := check_heights(mission, scene)):
         return problems
@@ -107,7 +117,7 @@ def check_mission(
     if mission.setpoints is not None:
         steered = replace(fence, ground=scene.spawn[2]) if planar else fence
         return _check_setpoints(Path(mission.setpoints), steered)
-    known = obstacles(scene, contact=contact)
+    known = obstacles(scene, touch=mission.touched)
     if mission.steps is not None:
         reason = _check_steps(mission.steps, known, fence, planar=planar)
         return [ConfigProblem(("steps",), "", reason)] if reason else []

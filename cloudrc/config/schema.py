@@ -23,6 +23,7 @@ from pydantic import (
 )
 
 from cloudrc.geometry.fence import Corners, order_of
+from cloudrc.messages import TOUCH_NAME_MAX
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Point = tuple[Finite, Finite, Finite]
@@ -289,6 +290,22 @@ class Steps(Section):
     obstacles"""
 
 
+class Touch(Section):
+    """The body of the scene that the robot has to touch in a mission."""
+
+    body: Annotated[str, Field(min_length=1)]
+    """Name of the body. All other bodies but floor are obstacles"""
+    speed_max_mps: Positive = 0.25
+    """Largest speed at the first touch [m/s]; with a higher speed the mission fails"""
+
+    @field_validator("body")
+    @classmethod
+    def _fits(cls, body: str) -> str:
+        if len(body.encode()) > TOUCH_NAME_MAX:
+            raise ValueError(f"must have at most {TOUCH_NAME_MAX} bytes; rename the body")
+        return body
+
+
 class MissionConfig(Section):
     """A mission: waypoints, random steps, or setpoints from a file."""
 
@@ -307,6 +324,13 @@ class MissionConfig(Section):
     drive by hand writes such a file, drive.csv"""
     carrot: Carrot | None = None
     """Moves the setpoint at limited speed from waypoint to waypoint; null: the setpoint jumps"""
+    touch: Touch | None = None
+    """What the robot has to touch; null: nothing, every body but floor is an obstacle"""
+
+    @property
+    def touched(self) -> str | None:
+        """Name of the body that the robot has to touch; None without one."""
+        return self.touch.body if self.touch else None
 
     @property
     def count(self) -> int:
@@ -522,12 +546,6 @@ class Cloud(Section):
 class Criteria(Section):
     """Conditions for the success of a flight."""
 
-    contact: bool | None = None
-    """Whether the tip of the arm must touch the board; if not, the board is an obstacle. null: only
-    in a scene that has a board, and not with random steps"""
-    contact_speed_max_mps: Positive = 0.25
-    """Largest speed of the tip when it touches the board [m/s]; with a higher speed the flight
-    fails"""
     settle_m: Positive | None = 0.15
     """Largest distance from the setpoint in the last 0.5 s of each random step [m]. An oscillation
     that does not decay fails a mission, too, with or without random steps. null: neither distance

@@ -87,9 +87,8 @@ class FaultRun:
         self.changes = list[GuardChange]()
         self.watch = Watch(facts_of(self.experiment))
         self.listeners: list[Callable[[list[Record], int], None]] = [self.watch.see]
-        touch_speed = self.experiment.criteria.contact_speed_max_mps
         phase_ns = int(generator(self.experiment.seed, 45).integers(WAKE_NS))
-        self.teleop = TeleopModel(touch_speed, self._fence, phase_ns)
+        self.teleop = TeleopModel(self._fence, phase_ns)
         if start:
             self.teleop.order(self.make_order(), self._clock.at(0))
         self.world = RestartableEndpoint(self._build_world, Clock())
@@ -118,7 +117,7 @@ class FaultRun:
     def make_order(self) -> Order:
         """Make the order with which teleop flies the experiment's mission."""
         plan = assembly.build_plan(self.experiment)
-        return Order(plan, contact=bool(self.experiment.criteria.contact))
+        return Order(plan, touch=self.experiment.mission.touch)
 
     def order_if_possible(self, now_ns: int) -> None:
         """Order the experiment's mission; teleop may refuse the order. `now_ns` is not used."""

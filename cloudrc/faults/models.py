@@ -189,15 +189,14 @@ class TeleopModel:
         events: Events of all missions, oldest first.
     """
 
-    def __init__(self, contact_speed_max: float, fence: Fence, phase_ns: int) -> None:
+    def __init__(self, fence: Fence, phase_ns: int) -> None:
         """Start teleop.
 
         Args:
-            contact_speed_max: Limit of the speed of the arm's tip at the board [m/s].
             fence: Fence of the scene.
             phase_ns: Time at which teleop's process wakes for the first time [ns, virtual time].
         """
-        self._contact_speed_max, self._fence = contact_speed_max, fence
+        self._fence = fence
         self._phase_ns, self._starts = phase_ns, 0
         self._disk = b""  # the bytes of its database
         self.events: list[MissionEvent] = []
@@ -215,7 +214,7 @@ class TeleopModel:
             self._database.deserialize(self._disk)
         salt = b"desk %d" % self._starts  # random in production
         store = MissionStore(self._database, salt)
-        service = MissionService(self._contact_speed_max, store, self._fence)
+        service = MissionService(store, self._fence)
         self.service: MissionService | None = service
         self._peer.waiting.clear()
         self._calls, self._stops = list[Call](), list[Call]()

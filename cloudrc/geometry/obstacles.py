@@ -9,21 +9,20 @@ import numpy as np
 
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.geometry.fence import SPACE, Fence
-from cloudrc.geometry.scene import BOARD, WORLD, Board, Pipe, Scene, is_obstacle
+from cloudrc.geometry.scene import BOARD, FLOOR, WORLD, Board, Pipe, Scene, is_obstacle
 from cloudrc.geometry.solids import Solid
 
 Obstacle: TypeAlias = Pipe | Solid
 BOARD_DEPTH = 0.05
 """Thickness of a declared board [m], as in the shipped scene `pipes`."""
 _WORDS = {
-    BOARD: "the board, an obstacle without criteria.contact",
     WORLD: "world, the geoms in the worldbody of the scene",
 }
 """Name of a body -> words for messages; all other bodies have their names alone."""
 
 
-def obstacles(scene: Scene, *, contact: bool) -> tuple[Obstacle, ...]:
-    """Return all obstacles of a scene; with `contact`, the mission has to touch the board.
+def obstacles(scene: Scene, *, touch: str | None) -> tuple[Obstacle, ...]:
+    """Return all obstacles of a scene: not the body `touch`, which the mission has to touch.
 
     Shapes that the scene declares as numbers are read without MuJoCo, all others with MuJoCo. If it
     is not installed, the others are missing.
@@ -37,7 +36,7 @@ def obstacles(scene: Scene, *, contact: bool) -> tuple[Obstacle, ...]:
         declared.add(BOARD)
         found.append(_as_solid(scene.board))
     found += [solid for solid in _compiled(scene)[1] if solid.name not in declared]
-    return tuple(each for each in found if is_obstacle(each.name, contact=contact))
+    return tuple(each for each in found if is_obstacle(each.name, touch=touch))
 
 
 def surface(obstacle: Obstacle) -> str:
@@ -48,10 +47,10 @@ def surface(obstacle: Obstacle) -> str:
 
 
 def body_names(scene: Scene) -> tuple[str, ...] | None:
-    """Return the names of all bodies of a scene that may have bodies without numbers.
-
-    Return None if the scene has no such bodies, or if they are not `known`.
-    """
+    """Return the names of all bodies of a scene; None if they are not `known`."""
+    if scene.path is None:
+        boards = () if scene.board is None else (BOARD,)
+        return (FLOOR, *(pipe.name for pipe in scene.pipes), *boards)
     return _compiled(scene)[0] or None
 
 

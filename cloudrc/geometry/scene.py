@@ -64,13 +64,12 @@ class Scene:
     own_fence: Fence | None = None  # fence that is declared; None: see `obstacles.fence_of`
 
 
-def is_obstacle(body: str, *, contact: bool) -> bool:
+def is_obstacle(body: str, *, touch: str | None) -> bool:
     """Return whether the robot must not touch a body, given by its name.
 
-    Every body but the floor is an obstacle. If the mission has to touch the board (`contact`, of
-    criteria.contact), the board is none.
+    Every body is an obstacle but the floor and the body `touch`, which the mission has to touch.
     """
-    return body != FLOOR and not (contact and body == BOARD)
+    return body not in (FLOOR, touch)
 
 
 def load_scene(name: str, corners: Corners | None = None) -> Scene:

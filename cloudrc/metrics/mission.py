@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from cloudrc.config.schema import Waypoint
-from cloudrc.geometry.scene import BOARD, is_obstacle
+from cloudrc.geometry.scene import is_obstacle
 from cloudrc.metrics.definitions import Holds
 from cloudrc.metrics.flight import Array, Flight, Measure, add_metrics, mean, select
 from cloudrc.rounding import differences
@@ -34,9 +34,11 @@ FAILURES = ("estimator_failed", "predictor_failed", "controller_failed", "horizo
 
 
 def first_touch(flight: Flight) -> dict[str, Array] | None:
-    """Return the first row of /contact in which the arm's tip touches the board, else None."""
+    """Return the first row of /contact in which the robot touches what it has to, or None."""
     contact = flight.during("/contact")
-    touches = np.flatnonzero((contact["body"] == BOARD) & contact["tip"].astype(bool))
+    touches = np.flatnonzero(
+        (contact["body"] == flight.mission.touched) & contact["tip"].astype(bool)
+    )
     return select(contact, touches[0]) if len(touches) else None
 
 
@@ -142,8 +144,8 @@ def _steady_force(flight: Flight, touch: dict[str, Array]) -> float | None:
 
 def obstacle_contacts(flight: Flight) -> dict[str, Array]:
     """Select the rows of /contact in which the robot touches an obstacle."""
-    contact, board = flight.during("/contact"), bool(flight.criteria.contact)
-    rows = [is_obstacle(str(body), contact=board) for body in contact["body"]]
+    contact, touch = flight.during("/contact"), flight.mission.touched
+    rows = [is_obstacle(str(body), touch=touch) for body in contact["body"]]
     return select(contact, np.array(rows, dtype=bool))
 
 

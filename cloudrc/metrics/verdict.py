@@ -22,6 +22,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from cloudrc.config.schema import Touch
 from cloudrc.errors import DISK_FULL, DiskFullError
 from cloudrc.messages import Cause, GuardState, Vector
 from cloudrc.metrics import Flight, Number
@@ -108,24 +109,18 @@ class Evidence:
 
     waypoints: int
     reached: int  # number of waypoints reached
-    contact: bool  # whether the arm's tip has to touch the board
-    contact_speed_max: float  # limit of the speed at the touch [m/s]
+    wanted: Touch | None  # what the robot has to touch; None: nothing
     ending: Ending
     end: Moment = UNKNOWN
     time_limit: float = inf  # limit of the time of `end` [s]
-    touch: tuple[float, Moment] | None = None  # speed of the first touch of the board [m/s]
+    touch: tuple[float, Moment] | None = None  # speed of the first touch of `wanted` [m/s]
     violations: tuple[FlightFailure, ...] = ()  # other events that must not happen
     slow: str = ""  # why the run failed to keep real time; "" if it did not fail
 
 
 def judge(evidence: Evidence) -> FlightVerdict:
     """Judge a mission by its evidence; the verdict lists all violations and unmet goals."""
-    violations, limit = evidence.violations, evidence.contact_speed_max
-    if evidence.contact and evidence.touch is not None and not exceeds(limit, evidence.touch[0]):
-        speed, moment = evidence.touch
-        key = f"criteria.contact_speed_max_mps {limit:g}"
-        text = f"the tip met the board at {format_beside(speed, limit)} m/s, not below {key}"
-        violations = (FlightFailure("contact_too_fast", text, *moment), *violations)
+    violations = (*_too_fast(evidence), *evidence.violations)
     if evidence.ending.code in BROKEN_OFF:
         return FlightVerdict(
             "interrupted", (FlightFailure(*evidence.ending, *evidence.end), *violations)
@@ -138,6 +133,20 @@ def judge(evidence: Evidence) -> FlightVerdict:
     return FlightVerdict("failure" if failures else "success", tuple(failures))
 
 
+def _too_fast(evidence: Evidence) -> Iterator[FlightFailure]:
+    """Yield a failure if the robot touched too fast what it had to touch."""
+    wanted, touch = evidence.wanted, evidence.touch
+    if wanted is None or touch is None or exceeds(wanted.speed_max_mps, touch[0]):
+        return
+    speed, moment = touch
+    limit = wanted.speed_max_mps
+    text = (
+        f"the robot met {wanted.body} at {format_beside(speed, limit)} m/s, not below "
+        f"mission.touch.speed_max_mps {limit:g}"
+    )
+    yield FlightFailure("contact_too_fast", text, *moment)
+
+
 def _unmet_goals(evidence: Evidence) -> Iterator[FlightFailure]:
     ending, end = evidence.ending, evidence.end
     if ending.code != "done":
@@ -147,8 +156,8 @@ def _unmet_goals(evidence: Evidence) -> Iterator[FlightFailure]:
     if evidence.reached < evidence.waypoints:
         text = f"{evidence.reached} of {evidence.waypoints} waypoints reached"
         yield FlightFailure("waypoint_not_reached", text, *end)
-    if evidence.contact and evidence.touch is None:
-        text = "the arm never touched the board, which criteria.contact requires"
+    if evidence.wanted is not None and evidence.touch is None:
+        text = f"the robot never touched {evidence.wanted.body}, which mission.touch requires"
         yield FlightFailure("board_not_touched", text)
     if end.time is not None and exceeds(end.time, evidence.time_limit):
         key = f"criteria.time_limit_s {evidence.time_limit:g}"
@@ -184,8 +193,7 @@ def flight_evidence(
     return Evidence(
         waypoints=flight.waypoints,
         reached=0 if reached is None else round(reached.value),
-        contact=bool(criteria.contact),
-        contact_speed_max=criteria.contact_speed_max_mps,
+        wanted=flight.mission.touch,
         ending=_ending(flight, interrupted),
         end=UNKNOWN if end_ns is None else _moment(flight, end_ns),
         time_limit=criteria.time_limit_s or inf,

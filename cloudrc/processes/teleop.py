@@ -72,12 +72,10 @@ def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
         book = _open_store(settings.journal, stop, server.bridge)
         if book is not None:  # None: stopped while another teleop process locked the journal
             opened.callback(book.close)
-            touch_speed = experiment.criteria.contact_speed_max_mps
-            fence = steered_in(experiment.world)
-            service = MissionService(touch_speed, book, fence, scene)
+            service = MissionService(book, steered_in(experiment.world), scene)
             if settings.start:
-                contact = bool(experiment.criteria.contact)
-                order = Order(assembly.build_plan(experiment), experiment.name, contact=contact)
+                touch = experiment.mission.touch
+                order = Order(assembly.build_plan(experiment), experiment.name, touch=touch)
                 service.create(order, time.monotonic_ns())
             pause = GracefulStop(
                 stop,
@@ -98,14 +96,14 @@ def serve_api(settings: TeleopSettings, experiment: ResolvedExperiment, scene: S
     """Start the API; until the mission service runs, the API answers that teleop is starting."""
     if not isinstance(settings.api, Path):
         warn_if_exposed(settings.api)
-    bridge, contact = Bridge(), bool(experiment.criteria.contact)
+    bridge = Bridge()
     planar = is_planar(experiment.world.robot)
     grounded = f"the robot {Path(experiment.world.robot).name}" if planar else ""
     speed_max = experiment.guard.speed_max_mps
     plan = partial(assembly.mission_plan, fence=steered_in(experiment.world), speed_max=speed_max)
-    order = partial(read_order, scene=scene, contact=contact, planar=planar, plan=plan)
+    order = partial(read_order, scene=scene, planar=planar, plan=plan)
     tokens = Tokens(settings.tokens, log_line) if settings.tokens else None
-    goto = partial(read_goto, scene=scene, planar=planar)
+    goto = partial(read_goto, scene=scene, touch=experiment.mission.touch, planar=planar)
     app = create_app(bridge, order, goto, partial(read_drive, grounded=grounded), log_line)
     server = ApiServer(Gate(app, tokens, Audit(settings.audit, log_line)), bridge, settings.api)
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)

@@ -86,9 +86,9 @@ def _clamped_horizon(flight: Flight, experiment: ResolvedExperiment) -> list[str
 
 def _unknown_clearance(flight: Flight) -> list[str]:
     """Return a note if the report has no clearance from some obstacles of the scene."""
-    scene, contact = flight.scene, bool(flight.criteria.contact)
+    scene = flight.scene
     try:
-        found = obstacles(scene, contact=contact)
+        found = obstacles(scene, touch=flight.mission.touched)
     except BadInputError as error:
         return [f"{UNKNOWN} all bodies but declared pipes: {error}."]
     if not known(scene):

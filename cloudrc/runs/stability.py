@@ -136,7 +136,7 @@ def _with_step(
     ]
     changed = {
         "mission": MissionConfig(waypoints=tuple(points)),
-        "criteria": Criteria(contact=False, settle_m=None, time_limit_s=limit),
+        "criteria": Criteria(settle_m=None, time_limit_s=limit),
         "world": experiment.world.model_copy(update={"scene": SCENE, "fence_m": None}),
     }
     return experiment.model_copy(update=changed)

@@ -185,7 +185,7 @@ class Teleop:
         self._continued, self._was_held = bool(mission.world), mission.state == HELD
         self._followed = self._waits = False
         self._knot, self._is_pending = -1, not self._was_held
-        self.requests.begin(mission.number, self.leg, contact=mission.order.contact)
+        self.requests.begin(mission.number, self.leg, touch=mission.order.touched or "")
         if self._continued:
             self._began_ns -= round(mission.elapsed * 1e9)
             self._world, self._expected = mission.world, (mission.number,)

@@ -7,7 +7,7 @@ configuration file, so that the same code checks both and describes the problems
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import cos, radians, sin
+from math import radians
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -23,10 +23,10 @@ from cloudrc.config.schema import (
     Place,
     Section,
     TimeLimit,
+    Touch,
     Waypoint,
 )
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.clearance import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Vector
 from cloudrc.records import FAILURES
@@ -53,11 +53,7 @@ class MissionRequest(Section):
     )
     waypoints: tuple[Waypoint, ...] = Field((), max_length=MAX_WAYPOINTS, description="In order")
     carrot: Carrot | None = Field(None, description="How the setpoint moves; null: it jumps")
-    contact: bool | None = Field(
-        None,
-        description="The arm has to touch the board; default: as in the experiment, if a waypoint "
-        "is at the board",
-    )
+    touch: Touch | None = Field(None, description="What the robot has to touch; null: nothing")
     key: Text = Field("", description="Teleop makes one mission for each key")
     queue: bool = Field(False, description="Wait for the mission under way, if there is one")
     lease_s: Annotated[float, Field(ge=LEASE_MIN, le=LEASE_MAX)] | None = Field(
@@ -245,41 +241,45 @@ def read_order(
     body: bytes,
     scene: Scene,
     *,
-    contact: bool,
     planar: bool = False,
     plan: Callable[[MissionConfig, float | None], Plan],
 ) -> Order:
     """Read, check and plan the mission in the body of a request.
 
-    `contact` is a default: whether the arm has to touch the board in missions with a waypoint at
-    the board. A `planar` robot stays on the ground. `plan` makes a plan from a mission and a time
+    A `planar` robot stays on the ground. `plan` makes a plan from a mission and a time
     limit [s], which may be None. Raise a RefusedError that lists all problems.
     """
     request = _parse(body, MissionRequest)
     if not request.waypoints:  # only an experiment may have steps instead
         raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
-    mission = MissionConfig(start=request.start, waypoints=request.waypoints, carrot=request.carrot)
+    mission = MissionConfig(
+        start=request.start,
+        waypoints=request.waypoints,
+        carrot=request.carrot,
+        touch=request.touch,
+    )
     mission = put_on_ground(mission, scene) if planar else mission
-    contact = contact and leads_to_board(mission, scene)
-    contact = contact if request.contact is None else request.contact
-    if problems := check_mission(mission, scene, contact=contact, planar=planar):
+    if problems := check_mission(mission, scene, planar=planar):
         raise RefusedError(problems)
     planned = plan(mission, request.time_limit_s)
     lease = request.lease_s or 0.0
-    return Order(planned, request.name, request.key, contact, request.queue, lease)
+    return Order(planned, request.name, request.key, request.touch, request.queue, lease)
 
 
-def read_goto(body: bytes, scene: Scene, *, planar: bool = False) -> Leg:
+def read_goto(
+    body: bytes, scene: Scene, *, touch: Touch | None = None, planar: bool = False
+) -> Leg:
     """Read and check a point in a request's body; raise a RefusedError that lists all problems.
 
+    The experiment's mission has to `touch` a body, so that a point there is none of the problems.
     A `planar` robot stays on the ground.
     """
     request = _parse(body, GoToRequest)
     position = on_ground(request.position_m, scene) if planar else request.position_m
     waypoint = Waypoint(position_m=position, yaw_deg=request.yaw_deg)
-    # Whether the board is an obstacle depends on the mission; the service checks the way.
-    mission = MissionConfig(start="here", waypoints=(waypoint,))
-    problems = check_mission(mission, scene, contact=True, planar=planar)
+    # What is an obstacle depends on the mission under way; the service checks the way there.
+    mission = MissionConfig(start="here", waypoints=(waypoint,), touch=touch)
+    problems = check_mission(mission, scene, planar=planar)
     if problems:
         raise RefusedError([ConfigProblem(p.path[2:], p.value, p.reason) for p in problems])
     return Leg(position, radians(request.yaw_deg))
@@ -296,19 +296,6 @@ def read_drive(body: bytes, *, grounded: str = "") -> Vector:
         reason = f"leads up or down, but {grounded} stays on the ground; set it to 0"
         raise RefusedError([ConfigProblem(("velocity_mps", "2"), f"{velocity[2]:g}", reason)])
     return velocity
-
-
-def leads_to_board(mission: MissionConfig, scene: Scene) -> bool:
-    """Return whether the arm's tip is at or behind the board's face at any waypoint."""
-    board = scene.board
-    if board is None:
-        return False
-    for waypoint in mission.waypoints:
-        (x, y, z), yaw = waypoint.position_m, radians(waypoint.yaw_deg)
-        x, y, z = x + ARM_LENGTH * cos(yaw), y + ARM_LENGTH * sin(yaw), z + ARM_HEIGHT
-        if x >= board.x and board.y[0] <= y <= board.y[1] and board.z[0] <= z <= board.z[1]:
-            return True
-    return False
 
 
 def as_json(problem: ConfigProblem) -> dict[str, str | int | None]:

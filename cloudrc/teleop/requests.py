@@ -39,6 +39,7 @@ class RequestSender:
         self._pending: OperatorRequest | None = None
         self._next: OperatorRequest | None = None  # sent after the pending request
         self._progress = OperatorRequest(UNNUMBERED, Request.PROGRESS)
+        self._touch = ""  # name of the body that the mission has to touch, if any
         self._number = UNNUMBERED
         self._asked_epoch = 0
         self._ended = NOT_ENDED  # epoch and number of the last END; NOT_ENDED after a START
@@ -66,6 +67,8 @@ class RequestSender:
         place where a mission starts; only a START needs it.
         """
         asked = self._progress._replace(request=request, start=start)
+        if request is Request.START:
+            asked = asked._replace(touch=self._touch)
         if self._pending is None or not after:
             self._pending, self._next = asked, None
         elif self._pending.request is not request:
@@ -76,9 +79,9 @@ class RequestSender:
         self._is_started = False
         self._pending = self._next = None
 
-    def begin(self, mission_id: int, reached: int, *, contact: bool) -> None:
-        """Set the mission of the following requests; `contact`: it has to touch the board."""
-        self._progress = self._progress._replace(contact=contact)
+    def begin(self, mission_id: int, reached: int, *, touch: str = "") -> None:
+        """Set the mission of the following requests; it has to touch the body `touch`, if any."""
+        self._touch = touch
         self.report(mission_id, reached)
 
     def report(self, mission_id: int, reached: int) -> None:

@@ -101,19 +101,12 @@ class MissionService:
     UnavailableError if the disk refuses the mission, or if this process ends.
     """
 
-    def __init__(
-        self,
-        contact_speed_max: float,
-        book: MissionStore,
-        fence: Fence,
-        scene: Scene | None = None,
-    ) -> None:
+    def __init__(self, book: MissionStore, fence: Fence, scene: Scene | None = None) -> None:
         """Begin with the missions in the store `book`, in a scene with `fence`.
 
-        `contact_speed_max` limits the speed of the arm's tip when it touches the board [m/s]. With
-        a `scene`, the service refuses straight ways through obstacles.
+        With a `scene`, the service refuses straight ways through obstacles.
         """
-        self._contact_speed_max, self._scene = contact_speed_max, scene
+        self._scene = scene
         self._outputs: list[Output | Fault] = []
         self.book, self._teleop, self._fence = book, Teleop(fence, book.has_ended), fence
         self._heard_ns: int | None = None  # when the last message from cloud arrived
@@ -152,7 +145,7 @@ class MissionService:
         known = self.book.with_key(order.key)
         if known is not None:
             self._renewed_ns[known.id] = now_ns
-            if (known.order.plan, known.order.contact) != (order.plan, order.contact):
+            if (known.order.plan, known.order.touch) != (order.plan, order.touch):
                 text = f"mission {known.id} has the key '{order.key}' already, with another plan"
                 raise ConflictError(f"{text}; take a new key", known.id)
             return known, False
@@ -163,7 +156,7 @@ class MissionService:
             raise ConflictError(f"{QUEUE_MAX} missions wait already; cancel one", waiting[0].id)
         self._check_can_fly()
         if order.plan.start is Start.HERE and not waiting and not order.plan.by_hand:
-            self._check_way(order.plan.legs[0], contact=order.contact)
+            self._check_way(order.plan.legs[0], touch=order.touched)
         mission = self.book.add(order)
         self._renewed_ns[mission.id] = now_ns
         if waiting:
@@ -206,7 +199,7 @@ class MissionService:
         self._check_can_fly()
         if (mission := self._current) is not None and mission.state == HELD:
             leg = mission.order.plan.legs[mission.waypoint]
-            self._check_way(leg, contact=mission.order.contact)
+            self._check_way(leg, touch=mission.order.touched)
         return self._operate(self._teleop.resume, now_ns)
 
     def go_to(self, leg: Leg, now_ns: int) -> MissionRecord:
@@ -218,7 +211,7 @@ class MissionService:
             return self.create(Order(plan, "goto"), now_ns)[0]
         if waiting[0].state != HELD:
             raise _busy(waiting[0], "hold or cancel it first")
-        self._check_way(leg, contact=waiting[0].order.contact)
+        self._check_way(leg, touch=waiting[0].order.touched)
         return self._operate(lambda now: self._teleop.go_to(now, leg), now_ns)
 
     def drive(self, velocity: Vector, now_ns: int) -> MissionRecord:
@@ -408,22 +401,22 @@ class MissionService:
         if not seen.obstacle_contacts or mission is None:
             return ""
         text = f"at {self._teleop.elapsed(now_ns):.2f} s, {_place(seen.position)} m"
-        known = () if scene is None else obstacles(scene, contact=mission.order.contact)
+        known = () if scene is None else obstacles(scene, touch=mission.order.touched)
         if not known:
             return text
         away = clearance_per_obstacle(known, [seen.position], [seen.orientation_wxyz])[0]
         return f"{text}, next to {known[away.argmin()].name}"
 
-    def _check_way(self, leg: Leg, *, contact: bool) -> None:
+    def _check_way(self, leg: Leg, *, touch: str | None) -> None:
         """Raise ConflictError if an obstacle lies between the robot and the waypoint of `leg`.
 
-        With `contact`, the mission has to touch the board, which is then no obstacle.
+        The body `touch`, which the mission has to touch, is none.
         """
         seen, scene = self.seen, self._scene
         if seen is None or scene is None:
             return
         here, there = np.array([seen.position]), np.array([leg.position])
-        known = obstacles(scene, contact=contact)
+        known = obstacles(scene, touch=touch)
         through = int(find_crossed(known, here, there)[0])
         if through >= 0:
             raise ConflictError(
@@ -520,8 +513,7 @@ class MissionService:
                 self._teleop.elapsed(now_ns),
                 waypoints=len(mission.order.plan.legs),
                 reached=len(mission.reached),
-                contact=mission.order.contact,
-                contact_speed_max=self._contact_speed_max,
+                wanted=mission.order.touch,
             )
             if event.event != "done":  # an interruption may be the reason
                 told = self._interruptions.failures(self._teleop.elapsed(now_ns))

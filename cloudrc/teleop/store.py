@@ -19,9 +19,10 @@ from typing import Any, TypeAlias
 
 from pydantic import TypeAdapter
 
+from cloudrc.config.schema import Touch
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.metrics.verdict import Observations
-from cloudrc.renamed import with_new_names
+from cloudrc.renamed import with_new_names, with_touch
 from cloudrc.teleop.wire import ENDED, QUEUED, STATES, Plan
 
 Event: TypeAlias = dict[str, Any]
@@ -37,9 +38,14 @@ class Order:
     plan: Plan
     name: str = ""  # shown to people
     key: str = ""  # orders with the same key make one mission; "": no key
-    contact: bool = False  # whether the arm has to touch the board
+    touch: Touch | None = None  # what the robot has to touch; None: nothing
     queue: bool = False  # whether the order waits for the mission under way; else it is refused
     lease: float = 0.0  # longest time without word from the mission's watcher [s]; 0: no watcher
+
+    @property
+    def touched(self) -> str | None:
+        """Name of the body that the robot has to touch; None without one."""
+        return self.touch.body if self.touch else None
 
 
 @dataclass(slots=True)
@@ -324,7 +330,7 @@ class MissionStore:
             known = {
                 "id": f"m{row}",
                 "number": number,
-                "order": order,
+                "order": with_touch(order),
                 **json.loads(with_new_names(status)),
             }
             mission = _MISSION.validate_python(known)

@@ -9,12 +9,13 @@ Deviation: the paper's tunnel sends pickled ROS messages, which have 1 kB and ca
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from enum import IntEnum
 from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc.messages import (
     NEVER_NS,
+    TOUCH_NAME_MAX,
     Cause,
     Command,
     Datagram,
@@ -28,7 +29,7 @@ from cloudrc.messages import (
     Vector,
 )
 
-VERSION = 6  # of the wire format; a release of cloudrc refuses all other versions
+VERSION = 7  # of the wire format; a release of cloudrc refuses all other versions
 PLAN_MAX = 80  # largest number of velocities in a command's plan
 DATAGRAM_MAX = 1200  # size of the receive buffer; valid datagrams fit into one packet [bytes]
 NUMBER_MAX = 2**32 - 1  # highest number of an operator request
@@ -83,7 +84,6 @@ class Accept(NamedTuple):
     clock: bytes  # 16 bytes that identify world's monotonic clock
 
 
-_CONTACT = 0b10  # bit of the byte `start`: the mission has to touch the board
 COOKIE_SIZE = 13  # size of a cookie [bytes]
 _HEADER = struct.Struct("<BBIxBQ")  # the pad byte is 0
 _BODIES = {
@@ -111,7 +111,12 @@ COMMAND_SIZES = tuple(
     for n in range(PLAN_MAX + 1)
 )
 """Number of velocities in a command's plan -> size of the datagram [bytes]."""
-_size_of = SIZES.get
+_sizes_of: dict[int, Container[int]] = {
+    **{kind: (size,) for kind, size in SIZES.items()},
+    int(Kind.COMMAND): frozenset(COMMAND_SIZES),
+    int(Kind.OPERATOR): range(SIZES[Kind.OPERATOR], SIZES[Kind.OPERATOR] + TOUCH_NAME_MAX + 1),
+}
+"""Kind -> valid sizes of its datagrams [bytes]."""
 _COMMAND_KIND = int(Kind.COMMAND)  # looking up a member of an enum is slow
 _unpack_header: Callable[[bytes], Header] = _HEADER.unpack_from
 
@@ -142,7 +147,7 @@ def check(data: bytes) -> Header:
         raise DecodeError("version")
     if header[1] > 1:
         raise DecodeError("malformed")
-    if _size_of(header[3]) != size and (header[3] != Kind.COMMAND or size not in COMMAND_SIZES):
+    if size not in _sizes_of.get(header[3], ()):
         raise DecodeError("malformed")
     return header
 
@@ -225,20 +230,23 @@ def decode_command(body: bytes) -> Command:
 
 def encode_operator(request: OperatorRequest) -> bytes:
     """Encode the body of an OPERATOR datagram; the header has the request's epoch."""
-    number, kind, start, mission_id, reached, basis_stamp_ns, _, contact = request
-    place = start | _CONTACT if contact else start
-    return _OPERATOR.pack(number, kind, place, mission_id, reached, basis_stamp_ns)
+    number, kind, start, mission_id, reached, basis_stamp_ns, _, touch = request
+    body = _OPERATOR.pack(number, kind, start, mission_id, reached, basis_stamp_ns)
+    return body + touch.encode()
 
 
 def decode_operator(body: bytes) -> OperatorRequest:
     """Decode the body of an OPERATOR datagram."""
-    number, kind, place, mission_id, reached, basis_stamp_ns = _OPERATOR.unpack(body)
-    start, contact = place & ~_CONTACT, bool(place & _CONTACT)
+    number, kind, start, mission_id, reached, basis_stamp_ns = _OPERATOR.unpack_from(body)
     # A recording holds signed 64-bit integers.
     if mission_id >> 63 or kind >= len(Request) or start >= len(Start):
         raise DecodeError("malformed")
+    try:
+        touch = body[_OPERATOR.size :].decode()
+    except UnicodeDecodeError:
+        raise DecodeError("malformed") from None
     fields = number, Request(kind), Start(start), mission_id, reached, basis_stamp_ns
-    return OperatorRequest(*fields, contact=contact)
+    return OperatorRequest(*fields, touch=touch)
 
 
 def encode(kind: Kind, *fields: Any) -> bytes:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from math import hypot, isnan, nan
 
-from cloudrc.geometry.scene import BOARD, is_obstacle
+from cloudrc.geometry.scene import is_obstacle
 from cloudrc.messages import (
     NEVER_NS,
     Command,
@@ -96,10 +96,10 @@ class WorldEndpoint(TunnelEnd):
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
         self._number = 0  # of the newest operator request carried out in this session
         # Of the mission that was started last: its number, waypoints reached as reported by the
-        # operator, contacts with obstacles, speed of the tip at its first touch of the board, and
-        # whether the mission has to touch the board, so that the board is no obstacle.
+        # operator, contacts with obstacles, name of the body that the mission has to touch ("" for
+        # none), and speed of the first touch.
         self._mission_id = self._reached = self._obstacles = 0
-        self._touch_speed, self._contact = nan, False
+        self._touch_speed, self._touch = nan, ""
 
     @property
     def slip_ns(self) -> int:
@@ -266,9 +266,9 @@ class WorldEndpoint(TunnelEnd):
             observer.see_session(now_ns)
 
     def _note_touch(self, touch: Contact) -> None:
-        if is_obstacle(touch.body, contact=self._contact):
+        if is_obstacle(touch.body, touch=self._touch):
             self._obstacles += 1
-        if touch.body == BOARD and touch.tip and isnan(self._touch_speed):
+        if touch.body == self._touch and touch.tip and isnan(self._touch_speed):
             self._touch_speed = hypot(*touch.tip_velocity)
 
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
@@ -307,7 +307,7 @@ class WorldEndpoint(TunnelEnd):
         if request.mission_id != self._mission_id or request.start is Start.SPAWN:
             self._mission_id, self._reached = request.mission_id, 0
             self._obstacles, self._touch_speed = 0, nan
-        self._contact = request.contact
+        self._touch = request.touch
 
     def _obey(self, request: OperatorRequest, now_ns: int) -> None:
         """Carry out a request other than PROGRESS, and inform the observers."""

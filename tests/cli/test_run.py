@@ -96,7 +96,7 @@ def test_a_closed_pipe_does_not_end_the_run(folder, monkeypatch):
     os.close(reader)
     with os.fdopen(writer, "w") as closed_pipe:
         monkeypatch.setattr("sys.stdout", closed_pipe)
-        assert main([*FLY, "--out", "here", "--set", "criteria.contact=true"]) == 1
+        assert main([*FLY, "--out", "here", "--set", "criteria.time_limit_s=0.5"]) == 1
     assert (folder / "here" / "report.json").is_file()
 
 
@@ -114,13 +114,16 @@ def build() -> Bad:
 @pytest.mark.parametrize(
     ("how", "more"),
     [
-        ("--mode virtual", ["  also: the arm never touched the board", "faults noted in flight: "]),
+        (
+            "--mode virtual --set criteria.time_limit_s=0.5",
+            ["  also: ", "faults noted in flight: "],
+        ),
         ("--seeds 1", []),
     ],
 )
 def test_a_failing_plug_in_fails_the_run_and_debug_shows_where(how, more, folder, call):
     (folder / "bad.py").write_text(FAILING)
-    line = [f"run steps {how} --set cloud.predictor=./bad.py --set criteria.contact=true", *SHORT]
+    line = [f"run steps {how} --set cloud.predictor=./bad.py", *SHORT]
     shown = call(*line, code=1)
     for said in ("KeyError: 'oops', bad.py:5 in predict", *more):
         assert said in shown.out

@@ -36,9 +36,10 @@ USING = "cloudrc: using the run in s\n"
 def test_a_flown_order_becomes_the_mission_of_the_report(name):
     experiment = load_experiment(name)
     plan = assembly.mission_plan(experiment.mission, 33.0, fence=FENCE)
-    flown = assembly.with_order(load_experiment("hover"), Order(plan, contact=True), "")
+    order = Order(plan, touch=experiment.mission.touch)
+    flown = assembly.with_order(load_experiment("hover"), order, "")
     assert assembly.mission_plan(flown.mission, flown.criteria.time_limit_s, fence=FENCE) == plan
-    assert (flown.criteria.contact, flown.name) == (True, "hover")
+    assert (flown.mission.touched, flown.name) == ("board", "hover")
 
 
 @pytest.fixture
@@ -76,7 +77,7 @@ def test_a_drive_becomes_a_mission_with_setpoints(folder):
     (folder / "drive.csv").write_text(rest)
     again = read_experiment(folder / "config.yaml")
     assert again.mission.setpoints == str(folder / "drive.csv")
-    assert (again.mission.start, again.criteria.contact) == ("here", False)
+    assert (again.mission.start, again.mission.touch) == ("here", None)
     assert assembly.build_plan(again).track[0][1][1] < 10.0
 
 

@@ -122,7 +122,7 @@ def order(point):
 
 
 def test_teleop_takes_two_numbers_and_refuses_heights():
-    options = {"contact": False, "planar": True, "plan": partial(mission_plan, fence=FENCE)}
+    options = {"planar": True, "plan": partial(mission_plan, fence=FENCE)}
     taken = read_order(order([1.5, 1.2]), SCENE, **options)
     assert taken.plan.legs[0].position == (1.5, 1.2, 0.1)
     with pytest.raises(RefusedError, match="has a height"):

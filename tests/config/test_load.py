@@ -1,12 +1,14 @@
 """Experiments are resolved, values override each other in order, and a dump loads again."""
 
 import hashlib
+import re
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cloudrc import renamed
 from cloudrc.config import document, shipped
 from cloudrc.config.document import parse_value
 from cloudrc.config.load import dump, fingerprint, load_experiment, load_profile, read_experiment
@@ -15,6 +17,9 @@ from cloudrc.geometry.scene import SCENES, load_scene
 from cloudrc.link.traces import link_profile
 
 PROFILES = shipped.names("profile")
+BOARD = "board", 0.25
+IN_PIPES = "world.scene=pipes", "mission.waypoints=[{position_m: [0.5, 0, 0.7]}]"
+SPEED = "contact_speed_max_mps"
 
 
 def again(experiment, folder, *settings):
@@ -53,7 +58,7 @@ def test_paper_is_the_published_scheme():
     assert paper.cloud.controller.model_extra["gain_p"] == [0.8, 0.8, 1.5]
     assert len(paper.mission.waypoints) == 7
     assert paper.mission.waypoints[-1].position_m == (8.235, -6.422, 0.7)
-    assert (paper.guard.command_age_max_ms, paper.criteria.contact) == (250, True)
+    assert (paper.guard.command_age_max_ms, paper.mission.touched) == (250, "board")
     verbatim = load_experiment("paper-verbatim")
     assert (verbatim.tunnel.order, verbatim.guard.command_age_max_ms) == ("arrival", 400)
 
@@ -86,18 +91,63 @@ def test_a_profile_sets_and_another_resets_the_limits_of_cloud(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "settings", "contact"),
+    ("name", "settings", "touch", "said"),
     [
-        ("paper", [], True),
-        ("paper", ["world.scene=empty", "mission=hover"], False),
-        ("steps", [], False),
-        ("hover", [], False),
-        ("hover", ["criteria.contact=true"], True),
-        ("paper", ["criteria.contact=false", "mission.waypoints=[{position_m: [1, 0, 1]}]"], False),
+        ("paper", [], BOARD, []),
+        ("paper", ["mission=hover"], None, []),
+        ("hover", ["world.scene=pillars", "mission.touch.body=pillar_1"], ("pillar_1", 0.25), []),
+        ("paper", ["mission.setpoints=drive.csv"], None, []),
+        # The keys of older files
+        (
+            "hover",
+            ["criteria.contact=true", *IN_PIPES],
+            BOARD,
+            ["mission.touch.body=board"],
+        ),
+        ("paper", ["criteria={contact: false}", *IN_PIPES], None, ["mission.touch=null"]),
+        ("paper", ["criteria.contact=null"], BOARD, []),
+        ("paper", [f"criteria.{SPEED}=1"], ("board", 1), ["mission.touch.speed_max_mps=1"]),
+        ("steps", [f"criteria.{SPEED}=1"], None, ["mission.touch.speed_max_mps=1"]),
     ],
 )
-def test_contact_is_required_only_where_the_scene_has_a_board(name, settings, contact):
-    assert load_experiment(name, settings).criteria.contact is contact
+def test_a_mission_says_what_the_robot_touches(
+    tmp_path, monkeypatch, caplog, name, settings, touch, said
+):
+    renamed.tell.cache_clear()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "drive.csv").write_text("time_s,x_m,y_m,z_m\n0,0,0,1\n1,0,0,1\n")
+    found = load_experiment(name, settings).mission.touch
+    assert (found and (found.body, found.speed_max_mps)) == touch
+    assert [text.split(" is ")[1] for text in caplog.messages] == [f"{each} now" for each in said]
+
+
+@pytest.mark.parametrize(
+    ("name", "setting", "said"),
+    [
+        (
+            "paper",
+            "touch.body=bord",
+            "bord: the scene pipes has no such body; the nearest name is board",
+        ),
+        (
+            "paper",
+            "touch.body=x",
+            "its bodies: pipe_1, pipe_2, pipe_3, board; or set",
+        ),
+        ("paper", "touch.body=floor", "floor: the robot stands on it"),
+        ("hover", "touch.body=board", "its bodies: none but floor"),
+        ("steps", "touch.body=board", "mission.touch: random steps lead to no body"),
+        ("paper", "touch.speed_max_mps=0", "touch.speed_max_mps: 0: must be a number > 0"),
+        ("paper", "touch.speed_max_mps=-1", "must be a number > 0"),
+        ("paper", f"touch.body={'é' * 33}", "must have at most 64 bytes"),
+        ("hover", "touch.speed_max_mps=1", "mission.touch.body: is missing"),
+        ("paper", "touch=board", "mission.touch: 'board': must be"),
+    ],
+)
+def test_a_touch_that_cannot_be_is_refused_in_one_line(name, setting, said):
+    with pytest.raises(BadInputError, match=re.escape(said)) as refused:
+        load_experiment(name, [f"mission.{setting}"])
+    assert "\n" not in str(refused.value)
 
 
 def test_single_values_override_the_profile(tmp_path):

@@ -19,7 +19,7 @@ from tests.conftest import nightly
 OWN = """\
 mission: {waypoints: [{position_m: [0, 0, 1.0]}]}
 world: {scene: empty}
-criteria: {contact: false, time_limit_s: 40}
+criteria: {time_limit_s: 40}
 """
 NAMES = {
     **{"robot": "pelican", "scene": "empty", "profile": "paper-p2", "mission": "hover"},
@@ -37,7 +37,11 @@ CHOSEN = [
     *(("link.both.delay_ms", 300), ("link.uplink.loss", {"bad_start": 0.1, "bad_end": 0.3})),
     ("link.uplink.changes", [{"at_s": 3, "delay_ms": 50}]),
     ("link.downlink.blackouts", [{"start_s": 3, "duration_s": 0.4}]),
-    *(("mission", "steps"), ("mission.carrot", {"speed_mps": 2}), ("criteria.contact", True)),
+    *(
+        ("mission", "steps"),
+        ("mission.carrot", {"speed_mps": 2}),
+        ("mission.touch", None),
+    ),
 ]
 """Settings that depend on each other, or replace many values."""
 

@@ -76,9 +76,9 @@ class BareCloud:
         body = codec.encode_command(Command(now_ns, basis_ns, 0, velocity, 0.0))
         return self.session.seal(Kind.COMMAND, body)
 
-    def ask(self, number, request, start, mission_id=0, basis_ns=0, reached=0, contact=False):
+    def ask(self, number, request, start, mission_id=0, basis_ns=0, reached=0, touch=""):
         asked = OperatorRequest(
-            number, request, start, mission_id, reached, basis_stamp_ns=basis_ns, contact=contact
+            number, request, start, mission_id, reached, basis_stamp_ns=basis_ns, touch=touch
         )
         return self.session.seal(Kind.OPERATOR, codec.encode_operator(asked))
 

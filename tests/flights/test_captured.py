@@ -8,7 +8,7 @@ from cloudrc.tunnel.codec import Kind, peek
 
 HOVER = (
     "mission.waypoints=[{position_m: [0.5, 0, 0.8], dwell_s: 1}]",
-    "criteria.contact=false",
+    "mission.touch=null",
 )
 
 

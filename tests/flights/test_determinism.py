@@ -19,7 +19,7 @@ from cloudrc.tunnel.codec import DecodeError
 from cloudrc.tunnel.end import Identity
 from tests.flights.conftest import both_ways, ring
 
-SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 1.0}]", "criteria.contact=false")
+SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 1.0}]", "mission.touch=null")
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = sorted((ROOT / "cloudrc").rglob("*.py"))
 PRINT = """

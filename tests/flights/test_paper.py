@@ -58,7 +58,7 @@ def test_the_limit_of_a_leg_defaults_to_three_times_its_time():
 
 
 def test_a_long_mission_needs_no_time_limit_of_its_own():
-    flight = fly("hover", "mission.waypoints.0.dwell_s=70", "criteria={contact: false}")
+    flight = fly("hover", "mission.waypoints.0.dwell_s=70", "criteria={settle_m: 0.15}")
     assert flight.verdict.failures == ()
     steps = load_experiment("steps", ["mission.steps.count=20"])
     assert assembly.build_plan(steps).time_limit > 20 * 4.25

@@ -19,7 +19,7 @@ HOLD_MAX = 2 * DELAY + 1.1
 """Longest HOLD of a change of keys [s]: a round trip, and the guard's settling time."""
 HOVER = (
     "mission.waypoints=[{position_m: [0.5, 0, 0.8], dwell_s: 400, time_limit_s: 500}]",
-    *("criteria.time_limit_s=500", "criteria.contact=false", f"link.both.delay_ms={DELAY * 1e3}"),
+    *("criteria.time_limit_s=500", "mission.touch=null", f"link.both.delay_ms={DELAY * 1e3}"),
 )
 ENDS = ("world", "cloud")
 

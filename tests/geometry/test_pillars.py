@@ -11,7 +11,7 @@ from cloudrc.geometry.scene import load_scene
 
 def test_all_bodies_of_a_shipped_scene_are_obstacles_also_without_numbers_in_its_file():
     scene = load_scene("pillars")
-    found = {each.name for each in obstacles(scene, contact=False)}
+    found = {each.name for each in obstacles(scene, touch=None)}
     assert found == set(body_names(scene)) - {"floor"}
     assert {"pillar_1", "pillar_4", "thick_left", "block"} <= found
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.config.mission_check import check_mission, check_scene
-from cloudrc.config.schema import MissionConfig, Steps, Waypoint
+from cloudrc.config.schema import MissionConfig, Steps, Touch, Waypoint
 from cloudrc.geometry.clearance import clearance
 from cloudrc.geometry.obstacles import obstacles
 from cloudrc.geometry.placement import (
@@ -22,7 +22,7 @@ from cloudrc.geometry.scene import SCENES, load_scene
 from tests.fences import FENCE
 
 PIPES = load_scene("pipes")
-KNOWN = obstacles(PIPES, contact=True)
+KNOWN = obstacles(PIPES, touch="board")
 
 
 def hit(position, yaw=0.0):
@@ -35,9 +35,9 @@ def crossed(start, end):
 
 def refusals(*positions, start="spawn", scene="pipes", **more):
     waypoints = tuple(Waypoint(position_m=position, **more) for position in positions)
-    problems = check_mission(
-        MissionConfig(start=start, waypoints=waypoints), load_scene(scene), contact=True
-    )
+    touch = Touch(body="board") if scene == "pipes" else None
+    mission = MissionConfig(start=start, waypoints=waypoints, touch=touch)
+    problems = check_mission(mission, load_scene(scene))
     return "\n".join(map(str, problems))
 
 
@@ -141,13 +141,11 @@ def test_a_mission_with_a_wall_on_its_way_is_refused(positions, start, reason):
     ],
 )
 def test_steps_that_can_end_in_a_wall_are_refused(steps, scene, reason):
-    (problem,) = check_mission(
-        MissionConfig(steps=Steps(**steps)), load_scene(scene), contact=False
-    )
+    (problem,) = check_mission(MissionConfig(steps=Steps(**steps)), load_scene(scene))
     assert problem.path == ("steps",)
     assert reason in problem.reason
     both = MissionConfig(waypoints=(Waypoint(position_m=(0.0, 0.0, 1.0)),), steps=Steps(**steps))
-    assert "not both" in str(check_mission(both, PIPES, contact=False)[0])
+    assert "not both" in str(check_mission(both, PIPES)[0])
 
 
 POST = '<body name="post" pos="1.2 0 1"><geom type="capsule" size=".05 1"/></body>'
@@ -176,35 +174,34 @@ def own_scene(tmp_path):
         (POST.replace('name="post" ', ""), [(2.4, 0, 1)], "through unnamed body 1, or within"),
         (f'<body name="hall">{POST}</body>', [(0, 0, 1), (2.4, 0, 1)], "through post, or within"),
         (POST.replace("<geom", '<geom contype="0" conaffinity="0"'), [(2.4, 0, 1)], ""),
-        (POST.replace('"post"', '"board"'), [(0, 0, 1), (2.4, 0, 1)], "the board, an obstacle"),
+        (POST.replace('"post"', '"board"'), [(0, 0, 1), (2.4, 0, 1)], "through board, or within"),
     ],
 )
 def test_every_body_of_a_scene_of_ones_own_is_in_the_way(own_scene, bodies, waypoints, reason):
     mission = MissionConfig(waypoints=tuple(Waypoint(position_m=each) for each in waypoints))
-    said = "\n".join(map(str, check_mission(mission, own_scene(bodies), contact=False)))
+    said = "\n".join(map(str, check_mission(mission, own_scene(bodies))))
     assert reason in said if reason else said == ""
 
 
 def test_the_board_is_in_the_way_of_missions_that_need_not_touch_it():
     before, behind = (Waypoint(position_m=(x, -6.42, 0.7)) for x in (7.5, 8.235))
     mission = MissionConfig(start="here", waypoints=(before, behind))
-    assert check_mission(mission, PIPES, contact=True) == []
-    (problem,) = check_mission(mission, PIPES, contact=False)
-    assert "within 0.04 m of the board" in problem.reason
+    to_board = mission.model_copy(update={"touch": Touch(body="board")})
+    assert check_mission(to_board, PIPES) == []
+    (problem,) = check_mission(mission, PIPES)
+    assert "within 0.04 m of board" in problem.reason
 
 
 @pytest.mark.parametrize(
-    ("bodies", "contact", "path", "reason"),
+    ("bodies", "touch", "path", "reason"),
     [
-        (POST, False, None, ""),
-        (GROUND, False, ("world", "scene"), "touches world, the geoms in the worldbody"),
-        (POST.replace("1.2 0 1", "0 0 1"), False, ("world", "scene"), "touches post"),
-        (POST, True, ("criteria", "contact"), "no body named board to touch; it has floor, post"),
-        (POST.replace("post", "bord"), True, ("criteria", "contact"), "the nearest name is bord"),
-        (POST.replace("post", "board"), True, None, ""),
+        (POST, None, None, ""),
+        (POST.replace("1.2 0 1", "0 0 1"), "post", None, ""),
+        (GROUND, None, ("world", "scene"), "touches world, the geoms in the worldbody"),
+        (POST.replace("1.2 0 1", "0 0 1"), None, ("world", "scene"), "touches post"),
     ],
 )
-def test_a_scene_fits_its_missions(own_scene, bodies, contact, path, reason):
-    problems = check_scene(own_scene(bodies), contact=contact)
+def test_a_scene_fits_its_missions(own_scene, bodies, touch, path, reason):
+    problems = check_scene(own_scene(bodies), touch=touch)
     assert [problem.path for problem in problems] == ([path] if path else [])
     assert all(reason in problem.reason for problem in problems)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cache
 
 from cloudrc.config.load import load_experiment
-from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
+from cloudrc.config.schema import Criteria, MissionConfig, Touch, Waypoint
 from cloudrc.geometry.scene import Board, Pipe, Scene
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.metrics import Flight
@@ -64,12 +64,15 @@ class Log:
             changed = [next(new) if isinstance(each, kind) else each for each in records]
             records[:] = [each for each in changed if each is not None]
 
-    def flight(self, scene=OPEN_AIR, *, waypoints=1, mission=None, time_limit=60.0, **criteria):
+    def flight(
+        self, scene=OPEN_AIR, *, waypoints=1, mission=None, time_limit=60.0, touch=None, **criteria
+    ):
         anywhere = Waypoint(position_m=(10.0, 0.0, 1.0), tolerance_m=10.0, dwell_s=0.0)
+        mission = mission or MissionConfig(waypoints=(anywhere,) * waypoints)
         return Flight(
             Recording.from_records(*self.ends()),
             Criteria(time_limit_s=time_limit, **criteria),
-            mission or MissionConfig(waypoints=(anywhere,) * waypoints),
+            mission.model_copy(update={"touch": touch and Touch(body=touch)}),
             scene,
         )
 

@@ -57,7 +57,7 @@ def contact():
     log.world += [touch(6, "floor"), touch(7, tip=False), touch(8), touch(9)]
     log.world.append(touch(3, "pipe_1", tip=False))
     pressing(log, 8, lambda n: 0.1 if n % 2 else 0.3)
-    return log.flight(ONE_PIPE, contact=True)
+    return log.flight(ONE_PIPE, touch="board")
 
 
 def changed(kind, how, scene=OPEN_AIR):
@@ -141,7 +141,7 @@ def armed_early():
 
     log.change(TelemetrySent, number)
     log.world.append(touch(8))
-    return log.flight()
+    return log.flight(touch="board")
 
 
 def resting():

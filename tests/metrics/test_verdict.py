@@ -81,7 +81,7 @@ def met(speed):
     ],
 )
 def test_rules(log, limits, outcome, found):
-    verdict = judged(log().flight(ONE_PIPE, **{"contact": True, **limits}))
+    verdict = judged(log().flight(ONE_PIPE, **{"touch": "board", **limits}))
     assert (verdict.outcome, codes(verdict)) == (outcome, found)
 
 
@@ -105,7 +105,7 @@ def test_rules(log, limits, outcome, found):
     ],
 )
 def test_a_failure_says_what_when_and_where(log, code, text, time):
-    (failure,) = judged(log.flight(ONE_PIPE, contact=True)).failures
+    (failure,) = judged(log.flight(ONE_PIPE, touch="board")).failures
     assert failure.code == code
     assert text in failure.text
     assert failure.time == pytest.approx(time)
@@ -113,15 +113,16 @@ def test_a_failure_says_what_when_and_where(log, code, text, time):
 
 
 @pytest.mark.parametrize(
-    ("body", "contact", "is_obstacle"),
+    ("body", "wanted", "is_obstacle"),
     [
-        *((body, True, True) for body in ("pillar", "world", "pipe_1", "unnamed body 1", "board2")),
-        *(("board", contact, not contact) for contact in (True, False)),
-        *(("floor", contact, False) for contact in (True, False)),
+        *((body, "board", True) for body in ("pillar", "world", "unnamed body 1", "board2")),
+        *(("board", wanted, wanted != "board") for wanted in ("board", "pillar", None)),
+        *(("floor", wanted, False) for wanted in ("board", None)),
+        ("pillar", "pillar", False),
     ],
 )
-def test_every_body_is_an_obstacle_but_the_floor_and_a_board_to_touch(body, contact, is_obstacle):
-    flight = world(touch(3, body), log=flown).flight(contact=contact)
+def test_every_body_is_an_obstacle_but_the_floor_and_what_to_touch(body, wanted, is_obstacle):
+    flight = world(touch(3, body), log=flown).flight(touch=wanted)
     found = [f for f in judged(flight).failures if f.code == "obstacle_touched"]
     said = [(f.text, f.time, f.place) for f in found]
     assert said == [(f"the robot touched {body}", 3.0, (3.0, 0.0, 1.0))] * is_obstacle
@@ -130,7 +131,7 @@ def test_every_body_is_an_obstacle_but_the_floor_and_a_board_to_touch(body, cont
 
 def test_two_bodies_touched_at_once_are_two_failures():
     log = world(touch(3, "b"), touch(3, "a"), touch(4, "b"), log=flown)
-    found = judged(log.flight(contact=False)).failures
+    found = judged(log.flight()).failures
     assert [each.text for each in found if each.code == "obstacle_touched"] == [
         "the robot touched a",
         "the robot touched b (2 times)",
@@ -140,21 +141,21 @@ def test_two_bodies_touched_at_once_are_two_failures():
 def test_a_robot_that_never_flew_is_a_failure():
     log = flown()
     log.change(GuardChange, lambda n, change: None)
-    (failure,) = judged(log.flight(ONE_PIPE, contact=True)).failures
+    (failure,) = judged(log.flight(ONE_PIPE, touch="board")).failures
     assert failure.code == "not_started"
     assert "guard.command_age_max_ms" in failure.text
 
 
 def test_an_interrupted_run_lists_only_certain_failures():
     log = without_end(world(touch(3, "pipe_1"), log=flown))
-    verdict = judged(log.flight(ONE_PIPE, contact=True), interrupted=True)
+    verdict = judged(log.flight(ONE_PIPE, touch="board"), interrupted=True)
     assert verdict.outcome == "interrupted"
     assert codes(verdict) == ["interrupted", "obstacle_touched"]
     log.change(GuardChange, lambda n, change: None)
     (failure,) = judged(log.flight(), interrupted=True).failures
     assert failure.text.endswith("before the mission started")
     # After the mission's end an interruption changes nothing.
-    assert judged(good().flight(ONE_PIPE, contact=True), interrupted=True).outcome == "success"
+    assert judged(good().flight(ONE_PIPE, touch="board"), interrupted=True).outcome == "success"
 
 
 MISSED = MissionConfig(waypoints=(Waypoint(position_m=(0.0, 5.0, 1.0)),))
@@ -172,7 +173,7 @@ MISSED = MissionConfig(waypoints=(Waypoint(position_m=(0.0, 5.0, 1.0)),))
     ],
 )
 def test_the_operator_knows_what_had_arrived(log, mission, report, operator):
-    flight = log.flight(ONE_PIPE, contact=True, mission=mission)
+    flight = log.flight(ONE_PIPE, touch="board", mission=mission)
     numbers = measured(flight)
     evidence = flight_evidence(flight, numbers, real_time=True, interrupted=False)
     assert codes(judged(flight)) == report
@@ -190,7 +191,7 @@ def test_the_operator_knows_what_had_arrived(log, mission, report, operator):
 def test_real_time_is_kept_or_the_run_is_invalid(slip, factor, found):
     values = {"waypoints_reached": 1.0, "world_slip": slip, "real_time_factor": factor}
     numbers = {name: Number(value, "", "") for name, value in values.items()}
-    flight = good().flight(ONE_PIPE, contact=True)
+    flight = good().flight(ONE_PIPE, touch="board")
     verdict = judge(flight_evidence(flight, numbers, real_time=True, interrupted=False))
     assert (verdict.outcome, codes(verdict)) == ("invalid" if found else "success", found)
     # Virtual time does not depend on the machine.
@@ -206,7 +207,7 @@ def test_a_plug_in_may_fail_in_one_percent_of_the_periods(failures, found):
     text = "the predictor failed (KeyError: 'oops', my.py:12 in predict)"
     log.cloud.append(Fault(at(1), "predictor_failed", text))
     log.cloud.append(Counted(at(2), "cloud", "predictor_failed", failures))
-    verdict = judged(log.flight(ONE_PIPE, contact=True))
+    verdict = judged(log.flight(ONE_PIPE, touch="board"))
     assert codes(verdict) == found
     assert all(
         "failed in 1.25% of its periods, above 1%:" in each.text for each in verdict.failures

@@ -19,7 +19,7 @@ from cloudrc.record.topics import TOPICS, VIEWS
 from cloudrc.runs.fly import fly
 
 LAYOUT = Path(__file__).resolve().parents[2] / "docs" / "cloudrc.foxglove.json"
-SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 1.0}]", "criteria.contact=false")
+SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 1.0}]", "mission.touch=null")
 
 
 @pytest.fixture(scope="module")

@@ -225,7 +225,7 @@ def test_points_that_share_results_are_independent(write_sweep):
 def test_nothing_is_kept_after_the_plan(write_sweep, tmp_path):
     """A notebook may edit a mission, and read its sweep again."""
     (tmp_path / "mine.yaml").write_text("waypoints: [{position_m: [0, 0, 1]}]\n")
-    keys = {"set": {"mission": "./mine.yaml", "criteria.contact": False, "world.scene": "empty"}}
+    keys = {"set": {"mission": "./mine.yaml", "world.scene": "empty"}}
     path = write_sweep({}, **keys)
     before = read_grid(path).points[0].mission.waypoints[0].position_m
     (tmp_path / "mine.yaml").write_text("waypoints: [{position_m: [0, 0, 2]}]\n")

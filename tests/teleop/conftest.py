@@ -205,7 +205,7 @@ class ServiceFlight(Flight):
     def restart_teleop(self):
         """Start a new service with the missions on the disk."""
         self.killed_before = self.killed_after = None  # number of a commit
-        self.teleop = MissionService(0.25, self.stored(), FENCE, self.scene)
+        self.teleop = MissionService(self.stored(), FENCE, self.scene)
 
     def stored(self):
         """Return the store that a new process reads from the disk."""
@@ -323,7 +323,7 @@ class Running:
         self.flight.uplink = uplink
         self.alarms, self.complaints = [], []
         self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
-        how = {"contact": True, "plan": partial(assembly.mission_plan, fence=FENCE)}
+        how = {"plan": partial(assembly.mission_plan, fence=FENCE)}
         order, goto = (partial(read, scene=self.scene) for read in (read_order, read_goto))
         order = partial(order, **how)
         app = create_app(self.bridge, order, goto, read_drive, self.complaints.append)

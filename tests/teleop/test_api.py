@@ -92,12 +92,15 @@ def test_a_lease_is_renewed_and_an_impossible_one_refused(api):
         assert api.post("/v1/missions", {**MISSION, "lease_s": lease})[0] == 422
 
 
-def test_only_a_mission_to_the_board_must_touch_it(api):
-    pipes = [point.position_m for point in load_experiment("paper").mission.waypoints]
-    for points, contact in (([(0.5, 0.0, 1.0)], False), (pipes, True)):
-        _, view = api.post("/v1/missions", {"waypoints": [{"position_m": p} for p in points]})
-        assert api.flight.teleop.book.find(view["id"]).order.contact is contact
+def test_a_mission_may_have_to_touch_a_body_of_the_scene(api):
+    pipes = load_experiment("paper").mission.model_dump(include={"waypoints", "touch"})
+    for mission, touched in ((MISSION, None), (pipes, "board")):
+        _, view = api.post("/v1/missions", mission)
+        assert api.flight.teleop.book.find(view["id"]).order.touched == touched
         api.post(f"/v1/missions/{view['id']}/cancel")
+    for touch in ({"body": "bord"}, {"body": "floor"}, {"body": "board", "speed_max_mps": 0}):
+        status, answer = api.post("/v1/missions", {**pipes, "touch": touch})
+        assert (status, answer["problems"][0]["path"][:6]) == (422, "touch.")
 
 
 def test_requests_and_refusals_become_metrics(api):

@@ -6,6 +6,7 @@ from unittest.mock import Mock
 
 import pytest
 
+from cloudrc.config.schema import Touch
 from cloudrc.drivers.teleop import STALL_NS, TeleopLoop
 from cloudrc.exposition.table import MISSION_OUTCOMES
 from cloudrc.geometry.scene import load_scene
@@ -16,6 +17,7 @@ from cloudrc.teleop.store import ConflictError, Order, UnavailableError
 from cloudrc.teleop.wire import ENDED, STATES, Leg, Plan
 from tests.teleop.conftest import FROM_SPAWN, PLACES, A, ServiceFlight, play, service_flying
 
+BOARD = Touch(body="board")
 QUICK = Plan((Leg(A, dwell=0.0),), Start.HERE)
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
@@ -257,7 +259,7 @@ def test_a_key_is_that_of_one_order_for_ever():
     play(flight, "A B C")
     for _ in range(2):
         assert flight.create(key="uid") == mission_id
-        for order in (Order(QUICK, key="uid"), Order(FROM_SPAWN, key="uid", contact=True)):
+        for order in (Order(QUICK, key="uid"), Order(FROM_SPAWN, key="uid", touch=BOARD)):
             with pytest.raises(ConflictError, match="mission m1 has the key 'uid' already"):
                 flight.teleop.create(order, flight.now_ns)
         flight.restart_teleop()
@@ -330,7 +332,7 @@ def test_the_setpoint_is_repeated_at_10_hz():
 @pytest.mark.parametrize("restarted", [False, True])
 def test_what_the_robot_touched_decides(seen, codes, exit_code, restarted):
     """Also what it touched while teleop was away, but not the time that world lost then."""
-    flight, mission_id = service_flying(contact=True)
+    flight, mission_id = service_flying(touch=BOARD)
     if restarted:
         flight.restart_teleop()
         if "slip_ns" in seen:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc.config.schema import Touch
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Start
 from cloudrc.teleop import models
@@ -29,7 +30,7 @@ from cloudrc.teleop.wire import Leg, Plan
 from tests.teleop.conftest import A, B, C, KilledError, ServiceFlight, play, service_flying
 
 PLAN = Plan((Leg(A, 0.1, float("inf"), 0.5, 3.0), Leg(B)), Start.HERE, 12.5)
-ORDER = Order(PLAN, "näme", "key", contact=True)
+ORDER = Order(PLAN, "näme", "key", touch=Touch(body="board"))
 FULL = "the journal cannot be written: database or disk is full"
 
 

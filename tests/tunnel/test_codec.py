@@ -93,11 +93,14 @@ def test_every_wrong_length_direction_and_version_is_refused(kind):
     body = bytes(codec.BODY_SIZES[kind] + codec.TAG_SIZE)
     whole = codec.encode_header(kind, 0, 1, 2) + body
     assert outcome(codec.check, whole) == "fine"
-    plans = {len(whole) + 8 + 12 * n for n in range(1, 81)} if kind == Kind.COMMAND else set()
-    assert max(plans, default=0) <= codec.DATAGRAM_MAX <= 1200
-    for length in {*range(1300), 2048} - plans - {len(whole)}:
+    longer = {
+        Kind.COMMAND: {len(whole) + 8 + 12 * n for n in range(1, 81)},
+        Kind.OPERATOR: {len(whole) + n for n in range(1, 65)},
+    }.get(kind, set())
+    assert max(longer, default=0) <= codec.DATAGRAM_MAX <= 1200
+    for length in {*range(1300), 2048} - longer - {len(whole)}:
         assert outcome(codec.check, whole[:length].ljust(length, b"\0")) == "malformed"
-    for length in plans:
+    for length in longer:
         assert outcome(codec.check, whole.ljust(length, b"\0")) == "fine"
     assert outcome(codec.check, bytes([whole[0], 2]) + whole[2:]) == "malformed"
     for version in {*range(256)} - {codec.VERSION}:
@@ -123,7 +126,7 @@ TELEMETRY = bytes(codec.BODY_SIZES[Kind.TELEMETRY])
     ("decode", "body", "offset", "largest"),
     [
         (codec.decode_operator, LARGEST, 4, max(Request)),
-        (codec.decode_operator, LARGEST, 5, max(Start) + 0b10),  # with the bit of the board
+        (codec.decode_operator, LARGEST, 5, max(Start)),
         (codec.decode_operator, LARGEST, 13, 0x7F),  # a mission that no recording can name
         (codec.decode_telemetry, TELEMETRY, -2, max(GuardState)),
         (codec.decode_telemetry, TELEMETRY, -1, max(Cause)),
@@ -134,6 +137,14 @@ def test_an_undefined_value_is_refused(decode, body, offset, largest):
     for value, said in ((largest, "fine"), (largest + 1, "malformed"), (255, "malformed")):
         changed[offset] = value
         assert outcome(decode, changed) == said
+
+
+@pytest.mark.parametrize("name", ["", "board", "é" * 32, "a b/1"])
+def test_the_name_of_the_body_to_touch_arrives(name):
+    request = OperatorRequest(1, Request.START, touch=name)
+    body = codec.encode_operator(request)
+    assert codec.decode_operator(body) == request
+    assert outcome(codec.decode_operator, body + b"\xff") == "malformed"
 
 
 def test_a_velocity_as_planned_arrives_as_it_is():

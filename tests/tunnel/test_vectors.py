@@ -25,13 +25,13 @@ def derived(salt, info):
 
 GOLDEN = {
     "accept": (
-        "06000700000000020000000000000000636c6f75642020202020202020202020776f726c642020202020"
-        "202020202020636c6f636b202020202020202020202000dd78ebc4d57ae7a9a0b488b1fca35b57"
+        "07000700000000020000000000000000636c6f75642020202020202020202020776f726c642020202020"
+        "202020202020636c6f636b2020202020202020202020006dd44578972cf95d28cd35d4a05280ee"
     ),
     "command": (
-        "06010700000000060100000000000000a84139dbc99cdad5c8becaab1240adb008bfb7d295490f703877"
-        "0e572de88fe66b6b9c6ba1cde8361cde9d0787427d60f5e7672c796e27f79879912f2c71aac103590409"
-        "402bd85b"
+        "070107000000000601000000000000001ca1c4fd79f9a3ace043c427d057383ef63acdfee43e695569ef"
+        "63d759ffbbc288c3efabaa084b2e8b0514ec06f58131e5b7792b23d7e389189571a1d14fe6a130fa1a90"
+        "8bc2568b"
     ),
 }
 """Bytes of datagrams. If they change, the format has changed: raise `codec.VERSION`."""
@@ -39,14 +39,14 @@ GOLDEN = {
 
 def greeting(direction, epoch, kind, counter, body):
     """Make a greeting as docs/wire.md describes it."""
-    data = struct.pack("<BBIBBQ", 6, direction, epoch, 0, kind, counter) + body
-    return data + hmac.digest(derived(b"", b"cloudrc 6 greeting"), data, hashlib.sha256)[:16]
+    data = struct.pack("<BBIBBQ", 7, direction, epoch, 0, kind, counter) + body
+    return data + hmac.digest(derived(b"", b"cloudrc 7 greeting"), data, hashlib.sha256)[:16]
 
 
 def sealed(direction, epoch, kind, counter, body):
     """Make a datagram of a session as docs/wire.md describes it."""
-    key = derived(CLOUD + WORLD, b"cloudrc 6 session %d %d" % (direction, epoch))
-    header = struct.pack("<BBIBBQ", 6, direction, epoch, 0, kind, counter)
+    key = derived(CLOUD + WORLD, b"cloudrc 7 session %d %d" % (direction, epoch))
+    header = struct.pack("<BBIBBQ", 7, direction, epoch, 0, kind, counter)
     return header + AESGCM(key).encrypt(header[4:], body, header)
 
 
@@ -62,7 +62,7 @@ def test_the_tunnel_is_as_described_and_as_it_was():
         )
         return told.datagrams[0]
 
-    cookie = hmac.digest(derived(WORLD, b"cloudrc 6 cookies"), b"3", hashlib.sha256)[:13]
+    cookie = hmac.digest(derived(WORLD, b"cloudrc 7 cookies"), b"3", hashlib.sha256)[:13]
     first = cloud.greet(Kind.HELLO, client.make_hello())
     challenge = answer(first)
     assert codec.decode(Kind.CHALLENGE, cloud.open(challenge)[-1])[0] == cookie
@@ -97,7 +97,7 @@ def test_the_tunnel_is_as_described_and_as_it_was():
 
 
 def test_names_and_nonces_are_derived_as_described():
-    assert Key(SECRET).name == derived(b"", b"cloudrc 6 name")[:4].hex()
+    assert Key(SECRET).name == derived(b"", b"cloudrc 7 name")[:4].hex()
     client = ClientHandshake(CLOUD, CLOCK)
     for world in (b"1" * 16, b"2" * 16, b"1" * 16):  # the first one comes back
         client.receive_accept(1, codec.Accept(CLOUD, world, CLOCK), asks=True)

@@ -14,7 +14,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cloudrc.config.schema import DirectionConfig
-from cloudrc.geometry.scene import BOARD
 from cloudrc.geometry.shapes import Shapes, Surface
 from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Array
@@ -118,7 +117,7 @@ class Subject:
     @property
     def touch(self) -> str | None:
         """Name of the body that the mission touches; None if there is none."""
-        return BOARD if self.flight.criteria.contact is not False else None
+        return self.flight.mission.touched
 
 
 def own_bodies(subject: Subject) -> list[Surface]:
