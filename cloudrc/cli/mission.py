@@ -102,8 +102,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     follow = "keep printing new events"
     verbs["logs"].add_argument("-f", "--follow", action="store_true", help=follow)
     about, metres = "[m], world frame", number(-1000, 1000, "metres")
-    for axis in "XYZ":
+    for axis in "XY":
         verbs["goto"].add_argument(axis.lower(), type=metres, metavar=axis, help=about)
+    about += "; none for a robot on the ground"
+    verbs["goto"].add_argument("z", nargs="?", type=metres, metavar="Z", help=about)
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -244,9 +246,9 @@ def _logs(options: argparse.Namespace, api: Api) -> int:
 
 def _order(options: argparse.Namespace, api: Api) -> int:
     if options.verb == "goto":
-        point = options.x, options.y, options.z
+        point = [each for each in (options.x, options.y, options.z) if each is not None]
         mission = api.post("/v1/goto", {"position_m": point})
-        action = "flying to ({:g}, {:g}, {:g})".format(*point)
+        action = f"on the way to ({', '.join(f'{each:g}' for each in point)})"
     else:
         mission = api.post(f"/v1/{options.verb}")
         if options.verb == "resume" and mission["by_hand"]:
@@ -304,7 +306,7 @@ VERBS: dict[str, tuple[str, Callable[[argparse.Namespace, Api], int]]] = {
     "status": ("show the robot's state, or the state of a mission", _status),
     "cancel": ("cancel a mission; the robot holds its position", _cancel),
     "logs": ("show the events of missions", _logs),
-    "goto": ("fly to a point; a held mission then holds there", _order),
+    "goto": ("go to a point; a held mission then holds there", _order),
     "drive": ("drive the robot with the keys of this terminal", _drive),
     "hold": ("hold the robot where it is, at least 0.35 m above the ground", _order),
     "resume": ("resume the held mission", _order),

@@ -32,14 +32,14 @@ DOWN_LIMIT = 120.0
 """Time limit for a session to end and to write its report [s]."""
 NEXT = """\
 in another terminal:
-  cloudrc mission run pipes
-  cloudrc mission goto 0.5 0 1.2
+  cloudrc mission run {mission}
+  cloudrc mission goto {point}
   cloudrc link set --profile paper-p3
 to end: Ctrl-C here, or cloudrc down"""
 NEXT_UNSEEN = """\
 in another terminal:
-  cloudrc mission run pipes --api {api}
-  cloudrc mission goto 0.5 0 1.2 --api {api}
+  cloudrc mission run {mission} --api {api}
+  cloudrc mission goto {point} --api {api}
 to end: Ctrl-C here"""
 """In place of `NEXT` if other commands do not find the session."""
 UP_EPILOG = """\
@@ -75,10 +75,15 @@ def _up(options: argparse.Namespace) -> int:
         say(escape(f"  API      {api}"))
         say(f"  metrics  http://127.0.0.1:PORT/metrics ({ports})")
         is_seen = folder.resolve() in under_way()
-        say(NEXT if is_seen else NEXT_UNSEEN.format(api=quote(escape(api))))
+        planar = is_planar(read_experiment(folder / "config.yaml", flown=True).world.robot)
+        mission, point = ("pillars", "1 0") if planar else ("pipes", "0.5 0 1.2")
+        text = NEXT if is_seen else NEXT_UNSEEN
+        say(text.format(api=quote(escape(api)), mission=mission, point=point))
         if options.console:
             stack.enter_context(_console(folder, say))
 
+    from cloudrc.config.load import read_experiment
+    from cloudrc.config.robot import is_planar
     from cloudrc.drivers.local import under_way
     from cloudrc.runs.under_way import short
 

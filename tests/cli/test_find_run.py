@@ -84,7 +84,7 @@ def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
 
         for words, does in (
             ("hold", "holding at ("),
-            ("goto 0.5 -1 1.2", "flying to (0.5, -1, 1.2); mission m1 (far): held"),
+            ("goto 0.5 -1 1.2", "on the way to (0.5, -1, 1.2); mission m1 (far): held"),
             ("resume", "flying to waypoint 1 of 1; mission m1 (far): flying"),
             ("cancel", "holding at ("),
             ("acknowledge", "acknowledged: the next mission may fly"),

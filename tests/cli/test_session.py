@@ -148,7 +148,7 @@ def test_a_session_flies_missions_and_reports_the_last_one(folder, command, figu
         wait_until(lambda: "guard GROUND" in command("mission status --run s"))
         (folder / "m.yaml").write_text("waypoints: [{position_m: [0.2, 0, 0.6]}]")
         assert "SUCCESS" in command("mission run m.yaml --run s")
-        assert "s: flying to (0.5, 0, 1.2); mission m2" in command("mission goto 0.5 0 1.2")
+        assert "s: on the way to (0.5, 0, 1.2); mission m2" in command("mission goto 0.5 0 1.2")
         wait_until(lambda: "done" in command("mission list --run s").splitlines()[-1])
         assert "s: in force after" in command("link set downlink.delay_ms=60")
         wait_until(lambda: "link: downlink 60 " in (folder / "said").read_text())
