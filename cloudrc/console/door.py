@@ -1,4 +1,4 @@
-"""Listen at the console's address: check every request, stop the rotors, show the plain page.
+"""Listen at the console's address: check every request, switch the robot off, show the plain page.
 
 The door has a thread of its own and does not draw, so that STOP never waits for the scene. It
 passes the WebSockets of checked pages on to viser, up to `PAGES_MAX`.
@@ -71,7 +71,7 @@ class PageAnswer(NamedTuple):
 class Desk(NamedTuple):
     """What the door needs of the console; it calls these functions in its own threads."""
 
-    stop: Callable[[], bool]  # stops the rotors, does not wait; False: not ready, ask again
+    stop: Callable[[], bool]  # switches the robot off, does not wait; False: not ready, ask again
     acts: Mapping[str, Callable[[], str]]  # name of a button -> act, returns the answer in words
     describe: Callable[[], list[str]]  # the state, line by line
     has_pilot: Callable[[], bool]  # whether a page with the scene steers
@@ -256,7 +256,7 @@ class Door:
         """Carry out what a page asks for."""
         if name == "stop":
             if self._desk.stop():
-                return PageAnswer(HTTPStatus.ACCEPTED, b"stopping the rotors")
+                return PageAnswer(HTTPStatus.ACCEPTED, b"switching the robot off")
             return PageAnswer(HTTPStatus.SERVICE_UNAVAILABLE, b"the console starts; ask again")
         if (act := self._desk.acts.get(name)) is None:
             return PageAnswer(HTTPStatus.NOT_FOUND)

@@ -123,6 +123,7 @@ class Page:
         from cloudrc.world.shapes import read_shapes  # needs MuJoCo, which takes a second
 
         shapes = read_shapes(experiment.world)
+        self._planar = shapes.planar
         self._scene = FlightScene(self._server, experiment, shapes, ASPECT)
         self._surroundings = scene_of(experiment.world)
         gui = self._server.gui
@@ -170,7 +171,8 @@ class Page:
         with suppress(RuntimeError):  # viser has just removed the controls of a browser that left
             self._follow_link(now)
             if target := self._target:
-                target[0].position = target[1].value = self._place_target(now)
+                target[0].position = place = self._place_target(now)
+                target[1].value = self._without_height(place)
 
     def close(self) -> None:
         """Stop serving the page."""
@@ -178,7 +180,7 @@ class Page:
         self._server.stop()
 
     def _stop(self) -> bool:
-        """Stop the rotors, do not wait; return False before the page is filled."""
+        """Switch the robot off, do not wait; return False before the page is filled."""
         if self._filled.is_set():
             self._steering.stop()
         return self._filled.is_set()
@@ -266,7 +268,7 @@ class Page:
     def _add_controls(self, client: viser.ClientHandle) -> None:
         gui = client.gui
         tabs = gui.add_tab_group(order=3)
-        with tabs.add_tab("Fly"):
+        with tabs.add_tab("Steer"):
             self._add_mission(gui)
             self._add_target(client)
             self._add_keys(gui)
@@ -315,24 +317,23 @@ class Page:
             self._steering.say(text, is_refusal=True)
             return
         order = mission.model_dump(mode="json", exclude={"steps"}, exclude_none=True)
-        self._steering.fly({**order, "name": experiment.name})
+        self._steering.start_mission({**order, "name": experiment.name})
 
     def _add_target(self, client: viser.ClientHandle) -> None:
         """Add a gizmo and number fields for the target position; a change of one updates both."""
-        fence = fence_of(self._surroundings)
-        low, high = fence.inner_low, fence.inner_high
         start = self._place_target(time.monotonic())
-        limits = tuple(zip(low, high, strict=True))
+        limits = tuple(zip(*self._limits(), strict=True))
         gizmo = client.scene.add_transform_controls(
             "/target",
             scale=0.45,
             disable_rotations=True,
+            active_axes=(True, True, not self._planar),
             translation_limits=limits,  # type: ignore[arg-type]
             depth_test=False,
             position=start,
         )
-        numbers: Any = client.gui.add_vector3("Target [m]", start, step=0.01)
-        send = client.gui.add_button("Send", hint="Fly to the target; a mission is held first")
+        numbers = self._add_place(client.gui, start)
+        send = client.gui.add_button("Send", hint="Go to the target; a mission is held first")
 
         free = self._target = gizmo, numbers
 
@@ -340,13 +341,12 @@ class Page:
         def _(event: Any) -> None:
             if event.client is not None:  # somebody drags
                 self._target = None
-                x, y, z = map(float, np.round(gizmo.position, 2))
-                numbers.value = (x, y, z)
+                numbers.value = self._without_height(np.round(gizmo.position, 2))
 
         def move(event: Any) -> None:
             if event.client is not None:  # somebody has typed
                 self._target = None
-                gizmo.position = numbers.value
+                gizmo.position = (*numbers.value, gizmo.position[2])[:3]
 
         numbers.on_update(move)
 
@@ -355,26 +355,44 @@ class Page:
             if self._steering.go_to(numbers.value):
                 self._target = free
 
+    def _add_place(self, gui: viser.GuiApi, start: Vector) -> Any:
+        """Add number fields for the target: three, or two for a robot that stays on the ground."""
+        add = gui.add_vector2 if self._planar else gui.add_vector3
+        return add("Target [m]", self._without_height(start), step=0.01)
+
+    def _without_height(self, place: Any) -> Any:
+        """Return a place [m] as the number fields show it."""
+        return tuple(map(float, place[:2] if self._planar else place))
+
     def _place_target(self, now: float) -> Vector:
         """Return the position [m] for a target that no user has moved, inside the fence.
 
-        It is the setpoint if cloud controls the robot, else the point 0.6 m above the robot.
+        It is the setpoint if cloud controls the robot, else the point 0.6 m above the robot, or the
+        robot's own place on the ground.
         """
         feed = self._feed
         if (control := feed.control(now)) is not None:
             at: Any = control.setpoint
         else:
             here = feed.status.position if feed.status else self._surroundings.spawn
-            at = np.add(here, (0, 0, 0.6))
-        fence = fence_of(self._surroundings)
-        x, y, z = map(float, np.round(np.clip(at, fence.inner_low, fence.inner_high), 2))
+            at = np.add(here, (0, 0, 0 if self._planar else 0.6))
+        x, y, z = map(float, np.round(np.clip(at, *self._limits()), 2))
         return x, y, z
+
+    def _limits(self) -> tuple[Vector, Vector]:
+        """Return the corners of the box for targets [m], with the smallest coordinates first."""
+        fence, ground = fence_of(self._surroundings), self._surroundings.spawn[2]
+        if not self._planar:
+            return fence.inner_low, fence.inner_high
+        return (*fence.inner_low[:2], ground), (*fence.inner_high[:2], ground)
 
     def _add_keys(self, gui: viser.GuiApi) -> None:
         """Add the buttons for driving by hand; a held button repeats its key at 10 Hz."""
         steering = self._steering
         speed = gui.add_slider("Drive [m/s]", 0.1, 1.0, 0.1, 0.4)
         for code, (label, direction) in KEYS.items():
+            if self._planar and direction[2]:
+                continue  # the key has no button, so it does nothing
             button = gui.add_button(label, color="gray")
 
             @button.on_hold

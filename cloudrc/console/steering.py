@@ -97,7 +97,7 @@ class Steering:
         self._drive.join()
 
     def stop(self) -> None:
-        """Stop the rotors, and repeat the request until the API answers; return at once."""
+        """Switch the robot off, and repeat the request until the API answers; return at once."""
         self._stops.set()
 
     def ask(self, words: str, path: str, body: Mapping[str, Any] | None = None) -> bool:
@@ -129,8 +129,8 @@ class Steering:
         words = "ending the drive" if is_drive(self.state.get("mission")) else "resumed"
         return self.ask(words, "/v1/resume")
 
-    def fly(self, order: Mapping[str, Any]) -> None:
-        """Fly a mission; if the user drives the robot by keys, first end this drive."""
+    def start_mission(self, order: Mapping[str, Any]) -> None:
+        """Start a mission; if the user drives the robot by keys, first end this drive."""
         if is_drive(self.state.get("mission")):
             if not self.resume():
                 return
@@ -139,16 +139,18 @@ class Steering:
         words = "starting; the robot is set back to its spawn" if back else "starting"
         self.ask(words, "/v1/missions", order)
 
-    def go_to(self, position: Vector) -> bool:
-        """Hold the present mission, if one flies, then request a flight to a position [m].
+    def go_to(self, position: Sequence[float]) -> bool:
+        """Hold the present mission, if one is under way, then ask the robot to go to a position.
 
-        Return whether teleop has accepted the requests.
+        `position` [m] has two numbers for a robot that stays on the ground. Return whether teleop
+        has accepted the requests.
         """
-        x, y, z = (round(float(value), 3) for value in position)
+        place = [round(float(value), 3) for value in position]
         mission = self.state.get("mission") or {"state": ""}
         if mission["state"] in ("starting", "flying") and not self.ask("hold", "/v1/hold"):
             return False
-        return self.ask(f"flying to ({x:g}, {y:g}, {z:g})", "/v1/goto", {"position_m": (x, y, z)})
+        words = f"going to ({', '.join(f'{value:g}' for value in place)})"
+        return self.ask(words, "/v1/goto", {"position_m": place})
 
     def hold_key(self, key: str, velocity: Vector, lasts: float) -> None:
         """Drive the robot with `velocity` [m/s] for `lasts` [s], because the user holds `key`.
@@ -203,7 +205,7 @@ class Steering:
 
     def _stop_loop(self) -> None:
         while self._stops.wait():
-            if self.ask("stopping the rotors", "/v1/estop"):
+            if self.ask("switching the robot off", "/v1/estop"):
                 self._stops.clear()
             else:
                 time.sleep(STOP_PERIOD)

@@ -13,7 +13,7 @@ from PIL import Image
 from cloudrc.cli import console
 from cloudrc.config.load import load_experiment
 from cloudrc.console.feed import FlightFeed
-from cloudrc.console.page import PANEL_WIDTH, Page, _with_gaps
+from cloudrc.console.page import KEYS, PANEL_WIDTH, Page, _with_gaps
 from cloudrc.console.steering import Steering
 from cloudrc.drivers.local import LINK_FOLDER
 from cloudrc.geometry.scene import Scene, load_scene
@@ -152,7 +152,7 @@ def test_keys_drive_sliders_change_the_delay_and_buttons_steer(flight, page, fig
     wait_until(lambda: page.get_by_role("textbox").first.input_value() == "500")
     page.get_by_role("textbox").first.fill("10")  # with 500 ms no drive ends: the guard holds
     page.keyboard.press("Enter")
-    page.get_by_role("tab", name="Fly").click()
+    page.get_by_role("tab", name="Steer").click()
     button(page, "Start").click()  # it ends the drive first
     wait_until(lambda: (api.get("/v1/state")["mission"] or mission)["name"] == "hover")
     wait_until(lambda: api.get("/v1/state")["mission"]["state"] == "flying")
@@ -251,6 +251,21 @@ def test_controls_of_a_browser_that_left_do_not_end_the_console(filled):
     slider.remove()
     steering.conditions = {"uplink.delay_ms": 70.0}
     page.update(2.0)
+
+
+@pytest.mark.parametrize(("name", "axes"), [("hover", 3), ("pillars", 2)])
+def test_controls_have_heights_only_for_a_robot_that_flies(filled, name, axes):
+    page, _, _ = filled(name)
+    page._add_controls(page._server)
+    handles = page._server.gui._gui_input_handle_from_uuid.values()
+    labels = {handle.label: handle for handle in handles if hasattr(handle, "label")}
+    keys = {label for label, direction in KEYS.values() if axes == 3 or not direction[2]}
+    assert keys == labels.keys() & {label for label, _ in KEYS.values()}
+    assert len(labels["Target [m]"].value) == axes
+    gizmo, numbers = page._target
+    assert tuple(gizmo.active_axes) == (True, True, axes == 3)
+    page.update(1.0)
+    assert tuple(numbers.value) == tuple(gizmo.position[:axes])
 
 
 def test_a_curve_has_gaps_and_an_unknown_one_keeps_its_axis():

@@ -48,7 +48,7 @@ def test_sliders_show_the_numbers_of_the_profile(api, loss):
 def test_a_flying_mission_is_held_before_a_goto(api, steering):
     steering.state = {"mission": {"state": "flying"}}
     steering.go_to((0.5, 0.0, 1.2004))
-    goto = ("/v1/goto", {"position_m": (0.5, 0.0, 1.2)})
+    goto = ("/v1/goto", {"position_m": [0.5, 0.0, 1.2]})
     assert api.posted == [("/v1/hold", None), goto]
     api.posted.clear()
     steering.state = {"mission": None}
@@ -56,9 +56,15 @@ def test_a_flying_mission_is_held_before_a_goto(api, steering):
     assert api.posted == [goto]
 
 
+def test_a_target_on_the_ground_has_two_numbers(api, steering):
+    assert steering.go_to((0.5, -1.0))
+    assert api.posted == [("/v1/goto", {"position_m": [0.5, -1.0]})]
+    assert steering.answer[0] == "going to (0.5, -1)"
+
+
 def test_a_start_ends_a_drive_that_waits_for_keys(api, steering):
     steering.state = {"mission": {"by_hand": True, "state": "held"}}
-    steering.fly({"waypoints": []})
+    steering.start_mission({"waypoints": []})
     start = ("/v1/missions", {"waypoints": [], "queue": True})
     assert api.posted == [("/v1/resume", None), start]
     api.posted.clear()
@@ -68,10 +74,10 @@ def test_a_start_ends_a_drive_that_waits_for_keys(api, steering):
         assert steering.answer[0] == words
     api.posted.clear()
     steering.state = {"mission": None}
-    steering.fly({"waypoints": []})
+    steering.start_mission({"waypoints": []})
     assert api.posted == [("/v1/missions", {"waypoints": []})]
     assert "set back to its spawn" in steering.answer[0]
-    steering.fly({"waypoints": [], "start": "here"})
+    steering.start_mission({"waypoints": [], "start": "here"})
     assert steering.answer[0] == "starting"
 
 
@@ -109,7 +115,7 @@ def test_a_stop_is_repeated_until_the_api_answers(api, steering):
     steering.stop()
     wait_until(lambda: len(api.posted) >= 3)
     api.refused.clear()
-    wait_until(lambda: steering.answer[0] == "stopping the rotors")
+    wait_until(lambda: steering.answer[0] == "switching the robot off")
     count = len(api.posted)
     time.sleep(0.5)
     assert len(api.posted) == count
