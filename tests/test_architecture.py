@@ -90,7 +90,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
         *("drivers/process", "faults/schedule"),
     ),
     **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("teleop/api", "teleop/auth")),
-    "fcntl": ("drivers/local", "cli/console", "runs/lock"),
+    "fcntl": ("drivers/local", "console/serve", "runs/lock"),
     "matplotlib": ("report/",),
     "viser": ("console/", "report/replay"),
     "mcap": ("record/",),
@@ -98,12 +98,12 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "kubernetes": ("cluster/",),
     "prometheus_client": ("drivers/",),
     "argparse": ("cli/",),
-    "importlib.metadata": ("plugins", "cli/", "report/"),
+    "importlib.metadata": ("plugins", "cli/", "report/", "runs/doctor"),
     "pkgutil": ("plugins",),
     # A compiler makes the machine code of the usual step.
     "subprocess": (
         *("drivers/", "cli/", "cluster/", "robots/pelican/native/library"),
-        *("exercise/scoring", "runs/link_under_test"),
+        *("exercise/scoring", "runs/doctor", "runs/link_under_test"),
     ),
     "multiprocessing": ("drivers/", "runs/workers"),
     "concurrent": ("cli/", "runs/workers", "cluster/", "teleop/"),

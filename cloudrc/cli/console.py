@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import fcntl
 import sys
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Sequence
 from pathlib import Path
 from secrets import token_hex
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.cluster_flags import flown_release, release_arguments
 from cloudrc.cli.find_run import find_local_run
@@ -22,7 +20,8 @@ from cloudrc.runs.requirements import require
 from cloudrc.teleop.client import Api
 
 if TYPE_CHECKING:
-    from cloudrc.console.steering import LinkControl
+    from cloudrc.console.page import Page
+    from cloudrc.console.serve import ConsoleTarget
 
 EPILOG = """\
 examples:
@@ -39,11 +38,6 @@ stops the rotors. No key turns the robot: the published onboard controller holds
 the yaw at 0."""
 LINK_SET = "link set "
 """Start of a line that a pod's console prints to request a change of the link."""
-SWITCH_PERIOD = 5e-4
-"""Time after which a thread of this process lets another one run [s]. With Python's 5 ms, the 90th
-percentile of the answers to STOP doubles while 50 pages have the scene."""
-RETRY_PERIOD = 0.2
-"""Time between two attempts to read the robot's status from the API [s]."""
 OWN_S = 150.0
 """Time for which the page in a pod shows a requested value of the link [s]. Afterwards the page
 shows the value in the profile's file, which Kubernetes has updated by then."""
@@ -90,67 +84,23 @@ def execute(options: argparse.Namespace) -> int:
     if options.config and not (options.api and options.profile):
         raise BadInputError("--config is for the chart's container: give --api and --profile, too")
     flight = _in_pod(options) if options.config else _local(options)
-    _serve(options, flight)
-    print_line("the flight has ended", sys.stderr)
-    return 0
+    from cloudrc.console.serve import serve
 
-
-class ConsoleTarget(NamedTuple):
-    """The flight that the console shows and steers."""
-
-    config: Path  # experiment file
-    api: Api  # of teleop
-    link: LinkControl  # reads and changes the link
-    has_ended: Callable[[], bool]
-    token: Callable[[], str] | None = None  # of the page; None: a new one, which is printed
-
-
-def _serve(options: argparse.Namespace, flight: ConsoleTarget) -> None:
-    with ExitStack() as opened:
-        from cloudrc.console.page import Page
-
-        sys.setswitchinterval(SWITCH_PERIOD)
-        page = Page(options.port, flight.token, options.allow_origin)
-        opened.callback(page.close)
-        config = opened.enter_context(flight.config.open())
-        try:
-            fcntl.flock(config, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            text = "this run has a console already; open its page, or end it first"
-            raise BadInputError(text) from None
-        except OSError:  # a network file system may refuse the lock: then nothing is checked
-            pass
+    def ready(page: Page) -> None:
         if flight.token:  # the log of a pod is read by many
             print_line(f"console: port {page.port}; to open it: cloudrc console --cluster")
         else:
             print_line(f"console: {page.url}")
         if not (options.no_open or options.config):
             open_page(page.url)
-        from cloudrc.config.load import read_experiment
-        from cloudrc.config.scene import scene_of
-        from cloudrc.console.feed import FlightFeed
-        from cloudrc.console.steering import Steering
 
-        experiment = read_experiment(str(flight.config))
-        feed = FlightFeed(scene_of(experiment.world))
-        steering = Steering(flight.api, flight.link)
-        steering.watch()
-        steering.start()
-        page.fill(experiment, feed, steering)
-        due = 0.0
-        while not flight.has_ended():
-            with suppress(CloudrcError):  # teleop starts or ends; the page says what is wrong
-                for status in flight.api.robot():
-                    now = time.monotonic()
-                    feed.take(status, now)
-                    if now >= due:  # drawing takes half of the time: no old statuses queue up
-                        page.update(now)
-                        due = 2 * time.monotonic() - now
-            page.update(time.monotonic())
-            time.sleep(RETRY_PERIOD)
+    serve(flight, ready, options.port, options.allow_origin)
+    print_line("the flight has ended", sys.stderr)
+    return 0
 
 
 def _local(options: argparse.Namespace) -> ConsoleTarget:
+    from cloudrc.console.serve import ConsoleTarget
     from cloudrc.console.steering import LinkControl
     from cloudrc.drivers.local import LINK_FOLDER, under_way
     from cloudrc.runs.link_change import read_states, set_here
@@ -178,6 +128,7 @@ def _in_pod(options: argparse.Namespace) -> ConsoleTarget:
     """
     from cloudrc.config.load import load_link
     from cloudrc.console.access import page_token
+    from cloudrc.console.serve import ConsoleTarget
     from cloudrc.console.steering import LinkControl
 
     own: dict[str, tuple[float, float]] = {}  # key -> last requested value, and when [s]

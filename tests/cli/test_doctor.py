@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli import doctor
-from cloudrc.cli.doctor import Check
-from cloudrc.cli.parser import build_parser
 from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.runs import doctor as work
 from cloudrc.runs import requirements
+from cloudrc.runs.doctor import Check, Survey
 
 GOOD = Check("python", "ok", "3.12.1", "", ("local", "virtual"))
 NO_HELM = Check("helm", "missing", "not in PATH", "https://helm.sh", ("cluster",))
@@ -36,8 +36,7 @@ def test_only_a_needed_check_gives_exit_code_3(mode, found, code, monkeypatch, c
 
 def test_every_problem_says_how_to_fix_it(monkeypatch):
     monkeypatch.setitem(requirements.EXTRAS, "world", ("no_such_module",))
-    options = build_parser(["doctor"]).parse_args(["doctor"])
-    checks = {check.name: check for check in doctor.all_checks(options)}
+    checks = {check.name: check for check in work.all_checks("local", Survey())}
     for check in checks.values():
         assert check.state == "ok" or check.fix, check.name
         assert len(f"  missing  {check.name}  {check.found}") < 160
@@ -49,8 +48,8 @@ def test_every_problem_says_how_to_fix_it(monkeypatch):
 
 def test_the_doctor_says_where_the_usual_steps_run(monkeypatch):
     monkeypatch.setenv("CLOUDRC_NATIVE", "0")
-    _, steps = doctor.said(doctor.start(f"print('one'); {doctor.STEPS_PROGRAM}"))
-    check = doctor.native_steps(steps)
+    _, steps = work.said(work.start(f"print('one'); {work.STEPS_PROGRAM}"))
+    check = work.native_steps(steps)
     assert (check.state, check.found) == ("warn", "Python (CLOUDRC_NATIVE=0)")
     assert "CLOUDRC_NATIVE" in check.fix
 
@@ -64,7 +63,7 @@ def test_the_doctor_says_where_the_usual_steps_run(monkeypatch):
     ],
 )
 def test_a_check_without_a_result_has_the_reason_why_its_process_ended(program, told):
-    assert doctor.said(doctor.start(program)) == told
+    assert work.said(work.start(program)) == told
 
 
 def test_the_extras_are_those_of_pyproject():
