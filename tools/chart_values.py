@@ -93,7 +93,7 @@ RULES = {
     "leaseSeconds": {"type": "integer", "minimum": 5, "maximum": 3600},
     "allowFrom": PEERS,
     "dns": PEERS,
-    "plan": _either(STRING, _ref("Mission"), NULL),
+    "plan": _either(STRING, _ref("MissionConfig"), NULL),
     "interval": _text(r"^[0-9]+(ms|s|m)$"),
     "name": NAME,
     "ipFamilyPolicy": _either(_one_of("SingleStack", "PreferDualStack", "RequireDualStack"), NULL),

@@ -115,7 +115,7 @@ def _local(options: argparse.Namespace) -> ConsoleTarget:
         return states[0].profile if states else {}
 
     link = LinkControl(
-        read, lambda settings: set_here(run / LINK_FOLDER, None, settings, token_hex(4))
+        read, lambda settings: set_here(run / LINK_FOLDER, url, None, settings, token_hex(4))
     )
     return ConsoleTarget(run / "config.yaml", Api(url), link, lambda: under_way().get(run) != url)
 

@@ -33,6 +33,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--listen", type=read_address, default=(here, 7401), metavar="HOST:PORT", help=listen)
     route = "write the address to which the own tunnel end must send, once ready"
     add("--route", type=Path, required=True, metavar="FILE", help=route)
+    control = "answer PUT /link on this Unix socket, which changes the link"
+    add("--control", type=Path, metavar="FILE", help=control)
     origin = "start of the time line, monotonic clock [ns] (default: when the link comes up)"
     add("--origin", type=int, default=0, metavar="NS", help=origin)
 

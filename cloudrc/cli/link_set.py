@@ -59,7 +59,8 @@ def execute(options: argparse.Namespace) -> int:
 
     if (found := find_local_run(options)) is not None:
         run = found.folder
-        edit, states = set_here(run / LINK_FOLDER, options.profile, options.settings, number)
+        folder, asked = run / LINK_FOLDER, (options.profile, options.settings)
+        edit, states = set_here(folder, found.url, *asked, number)
         where = str(run)
         took = monotonic() - began
     else:

@@ -1,12 +1,12 @@
 """Change the link of a release in flight, for `cloudrc link set` in a cluster.
 
-First, `send` writes the new profile into the link containers of both pods, which apply it within a
-second. Then `keep` writes it into the ConfigMap, which restarted containers read. If a container
-refuses the profile, the ConfigMap stays unchanged. If a step fails, the error message lists
-the places where the change is in force. The files of traces are sent and stored with the profile.
+First, `send` sends the new profile to the link containers of both pods, by the same request as in a
+local run (`link.control`); they apply it within a second. Then `keep` writes it into the ConfigMap,
+which restarted containers read. If a container refuses the profile, the ConfigMap stays unchanged.
+If a step fails, the error message lists the places where the change is in force. The files of
+traces are sent and stored with the profile.
 
-This module uses kubectl, which starts in 0.1 s; the Python client takes 0.5 s. For the same reason
-it runs `sh` in the containers, not Python.
+This module uses kubectl, which starts in 0.1 s; the Python client takes 0.5 s.
 """
 
 from __future__ import annotations
@@ -25,26 +25,16 @@ from cloudrc.cluster.releases import INSTANCE, several_releases
 from cloudrc.config.document import Document, write_yaml
 from cloudrc.config.load import DIRECTIONS, FILE_READERS, Edit, edit_profile, load_link
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
-from cloudrc.link.follow import HANDED_FILE, PROFILE
-from cloudrc.link.state import (
-    CHANGE_FILE,
-    STATE_FILE,
-    ChangeFacts,
-    LinkState,
-    from_text,
-    write_change,
-)
+from cloudrc.link.control import APPLY_LIMIT, SOCKET, put_request, read_answer
+from cloudrc.link.follow import PROFILE
+from cloudrc.link.state import CHANGE_FILE, ChangeFacts, LinkState, write_change
 
 FOLDER = "/run/cloudrc"
-"""Folder in a link container with the files of the link: route, state, received change."""
-APPLY_LIMIT = 5.0
-"""Time limit for a link container to apply a change [s]; usually it takes 0.2 s."""
+"""Folder in a link container with the files of the link: route, state, socket."""
 EXPERIMENT = "experiment.yaml"
 """Key of the experiment in its ConfigMap."""
 SIZE_MAX = 1_000_000
 """Largest total size of the files in a ConfigMap [bytes], a little below Kubernetes' 1 MiB."""
-_LOOK_PERIOD = 0.02
-"""Time between two checks of a link container's state [s]."""
 
 
 @dataclass(frozen=True)
@@ -96,32 +86,29 @@ def read_link(release: Release) -> LinkParts:
     return LinkParts(release.name, maps[0]["metadata"]["name"], files, pods)
 
 
-APPLY_SCRIPT = f"""\
-cd "$1" 2>/dev/null && test -f {STATE_FILE} || {{
-    echo 'error: no link runs here;' >&2; exit 2; }}
-draft=.{HANDED_FILE}.$$
-cat > $draft && test "$(wc -c < $draft)" -eq "$3" && mv $draft {HANDED_FILE} || {{
-    rm -f $draft; echo 'error: the change arrived incomplete;' >&2; exit 2; }}
-for _ in $(seq {round(APPLY_LIMIT / _LOOK_PERIOD)}); do
-    grep -qF "\\"$2\\"" {STATE_FILE} && break
-    sleep {_LOOK_PERIOD}
-done
-cat {STATE_FILE}
+PIPE = """\
+import socket, sys
+pipe = socket.socket(socket.AF_UNIX)
+try:
+    pipe.connect(sys.argv[1])
+except OSError as error:
+    sys.exit(f"error: no link answers here: {error};")
+pipe.sendall(sys.stdin.buffer.read())
+pipe.shutdown(socket.SHUT_WR)
+while data := pipe.recv(65536):
+    sys.stdout.buffer.write(data)
 """
-"""Script for `sh` in a link container. Arguments: the folder, the number of the change, and the
-length of the change on standard input. The script renames the complete change to the file that the
-container reads. Then it waits until the container has accepted or refused the change, and prints
-the container's state."""
+"""Program for Python in a link container: carries its input to a Unix socket, the answer back."""
 
 
-def send_change(release: Release, pod: str, document: str, number: str) -> str:
-    """Send a change to a pod's link container; return the container's state as JSON.
+def ask(release: Release, pod: str, request: bytes) -> LinkState:
+    """Send a request to the link container of a pod; return the state of its direction.
 
-    `document` is the content for `HANDED_FILE`, `number` that of the change.
+    Raise a ValueError or a BadInputError as `read_answer`, a ClusterError if kubectl fails.
     """
-    words = ["sh", "-c", APPLY_SCRIPT, "sh", FOLDER, number, str(len(document.encode()))]
+    words = ["python", "-I", "-S", "-c", PIPE, f"{FOLDER}/{SOCKET}"]
     command = [*release.flags, "exec", "--stdin", pod, "--container=link", "--", *words]
-    return run("kubectl", command, given=document)
+    return read_answer(run("kubectl", command, given=request.decode()).encode())
 
 
 class Sent(NamedTuple):
@@ -144,33 +131,40 @@ def send(
     """
     edit, files = with_files(link.files, profile, settings)
     files[CHANGE_FILE] = write_change(ChangeFacts(number, edit.cause, edit.restart))
-    document = json.dumps(_needed_files(edit.values, {**link.files, **files}))
-
-    def ask(component: str) -> LinkState | CloudrcError:
-        try:
-            state = from_text(send_change(release, link.pods[component], document, number))
-        except CloudrcError as error:
-            return error
-        except ValueError as error:
-            return ClusterError(f"a link container has another version: {error}; upgrade it")
-        if number in (state.change, state.refused):
-            return state
-        return TimedOutError(
-            f"the {state.direction} did not apply the change within {APPLY_LIMIT:g} s; see the log "
-            f"of the container link of pod {link.pods[component]}"
-        )
-
+    needed = _needed_files(edit.values, {**link.files, **files})
+    request, at = put_request(json.dumps(needed)), [link.pods[each] for each in COMPONENTS]
     with ThreadPoolExecutor(len(COMPONENTS)) as pool:
-        answers = list(pool.map(ask, COMPONENTS))
+        answers = list(pool.map(lambda pod: _answer_of(release, pod, request, number), at))
     failed = [answer for answer in answers if isinstance(answer, CloudrcError)]
     states = [answer for answer in answers if isinstance(answer, LinkState)]
+    _raise_refused(states, failed, number)
+    return Sent(edit, files, states, failed)
+
+
+def _answer_of(release: Release, pod: str, request: bytes, number: str) -> LinkState | CloudrcError:
+    """Return the state of a direction that has decided about a change, or why there is none."""
+    try:
+        state = ask(release, pod, request)
+    except CloudrcError as error:
+        return error
+    except ValueError as error:
+        return ClusterError(f"a link container has another version: {error}; upgrade it")
+    if number in (state.change, state.refused):
+        return state
+    return TimedOutError(
+        f"the {state.direction} did not apply the change within {APPLY_LIMIT:g} s; see the log "
+        f"of the container link of pod {pod}"
+    )
+
+
+def _raise_refused(states: list[LinkState], failed: list[CloudrcError], number: str) -> None:
+    """Raise a BadInputError if a direction has refused the change."""
     if refused := [state for state in states if state.refused == number]:
         said = [f"the {state.direction} is unchanged: {state.refusal}" for state in refused]
         said += [f"the {s.direction} has the change" for s in states if s not in refused]
         said += map(str, failed)
         kept = "the ConfigMap is unchanged, and restarted pods take it"
         raise BadInputError("; ".join([*said, kept]))
-    return Sent(edit, files, states, failed)
 
 
 def keep(release: Release, link: LinkParts, sent: Sent) -> None:

@@ -49,14 +49,13 @@ line at least once a second."""
 PAUSE = 1.0
 """Longest turn of the supervisor's loop [s]. A longer turn means that the supervisor was paused; it
 does not count for time limits."""
-SOCKET_NAME = "/cloudrc-12345678/teleop.sock"
+SOCKET_NAME = "/cloudrc-12345678/downlink.sock"
 """Longest path of a socket, relative to the folder for temporary files."""
 API_FILE, AUDIT_FILE = "api.json", "audit.jsonl"
 """Files in a run's folder: the API's address, and the log of the API's commands."""
 LINK_FOLDER, ROUTE_FILE = "link", "route"
 """Folder in a run's folder, during the flight: the link's profile, and a folder per direction with
-the address of the relay (`ROUTE_FILE`), the state of the link and the change from `cloudrc link
-set`."""
+the address of the relay (`ROUTE_FILE`) and the state of the link."""
 UNSEEN = (
     "warning: other commands do not find this flight ({unseen}): 'cloudrc mission' needs --api"
     " {url}; 'console' and 'down' need a folder of your own in XDG_RUNTIME_DIR, here and there"
@@ -270,6 +269,7 @@ class LocalRun:
         def start_link(way: str, end: str, peer: str) -> None:
             more: dict[str, object] = {"listen": at[way], "end": at[end], "peer": at[peer]}
             words = link_words(folder / LINK_FOLDER, way)
+            more["control"] = link_socket(url, way)
             self._start(way, *words, mode="relay", origin=origin_ns, **more)
 
         start_end("world", "uplink")
@@ -388,6 +388,14 @@ def start_process(
     )
 
 
+def link_socket(url: str, way: str) -> Path:
+    """Return the socket on which a direction of a run's link can be changed.
+
+    `url` is the address of the run's API, `way` "uplink" or "downlink".
+    """
+    return Path(url.removeprefix("unix:")).with_name(f"{way}.sock")
+
+
 def link_words(folder: Path, way: str) -> list[str]:
     """Return the arguments of `cloudrc` for the process that shapes the direction `way` of a link.
 
@@ -411,7 +419,7 @@ def socket_folder() -> str:
                 tempfile.TemporaryDirectory(prefix="cloudrc-", dir=own) as folder,
                 socket.socket(socket.AF_UNIX) as probe,
             ):
-                probe.bind(f"{folder}/teleop.sock")  # the longest name
+                probe.bind(f"{folder}/downlink.sock")  # the longest name
             return str(own)
     given = tempfile.gettempdir()
     return given if len(os.fsencode(given)) + len(SOCKET_NAME) <= PATH_MAX else "/tmp"

@@ -1,14 +1,13 @@
 """Follow changes of a running link: a new profile, or a new address of the other pod (the peer).
 
-`cloudrc link set` changes the release's ConfigMap, so that the change is permanent. Kubernetes may
-need a minute to copy the ConfigMap to a pod. Therefore the command also writes the same files, as
-one JSON document, into the pod. ConfigMap and document contain the number of the change; the link
-applies the one that arrives first and ignores the other.
+In a cluster the ConfigMap is the source of truth. Kubernetes may need a minute to copy it to a
+pod. Therefore `cloudrc link set` first sends the same files to the process that shapes the link,
+and then writes the ConfigMap. Both contain the number of the change; the link applies the one that
+arrives first and ignores the other.
 """
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,7 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc.errors import BadInputError
-from cloudrc.files import read, version
+from cloudrc.files import version
 from cloudrc.link.state import CHANGE_FILE, ChangeFacts, parse, read_change
 
 if TYPE_CHECKING:
@@ -30,10 +29,6 @@ PEER_PAUSE = (0.5, 1.0)
 """Shortest and longest pause before the peer's name is resolved again [s]. The pause is random, so
 that the links of many releases do not query their name server at the same time.
 Source: docs/reference/faults.md, "F19"."""
-HANDED_FILE = "asked.json"
-"""JSON document of `cloudrc link set`, beside the route file: the files of a change, name -> text.
-The files are `PROFILE`, the traces that it names, and `CHANGE_FILE`."""
-SIZE_MAX = 1_200_000  # size limit of the JSON document [bytes]: room for the content of a ConfigMap
 PROFILE = "profile.yaml"
 _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
 
@@ -64,7 +59,7 @@ def prepare_link(folder: Path, link: ResolvedExperiment) -> None:
 
 
 def read_handed(text: bytes | str) -> dict[str, str]:
-    """Parse the JSON document of a change: name -> text of each file beside the new profile.
+    """Parse the body of a change: name -> text of each file, the new profile among them.
 
     Raises:
         ValueError: If the text is invalid, or if a file name could lead to another folder.
@@ -86,31 +81,40 @@ def _with_names(values: dict[str, Any]) -> dict[str, Any]:
 
 
 class Profiles:
-    """Watches two files for changes: the profile's, and the one that `cloudrc link set` writes.
+    """Watches the profile's file for changes, and takes changes that are sent.
 
-    A change that reaches both files is returned once.
+    A change that comes both ways is returned once.
 
     Kubernetes mounts a ConfigMap as symbolic links into `..data`, which is itself a symbolic link.
     For a new version, Kubernetes replaces `..data`, so that the same path leads to another file.
-    A check for a change takes only one system call per file, because it runs 20 times per second.
+    A check for a change takes only one system call, because it runs 20 times per second.
     """
 
-    def __init__(
-        self, profile: Path, document: Path, load: Load, log: Callable[[str], None]
-    ) -> None:
-        """Watch the file `profile`, and `document`, the file that `cloudrc link set` writes.
-
-        A document that exists already is ignored: in a pod, the ConfigMap contains its change.
-        """
+    def __init__(self, profile: Path, load: Load, log: Callable[[str], None]) -> None:
+        """Watch the file `profile`."""
         self._profile, self._load, self._log = profile, load, log
-        self._readers = {document: self._read_document, profile: self._read_profile}
-        self._seen = {path: version(path) for path in self._readers}
-        self._known: dict[str, dict[str, Any]] = {}
+        self._seen = version(profile)
+        self._known: dict[str, dict[str, Any]] = {}  # number of a change -> its values
 
     def first(self) -> Loaded:
         """Read the profile for the first time; raise a BadInputError if it is invalid."""
-        self._seen[self._profile] = version(self._profile)
+        self._seen = version(self._profile)
         loaded = self._read_profile(self._profile)
+        self._known[loaded.change.number] = loaded.values
+        return loaded
+
+    def take(self, document: bytes, folder: Path) -> Loaded:
+        """Read the files of a change that is sent, with `folder` for temporary files.
+
+        Raise a BadInputError or a ValueError if the change is invalid.
+        """
+        files = read_handed(document)
+        with TemporaryDirectory(prefix="handed-", dir=folder) as made:
+            for name, text in files.items():
+                (Path(made) / name).write_text(text, encoding="utf-8")
+            loaded = self._read_profile(Path(made) / PROFILE)
+        if not loaded.change.number:
+            raise ValueError("the change has no number")
         self._known[loaded.change.number] = loaded.values
         return loaded
 
@@ -119,25 +123,24 @@ class Profiles:
 
         An invalid profile is logged.
         """
-        for path, read_file in self._readers.items():
-            before, self._seen[path] = self._seen[path], version(path)
-            if self._seen[path] == before:
-                continue
-            try:
-                loaded = read_file(path)
-            except (BadInputError, OSError, ValueError) as error:
-                self._log(f"the new profile is refused, the old one stays: {error}")
-                continue
-            number = loaded.change.number
-            known = self._known.get(number) if number else None
-            self._known[number] = loaded.values
-            if known is None:
-                return loaded
-            if _with_names(known) != _with_names(loaded.values):
-                # `helm upgrade` keeps the number of the previous change.
-                return loaded._replace(change=ChangeFacts())
-            if known != loaded.values:  # the same files in another folder, which stays
-                return loaded._replace(change=replace(loaded.change, restart=False))
+        before, self._seen = self._seen, version(self._profile)
+        if self._seen == before:
+            return None
+        try:
+            loaded = self._read_profile(self._profile)
+        except (BadInputError, OSError, ValueError) as error:
+            self._log(f"the new profile is refused, the old one stays: {error}")
+            return None
+        number = loaded.change.number
+        known = self._known.get(number) if number else None
+        self._known[number] = loaded.values
+        if known is None:
+            return loaded
+        if _with_names(known) != _with_names(loaded.values):
+            # `helm upgrade` keeps the number of the previous change.
+            return loaded._replace(change=ChangeFacts())
+        if known != loaded.values:  # the same files in another folder, which stays
+            return loaded._replace(change=replace(loaded.change, restart=False))
         return None
 
     def _read_profile(self, path: Path) -> Loaded:
@@ -147,20 +150,6 @@ class Profiles:
         except (OSError, UnicodeDecodeError):
             return loaded
         return loaded._replace(change=read_change(note))
-
-    def _read_document(self, path: Path) -> Loaded:
-        """Read the document; raise a ValueError if the file belongs to another user.
-
-        All containers of the pod can write to the folder, but only the sidecar may run as root. So
-        a sidecar that runs as root follows only changes that root has made.
-        """
-        if path.lstat().st_uid != os.geteuid():
-            raise ValueError(f"{path} belongs to another user")
-        files = read_handed(read(path, SIZE_MAX))
-        with TemporaryDirectory(prefix="handed-", dir=path.parent) as folder:
-            for name, text in files.items():
-                (Path(folder) / name).write_text(text, encoding="utf-8")
-            return self._read_profile(Path(folder) / PROFILE)
 
 
 class PeerName:

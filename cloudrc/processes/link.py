@@ -1,7 +1,8 @@
 """Shape one direction of the link of a pod or local run, in a process of its own.
 
-GET /link.json on the metrics port returns the state of the shaper and the netem qdiscs of this pod
-or machine. The process calls tc and ip for this answer, at most once a second.
+PUT /link on the Unix socket of --control changes the link. GET /link.json on the metrics port
+returns the state of the shaper and the netem qdiscs of this pod or machine. The process calls tc
+and ip for this answer, at most once a second.
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal
 
 from cloudrc.config.load import load_link, read_experiment
+from cloudrc.drivers.link_control import ControlServer
 from cloudrc.drivers.process import Feed, StopSignal
 from cloudrc.drivers.programs import Programs, run_tool
 from cloudrc.drivers.realtime import Address
 from cloudrc.link.follow import (
-    HANDED_FILE,
     PEER_PAUSE,
     PROFILE_PERIOD,
     Load,
@@ -62,6 +63,7 @@ class LinkSettings:
     listen: Address  # where the relay receives datagrams
     route: Path  # file for the address to which the own tunnel end must send
     origin: int  # start of the time line, monotonic clock [ns]; 0: when the link comes up
+    control: Path | None = None  # Unix socket on which the link can be changed
     feed: bool = False  # write status for a supervisor to stdout
     metrics: Address | None = None  # serve metrics here
 
@@ -71,9 +73,8 @@ def run_link(settings: LinkSettings, stop: StopSignal) -> None:
     feed = Feed.on_stdout(watched=settings.feed)
     experiment = read_experiment(str(settings.config))
     exporter = open_exporter("link", experiment, settings.metrics)
-    document = settings.route.with_name(HANDED_FILE)
     load = make_profile_loader(settings.direction, settings.config.absolute())
-    profiles = Profiles(settings.profile, document, load, log)
+    profiles = Profiles(settings.profile, load, log)
     profile, peer = profiles.first(), PeerName(settings.peer, ipv4_addresses, log)
     with TemporaryDirectory(prefix="tc-", dir=settings.route.parent) as tables:
         programs = Programs(tables)
@@ -89,7 +90,12 @@ def run_link(settings: LinkSettings, stop: StopSignal) -> None:
         )
 
         def poll_profile() -> None:
-            sidecar.profile = profiles.poll() or sidecar.profile
+            if loaded := profiles.poll():  # another thread may set a profile, too
+                sidecar.profile = loaded
+
+        def change(document: bytes) -> str:
+            sidecar.profile = profiles.take(document, settings.route.parent)
+            return sidecar.profile.change.number
 
         def resolve_peer() -> None:
             sidecar.peer = peer.poll() or sidecar.peer
@@ -98,6 +104,8 @@ def run_link(settings: LinkSettings, stop: StopSignal) -> None:
 
         if exporter:
             exporter.link.tell = lambda: status_page(sidecar)
+        if settings.control:
+            ControlServer(settings.control, change, lambda: sidecar.state)
         try:
             _repeat(poll_profile, PROFILE_PERIOD, PROFILE_PERIOD)
             _repeat(resolve_peer, *PEER_PAUSE)

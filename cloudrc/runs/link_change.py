@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from time import monotonic, sleep
 
 from cloudrc.config.document import Document, write_yaml
 from cloudrc.config.load import DIRECTIONS, Edit, edit_profile
+from cloudrc.drivers.link_control import ask
+from cloudrc.drivers.local import link_socket
 from cloudrc.errors import BadInputError, TimedOutError
-from cloudrc.files import write_atomically
-from cloudrc.link.follow import HANDED_FILE, PROFILE
+from cloudrc.link.control import APPLY_LIMIT, put_request
+from cloudrc.link.follow import PROFILE
 from cloudrc.link.state import (
     CHANGE_FILE,
     STATE_FILE,
@@ -20,9 +21,6 @@ from cloudrc.link.state import (
     from_text,
     write_change,
 )
-
-LOCAL_TIMEOUT = 5.0
-"""Time limit for a local link to apply a change [s]; it needs about 0.2 s."""
 
 
 def read_states(folder: Path) -> list[LinkState]:
@@ -34,12 +32,13 @@ def read_states(folder: Path) -> list[LinkState]:
 
 
 def set_here(
-    folder: Path, profile: str | None, settings: Sequence[str], number: str
+    folder: Path, url: str, profile: str | None, settings: Sequence[str], number: str
 ) -> tuple[Edit, list[LinkState]]:
-    """Pass a profile to a local link; wait until it applies; return the profile and the new states.
+    """Send a profile to a local link; wait until it applies; return the profile and the new states.
 
-    `profile` is the name or file of a profile that replaces the present one; None keeps it.
-    `settings` are texts such as "uplink.delay_ms=120". `number` identifies the change.
+    `folder` is the link's folder, and `url` the address of the run's API. `profile` is the name or
+    file of a profile that replaces the present one; None keeps it. `settings` are texts such as
+    "uplink.delay_ms=120". `number` identifies the change.
 
     Raises:
         BadInputError: If there is no link yet, or if a value cannot be used.
@@ -52,17 +51,20 @@ def set_here(
         )
     edit = edit_profile(Document(states[0].profile), profile, settings)
     note = write_change(ChangeFacts(number, edit.cause, edit.restart))
-    document = json.dumps({CHANGE_FILE: note, PROFILE: write_yaml(edit.values)})
-    for state in states:
-        write_atomically(folder / state.direction / HANDED_FILE, document.encode())
-    deadline = monotonic() + LOCAL_TIMEOUT
-    while late := [state.direction for state in states if state.change != number]:
-        if monotonic() > deadline:
-            logs = " and ".join(str(folder.parent / f"{way}.log") for way in late)
-            raise TimedOutError(
-                f"the {' and '.join(late)} did not apply the change within {LOCAL_TIMEOUT:g} s; "
-                f"see {logs}"
-            )
-        sleep(0.05)
-        states = read_states(folder) or states
-    return edit, states
+    request = put_request(json.dumps({CHANGE_FILE: note, PROFILE: write_yaml(edit.values)}))
+    return edit, [_change(folder, way, url, request, number) for way in DIRECTIONS]
+
+
+def _change(folder: Path, way: str, url: str, request: bytes, number: str) -> LinkState:
+    """Change one direction of a link; return its new state."""
+    log = folder.parent / f"{way}.log"
+    try:
+        state = ask(link_socket(url, way), request)
+    except (OSError, ValueError) as error:
+        raise TimedOutError(f"the {way} does not answer ({error}); see {log}") from None
+    if state.refused == number:
+        raise BadInputError(f"the {way} is unchanged: {state.refusal}")
+    if state.change != number:
+        text = f"the {way} did not apply the change within {APPLY_LIMIT:g} s"
+        raise TimedOutError(f"{text}; see {log}")
+    return state

@@ -1,20 +1,26 @@
 """`cloudrc link set`: settings become a profile, take effect, and are read back."""
 
 import json
+import os
+import stat
 from copy import deepcopy
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
 from cloudrc.config.document import Document
 from cloudrc.config.load import edit_profile
 from cloudrc.drivers import local
+from cloudrc.drivers.link_control import ControlServer, ask
+from cloudrc.drivers.local import link_socket
 from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
-from cloudrc.link.follow import HANDED_FILE, Profiles
+from cloudrc.link.control import put_request
+from cloudrc.link.follow import Profiles
 from cloudrc.link.profile import summary
 from cloudrc.link.state import LinkState, to_text
 from cloudrc.processes.link import make_profile_loader
-from cloudrc.runs import link_change
 
 CHANGES = [{"at_s": 9.0, "delay_ms": 50.0, "jitter_ms": 20.0}, {"at_s": 12.0, "loss": 0.1}]
 TIMED = {"uplink": {"delay_ms": 40.0}, "downlink": {"delay_ms": 25.0, "changes": CHANGES}}
@@ -83,36 +89,42 @@ def test_invalid_settings_are_refused(settings, words):
         edit_profile(Document(deepcopy(TIMED)), None, settings)
 
 
-class Flight:
-    """A local run whose link reads the change while the command waits."""
+class Way:
+    """One direction of a local run, whose link applies each change at once."""
 
-    def __init__(self, folder):
-        self.links = {}
-        for way in ("uplink", "downlink"):
-            (own := folder / way).mkdir(parents=True)
-            (own / "map.yaml").write_text("{uplink: {delay_ms: 45}, downlink: {delay_ms: 45}}")
-            paths = own / "map.yaml", own / HANDED_FILE
-            self.links[own] = Profiles(*paths, make_profile_loader(way, own / "none.yaml"), print)
-            self.apply(own, self.links[own].first())
+    def __init__(self, folder, way, url):
+        folder.mkdir(parents=True)
+        (folder / "map.yaml").write_text("{uplink: {delay_ms: 45}, downlink: {delay_ms: 45}}")
+        load = make_profile_loader(way, folder / "none.yaml")
+        self.folder, self.profiles = folder, Profiles(folder / "map.yaml", load, print)
+        self.deaf, self.state = False, None
+        self.apply(self.profiles.first())
+        self.server = ControlServer(link_socket(url, way), self.change, lambda: self.state)
 
-    def apply(self, own, loaded):
+    def change(self, document):
+        loaded = self.profiles.take(document, self.folder)
+        if not self.deaf:
+            self.apply(loaded)
+        return loaded.change.number
+
+    def apply(self, loaded):
         (_, values, change), asked = loaded, summary(loaded.direction)
         about = {"change": change.number, "cause": change.cause, "asked": asked}
-        state = LinkState("relay", "", "relay", own.name, values, "", 1, **about)
-        write_atomically(own / "link.json", to_text(state).encode())
-
-    def wait(self, _):
-        for own, profiles in self.links.items():
-            if loaded := profiles.poll():
-                self.apply(own, loaded)
+        self.state = LinkState("relay", "", "relay", self.folder.name, values, "", 1, **about)
+        write_atomically(self.folder / "link.json", to_text(self.state).encode())
 
 
 @pytest.fixture
-def flight(tmp_path, monkeypatch):
-    found = Flight(tmp_path / "runs" / "latest" / "link")
-    monkeypatch.setattr(link_change, "sleep", found.wait)
-    with local.announced(tmp_path / "runs" / "latest", ""):
-        yield found
+def flight(tmp_path):
+    run = tmp_path / "runs" / "latest"
+    with TemporaryDirectory(prefix="cloudrc-") as sockets:  # their paths are short
+        url = f"unix:{sockets}/api.sock"
+        ways = [Way(run / "link" / way, way, url) for way in ("uplink", "downlink")]
+        with local.announced(run, url):
+            yield ways
+        for way in ways:
+            way.server.shutdown()
+            way.server.server_close()
 
 
 @pytest.mark.usefixtures("flight")
@@ -127,11 +139,21 @@ def test_a_run_here_is_found_changed_and_read_back(call):
     assert downlink["cause"] == "profile paper-p1"
 
 
-@pytest.mark.usefixtures("flight")
-def test_a_link_that_does_not_answer_is_an_error(monkeypatch, refused):
-    monkeypatch.setattr(link_change, "LOCAL_TIMEOUT", 0.0)
-    monkeypatch.setattr(link_change, "sleep", lambda _: None)
-    assert refused("link set downlink.delay_ms=120", code=4) == (
-        "cloudrc: error: the uplink and downlink did not apply the change within 0 s; "
-        "see runs/latest/uplink.log and runs/latest/downlink.log\n"
-    )
+def test_only_its_user_can_open_the_socket_of_a_link(flight):
+    for way in flight:
+        assert stat.S_IMODE(os.stat(way.server.server_address).st_mode) == 0o600
+
+
+def test_a_link_that_does_not_answer_is_an_error(flight, monkeypatch, refused):
+    flight[1].deaf = True
+    monkeypatch.setattr("cloudrc.drivers.link_control.APPLY_LIMIT", 0.05)
+    said = refused("link set downlink.delay_ms=120", code=4)
+    assert "the downlink did not apply the change within" in said
+    assert "see runs/latest/downlink.log" in said
+    Path(flight[0].server.server_address).unlink()
+    assert "the uplink does not answer (" in refused("link set downlink.delay_ms=120", code=4)
+
+
+def test_a_change_that_is_none_is_refused(flight):
+    with pytest.raises(BadInputError, match="not a profile's files"):
+        ask(Path(flight[0].server.server_address), put_request("{}"))

@@ -1,23 +1,22 @@
 """`cloudrc link set` in a cluster: pods, ConfigMap, messages and permissions."""
 
 import json
-import os
 import subprocess
-import threading
-import time
+import sys
 from dataclasses import asdict
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 import yaml
 
 from cloudrc.cluster.client import ClusterError
-from cloudrc.cluster.link import APPLY_LIMIT, APPLY_SCRIPT, with_files
+from cloudrc.cluster.link import PIPE, with_files
+from cloudrc.drivers.link_control import ControlServer
 from cloudrc.errors import BadInputError
-from cloudrc.files import write_atomically
-from cloudrc.link.follow import HANDED_FILE, read_handed
-from cloudrc.link.state import STATE_FILE, LinkState, to_text
+from cloudrc.link.control import put_request, read_answer
+from cloudrc.link.state import LinkState
 
 PROFILE = "uplink: {delay_ms: 45, jitter_ms: 25}\ndownlink: {delay_ms: 45, jitter_ms: 25}\n"
 TRACE = "time_s,delay_ms\n0,40\n1,60\n"
@@ -64,13 +63,13 @@ class Cluster:
         pod = words[words.index("exec") + 2]
         if pod in self.broken:
             raise ClusterError("the pod is gone")
-        document, state = json.loads(given), self.states[pod]
+        document, state = json.loads(given.partition("\r\n\r\n")[2]), self.states[pod]
         change, self.handed[pod] = json.loads(document["change.json"]), document
         if pod in self.cannot and self.cannot[pod] in document["profile.yaml"]:
             state |= {"refused": change["number"], "refusal": "netem cannot do that"}
         elif pod not in self.deaf:
             state |= {"change": change["number"], "cause": change["cause"]}
-        return json.dumps(state)
+        return f"HTTP/1.0 200 OK\r\n\r\n{json.dumps(state)}"
 
 
 @pytest.fixture
@@ -172,64 +171,43 @@ def test_a_missing_pod_is_named(cluster, running, refused):
     assert "the world pod of release 'cloudrc' does not run" in refused(LINE, code=5)
 
 
-# The script in the link container, with a real `sh`.
+# The pipe in the link container, with a real Python.
 
 NOTE = json.dumps({"number": "b2", "cause": "zwölf", "restart": False})
 LONG = "time_s,delay_ms\n" + "0,40\n" * 20_000
-FILES = {"change.json": NOTE, "profile.yaml": "uplink: {trace: t.csv}\n", "t": LONG}
-DOCUMENT = json.dumps(FILES)
+DOCUMENT = json.dumps({"change.json": NOTE, "profile.yaml": "uplink: {trace: t}\n", "t": LONG})
 
 
-def start(folder, script=APPLY_SCRIPT):
-    length = str(len(DOCUMENT.encode()))
-    command = ["sh", "-c", script, "sh", str(folder), "b2", length]
-    pipe = subprocess.PIPE
-    return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+def through_pipe(path, request):
+    words = [sys.executable, "-I", "-S", "-c", PIPE, str(path)]
+    return subprocess.run(words, input=request, capture_output=True)
 
 
-def tell(folder, **state):
-    text = to_text(LinkState("relay", "", "relay", "uplink", {}, "", 1, **state))
-    write_atomically(folder / STATE_FILE, text.encode())
-    return text
+def test_the_pipe_carries_a_change_to_the_socket_and_the_state_back():
+    got, state = (
+        [],
+        LinkState("relay", "", "relay", "uplink", {}, "", 1, change="b2", cause="zwölf"),
+    )
+
+    def change(document):
+        got.append(document.decode())
+        return "b2"
+
+    with TemporaryDirectory(prefix="cloudrc-") as folder:
+        server = ControlServer(Path(folder) / "link.sock", change, lambda: state)
+        done = through_pipe(server.server_address, put_request(DOCUMENT))
+        cut = through_pipe(server.server_address, put_request(DOCUMENT)[:-1])
+        server.shutdown()
+        server.server_close()
+    assert got == [DOCUMENT, DOCUMENT[:-1]]
+    assert read_answer(done.stdout) == state
+    assert cut.returncode == 0
 
 
-@pytest.mark.parametrize("state", [{"change": "b2"}, {"change": "a1", "refused": "b2"}])
-def test_the_script_writes_a_change_and_prints_the_state(tmp_path, state):
-    tell(tmp_path, change="a1", refused="b22")
-    running = start(tmp_path)
-    decided = list[str]()
-
-    def sidecar():
-        while not (tmp_path / HANDED_FILE).exists():
-            time.sleep(0.005)
-        decided.append(tell(tmp_path, **state))
-
-    thread = threading.Thread(target=sidecar)
-    thread.start()
-    out, err = running.communicate(DOCUMENT, timeout=2 * APPLY_LIMIT)
-    thread.join()
-    assert (running.returncode, out, err) == (0, decided[0], "")
-    assert read_handed((tmp_path / HANDED_FILE).read_text()) == FILES
-    assert sorted(os.listdir(tmp_path)) == [HANDED_FILE, STATE_FILE], "no draft is left"
-
-
-def test_a_silent_sidecar_leaves_the_old_state(tmp_path):
-    told = tell(tmp_path, change="a1")
-    assert "seq 250" in APPLY_SCRIPT
-    out, _ = start(tmp_path, APPLY_SCRIPT.replace("seq 250", "seq 3")).communicate(DOCUMENT)
-    assert out == told
-
-
-@pytest.mark.parametrize(
-    ("folder", "given", "words"),
-    [(".", DOCUMENT[:-1], "the change arrived incomplete"), ("none", "", "no link runs here")],
-)
-def test_the_script_refuses_an_incomplete_change(tmp_path, folder, given, words):
-    tell(tmp_path, change="a1")
-    running = start(tmp_path / folder)
-    _, err = running.communicate(given)
-    assert (running.returncode, err) == (2, f"error: {words};\n")
-    assert os.listdir(tmp_path) == [STATE_FILE]
+def test_the_pipe_says_that_no_link_answers(tmp_path):
+    done = through_pipe(tmp_path / "none", b"")
+    assert done.returncode == 1
+    assert done.stderr.startswith(b"error: no link answers here: ")
 
 
 # The Role among the chart's examples.

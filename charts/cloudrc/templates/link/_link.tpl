@@ -66,6 +66,7 @@ auto
     - --end=127.0.0.1:7400
     - --listen=127.0.0.1:7401
     - --route=/run/cloudrc/route
+    - --control=/run/cloudrc/link.sock
     - "--metrics=[::]:9102"
   ports:
     - {name: link-metrics, containerPort: 9102, protocol: TCP}

@@ -1,0 +1,96 @@
+"""Answer `PUT /link` on a Unix socket, and send it to one: how a running link is changed."""
+
+from __future__ import annotations
+
+import os
+import socket
+import socketserver
+import threading
+import time
+from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler
+from pathlib import Path
+
+from cloudrc.errors import BadInputError
+from cloudrc.link.control import APPLY_LIMIT, OK, REFUSED, read_answer
+from cloudrc.link.state import LinkState, to_text
+
+ANSWER_MAX = 16 << 20
+"""Largest size of an answer [bytes]."""
+LOOK_PERIOD = 0.01
+"""Time between two looks whether a direction has decided about a change [s]."""
+
+Change = Callable[[bytes], str]
+"""Function that takes the body of a request as the new profile; returns the number of the change.
+Raises a BadInputError or a ValueError if the body is no valid change."""
+State = Callable[[], LinkState | None]
+"""Function that returns the present state of the direction."""
+
+
+class ControlServer(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
+    """Answers on a socket that only the user of this process can open."""
+
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, path: Path, change: Change, state: State) -> None:
+        """Serve at `path`, on threads of its own."""
+        self.change, self.state = change, state
+        path.unlink(missing_ok=True)  # of an earlier process
+        super().__init__(str(path), _Handler)
+        threading.Thread(target=self.serve_forever, args=(0.25,), daemon=True).start()
+
+    def server_bind(self) -> None:
+        """Bind the socket; it has its rights before it listens."""
+        super().server_bind()
+        os.chmod(str(self.server_address), 0o600)
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Ignore the errors of clients that disconnect early."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: ControlServer
+    timeout = APPLY_LIMIT
+
+    def do_PUT(self) -> None:
+        size = int(self.headers.get("Content-Length") or 0)
+        try:
+            number = self.server.change(self.rfile.read(size))
+        except (BadInputError, ValueError, OSError) as error:
+            self._answer(REFUSED, str(error))
+            return
+        until = time.monotonic() + APPLY_LIMIT
+        while (state := self.server.state()) is None or number not in (state.change, state.refused):
+            if time.monotonic() > until:
+                break
+            time.sleep(LOOK_PERIOD)
+        if state is None:
+            self._answer(REFUSED, "the link waits for the address of its peer")
+        else:
+            self._answer(OK, to_text(state))
+
+    def _answer(self, status: int, text: str) -> None:
+        content = text.encode()
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Log nothing: the sidecar logs each change."""
+
+
+def ask(path: Path, request: bytes) -> LinkState:
+    """Send a request to the socket of a direction; return the state of the direction.
+
+    Raise an OSError if nothing listens there, a ValueError or a BadInputError as `read_answer`.
+    """
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.settimeout(2 * APPLY_LIMIT)
+        connection.connect(str(path))
+        connection.sendall(request)
+        answer = b""
+        while len(answer) < ANSWER_MAX and (data := connection.recv(1 << 16)):
+            answer += data
+    return read_answer(answer)
