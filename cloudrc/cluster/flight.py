@@ -296,7 +296,7 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
 
 def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> bool:
     """Fly the experiment's mission by a Job; return False if it was interrupted."""
-    flown = {"start", "waypoints", "carrot"}
+    flown = {"start", "touch", "waypoints", "carrot"}
     mission = experiment.mission.model_dump(mode="json", include=flown)
     limit = experiment.criteria.time_limit_s
     job = run_job(release, {"name": experiment.name, "time_limit_s": limit, **mission})

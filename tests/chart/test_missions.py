@@ -19,7 +19,7 @@ ENABLED = {"mission": {"enabled": True}}
 
 
 def load(mission):
-    return load_experiment("hover", [f"mission={mission}"]).mission
+    return load_experiment("paper", [f"mission={mission}"], flown=True).mission
 
 
 def jobs(values=None, **where):

@@ -119,6 +119,7 @@ def test_a_job_flies_a_carrot_mission_over_the_users_profile(ready, tmp_path, ca
     maps = [body["data"] for key, body in ready.objects.items() if key[0] == "configmaps"]
     (text,) = (data["mission.yaml"] for data in maps if "mission.yaml" in data)
     assert json.loads(text)["carrot"] == {"speed_mps": 1.5, "acceleration_mps2": 2.0}
+    assert "touch" in json.loads(text), "else the body to touch is an obstacle"
 
 
 def test_the_users_robot_and_scene_fly_as_configmaps_that_belong_to_the_release(
