@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from cloudrc.faults.facts import ESTOP, FLOWN, HOLD, LAND, REELS_NS, Facts, Note
 from cloudrc.messages import GuardState, Vector
+from cloudrc.records import Contact
 from cloudrc.world.simulator import Simulator
 
 STANDS = 0.2  # speed per axis up to which a robot stands when it is switched off [m/s]
@@ -41,19 +42,18 @@ class ContactChecks:
         if self._facts.planar:  # its wheels always touch the floor
             new = [touch for touch in new if touch.body != FLOOR]
         for touch in new:
-            if self._honest and not self._is_allowed(state, touch.body, touch.tip, now_ns):
-                part = "tip" if touch.tip else "body"
-                self._note(now_ns, "collision", f"{part} touched {touch.body} in {state.name}")
+            if self._honest and not self._is_allowed(state, touch, now_ns):
+                self._note(now_ns, "collision", f"touched {touch.body} in {state.name}")
         return bool(new)
 
-    def _is_allowed(self, state: GuardState, body: str, tip: bool, now_ns: int) -> bool:
+    def _is_allowed(self, state: GuardState, touch: Contact, now_ns: int) -> bool:
         """Return whether the robot may touch a body in this state."""
-        if body == "board" and tip:
+        if touch.body == self._facts.touch and touch.tip:
             return True
         # A landing that is acknowledged just above an obstacle cannot stop in time.
         lands = state is LAND or (state is HOLD and now_ns - self._landed_ns <= BRAKE_NS)
         low = lands or state not in FLOWN
-        return low and (lands or self.comes_down or body == FLOOR)
+        return low and (lands or self.comes_down or touch.body == FLOOR)
 
     def check_actuators(
         self, state: GuardState, velocity: Vector, is_on: bool, now_ns: int

@@ -6,7 +6,9 @@ from collections.abc import Callable
 from math import inf
 from typing import NamedTuple, TypeAlias
 
-from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.load import ResolvedExperiment, ResolvedGuard
+from cloudrc.config.robot import find_robot
+from cloudrc.config.scene import fence_in
 from cloudrc.messages import GuardState, Vector
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -25,16 +27,15 @@ class Facts(NamedTuple):
     high: Vector  # opposite corner [m]
     braking: float  # deceleration of the robot [m/s^2]
     planar: bool  # whether the robot stays on the ground
+    touch: str | None = None  # body that the mission has to touch
 
     @classmethod
-    def of(
-        cls, limits: ResolvedGuard, low: Vector, high: Vector, braking: float, *, planar: bool
-    ) -> Facts:
-        """Make the facts; for a `planar` robot, leave out floor and ceiling of the fence.
-
-        `low` and `high` are corners of the scene's fence [m], world frame. `braking` is the
-        deceleration of the robot [m/s^2].
-        """
-        if planar:
+    def of(cls, experiment: ResolvedExperiment) -> Facts:
+        """Read the facts of an experiment; raise a BadInputError as `fence_in` and `find_robot`."""
+        world = experiment.world
+        robot, fence = find_robot(world.robot), fence_in(world)
+        low, high = fence.low, fence.high
+        if robot.planar:
             low, high = (*low[:2], -inf), (*high[:2], inf)
-        return cls(limits, low, high, braking, planar)
+        braking, touch = robot.guard.braking_mps2, experiment.mission.touched
+        return cls(experiment.guard, low, high, braking, robot.planar, touch)

@@ -22,8 +22,9 @@ from cloudrc.drivers.teleop import PERIOD_NS as WAKE_NS
 from cloudrc.drivers.virtual import Clock, VirtualRun
 from cloudrc.endpoint import Endpoint
 from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, dishonesty
+from cloudrc.faults.facts import Facts
 from cloudrc.faults.inject import BUGS, SECRET, bugs, inject, shaped
-from cloudrc.faults.invariants import Watch, facts_of
+from cloudrc.faults.invariants import Watch
 from cloudrc.faults.models import RestartableEndpoint, TeleopModel
 from cloudrc.faults.schedule import OFFSET_MAX, Schedule, generator
 from cloudrc.link.model import LinkDirection
@@ -85,7 +86,7 @@ class FaultRun:
         self.generations = {"world": 0, "cloud": 0}
         self.of_world, self.of_cloud = list[Record](), list[Record]()
         self.changes = list[GuardChange]()
-        self.watch = Watch(facts_of(self.experiment))
+        self.watch = Watch(Facts.of(self.experiment))
         self.listeners: list[Callable[[list[Record], int], None]] = [self.watch.see]
         phase_ns = int(generator(self.experiment.seed, 45).integers(WAKE_NS))
         self.teleop = TeleopModel(self._fence, phase_ns)

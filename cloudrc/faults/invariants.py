@@ -34,9 +34,6 @@ from bisect import bisect_right
 from collections import Counter
 from typing import NamedTuple
 
-from cloudrc.config.load import ResolvedExperiment
-from cloudrc.config.robot import find_robot
-from cloudrc.config.scene import fence_in
 from cloudrc.faults.contact_checks import ContactChecks
 from cloudrc.faults.facts import FLOWN, Facts
 from cloudrc.faults.motion_checks import MotionChecks
@@ -165,10 +162,3 @@ class RobotInvariants:
     def see_session(self, now_ns: int) -> None:
         """Implement `Observer.see_session`: forget the commands of the old session."""
         self._orders.forget_commands()
-
-
-def facts_of(experiment: ResolvedExperiment) -> Facts:
-    """Return what the invariants need to know about an experiment's robot, scene and limits."""
-    robot, fence = find_robot(experiment.world.robot), fence_in(experiment.world)
-    braking = robot.guard.braking_mps2
-    return Facts.of(experiment.guard, fence.low, fence.high, braking, planar=robot.planar)

@@ -4,8 +4,8 @@ from functools import cache
 from types import SimpleNamespace
 
 from cloudrc.config.load import load_experiment
-from cloudrc.faults.facts import FLOWN, TRACK
-from cloudrc.faults.invariants import Watch, facts_of
+from cloudrc.faults.facts import FLOWN, TRACK, Facts
+from cloudrc.faults.invariants import Watch
 from cloudrc.messages import ZERO, Command, OperatorRequest, Request, Start
 from cloudrc.records import Contact
 from cloudrc.robots.pelican.rotors import STOPPED
@@ -18,8 +18,8 @@ TURNING = (900.0,) * 4
 def facts(hold_ms=60_000, robot="pelican"):
     """Return what the invariants know of a robot in its experiment."""
     settings = f"guard.hold_max_s={hold_ms / 1000}", "guard.plan_max_s=0.8"
-    name = "pillars" if robot == "rover" else "hover"
-    return facts_of(load_experiment(name, ["link.profile=ideal", *settings]))
+    name = "pillars" if robot == "rover" else "paper"
+    return Facts.of(load_experiment(name, ["link.profile=ideal", *settings]))
 
 
 class FakeRobot:

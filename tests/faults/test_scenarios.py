@@ -27,7 +27,7 @@ def test_a_fault_passes_its_checks(scenario):
     [
         ("F13", "cloudrc.world.guard.state.SETTLE_NS", 3 * 10**9, "TRACK again after its start"),
         ("F40", "cloudrc.world.endpoint.REAL_TIME_FACTOR_MIN", 0.0, "times that world reports"),
-        ("F13", "cloudrc.faults.invariants.RAMP", 0.0, "breaches of an invariant"),
+        ("F13", "cloudrc.faults.motion_checks.SLACK", -1.0, "breaches of an invariant"),
     ],
 )
 def test_a_check_fails_if_its_promise_is_broken(name, broken, value, said, monkeypatch):

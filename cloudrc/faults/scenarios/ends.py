@@ -203,7 +203,7 @@ def _impossible(outcome: Outcome, seed: int) -> None:
     points: dict[str, Vector] = {
         "1 m behind a wall of the fence": (fence_of(scene).high[0] + 1.0, 0.0, 1.0),
         "far below the floor": (0.0, 0.0, -5.0),
-        "in a pipe's wall": _wall_of(scene.pipes[0]),
+        "in the wall of a tube": _wall_of(scene.pipes[0]),
     }
     others: dict[str, list[Any]] = {
         "NaN": [(0.0, 0.0, nan)],
@@ -230,9 +230,9 @@ def _impossible(outcome: Outcome, seed: int) -> None:
             outcome.true(f"{name}: offers another point", offered)
 
 
-def _wall_of(pipe: Pipe) -> Vector:
-    """Return a point inside the wall of a horizontal pipe, at half of its length."""
-    (x, y, z), (ax, ay, _), radius = pipe.centre, pipe.axis, 0.5 * (pipe.inner + pipe.outer)
+def _wall_of(tube: Pipe) -> Vector:
+    """Return a point inside the wall of a horizontal tube, at half of its length."""
+    (x, y, z), (ax, ay, _), radius = tube.centre, tube.axis, 0.5 * (tube.inner + tube.outer)
     return (x - ay * radius, y + ax * radius, z)
 
 

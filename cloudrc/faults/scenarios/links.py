@@ -64,16 +64,16 @@ def _silence(outcome: Outcome, seed: int) -> None:
 @scenario(
     3,
     "long-blackout",
-    injects="both directions silent for 75 s, over the floor and among the pipes",
+    injects="both directions silent for 75 s, over the floor and among obstacles",
     expects="HOLD; LAND after 60 s at 0.5 m/s; switches off after touch-down; stays in LAND",
 )
 def _long_silence(outcome: Outcome, seed: int) -> None:
-    """Interrupt the link for 75 s in two flights: above the free floor, and among the pipes."""
+    """Interrupt the link for 75 s in two flights: above the free floor, and among obstacles."""
     flight = _landed(outcome, seed, measures.instant(seed, 1.6, 2.6), "over the floor")
     first, last = (flight.trajectory()[n].odometry.position for n in (0, -1))
     text = "over the floor: base above where it took off"
     outcome.most(text, abs(last[2] - first[2]), 0.02, "m")
-    _landed(outcome, seed, measures.instant(seed, 8.0), "amid the pipes")
+    _landed(outcome, seed, measures.instant(seed, 8.0), "amid obstacles")
 
 
 def _landed(outcome: Outcome, seed: int, at: float, where: str) -> FaultRun:
