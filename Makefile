@@ -186,11 +186,13 @@ bench-link: $(VENV)/all ## compare the relay with its profiles and with a C prog
 
 # The end-to-end tests draw the dashboards, with the data of their Prometheus.
 # The film needs Chromium and flies in real time.
-pictures: $(VENV)/dev ## film the console for the README, draw a flight, and take the dashboards from 'make e2e'
+pictures: $(VENV)/dev ## film the console for the README, draw two robots, and take the dashboards from 'make e2e'
 	$(bin)/python -m tools.console_picture
 	rm -rf build/pictures
-	$(bin)/cloudrc run paper --mode virtual --out build/pictures
-	cp build/pictures/figures/overview.png docs/overview.png
+	$(bin)/cloudrc run paper --mode virtual --out build/pictures/paper
+	cp build/pictures/paper/figures/overview.png docs/overview.png
+	$(bin)/cloudrc run pillars --mode virtual --out build/pictures/pillars
+	cp build/pictures/pillars/figures/overview.png docs/pillars.png
 	@if [ -f build/e2e/dashboards.webp ]; then cp build/e2e/dashboards.webp docs/; \
 		else echo "no build/e2e/dashboards.webp: 'make e2e' draws it"; fi
 
