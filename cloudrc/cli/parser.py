@@ -35,6 +35,8 @@ GROUPS: dict[str, dict[str, str]] = {
     },
     "look around, set up": {
         "list": "list experiments, profiles, predictors and more",
+        "new": "write the files of a robot of your own",
+        "robot": "check a robot: facts, a flight, and what must change",
         "doctor": "check whether this machine can fly; say what to fix",
         "link": "show, record, verify or change the emulated network",
         "key": "make or replace the key that world and cloud share",

@@ -1,0 +1,37 @@
+"""`cloudrc new`: write the files of a robot of one's own."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from cloudrc.cli.output import print_or_drop
+from cloudrc.cli.parser import add_verbs
+
+VERBS = {"robot": "write a folder with a robot that flies, to change"}
+EPILOG = """\
+examples:
+  cloudrc new robot ./my_robot       robot.yaml, robot.xml and a test
+  cloudrc robot check ./my_robot"""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    (robot,) = add_verbs(parser, VERBS).values()
+    robot.add_argument("folder", type=Path, metavar="DIR", help="folder for the files")
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Write the files, and print what to type next."""
+    from cloudrc.runs.new_robot import write_robot
+
+    folder = options.folder
+    names = write_robot(folder)
+    path = folder if folder.is_absolute() or folder.parts[:1] == ("..",) else f"./{folder}"
+    print_or_drop(
+        f"change {', '.join(names)} in {folder}, then:\n"
+        f"  cloudrc robot check {path}\n"
+        f"  cloudrc run steps --mode virtual --set world.robot={path}\n"
+        f"  pytest {path}"
+    )
+    return 0

@@ -1,0 +1,195 @@
+"""Check a robot: read its facts from the compiled model, and move it in virtual time.
+
+The robot moves without a network, a cloud and a guard: it stands or hovers, follows a step of the
+velocity, and brakes.
+"""
+
+from __future__ import annotations
+
+from math import dist, hypot
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.robot import RobotFiles, find_robot
+from cloudrc.config.schema import World
+from cloudrc.config.shipped import file_of
+from cloudrc.geometry.shapes import Surface
+from cloudrc.messages import ZERO, Vector
+from cloudrc.robots.build import build_robot, controller, onboard_values
+from cloudrc.robots.onboard._airframe import thrust_to_weight
+from cloudrc.world.guard.limits import REACTION, step_towards
+from cloudrc.world.robot import STEP, Robot
+from cloudrc.world.scene import ROBOT_PREFIX, compile_model
+from cloudrc.world.shapes import read_shapes, shapes_of
+from cloudrc.world.watched import OnboardFailedError
+
+SCENE = "empty"
+"""Scene of the check."""
+CLIMB, RISE = 0.5, 2.0
+"""Speed [m/s] and duration [s] of the climb after the start."""
+STEADY, FAST, STOP = 3.0, 3.0, 4.0
+"""Durations of hovering or standing, of the step, and of braking [s]."""
+SPEED = 2.0
+"""Largest speed of the step [m/s]."""
+DRIFT_MAX = 0.2
+"""Largest distance from its place of a robot that hovers or stands [m]."""
+SHORT = 0.2
+"""Largest part of the step that may be missing at its end [1]."""
+REST = 0.1
+"""Largest speed at the end of braking [m/s]."""
+BRAKING_MAX = 10.0
+"""Largest deceleration that the check tells [m/s^2]: guard.braking_mps2 is not larger."""
+UPRIGHT_MIN = 0.2
+"""Smallest cosine of the tilt of a robot that has not turned over [1]."""
+DIVERGED = 4
+"""Number of the first of MuJoCo's three warnings about positions, velocities and accelerations."""
+
+
+class CheckFlight(NamedTuple):
+    """What the robot did in the check's flight."""
+
+    drift: float  # largest distance from its place while it hovers or stands [m]
+    speed: float  # commanded speed of the step [m/s]
+    reached: float  # part of this speed at the end of the step [1]
+    braking: float  # least deceleration that explains the braking distance [m/s^2]
+    rest: float  # speed at the end of braking [m/s]
+
+
+def check(name: str) -> tuple[dict[str, Any], list[str]]:
+    """Return the facts about a robot, and what must change, one line each.
+
+    Args:
+        name: Name of a shipped robot, or absolute path of a folder or an .xml file.
+
+    Raises:
+        BadInputError: If the robot does not compile or does not hold the contract.
+    """
+    world = World.model_validate({"robot": name, "scene": SCENE})
+    robot = find_robot(name)
+    body = build_robot(world, ResolvedGuard.model_validate({}))
+    model = compile_model(robot.model, file_of(SCENE))
+    facts = _read_facts(world, robot, model)
+    changes = _judge_hull(robot, facts["size_m"])
+    try:
+        motion = _move(body, robot)
+    except OnboardFailedError as error:
+        return facts, [*changes, str(error)]
+    facts |= {
+        "drift_m": motion.drift,
+        "step_mps": motion.speed,
+        "step_reached": motion.reached,
+        "braking_measured_mps2": motion.braking,
+    }
+    if body.simulator.data.warning.number[DIVERGED : DIVERGED + 3].any():
+        return facts, [*changes, "the simulation diverged: check masses and inertias of the model"]
+    return facts, changes + _judge(robot, motion)
+
+
+def read_surfaces(name: str) -> tuple[Surface, ...]:
+    """Return the surfaces of a robot, in the frame of its base."""
+    return read_shapes(World.model_validate({"robot": name, "scene": SCENE})).robot
+
+
+def _read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
+    """Return the facts that need no motion."""
+    base = model.jnt_bodyid[0]
+    ratio = thrust_to_weight(model) if not robot.planar else None
+    names = [model.sensor(n).name.removeprefix(ROBOT_PREFIX) for n in range(model.nsensor)]
+    size = _size(model)
+    return {
+        "model": str(robot.model),
+        "mass_kg": float(model.body_subtreemass[base]),
+        "actuators": [
+            model.actuator(n).name.removeprefix(ROBOT_PREFIX) or str(n) for n in range(model.nu)
+        ],
+        **({} if ratio is None else {"thrust_to_weight": ratio, "hover_thrust": 1.0 / ratio}),
+        "planar": robot.planar,
+        "onboard": controller(robot, model).name,
+        "parameters": onboard_values(world),
+        "guard": robot.guard.model_dump(),
+        "size_m": size,
+        "hull_m": robot.hull or size,
+        "has_response": robot.response is not None,
+        "sensors": names,
+    }
+
+
+def _size(model: Any) -> float:
+    """Return the radius of a ball about the base that holds the robot's geoms [m], upright."""
+    return 0.5 * shapes_of(model, planar=False).size
+
+
+def _judge_hull(robot: RobotFiles, size: float) -> list[str]:
+    if robot.hull is None or robot.hull >= size - 1e-3:
+        return []
+    return [f"robot.yaml: hull_m is {robot.hull:g}, but the geoms reach {size:.3f} m from the base"]
+
+
+def _move(body: Robot, robot: RobotFiles) -> CheckFlight:
+    """Let the robot hover or stand, follow a step along x, and brake."""
+    climb = (0.0, 0.0, 0.0 if robot.planar else CLIMB)
+    body.simulator.reset()
+    body.onboard.reset()
+    reference = _follow(body, robot, ZERO, climb, RISE)
+    reference = _follow(body, robot, reference, ZERO, 1.0)
+    place = body.simulator.readings.position
+    reference = _follow(body, robot, reference, ZERO, STEADY)
+    drift = dist(place, body.simulator.readings.position)
+    speed = min(robot.guard.speed_max_mps or SPEED, SPEED)
+    _follow(body, robot, reference, (speed, 0.0, 0.0), FAST)
+    start, before = body.simulator.readings.position, _speed(body)
+    _follow(body, robot, None, ZERO, STOP)
+    way = hypot(*np.subtract(body.simulator.readings.position, start)[:2]) - REACTION * before
+    braking = min(before * before / (2.0 * max(way, 1e-9)), BRAKING_MAX)
+    return CheckFlight(drift, speed, before / speed, braking, _speed(body))
+
+
+def _follow(
+    body: Robot, robot: RobotFiles, reference: Vector | None, wanted: Vector, duration: float
+) -> Vector:
+    """Follow `wanted` [m/s] for a time [s], and return the last reference [m/s].
+
+    The reference starts at `reference` and changes as fast as the guard allows; None: brake.
+    """
+    simulator, onboard = body.simulator, body.onboard
+    change = robot.guard.acceleration_max_mps2 * STEP
+    for _ in range(round(duration / STEP)):
+        readings = simulator.readings
+        if reference is None:
+            commands = onboard.brake(readings, wanted)
+        else:
+            reference = step_towards(reference, wanted, change)
+            commands = onboard.update(readings, reference, 0.0)
+        simulator.step(commands)
+        if simulator.readings.axes[8] < UPRIGHT_MIN:
+            raise OnboardFailedError("the robot turns over: check the onboard controller's gains")
+    return reference or ZERO
+
+
+def _speed(body: Robot) -> float:
+    x, y, _ = body.simulator.readings.velocity
+    return hypot(x, y)
+
+
+def _judge(robot: RobotFiles, motion: CheckFlight) -> list[str]:
+    """Return what must change because of the robot's motion."""
+    found, verb = [], "stand" if robot.planar else "hover"
+    if motion.drift > DRIFT_MAX:
+        found.append(f"the robot does not {verb}: it drifts {motion.drift:.2f} m in {STEADY:g} s")
+    if abs(motion.reached - 1.0) > SHORT:
+        found.append(
+            f"the robot reaches {motion.reached:.0%} of a velocity of {motion.speed:g} m/s along x "
+            f"in {FAST:g} s: check the onboard controller, or set guard.speed_max_mps"
+        )
+        return found
+    if motion.rest > REST:
+        found.append(f"the robot still moves at {motion.rest:.2f} m/s, {STOP:g} s after it brakes")
+    if motion.braking < robot.guard.braking_mps2:
+        fits = int(motion.braking * 10) / 10
+        found.append(
+            f"robot.yaml: guard.braking_mps2 is {robot.guard.braking_mps2:g}, but the robot brakes "
+            f"with {motion.braking:.2f} m/s^2; set it to {fits:g} or less"
+        )
+    return found

@@ -1,0 +1,119 @@
+"""`cloudrc new robot` and `cloudrc robot check`."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from cloudrc.cli.main import main
+
+
+@pytest.fixture
+def mine(tmp_path, capsys):
+    folder = tmp_path / "my_robot"
+    assert main(["new", "robot", str(folder)]) == 0
+    assert f"cloudrc robot check {folder}" in capsys.readouterr().out
+    return folder
+
+
+def replace(file, old, new):
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+def test_a_new_robot_is_complete_and_its_test_flies_it(mine):
+    assert sorted(each.name for each in mine.iterdir()) == [
+        "robot.xml",
+        "robot.yaml",
+        "test_robot.py",
+    ]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(mine)]
+    assert subprocess.run(command, cwd=mine, check=False).returncode == 0
+
+
+def test_a_folder_with_files_stays_as_it_is(mine, capsys):
+    before = (mine / "robot.yaml").read_text()
+    for path in (mine, mine / "robot.yaml"):
+        assert main(["new", "robot", str(path)]) == 2
+        assert "exists and is not empty" in capsys.readouterr().err
+    assert (mine / "robot.yaml").read_text() == before
+
+
+def test_a_new_robot_needs_no_change(mine, capsys):
+    assert main(["robot", "check", str(mine), "-o", "json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["ok"], found["changes"]) == (True, [])
+    assert found["facts"]["mass_kg"] == pytest.approx(1.3)
+    assert (mine / "check.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("robot", ["pelican", "nano", "rover"])
+def test_a_shipped_robot_needs_no_change(robot, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["robot", "check", robot]) == 0
+    assert "nothing must change" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "shown"),
+    [
+        ("robot.yaml", "braking_mps2: 3", "braking_mps2: 9", "guard.braking_mps2 is 9, but"),
+        ("robot.yaml", "# hull_m: 0.4", "hull_m: 0.1", "hull_m is 0.1, but the geoms reach"),
+        ("robot.yaml", "onboard: multirotor", "onboard: ./own.py", "own.py:10 in update"),
+        ("robot.yaml", "onboard: multirotor", "onboard: ./turns.py", "the robot turns over"),
+    ],
+)
+def test_what_must_change_is_a_line_each_and_exit_code_2(mine, capsys, file, old, new, shown):
+    law = "from cloudrc.robots.onboard.multirotor import build as general\n"
+    own = """
+class Mine:
+    stopped = (0.0,) * 4
+
+    def reset(self):
+        pass
+
+    def update(self, readings, velocity, yaw_rate):
+        {0}
+
+    brake = update
+
+
+def build(model):
+    return Mine()
+"""
+    (mine / "own.py").write_text(law + own.replace("{0}", "return commands"))
+    (mine / "turns.py").write_text(own.replace("{0}", "return (8.0, 8.0, 0.0, 0.0)"))
+    replace(mine / file, old, new)
+    assert main(["robot", "check", str(mine)]) == 2
+    found = capsys.readouterr()
+    (line,) = [each for each in found.out.splitlines() if each.startswith("must change: ")]
+    assert shown in line
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "shown"),
+    [
+        ('mass="1.22"', 'mass="1220"', "kg, not g"),
+        ('mass="1.22"', 'mass="3.3"', "hover needs 104 % of the thrust"),
+        ('diaginertia=".022 .018 .038"', 'diaginertia="22 18 38"', "robot.xml"),
+        ("<freejoint", "<!-- <freejoint", "robot.xml"),
+        (' gear="0 0 1 0 0 .02"', ' gear="0 0 1"', "spin directions"),
+    ],
+)
+def test_a_model_that_cannot_fly_is_refused_in_one_line(mine, capsys, old, new, shown):
+    replace(mine / "robot.xml", old, new)
+    assert main(["robot", "check", str(mine)]) == 2
+    error = capsys.readouterr().err
+    assert shown in error
+    assert error.count("\n") == 1
+
+
+def test_a_picture_replaces_no_other_file(mine, capsys):
+    other = mine / "notes.png"
+    other.write_text("mine")
+    assert main(["robot", "check", "x2", "--picture", str(other)]) == 2
+    assert main(["robot", "check", "x2", "--picture", "x2.gif"]) == 2
+    assert other.read_text() == "mine"
