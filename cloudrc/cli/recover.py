@@ -6,16 +6,15 @@ import argparse
 import os
 from dataclasses import asdict
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import output_argument, print_result
-from cloudrc.errors import BadInputError, describe_error
+from cloudrc.errors import BadInputError
 from cloudrc.runs.requirements import require
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
-    from cloudrc.record.columns import Message, Recording
+    pass
 
 LOSSY = 1
 """Exit code if the copy lacks data of the recording."""
@@ -40,12 +39,13 @@ def execute(options: argparse.Namespace) -> int:
     require("a recovery", ("record",))
     from cloudrc.record.reader import LISTED_MAX
     from cloudrc.record.recovery import recover
+    from cloudrc.report.attached import attached_views
 
     source: Path = options.file
     target = options.to or source.parent / f"{source.stem}.recovered{source.suffix}"
     if os.path.lexists(target):
         raise BadInputError(f"{target}: already there; name another file with --to")
-    recovery = recover(source, target, _views)
+    recovery = recover(source, target, attached_views)
     kept = ", ".join(f"{count} {kind}" for kind, count in recovery.kept.items() if count)
     lines = [f"kept {recovery.share:.1%}: {kept}"]
     lines.append("topics: " + ", ".join(f"{name} {n}" for name, n in recovery.topics.items()))
@@ -59,21 +59,3 @@ def execute(options: argparse.Namespace) -> int:
     text = "\n".join(map(escape, [*lines, str(target)]))
     print_result(options.output, {"file": str(target), **asdict(recovery)}, text)
     return 0 if recovery.complete else LOSSY
-
-
-def _views(recording: Recording) -> list[Message]:
-    """Make the topics for viewers from a recording and the experiment that is attached to it."""
-    from cloudrc.config.load import read_experiment
-    from cloudrc.report.views import views
-
-    if "config.yaml" not in recording.attachments:
-        raise BadInputError("its config.yaml, which names the scene, is lost")
-    with TemporaryDirectory() as folder:
-        config = Path(folder) / "config.yaml"
-        config.write_bytes(recording.attachments["config.yaml"])
-        try:
-            return views(recording, read_experiment(config, flown=True))
-        except BadInputError as error:
-            raise BadInputError(str(error).replace(str(config), "its config.yaml")) from error
-        except (ValueError, OSError) as error:  # impossible values
-            raise BadInputError(describe_error(error)) from error

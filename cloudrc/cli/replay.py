@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,8 +13,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
-    from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.record.columns import Recording
+    pass
 
 EPILOG = """\
 examples:
@@ -37,13 +35,14 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.config.scene import scene_of
     from cloudrc.files import write_atomically
     from cloudrc.metrics import Flight
+    from cloudrc.report.attached import read_flight
     from cloudrc.report.replay import write_page
 
     run: Path = options.run
     out = options.out or (run if run.is_dir() else run.parent) / "replay.html"
     if options.out and os.path.lexists(out):
         raise BadInputError(f"{out}: already there; name another file with --out")
-    recording, experiment = _read(run)
+    recording, experiment = read_flight(run)
     scene = scene_of(experiment.world)
     flight = Flight(recording, experiment.criteria, experiment.mission, scene)
     try:
@@ -54,20 +53,3 @@ def execute(options: argparse.Namespace) -> int:
         print_line("cloudrc: found no browser here; open the page yourself", sys.stderr)
     print_line(str(out))
     return 0
-
-
-def _read(run: Path) -> tuple[Recording, ResolvedExperiment]:
-    """Read a run's recording and its experiment, which an MCAP file contains as an attachment."""
-    from cloudrc.config.load import read_experiment
-    from cloudrc.record.columns import Recording
-    from cloudrc.report.folder import read_run
-
-    if run.is_dir():
-        return read_run(run)[:2]
-    recording = Recording.read(run)
-    if (config := recording.attachments.get("config.yaml")) is None:
-        raise BadInputError(f"{run}: has no config.yaml attached; name the folder of the run")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "config.yaml")
-        path.write_bytes(config)
-        return recording, read_experiment(path, flown=True)

@@ -33,12 +33,11 @@ from cloudrc.runs import store, sweep
 from cloudrc.runs.experiment import load, refuse_seed
 from cloudrc.runs.flight import Row
 from cloudrc.runs.folder import new_folder
-from cloudrc.runs.grid import Grid, SweepPoint, read_flight, read_grid, unpack
+from cloudrc.runs.grid import Grid, SweepPoint, read_grid, unpack
 from cloudrc.runs.lock import lock_folder
 from cloudrc.runs.pods import PodSettings, fly_in_pods
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.runs.workers import map_in_order, take_each
-from cloudrc.source import code_hash
 from cloudrc.text import FAILED_MARK, FAILED_NOTE, escape, format_number, table
 
 
@@ -105,20 +104,8 @@ def _read(options: argparse.Namespace) -> Grid:
 def fly_again(options: argparse.Namespace) -> int:
     """Repeat a flight of a sweep with recording and report; exit with 6 if its records changed."""
     require("a report", MODES["virtual"])
-    store.read_summary(options.folder)
-    rows = [row for key, row in store.read_rows(options.folder).items()
-            if key.startswith(options.key)]  # fmt: skip
-    if len(rows) != 1:
-        text = f"{len(rows)} rows have a key that begins like this; give one key"
-        raise BadInputError(f"{options.folder}: {options.key}: {text}")
-    (row,), key = rows, rows[0]["key"]
-    flight = read_flight(options.folder / store.FILE, row["point"], row["seed"])
-    if flight is None or flight.key != key:
-        code = row.get("code") or "without a hash"
-        why = f"was flown by code {code}, this is code {code_hash()}"
-        if code == code_hash():
-            why = "the experiment or a file of a plug-in, trace, robot or scene has changed since"
-        raise InvalidRunError(f"{key}: {why}; fly the sweep again")
+    row, flight = sweep.find_flight(options.folder, options.key)
+    key = flight.key
     report = sweep.fly_into(options.folder / key, flight, page=True)
     print_traceback(options, report)
     print_or_drop(summary(report, options.folder / key))
@@ -131,20 +118,13 @@ def fly_again(options: argparse.Namespace) -> int:
 
 def print_status(options: argparse.Namespace) -> int:
     """Print how many flights of a sweep are done, and how many succeeded per value of an axis."""
-    summary = store.read_summary(options.folder)
-    rows, values = store.read_rows(options.folder).values(), []
-    store.check_points(options.folder, rows, summary["axes"])
-    for axis, choices in summary["axes"].items():
-        for value in choices:
-            found = [row["verdict"] for row in rows if row["point"][axis] == value]
-            counts = {"flights": len(found), "success": found.count("success")}
-            values.append({"axis": axis, "value": value, **counts})
-    text = f"{len(rows)} of {summary['flights']} flights are done: {_verdicts(rows)}"
+    flights, rows, values = sweep.count_successes(options.folder)
+    text = f"{len(rows)} of {flights} flights are done: {_verdicts(rows)}"
     cells = [(each["axis"], store.as_text(each["value"]), f"{each['success']}/{each['flights']}")
              for each in values]  # fmt: skip
     if cells:
         text += f"\n\n{table([('axis', 'value', 'success'), *cells], right=(2,))}"
-    document = {"flights": summary["flights"], "rows": len(rows), "axes": values}
+    document = {"flights": flights, "rows": len(rows), "axes": values}
     print_result(options.output, document, text)
     return 0
 

@@ -8,11 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError
 from cloudrc.runs import store
 from cloudrc.runs.flight import Row, counts, fly_point, measure
 from cloudrc.runs.fly import fly
-from cloudrc.runs.grid import Grid, SweepPoint
+from cloudrc.runs.grid import Grid, SweepPoint, read_flight
 from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.source import code_hash
 from cloudrc.statistics import median_interval
@@ -107,6 +107,42 @@ def fly_into(folder: Path, flight: SweepPoint, *, page: bool) -> dict[str, Any]:
     folder.mkdir(exist_ok=True)
     (folder / "environment.json").unlink(missing_ok=True)  # it describes an earlier flight
     return fly(flight.experiment, "virtual", folder, page=page)
+
+
+def find_flight(folder: Path, begin: str) -> tuple[Row, SweepPoint]:
+    """Return the row of a sweep whose key begins like this, and the flight that repeats it.
+
+    Raises:
+        BadInputError: If no row, or more than one, has such a key.
+        InvalidRunError: If code or files have changed, so that the flight would be another.
+    """
+    store.read_summary(folder)
+    rows = [row for key, row in store.read_rows(folder).items() if key.startswith(begin)]
+    if len(rows) != 1:
+        text = f"{len(rows)} rows have a key that begins like this; give one key"
+        raise BadInputError(f"{folder}: {begin}: {text}")
+    (row,), key = rows, rows[0]["key"]
+    flight = read_flight(folder / store.FILE, row["point"], row["seed"])
+    if flight is None or flight.key != key:
+        code = row.get("code") or "without a hash"
+        why = f"was flown by code {code}, this is code {code_hash()}"
+        if code == code_hash():
+            why = "the experiment or a file of a plug-in, trace, robot or scene has changed since"
+        raise InvalidRunError(f"{key}: {why}; fly the sweep again")
+    return row, flight
+
+
+def count_successes(folder: Path) -> tuple[int, list[Row], list[dict[str, Any]]]:
+    """Return the number of flights of a sweep, its rows, and the successes per value of an axis."""
+    summary, rows = store.read_summary(folder), [*store.read_rows(folder).values()]
+    store.check_points(folder, rows, summary["axes"])
+    values = []
+    for axis, choices in summary["axes"].items():
+        for value in choices:
+            found = [row["verdict"] for row in rows if row["point"][axis] == value]
+            counts = {"flights": len(found), "success": found.count("success")}
+            values.append({"axis": axis, "value": value, **counts})
+    return summary["flights"], rows, values
 
 
 def fly_seed(flight: SweepPoint) -> Row:
