@@ -7,7 +7,7 @@ folders in `cloudrc/robots/`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -101,6 +101,9 @@ class RobotFile(Section):
     hull_m: Hull | None = None
     """Radius of the ball about the base that contains the robot [m], for the distance from
     obstacles. null: the smallest ball that contains the geoms of the model"""
+    probe: Annotated[str, Field(min_length=1)] | None = None
+    """Name of a sphere, a site of the model: with it the robot touches what a mission has to touch.
+    A touch sensor at this site measures the force. null: any part of the robot touches"""
 
     @model_validator(mode="after")
     def _check_stop(self) -> RobotFile:
@@ -126,6 +129,7 @@ class RobotFiles:
     tunings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     response: Response | None = None  # first-order model of the velocity loop
     motion: str | None = None  # path of a Python file with a better model
+    probe: str | None = None  # site with which the robot touches; None: any part of it touches
 
 
 def find_robot(name: str) -> RobotFiles:
@@ -145,9 +149,8 @@ def find_robot(name: str) -> RobotFiles:
     tunings = {key: tuning.model_extra or {} for key, tuning in robot.tunings.items()}
     model = folder / robot.model
     motion = robot.motion and str((folder / robot.motion).resolve())
-    return RobotFiles(
-        model, onboard, robot.planar, limits, robot.hull_m, tunings, robot.response, motion
-    )
+    found = RobotFiles(model, onboard, robot.planar, limits, robot.hull_m, tunings, robot.response)
+    return replace(found, motion=motion, probe=robot.probe)
 
 
 def parameters(robot: RobotFiles, world: World) -> dict[str, Any]:

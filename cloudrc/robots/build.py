@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from math import isfinite
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,7 +22,7 @@ from cloudrc.world.onboard import Accelerator, Actuators, Direct, Onboard
 from cloudrc.world.plant import Wind
 from cloudrc.world.robot import STEP, Robot
 from cloudrc.world.scene import compile_model, compile_true
-from cloudrc.world.simulator import Simulator
+from cloudrc.world.simulator import Simulator, find_site
 from cloudrc.world.watched import WatchedActuators, WatchedOnboard
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ class Parts(NamedTuple):
     plugin: Any  # plug-in of the onboard controller
     onboard: Onboard
     actuators: Actuators
+    probe: str | None  # site with which the robot touches; None: any part of it touches
 
 
 def check_robot(world: World) -> None:
@@ -55,15 +57,15 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     Raises:
         BadInputError: If the robot does not compile, or if it cannot move as `world` says.
     """
-    model, plugin, onboard, actuators = _make_parts(world)
+    model, plugin, onboard, actuators, probe = _make_parts(world)
     robot = find_robot(world.robot)
     guard = Guard(limits, fence_in(world), robot.guard, planar=robot.planar)
     faster = _accelerator(world, plugin)
     if faster is not None and faster.make is not None:
-        return faster.make(Simulator(model, actuators, wind), onboard, guard)  # type: ignore[no-any-return]
+        return faster.make(Simulator(model, actuators, wind, probe), onboard, guard)  # type: ignore[no-any-return]
     if not isinstance(actuators, Direct):
         actuators = WatchedActuators(actuators, model.nu)
-    return Robot(Simulator(model, actuators, wind), WatchedOnboard(onboard), guard)
+    return Robot(Simulator(model, actuators, wind, probe), WatchedOnboard(onboard), guard)
 
 
 def controller(robot: RobotFiles, model: Any) -> PlugIn:
@@ -141,7 +143,24 @@ def _make_parts(world: World) -> Parts:
     _check_onboard(onboard, nominal.nu if isinstance(actuators, Direct) else None)
     if world.wind.blows and isinstance(actuators, Direct):
         _refuse_wind(world, plugin)
-    return Parts(true, plugin, onboard, actuators)
+    return Parts(true, plugin, onboard, actuators, _find_probe(robot, choice, nominal))
+
+
+def _find_probe(robot: RobotFiles, choice: PlugIn, model: Any) -> str | None:
+    """Return the site with which a robot touches; None if any part of it touches.
+
+    A model without `robot.yaml` that has the Pelican's controller has its probe, too.
+    """
+    if robot.probe is not None:
+        find_site(model, robot.probe)
+        return robot.probe
+    pelican = find_robot("pelican")
+    if robot.onboard is not None or choice != pelican.onboard:
+        return None
+    with suppress(BadInputError):
+        find_site(model, pelican.probe or "")
+        return pelican.probe
+    return None
 
 
 def _build_onboard(

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cloudrc.errors import BadInputError
 from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import ZERO, Odometry, Vector
 from cloudrc.records import Contact
@@ -51,8 +52,20 @@ class Simulator:
             a list.
     """
 
-    def __init__(self, model: Any, actuators: Actuators, wind: Wind | None = None) -> None:
-        """Put the robot of a compiled `MjModel` at its spawn; without `wind` the air is at rest."""
+    def __init__(
+        self,
+        model: Any,
+        actuators: Actuators,
+        wind: Wind | None = None,
+        probe: str | None = None,
+    ) -> None:
+        """Put the robot of a compiled `MjModel` at its spawn; without `wind` the air is at rest.
+
+        `probe` is the name of the site with which the robot touches; None: any part touches.
+
+        Raises:
+            BadInputError: If the model has no such site.
+        """
         self.model = model
         self._wind = wind
         self.dt: float = model.opt.timestep
@@ -65,9 +78,8 @@ class Simulator:
         self._qpos, self._qvel = memoryview(data.qpos), memoryview(data.qvel)
         self._ctrl, self._applied = memoryview(data.ctrl), memoryview(data.qfrc_applied)
         self._sensors: memoryview[float] = memoryview(data.sensordata)
-        # A robot without a site and a sensor named tip touches with its body alone.
-        self._tip_sensor = _address(model, mujoco.mjtObj.mjOBJ_SENSOR)
-        self._tip = _address(model, mujoco.mjtObj.mjOBJ_SITE)
+        self._tip = -1 if probe is None else find_site(model, probe)
+        self._tip_sensor = _force_sensor(model, self._tip)
         self._tip_offset: Vector = ZERO
         self._tip_radius = -1.0
         if self._tip >= 0:
@@ -88,7 +100,7 @@ class Simulator:
             self.tape.clear()
         self.touches: list[Contact] = []
         # The robot stands on the floor: only after a flight is the next contact a new contact.
-        self._last_touch: dict[tuple[str, bool], int] = {("floor", False): 0}
+        self._last_touch: dict[tuple[str, bool], int] = {("floor", self._tip < 0): 0}
         self._readings: Readings | None = None
 
     def step(self, commands: Commands) -> None:
@@ -207,7 +219,7 @@ class Simulator:
             if is_near:  # not nearer than the `gap` of a geom
                 continue
             body = self._bodies[first] or self._bodies[second]
-            by_tip = dist(place, tip) <= self._tip_radius
+            by_tip = self._tip < 0 or dist(place, tip) <= self._tip_radius
             last = self._last_touch.get((body, by_tip))
             if last is None or self.steps - last > self._gap_steps:
                 motion = before.position, before.velocity, _velocity_at(before, self._tip_offset)
@@ -215,12 +227,22 @@ class Simulator:
             self._last_touch[body, by_tip] = self.steps
 
 
-def _address(model: Any, kind: Any) -> int:
-    """Return the number of the site `tip`, or where its sensor writes; -1 if there is none."""
-    number: int = mujoco.mj_name2id(model, kind, f"{ROBOT_PREFIX}tip")
-    if number >= 0 and kind == mujoco.mjtObj.mjOBJ_SENSOR:
-        number = int(model.sensor_adr[number])
+def find_site(model: Any, name: str) -> int:
+    """Return the number of the robot's site `name`; raise a BadInputError if there is none."""
+    number: int = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, f"{ROBOT_PREFIX}{name}")
+    if number < 0:
+        names = (model.site(each).name for each in range(model.nsite))
+        own = [each.removeprefix(ROBOT_PREFIX) for each in names if each.startswith(ROBOT_PREFIX)]
+        has = ", ".join(filter(None, own)) or "none"
+        raise BadInputError(f"probe: {name}: the robot has no such site; its sites: {has}")
     return number
+
+
+def _force_sensor(model: Any, site: int) -> int:
+    """Return where the touch sensor at a site writes; -1 if there is none."""
+    at_site = (model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH) & (model.sensor_objid == site)
+    found = np.flatnonzero(at_site)
+    return int(model.sensor_adr[found[0]]) if len(found) else -1
 
 
 def _velocity_at(readings: Readings, offset: Vector) -> Vector:

@@ -60,6 +60,8 @@ def test_limits_and_hull_are_read_and_have_defaults(read):
         ("hull_m: 0", "hull_m: 0: must be a number > 0 and <= 10"),
         ("hull_m: -0.3", "hull_m: -0.3: must be a number > 0 and <= 10"),
         ("hull_m: 350", "hull_m: 350: must be a number > 0 and <= 10"),
+        ("probe: ''", "probe: '': must be"),
+        ("probe: 3", "probe: 3: must be text"),
         ("hull: 0.3", "hull: unknown key; did you mean hull_m [m]?"),
     ],
 )

@@ -5,9 +5,13 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc.config import shipped
 from cloudrc.config.load import load_experiment
+from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of
+from cloudrc.errors import BadInputError
 from cloudrc.report.write import assess
+from cloudrc.robots.build import check_robot
 from cloudrc.runs.flight import fly_in_memory
 
 TRACK = "time_s,x_m,y_m,z_m\n0,0,0,1\n1.5,0,0,1\n2.5,1.5,0,1\n4,1.5,0,1\n"
@@ -110,3 +114,28 @@ def test_a_report_needs_neither_mujoco_nor_a_scene_that_compiles(flown_into, mon
     monkeypatch.setitem(sys.modules, "mujoco", None)
     (note,) = clearance_notes(found)
     assert note.endswith("all bodies but declared pipes: MuJoCo is not installed.")
+
+
+@pytest.mark.parametrize(
+    ("robot", "codes"),
+    [
+        ("nano", []),  # without a probe, any part of the robot touches
+        ("pelican", []),
+    ],
+)
+def test_every_robot_can_touch_a_body(flown_into, robot, codes):
+    board = f'<body name="wall" {PLACED}>{GEOM}</body>'
+    touch = "mission.touch={body: wall, speed_max_mps: 9}"
+    found = flown_into(board, touch, f"world.robot={robot}")
+    assert [each.code for each in found.verdict.failures] == codes
+    assert found.numbers["contact_time"].value > 0
+
+
+def test_a_probe_that_the_robot_lacks_is_refused_in_one_line(tmp_path):
+    (tmp_path / "robot.yaml").write_text("{onboard: multirotor, model: robot.xml, probe: arm}")
+    (tmp_path / "robot.xml").write_text(
+        (shipped.FOLDERS["robot"] / "nano" / "robot.xml").read_text()
+    )
+    said = "probe: arm: the robot has no such site; its sites: "
+    with pytest.raises(BadInputError, match=said):
+        check_robot(World(robot=str(tmp_path), scene="empty"))

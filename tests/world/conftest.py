@@ -27,4 +27,4 @@ def model_of(robot="pelican", scene="empty", plant=None):
 
 def simulate(robot="pelican", scene="empty", plant=None):
     """Return a simulator of the Pelican, or of a changed copy of it, with its rotors."""
-    return Simulator(model_of(robot, scene, plant), Rotors(STEP))
+    return Simulator(model_of(robot, scene, plant), Rotors(STEP), probe="tip")

@@ -300,7 +300,8 @@ def _self_test() -> str:
     model = compile_model(find_robot("pelican").model, file_of("empty"))
     fence = fence_of(load_scene("empty"))
     parts = [
-        (Simulator(model, rotors.Rotors(STEP)), LowLevel(), Guard(limits, fence)) for _ in range(2)
+        (Simulator(model, rotors.Rotors(STEP), probe="tip"), LowLevel(), Guard(limits, fence))
+        for _ in range(2)
     ]
     wrong = ""
     try:
