@@ -1,12 +1,15 @@
-"""The images; `cloudrc run --mode cluster` has the files and numbers of a run in virtual time."""
+"""The images; `cloudrc run --mode cluster` is like a run in virtual time; another robot drives."""
 
 import json
+import time
 
 import pytest
 
 from cloudrc import __version__
+from cloudrc.cluster.client import connect
+from cloudrc.cluster.jobs import follow
 from cloudrc.config.load import load_experiment
-from tests.e2e.conftest import CHART, NAMESPACE, cloudrc, command, helm, in_release
+from tests.e2e.conftest import CHART, NAMESPACE, cloudrc, command, helm, in_release, read
 from tests.flights.conftest import fly, numbers
 
 TIME_TOLERANCE = 0.05
@@ -80,3 +83,19 @@ def test_a_run_in_a_cluster_is_that_of_virtual_time(
     for mean in ("uplink_delay_mean", "downlink_delay_mean"):
         assert real[mean] == pytest.approx(virtual[mean], abs=DELAY_TOLERANCE)
     assert load_experiment(report / "config.yaml").name == name
+
+
+def test_a_job_drives_another_robot_through_its_mission(cluster, note):
+    name, began = "rover", time.monotonic()
+    world = "experiment.world.robot=rover,experiment.world.scene=pillars"
+    given = f"--set=link.mode=relay,mission.enabled=true,experiment.mission=pillars,{world}"
+    try:
+        helm("install", name, str(CHART), given)
+        (job,) = read("jobs", f"--selector=app.kubernetes.io/instance={name}")["items"]
+        lines: list[str] = []
+        end = follow(connect(None, NAMESPACE, name), job["metadata"]["name"], lines.append)
+    finally:
+        helm("uninstall", name)
+    assert end.exit_code == 0, (end, lines)
+    assert "waypoint 4 of 4 reached" in "\n".join(lines)
+    note(f"rover through pillars by a Job, with install: {time.monotonic() - began:.0f} s")
