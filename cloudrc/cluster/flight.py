@@ -120,23 +120,34 @@ def _why_never(causes: Mapping[str, str]) -> str:
 def _state(release: Release, component: str) -> tuple[str, bool]:
     """Return why a component is not ready ("" if ready), and whether it can never be ready."""
     deployment = pods.find_deployment(release, component)
-    status = deployment.status
-    for condition in status.conditions or []:  # for example Pod Security or a quota
+    spec = deployment.spec.template.spec
+    for condition in deployment.status.conditions or []:  # for example Pod Security or a quota
         if condition.type == "ReplicaFailure" and condition.status == "True":
-            return explain_refusal(str(condition.message), deployment.spec.template.spec), True
+            return explain_refusal(str(condition.message), spec), True
     found = pods.list_pods(release, component)
     for pod in found:
         if why := pods.pod_failure(pod):
-            return why + _secret_in(why, deployment.spec.template.spec), True
-    current = (status.observed_generation or 0) >= deployment.metadata.generation
-    if not (current and status.updated_replicas == 1 and status.replicas == 1 and found):
+            return why + _secret_in(why, spec), True
+    if not (found and _is_current(deployment)):
         return "its pod is being created", False
-    if any(c.type == "Ready" and c.status == "True" for c in found[0].status.conditions or []):
+    return _pod_state(release, found[0])
+
+
+def _is_current(deployment: Any) -> bool:
+    """Return whether a Deployment has one pod, of its newest version."""
+    status = deployment.status
+    observed = (status.observed_generation or 0) >= deployment.metadata.generation
+    return bool(observed and status.updated_replicas == status.replicas == 1)
+
+
+def _pod_state(release: Release, pod: Any) -> tuple[str, bool]:
+    """Return why a pod is not ready ("" if ready), and whether it can never be ready."""
+    if any(each.type == "Ready" and each.status == "True" for each in pod.status.conditions or []):
         return "", False
-    if found[0].status.phase == "Pending" and (why := pods.mount_failure(release, found[0])):
+    if pod.status.phase == "Pending" and (why := pods.mount_failure(release, pod)):
         return why, any(words in why for words in MISSING)
-    waiting = [each.name for each in pods.container_statuses(found[0]) if not each.ready]
-    return f"container {' and '.join(waiting)} is not ready yet", False
+    waiting = [each.name for each in pods.container_statuses(pod) if not each.ready]
+    return f"container {' and '.join(waiting)} is not ready yet" if waiting else "it starts", False
 
 
 def _secret_in(why: str, pod: Any) -> str:

@@ -59,31 +59,37 @@ def read_link(release: Release) -> LinkParts:
     selector += f",{INSTANCE}={release.name}" if release.name else ""
     words = [*release.flags, "get", "configmaps,pods", f"--selector={selector}", "--output=json"]
     found = json.loads(run("kubectl", words))["items"]
-    links = (each for each in found if PROFILE in each.get("data", {}))
-    names = {each["metadata"]["labels"].get(INSTANCE, release.name) for each in links}
+    maps = [each for each in found if PROFILE in each.get("data", {})]
+    names = {each["metadata"]["labels"].get(INSTANCE, release.name) for each in maps}
     if len(names) > 1:
         raise several_releases(release, list(names))
     release = replace(release, name=next(iter(names), release.name))
-    # The newest pod comes last, and replaces older pods in the dictionary below.
-    found.sort(key=lambda item: str(item["metadata"]["creationTimestamp"]))
-    maps = [each for each in found if PROFILE in each.get("data", {})]
-    pods = {
-        each["metadata"]["labels"].get("app.kubernetes.io/component"): each["metadata"]["name"]
-        for each in found
-        if each["kind"] == "Pod"
-        and each["status"].get("phase") == "Running"
-        and "deletionTimestamp" not in each["metadata"]
-    }
-    if maps and not pods.keys() >= set(COMPONENTS):
-        raise ClusterError(f"a pod of release '{release.name}' {release.where} does not run")
     if not maps:
         raise ClusterError(
             f"release '{release.name}' has no link to change; is it a release of cloudrc? see: "
             "helm list --all-namespaces"
         )
+    pods = _running_pods(found)
+    if not pods.keys() >= set(COMPONENTS):
+        raise ClusterError(f"a pod of release '{release.name}' {release.where} does not run")
     experiments = [each["data"] for each in found if EXPERIMENT in each.get("data", {})]
     files = {EXPERIMENT: "{}", **(experiments[0] if experiments else {}), **maps[0]["data"]}
     return LinkParts(release.name, maps[0]["metadata"]["name"], files, pods)
+
+
+def _running_pods(found: list[Any]) -> dict[str, str]:
+    """Return component -> name of its newest running pod, from the answer of kubectl."""
+    pods = [
+        each
+        for each in found
+        if each["kind"] == "Pod"
+        and each["status"].get("phase") == "Running"
+        and "deletionTimestamp" not in each["metadata"]
+    ]
+    # The newest pod comes last, and replaces older pods in the dictionary.
+    pods.sort(key=lambda pod: str(pod["metadata"]["creationTimestamp"]))
+    label = "app.kubernetes.io/component"
+    return {pod["metadata"]["labels"].get(label): pod["metadata"]["name"] for pod in pods}
 
 
 PIPE = """\

@@ -100,15 +100,8 @@ def find_deployment(release: Release, component: str) -> Any:
 def pod_failure(pod: Any) -> str:
     """Describe in one sentence why a pod will never run; return "" if the pod may run."""
     for status in container_statuses(pod):
-        waiting, ended = status.state.waiting, status.last_state and status.last_state.terminated
-        reason = waiting.reason if waiting else ""
-        if (status.restart_count or 0) > RESTARTS_MAX and reason not in FATAL:
-            reason = "CrashLoopBackOff"
-        if reason in FATAL:
-            message = to_one_line(waiting and waiting.message)
-            end = f" (exit code {ended.exit_code}): {error_in(ended.message)}" if ended else ""
-            words = {"name": status.name, "image": status.image, "reason": reason}
-            return FATAL[reason].format(**words, message=message, end=end.removesuffix(": "))
+        if failure := _container_failure(status):
+            return failure
     for condition in pod.status.conditions or []:
         message = condition.message or ""
         # Kubernetes makes some volumes only on first use.
@@ -116,6 +109,20 @@ def pod_failure(pod: Any) -> str:
         if (condition.type, condition.status) == ("PodScheduled", "False") and not waits_for_volume:
             return f"{UNSCHEDULED}: {message}"
     return ""
+
+
+def _container_failure(status: Any) -> str:
+    """Describe in one sentence why a container will never run; return "" if it may run."""
+    waiting, ended = status.state.waiting, status.last_state and status.last_state.terminated
+    reason = waiting.reason if waiting else ""
+    if (status.restart_count or 0) > RESTARTS_MAX and reason not in FATAL:
+        reason = "CrashLoopBackOff"
+    if reason not in FATAL:
+        return ""
+    message = to_one_line(waiting and waiting.message)
+    end = f" (exit code {ended.exit_code}): {error_in(ended.message)}" if ended else ""
+    words = {"name": status.name, "image": status.image, "reason": reason}
+    return FATAL[reason].format(**words, message=message, end=end.removesuffix(": "))
 
 
 def error_in(output: str | None) -> str:
