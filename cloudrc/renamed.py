@@ -8,6 +8,7 @@ from typing import Any
 
 NEW_NAMES = {
     "pipe_touched": "obstacle_touched",
+    "board_not_touched": "not_touched",
     "pipe_contacts": "obstacle_contacts",
 }
 """Old name -> new name."""

@@ -158,7 +158,7 @@ def _unmet_goals(evidence: Evidence) -> Iterator[FlightFailure]:
         yield FlightFailure("waypoint_not_reached", text, *end)
     if evidence.wanted is not None and evidence.touch is None:
         text = f"the robot never touched {evidence.wanted.body}, which mission.touch requires"
-        yield FlightFailure("board_not_touched", text)
+        yield FlightFailure("not_touched", text)
     if end.time is not None and exceeds(end.time, evidence.time_limit):
         key = f"criteria.time_limit_s {evidence.time_limit:g}"
         text = f"the mission took {format_beside(end.time, evidence.time_limit)} s, more than {key}"

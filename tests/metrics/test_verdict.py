@@ -63,7 +63,7 @@ def met(speed):
         (good, {}, "success", []),
         (good, {"waypoints": 3}, "failure", ["waypoint_not_reached"]),
         (good, {"time_limit": 9.9}, "failure", ["time_limit_exceeded"]),
-        (flown, {}, "failure", ["board_not_touched"]),
+        (flown, {}, "failure", ["not_touched"]),
         (lambda: met(0.249), {}, "success", []),
         (lambda: met(0.25), {}, "failure", ["contact_too_fast"]),
         (lambda: world(GuardChange(at(5), GuardState.HOLD, "")), {}, "success", []),
@@ -76,7 +76,7 @@ def met(speed):
             lambda: world(touch(7, "pipe_1"), GuardChange(at(2), GuardState.LAND, ""), log=flown),
             {"waypoints": 2},
             "failure",
-            ["guard_intervened", "obstacle_touched", "waypoint_not_reached", "board_not_touched"],
+            ["guard_intervened", "obstacle_touched", "waypoint_not_reached", "not_touched"],
         ),
     ],
 )
@@ -169,7 +169,7 @@ MISSED = MissionConfig(waypoints=(Waypoint(position_m=(0.0, 5.0, 1.0)),))
         (world(touch(3, "pipe_1")), None, ["obstacle_touched"], ["obstacle_touched"]),
         # What telemetry had not shown when the mission ended
         (world(touch(9.99, "pipe_1")), None, ["obstacle_touched"], []),
-        (world(touch(9.99), log=flown), None, [], ["board_not_touched"]),
+        (world(touch(9.99), log=flown), None, [], ["not_touched"]),
     ],
 )
 def test_the_operator_knows_what_had_arrived(log, mission, report, operator):

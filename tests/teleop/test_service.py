@@ -324,7 +324,7 @@ def test_the_setpoint_is_repeated_at_10_hz():
     [
         ({"obstacle_contacts": 2, "touch_speed": 0.1}, ["obstacle_touched"], 1),
         ({"touch_speed": 0.3}, ["contact_too_fast"], 1),
-        ({}, ["board_not_touched"], 1),
+        ({}, ["not_touched"], 1),
         ({"slip_ns": 1_000_000_000, "touch_speed": 0.1}, ["not_real_time"], 6),
         ({"touch_speed": 0.12}, [], 0),
     ],
