@@ -4,6 +4,7 @@ import pytest
 
 import cloudrc
 from cloudrc.config.load import load_experiment
+from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
 from cloudrc.runs.grid import read_grid
 from tests.robots.conftest import CONTROLLER
@@ -80,3 +81,36 @@ def test_the_key_of_a_flight_has_the_files_of_its_robot(own_robot, tmp_path):
         keys.append(list(read_grid(sweep).flights))
         (mine / "own.py").write_text(CLIMBS + "\n# changed\n")
     assert keys[0] != keys[1]
+
+
+def test_the_key_of_a_flight_has_the_meshes_of_its_robot(own_robot, tmp_path):
+    cube = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
+    mesh = '<asset><mesh name="skin" file="skin.obj" scale=".01 .01 .01"/></asset><worldbody>'
+    text = find_robot("x2").model.read_text().replace("<worldbody>", mesh, 1)
+    mine = own_robot("onboard: multirotor", text)
+    sweep, keys = tmp_path / "sweep.yaml", []
+    sweep.write_text(f"experiment: hover\nset: {{world.robot: {mine}}}\nseeds: 1\n")
+    for more in ("", "v 2 0 0\n"):
+        (mine / "skin.obj").write_text(cube + more)
+        keys.append(list(read_grid(sweep).flights))
+    assert keys[0] != keys[1]
+
+
+def test_a_folder_named_like_a_shipped_robot_is_a_robot_of_its_own(own_robot, tmp_path):
+    own_robot("onboard: multirotor", find_robot("x2").model.read_text()).rename(tmp_path / "nano")
+    name = load_experiment("hover", [f"world.robot={tmp_path}/nano"]).world.robot
+    assert find_robot(name).model.read_text() != find_robot("nano").model.read_text()
+
+
+def test_a_symlink_leads_to_the_robot(own_robot, tmp_path):
+    mine = own_robot("onboard: multirotor", find_robot("x2").model.read_text())
+    (tmp_path / "linked").symlink_to(mine)
+    assert load_experiment("hover", [f"world.robot={tmp_path}/linked"]).world.robot == str(mine)
+
+
+def test_a_mesh_without_its_file_is_one_problem_that_names_it(own_robot):
+    mesh = '<asset><mesh name="skin" file="no.stl"/></asset><worldbody>'
+    text = find_robot("x2").model.read_text().replace("<worldbody>", mesh, 1)
+    mine = own_robot("onboard: multirotor", text)
+    with pytest.raises(BadInputError, match=r"no\.stl"):
+        cloudrc.fly("hover", HOVER | {"world.robot": str(mine)})
