@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from cloudrc import plugins
 from cloudrc.config.overrides import build_plugin, check_plugin, default_parameters
 from cloudrc.config.robot import RobotFiles, find_robot, parameters
-from cloudrc.config.scene import fence_in
+from cloudrc.config.scene import steered_in
 from cloudrc.config.schema import PlugIn, World
 from cloudrc.config.shipped import file_of
 from cloudrc.errors import BadInputError
@@ -59,7 +59,7 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     """
     model, plugin, onboard, actuators, probe = _make_parts(world)
     robot = find_robot(world.robot)
-    guard = Guard(limits, fence_in(world), robot.guard, planar=robot.planar)
+    guard = Guard(limits, steered_in(world), robot.guard)
     faster = _accelerator(world, plugin)
     if faster is not None and faster.make is not None:
         return faster.make(Simulator(model, actuators, wind, probe), onboard, guard)  # type: ignore[no-any-return]

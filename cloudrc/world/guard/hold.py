@@ -208,11 +208,12 @@ class TakeOff:
     margin.
     """
 
-    def __init__(self, fence: Fence, *, planar: bool = False) -> None:
+    def __init__(self, fence: Fence) -> None:
         """Set the fence; begin before the take-off."""
         (ax, ay, az), (bx, by, bz) = fence.low, fence.high
-        margin = 0.0 if planar else TAKE_OFF_MARGIN
-        self._lift_off = 0.0 if planar else LIFT_OFF_HEIGHT
+        margin, self._lift_off = TAKE_OFF_MARGIN, LIFT_OFF_HEIGHT
+        if fence.ground is not None:
+            margin, self._lift_off, az, bz = 0.0, 0.0, -inf, inf
         self._low = (ax + margin, ay + margin, az)
         self._high = (bx - margin, by - margin, bz)
         self.over = self._stopped = False

@@ -111,13 +111,10 @@ class Guard:
         limits: ResolvedGuard,
         fence: Fence,
         robot: RobotLimits = DEFAULT_LIMITS,
-        *,
-        planar: bool = False,
     ) -> None:
-        """Begin in GROUND, inside `fence`.
+        """Begin in GROUND, inside `fence`, which has a height if the robot stays on the ground.
 
-        `robot` tells how fast the robot brakes and how it lands. A `planar` robot stays on the
-        ground.
+        `robot` tells how fast the robot brakes and how it lands.
         """
         self.command_age_max_ns = round(limits.command_age_max_ms * 1_000_000)
         self._hold_max_ns = round(limits.hold_max_s * 1e9)
@@ -126,16 +123,16 @@ class Guard:
         self.acceleration_max = limits.acceleration_max_mps2
         self._yaw_rate_max = limits.yaw_rate_max_radps
         self._speed_max = limits.speed_max_mps * rules.ROUNDING_FACTOR
-        self._braking, self._planar = robot.braking_mps2, planar
+        self._braking, self._planar = robot.braking_mps2, fence.ground is not None
         self.stop_coefficient = rules.stop_coefficient(self._braking)
         self.fence = fence
         self._low, self._high = fence.inner_low, fence.inner_high
-        if planar:
+        if self._planar:
             self._low, self._high = (*self._low[:2], -inf), (*self._high[:2], inf)
         self._floor, half = self._low[2], 0.5 * limits.speed_max_mps
         self._position_hold = PositionHold(self._low, self._high, half, self._braking)
         self._descent = Halt() if robot.stop == "brake" else Descent(self._floor, half)
-        self._take_off = TakeOff(fence, planar=planar)
+        self._take_off = TakeOff(fence)
         self.changes: list[GuardChange] = []
         self.counts: Counter[str] = Counter()
         self.state, self.cause = GROUND, Cause.SPAWN

@@ -1,5 +1,6 @@
 """The guard of a robot that stays on the ground: no heights, HOLD and LAND brake to rest."""
 
+from dataclasses import replace
 from itertools import pairwise
 from math import nan
 
@@ -14,11 +15,12 @@ from tests.world.guard.conftest import DT, LIMITS, MS, SECOND, command, run
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 AT = (1.0, 2.0, 0.1)
+FLAT = replace(FENCE, ground=AT[2])
 MOVES = (1.0, 0.0, 0.0)
 
 
 def tracking(velocity=MOVES, limits=LIMITS, braking=3.0):
-    guard = Guard(limits, FENCE, RobotLimits(braking_mps2=braking, stop="brake"), planar=True)
+    guard = Guard(limits, FLAT, RobotLimits(braking_mps2=braking, stop="brake"))
     guard.start_mission(0)
     assert guard.accept_command(command(velocity), 0) is None
     assert guard.state is TRACK
@@ -164,3 +166,14 @@ def test_a_robot_in_the_air_or_water_may_brake_instead_of_landing():
     assert min(z for _, _, z in references) >= -0.4, "it does not descend faster"
     assert run(guard, SECOND + 100 * MS, 2 * SECOND, up)[-1] is None
     assert guard.state is GROUND
+
+
+def test_after_a_stop_it_moves_again_on_a_floor_at_any_height():
+    high = replace(FLAT, low=(*FENCE.low[:2], 1.0), high=(*FENCE.high[:2], 3.0), ground=1.1)
+    guard = Guard(LIMITS, high, RobotLimits(stop="brake"))
+    guard.stop(0)
+    guard.acknowledge(0)
+    run(guard, 0, SECOND, (1.0, 2.0, 1.1))
+    guard.start_mission(SECOND)
+    guard.accept_command(command(MOVES, SECOND), SECOND)
+    assert guard.state is TRACK
