@@ -32,6 +32,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Write the page, open it in the browser, and print its path."""
     require("a replay", ("world", "record", "console"))
+    from cloudrc.config.hull import known_hull
     from cloudrc.config.scene import scene_of
     from cloudrc.files import write_atomically
     from cloudrc.metrics import Flight
@@ -44,7 +45,8 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"{out}: already there; name another file with --out")
     recording, experiment = read_flight(run)
     scene = scene_of(experiment.world)
-    flight = Flight(recording, experiment.criteria, experiment.mission, scene)
+    hull = known_hull(experiment.world.robot)
+    flight = Flight(recording, experiment.criteria, experiment.mission, scene, hull)
     try:
         write_atomically(out, write_page(flight, experiment).encode())
     except BadInputError as error:

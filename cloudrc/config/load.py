@@ -27,6 +27,7 @@ from cloudrc import plugins, renamed
 from cloudrc.config import overrides, problems, shipped
 from cloudrc.config.document import Document, KeyPath, read_document, write_yaml
 from cloudrc.config.ground import put_on_ground
+from cloudrc.config.hull import hull_of
 from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import ConfigProblem
@@ -51,6 +52,7 @@ from cloudrc.config.schema import (
     World,
 )
 from cloudrc.errors import BadInputError
+from cloudrc.geometry.clearance import NO_SIZE
 from cloudrc.geometry.obstacles import fence_of, known
 from cloudrc.geometry.scene import Scene
 from cloudrc.link.doubts import describe_heavy_shares
@@ -227,21 +229,26 @@ def _judge(
         with _collect(found, ("world", "tuning")):
             parameters(robot, experiment.world)
         mission = put_on_ground(mission, scene) if robot.planar else mission
-        found += _check_flown(mission, scene, robot.planar)
+        found += _check_flown(mission, scene, experiment.world.robot)
         problems.raise_problems(document, found, name)
     return experiment.model_copy(update={"mission": mission})
 
 
-def _check_flown(mission: MissionConfig, scene: Scene, planar: bool) -> list[ConfigProblem]:
+def _check_flown(mission: MissionConfig, scene: Scene, robot: str) -> list[ConfigProblem]:
     """List the problems of a mission in a scene, with their paths in the experiment."""
+    planar = known_robot(robot).planar
 
     def check() -> list[ConfigProblem]:
-        if above := check_scene(scene, touch=mission.touched, planar=planar):
+        try:
+            size = hull_of(robot).dense
+        except BadInputError:  # of its model; `check_robot` says what is wrong with it
+            size = NO_SIZE.dense
+        if above := check_scene(scene, size, touch=mission.touched, planar=planar):
             return above
-        wrong = check_mission(mission, scene, planar=planar)
+        wrong = check_mission(mission, scene, size, planar=planar)
         return [problem._replace(path=("mission", *problem.path)) for problem in wrong]
 
-    return reuse(("mission", mission.model_dump_json(), repr(scene), planar), check)
+    return reuse(("mission", mission.model_dump_json(), repr(scene), robot), check)
 
 
 def read_experiment(

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.schema import MissionConfig, Steps
 from cloudrc.config.setpoints import read_setpoints
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.clearance import Array
+from cloudrc.geometry.clearance import Array, Spheres
 from cloudrc.geometry.fence import HEIGHT_MIN, WIDTH_MIN, Fence
 from cloudrc.geometry.obstacles import Obstacle, body_names, fence_of, obstacles, surface
 from cloudrc.geometry.placement import (
@@ -40,15 +41,27 @@ TOUCHING = 1e-3
 """Distance from an obstacle below which the robot touches it [m]; it covers rounding errors."""
 
 
-def check_scene(scene: Scene, *, touch: str | None, planar: bool = False) -> list[ConfigProblem]:
+class _Place(NamedTuple):
+    """What a mission has to keep away from, and the robot that flies it."""
+
+    known: Sequence[Obstacle]
+    robot: Spheres  # dense
+    fence: Fence
+    planar: bool
+
+
+def check_scene(
+    scene: Scene, robot: Spheres, *, touch: str | None, planar: bool = False
+) -> list[ConfigProblem]:
     """List the problems of a scene for a mission that has to touch the body `touch`.
 
-    Their paths are those of the experiment. A `planar` robot stays on the ground.
+    Their paths are those of the experiment. The `robot` is given as dense spheres. A `planar` robot
+    stays on the ground.
     """
     if problem := _check_fence(scene, planar=planar):
         return [problem]
     known, spawn = obstacles(scene, touch=touch), np.array([scene.spawn])
-    (hit,) = find_overlapped(known, spawn, np.zeros(1), TOUCHING)
+    (hit,) = find_overlapped(known, robot, spawn, np.zeros(1), TOUCHING)
     if hit < 0:
         return []
     reason = (
@@ -103,11 +116,12 @@ def _check_touch(mission: MissionConfig, scene: Scene) -> ConfigProblem | None:
 
 
 def check_mission(
-    mission: MissionConfig, scene: Scene, *, planar: bool = False
+    mission: MissionConfig, scene: Scene, robot: Spheres, *, planar: bool = False
 ) -> list[ConfigProblem]:
     """List the problems of a mission in a scene, each with its path inside the mission.
 
-    A `planar` robot stays on the ground, at the height of the spawn.
+    The `robot` is given as dense spheres. A `planar` robot stays on the ground, at the height of
+    the spawn.
     """
     if problem := _check_parts(mission) or _check_touch(mission, scene):
         return [problem]
@@ -117,12 +131,12 @@ def check_mission(
     if mission.setpoints is not None:
         steered = replace(fence, ground=scene.spawn[2]) if planar else fence
         return _check_setpoints(Path(mission.setpoints), steered)
-    known = obstacles(scene, touch=mission.touched)
+    place = _Place(obstacles(scene, touch=mission.touched), robot, fence, planar)
     if mission.steps is not None:
-        reason = _check_steps(mission.steps, known, fence, planar=planar)
+        reason = _check_steps(mission.steps, place)
         return [ConfigProblem(("steps",), "", reason)] if reason else []
     start = scene.spawn if mission.start == "spawn" else None
-    return list(_check_waypoints(mission, known, start, fence, planar=planar))
+    return list(_check_waypoints(mission, place, start))
 
 
 def _check_setpoints(path: Path, fence: Fence) -> list[ConfigProblem]:
@@ -158,19 +172,15 @@ def _check_parts(mission: MissionConfig) -> ConfigProblem | None:
 
 
 def _check_waypoints(
-    mission: MissionConfig,
-    known: Sequence[Obstacle],
-    start: Vector | None,
-    fence: Fence,
-    *,
-    planar: bool,
+    mission: MissionConfig, place: _Place, start: Vector | None
 ) -> Iterator[ConfigProblem]:
+    known, robot, fence, planar = place
     positions = np.array([waypoint.position_m for waypoint in mission.waypoints])
     yaws = np.radians([waypoint.yaw_deg for waypoint in mission.waypoints])
     # A waypoint may be outside by half its tolerance; the other half is for control errors.
     slack = np.array([0.5 * waypoint.tolerance_m for waypoint in mission.waypoints])
     outside = outside_fence(fence, positions, slack, planar=planar)
-    hit = find_overlapped(known, positions, yaws)
+    hit = find_overlapped(known, robot, positions, yaws)
     wrong = np.flatnonzero(outside | (hit >= 0))
     for index in np.flatnonzero(yaws)[:_REPORTED]:
         path = ("waypoints", str(index), "yaw_deg")
@@ -187,17 +197,18 @@ def _check_waypoints(
         legal = None if index - 1 in wrong else before
         near = None
         if not planar:
-            near = find_nearest_legal(fence, known, position, float(yaws[index]), legal)
+            near = find_nearest_legal(fence, known, robot, position, float(yaws[index]), legal)
         if near is not None:
             reason += f"; nearest legal point found: {_point(np.array(near))}"
         yield _at_point(index, positions[index], reason)
     if not len(wrong):
-        yield from _check_ways(np.vstack([start or positions[0], positions]), known)
+        yield from _check_ways(np.vstack([start or positions[0], positions]), place)
 
 
-def _check_ways(positions: Array, known: Sequence[Obstacle]) -> Iterator[ConfigProblem]:
+def _check_ways(positions: Array, place: _Place) -> Iterator[ConfigProblem]:
     """Report straight ways between successive `positions` [m], shape (n, 3), to an obstacle."""
-    through = find_crossed(known, positions[:-1], positions[1:])
+    known = place.known
+    through = find_crossed(known, place.robot, positions[:-1], positions[1:])
     for index in np.flatnonzero(through >= 0)[:_REPORTED]:
         obstacle = known[through[index]]
         around = "around it or through the pipe" if isinstance(obstacle, Pipe) else "around it"
@@ -209,8 +220,9 @@ def _check_ways(positions: Array, known: Sequence[Obstacle]) -> Iterator[ConfigP
         yield _at_point(index, positions[index + 1], reason)
 
 
-def _check_steps(steps: Steps, known: Sequence[Obstacle], fence: Fence, *, planar: bool) -> str:
+def _check_steps(steps: Steps, place: _Place) -> str:
     """Check the box that contains all random setpoints; return the problem, "" if none."""
+    known, robot, fence, planar = place
     axis = np.linspace(-1, 1, 9)
     box = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     with np.errstate(over="ignore"):  # an infinite position is outside the fence, too
@@ -218,7 +230,7 @@ def _check_steps(steps: Steps, known: Sequence[Obstacle], fence: Fence, *, plana
     if outside_fence(fence, positions, planar=planar).any():
         where = _allowed(fence, planar=planar)
         return f"steps reach beyond the fence, or too near to it; {where}; choose a smaller range_m"
-    hit = find_overlapped(known, positions, np.zeros(len(positions))).max()
+    hit = find_overlapped(known, robot, positions, np.zeros(len(positions))).max()
     if hit >= 0:
         where = surface(known[hit])
         return f"steps can end in {where}; choose another centre_m, range_m or scene"

@@ -104,6 +104,10 @@ class RobotFile(Section):
     probe: Annotated[str, Field(min_length=1)] | None = None
     """Name of a sphere, a site of the model: with it the robot touches what a mission has to touch.
     A touch sensor at this site measures the force. null: any part of the robot touches"""
+    hull_points: str | None = None
+    """Python file with spheres in place of the ball of hull_m: its functions `few` and `dense`
+    return rows x, y, z, radius [m], body frame, for the distance from obstacles and for the check
+    of paths. null: there is none"""
 
     @model_validator(mode="after")
     def _check_stop(self) -> RobotFile:
@@ -125,6 +129,7 @@ class RobotFiles:
     planar: bool = False  # whether it stays on the ground
     guard: RobotLimits = DEFAULT_LIMITS
     hull: float | None = None  # radius about the base [m]; None: that of the model
+    hull_points: str | None = None  # path of a Python file with spheres in place of the ball
     # Name -> parameters of the onboard controller, in place of those in `onboard`.
     tunings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     response: Response | None = None  # first-order model of the velocity loop
@@ -149,8 +154,15 @@ def find_robot(name: str) -> RobotFiles:
     tunings = {key: tuning.model_extra or {} for key, tuning in robot.tunings.items()}
     model = folder / robot.model
     motion = robot.motion and str((folder / robot.motion).resolve())
-    found = RobotFiles(model, onboard, robot.planar, limits, robot.hull_m, tunings, robot.response)
-    return replace(found, motion=motion, probe=robot.probe)
+    found = RobotFiles(model, onboard, robot.planar, limits, robot.hull_m)
+    return replace(
+        found,
+        hull_points=robot.hull_points and str((folder / robot.hull_points).resolve()),
+        tunings=tunings,
+        response=robot.response,
+        motion=motion,
+        probe=robot.probe,
+    )
 
 
 def parameters(robot: RobotFiles, world: World) -> dict[str, Any]:

@@ -7,13 +7,14 @@ the downlink is the newest round trip minus the delay of the uplink.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from math import dist, hypot, inf, nan
 from typing import NamedTuple
 
 import numpy as np
 
-from cloudrc.geometry.clearance import Array, clearance
-from cloudrc.geometry.scene import Scene
+from cloudrc.geometry.clearance import NO_SIZE, Array, Hull, clearance
+from cloudrc.geometry.obstacles import Obstacle
 from cloudrc.messages import NEVER_NS, GuardState
 from cloudrc.metrics.definitions import Echoes, PredictionJudge, tracking_error
 from cloudrc.records import Control
@@ -52,9 +53,13 @@ class FlightFeed:
         flown: Number of points added so far to the trail, the line that shows the robot's path.
     """
 
-    def __init__(self, scene: Scene) -> None:
-        """Begin without a status; measure the clearance from the pipes of `scene`."""
-        self._scene, self._judge, self._echoes = scene, PredictionJudge(), Echoes()
+    def __init__(self, known: Sequence[Obstacle] = (), hull: Hull | None = None) -> None:
+        """Begin without a status; measure the clearance of the robot's `hull` from obstacles.
+
+        `known` are the obstacles. Without a hull the clearance is infinite.
+        """
+        self._obstacles, self._robot = () if hull is None else known, (hull or NO_SIZE).few
+        self._judge, self._echoes = PredictionJudge(), Echoes()
         self.status: RobotStatus | None = None
         self.samples: deque[Sample] = deque()
         self.flown = 0
@@ -126,7 +131,7 @@ class FlightFeed:
         if last is not None and dist(position, last.position) > JUMP:
             self._trail.clear()
         if not self._trail or dist(position, self._trail[-1][:3]) > TRAIL_STEP:
-            near = clearance(self._scene, [position], [status.orientation_wxyz])
+            near = clearance(self._obstacles, [position], [status.orientation_wxyz], self._robot)
             self._trail.append((*position, float(near[0])))
             self.flown += 1
 

@@ -10,12 +10,14 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import NamedTuple
 
+from cloudrc.config.hull import known_hull
 from cloudrc.config.load import read_experiment
 from cloudrc.config.scene import scene_of
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import Page
 from cloudrc.console.steering import LinkControl, Steering
 from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.geometry.obstacles import obstacles
 from cloudrc.teleop.client import Api
 
 SWITCH_PERIOD = 5e-4
@@ -60,7 +62,8 @@ def serve(
             pass
         ready(page)
         experiment = read_experiment(str(flight.config))
-        feed = FlightFeed(scene_of(experiment.world))
+        known = obstacles(scene_of(experiment.world), touch=experiment.mission.touched)
+        feed = FlightFeed(known, known_hull(experiment.world.robot))
         steering = Steering(flight.api, flight.link)
         steering.watch()
         steering.start()

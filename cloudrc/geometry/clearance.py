@@ -1,9 +1,9 @@
-"""Represent the robot by points, and compute their distance from pipes and other obstacles.
+"""Represent a robot by spheres, and compute their distance from pipes and other obstacles.
 
 A pipe is an ideal hollow cylinder with flat ends. The physics builds each pipe from flat staves,
 which deviate from the cylinder by up to 3.2 mm.
 
-Source: docs/reference/plant.md, "Robot", "Key points for clearance", "Staves".
+Source: docs/reference/plant.md, "Staves".
 """
 
 from __future__ import annotations
@@ -19,12 +19,6 @@ from cloudrc.geometry.scene import Pipe, Scene
 from cloudrc.geometry.solids import Solid
 
 Array = NDArray[np.float64]
-
-# Dimensions of the robot [m], body frame. The arm points along +x; heights are along z.
-BASE_HALF = (0.05, 0.05, 0.10)
-ARM_LENGTH, ARM_HEIGHT, ARM_RADIUS = 0.40, 0.17, 0.01
-ROTOR_ARM, ROTOR_HEIGHT, ROTOR_RADIUS, ROTOR_HALF_THICKNESS = 0.21, 0.05, 0.128, 0.0025
-ROD_RADIUS, ROD_BOTTOM, ROD_TOP = 0.05, 0.06, 0.18
 
 CLEARANCE_SHOWN = 0.40
 """Upper end of the colour scale in figures and scenes [m]; inside a pipe no clearance is larger."""
@@ -42,17 +36,21 @@ class Spheres(NamedTuple):
     radii: Array
 
 
-def key_points() -> Spheres:
-    """Return the 225 spheres (on arm, rotors, base box and top rod) that give the clearance."""
-    return _points(_box(2, 2, 2), arm=9)
+class Hull(NamedTuple):
+    """A robot as spheres."""
+
+    few: Spheres  # for its distance from obstacles
+    dense: Spheres  # for the check of a path: their gaps are smaller than a wall is thick
 
 
-def robot_points() -> Spheres:
-    """Return points of the whole robot, dense enough to find every overlap with a pipe's wall.
+def ball(radius: float) -> Hull:
+    """Return the hull of a robot that is inside a ball of `radius` [m] about its base."""
+    spheres = Spheres(np.zeros((1, 3)), np.array([radius]))
+    return Hull(spheres, spheres)
 
-    Neighbouring points are at most 0.034 m apart, less than a wall's thickness of 0.038 m.
-    """
-    return _points(_box(4, 4, 7), arm=21)
+
+NO_SIZE = ball(0.0)
+"""Hull of a robot whose size is not known."""
 
 
 def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) -> Array:
@@ -97,16 +95,15 @@ def clearance_per_obstacle(
     obstacles: Sequence[Obstacle],
     positions: ArrayLike,
     orientations_wxyz: ArrayLike,
-    points: Spheres | None = None,
+    points: Spheres,
+    far: float = _FAR,
 ) -> Array:
     """Compute the robot's distance from each of m obstacles [m], shape (n, m).
 
-    The distance is that of the robot's nearest point; it is negative inside an obstacle. The true
-    distance from a solid that is far away may be larger. `positions` [m] and `orientations_wxyz`
-    (unit quaternions) are as for `place_points`. `points` are points of the robot; None:
-    `key_points()`.
+    The distance is that of the nearest of the robot's `points`; it is negative inside an obstacle.
+    From a solid that is further away than `far` [m], it is a lower bound. `positions` [m] and
+    `orientations_wxyz` (unit quaternions) are as for `place_points`.
     """
-    points = points or key_points()
     at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
     facing = np.asarray(orientations_wxyz, dtype=np.float64).reshape(-1, 4)
     result = np.full((len(at), len(obstacles)), np.inf)
@@ -118,37 +115,49 @@ def clearance_per_obstacle(
                 distance = distance_to_pipe(obstacle, placed) - points.radii
                 result[part, index] = distance.min(axis=1)
             else:
-                result[part, index] = _distance_to_solid(obstacle, at[part], placed, points)
+                result[part, index] = _distance_to_solid(obstacle, at[part], placed, points, far)
     return result
 
 
-def _distance_to_solid(solid: Solid, at: Array, placed: Array, points: Spheres) -> Array:
+def _distance_to_solid(
+    solid: Solid, at: Array, placed: Array, points: Spheres, far: float
+) -> Array:
     """Compute the robot's distance from a solid at n poses [m], shape (n,).
 
     `at` are the base's positions, shape (n, 3), `placed` the robot's points, shape (n, k, 3), in
-    [m], world frame. For a robot further away than `_FAR`, return a lower bound.
+    [m], world frame. For a robot further away than `far` [m], return a lower bound.
     """
     reach = solid.radius + np.linalg.norm(points.positions, axis=1).max() + points.radii.max()
     result: Array = np.linalg.norm(at - solid.centre, axis=1) - reach
-    near = ~(result > _FAR)  # the radius of a plane is infinite
+    near = ~(result > far)  # the radius of a plane is infinite
     if near.any():
         distance = solid.distance(placed[near]) - points.radii
         result[near] = distance.min(axis=1)
     return result
 
 
-def clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: ArrayLike) -> Array:
-    """Compute the robot's distance from the nearest pipe's wall [m], shape (n,).
+def clearance(
+    obstacles: Sequence[Obstacle],
+    positions: ArrayLike,
+    orientations_wxyz: ArrayLike,
+    points: Spheres,
+) -> Array:
+    """Compute the distance of the robot's `points` from the nearest obstacle [m], shape (n,).
 
     `positions` [m] have the shape (n, 3), `orientations_wxyz` (unit quaternions, body to world) the
-    shape (n, 4). Without pipes the distance is infinite.
+    shape (n, 4). Without obstacles the distance is infinite.
     """
-    distances = clearance_per_obstacle(scene.pipes, positions, orientations_wxyz)
+    distances = clearance_per_obstacle(obstacles, positions, orientations_wxyz, points, np.inf)
     nearest: Array = distances.min(axis=1, initial=np.inf)
     return nearest
 
 
-def least_clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: ArrayLike) -> float:
+def least_clearance(
+    obstacles: Sequence[Obstacle],
+    positions: ArrayLike,
+    orientations_wxyz: ArrayLike,
+    points: Spheres,
+) -> float:
     """Compute the smallest `clearance` of n poses along a path [m]; infinite without poses.
 
     The result is exactly that of all poses, although most poses are skipped. Between two poses no
@@ -159,9 +168,9 @@ def least_clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: Array
     """
     at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
     facing = np.asarray(orientations_wxyz, dtype=np.float64).reshape(-1, 4)
-    if not len(at) or not scene.pipes:
+    if not len(at) or not obstacles:
         return np.inf
-    reach = np.linalg.norm(key_points().positions, axis=1).max()
+    reach = np.linalg.norm(points.positions, axis=1).max()
     turned = np.linalg.norm(np.diff(facing, axis=0), axis=1)
     moved = np.linalg.norm(np.diff(at, axis=0), axis=1) + 2 * reach * turned
     path = np.concatenate(([0.0], np.cumsum(moved)))
@@ -169,7 +178,7 @@ def least_clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: Array
     new = np.unique(np.append(np.arange(0, len(at), _STRIDE), len(at) - 1))
     starts, ends = new[:-1], new[1:]
     while len(new):
-        found[new] = clearance(scene, at[new], facing[new])
+        found[new] = clearance(obstacles, at[new], facing[new], points)
         bound = (found[starts] + found[ends] - (path[ends] - path[starts])) / 2
         open_ = (ends - starts > 1) & (bound <= found.min() + _ROUNDING)
         starts, ends = starts[open_], ends[open_]
@@ -193,26 +202,3 @@ def pipe_index(scene: Scene, positions: ArrayLike) -> NDArray[np.int64]:
         r = np.linalg.norm(relative - s[:, None] * np.asarray(pipe.axis), axis=1)
         result[(np.abs(s) <= 0.5 * pipe.length) & (r < pipe.inner)] = index
     return result
-
-
-def _points(box: Array, arm: int) -> Spheres:
-    along = np.linspace(0, ARM_LENGTH, arm)
-    parts = [np.stack([along, np.zeros(arm), np.full(arm, ARM_HEIGHT)], axis=1)]
-    for x, y in ((ROTOR_ARM, 0), (0, ROTOR_ARM), (-ROTOR_ARM, 0), (0, -ROTOR_ARM)):
-        for side in (-ROTOR_HALF_THICKNESS, ROTOR_HALF_THICKNESS):
-            parts.append(_ring(x, y, ROTOR_HEIGHT + side, ROTOR_RADIUS, 24))
-    parts += [box, *(_ring(0, 0, z, ROD_RADIUS, 8) for z in (ROD_BOTTOM, ROD_TOP))]
-    positions = np.concatenate(parts)
-    return Spheres(positions, np.where(np.arange(len(positions)) < arm, ARM_RADIUS, 0.0))
-
-
-def _ring(x: float, y: float, z: float, radius: float, count: int) -> Array:
-    angle = np.arange(count) * (2 * np.pi / count)
-    return np.stack(
-        [x + radius * np.cos(angle), y + radius * np.sin(angle), np.full(count, z)], axis=1
-    )
-
-
-def _box(nx: int, ny: int, nz: int) -> Array:
-    axes = [np.linspace(-half, half, n) for half, n in zip(BASE_HALF, (nx, ny, nz), strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -198,3 +198,44 @@ def _faces(model: Any, mesh: int) -> tuple[Array, Array]:
     corners = model.mesh_polyvert[model.mesh_polyvertadr[first : first + number]]
     places = model.mesh_vert[model.mesh_vertadr[mesh] + corners]
     return normals, np.einsum("ij,ij->i", normals, places)
+
+
+def reach_of(robot: Path) -> float:
+    """Return the radius of the smallest ball about the base that holds a robot's geoms [m].
+
+    Raise a BadInputError if the robot does not compile.
+    """
+    try:
+        model = mujoco.MjSpec.from_file(str(robot)).compile()
+    except (ValueError, KeyError) as error:
+        raise compile_error(str(robot), error) from None
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    if not model.njnt:  # no robot, as `world.scene` says
+        return 0.0
+    body = model.jnt_bodyid[0]
+    geoms = np.flatnonzero(model.body_rootid[model.geom_bodyid] == model.body_rootid[body])
+    base = data.xpos[body]
+    return max((_reach(model, data, geom, base) for geom in geoms.tolist()), default=0.0)
+
+
+def _reach(model: Any, data: Any, geom: int, base: Array) -> float:
+    """Return the largest distance of a geom's points from the point `base` [m]."""
+    kind, size = _GEOM(model.geom_type[geom]), model.geom_size[geom]
+    centre, axes = data.geom_xpos[geom] - base, data.geom_xmat[geom].reshape(3, 3)
+    if kind == _GEOM.mjGEOM_CYLINDER:
+        along = axes[:, 2] @ centre
+        across = np.linalg.norm(centre - along * axes[:, 2])
+        return float(np.hypot(abs(along) + size[1], across + size[0]))
+    if kind == _GEOM.mjGEOM_CAPSULE:
+        ends = centre + np.outer((-size[1], size[1]), axes[:, 2])
+        return float(np.linalg.norm(ends, axis=1).max() + size[0])
+    if kind == _GEOM.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        first, number = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        points = centre + model.mesh_vert[first : first + number] @ axes.T
+        return float(np.linalg.norm(points, axis=1).max())
+    if kind == _GEOM.mjGEOM_BOX:
+        points = centre + (np.stack(np.meshgrid(*[(-1, 1)] * 3), -1).reshape(-1, 3) * size) @ axes.T
+        return float(np.linalg.norm(points, axis=1).max())
+    return float(np.linalg.norm(centre) + model.geom_rbound[geom])

@@ -1,4 +1,7 @@
-"""Check whether the robot can fly to a position: the guard's limits, and obstacles in the way."""
+"""Check whether a robot can fly to a position: the guard's limits, and obstacles in the way.
+
+The `robot` is represented by spheres that are dense enough to check a path.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cloudrc.geometry.clearance import Array, clearance_per_obstacle, robot_points
+from cloudrc.geometry.clearance import Array, Spheres, clearance_per_obstacle
 from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.obstacles import Obstacle
 from cloudrc.geometry.scene import Pipe
@@ -43,7 +46,11 @@ def outside_fence(
 
 
 def find_overlapped(
-    obstacles: Sequence[Obstacle], positions: Array, yaws: Array, least: float = CLEARANCE_MIN
+    obstacles: Sequence[Obstacle],
+    robot: Spheres,
+    positions: Array,
+    yaws: Array,
+    least: float = CLEARANCE_MIN,
 ) -> NDArray[np.int64]:
     """Return for each pose the index of the obstacle that the robot is too near to, shape (n,).
 
@@ -53,11 +60,13 @@ def find_overlapped(
     """
     if not obstacles:
         return np.full(len(positions), -1, dtype=np.int64)
-    distance = _distances(obstacles, np.clip(positions, -_FAR, _FAR), yaws)
+    distance = _distances(obstacles, robot, np.clip(positions, -_FAR, _FAR), yaws)
     return np.where(distance.min(axis=1) < least, distance.argmin(axis=1), -1)
 
 
-def find_crossed(obstacles: Sequence[Obstacle], starts: Array, ends: Array) -> NDArray[np.int64]:
+def find_crossed(
+    obstacles: Sequence[Obstacle], robot: Spheres, starts: Array, ends: Array
+) -> NDArray[np.int64]:
     """Find the first obstacle along each of n straight ways to which the robot comes too near.
 
     Too near is a distance below `CLEARANCE_MIN`. The robot is level with yaw 0. A way may begin
@@ -74,7 +83,7 @@ def find_crossed(obstacles: Sequence[Obstacle], starts: Array, ends: Array) -> N
     while len(flying):
         share = flown[flying] / np.maximum(length[flying], 1e-12)
         at = starts[flying] + share[:, None] * (ends - starts)[flying]
-        distances = _distances(obstacles, at, np.zeros(len(at)))
+        distances = _distances(obstacles, robot, at, np.zeros(len(at)))
         nearest = distances.min(axis=1)
         if np.isinf(least).any():  # a way may begin near a wall
             least = np.minimum(CLEARANCE_MIN, nearest - STEP_MIN)
@@ -90,6 +99,7 @@ def find_crossed(obstacles: Sequence[Obstacle], starts: Array, ends: Array) -> N
 def find_nearest_legal(
     fence: Fence,
     obstacles: Sequence[Obstacle],
+    robot: Spheres,
     position: Vector,
     yaw: float,
     before: Vector | None = None,
@@ -115,19 +125,21 @@ def find_nearest_legal(
     around = start + steps[:, None, None] * np.array(directions)
     candidates = np.round(around.reshape(-1, 3), 2)
     legal = ~outside_fence(fence, candidates)
-    legal &= find_overlapped(obstacles, candidates, np.full(len(candidates), yaw)) < 0
+    legal &= find_overlapped(obstacles, robot, candidates, np.full(len(candidates), yaw)) < 0
     candidates = candidates[legal]
     candidates = candidates[np.linalg.norm(candidates - start, axis=1).argsort(kind="stable")]
     for part in np.array_split(candidates, max(1, len(candidates) // _AT_ONCE)):
         if before is not None:
-            part = part[find_crossed(obstacles, np.tile(before, (len(part), 1)), part) < 0]
+            part = part[find_crossed(obstacles, robot, np.tile(before, (len(part), 1)), part) < 0]
         if len(part):
             x, y, z = part[0].tolist()
             return x, y, z
     return None
 
 
-def _distances(obstacles: Sequence[Obstacle], positions: Array, yaws: Array) -> Array:
+def _distances(
+    obstacles: Sequence[Obstacle], robot: Spheres, positions: Array, yaws: Array
+) -> Array:
     facing = np.zeros((len(positions), 4))
     facing[:, 0], facing[:, 3] = np.cos(yaws / 2), np.sin(yaws / 2)
-    return clearance_per_obstacle(obstacles, positions, facing, robot_points())
+    return clearance_per_obstacle(obstacles, positions, facing, robot)

@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.config.schema import Criteria, MissionConfig
-from cloudrc.geometry.clearance import clearance, least_clearance, pipe_index
+from cloudrc.errors import BadInputError
+from cloudrc.geometry.clearance import Hull, clearance, least_clearance, pipe_index
+from cloudrc.geometry.obstacles import Obstacle, obstacles
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording, Table
@@ -38,7 +40,8 @@ class Flight:
     recording: Recording  # all topics; cloud's stamps are shifted to world's clock
     criteria: Criteria
     mission: MissionConfig  # with its waypoints or random steps
-    scene: Scene  # pipes and board
+    scene: Scene  # its pipes and all other obstacles
+    hull: Hull | None = None  # of the robot; None: not known
 
     @property
     def waypoints(self) -> int:
@@ -141,10 +144,19 @@ class Flight:
 
     @cached_property
     def clearance(self) -> Array:
-        """Distance to the nearest pipe wall [m], per row of `truth`; empty without pipes."""
-        if not self.scene.pipes or not len(self.truth["stamp_ns"]):
+        """Distance to the nearest obstacle [m], per row of `truth`; empty without obstacles."""
+        if self.hull is None or not self.obstacles or not len(self.truth["stamp_ns"]):
             return np.zeros(0)
-        return clearance(self.scene, self.truth["position"], self.truth["orientation_wxyz"])
+        poses = self.truth["position"], self.truth["orientation_wxyz"]
+        return clearance(self.obstacles, *poses, self.hull.few)
+
+    @cached_property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """All bodies that the robot must not touch; if the scene cannot be read, its pipes."""
+        try:
+            return obstacles(self.scene, touch=self.mission.touched)
+        except BadInputError:
+            return self.scene.pipes
 
     @cached_property
     def inside(self) -> Array:
@@ -265,7 +277,10 @@ def rms(errors: Array) -> float | None:
 
 def _least_clearance(flight: Flight, *, inside: bool) -> float | None:
     truth, rows = flight.truth, flight.inside if inside else slice(None)
-    found = least_clearance(flight.scene, truth["position"][rows], truth["orientation_wxyz"][rows])
+    if flight.hull is None:
+        return None
+    poses = truth["position"][rows], truth["orientation_wxyz"][rows]
+    found = least_clearance(flight.obstacles, *poses, flight.hull.few)
     return finite(found)
 
 
@@ -289,9 +304,9 @@ add_metrics(
     ("speed_max", "m/s", "Largest true speed of the robot's base.", _speed_max),
 )  # fmt: skip
 add_metrics(
-    "Distance to the pipes",
-    ("min_clearance", "m", "Smallest distance between the robot and a pipe's wall while the base "
+    "Distance to obstacles",
+    ("min_clearance", "m", "Smallest distance between the robot and an obstacle while the base "
      "is inside a pipe.", partial(_least_clearance, inside=True)),
-    ("min_clearance_flight", "m", "Smallest distance between the robot and a pipe during the whole "
-     "flight.", partial(_least_clearance, inside=False)),
+    ("min_clearance_flight", "m", "Smallest distance between the robot and an obstacle during the "
+     "whole flight.", partial(_least_clearance, inside=False)),
 )  # fmt: skip

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc import assembly
+from cloudrc.config.hull import hull_of
 from cloudrc.config.load import ResolvedExperiment, read_experiment
 from cloudrc.config.robot import is_planar
 from cloudrc.config.scene import scene_of, steered_in
@@ -72,7 +73,8 @@ def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
         book = _open_store(settings.journal, stop, server.bridge)
         if book is not None:  # None: stopped while another teleop process locked the journal
             opened.callback(book.close)
-            service = MissionService(book, steered_in(experiment.world), scene)
+            hull = hull_of(experiment.world.robot)
+            service = MissionService(book, steered_in(experiment.world), scene, hull)
             if settings.start:
                 touch = experiment.mission.touch
                 order = Order(assembly.build_plan(experiment), experiment.name, touch=touch)
@@ -99,11 +101,13 @@ def serve_api(settings: TeleopSettings, experiment: ResolvedExperiment, scene: S
     bridge = Bridge()
     planar = is_planar(experiment.world.robot)
     grounded = f"the robot {Path(experiment.world.robot).name}" if planar else ""
-    speed_max = experiment.guard.speed_max_mps
+    speed_max, robot = experiment.guard.speed_max_mps, hull_of(experiment.world.robot).dense
     plan = partial(assembly.mission_plan, fence=steered_in(experiment.world), speed_max=speed_max)
-    order = partial(read_order, scene=scene, planar=planar, plan=plan)
+    order = partial(read_order, scene=scene, robot=robot, planar=planar, plan=plan)
     tokens = Tokens(settings.tokens, log_line) if settings.tokens else None
-    goto = partial(read_goto, scene=scene, touch=experiment.mission.touch, planar=planar)
+    goto = partial(
+        read_goto, scene=scene, robot=robot, touch=experiment.mission.touch, planar=planar
+    )
     app = create_app(bridge, order, goto, partial(read_drive, grounded=grounded), log_line)
     server = ApiServer(Gate(app, tokens, Audit(settings.audit, log_line)), bridge, settings.api)
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)

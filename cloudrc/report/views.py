@@ -17,6 +17,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from cloudrc.config.hull import known_hull
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.scene import scene_of
 from cloudrc.geometry.shapes import Shapes, Surface
@@ -53,7 +54,8 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]
     scene, truth = scene_of(experiment.world), recording["/ground_truth"]
     if not len(truth):
         return []
-    flight = Flight(recording, experiment.criteria, experiment.mission, scene)
+    hull = known_hull(experiment.world.robot)
+    flight = Flight(recording, experiment.criteria, experiment.mission, scene, hull)
     poses, control = _thin({name: truth[name] for name in truth.names}), _thin(flight.control)
     first_ns = int(truth["stamp_ns"][0])
     bodies = flown_shapes(recording, experiment)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cloudrc.config.hull import known_hull
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
@@ -18,7 +19,6 @@ from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import read, write_atomically
 from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.obstacles import known, obstacles
-from cloudrc.geometry.scene import Pipe
 from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 UNKNOWN = "No clearance is known from"
 """Beginning of a note about obstacles without a declared shape."""
-LISTED = 8
-"""Largest number of obstacles that a note lists."""
 
 
 def assess(
@@ -44,7 +42,8 @@ def assess(
     the experiment names are not executed, because somebody else may have written them.
     """
     scene = scene_of(experiment.world)
-    flight = Flight(recording, experiment.criteria, experiment.mission, scene)
+    hull = known_hull(experiment.world.robot)
+    flight = Flight(recording, experiment.criteria, experiment.mission, scene, hull)
     numbers, metric_notes = measure_all(flight, own)
     real_time, stopped = run.mode != "virtual", run.interrupted or bool(recording.note)
     evidence = flight_evidence(flight, numbers, real_time=real_time, interrupted=stopped)
@@ -86,16 +85,15 @@ def _clamped_horizon(flight: Flight, experiment: ResolvedExperiment) -> list[str
 
 def _unknown_clearance(flight: Flight) -> list[str]:
     """Return a note if the report has no clearance from some obstacles of the scene."""
-    scene = flight.scene
+    if flight.hull is None:
+        return [f"{UNKNOWN} anything: the size of the robot is not known here."]
     try:
-        found = obstacles(scene, touch=flight.mission.touched)
+        obstacles(flight.scene, touch=flight.mission.touched)
     except BadInputError as error:
         return [f"{UNKNOWN} all bodies but declared pipes: {error}."]
-    if not known(scene):
+    if not known(flight.scene):
         return [f"{UNKNOWN} all bodies but declared pipes: MuJoCo is not installed."]
-    names = list(dict.fromkeys(each.name for each in found if not isinstance(each, Pipe)))
-    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
-    return [f"{UNKNOWN} {', '.join(names[:LISTED])}{more}."] if names else []
+    return []
 
 
 def write_report(

@@ -27,6 +27,7 @@ from cloudrc.config.schema import (
     Waypoint,
 )
 from cloudrc.errors import BadInputError
+from cloudrc.geometry.clearance import Spheres
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Vector
 from cloudrc.records import FAILURES
@@ -240,6 +241,7 @@ _Request = TypeVar("_Request", bound=Section)
 def read_order(
     body: bytes,
     scene: Scene,
+    robot: Spheres,
     *,
     planar: bool = False,
     plan: Callable[[MissionConfig, float | None], Plan],
@@ -259,7 +261,7 @@ def read_order(
         touch=request.touch,
     )
     mission = put_on_ground(mission, scene) if planar else mission
-    if problems := check_mission(mission, scene, planar=planar):
+    if problems := check_mission(mission, scene, robot, planar=planar):
         raise RefusedError(problems)
     planned = plan(mission, request.time_limit_s)
     lease = request.lease_s or 0.0
@@ -267,7 +269,7 @@ def read_order(
 
 
 def read_goto(
-    body: bytes, scene: Scene, *, touch: Touch | None = None, planar: bool = False
+    body: bytes, scene: Scene, robot: Spheres, *, touch: Touch | None = None, planar: bool = False
 ) -> Leg:
     """Read and check a point in a request's body; raise a RefusedError that lists all problems.
 
@@ -279,7 +281,7 @@ def read_goto(
     waypoint = Waypoint(position_m=position, yaw_deg=request.yaw_deg)
     # What is an obstacle depends on the mission under way; the service checks the way there.
     mission = MissionConfig(start="here", waypoints=(waypoint,), touch=touch)
-    problems = check_mission(mission, scene, planar=planar)
+    problems = check_mission(mission, scene, robot, planar=planar)
     if problems:
         raise RefusedError([ConfigProblem(p.path[2:], p.value, p.reason) for p in problems])
     return Leg(position, radians(request.yaw_deg))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.clearance import clearance_per_obstacle
+from cloudrc.geometry.clearance import NO_SIZE, Hull, clearance_per_obstacle
 from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.obstacles import obstacles, surface
 from cloudrc.geometry.placement import find_crossed
@@ -101,12 +101,18 @@ class MissionService:
     UnavailableError if the disk refuses the mission, or if this process ends.
     """
 
-    def __init__(self, book: MissionStore, fence: Fence, scene: Scene | None = None) -> None:
+    def __init__(
+        self,
+        book: MissionStore,
+        fence: Fence,
+        scene: Scene | None = None,
+        hull: Hull = NO_SIZE,
+    ) -> None:
         """Begin with the missions in the store `book`, in a scene with `fence`.
 
-        With a `scene`, the service refuses straight ways through obstacles.
+        With a `scene`, the service refuses straight ways of the robot's `hull` through obstacles.
         """
-        self._scene = scene
+        self._scene, self._hull = scene, hull
         self._outputs: list[Output | Fault] = []
         self.book, self._teleop, self._fence = book, Teleop(fence, book.has_ended), fence
         self._heard_ns: int | None = None  # when the last message from cloud arrived
@@ -404,7 +410,9 @@ class MissionService:
         known = () if scene is None else obstacles(scene, touch=mission.order.touched)
         if not known:
             return text
-        away = clearance_per_obstacle(known, [seen.position], [seen.orientation_wxyz])[0]
+        away = clearance_per_obstacle(
+            known, [seen.position], [seen.orientation_wxyz], self._hull.few
+        )[0]
         return f"{text}, next to {known[away.argmin()].name}"
 
     def _check_way(self, leg: Leg, *, touch: str | None) -> None:
@@ -417,7 +425,7 @@ class MissionService:
             return
         here, there = np.array([seen.position]), np.array([leg.position])
         known = obstacles(scene, touch=touch)
-        through = int(find_crossed(known, here, there)[0])
+        through = int(find_crossed(known, self._hull.dense, here, there)[0])
         if through >= 0:
             raise ConflictError(
                 f"the straight way from where the robot is, {_place(seen.position)}, to "

@@ -7,6 +7,7 @@ import pytest
 
 import cloudrc
 from cloudrc.assembly import mission_plan
+from cloudrc.config.hull import hull_of
 from cloudrc.config.load import dump, load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
@@ -14,6 +15,7 @@ from cloudrc.teleop.models import RefusedError, read_drive, read_goto, read_orde
 from tests.fences import FENCE
 
 SCENE = load_scene("pillars")
+SIZE = hull_of("rover").dense
 ROVER = ["world.robot=rover", "world.scene=empty"]
 
 
@@ -123,13 +125,17 @@ def order(point):
 
 def test_teleop_takes_two_numbers_and_refuses_heights():
     options = {"planar": True, "plan": partial(mission_plan, fence=FENCE)}
-    taken = read_order(order([1.5, 1.2]), SCENE, **options)
+    taken = read_order(order([1.5, 1.2]), SCENE, SIZE, **options)
     assert taken.plan.legs[0].position == (1.5, 1.2, 0.1)
     with pytest.raises(RefusedError, match="has a height"):
-        read_order(order([1.5, 1.2, 1.0]), SCENE, **options)
-    assert read_goto(b'{"position_m": [1, 1.2]}', SCENE, planar=True).position == (1.0, 1.2, 0.1)
+        read_order(order([1.5, 1.2, 1.0]), SCENE, SIZE, **options)
+    assert read_goto(b'{"position_m": [1, 1.2]}', SCENE, SIZE, planar=True).position == (
+        1.0,
+        1.2,
+        0.1,
+    )
     with pytest.raises(RefusedError, match=r"position_m: .* has a height"):
-        read_goto(b'{"position_m": [1, 1.2, 1]}', SCENE, planar=True)
+        read_goto(b'{"position_m": [1, 1.2, 1]}', SCENE, SIZE, planar=True)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ from cloudrc.console.access import ORIGIN, Access, page_token, parse_head
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import Page
 from cloudrc.console.steering import Steering
-from cloudrc.geometry.scene import Scene
 
 TOKEN = "0123456789abcdef" * 2
 PROXY = "https://hub.example.org"
@@ -27,7 +26,7 @@ def served():
             posted.append(path)
 
     page = Page(0, lambda: TOKEN, [PROXY])
-    page.fill(load_experiment("hover"), FlightFeed(Scene("empty")), Steering(Api()))
+    page.fill(load_experiment("hover"), FlightFeed(), Steering(Api()))
     yield page, posted
     page.close()
 

@@ -24,7 +24,6 @@ from cloudrc.console.handed import HandedSockets, viser_behind
 from cloudrc.console.page import Page
 from cloudrc.console.steering import Steering
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.scene import Scene
 from cloudrc.messages import ZERO
 from tests.conftest import wait_until
 from tests.console.conftest import LIMIT
@@ -38,7 +37,7 @@ def page(api):
     page = Page(0)
     steering = Steering(api)
     steering.watch()
-    page.fill(load_experiment("hover"), FlightFeed(Scene("empty")), steering)
+    page.fill(load_experiment("hover"), FlightFeed(), steering)
     yield page
     page.close()
 

@@ -16,7 +16,7 @@ from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import KEYS, PANEL_WIDTH, Page, _with_gaps
 from cloudrc.console.steering import Steering
 from cloudrc.drivers.local import LINK_FOLDER
-from cloudrc.geometry.scene import Scene, load_scene
+from cloudrc.geometry.scene import load_scene
 from cloudrc.runs import requirements
 from cloudrc.runs.link_change import read_states
 from tests.conftest import wait_until
@@ -60,7 +60,7 @@ def filled(api):
     page = Page(0)
 
     def fill(name):
-        feed, steering = FlightFeed(Scene("empty")), Steering(api)
+        feed, steering = FlightFeed(), Steering(api)
         page.fill(load_experiment(name), feed, steering)
         return page, feed, steering
 

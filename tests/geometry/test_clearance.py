@@ -7,19 +7,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cloudrc.config.hull import hull_of
 from cloudrc.geometry.clearance import (
     clearance,
     clearance_per_obstacle,
     distance_to_pipe,
-    key_points,
     least_clearance,
     pipe_index,
     place_points,
-    robot_points,
 )
-from cloudrc.geometry.scene import Pipe, Scene, load_scene
+from cloudrc.geometry.obstacles import obstacles
+from cloudrc.geometry.scene import Pipe, load_scene
 
 PIPES = load_scene("pipes")
+TUBES = PIPES.pipes
+FEW, DENSE = hull_of("pelican")
 ALONG_X = Pipe("pipe_x", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5.0, 0.662, 0.700)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 
@@ -45,23 +47,23 @@ def test_clearance_on_the_axis_is_that_of_the_plant():
     """Source: docs/reference/plant.md, "Clearance on the axis"."""
     for height, expected in ((0.8, (0.217, 0.326, 0.320)), (0.7, (0.246, 0.365, 0.320))):
         at = [(*pipe.centre[:2], height) for pipe in PIPES.pipes]
-        found = clearance(PIPES, at, [LEVEL] * 3)
+        found = clearance(TUBES, at, [LEVEL] * 3, FEW)
         assert found == pytest.approx(expected, abs=2e-3)
-        assert np.array_equal(np.diag(clearance_per_obstacle(PIPES.pipes, at, [LEVEL] * 3)), found)
+        assert np.array_equal(np.diag(clearance_per_obstacle(TUBES, at, [LEVEL] * 3, FEW)), found)
     for pipe in PIPES.pipes:  # along each pipe it is the same
         yaw = math.atan2(pipe.axis[1], pipe.axis[0])
         facing = (math.cos(yaw / 2), 0, 0, math.sin(yaw / 2))
-        assert clearance(PIPES, pipe.centre, facing) == pytest.approx([0.320], abs=1e-3)
+        assert clearance(TUBES, pipe.centre, facing, FEW) == pytest.approx([0.320], abs=1e-3)
 
 
 def test_clearance_is_infinite_in_an_empty_scene():
-    assert clearance(Scene("empty"), [(0, 0, 1), (1, 0, 1)], [LEVEL] * 2).tolist() == [math.inf] * 2
-    assert clearance(PIPES, np.empty((0, 3)), np.empty((0, 4))).shape == (0,)
+    assert clearance((), [(0, 0, 1), (1, 0, 1)], [LEVEL] * 2, FEW).tolist() == [math.inf] * 2
+    assert clearance(TUBES, np.empty((0, 3)), np.empty((0, 4)), FEW).shape == (0,)
 
 
 def test_points_are_those_of_the_plant_and_turn_with_the_robot():
-    points = key_points()
-    assert (points.positions.shape, len(robot_points().radii)) == ((225, 3), 341)
+    points = FEW
+    assert (points.positions.shape, len(DENSE.radii)) == ((225, 3), 341)
     # A third of a turn about (1, 1, 1) takes x to y, y to z, z to x.
     placed = place_points(points, np.zeros((1, 3)), np.array([[0.5, 0.5, 0.5, 0.5]]))[0]
     assert placed == pytest.approx(points.positions[:, [2, 0, 1]])
@@ -73,7 +75,7 @@ def test_inside_a_pipe_is_in_its_bore_and_between_its_ends():
     inside = [(-1, 2.5, 0.8), (-1, 0, 1.461), (5.66, -6.42, 0.8)]
     outside = [(-1, 2.501, 0.8), (-1, 0, 1.463), (0.5, 0, 0.7)]
     assert pipe_index(PIPES, [*inside, *outside]).tolist() == [0, 0, 2, -1, -1, -1]
-    assert set(pipe_index(Scene("empty"), inside)) == {-1}
+    assert set(pipe_index(load_scene("empty"), inside)) == {-1}
 
 
 @settings(max_examples=30, deadline=None)
@@ -84,5 +86,38 @@ def test_the_least_clearance_is_that_of_all_poses_to_the_bit(seed, count, step):
     positions = draw.uniform((-4, -8, 0), (8, 1, 2)) + step * draw.normal(size=(count, 3)).cumsum(0)
     facing = draw.normal(size=4) + step * draw.normal(size=(count, 4)).cumsum(0)
     facing /= np.linalg.norm(facing, axis=1)[:, None]
-    every = clearance(PIPES, positions, facing)
-    assert least_clearance(PIPES, positions, facing) == every.min(initial=math.inf)
+    every = clearance(TUBES, positions, facing, FEW)
+    assert least_clearance(TUBES, positions, facing, FEW) == every.min(initial=math.inf)
+
+
+@pytest.mark.parametrize(
+    ("robot", "at", "expected"),
+    [
+        # A pillar of 0.2 m radius at x = 1.5 m; the ball of the robot reaches to the wall.
+        ("nano", (0.5, 0.0, 1.0), 0.8),
+        ("rover", (0.5, 0.0, 0.1), 0.8),
+        ("rover", (-2.5, 0.0, 0.1), 3.8),  # also where it is far
+        ("pelican", (0.5, 0.0, 1.0), 0.39),  # the tip of its arm
+    ],
+)
+def test_clearance_is_known_for_every_robot_and_scene(robot, at, expected):
+    hull = hull_of(robot)
+    reach = 0.0 if robot == "pelican" else hull.few.radii[0]
+    found = clearance(obstacles(load_scene("pillars"), touch=None), [at], [LEVEL], hull.few)
+    assert found == pytest.approx([expected - reach], abs=0.01)
+
+
+def test_the_ball_of_a_robot_holds_its_geoms(tmp_path):
+    (tmp_path / "robot.yaml").write_text("onboard: multirotor")
+    (tmp_path / "robot.xml").write_text(
+        '<mujoco><worldbody><body><freejoint/><geom type="box" size=".3 .4 .01"/>'
+        '<body pos="0 .5 0"><geom type="cylinder" size=".12 .05" euler="90 0 0"/></body>'
+        "</body></worldbody></mujoco>"
+    )
+    assert hull_of(str(tmp_path)).few.radii == pytest.approx([0.5629], abs=1e-3)
+
+
+def test_robots_of_three_sizes_have_their_hull_without_mujoco(monkeypatch):
+    monkeypatch.setattr("cloudrc.config.hull.find_spec", lambda name: None)
+    sizes = [hull_of(name).few.radii[0] for name in ("nano", "rover", "x2")]
+    assert sizes == sorted(sizes)

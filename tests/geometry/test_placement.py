@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cloudrc.config.hull import hull_of
 from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.schema import MissionConfig, Steps, Touch, Waypoint
 from cloudrc.geometry.clearance import clearance
@@ -23,21 +24,22 @@ from tests.fences import FENCE
 
 PIPES = load_scene("pipes")
 KNOWN = obstacles(PIPES, touch="board")
+FEW, DENSE = hull_of("pelican")
 
 
 def hit(position, yaw=0.0):
-    return int(find_overlapped(KNOWN, np.array([position]), np.array([yaw]))[0])
+    return int(find_overlapped(KNOWN, DENSE, np.array([position]), np.array([yaw]))[0])
 
 
 def crossed(start, end):
-    return int(find_crossed(KNOWN, np.array([start]), np.array([end]))[0])
+    return int(find_crossed(KNOWN, DENSE, np.array([start]), np.array([end]))[0])
 
 
 def refusals(*positions, start="spawn", scene="pipes", **more):
     waypoints = tuple(Waypoint(position_m=position, **more) for position in positions)
     touch = Touch(body="board") if scene == "pipes" else None
     mission = MissionConfig(start=start, waypoints=waypoints, touch=touch)
-    problems = check_mission(mission, load_scene(scene))
+    problems = check_mission(mission, load_scene(scene), DENSE)
     return "\n".join(map(str, problems))
 
 
@@ -80,7 +82,7 @@ def test_a_way_touches_a_wall_if_one_of_its_points_does(start, end):
     if hit(start) >= 0:
         return
     points = np.linspace(start, end, 1 + int(100 * math.dist(start, end)))
-    distance = clearance(PIPES, points, np.tile([1.0, 0, 0, 0], (len(points), 1))).min()
+    distance = clearance(KNOWN, points, np.tile([1.0, 0, 0, 0], (len(points), 1)), FEW).min()
     if abs(distance - CLEARANCE_MIN) > 0.02:
         assert (crossed(start, end) >= 0) is bool(distance < CLEARANCE_MIN)
 
@@ -90,11 +92,11 @@ def test_a_way_touches_a_wall_if_one_of_its_points_does(start, end):
     st.tuples(st.floats(-4, 10), st.floats(-9, 6), st.floats(-1, 3)), st.floats(-math.pi, math.pi)
 )
 def test_the_nearest_legal_point_is_legal(position, yaw):
-    found = find_nearest_legal(FENCE, KNOWN, position, yaw)
+    found = find_nearest_legal(FENCE, KNOWN, DENSE, position, yaw)
     assert found is not None
     assert hit(found, yaw) == -1
     assert not outside_fence(FENCE, np.array([found]))[0]
-    assert find_nearest_legal(FENCE, KNOWN, found, yaw) == found
+    assert find_nearest_legal(FENCE, KNOWN, DENSE, found, yaw) == found
 
 
 def test_a_straight_way_leads_to_the_offered_point():
@@ -141,11 +143,11 @@ def test_a_mission_with_a_wall_on_its_way_is_refused(positions, start, reason):
     ],
 )
 def test_steps_that_can_end_in_a_wall_are_refused(steps, scene, reason):
-    (problem,) = check_mission(MissionConfig(steps=Steps(**steps)), load_scene(scene))
+    (problem,) = check_mission(MissionConfig(steps=Steps(**steps)), load_scene(scene), DENSE)
     assert problem.path == ("steps",)
     assert reason in problem.reason
     both = MissionConfig(waypoints=(Waypoint(position_m=(0.0, 0.0, 1.0)),), steps=Steps(**steps))
-    assert "not both" in str(check_mission(both, PIPES)[0])
+    assert "not both" in str(check_mission(both, PIPES, DENSE)[0])
 
 
 POST = '<body name="post" pos="1.2 0 1"><geom type="capsule" size=".05 1"/></body>'
@@ -179,7 +181,7 @@ def own_scene(tmp_path):
 )
 def test_every_body_of_a_scene_of_ones_own_is_in_the_way(own_scene, bodies, waypoints, reason):
     mission = MissionConfig(waypoints=tuple(Waypoint(position_m=each) for each in waypoints))
-    said = "\n".join(map(str, check_mission(mission, own_scene(bodies))))
+    said = "\n".join(map(str, check_mission(mission, own_scene(bodies), DENSE)))
     assert reason in said if reason else said == ""
 
 
@@ -187,8 +189,8 @@ def test_the_board_is_in_the_way_of_missions_that_need_not_touch_it():
     before, behind = (Waypoint(position_m=(x, -6.42, 0.7)) for x in (7.5, 8.235))
     mission = MissionConfig(start="here", waypoints=(before, behind))
     to_board = mission.model_copy(update={"touch": Touch(body="board")})
-    assert check_mission(to_board, PIPES) == []
-    (problem,) = check_mission(mission, PIPES)
+    assert check_mission(to_board, PIPES, DENSE) == []
+    (problem,) = check_mission(mission, PIPES, DENSE)
     assert "within 0.04 m of board" in problem.reason
 
 
@@ -202,6 +204,6 @@ def test_the_board_is_in_the_way_of_missions_that_need_not_touch_it():
     ],
 )
 def test_a_scene_fits_its_missions(own_scene, bodies, touch, path, reason):
-    problems = check_scene(own_scene(bodies), touch=touch)
+    problems = check_scene(own_scene(bodies), DENSE, touch=touch)
     assert [problem.path for problem in problems] == ([path] if path else [])
     assert all(reason in problem.reason for problem in problems)

@@ -7,6 +7,7 @@ commands per second. The mission lasts from 10 s to 20 s on the shared clock of 
 from dataclasses import dataclass, field
 from functools import cache
 
+from cloudrc.config.hull import hull_of
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Criteria, MissionConfig, Touch, Waypoint
 from cloudrc.geometry.scene import Board, Pipe, Scene
@@ -33,6 +34,7 @@ PERIOD = 40_000_000
 UPLINK, DOWNLINK, HORIZON = 0.05, 0.04, 0.08
 
 OPEN_AIR = Scene("empty")
+PELICAN = hull_of("pelican")
 ONE_PIPE = Scene(
     "pipe",
     (Pipe("pipe_1", (4.5, 0.0, 1.0), (1.0, 0.0, 0.0), 5.0, 0.662, 0.7),),
@@ -74,6 +76,7 @@ class Log:
             Criteria(time_limit_s=time_limit, **criteria),
             mission.model_copy(update={"touch": touch and Touch(body=touch)}),
             scene,
+            PELICAN,
         )
 
     def ends(self):

@@ -26,6 +26,7 @@ from cloudrc.records import (
 from tests.metrics.conftest import (
     ONE_PIPE,
     OPEN_AIR,
+    PELICAN,
     PERIOD,
     SECOND,
     START,
@@ -232,7 +233,7 @@ NUMBERS = {
     },
     # The pipe is from x = 2 m to 7 m. Just before it the robot's front is inside it, with the rotor
     # at y = .21 + .1.
-    lambda: flown(lambda t: (t, 0.1 if t < 2 else 0.0, 1.0)).flight(ONE_PIPE): {
+    lambda: flown(lambda t: (t, 0.1 if t < 2 else 0.0, 1.0)).flight(ONE_PIPE, touch="board"): {
         "min_clearance": approx(ON_AXIS),
         "min_clearance_flight": approx(ON_AXIS - 0.1, abs=0.05),
         "obstacle_contacts": 0.0,
@@ -305,7 +306,7 @@ def test_numbers(fly, expected):
 
 
 def flight_of(recording):
-    return Flight(recording, Criteria(), paper()[0].mission, load_scene("pipes"))
+    return Flight(recording, Criteria(), paper()[0].mission, load_scene("pipes"), PELICAN)
 
 
 def test_the_paper_flight_has_all_numbers_of_virtual_flight():
@@ -331,7 +332,7 @@ NOTHING = Recording.from_records([])
 def test_a_missing_topic_makes_no_metric_fail(lost):
     recording = replace(straight_flight().recording)
     recording._tables[lost] = NOTHING[lost]
-    assert measure_all(Flight(recording, Criteria(), MissionConfig(), ONE_PIPE))[1] == []
+    assert measure_all(Flight(recording, Criteria(), MissionConfig(), ONE_PIPE, PELICAN))[1] == []
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import pytest
 
 from cloudrc import assembly
 from cloudrc.cloud.operator import EmergencyStopRepeater
+from cloudrc.config.hull import hull_of
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Cause, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, MissionEvent
@@ -32,6 +33,7 @@ from tests.conftest import wait_until
 from tests.fences import FENCE
 
 PERIOD_NS = 10_000_000
+PELICAN = hull_of("pelican")
 A, B, C = (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (3.0, 0.0, 1.0)
 AWAY = (0.0, -5.0, 1.0)
 ID = 7
@@ -205,7 +207,7 @@ class ServiceFlight(Flight):
     def restart_teleop(self):
         """Start a new service with the missions on the disk."""
         self.killed_before = self.killed_after = None  # number of a commit
-        self.teleop = MissionService(self.stored(), FENCE, self.scene)
+        self.teleop = MissionService(self.stored(), FENCE, self.scene, PELICAN)
 
     def stored(self):
         """Return the store that a new process reads from the disk."""
@@ -324,7 +326,8 @@ class Running:
         self.alarms, self.complaints = [], []
         self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
         how = {"plan": partial(assembly.mission_plan, fence=FENCE)}
-        order, goto = (partial(read, scene=self.scene) for read in (read_order, read_goto))
+        where = {"scene": self.scene, "robot": PELICAN.dense}
+        order, goto = (partial(read, **where) for read in (read_order, read_goto))
         order = partial(order, **how)
         app = create_app(self.bridge, order, goto, read_drive, self.complaints.append)
         tokens = None if unix else Tokens(folder, self.complaints.append)

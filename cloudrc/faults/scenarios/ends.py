@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from cloudrc import assembly
+from cloudrc.config.hull import hull_of
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.schema import MissionConfig
 from cloudrc.faults import measures
@@ -200,6 +201,7 @@ def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
 )
 def _impossible(outcome: Outcome, seed: int) -> None:
     scene, first = load_scene("pipes"), (0.5, 0.0, 0.8)
+    robot = hull_of("pelican").dense
     points: dict[str, Vector] = {
         "1 m behind a wall of the fence": (fence_of(scene).high[0] + 1.0, 0.0, 1.0),
         "far below the floor": (0.0, 0.0, -5.0),
@@ -218,7 +220,7 @@ def _impossible(outcome: Outcome, seed: int) -> None:
             mission = MissionConfig.model_validate(
                 {"waypoints": waypoints, "touch": {"body": "board"}}
             )
-            problems = [str(each) for each in check_mission(mission, scene)]
+            problems = [str(each) for each in check_mission(mission, scene, robot)]
         except ValueError as error:
             problems = [str(error)]
         outcome.true(f"{name}: refused", bool(problems))

@@ -1,0 +1,55 @@
+"""The size of a robot: spheres that contain it, for clearance and the check of paths."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from cloudrc import plugins
+from cloudrc.config.reuse import reuse
+from cloudrc.config.robot import RobotFiles, known_robot
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.geometry.clearance import Hull, Spheres, ball
+
+
+def hull_of(name: str) -> Hull:
+    """Return the hull of a robot, given as for `find_robot`.
+
+    Raises:
+        BadInputError: If its model or its file of spheres is wrong.
+        MissingPrerequisiteError: If it gives no hull_m, and MuJoCo is missing.
+    """
+    return reuse(("hull", name), lambda: _read_hull(name, known_robot(name)))
+
+
+def known_hull(name: str) -> Hull | None:
+    """Return the hull of a robot; None if its files cannot be read here."""
+    try:
+        return hull_of(name)
+    except (BadInputError, MissingPrerequisiteError):
+        return None
+
+
+def _read_hull(name: str, robot: RobotFiles) -> Hull:
+    if robot.hull_points is not None:
+        file = plugins.find("hull", robot.hull_points, look=False)
+        return Hull(*(_spheres(getattr(file, part)(), robot.hull_points) for part in Hull._fields))
+    if robot.hull is not None:
+        return ball(robot.hull)
+    if find_spec("mujoco") is None:
+        raise MissingPrerequisiteError(
+            f"robot {name}: its size needs MuJoCo; give hull_m in its robot.yaml, or run: "
+            "pip install 'cloudrc[world]'"
+        )
+    from cloudrc.geometry.compiled import reach_of
+
+    return ball(reach_of(robot.model))
+
+
+def _spheres(rows: Any, path: str) -> Spheres:
+    numbers = np.asarray(rows, dtype=np.float64)
+    if numbers.ndim != 2 or numbers.shape[1] != 4 or not np.isfinite(numbers).all():
+        raise BadInputError(f"{path}: few and dense must return rows of x, y, z, radius [m]")
+    return Spheres(numbers[:, :3], numbers[:, 3])
