@@ -134,8 +134,8 @@ def _make_parts(world: World) -> Parts:
     robot, scene = find_robot(world.robot), file_of(world.scene)
     nominal, where = compile_model(robot.model, scene), f"{robot.model} in {scene}"
     choice = controller(robot, nominal)
+    plugin = plugins.find(KIND, choice.name)  # the build below uses the same import of the file
     onboard = _build_onboard(world, where, choice, parameters(robot, world), nominal)
-    plugin = plugins.find(KIND, choice.name)
     true = compile_true(robot.model, scene, nominal, world.plant)
     if not robot.planar:
         _check_lift(world, where, true)

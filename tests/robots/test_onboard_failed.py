@@ -142,3 +142,22 @@ def test_a_controller_without_its_parts_is_refused_before_the_flight(fly, old, n
 def test_actuators_that_cannot_be_made_are_refused_before_the_flight(fly):
     with pytest.raises(BadInputError, match=r"actuators\(\) of the onboard controller failed"):
         fly(FAILS.replace("{what}", "pass") + "\ndef actuators(model, dt):\n    return 1 / 0\n")
+
+
+def test_build_and_actuators_are_of_one_import_of_the_file(fly):
+    shared = """
+from cloudrc.robots.onboard.multirotor import build as general
+from cloudrc.world.onboard import Direct
+
+BUILT = []
+
+
+def build(model):
+    BUILT.append(model.nu)
+    return general(model)
+
+
+def actuators(model, dt):
+    return Direct(BUILT[0])
+"""
+    assert fly(shared).verdict == "success"
