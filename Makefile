@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 EXPERIMENT ?= paper
 bin := $(VENV)/bin
-VERSION := $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' cloudrc/__init__.py)
+VERSION := $(shell sed -n 's/^__version__ = "\(.*\)"/\1/p' cloudrc/version.py)
 # Prefix of the images' names, with a slash at the end: make images REGISTRY=ghcr.io/me/
 REGISTRY ?=
 # Base image, if not that of the Dockerfiles: BASE=python:3.11-slim-bookworm@sha256:...

@@ -2,6 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
+from cloudrc.version import __version__
+
 if TYPE_CHECKING:
     from cloudrc.api import (
         Comparison,
@@ -15,7 +17,6 @@ if TYPE_CHECKING:
         verify,
     )
 
-__version__ = "0.1.0"
 __all__ = [
     "Comparison",
     "Result",

@@ -8,6 +8,8 @@ import tomllib
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "cloudrc"
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -24,6 +26,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "rounding": set(),
     "source": set(),
     "text": set(),
+    "version": set(),
     "endpoint": set(),
     "files": set(),
     "geometry": set(),
@@ -75,7 +78,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 }
 ALWAYS = {
     *("errors", "messages", "patience", "records", "renamed", "rounding", "source", "text"),
-    "__version__",
+    "version",
 }
 
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it. Ruff checks
@@ -159,6 +162,72 @@ def violations(place, tree):
 def test_a_file_imports_only_allowed_modules():
     found = {place_of(path): violations(place_of(path), tree) for path, tree in TREES.items()}
     assert {place: breaches for place, breaches in found.items() if breaches} == {}
+
+
+def run_time_nodes(node):
+    """Yield the nodes of a file, also inside of functions, but not what only type checkers see."""
+    yield node
+    is_typing = isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
+    for child in node.orelse if is_typing else ast.iter_child_nodes(node):
+        yield from run_time_nodes(child)
+
+
+def imported_files(tree, names):
+    """Return those of the dotted `names` of files that a file imports itself."""
+    found = set()
+    for node in run_time_nodes(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            inner = {f"{node.module}.{alias.name}": node.module for alias in node.names}
+            found |= {name if name in names else package for name, package in inner.items()}
+    return found & names
+
+
+def circles(trees):
+    """Return the groups of files that import each other; `trees`: dotted name -> tree."""
+    graph = {name: imported_files(tree, trees.keys()) for name, tree in trees.items()}
+    reached = {}
+    for name in graph:
+        reached[name], waiting = set(), [name]
+        while waiting:
+            new = graph[waiting.pop()] - reached[name]
+            reached[name] |= new
+            waiting += new
+    return {
+        tuple(sorted(other for other in reached[name] if name in reached[other]))
+        for name in graph
+        if name in reached[name]
+    }
+
+
+def test_no_files_import_each_other_in_a_circle():
+    names = {path: ".".join(path.relative_to(ROOT).with_suffix("").parts) for path in FILES}
+    trees = {names[path].removesuffix(".__init__"): tree for path, tree in TREES.items()}
+    assert circles(trees) == set()
+
+
+@pytest.mark.parametrize(
+    ("last", "found"),
+    [
+        ("from own.a import f", {("own.a", "own.b", "own.c")}),
+        ("def f():\n    from own import a", {("own.a", "own.b", "own.c")}),
+        ("class C:\n    import own.a as other", {("own.a", "own.b", "own.c")}),
+        ("import own.c", {("own.c",)}),
+        ("if TYPE_CHECKING:\n    from own import a", set()),
+        ("if typing.TYPE_CHECKING:\n    x = 1\nelse:\n    import own.b", {("own.b", "own.c")}),
+        ("import other.a", set()),
+    ],
+)
+def test_a_circle_of_files_is_found_wherever_the_import_is(last, found):
+    sources = {
+        "own": "",
+        "own.a": "from own import b",
+        "own.b": "def f():\n    from own.c import g",
+        "own.c": last,
+        "own.d": "import own.a",
+    }
+    assert circles({name: ast.parse(source) for name, source in sources.items()}) == found
 
 
 def test_live_metrics_load_neither_recordings_nor_heavy_libraries():

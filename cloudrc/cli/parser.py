@@ -12,8 +12,8 @@ from math import nan
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
-from cloudrc import __version__
 from cloudrc.errors import BadInputError
+from cloudrc.version import __version__
 
 GROUPS: dict[str, dict[str, str]] = {
     "fly": {

@@ -18,12 +18,12 @@ from prometheus_client import CollectorRegistry, ProcessCollector, generate_late
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric as Family
 
-from cloudrc import __version__
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.exposition.live import LinkMetrics, LiveMetrics
 from cloudrc.exposition.parts import Histogram, Readings, samples
 from cloudrc.exposition.table import Labels, LiveMetric, MetricKind, of_role
 from cloudrc.records import Counted, Record
+from cloudrc.version import __version__
 
 TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
 """Content type of Prometheus' text format."""

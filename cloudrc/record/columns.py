@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError
+from cloudrc.record.content import Content
+from cloudrc.record.content import Message as Message  # callers take it from here, too
 from cloudrc.record.topics import ADDED, BY_SOURCE, TOPICS, Kind, Topic
 from cloudrc.records import Arrival, Record
 from cloudrc.renamed import new_name
 
 Column: TypeAlias = NDArray[Any]
-Message: TypeAlias = tuple[str, int, bytes]
-"""Topic, log time [ns] and CDR bytes of a message."""
 
 BLOCK = 200
 """Number of waiting rows of a topic that are converted to columns together."""
@@ -88,23 +88,14 @@ def _column(kind: Kind, values: Any) -> Column:
 
 
 @dataclass(eq=False)
-class Recording:
+class Recording(Content):
     """The tables of a flight by topic, and what else a file contains.
 
     A topic is decoded when its table is read for the first time. This raises a BadInputError if a
     message of the topic is not readable.
     """
 
-    messages: list[Message] = field(default_factory=list)  # in the order of log times
     records: RecordStore | None = None  # in place of messages
-    metadata: dict[str, str] = field(default_factory=dict)  # of a repeated key, the last value
-    attachments: dict[str, bytes] = field(default_factory=dict)  # name -> content of a file
-    views: list[Message] = field(default_factory=list)  # messages of `VIEWS`
-    source: str = ""  # the file, for errors
-    torn: str = ""  # that a killed process has not written the end of the file, in words
-    lacking: str = ""  # what was damaged or changed in the file, in words
-    told: str = ""  # what the writer of the file missed, in words
-    remarks: tuple[str, ...] = ()  # what was ignored or sorted; "The recording" precedes each
 
     def __post_init__(self) -> None:
         self._tables: dict[str, Table] = {}
@@ -124,19 +115,18 @@ class Recording:
         """
         from cloudrc.record.reader import read
 
-        return read(path)
+        return Recording.of(read(path))
+
+    @staticmethod
+    def of(content: Content) -> Recording:
+        """Make a recording of what a file contains; both share the content."""
+        return Recording(**vars(content))
 
     def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
         """Write the messages and further `attachments` to a file, atomically; may raise OSError."""
         from cloudrc.record.writer import write
 
         write(self, target, attachments or {})
-
-    @property
-    def note(self) -> str:
-        """What is missing or wrong, in words; "" if no message of the flight is missing."""
-        lacking = "" if self.lacking in self.told else self.lacking
-        return "; ".join(filter(None, (self.torn, lacking, self.told)))
 
     @property
     def sha256(self) -> str:

@@ -32,7 +32,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file
-from cloudrc.record.columns import Recording
+from cloudrc.record.content import Content
 from cloudrc.record.ros import is_known
 from cloudrc.record.topics import TOPICS, VIEWS
 from cloudrc.record.writer import CHANGED, CLOCK, COUNTS, MISSING
@@ -178,7 +178,7 @@ class File:
             self.size = os.fstat(self._stream.fileno()).st_size  # [bytes]
             self._clear()
             self._read()
-        if not self.recording.messages and (self.gaps or not self.data_ended):
+        if not self.content.messages and (self.gaps or not self.data_ended):
             damage = _describe(self.gaps) if self.gaps else ""
             reasons = [self._unreadable or damage, self.fault]
             reason = "; ".join(filter(None, reasons))
@@ -189,7 +189,7 @@ class File:
         _note(self)
 
     def _clear(self) -> None:
-        self.recording = Recording(source=str(self._path))
+        self.content = Content(source=str(self._path))
         self.position = 0  # end of the last intact record in the file [bytes]
         self.data_ended = False  # whether all messages were read; only the index follows
         self.ended = False  # whether the whole file was read
@@ -267,9 +267,7 @@ class File:
         if MCAP0_MAGIC in rest or self._next_intact(rest, 0) < len(rest):
             self.fault = "something follows its end"
         elif rest:
-            self.recording.remarks += (
-                f"had {len(rest)} bytes behind its end, which were left out",
-            )
+            self.content.remarks += (f"had {len(rest)} bytes behind its end, which were left out",)
             self.position = self.size
 
     def _read_parts(self, found: _Found) -> None:
@@ -292,7 +290,7 @@ class File:
         elif not self.gaps:
             self.fault = "damaged outside of its messages"
         elif self._has_all(kinds):
-            self.recording.remarks += (f"was {_describe(self.gaps)}; nothing is missing",)
+            self.content.remarks += (f"was {_describe(self.gaps)}; nothing is missing",)
             self.gaps = []
         if self.ended:
             self._see_what_follows()
@@ -373,7 +371,7 @@ class File:
 
     def _store(self, record: mcap.McapRecord) -> None:
         """Store a record."""
-        recording = self.recording
+        content = self.content
         if isinstance(record, mcap.Message):
             self._take_room(MESSAGE_COST)
             self.read[record.channel_id] += 1
@@ -383,18 +381,18 @@ class File:
                 return
             topic = self.channels[record.channel_id].topic
             if topic in VIEWS:
-                recording.views.append((topic, record.log_time, record.data))
+                content.views.append((topic, record.log_time, record.data))
             else:
-                recording.messages.append((topic, record.log_time, record.data))
+                content.messages.append((topic, record.log_time, record.data))
                 self._sequences.append(record.sequence)
         elif isinstance(record, mcap.Schema):
             self._schemas[record.id] = record
         elif isinstance(record, mcap.Channel):
             self.channels[record.id] = record
         elif isinstance(record, mcap.Metadata):
-            recording.metadata.update(record.metadata)
+            content.metadata.update(record.metadata)
         elif isinstance(record, mcap.Attachment):
-            recording.attachments[record.name] = record.data
+            content.attachments[record.name] = record.data
 
     def _is_ours(self, channel: mcap.Channel | None) -> bool:
         """Check whether a channel's topic and layout are those that cloudrc records."""
@@ -407,12 +405,12 @@ class File:
         return is_known(ros_type, with_new_names(schema.data.decode("utf-8", "replace")))
 
     def _sort(self) -> None:
-        messages = self.recording.messages
+        messages = self.content.messages
         if late := sum(after[1] < before[1] for before, after in pairwise(messages)):
             keys = zip((message[1] for message in messages), self._sequences, strict=True)
             order = [row for _, row in sorted(zip(keys, range(len(messages)), strict=True))]
-            self.recording.messages = [messages[row] for row in order]
-            self.recording.remarks += (f"was not in order of time: {late} messages were sorted",)
+            self.content.messages = [messages[row] for row in order]
+            self.content.remarks += (f"was not in order of time: {late} messages were sorted",)
 
     @property
     def unread(self) -> int:
@@ -433,12 +431,12 @@ class File:
             channel = self.channels.get(number)
             topic = to_one_line(channel.topic) if channel else UNKNOWN
             found[topic] += max(self.read[number], counts.get(number, 0))
-        return found | _stored_counts(self.recording)  # of both, the larger number
+        return found | _stored_counts(self.content)  # of both, the larger number
 
     @property
     def has_counts(self) -> bool:
         """Whether the writer's count of the messages is known."""
-        return bool(_stored_counts(self.recording))
+        return bool(_stored_counts(self.content))
 
     def _take_room(self, size: int) -> None:
         self._room -= size
@@ -485,20 +483,20 @@ def _parse(data: bytes) -> mcap.McapRecord:
     return record
 
 
-def read(path: Path) -> Recording:
+def read(path: Path) -> Content:
     """Read an MCAP file without its damaged parts, for `Recording.read`."""
-    return File(path).recording
+    return File(path).content
 
 
 def _note(file: File) -> None:
-    """Describe in words what a file lacks; store the texts in the file's `recording`."""
-    recording, fault = file.recording, file.fault
-    metadata = recording.metadata
+    """Describe in words what a file lacks; store the texts in the file's `content`."""
+    content, fault = file.content, file.fault
+    metadata = content.metadata
     if file.data_ended and file.cut:
-        recording.remarks += ("had a torn index: all its messages were read",)
+        content.remarks += ("had a torn index: all its messages were read",)
         fault = ""
     elif fault and not file.data_ended:
-        count, until = len(recording.messages), recording.messages[-1][1] * 1e-9
+        count, until = len(content.messages), content.messages[-1][1] * 1e-9
         fault += f": {count} messages were read, the last at {until:.2f} s"
     damage = [_describe(file.gaps)] if file.gaps else []
     if nameless := file.stated[UNKNOWN]:
@@ -510,9 +508,9 @@ def _note(file: File) -> None:
         changed.append(before)
     if changed:
         metadata[CHANGED] = "; ".join(changed)
-    recording.torn = fault if file.cut else ""
-    recording.lacking = "; ".join([*damage, *changed])
-    recording.told = to_one_line(metadata.get(MISSING, ""))
+    content.torn = fault if file.cut else ""
+    content.lacking = "; ".join([*damage, *changed])
+    content.told = to_one_line(metadata.get(MISSING, ""))
 
 
 def _describe(gaps: list[FilePart]) -> str:
@@ -528,38 +526,38 @@ def _describe(gaps: list[FilePart]) -> str:
 
 def _changes(file: File) -> Iterator[str]:
     """Describe what another program has removed from a file or added to it."""
-    recording = file.recording
+    content = file.content
     channels = Counter(
         (file.channels[n].topic, ours) for n, ours in file.ours.items() if n in file.channels
     )
     others = {name for name, known in channels if not known}
     if foreign := sorted(others - TOPICS.keys()):
         told = f"has topics that cloudrc does not record: {list_some(foreign)}"
-        recording.remarks += (to_one_line(told),)
+        content.remarks += (to_one_line(told),)
     if other := sorted(others & TOPICS.keys()):
         yield f"topics of another layout were left out: {', '.join(other)}"
     twice = [name for (name, known), n in channels.items() if known and n > 1 and name in TOPICS]
     if double := [name for name in twice if TOPICS[name].end != "either"]:
         yield f"two robots or two recordings are in one file: {', '.join(double)}"
-    if not recording.metadata.get(CLOCK):
+    if not content.metadata.get(CLOCK):
         yield "the metadata of cloudrc, which names the clock, is not there"
     if file.data_ended and not file.gaps:
-        yield from _changed(recording)
+        yield from _changed(content)
 
 
-def _stored_counts(recording: Recording) -> Counter[str]:
+def _stored_counts(content: Content) -> Counter[str]:
     """Return the number of messages by topic that the writer has noted; empty if it has not."""
     with suppress(ValueError, RecursionError):
-        stored = json.loads(recording.metadata.get(COUNTS) or "{}")
+        stored = json.loads(content.metadata.get(COUNTS) or "{}")
         if isinstance(stored, dict):
             return Counter({t: n for t in TOPICS if isinstance(n := stored.get(t), int)})
     return Counter()
 
 
-def _changed(recording: Recording) -> Iterator[str]:
+def _changed(content: Content) -> Iterator[str]:
     """Describe how the messages of a complete file differ from the counts stored by its writer."""
-    metadata, read = recording.metadata, Counter(message[0] for message in recording.messages)
-    counts = _stored_counts(recording)
+    metadata, read = content.metadata, Counter(message[0] for message in content.messages)
+    counts = _stored_counts(content)
     pairs = [(topic, read[topic], counts[topic]) for topic in TOPICS if counts]
     if wrong := [f"{found} of {n} on {topic}" for topic, found, n in pairs if found != n]:
         yield f"messages were removed or added: it holds {list_some(wrong)}"

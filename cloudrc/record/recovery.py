@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cloudrc.errors import BadInputError
-from cloudrc.record.columns import Message, Recording
+from cloudrc.record.columns import Recording
+from cloudrc.record.content import Message
 from cloudrc.record.reader import File, list_some
 from cloudrc.record.topics import VIEWS
 
@@ -44,15 +45,15 @@ def recover(
     message, or an OSError if the new file cannot be written.
     """
     file = File(source)
-    recording = file.recording
+    recording = Recording.of(file.content)
     if not recording.messages:
         reason = "; ".join([*recording.remarks, recording.note]).strip("; ") or "none is in it"
         raise BadInputError(f"{source}: holds no readable message: {reason}; nothing is written")
     notes = [recording.note] if recording.note else []
-    derived, missed = _make_views_again(file, views) if views else ([], [])
+    derived, missed = _make_views_again(file, recording, views) if views else ([], [])
     if file.unread:
         missed.insert(0, f"{file.unread} bytes after the last intact part were not read")
-    if dropped := _dropped(file):
+    if dropped := _dropped(file, recording):
         counts = [f"{'?' if n is None else n} on {topic}" for topic, n in sorted(dropped.items())]
         missed.append(f"messages that are not in the copy: {list_some(counts)}")
     recording.told = "; ".join(filter(None, [recording.told, *missed]))
@@ -77,16 +78,16 @@ def recover(
 
 
 def _make_views_again(
-    file: File, views: Callable[[Recording], list[Message]]
+    file: File, recording: Recording, views: Callable[[Recording], list[Message]]
 ) -> tuple[list[str], list[str]]:
     """Make the topics for viewers again if messages are lost; return their names, and notes."""
-    if not _has_views(file) or not (file.unread or _dropped(file)):
+    if not _has_views(file) or not (file.unread or _dropped(file, recording)):
         return [], []
     try:
-        file.recording.views = views(file.recording)
+        recording.views = views(recording)
     except BadInputError as error:
         return [], [f"the topics for viewers could not be made again: {error}"]
-    return sorted({topic for topic, _, _ in file.recording.views}), []
+    return sorted({topic for topic, _, _ in recording.views}), []
 
 
 def _share(file: File, written: int, lost: int) -> float:
@@ -100,18 +101,18 @@ def _share(file: File, written: int, lost: int) -> float:
 def _has_views(file: File) -> bool:
     """Return whether a file is the recording of a mission, which has topics for viewers."""
     known = {channel.topic for channel in file.channels.values()}
-    return bool(known & VIEWS.keys()) or "config.yaml" in file.recording.attachments
+    return bool(known & VIEWS.keys()) or "config.yaml" in file.content.attachments
 
 
 def _written(recording: Recording) -> Counter[str]:
     return Counter(topic for topic, _, _ in [*recording.messages, *recording.views])
 
 
-def _dropped(file: File) -> dict[str, int | None]:
+def _dropped(file: File, recording: Recording) -> dict[str, int | None]:
     """Count the messages that `file` has lost, by topic; None: some, but nobody knows how many."""
-    written, stated = _written(file.recording), file.stated
+    written, stated = _written(recording), file.stated
     dropped: dict[str, int | None] = dict(sorted((stated - written).items()))
-    is_uncounted = file.statistics is None and (file.recording.torn or file.gaps or file.unread)
+    is_uncounted = file.statistics is None and (recording.torn or file.gaps or file.unread)
     if not is_uncounted:
         return dropped
     topics = VIEWS.keys() - written.keys() if _has_views(file) else set[str]()

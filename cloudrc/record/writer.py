@@ -17,21 +17,19 @@ from contextlib import suppress
 from io import FileIO
 from operator import itemgetter
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Self
+from typing import IO, Any, Self
 
 from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer, Metadata
 from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 
-from cloudrc import __version__
 from cloudrc.files import atomic_file
 from cloudrc.record import WALL_OFFSET, wall_time
+from cloudrc.record.content import Content
 from cloudrc.record.ros import definition, encode, type_hash
 from cloudrc.record.topics import TOPICS, VIEWS, topics_of
 from cloudrc.records import Record
-
-if TYPE_CHECKING:
-    from cloudrc.record.columns import Recording
+from cloudrc.version import __version__
 
 CHUNK_NS = 500_000_000
 """Longest time between the first and the last message of a chunk [ns]."""
@@ -225,19 +223,19 @@ class McapWriter:
         return channel
 
 
-def write(recording: Recording, target: Path, attachments: Mapping[str, bytes]) -> None:
-    """Write the messages of a recording and further `attachments` to a file, atomically.
+def write(content: Content, target: Path, attachments: Mapping[str, bytes]) -> None:
+    """Write the content of a recording and further `attachments` to a file, atomically.
 
     The attachments come first: a copy that was cut short still contains the experiment.
     """
-    metadata, messages = recording.metadata, recording.messages
+    metadata, messages = content.metadata, content.messages
     clock, machine = metadata.get(CLOCK, ""), metadata.get("clock_id", "")
     with atomic_file(target) as file, McapWriter(file, clock=clock, clock_id=machine) as writer:
-        writer.note({**metadata, **({MISSING: recording.note} if recording.note else {})})
+        writer.note({**metadata, **({MISSING: content.note} if content.note else {})})
         if messages and (began := wall_time(metadata, messages[0][1])):
             writer.note({STARTED: began.isoformat(timespec="milliseconds")})
-        for name, data in {**recording.attachments, **attachments}.items():
+        for name, data in {**content.attachments, **attachments}.items():
             writer.attach(name, data)
         for message in messages:
             writer.write_message(*message)
-        writer.write_views(recording.views)
+        writer.write_views(content.views)

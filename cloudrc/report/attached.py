@@ -7,7 +7,8 @@ from tempfile import TemporaryDirectory
 
 from cloudrc.config.load import ResolvedExperiment, read_experiment
 from cloudrc.errors import BadInputError, describe_error
-from cloudrc.record.columns import Message, Recording
+from cloudrc.record.columns import Recording
+from cloudrc.record.content import Message
 from cloudrc.report.folder import read_run
 from cloudrc.report.views import views
 

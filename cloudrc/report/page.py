@@ -14,7 +14,6 @@ from importlib.resources import files
 from string import Template
 from typing import Any
 
-from cloudrc import __version__
 from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.metrics import SHIPPED, Flight, Number, scale
 from cloudrc.metrics.verdict import FlightFailure
@@ -22,6 +21,7 @@ from cloudrc.record import wall_time
 from cloudrc.report.document import Assessment, Run
 from cloudrc.report.figures import Picture
 from cloudrc.report.figures.style import PAGE
+from cloudrc.version import __version__
 
 HEADLINES = {
     "success": ("The mission succeeded.", "#00694b"),

@@ -25,7 +25,8 @@ from cloudrc.geometry.tubes import wall
 from cloudrc.metrics import Flight
 from cloudrc.metrics.control import prediction_errors, tracking_errors
 from cloudrc.metrics.flight import Array, Columns, select
-from cloudrc.record.columns import Message, Recording
+from cloudrc.record.columns import Recording
+from cloudrc.record.content import Message
 from cloudrc.record.ros import encode_view, header, part
 from cloudrc.report.shapes import flown_shapes
 

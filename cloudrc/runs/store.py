@@ -19,7 +19,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError
 
-from cloudrc import __version__, files
+from cloudrc import files
 from cloudrc.config.document import read_document, write_yaml
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file, write_atomically
@@ -28,6 +28,7 @@ from cloudrc.runs.flight import Row, units
 from cloudrc.runs.grid import Grid, read_grid
 from cloudrc.runs.lock import LOCK
 from cloudrc.source import code_hash
+from cloudrc.version import __version__
 
 FILE, SUMMARY = "sweep.yaml", "sweep.json"
 TABLE, PARQUET = "table.csv", "table.parquet"

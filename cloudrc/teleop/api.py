@@ -23,7 +23,6 @@ from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
-from cloudrc import __version__
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.messages import Vector
@@ -39,6 +38,7 @@ from cloudrc.teleop.store import (
     UnknownMissionError,
 )
 from cloudrc.teleop.wire import Leg, RobotStatus, write_line
+from cloudrc.version import __version__
 
 ROBOT_PERIOD = 0.033
 """Time between two lines of a stream of the robot's status [s]."""

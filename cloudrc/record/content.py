@@ -1,0 +1,30 @@
+"""What the file of a recording contains; the reader makes it, and the writer stores it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+Message: TypeAlias = tuple[str, int, bytes]
+"""Topic, log time [ns] and CDR bytes of a message."""
+
+
+@dataclass(eq=False)
+class Content:
+    """The messages of a file in the form of bytes, and what else the file contains."""
+
+    messages: list[Message] = field(default_factory=list)  # in the order of log times
+    metadata: dict[str, str] = field(default_factory=dict)  # of a repeated key, the last value
+    attachments: dict[str, bytes] = field(default_factory=dict)  # name -> content of a file
+    views: list[Message] = field(default_factory=list)  # messages of `VIEWS`
+    source: str = ""  # the file, for errors
+    torn: str = ""  # that a killed process has not written the end of the file, in words
+    lacking: str = ""  # what was damaged or changed in the file, in words
+    told: str = ""  # what the writer of the file missed, in words
+    remarks: tuple[str, ...] = ()  # what was ignored or sorted; "The recording" precedes each
+
+    @property
+    def note(self) -> str:
+        """What is missing or wrong, in words; "" if no message of the flight is missing."""
+        lacking = "" if self.lacking in self.told else self.lacking
+        return "; ".join(filter(None, (self.torn, lacking, self.told)))
