@@ -26,7 +26,7 @@ def own_robot(tmp_path):
     ("settings", "speed", "acceleration"),
     [
         (["world.robot=pelican", *FLIES], 6.0, 12.0),
-        (["world.robot=nano", *FLIES], 6.0, 12.0),
+        (["world.robot=nano", *FLIES], 6.0, 4.0),
         (DRIVES, 1.5, 2.0),
         ([*DRIVES, "guard.speed_max_mps=0.5"], 0.5, 2.0),
         ([*DRIVES, "guard.acceleration_max_mps2=1"], 1.5, 1.0),
@@ -60,6 +60,6 @@ def test_another_robot_in_a_resolved_experiment_brings_its_own_limits(tmp_path):
     file = tmp_path / "again.yaml"
     file.write_text(dump(load_experiment("pillars")))
     again = load_experiment(file, ["world.robot=x2", *FLIES]).guard
-    assert (again.speed_max_mps, again.acceleration_max_mps2) == (6.0, 12.0)
+    assert (again.speed_max_mps, again.acceleration_max_mps2) == (6.0, 4.0)
     file.write_text(dump(load_experiment("pillars", ["guard.speed_max_mps=1"])))
     assert load_experiment(file, ["world.robot=x2", *FLIES]).guard.speed_max_mps == 1.0
