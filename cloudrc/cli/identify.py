@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
+from math import isnan
 from pathlib import Path
 
 from cloudrc.cli.output import format_document, output_argument, print_result
@@ -45,6 +46,9 @@ def execute(options: argparse.Namespace) -> int:
         ("axis", "time constant [s]", "dead time [s]", "gain", "explained")
     ]
     for name, fit in zip("xyz", fits, strict=True):
+        if isnan(fit.share):
+            rows.append((name, "stays on the ground", "", "", ""))
+            continue
         cells = [f"{v:.3f} ± {h:.3f}" for v, h in zip(*fit[:2], strict=True)]
         rows.append((name, *cells, f"{fit.share:.1%}"))
     shown = table(rows, right=(1, 2, 3, 4))

@@ -19,11 +19,12 @@ from cloudrc.config.problems import validate
 from cloudrc.config.reuse import reuse
 from cloudrc.config.schema import (
     Acceleration,
+    Constants,
+    DeadTimes,
     NameOr,
     NotNegatives,
     Parameters,
     PlugIn,
-    Positives,
     Section,
     Speed,
     World,
@@ -65,9 +66,9 @@ class Response(Parameters):
     What else identify writes, such as the intervals, is for the reader.
     """
 
-    time_constant: Positives
+    time_constant: Constants
     """Time constant of the velocity loop [s]"""
-    dead_time: NotNegatives
+    dead_time: DeadTimes
     """Time until the robot reacts to a command [s]"""
     gain: NotNegatives
     """Velocity per commanded velocity [1]"""

@@ -45,6 +45,12 @@ NotNegative = Annotated[float, Field(ge=0)]
 NotNegatives = tuple[NotNegative, NotNegative, NotNegative]
 Positive = Annotated[float, Field(gt=0)]
 Positives = tuple[Positive, Positive, Positive]
+_Constant = Annotated[float, Field(gt=0, le=30)]
+_DeadTime = Annotated[float, Field(ge=0, le=5)]
+Constants = tuple[_Constant, _Constant, _Constant]
+DeadTimes = tuple[_DeadTime, _DeadTime, _DeadTime]
+"""Time constants and dead times of a robot's velocity loop per axis [s]. Larger values are meant in
+milliseconds."""
 Gain = Annotated[float, Field(gt=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
 # Every limit of the guard has a smallest and a largest value, so that nobody can switch it off.

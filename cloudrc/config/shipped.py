@@ -80,8 +80,11 @@ def model_path(kind: str, name: str, folder: Path) -> str:
         if not os.path.isfile(path / ROBOT_FILE):
             raise BadInputError(f"{path}: has no {ROBOT_FILE}, so it is no robot")
         return str(path)
+    if kind == "robot" and path.name == ROBOT_FILE and os.path.isfile(path):
+        raise BadInputError(f"{path}: give its folder: {path.parent}")
     if path.suffix != ".xml" or not os.path.isfile(path):
-        raise _no_file("no such .xml file", kind, path)
+        what = "folder or .xml file" if kind == "robot" else ".xml file"
+        raise _no_file(f"no such {what}", kind, path)
     return str(path)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isnan, nan
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +50,14 @@ def _is_planar(folder: Path) -> bool:
 
 
 def _still(fit: Fit) -> Fit:
-    """Return the model of an axis along which the robot never moves: the gain is 0."""
+    """Return the model of an axis along which the robot never moves: nothing is measured."""
     constant = np.array([fit.values[0], 0.0, 0.0])
-    return Fit(constant, np.zeros(3), 1.0)
+    return Fit(constant, np.full(3, nan), nan)
+
+
+def _rounded(value: float) -> float | None:
+    """Return a number for a file; None if it was not measured."""
+    return None if isnan(value) else round(float(value), 4)
 
 
 def describe(fits: Sequence[Fit], seconds: float) -> dict[str, Any]:
@@ -60,9 +66,9 @@ def describe(fits: Sequence[Fit], seconds: float) -> dict[str, Any]:
     `seconds` is the duration of the recording [s].
     """
     values, halves = (
-        {name: [round(float(fit[:2][part][n]), 4) for fit in fits] for n, name in enumerate(NAMES)}
+        {name: [_rounded(fit[:2][part][n]) for fit in fits] for n, name in enumerate(NAMES)}
         for part in (0, 1)
     )
-    shares = [round(fit.share, 4) for fit in fits]
+    shares = [_rounded(fit.share) for fit in fits]
     more = {"seconds": round(seconds, 2), "input": INPUT, "output": OUTPUT}
     return {**values, "half_width_95": halves, "explained": shares, **more}

@@ -1,10 +1,10 @@
 """Decide whether a control loop is stable: fly one step of the setpoint, and see if it dies out.
 
 Two flights with the same random numbers differ in the step alone: both hover at a point, and in one
-of them the setpoint then moves by a step along x, y and z. The *response* is the difference of the
-two positions minus the step: what is left of the step. In a linear loop, wind, sensor noise and
-losses act equally on both flights, so they cancel in the response. The response of a stable loop
-dies out, that of an unstable loop does not.
+of them the setpoint then moves by a step along x, y and z, or along x and y if the robot stays on
+the ground. The *response* is the difference of the two positions minus the step: what is left of
+the step. In a linear loop, wind, sensor noise and losses act equally on both flights, so they
+cancel in the response. The response of a stable loop dies out, that of an unstable loop does not.
 
 The judged step is small. The limits of the guard (speed, acceleration, fence) bound a large
 oscillation, so that a loop that is unstable may seem to decay after a large step.
@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 
 from cloudrc import assembly, plugins
 from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
 from cloudrc.errors import describe_error, machine_error
+from cloudrc.geometry.scene import load_scene
 from cloudrc.link.ages import simulate_ages
 from cloudrc.messages import GuardState
 from cloudrc.metrics.verdict import NOT_STARTED, plugin_failures
@@ -88,13 +90,16 @@ def fly_step(experiment: ResolvedExperiment, size: float = SMALL) -> Answer:
 
 def _fly_step(experiment: ResolvedExperiment, size: float) -> Answer:
     window = window_of(experiment)
-    end = np.array((size, size, END_HEIGHT))
-    start = end - size
+    if is_planar(experiment.world.robot):
+        start, step = np.array(load_scene(SCENE).spawn), np.array((size, size, 0.0))
+    else:
+        start, step = np.array((0.0, 0.0, END_HEIGHT - size)), np.full(3, size)
+    end = start + step
     stepped = fly(experiment, start, end, window)
     still = fly(experiment, start, start, window)
     if problem := stepped.problem or still.problem:
         return {"stable": False, "code": problem[0], "text": problem[1]}
-    answer = judge(response(stepped, still, size), stepped.step_ns, window, size)
+    answer = judge(response(stepped, still, step), stepped.step_ns, window, size)
     if stepped.fault and not answer["stable"]:
         answer |= {"code": "plugin_failed", "text": stepped.fault}
     return answer | {"speed_limited": stepped.speed_limited}
@@ -196,13 +201,13 @@ def _problem(recording: Recording, step_ns: int) -> tuple[str, str] | None:
     return None
 
 
-def response(stepped: Track, still: Track, size: float) -> tuple[NDArray[np.int64], Array]:
-    """Return what is left of a step of `size` [m] per axis: stamps [ns] and response [m].
+def response(stepped: Track, still: Track, step: Array) -> tuple[NDArray[np.int64], Array]:
+    """Return what is left of a `step` [m], shape (3,): stamps [ns] and response [m].
 
-    The shapes are (n,) and (n, 3). The response is -`size` at the step, and 0 when it has died out.
+    The shapes are (n,) and (n, 3). The response is -`step` at the step, and 0 when it has died out.
     """
     count = min(len(stepped.positions), len(still.positions))
-    left = stepped.positions[:count] - still.positions[:count] - size
+    left = stepped.positions[:count] - still.positions[:count] - step
     return stepped.stamps_ns[:count], left
 
 

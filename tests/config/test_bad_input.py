@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc.config import shipped
 from cloudrc.config.load import load_profile
 from cloudrc.errors import BadInputError
 from tests.config.conftest import refused
@@ -142,7 +143,11 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("mission.waypoints.2.speed_mps=1", "waypoints.2.speed_mps: 1: is the speed of a carrot;"),
         ("mission=steps mission.carrot.speed_mps=1", "mission.carrot: impossible with steps"),
         ("world.robot=./no.xml", "no.xml; names of shipped robots: nano, pelican"),
-        ("world.robot=/x/q", "world.robot: no such .xml file: /x/q"),
+        (
+            f"world.robot={shipped.FOLDERS['robot']}/nano/robot.yaml",
+            "robot.yaml: give its folder: ",
+        ),
+        ("world.robot=/x/q", "world.robot: no such folder or .xml file: /x/q"),
         # A limit of the guard cannot be switched off.
         ("guard.command_age_max_ms=true", "--set: guard.command_age_max_ms: "),
         ("guard.speed_max_mps=1e-320", "--set: guard.speed_max_mps: "),

@@ -24,7 +24,8 @@ class Drive:
     """A flight whose operator drives; it takes off at 0.5 s."""
 
     def __init__(self, profile="paper-p3", seed=1, link=()):
-        self.flight = FaultRun(Schedule(seed, profile), "world.scene=empty", "mission.touch=null", *link, start=False)
+        settings = "world.scene=empty", "mission.touch=null", *link
+        self.flight = FaultRun(Schedule(seed, profile), *settings, start=False)
         ways = self.flight.experiment.uplink, self.flight.experiment.downlink
         self.rtt = sum(way.delay_ms for way in ways) * 1e-3
         self.random = generator(seed, 46).uniform

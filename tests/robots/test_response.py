@@ -101,6 +101,10 @@ def test_a_parameter_that_the_model_does_not_have_is_one_line(robot, predictor, 
             "response: {time_constant: [1, 1], dead_time: [0, 0, 0], gain: [1, 1, 1]}",
             "time_constant.2: is missing",
         ),
+        (
+            "response: {time_constant: [220, 220, 68], dead_time: [0, 0, 0], gain: [1, 1, 1]}",
+            "time_constant.0: 220: must be a number > 0 and <= 30",
+        ),
         ("response: 3", "response: 3: must be null or a mapping of keys"),
         ("tunings: {fast: 3}", "tunings.fast: 3: is not valid"),
         ("motion: 3", "motion: 3: must be text or null"),
@@ -135,6 +139,8 @@ def test_identify_writes_a_response_for_a_robot_on_the_ground(call, tmp_path, mo
     found = json.loads(call("identify run -o json").out)
     response = known_robot("rover").response
     assert found["gain"][2] == 0.0
+    assert (found["explained"][2], found["half_width_95"]["gain"][2]) == (None, None)
+    assert "stays on the ground" in call("identify run --out other.yaml").out
     assert found["gain"][:2] == pytest.approx(response.gain[:2], abs=0.1)
     delays = [sum(pair) for pair in zip(found["time_constant"], found["dead_time"], strict=True)]
     assert delays[:2] == pytest.approx([0.1, 0.1], abs=0.05)

@@ -131,6 +131,11 @@ def test_a_slow_or_disturbed_loop_is_stable(settings):
     assert found["stable"], found
 
 
+def test_a_robot_on_the_ground_is_judged_by_its_step_on_the_ground():
+    found = fly_step(load_experiment("pillars"))
+    assert found["stable"], found
+
+
 def test_a_robot_that_does_not_follow_is_not_stable():
     assert fly_step(flown("cloud.controller.gain_p=[0, 0, 0]"))["code"] == "unstable"
     assert fly_step(flown("link.both.loss=1"))["code"] == "not_started"

@@ -16,7 +16,7 @@ from cloudrc.cloud.motion import Body, approach
 from cloudrc.cloud.predictors._history import COUNT, PERIOD_NS, Replay
 from cloudrc.config.document import read_document
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotFacts
-from cloudrc.config.schema import NotNegatives, Positive, Positives
+from cloudrc.config.schema import Constants, DeadTimes, NotNegatives, Positive
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.messages import ZERO, Command, Odometry, Vector
 
@@ -122,8 +122,8 @@ class CommandHistory(Replay):
 
 
 def build(
-    time_constant: Positives | None = None,
-    dead_time: NotNegatives | None = None,
+    time_constant: Constants | None = None,
+    dead_time: DeadTimes | None = None,
     gain: NotNegatives | None = None,
     acceleration_max: Positive | None = None,
     model: Path | None = None,
