@@ -31,7 +31,7 @@ from cloudrc.geometry.placement import (
     find_overlapped,
     outside_fence,
 )
-from cloudrc.geometry.scene import FLOOR, Pipe, Scene
+from cloudrc.geometry.scene import FLOOR, Scene, Tube
 from cloudrc.messages import Vector
 
 _YAW = "the onboard controller holds yaw at 0, as the published one does; leave it out"
@@ -211,7 +211,7 @@ def _check_ways(positions: Array, place: _Place) -> Iterator[ConfigProblem]:
     through = find_crossed(known, place.robot, positions[:-1], positions[1:])
     for index in np.flatnonzero(through >= 0)[:_REPORTED]:
         obstacle = known[through[index]]
-        around = "around it or through the pipe" if isinstance(obstacle, Pipe) else "around it"
+        around = "around it or through the tube" if isinstance(obstacle, Tube) else "around it"
         before = f"waypoint {index - 1}" if index else "the spawn"
         reason = (
             f"the straight way there from {before} leads through {surface(obstacle)}, or within "

@@ -131,7 +131,7 @@ class Page:
         gui.main_panel.set_width(PANEL_WIDTH)
         gui.add_html(BELOW_STOP, order=-1)
         self._status = gui.add_markdown("waiting for the robot", order=2)
-        if self._surroundings.pipes:
+        if self._surroundings.tubes:
             gui.add_html(LEGEND, order=2.5)
         panel = gui.add_panel()
         with panel.add_tab("Charts"):

@@ -170,14 +170,14 @@ class FlightScene:
         self._scene.add_grid(
             f"/{FLOOR}", position=(0.0, 0.0, geometry.floor), infinite_grid=True, **GRID
         )
-        tubes = {tube.name for tube in geometry.pipes}
+        tubes = {tube.name for tube in geometry.tubes}
         bodies = defaultdict(list)
         for surface in shapes.scene:
             if surface.body not in tubes:
                 bodies[surface.body].append(surface)
         for name, surfaces in bodies.items():
             self._add_meshes(f"/{name}", surfaces)
-        for tube in geometry.pipes:
+        for tube in geometry.tubes:
             # Only the far wall is drawn, so that the robot in the tube is seen from every side.
             self._add_mesh(f"/{tube.name}/wall", [wall(tube, TUBE)], TUBE, side="back")
             for end, rim in zip("+-", rims(tube, RIM), strict=True):
@@ -220,7 +220,7 @@ def _camera(geometry: Scene, waypoints: Sequence[Vector], aspect: float) -> tupl
     The viewer looks along +x: the key ↑ moves the robot away from the viewer, the key ← to the
     viewer's left. The place is the nearest one from which spawn, tubes and waypoints are in sight.
     """
-    tubes = [(tube.centre, 0.5 * tube.length * np.array(tube.axis)) for tube in geometry.pipes]
+    tubes = [(tube.centre, 0.5 * tube.length * np.array(tube.axis)) for tube in geometry.tubes]
     ends = [centre + sign * half for centre, half in tubes for sign in (-1, 1)]
     forward = LOOK / np.linalg.norm(LOOK)
     right = np.cross(forward, (0.0, 0.0, 1.0)) / np.hypot(*forward[:2])

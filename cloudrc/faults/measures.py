@@ -149,7 +149,7 @@ def scenario(number: int, name: str, *, injects: str, expects: str) -> Callable[
 
 
 def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
-    """Choose a time from `first` to `last` [s]; by default, the robot is among the pipes then."""
+    """Choose a time from `first` to `last` [s]; by default, the robot is among the tubes then."""
     return float(generator(seed, 77).uniform(first, last))
 
 

@@ -1,6 +1,6 @@
-"""Represent a robot by spheres, and compute their distance from pipes and other obstacles.
+"""Represent a robot by spheres, and compute their distance from tubes and other obstacles.
 
-A pipe is an ideal hollow cylinder with flat ends. The physics builds each pipe from flat staves,
+A tube is an ideal hollow cylinder with flat ends. The physics builds each tube from flat staves,
 which deviate from the cylinder by up to 3.2 mm.
 
 Source: docs/reference/plant.md, "Staves".
@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cloudrc.geometry.obstacles import Obstacle
-from cloudrc.geometry.scene import Pipe, Scene
+from cloudrc.geometry.scene import Scene, Tube
 from cloudrc.geometry.solids import Solid
 
 Array = NDArray[np.float64]
 
 CLEARANCE_SHOWN = 0.40
-"""Upper end of the colour scale in figures and scenes [m]; inside a pipe no clearance is larger."""
+"""Upper end of the colour scale in figures and scenes [m]; inside a tube no clearance is larger."""
 
 _CHUNK = 100  # poses per batch: 100 x 225 points fit in the processor's cache
 _STRIDE = 32  # `least_clearance` begins with every 32nd pose
@@ -72,18 +72,18 @@ def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) ->
     return placed
 
 
-def distance_to_pipe(pipe: Pipe, points: Array) -> Array:
-    """Compute the distance of points from a pipe's wall [m], shape (...); negative inside the wall.
+def distance_to_tube(tube: Tube, points: Array) -> Array:
+    """Compute the distance of points from a tube's wall [m], shape (...); negative inside the wall.
 
     `points` are in [m], world frame, shape (..., 3). With s the position along the axis and r the
     distance from the axis, the wall is a rectangle in the (s, r) plane.
     """
-    relative = points - np.asarray(pipe.centre)
-    s = relative @ np.asarray(pipe.axis)
+    relative = points - np.asarray(tube.centre)
+    s = relative @ np.asarray(tube.axis)
     r_squared = np.einsum("...i,...i->...", relative, relative) - s * s
     r = np.sqrt(np.maximum(r_squared, 0.0))
-    beyond_end = np.abs(s) - 0.5 * pipe.length
-    beyond_face = np.abs(r - 0.5 * (pipe.inner + pipe.outer)) - 0.5 * (pipe.outer - pipe.inner)
+    beyond_end = np.abs(s) - 0.5 * tube.length
+    beyond_face = np.abs(r - 0.5 * (tube.inner + tube.outer)) - 0.5 * (tube.outer - tube.inner)
     nearest: Array = np.minimum(np.maximum(beyond_end, beyond_face), 0.0)
     np.maximum(beyond_end, 0.0, out=beyond_end)
     np.maximum(beyond_face, 0.0, out=beyond_face)
@@ -111,8 +111,8 @@ def clearance_per_obstacle(
         part = slice(start, start + _CHUNK)
         placed = place_points(points, at[part], facing[part])
         for index, obstacle in enumerate(obstacles):
-            if isinstance(obstacle, Pipe):
-                distance = distance_to_pipe(obstacle, placed) - points.radii
+            if isinstance(obstacle, Tube):
+                distance = distance_to_tube(obstacle, placed) - points.radii
                 result[part, index] = distance.min(axis=1)
             else:
                 result[part, index] = _distance_to_solid(obstacle, at[part], placed, points, far)
@@ -187,18 +187,18 @@ def least_clearance(
     return float(found.min())
 
 
-def pipe_index(scene: Scene, positions: ArrayLike) -> NDArray[np.int64]:
-    """Return the index of the first pipe whose bore contains the base, or -1; shape (n,).
+def tube_index(scene: Scene, positions: ArrayLike) -> NDArray[np.int64]:
+    """Return the index of the first tube whose bore contains the base, or -1; shape (n,).
 
     The base is in the bore if it is between both ends and nearer to the axis than the inner radius.
     `positions` are those of the base [m], world frame, shape (n, 3).
     """
     at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
     result = np.full(len(at), -1, dtype=np.int64)
-    for index in reversed(range(len(scene.pipes))):
-        pipe = scene.pipes[index]
-        relative = at - np.asarray(pipe.centre)
-        s = relative @ np.asarray(pipe.axis)
-        r = np.linalg.norm(relative - s[:, None] * np.asarray(pipe.axis), axis=1)
-        result[(np.abs(s) <= 0.5 * pipe.length) & (r < pipe.inner)] = index
+    for index in reversed(range(len(scene.tubes))):
+        tube = scene.tubes[index]
+        relative = at - np.asarray(tube.centre)
+        s = relative @ np.asarray(tube.axis)
+        r = np.linalg.norm(relative - s[:, None] * np.asarray(tube.axis), axis=1)
+        result[(np.abs(s) <= 0.5 * tube.length) & (r < tube.inner)] = index
     return result

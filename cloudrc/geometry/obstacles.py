@@ -1,4 +1,4 @@
-"""List the obstacles of a scene, declared pipes and board and all other bodies; find its fence."""
+"""List the obstacles of a scene, declared tubes and plates and all others; find its fence."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.geometry.fence import SPACE, Fence
-from cloudrc.geometry.scene import BOARD, FLOOR, WORLD, Board, Pipe, Scene, is_obstacle
+from cloudrc.geometry.scene import FLOOR, WORLD, Plate, Scene, Tube, is_obstacle
 from cloudrc.geometry.solids import Solid
 
-Obstacle: TypeAlias = Pipe | Solid
-BOARD_DEPTH = 0.05
-"""Thickness of a declared board [m], as in the shipped scene `pipes`."""
+Obstacle: TypeAlias = Tube | Solid
+PLATE_DEPTH = 0.05
+"""Thickness of a declared plate [m], as in the shipped scene `pipes`."""
 _WORDS = {
     WORLD: "world, the geoms in the worldbody of the scene",
 }
@@ -30,18 +30,15 @@ def obstacles(scene: Scene, *, touch: str | None) -> tuple[Obstacle, ...]:
     Raises:
         BadInputError: If MuJoCo cannot read the scene.
     """
-    declared = {pipe.name for pipe in scene.pipes}
-    found: list[Obstacle] = [*scene.pipes]
-    if scene.board is not None:
-        declared.add(BOARD)
-        found.append(_as_solid(scene.board))
+    found: list[Obstacle] = [*scene.tubes, *map(_as_solid, scene.plates)]
+    declared = {each.name for each in found}
     found += [solid for solid in _compiled(scene)[1] if solid.name not in declared]
     return tuple(each for each in found if is_obstacle(each.name, touch=touch))
 
 
 def surface(obstacle: Obstacle) -> str:
     """Return how messages name what the robot would touch."""
-    if isinstance(obstacle, Pipe):
+    if isinstance(obstacle, Tube):
         return f"the wall of {obstacle.name}"
     return _WORDS.get(obstacle.name, obstacle.name)
 
@@ -49,8 +46,8 @@ def surface(obstacle: Obstacle) -> str:
 def body_names(scene: Scene) -> tuple[str, ...] | None:
     """Return the names of all bodies of a scene; None if they are not `known`."""
     if scene.path is None:
-        boards = () if scene.board is None else (BOARD,)
-        return (FLOOR, *(pipe.name for pipe in scene.pipes), *boards)
+        tubes, plates = scene.tubes, scene.plates
+        return (FLOOR, *(tube.name for tube in tubes), *(plate.name for plate in plates))
     return _compiled(scene)[0] or None
 
 
@@ -95,7 +92,9 @@ def _compiled(scene: Scene) -> tuple[tuple[str, ...], tuple[Solid, ...]]:
     return bodies.names, bodies.solids
 
 
-def _as_solid(board: Board) -> Solid:
-    spans = np.array([(board.x, board.x + BOARD_DEPTH), board.y, board.z])
+def _as_solid(plate: Plate) -> Solid:
+    spans = np.array([(plate.x, plate.x + PLATE_DEPTH), plate.y, plate.z])
     half = (spans[:, 1] - spans[:, 0]) / 2
-    return Solid(BOARD, "box", spans.mean(axis=1), np.eye(3), half, float(np.linalg.norm(half)))
+    return Solid(
+        plate.name, "box", spans.mean(axis=1), np.eye(3), half, float(np.linalg.norm(half))
+    )

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from cloudrc.geometry.clearance import Array, Spheres, clearance_per_obstacle
 from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.obstacles import Obstacle
-from cloudrc.geometry.scene import Pipe
+from cloudrc.geometry.scene import Tube
 from cloudrc.messages import Vector
 
 CLEARANCE_MIN = 0.04
@@ -107,7 +107,7 @@ def find_nearest_legal(
     """Find a point that the guard allows and that is clear of obstacles; None if none is near.
 
     The search begins at `position` (of the base, [m], world frame), moved into the guard's limits.
-    It goes up to 1.5 m along x, y and z, and towards and away from the axes of the pipes.
+    It goes up to 1.5 m along x, y and z, and towards and away from the axes of the tubes.
     The coordinates of the point are whole centimetres, so that a message can show them exactly.
 
     `yaw` is the heading of the level robot [rad]. If `before` [m] is given, the straight way from
@@ -115,11 +115,11 @@ def find_nearest_legal(
     """
     start = np.clip(position, fence.inner_low, fence.inner_high)
     directions = [*np.eye(3), *-np.eye(3)]
-    for pipe in (each for each in obstacles if isinstance(each, Pipe)):
-        relative = start - np.asarray(pipe.centre)
-        radial = relative - (relative @ np.asarray(pipe.axis)) * np.asarray(pipe.axis)
+    for tube in (each for each in obstacles if isinstance(each, Tube)):
+        relative = start - np.asarray(tube.centre)
+        radial = relative - (relative @ np.asarray(tube.axis)) * np.asarray(tube.axis)
         norm = float(np.linalg.norm(radial))
-        if 0 < norm < pipe.outer + _SEARCH:
+        if 0 < norm < tube.outer + _SEARCH:
             directions += [radial / norm, -radial / norm]
     steps = np.arange(0, _SEARCH, 0.02)
     around = start + steps[:, None, None] * np.array(directions)

@@ -1,12 +1,12 @@
-"""Read the pipes, the board and the floor of a scene from its MJCF file, without MuJoCo.
+"""Read the tubes, the plates and the floor of a scene from its MJCF file, without MuJoCo.
 
-For this reader, the MJCF file repeats the ideal shapes as numbers: `<custom><numeric name="pipe_1"
-data="..."/>`, in metres, world frame.
+For this reader, the MJCF file repeats the ideal shapes as numbers: `<custom><numeric name="..."
+data="..."/>`, in metres, world frame. The name of a tube or plate is that of its body.
 
 | name | data |
 |---|---|
-| `pipe_*` | centre x y z, axis x y z, length, inner radius, outer radius |
-| `board` | x of the front face, smallest and largest y, smallest and largest z |
+| a body | 9 numbers, a tube: centre x y z, axis x y z, length, inner radius, outer radius |
+| a body | 5 numbers, a plate: x of the front face, smallest and largest y, smallest and largest z |
 | `floor` | z; 0 if the file has no `floor` |
 | `fence` | corner with the smallest x y z, corner with the largest |
 """
@@ -24,14 +24,13 @@ from cloudrc.messages import Vector
 
 SPAWN: Vector = (0.0, 0.0, 0.1)
 """Position of the base at the start of a mission in the shipped scenes [m], world frame."""
-FLOOR, BOARD, WORLD = "floor", "board", "world"
-"""Names of the body on which the robot stands, of the body that a mission may have to touch, and of
-all geoms in a scene's worldbody."""
+FLOOR, WORLD = "floor", "world"
+"""Names of the body on which the robot stands, and of all geoms in a scene's worldbody."""
 SCENES = Path(__file__).parents[1] / "world" / "scenes"
 
 
 @dataclass(frozen=True, slots=True)
-class Pipe:
+class Tube:
     """A hollow cylinder with flat ends."""
 
     name: str  # of the body
@@ -43,9 +42,10 @@ class Pipe:
 
 
 @dataclass(frozen=True, slots=True)
-class Board:
-    """A wall that the robot can touch with its arm; the front face points along -x."""
+class Plate:
+    """A thin upright wall; the front face points along -x."""
 
+    name: str  # of the body
     x: float  # position of the front face [m], world frame
     y: tuple[float, float]  # smallest and largest y [m], world frame
     z: tuple[float, float]  # smallest and largest z [m], world frame
@@ -56,8 +56,8 @@ class Scene:
     """The parts of a scene that its file declares as numbers."""
 
     name: str  # file name without .xml
-    pipes: tuple[Pipe, ...] = ()  # in the order of the file
-    board: Board | None = None
+    tubes: tuple[Tube, ...] = ()  # in the order of the file
+    plates: tuple[Plate, ...] = ()  # in the order of the file
     floor: float = 0.0  # z of the floor [m], world frame
     spawn: Vector = SPAWN  # position of the base at the start of a mission [m], world frame
     path: Path | None = None  # of the file if it may have more bodies; None: this is all it has
@@ -83,16 +83,16 @@ def load_scene(name: str, corners: Corners | None = None) -> Scene:
     try:
         root = ElementTree.parse(path).getroot()
         numerics = [(n.get("name", ""), n.get("data", "")) for n in root.iterfind("custom/numeric")]
-        pipes = tuple(_pipe(name, data) for name, data in numerics if name.startswith("pipe_"))
-        board, floor, fence = None, 0.0, None
+        names = {body.get("name") for body in root.iter("body")}
+        shapes: list[Tube | Plate] = []
+        floor, fence = 0.0, None
         for name, data in numerics:
-            if name == "board":
-                x, *spans = _numbers(name, data, 5)
-                board = Board(x, (spans[0], spans[1]), (spans[2], spans[3]))
-            elif name == "floor":
+            if name == FLOOR:
                 (floor,) = _numbers(name, data, 1)
             elif name == "fence":
                 fence = _fence(_numbers(name, data, 6))
+            elif name in names:
+                shapes.append(_shape(name, data))
         frame = root.find("./worldbody/frame[@name='spawn']")
         x, y, z = SPAWN if frame is None else _numbers("spawn", frame.get("pos", "0 0 0"), 3)
     except OSError as error:
@@ -105,7 +105,9 @@ def load_scene(name: str, corners: Corners | None = None) -> Scene:
     is_complete = own is None and bodies <= {FLOOR, *(name for name, _ in numerics)}
     own_fence = Fence(*corners) if corners else fence
     whole = None if is_complete else path
-    return Scene(path.stem, pipes, board, floor, (x, y, z), whole, own_fence)
+    tubes = tuple(shape for shape in shapes if isinstance(shape, Tube))
+    plates = tuple(shape for shape in shapes if isinstance(shape, Plate))
+    return Scene(path.stem, tubes, plates, floor, (x, y, z), whole, own_fence)
 
 
 def _fence(numbers: list[float]) -> Fence:
@@ -116,14 +118,20 @@ def _fence(numbers: list[float]) -> Fence:
     return fence
 
 
-def _pipe(name: str, data: str) -> Pipe:
+def _shape(name: str, data: str) -> Tube | Plate:
+    count = len(data.split())
+    if count not in (5, 9):
+        raise ValueError(f"{name}: data must be 9 numbers (a tube) or 5 (a plate): {data!r}")
+    if count == 5:
+        x, y_min, y_max, z_min, z_max = _numbers(name, data, 5)
+        return Plate(name, x, (y_min, y_max), (z_min, z_max))
     cx, cy, cz, ax, ay, az, length, inner, outer = _numbers(name, data, 9)
     norm = math.hypot(ax, ay, az)
     if norm == 0 or length <= 0 or not 0 < inner < outer:
         raise ValueError(
             f"{name}: needs an axis that is not zero, a length above 0 and 0 < inner < outer radius"
         )
-    return Pipe(name, (cx, cy, cz), (ax / norm, ay / norm, az / norm), length, inner, outer)
+    return Tube(name, (cx, cy, cz), (ax / norm, ay / norm, az / norm), length, inner, outer)
 
 
 def _numbers(name: str, data: str, count: int) -> list[float]:

@@ -6,20 +6,20 @@ from itertools import pairwise
 
 import numpy as np
 
-from cloudrc.geometry.scene import Pipe
+from cloudrc.geometry.scene import Tube
 from cloudrc.geometry.shapes import Array, Rgba, Surface
 
 STATION = 0.25
 """Length of the parts of a tube that is cut open [m]: a drawing sorts parts by distance."""
 
 
-def wall(tube: Pipe, rgba: Rgba, sides: int = 64) -> Surface:
+def wall(tube: Tube, rgba: Rgba, sides: int = 64) -> Surface:
     """Return the inner face of a tube, open at both ends."""
     first, last = (_arc(tube, tube.inner, end, _across(tube), np.pi, sides) for end in (-0.5, 0.5))
     return _between(tube.name, first, last, rgba)
 
 
-def rims(tube: Pipe, rgba: Rgba, sides: int = 64) -> list[Surface]:
+def rims(tube: Tube, rgba: Rgba, sides: int = 64) -> list[Surface]:
     """Return the two ring-shaped ends of a tube."""
     found = []
     for end in (-0.5, 0.5):
@@ -32,7 +32,7 @@ def rims(tube: Pipe, rgba: Rgba, sides: int = 64) -> list[Surface]:
 
 
 def cut_open(
-    tube: Pipe, towards: Array, inside: Rgba, cut: Rgba, station: float = STATION
+    tube: Tube, towards: Array, inside: Rgba, cut: Rgba, station: float = STATION
 ) -> list[Surface]:
     """Return the half of a tube that is farther from a viewer in the direction `towards`.
 
@@ -54,7 +54,7 @@ def cut_open(
     return found
 
 
-def _across(tube: Pipe) -> Array:
+def _across(tube: Tube) -> Array:
     """Return a unit vector at a right angle to the axis of a tube, shape (3,)."""
     axis = np.array(tube.axis)
     across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
@@ -62,7 +62,7 @@ def _across(tube: Pipe) -> Array:
 
 
 def _arc(
-    tube: Pipe, radius: float, place: float, middle: Array, half_angle: float, sides: int
+    tube: Tube, radius: float, place: float, middle: Array, half_angle: float, sides: int
 ) -> Array:
     """Return points of a circle around the axis of a tube [m], world frame, shape (sides + 1, 3).
 

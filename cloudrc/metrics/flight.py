@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from cloudrc.config.schema import Criteria, MissionConfig
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.clearance import Hull, clearance, least_clearance, pipe_index
+from cloudrc.geometry.clearance import Hull, clearance, least_clearance, tube_index
 from cloudrc.geometry.obstacles import Obstacle, obstacles
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
@@ -40,7 +40,7 @@ class Flight:
     recording: Recording  # all topics; cloud's stamps are shifted to world's clock
     criteria: Criteria
     mission: MissionConfig  # with its waypoints or random steps
-    scene: Scene  # its pipes and all other obstacles
+    scene: Scene  # its tubes and all other obstacles
     hull: Hull | None = None  # of the robot; None: not known
 
     @property
@@ -152,16 +152,16 @@ class Flight:
 
     @cached_property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """All bodies that the robot must not touch; if the scene cannot be read, its pipes."""
+        """All bodies that the robot must not touch; if the scene cannot be read, its tubes."""
         try:
             return obstacles(self.scene, touch=self.mission.touched)
         except BadInputError:
-            return self.scene.pipes
+            return self.scene.tubes
 
     @cached_property
     def inside(self) -> Array:
-        """Whether the robot's base is inside a pipe, per row of `truth`."""
-        return pipe_index(self.scene, self.truth["position"]) >= 0
+        """Whether the robot's base is inside a tube, per row of `truth`."""
+        return tube_index(self.scene, self.truth["position"]) >= 0
 
     def count(self, number: float) -> float | None:
         """Return `number` [any unit] as the value of a metric; None if the robot never flew."""
@@ -306,7 +306,7 @@ add_metrics(
 add_metrics(
     "Distance to obstacles",
     ("min_clearance", "m", "Smallest distance between the robot and an obstacle while the base "
-     "is inside a pipe.", partial(_least_clearance, inside=True)),
+     "is inside a tube.", partial(_least_clearance, inside=True)),
     ("min_clearance_flight", "m", "Smallest distance between the robot and an obstacle during the "
      "whole flight.", partial(_least_clearance, inside=False)),
 )  # fmt: skip

@@ -63,8 +63,8 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]
     shapes = _robot(bodies)
     size = min(GOAL_SIZE, bodies.size / 4) if bodies.robot else GOAL_SIZE
     shapes.append(("setpoint", SPHERE, "setpoint", size, GOAL))
-    shapes += [_solid(tube.name, "world", [wall(tube, GLASS, 24)]) for tube in scene.pipes]
-    shapes += _obstacles(bodies, {tube.name for tube in scene.pipes})
+    shapes += [_solid(tube.name, "world", [wall(tube, GLASS, 24)]) for tube in scene.tubes]
+    shapes += _obstacles(bodies, {tube.name for tube in scene.tubes})
     if len(path := poses["position"]) > 1:
         shapes.append(("path", LINE_STRIP, "world", 0.02, PATH, path))
     markers = [_marker(number, first_ns, *shape) for number, shape in enumerate(shapes)]

@@ -90,9 +90,9 @@ def _unknown_clearance(flight: Flight) -> list[str]:
     try:
         obstacles(flight.scene, touch=flight.mission.touched)
     except BadInputError as error:
-        return [f"{UNKNOWN} all bodies but declared pipes: {error}."]
+        return [f"{UNKNOWN} all bodies but declared tubes: {error}."]
     if not known(flight.scene):
-        return [f"{UNKNOWN} all bodies but declared pipes: MuJoCo is not installed."]
+        return [f"{UNKNOWN} all bodies but declared tubes: MuJoCo is not installed."]
     return []
 
 

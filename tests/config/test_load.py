@@ -202,7 +202,7 @@ def test_paths_start_at_the_file_that_names_them(tmp_path, monkeypatch):
     assert experiment.cloud.predictor.name == str(tmp_path / "still.py")
     assert experiment.mission.waypoints[0].position_m == (0.5, 0, 0.7)
     assert experiment.world.robot == experiment.world.scene == str(tmp_path / "mine.xml")
-    assert load_scene(experiment.world.scene).pipes == load_scene("pipes").pipes
+    assert load_scene(experiment.world.scene).tubes == load_scene("pipes").tubes
     assert experiment.report.metrics == (str(tmp_path / "a.py"), "duration", str(links / "b.py"))
     assert again(experiment, links) == experiment
     texts = ["link.downlink.trace=trace.csv", "mission=../there.yaml"]

@@ -83,7 +83,7 @@ def test_samples_older_than_the_window_are_dropped(feed):
 
 
 def test_the_trail_is_coloured_by_the_clearance_from_the_pipes():
-    feed = FlightFeed(load_scene("pipes").pipes, hull_of("pelican"))
+    feed = FlightFeed(load_scene("pipes").tubes, hull_of("pelican"))
     feed.take(status(0.1, (0.5, 0.0, 0.7)), 1.0)
     feed.take(status(0.2, (0.505, 0.0, 0.7)), 1.1)  # too near to be a new point
     feed.take(status(0.3, (0.7, 0.0, 0.7)), 1.2)

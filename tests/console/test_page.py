@@ -213,7 +213,7 @@ def test_the_second_browser_reads_and_stop_works_under_load(browse, flight, page
 def test_the_first_view_shows_the_whole_mission(filled):
     page, _, _ = filled("paper")
     camera = page._server.initial_camera
-    pipes = load_scene("pipes").pipes
+    pipes = load_scene("pipes").tubes
     spots = [point.position_m for point in page._experiment.mission.waypoints]
     for pipe in pipes:
         along, wide = 0.5 * pipe.length * np.array(pipe.axis), (0.0, 0.0, pipe.outer)

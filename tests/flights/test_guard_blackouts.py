@@ -8,7 +8,7 @@ import pytest
 from cloudrc.faults import measures
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.schedule import FaultEvent, Schedule
-from cloudrc.geometry.clearance import pipe_index
+from cloudrc.geometry.clearance import tube_index
 from cloudrc.geometry.scene import load_scene
 from tests.conftest import nightly
 
@@ -30,7 +30,7 @@ def mid_pipe(*settings):
     """200 instants [s], evenly over the time in which the undisturbed robot is in a pipe."""
     flight = undisturbed(*settings)
     path = flight.trajectory()
-    pipes = pipe_index(load_scene("pipes"), [record.odometry.position for record in path])
+    pipes = tube_index(load_scene("pipes"), [record.odometry.position for record in path])
     ended = flight.events("done")[0].stamp_ns * 1e-9 - 0.1
     inside = [r.stamp_ns * 1e-9 for r, pipe in zip(path, pipes, strict=True) if pipe >= 0]
     early = [time for time in inside if time < ended]

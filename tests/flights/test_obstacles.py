@@ -105,11 +105,11 @@ def test_a_report_needs_neither_mujoco_nor_a_scene_that_compiles(flown_into, mon
     scene = Path(found.experiment.world.scene)
     scene.write_text(scene.read_text().replace('type="box"', 'type="bix"'))
     (note,) = clearance_notes(found)
-    assert "all bodies but declared pipes: " in note
+    assert "all bodies but declared tubes: " in note
     assert "mine.xml does not compile" in note
     monkeypatch.setitem(sys.modules, "mujoco", None)
     (note,) = clearance_notes(found)
-    assert note.endswith("all bodies but declared pipes: MuJoCo is not installed.")
+    assert note.endswith("all bodies but declared tubes: MuJoCo is not installed.")
 
 
 @pytest.mark.parametrize(

@@ -11,18 +11,18 @@ from cloudrc.config.hull import hull_of
 from cloudrc.geometry.clearance import (
     clearance,
     clearance_per_obstacle,
-    distance_to_pipe,
+    distance_to_tube,
     least_clearance,
-    pipe_index,
     place_points,
+    tube_index,
 )
 from cloudrc.geometry.obstacles import obstacles
-from cloudrc.geometry.scene import Pipe, load_scene
+from cloudrc.geometry.scene import Tube, load_scene
 
 PIPES = load_scene("pipes")
-TUBES = PIPES.pipes
+TUBES = PIPES.tubes
 FEW, DENSE = hull_of("pelican")
-ALONG_X = Pipe("pipe_x", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5.0, 0.662, 0.700)
+ALONG_X = Tube("pipe_x", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5.0, 0.662, 0.700)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
@@ -39,18 +39,18 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)
     ],
 )
 def test_distance_to_a_hollow_cylinder(point, distance):
-    found = distance_to_pipe(ALONG_X, np.array([point], dtype=float))
+    found = distance_to_tube(ALONG_X, np.array([point], dtype=float))
     assert found == pytest.approx([distance], abs=1e-9)
 
 
 def test_clearance_on_the_axis_is_that_of_the_plant():
     """Source: docs/reference/plant.md, "Clearance on the axis"."""
     for height, expected in ((0.8, (0.217, 0.326, 0.320)), (0.7, (0.246, 0.365, 0.320))):
-        at = [(*pipe.centre[:2], height) for pipe in PIPES.pipes]
+        at = [(*pipe.centre[:2], height) for pipe in PIPES.tubes]
         found = clearance(TUBES, at, [LEVEL] * 3, FEW)
         assert found == pytest.approx(expected, abs=2e-3)
         assert np.array_equal(np.diag(clearance_per_obstacle(TUBES, at, [LEVEL] * 3, FEW)), found)
-    for pipe in PIPES.pipes:  # along each pipe it is the same
+    for pipe in PIPES.tubes:  # along each pipe it is the same
         yaw = math.atan2(pipe.axis[1], pipe.axis[0])
         facing = (math.cos(yaw / 2), 0, 0, math.sin(yaw / 2))
         assert clearance(TUBES, pipe.centre, facing, FEW) == pytest.approx([0.320], abs=1e-3)
@@ -74,8 +74,8 @@ def test_points_are_those_of_the_plant_and_turn_with_the_robot():
 def test_inside_a_pipe_is_in_its_bore_and_between_its_ends():
     inside = [(-1, 2.5, 0.8), (-1, 0, 1.461), (5.66, -6.42, 0.8)]
     outside = [(-1, 2.501, 0.8), (-1, 0, 1.463), (0.5, 0, 0.7)]
-    assert pipe_index(PIPES, [*inside, *outside]).tolist() == [0, 0, 2, -1, -1, -1]
-    assert set(pipe_index(load_scene("empty"), inside)) == {-1}
+    assert tube_index(PIPES, [*inside, *outside]).tolist() == [0, 0, 2, -1, -1, -1]
+    assert set(tube_index(load_scene("empty"), inside)) == {-1}
 
 
 @settings(max_examples=30, deadline=None)

@@ -1,15 +1,16 @@
-"""Pipes, board and floor are read from a scene file; the error names an invalid number."""
+"""Tubes, plates and floor are read from a scene file; the error names an invalid number."""
 
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.scene import Board, Scene, load_scene
+from cloudrc.geometry.scene import Plate, Scene, load_scene
 
 
 def test_a_shipped_scene_is_read():
     scene = load_scene("pipes")
-    assert [pipe.name for pipe in scene.pipes] == ["pipe_1", "pipe_2", "pipe_3"]
-    assert (scene.board, scene.floor) == (Board(8.535, (-6.82, -6.02), (0.025, 1.225)), 0)
+    assert [tube.name for tube in scene.tubes] == ["pipe_1", "pipe_2", "pipe_3"]
+    board = Plate("board", 8.535, (-6.82, -6.02), (0.025, 1.225))
+    assert (scene.plates, scene.floor) == ((board,), 0)
     assert load_scene("empty") == Scene("empty", own_fence=load_scene("pipes").own_fence)
 
 
@@ -21,12 +22,15 @@ def scene_file(folder, numbers, world=""):
 
 def test_a_scene_of_ones_own_is_read(tmp_path):
     numbers = (
-        '<numeric name="pipe_a" data="0 0 1  0 3 4  2 .5 .6"/>'
+        '<numeric name="duct" data="0 0 1  0 3 4  2 .5 .6"/>'
+        '<numeric name="matrix" data="1 0 0  0 1 0  0 0 1"/>'
         '<numeric name="floor" data="-.1"/><numeric name="other" data="1 2"/>'
     )
-    scene = load_scene(scene_file(tmp_path, numbers, '<frame name="spawn" pos="1 2 3"/>'))
-    assert scene.pipes[0].axis == pytest.approx((0, 0.6, 0.8))
-    assert (scene.name, scene.floor, scene.board) == ("mine", -0.1, None)
+    world = '<frame name="spawn" pos="1 2 3"/><body name="hall"><body name="duct"/></body>'
+    scene = load_scene(scene_file(tmp_path, numbers, world))
+    assert [tube.name for tube in scene.tubes] == ["duct"], "only a shape that a body has"
+    assert scene.tubes[0].axis == pytest.approx((0, 0.6, 0.8))
+    assert (scene.name, scene.floor, scene.plates) == ("mine", -0.1, ())
     assert scene.spawn == (1, 2, 3)
 
 
@@ -34,6 +38,10 @@ def test_a_scene_of_ones_own_is_read(tmp_path):
     ("numbers", "reason"),
     [
         ('<numeric name="board" data="1 2 x 4 5"/>', "board: data must be 5 numbers"),
+        (
+            '<numeric name="pipe_1" data="0 0 0 1 0 0 5 .6"/>',
+            r"pipe_1: data must be 9 numbers \(a tube\) or 5",
+        ),
         ('<numeric name="pipe_1" data="0 0 0 1 0 0 5 .7 .6"/>', "0 < inner < outer"),
         ('<numeric name="floor" data="nan"/>', "floor: data must be 1 numbers"),
         ("<numeric", "not readable as XML"),
@@ -41,6 +49,6 @@ def test_a_scene_of_ones_own_is_read(tmp_path):
 )
 def test_bad_numbers_are_named(tmp_path, numbers, reason):
     with pytest.raises(BadInputError, match=r"scene mine\.xml: .*" + reason):
-        load_scene(scene_file(tmp_path, numbers))
+        load_scene(scene_file(tmp_path, numbers, '<body name="pipe_1"/><body name="board"/>'))
     with pytest.raises(BadInputError, match="spawn: data must be 3 numbers: '1 2'"):
         load_scene(scene_file(tmp_path, "", '<frame name="spawn" pos="1 2"/>'))

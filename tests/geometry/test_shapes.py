@@ -5,7 +5,7 @@ import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry import shapes
-from cloudrc.geometry.scene import Pipe
+from cloudrc.geometry.scene import Tube
 from cloudrc.geometry.shapes import Shapes, Surface
 from cloudrc.geometry.tubes import cut_open, rims, wall
 
@@ -76,7 +76,7 @@ def test_a_face_without_corner_is_refused():
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
 def test_a_tube_is_cut_open_towards_the_viewer(axis):
-    tube = Pipe("tube", (1.0, 2.0, 3.0), axis, 5.0, 0.6, 0.7)
+    tube = Tube("tube", (1.0, 2.0, 3.0), axis, 5.0, 0.6, 0.7)
     towards, colour = np.array([0.0, -0.6, 0.8]), (1.0, 1.0, 1.0, 1.0)
     cut = cut_open(tube, towards, colour, colour)
     for surface in (*cut, wall(tube, colour), *rims(tube, colour)):

@@ -10,7 +10,7 @@ from functools import cache
 from cloudrc.config.hull import hull_of
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Criteria, MissionConfig, Touch, Waypoint
-from cloudrc.geometry.scene import Board, Pipe, Scene
+from cloudrc.geometry.scene import Plate, Scene, Tube
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.metrics import Flight
 from cloudrc.record.columns import Recording
@@ -37,8 +37,8 @@ OPEN_AIR = Scene("empty")
 PELICAN = hull_of("pelican")
 ONE_PIPE = Scene(
     "pipe",
-    (Pipe("pipe_1", (4.5, 0.0, 1.0), (1.0, 0.0, 0.0), 5.0, 0.662, 0.7),),
-    Board(10.0, (-0.5, 0.5), (0.0, 1.5)),
+    (Tube("pipe_1", (4.5, 0.0, 1.0), (1.0, 0.0, 0.0), 5.0, 0.662, 0.7),),
+    (Plate("board", 10.0, (-0.5, 0.5), (0.0, 1.5)),),
 )
 
 

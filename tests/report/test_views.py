@@ -76,11 +76,11 @@ def test_the_scene_has_robot_pipes_board_and_path(flown):
     for marker in message.markers:
         assert marker.frame_locked, "it moves with its frame"
         markers[marker.ns, marker.header.frame_id].append(marker)
-    fixed = {(name, "world") for name in ("board", "path", *(pipe.name for pipe in scene.pipes))}
+    fixed = {(name, "world") for name in ("board", "path", *(pipe.name for pipe in scene.tubes))}
     moving = {("robot", "base_link"), ("estimate", "estimate"), ("setpoint", "setpoint")}
     assert markers.keys() == fixed | moving
     assert len({marker.id for marker in message.markers}) == len(message.markers)
-    for pipe in scene.pipes:
+    for pipe in scene.tubes:
         (tube,) = markers[pipe.name, "world"]
         points = np.array([(p.x, p.y, p.z) for p in tube.points]) - pipe.centre
         along = points @ np.array(pipe.axis)

@@ -37,7 +37,7 @@ def test_every_robot_compiles_in_every_scene(robot, scene, tmp_path, monkeypatch
     assert not list(tmp_path.iterdir()), "MuJoCo wrote a log"
 
 
-@pytest.mark.parametrize("pipe", load_scene("pipes").pipes, ids=lambda pipe: pipe.name)
+@pytest.mark.parametrize("pipe", load_scene("pipes").tubes, ids=lambda pipe: pipe.name)
 def test_staves_are_tangent_to_the_pipe(pipes, pipe):
     data = mujoco.MjData(pipes)
     mujoco.mj_kinematics(pipes, data)

@@ -17,7 +17,7 @@ from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.measures import Outcome, fly_safely, refused, scenario
 from cloudrc.faults.schedule import FaultEvent, Schedule, Way, generator
 from cloudrc.geometry.obstacles import fence_of
-from cloudrc.geometry.scene import Pipe, load_scene
+from cloudrc.geometry.scene import Tube, load_scene
 from cloudrc.messages import Command, GuardState, Vector
 from cloudrc.records import CommandApplied, Control, Fault
 from cloudrc.tunnel.handshake import BUSY_TEXT
@@ -171,7 +171,7 @@ def _invalid_values(outcome: Outcome, seed: int) -> None:
         outcome.true(f"{name}: the cause is reported", "impossible commands" in " ".join(causes))
         refused(outcome, flight, "range")
     for limit, changes in EXCESSIVE.items():
-        lie, harmless = _for_a_while(at, 1.0, changes), limit != "speed"  # it may hit a pipe
+        lie, harmless = _for_a_while(at, 1.0, changes), limit != "speed"  # it may hit a tube
         flight = FaultRun(Schedule(seed), honest=harmless, lies=[lie]).fly(40.0)
         measures.safe(outcome, flight)
         rejected = sum("impossible" in change.cause for change in flight.changes)
@@ -205,12 +205,12 @@ def _impossible(outcome: Outcome, seed: int) -> None:
     points: dict[str, Vector] = {
         "1 m behind a wall of the fence": (fence_of(scene).high[0] + 1.0, 0.0, 1.0),
         "far below the floor": (0.0, 0.0, -5.0),
-        "in the wall of a tube": _wall_of(scene.pipes[0]),
+        "in the wall of a tube": _wall_of(scene.tubes[0]),
     }
     others: dict[str, list[Any]] = {
         "NaN": [(0.0, 0.0, nan)],
         "a word": [(0.0, 0.0, "high")],
-        "behind a wall": [scene.pipes[0].centre, first],
+        "behind a wall": [scene.tubes[0].centre, first],
         "none at all": [],
         "10,001 waypoints": [first] * 10_001,
     }
@@ -232,7 +232,7 @@ def _impossible(outcome: Outcome, seed: int) -> None:
             outcome.true(f"{name}: offers another point", offered)
 
 
-def _wall_of(tube: Pipe) -> Vector:
+def _wall_of(tube: Tube) -> Vector:
     """Return a point inside the wall of a horizontal tube, at half of its length."""
     (x, y, z), (ax, ay, _), radius = tube.centre, tube.axis, 0.5 * (tube.inner + tube.outer)
     return (x - ay * radius, y + ax * radius, z)

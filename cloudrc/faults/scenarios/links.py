@@ -129,7 +129,7 @@ def _bursts(outcome: Outcome, seed: int) -> None:
         loss = f"link.both.loss={{bad_start: 0.005, bad_end: {1 / packets}}}"
         flight = FaultRun(Schedule(seed), "criteria.time_limit_s=150", loss).fly_mission(150.0)
         measures.safe(outcome, flight)
-        if packets < 50:  # else it hardly ever rests on the board for 4 s, and a leg may time out
+        if packets < 50:  # else it hardly ever rests on the body for 4 s, and a leg may time out
             measures.done(outcome, flight)
         outcome.true("the mission has ended", flight.mission.ended)
         text, busiest = f"bursts of {packets * 10} ms", measures.busiest_second(flight.changes)

@@ -15,8 +15,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from cloudrc.geometry.clearance import CLEARANCE_SHOWN, pipe_index
-from cloudrc.geometry.scene import Pipe
+from cloudrc.geometry.clearance import CLEARANCE_SHOWN, tube_index
+from cloudrc.geometry.scene import Tube
 from cloudrc.geometry.shapes import rotation
 from cloudrc.geometry.tubes import cut_open
 from cloudrc.metrics.flight import Array
@@ -62,7 +62,7 @@ def _panels(subject: Subject) -> list[str]:
 
 def caption(subject: Subject) -> str:
     """Return the figure's caption; it describes only what the flight has."""
-    tubes, panels = subject.flight.scene.pipes, _panels(subject)
+    tubes, panels = subject.flight.scene.tubes, _panels(subject)
     above = "path from above, waypoints numbered, the robot at its last pose in blue"
     above += ", tubes cut open" if tubes else ""
     above += ", obstacles above the robot dashed" if own_bodies(subject) else ""
@@ -144,7 +144,7 @@ def _draw_path(axes: Axes, subject: Subject, x: Array, y: Array) -> LineCollecti
 
 
 def _draw_top(axes: Axes, subject: Subject, position: Array) -> LineCollection | None:
-    for tube in subject.flight.scene.pipes:
+    for tube in subject.flight.scene.tubes:
         _draw_tube(axes, tube)
     coloured = _draw_path(axes, subject, position[:, 0], position[:, 1])
     for number, waypoint in enumerate(subject.flight.mission.waypoints, start=1):
@@ -160,7 +160,7 @@ def _draw_top(axes: Axes, subject: Subject, position: Array) -> LineCollection |
     return coloured
 
 
-def _draw_tube(axes: Axes, tube: Pipe) -> None:
+def _draw_tube(axes: Axes, tube: Tube) -> None:
     """Draw a tube from above, cut open along its axis: the bore, and the wall around it."""
     for surface in cut_open(tube, UP, BORE_RGBA, WALL_RGBA, station=tube.length):
         colour, zorder = (BORE, 1) if surface.rgba == BORE_RGBA else (GREY, 2)
@@ -222,12 +222,12 @@ def _draw_side(axes: Axes, subject: Subject, flown: Array, position: Array) -> N
     axes.set_ylabel("$z$ (m)")
 
 
-def _passages(subject: Subject, flown: Array, position: Array) -> list[tuple[Pipe, float, float]]:
-    """List each flight through a pipe: the pipe, and the distance flown to entry and exit [m]."""
-    inside = pipe_index(subject.flight.scene, position)
+def _passages(subject: Subject, flown: Array, position: Array) -> list[tuple[Tube, float, float]]:
+    """List each flight through a tube: the tube, and the distance flown to entry and exit [m]."""
+    inside = tube_index(subject.flight.scene, position)
     changes = np.flatnonzero(np.diff(inside, prepend=-1, append=-1))
     return [
-        (subject.flight.scene.pipes[inside[first]], float(flown[first]), float(flown[last - 1]))
+        (subject.flight.scene.tubes[inside[first]], float(flown[first]), float(flown[last - 1]))
         for first, last in pairwise(changes)
         if inside[first] >= 0
     ]
@@ -241,7 +241,7 @@ def _draw_clearance(axes: Axes, subject: Subject, flown: Array, position: Array)
     _draw_path(axes, subject, flown, clearance)
     axes.set_ylim(min(0.0, float(clearance.min())), CEILING)
     axes.set_xlim(0.0, max(float(flown[-1]), 1e-3))
-    rows = flight.inside if flight.scene.pipes else np.ones(len(clearance), dtype=bool)
+    rows = flight.inside if flight.scene.tubes else np.ones(len(clearance), dtype=bool)
     if rows.any():
         row = np.where(rows, clearance, np.inf).argmin()
         lowest = flown[row], clearance[row]

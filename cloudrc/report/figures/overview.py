@@ -87,7 +87,7 @@ class _Stage:
     def _places(self) -> Array:
         """Return the places that must be in the drawing [m], shape (n, 3)."""
         tubes = [
-            (np.array(each.centre), np.array(each.axis) * each.length) for each in self.scene.pipes
+            (np.array(each.centre), np.array(each.axis) * each.length) for each in self.scene.tubes
         ]
         ends = [centre + side * along for centre, along in tubes for side in (-0.5, 0.5)]
         found: list[Any] = [[self.scene.spawn], self.path, np.reshape(ends, (-1, 3))]
@@ -98,7 +98,7 @@ class _Stage:
     @property
     def has_shadow(self) -> bool:
         """Whether the path's shadow on the floor shows its height; tubes would hide it."""
-        return not (self.planar or self.scene.pipes)
+        return not (self.planar or self.scene.tubes)
 
     @property
     def shadow(self) -> Array:
@@ -118,12 +118,12 @@ class _Stage:
 
     def _front(self) -> Array | None:
         """Return the direction from the first tube to the spawn, from where tubes are seen."""
-        tubes = self.scene.pipes
+        tubes = self.scene.tubes
         return np.subtract(self.scene.spawn, tubes[0].centre) if tubes else None
 
     def _project(self, points: Array) -> Array:
         """Return `points` [m], shape (n, 3), and all tubes in the picture [m], shape (m, 2)."""
-        cut = [cut_open(tube, self.view.towards, TUBE, CUT) for tube in self.scene.pipes]
+        cut = [cut_open(tube, self.view.towards, TUBE, CUT) for tube in self.scene.tubes]
         walls = [surface.corners for surface in chain(*cut)]
         return self.view.project(np.concatenate([points, *walls]))
 
@@ -173,7 +173,7 @@ class _Stage:
                 found += glass(self.view, surface)
             else:
                 found += self.view.polygons([split(simplified(surface, self.dot))])
-        for tube in self.scene.pipes:
+        for tube in self.scene.tubes:
             found += self.view.polygons(cut_open(tube, self.view.towards, TUBE, CUT))
         return found
 
@@ -198,7 +198,7 @@ def caption(subject: Subject) -> str:
     """Return the caption of the figure."""
     stage = _Stage(subject)
     text = CAPTION
-    if subject.flight.scene.pipes:
+    if subject.flight.scene.tubes:
         text += " Tubes are cut open towards the reader."
     if stage.obstacles:
         text += " Obstacles in front of the path are translucent."

@@ -122,7 +122,7 @@ class Subject:
 
 def own_bodies(subject: Subject) -> list[Surface]:
     """Return the surfaces of a scene that are not those of tubes: the file gives their shape."""
-    tubes = {tube.name for tube in subject.flight.scene.pipes}
+    tubes = {tube.name for tube in subject.flight.scene.tubes}
     return [surface for surface in subject.shapes.scene if surface.body not in tubes]
 
 
