@@ -1,4 +1,4 @@
-"""The commands and the files in README.md, docs/experiment.md and docs/plugins.md work."""
+"""The commands and the files in README.md and in some pages of docs/ work."""
 
 import json
 import os
@@ -13,7 +13,7 @@ import pytest
 from tests.conftest import nightly
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", "docs/experiment.md", "docs/plugins.md")
+PAGES = ("README.md", "docs/experiment.md", "docs/plugins.md", "docs/scene.md")
 TEXT = "\n".join((ROOT / page).read_text() for page in PAGES)
 
 BLOCK = re.compile(r"(?:<!-- test: (\S+) -->\n)?```(\w+)\n(.*?)```", re.DOTALL)
@@ -24,6 +24,13 @@ LINES = [
     if language == "bash"
     for line in body.splitlines()
 ]
+REFUSED = [
+    (line.removeprefix("$ "), body.partition("\n")[2])
+    for _, language, body in BLOCK.findall(TEXT)
+    if language == "console"
+    for line in body.splitlines()[:1]
+]
+"""Commands that cloudrc refuses, with what it prints."""
 UNTESTED = {"", ". .venv/bin/activate", ".venv/bin/cloudrc up --console"}
 """Lines that are not run here; the last one runs until Ctrl-C, and tests/console tests it."""
 COMMANDS = [line for line in LINES if line not in UNTESTED]
@@ -97,6 +104,12 @@ def numbers_only(folder, monkeypatch):
     """Fly in this process and without figures, which is fast."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
+
+
+@pytest.mark.parametrize(("command", "printed"), REFUSED)
+def test_a_command_is_refused_as_the_page_shows(command, printed, folder):
+    done = execute(command, folder)
+    assert (done.returncode, done.stderr) == (2, printed)
 
 
 @pytest.mark.usefixtures("numbers_only")
