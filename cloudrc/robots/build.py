@@ -13,7 +13,7 @@ from cloudrc.config.overrides import build_plugin, check_plugin, default_paramet
 from cloudrc.config.robot import RobotFiles, find_robot, parameters
 from cloudrc.config.scene import steered_in
 from cloudrc.config.schema import PlugIn, World
-from cloudrc.config.shipped import file_of
+from cloudrc.config.shipped import ROBOT_FILE, file_of
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Vector
 from cloudrc.robots.onboard._airframe import thrust_to_weight
@@ -134,7 +134,10 @@ def _make_parts(world: World) -> Parts:
     robot, scene = find_robot(world.robot), file_of(world.scene)
     nominal, where = compile_model(robot.model, scene), f"{robot.model} in {scene}"
     choice = controller(robot, nominal)
-    plugin = plugins.find(KIND, choice.name)  # the build below uses the same import of the file
+    try:
+        plugin = plugins.find(KIND, choice.name)  # the build below uses the same import of the file
+    except BadInputError as error:
+        raise BadInputError(f"{_source_of(world, '')}: {error}") from error
     onboard = _build_onboard(world, where, choice, parameters(robot, world), nominal)
     true = compile_true(robot.model, scene, nominal, world.plant)
     if not robot.planar:
@@ -168,14 +171,24 @@ def _build_onboard(
 ) -> Onboard:
     """Build an onboard controller for a compiled `MjModel`; errors name the files in `where`."""
     choice = PlugIn.model_validate({**given, "name": choice.name})
-    keys = world.onboard.model_extra
-    if keys and (own := [each for each in check_plugin(KIND, choice) if each.path[0] in keys]):
-        listed = "; ".join(f"world.onboard.{problem}" for problem in own)
+    if found := check_plugin(KIND, choice):
+        listed = "; ".join(f"{_source_of(world, each.path[0])}.{each}" for each in found)
         raise BadInputError(f"{listed} (controller of {world.robot}: {choice.name})")
     try:
         return build_plugin(KIND, choice, model=model)  # type: ignore[no-any-return]
     except BadInputError as error:
-        raise BadInputError(f"{where}: {error}") from error
+        named = next((key for key in given if key in str(error)), None)
+        place = where if named is None else _source_of(world, named)
+        raise BadInputError(f"{place}: {error}") from error
+
+
+def _source_of(world: World, parameter: str) -> str:
+    """Return where a parameter of the onboard controller is set; "" asks for the controller."""
+    if parameter in (world.onboard.model_extra or {}):
+        return "world.onboard"
+    file = world.robot if world.robot.endswith(".xml") else f"{world.robot}/{ROBOT_FILE}"
+    tuning = find_robot(world.robot).tunings.get(world.tuning or "", ())
+    return f"{file}: tunings.{world.tuning}" if parameter in tuning else f"{file}: onboard"
 
 
 def _check_lift(world: World, where: str, model: Any) -> None:
