@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from math import ceil, floor
+from itertools import pairwise
+from math import ceil, dist, floor
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.errors import MissingPrerequisiteError
@@ -48,6 +49,7 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
             f"the carrot moves at {cap:.3g} instead of {carrot.speed_mps:g} m/s, because the guard "
             f"caps the speed; a value that fits: {fits}"
         )
+    yield from _fast_track(experiment)
     ages, echoes = simulate_ages(experiment)
     low_rates = list(_low_rates(experiment))
     yield from low_rates
@@ -152,6 +154,25 @@ def _time(experiment: ResolvedExperiment) -> Iterator[str]:
         )
     elif lasts > LONG:
         yield f"{what} {lasts:,.6g} s: this is {lasts / 3600:.3g} hours; give times in seconds"
+
+
+def _fast_track(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Yield a warning if the setpoints of a file move faster than the robot may."""
+    from cloudrc.assembly import build_plan
+
+    track, cap = build_plan(experiment).track, experiment.guard.speed_max_mps
+    speeds = [
+        (dist(start, position) / (end - begin), begin)
+        for (begin, start), (end, position) in pairwise(track)
+        if end > begin
+    ]
+    fastest, begin = max(speeds, default=(0.0, 0.0))
+    if fastest > cap:
+        yield (
+            f"the setpoints of mission.setpoints move at {fastest:.3g} m/s after {begin:g} s, and "
+            f"the guard caps the speed at {cap:.3g} m/s: the robot falls behind, and the mission "
+            "ends with the last row, wherever the robot is"
+        )
 
 
 def _balance(experiment: ResolvedExperiment) -> Iterator[str]:

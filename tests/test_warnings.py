@@ -169,3 +169,14 @@ def test_a_hold_is_announced_if_and_only_if_the_guard_holds(conditions):
     settings = both(delay, jitter, **others)
     warned = any("guard" in text for text in advise(load_experiment("steps", settings)))
     assert warned == (numbers(fly("steps", *settings))["hold_count"] > 0)
+
+
+@pytest.mark.parametrize(("way", "words"), [(9, ["move at 7 m/s after 2 s", "at 6 m/s"]), (2, [])])
+def test_setpoints_that_are_faster_than_the_robot_are_named(way, words, tmp_path):
+    (tmp_path / "d.csv").write_text(f"time_s,x_m,y_m,z_m\n0,0,0,1\n2,2,0,1\n3,{way},0,1\n")
+    flown = load_experiment(
+        "hover", [f"mission.setpoints={tmp_path / 'd.csv'}", "mission.waypoints=[]"]
+    )
+    text = " ".join(advise(flown))
+    assert ("mission.setpoints" in text) == bool(words)
+    assert all(word in text for word in words)
