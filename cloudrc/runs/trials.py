@@ -11,7 +11,7 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.errors import BadInputError
 from cloudrc.renamed import new_key
 from cloudrc.runs import flight, stability
-from cloudrc.runs.experiment import load, refuse_seed
+from cloudrc.runs.experiment import check_world, load, refuse_seed
 from cloudrc.runs.margin import (
     LIMIT_MAX,
     STEPS_MAX,
@@ -125,6 +125,7 @@ class Trials:
         settings = [*asked.settings, f"{asked.key}={self.value(number):.12g}"]
         try:
             experiment = load(asked.experiment, settings)
+            check_world(experiment.world)
         except BadInputError as error:
             return None, str(error)
         given = [text.partition("=")[0].strip() for text in settings]

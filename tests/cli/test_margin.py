@@ -47,6 +47,10 @@ def uplink(limit):
         # The experiment allows no loss above 1: that is no failure of the loop.
         ("link.uplink.loss --resolution 0.3", lambda found: True, 0,
          "settles up to 0.9, the largest value possible: --set: link.uplink.loss: 1.2:"),
+        # Nor is a robot too heavy to lift off.
+        ("world.plant.payload_kg --set world.robot=nano --resolution 0.004 --max 0.05 --seeds 1",
+         lambda found: True, 0,
+         "settles up to 0.012, the largest value possible: world.plant: the thrust-to-weight"),
         # A large value is flown with all digits.
         ("link.uplink.rate_kbit --max 1234567 --resolution 1 --seeds 1",
          lambda found: found.uplink.rate_kbit <= 1234567, 0, "settles up to 1234567,"),
