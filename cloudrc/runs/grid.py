@@ -265,7 +265,13 @@ def _resolve(experiment: str, entries: Iterable[_Entry]) -> ResolvedExperiment:
         source = settings["seed",].source
         raise BadInputError(f"{source.label}: seed: give the seeds with the key 'seeds'")
     resolved = load_experiment(experiment, settings)
-    check_world(resolved.world)
+    try:
+        check_world(resolved.world)
+    except BadInputError as error:
+        key = str(error).partition(": ")[0]
+        if setting := settings.get(tuple(key.split("."))):
+            raise BadInputError(f"{setting.source.label}: {error}") from error
+        raise
     own = resolved.report.metrics
     reuse(("metrics", own), lambda: metrics.check(own))
     return resolved

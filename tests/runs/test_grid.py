@@ -132,6 +132,7 @@ def test_relative_paths_start_at_the_file(write_sweep, tmp_path, monkeypatch):
         ({"grid": {"link.both.delay_ms": []}}, "grid.link.both.delay_ms: must be a list of values"),
         ({"grid": {"gains": {"low": 3}}}, "grid.gains: must be a list of values, or names"),
         ({"grid": {"cloud.predictor": ["last_sampl"]}}, "did you mean last_sample?"),
+        ({"grid": {"world.onboard.tilt": [1, 2]}}, "world.onboard.tilt: unknown key; known here"),
         ({"set": {"seed": 1}}, "seed: give the seeds with the key 'seeds'"),
         ({"grid": {"duration": {"one": {}}}}, "grid.duration: is the name of another column"),
         ({"grid": {"link.uplink.x": [1], "link.both.x": [1]}}, "link.both.x: is set twice"),
