@@ -65,6 +65,15 @@ class InterruptedRunError(CloudrcError):
     exit_code = 130
 
 
+_NO_MEMORY = ("could not allocate", "failed to map segment")
+"""Words of MuJoCo and of the loader of libraries if memory ran out, in lower case."""
+
+
+def tells_no_memory(text: str) -> bool:
+    """Return whether the text of an error says that memory ran out."""
+    return any(words in text.lower() for words in _NO_MEMORY)
+
+
 def machine_error(error: BaseException) -> MissingPrerequisiteError | None:
     """Return the error to report if the machine has raised `error`; None for all other errors.
 
@@ -79,7 +88,7 @@ def machine_error(error: BaseException) -> MissingPrerequisiteError | None:
         where = f"{error.filename}: " if error.filename else ""
         text = to_one_line(f"{where}{error.strerror or error}")
         return MissingPrerequisiteError(f"{text}; check disk, path and permissions")
-    if isinstance(error, MemoryError):
+    if isinstance(error, MemoryError) or tells_no_memory(describe_error(error)):
         return MissingPrerequisiteError(
             f"memory ran out ({describe_error(error)}); use fewer processes, or free some memory"
         )

@@ -15,6 +15,7 @@ from cloudrc.errors import (
     CloudrcError,
     DiskFullError,
     InterruptedRunError,
+    machine_error,
 )
 from cloudrc.files import naming
 from cloudrc.runs.leave import limit_exit
@@ -84,5 +85,7 @@ def _explain(error: Exception) -> tuple[str, int]:
             return str(full), full.exit_code
         remedy = "check the path, and whether you have access to it ('--debug' shows where)"
         return f"{where}{error.strerror or error}; {remedy}", BadInputError.exit_code
+    if failure := machine_error(error):
+        return str(failure), failure.exit_code
     kind, text = type(error).__name__, " ".join(str(error).split())
     return f"internal error: {kind}: {text}; '--debug' shows where, please report it", INTERNAL

@@ -17,6 +17,7 @@ from cloudrc.errors import (
     CloudrcError,
     MissingPrerequisiteError,
     OutOfMemoryError,
+    tells_no_memory,
 )
 from cloudrc.geometry.fence import Corners
 from cloudrc.geometry.model_files import model_files
@@ -60,8 +61,6 @@ _SHAPES: dict[Any, Shape] = {
     _GEOM.mjGEOM_MESH: "hull",
 }
 """Type of a geom -> shape of its solid; all other types become the box around the geom."""
-NO_MEMORY = "could not allocate"
-"""Words of all of MuJoCo's messages about a lack of memory, in lower case."""
 ROBOT_BITS = 1
 """Value of contype and conaffinity of the robot's geoms."""
 
@@ -81,7 +80,7 @@ def compile_error(what: str, error: Exception) -> CloudrcError:
     MuJoCo reports a lack of memory as an error of the file. It says nothing about the file.
     """
     reason = " ".join(str(error).split())
-    if NO_MEMORY in reason.lower():
+    if tells_no_memory(reason):
         text = f"memory ran out: {what} could not be compiled"
         return OutOfMemoryError(f"{text}; use fewer processes, or free some memory")
     return BadInputError(f"{what} does not compile: {reason}")

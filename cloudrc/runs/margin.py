@@ -120,7 +120,9 @@ def present_value(experiment: ResolvedExperiment, key: str) -> int | float | Non
         value["world"]["onboard"] = onboard_values(experiment.world)
     for name in names:
         value = child(value, name)
-    if isinstance(value, str | bool | dict | list):
+    if isinstance(value, list):
+        raise BadInputError(f"{key}: is a list; name one of its numbers, such as {key}.0")
+    if isinstance(value, str | bool | dict):
         raise BadInputError(f"{key}: is no number; name a key such as link.both.delay_ms")
     if choices := _choices(experiment, names):
         listed = ", ".join(map(str, choices))

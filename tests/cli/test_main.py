@@ -68,6 +68,7 @@ def test_a_wrong_command_line_is_one_line_of_error(line, words, refused):
         (InvalidRunError("fell behind"), 6, "fell behind"),
         (PermissionError(13, "Not allowed", "/x"), 2, "/x: Not allowed; check the path"),
         (OSError(28, "No space left on device"), 3, "disk_full: a file: free some space"),
+        (RuntimeError("Could not allocate memory"), 3, "memory ran out (RuntimeError: Could not"),
         (ZeroDivisionError("two\nlines"), INTERNAL, "ZeroDivisionError: two lines"),
     ],
 )

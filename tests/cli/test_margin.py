@@ -137,7 +137,10 @@ def test_the_end_of_the_limits_is_no_failure_of_the_loop(fly_with, call):
         ("seed", "seed: each flight has its own seed"),
         (f"{KEY} --set seed=2", "seed: each flight has its own seed"),
         ("link.profile", "is no number; name a key such as"),
-        ("cloud.controller.gain_p", "is no number; name a key such as"),
+        (
+            "cloud.controller.gain_p",
+            "is a list; name one of its numbers, such as cloud.controller.gain_p.0",
+        ),
         ("world.odometry_rate_hz", "allows only 20, 25, 50, 100, 125, 250, 500; fly a sweep"),
         ("link.uplink.rate_kbit", "has no value now; name the largest one to try with --max"),
         ("cloud.command_rate_hz --resolution 0.3", "cloud.command_rate_hz: 99.9: must be"),
