@@ -206,9 +206,9 @@ def job_log(name):
     return kubectl("logs", runs[0]["metadata"]["name"]) if runs else ""
 
 
-def fly(name, waypoints, limit=60.0):
-    """Start a Job that flies waypoints, as `cloudrc mission run` does."""
-    mission = {"name": name, "time_limit_s": limit, "waypoints": list(waypoints)}
+def fly(name, waypoints, limit=60.0, **keys):
+    """Start a Job that flies waypoints, as `cloudrc mission run` does; `keys` of the mission."""
+    mission = {"name": name, "time_limit_s": limit, "waypoints": list(waypoints), **keys}
     run_job(place(), mission, name=name)
 
 

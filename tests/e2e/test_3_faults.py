@@ -30,7 +30,8 @@ from tests.e2e.conftest import (
     value,
 )
 
-PIPES = load_experiment("paper").mission.model_dump(mode="json")["waypoints"]
+MISSION = load_experiment("paper").mission.model_dump(mode="json")
+PIPES = {name: MISSION[name] for name in ("waypoints", "touch")}
 ENDS_IN = 2.0
 """Time limit for a deleted pod to end, and for its robot to hold [s].
 Source: docs/reference/faults.md, "F33"."""
@@ -54,7 +55,7 @@ def guard():
 
 
 def fly_until(name, line, limit=120.0):
-    fly(name, PIPES, limit)
+    fly(name, **PIPES, limit=limit)
     eventually(lambda: line in job_log(name), f"{name}: {line}", 90.0)
 
 
@@ -122,7 +123,7 @@ def test_a_mission_whose_job_is_deleted_is_cancelled(installed):
     kubectl("delete", "job", "leaderless")
     assert guard() == "TRACK", "the mission ends with its lease"
     eventually(lambda: guard() == "HOLD", "the robot holds", LEASE + 10.0)
-    fly("successor", PIPES, 120.0)
+    fly("successor", **PIPES, limit=120.0)
     check_completed("successor")
 
 
