@@ -20,7 +20,7 @@ VELOCITIES = st.tuples(*[st.sampled_from([-1e3, -2.0, 0.0, 0.5, 9.0])] * 3)
 # Allowed changes of the state (from, to) for each event.
 ALLOWED = {
     "start": set(),
-    "end": {(TRACK, HOLD)},
+    "end": {(TRACK, HOLD), (HOLD, HOLD)},  # a HOLD without a mission has a cause of its own
     "stop": {(state, ESTOP) for state in (GROUND, TRACK, HOLD, LAND)},
     "acknowledge": {(LAND, GROUND), (ESTOP, GROUND)},
     "spawn": {(state, GROUND) for state in GuardState},
