@@ -44,7 +44,6 @@ Place = Annotated[
 NotNegative = Annotated[float, Field(ge=0)]
 NotNegatives = tuple[NotNegative, NotNegative, NotNegative]
 Positive = Annotated[float, Field(gt=0)]
-Positives = tuple[Positive, Positive, Positive]
 _Constant = Annotated[float, Field(gt=0, le=30)]
 _DeadTime = Annotated[float, Field(ge=0, le=5)]
 Constants = tuple[_Constant, _Constant, _Constant]

@@ -24,6 +24,7 @@ Rgba: TypeAlias = tuple[float, float, float, float]
 SHAPES_FILE = "shapes.npz"
 """Name of the attachment of a recording."""
 _UNREADABLE = ValueError, KeyError, IndexError, OSError, EOFError, BadZipFile, zlib.error
+"""What reading a damaged attachment raises."""
 SIDES = 20
 """Number of corners of a circle; a multiple of 4."""
 
@@ -101,15 +102,7 @@ class Shapes:
         try:
             with np.load(BytesIO(data), allow_pickle=False) as file:
                 return _read({name: file[name] for name in file.files})
-        except (
-            ValueError,
-            KeyError,
-            IndexError,
-            OSError,
-            EOFError,
-            BadZipFile,
-            zlib.error,
-        ) as error:
+        except _UNREADABLE as error:
             raise BadInputError(
                 f"the recording's {SHAPES_FILE} is not readable; use the original recording"
             ) from error
