@@ -39,14 +39,3 @@ class Body(Model):
         stamp_ns = self.basis.stamp_ns + round(self.horizon * 1e9)
         orientation = rotate_ahead(orientation, rate, self.horizon)
         return _new(Odometry, (stamp_ns, self.position, orientation, self.velocity, rate))
-
-
-def approach(reference: Vector, wanted: Vector, change_max: float) -> Vector:
-    """Change the velocity `reference` towards `wanted`, by at most `change_max`, all [m/s]."""
-    (ax, ay, az), (bx, by, bz) = reference, wanted
-    x, y, z = bx - ax, by - ay, bz - az
-    square = x * x + y * y + z * z
-    if square <= change_max * change_max:
-        return wanted
-    share = change_max / square**0.5
-    return (ax + share * x, ay + share * y, az + share * z)

@@ -16,10 +16,11 @@ from cloudrc.config.robot import RobotFiles, find_robot
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of
 from cloudrc.geometry.shapes import Surface
+from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Vector
 from cloudrc.robots.build import build_robot, controller, onboard_values
 from cloudrc.robots.onboard._airframe import thrust_to_weight
-from cloudrc.world.guard.limits import REACTION, step_towards
+from cloudrc.world.guard.limits import REACTION
 from cloudrc.world.robot import STEP, Robot
 from cloudrc.world.scene import ROBOT_PREFIX, compile_model
 from cloudrc.world.shapes import read_shapes, shapes_of

@@ -12,12 +12,13 @@ from math import ceil, exp, inf
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from cloudrc.cloud.motion import Body, approach
+from cloudrc.cloud.motion import Body
 from cloudrc.cloud.predictors._history import COUNT, PERIOD_NS, Replay
 from cloudrc.config.document import read_document
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotFacts
 from cloudrc.config.schema import Constants, DeadTimes, NotNegatives, Positive
 from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Command, Odometry, Vector
 
 Axes: TypeAlias = tuple[Vector, ...]
@@ -51,7 +52,7 @@ class FirstOrder(Body):
 
     def _step(self, command: Vector, dt: float) -> None:
         before = self._reference
-        self._reference = approach(before, command, self._acceleration_max * dt)
+        self._reference = step_towards(before, command, self._acceleration_max * dt)
         axes = []
         for a, b, late, v, p, (constant, dead, gain) in zip(
             before, self._reference, self._delayed, self.velocity, self.position, self._axes,

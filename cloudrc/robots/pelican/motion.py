@@ -16,8 +16,9 @@ from collections.abc import Callable
 from functools import partial
 from math import ceil, sqrt
 
-from cloudrc.cloud.motion import Body, approach
+from cloudrc.cloud.motion import Body
 from cloudrc.config.schema import NotNegative, NotNegatives, Positive
+from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Odometry, Vector
 from cloudrc.robots.pelican.low_level import (
     GAIN_D,
@@ -106,7 +107,7 @@ class WhiteBox(Body):
         (nx, ny), (qx, qy), (tx, ty), (cx, cy) = self._axis, self._rate, self._torque, self._trim
         thrust, last = self._thrust, self._reference
         for _ in range(steps):
-            reference = approach(last, command, self._acceleration_max * h)
+            reference = step_towards(last, command, self._acceleration_max * h)
             if z < LOW_HEIGHT or reference[2] < 0.0:
                 reference = _limit(reference, last, z, vz)
             # The thrust pushes along its axis, the drag acts across it.

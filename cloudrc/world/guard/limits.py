@@ -113,17 +113,6 @@ def within(velocities: Iterable[Vector], most: float) -> bool:
     return all(abs(x) <= most and abs(y) <= most and abs(z) <= most for x, y, z in velocities)
 
 
-def step_towards(start: Vector, end: Vector, step: float) -> Vector:
-    """Move a velocity from `start` towards `end` by at most `step`, all in [m/s]."""
-    (ax, ay, az), (bx, by, bz) = start, end
-    x, y, z = bx - ax, by - ay, bz - az
-    square = x * x + y * y + z * z
-    if square <= step * step:
-        return end
-    share = step / sqrt(square)
-    return (ax + share * x, ay + share * y, az + share * z)
-
-
 def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
     """Return the velocity `after`, slowed so that the speed grows by at most `step` [m/s].
 

@@ -48,6 +48,7 @@ from math import inf
 from cloudrc.config.load import ResolvedGuard
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits
 from cloudrc.geometry.fence import Fence
+from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import (
     NEVER_NS,
     PLAN_STEP_NS,
@@ -335,7 +336,7 @@ class Guard:
             self._take_off.look(readings, self._flies)
         if now_ns <= self._track_until_ns:
             change_max = self.acceleration_max * dt
-            reference = rules.step_towards(self.reference, self._wanted, change_max)
+            reference = step_towards(self.reference, self._wanted, change_max)
         else:
             self._look_after_itself(now_ns, readings)
             if not self._flies:

@@ -116,15 +116,6 @@ def test_limit_length_keeps_a_vector_of_the_allowed_length():
     assert rules.limit_length(longer, 1.0) == longer  # rounding makes its length 1.0 again
 
 
-@pytest.mark.parametrize("step", [1e-9, 0.024, 3.0])
-def test_step_towards_moves_by_at_most_a_step(step):
-    far = rules.step_towards((1.0, 1.0, 1.0), (4.0, 1.0, 5.0), step)
-    assert far == pytest.approx((1 + 0.6 * step, 1, 1 + 0.8 * step), rel=1e-12)
-    for share in (0.5, 1.0):
-        end = (share * step, 0.0, 0.0)
-        assert rules.step_towards(ZERO, end, step) is end
-
-
 @given(SPEEDS, PLACES)
 @MANY
 def test_limit_to_fence_lets_the_robot_stop_before_each_face(velocity, position):
