@@ -171,7 +171,7 @@ def _fast_track(experiment: ResolvedExperiment) -> Iterator[str]:
         yield (
             f"the setpoints of mission.setpoints move at {fastest:.3g} m/s after {begin:g} s, and "
             f"the guard caps the speed at {cap:.3g} m/s: the robot falls behind, and the mission "
-            "ends with the last row, wherever the robot is"
+            "fails if the robot is not at the last row in time"
         )
 
 

@@ -46,9 +46,12 @@ class FlightView:
     All times are those of the report: since the mission's start, on world's clock.
     """
 
-    def __init__(self, stream: TextIO, waypoints: int) -> None:
-        """Set the stream and the number of waypoints (0: unknown); show a status line at once."""
-        self._stream, self._waypoints = stream, waypoints
+    def __init__(self, stream: TextIO, waypoints: int, unit: str = "waypoint") -> None:
+        """Set the stream and the number of waypoints (0: unknown); show a status line at once.
+
+        `unit` is what the mission counts; "": nothing.
+        """
+        self._stream, self._waypoints, self._unit = stream, waypoints, unit
         self._first_ns = self._now_ns = self._start_ns = NEVER_NS
         self._mission = 0  # number of the mission in the newest telemetry
         self._began = self._seen = monotonic()
@@ -101,12 +104,11 @@ class FlightView:
         if self._ended and monotonic() - self._seen > REPORT_AFTER:
             return Text("the mission is over: writes the report")
         elapsed, flown = self._seen - self._began, (self._now_ns - self._first_ns) * 1e-9
-        number = self._waypoint + 1
         since = self._now_ns - self._start_ns if self._start_ns != NEVER_NS else 0
         cells = (
             f"{since * 1e-9:6.1f} s",
             f"{self._guard.name:<6}",
-            f"waypoint {number}{f'/{self._waypoints}' * bool(self._waypoints)}" if number else "",
+            self._leg(),
             self._place(),
             "" if math.isnan(self._delay) else f"delay {self._delay * 1e3:3.0f} ms",
             f"x{flown / elapsed:.2f}" if elapsed > 0 and flown > 0 else "",
@@ -115,6 +117,12 @@ class FlightView:
         colour = "green" if self._guard == GuardState.TRACK else "yellow"
         line.highlight_words([self._guard.name], colour)
         return line
+
+    def _leg(self) -> str:
+        number = self._waypoint + 1
+        if not (number and self._unit):
+            return ""
+        return f"{self._unit} {number}{f'/{self._waypoints}' * bool(self._waypoints)}"
 
     def _place(self) -> str:
         # Round first, then add 0.0: that turns a negative zero into a positive one.

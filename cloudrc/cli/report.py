@@ -78,7 +78,7 @@ def summary(report: Mapping[str, Any], folder: Path) -> str:
     from cloudrc.report.page import main_numbers
 
     outcome, failures = report["verdict"], report["failures"]
-    first = failures[0]["text"] if failures else "every waypoint reached, every criterion met"
+    first = failures[0]["text"] if failures else f"{_goal(report)}, every criterion met"
     lines = ["", f"{paint(outcome.upper(), COLOURS[outcome])}: {escape(first)}"]
     for failure in failures[1:]:
         when = f" (at {failure['time']:.2f} s)" if "time" in failure else ""
@@ -96,6 +96,13 @@ def summary(report: Mapping[str, Any], folder: Path) -> str:
     how = f"pip install 'cloudrc[console]', then cloudrc replay {folder}"
     replay = f"replay in 3-D: {how if missing('console') else f'cloudrc replay {folder}'}"
     return "\n".join([*lines, "", escape(replay), escape(str(folder / "report.html"))])
+
+
+def _goal(report: Mapping[str, Any]) -> str:
+    """Return what the robot has done in a mission that succeeded."""
+    if (end := report["numbers"].get("final_error")) is not None:
+        return f"setpoints flown to their end, {end['value']:.2f} m from the last one"
+    return "every step flown" if "steps" in report else "every waypoint reached"
 
 
 def print_traceback(options: argparse.Namespace, report: Mapping[str, Any]) -> None:

@@ -112,17 +112,16 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
     warn(experiment)
     in_cluster, for_programs = mode == "cluster", options.output != "table"
     stream = sys.stderr if for_programs else sys.stdout
-    count = experiment.mission.count
     # First prepare the flight: if that fails, no folder must be left.
     if in_cluster:
         flight = _cluster_flight(experiment, options, stream)
     else:
-        flight = _local_flight(experiment, mode, stream, 0 if ready else count, ready)
+        flight = _local_flight(experiment, mode, stream, ready)
     name = f"{experiment.name}-{'session' if ready else mode}-seed{experiment.seed}"
     folder = new_folder(options.out, name, "" if in_cluster else "latest")
     if not for_programs:
         facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
-        flown = "session" if ready else "1 waypoint" if count == 1 else f"{count} waypoints"
+        flown = "session" if ready else experiment.mission.contents
         print_or_drop(escape(f"{experiment.name}: {facts}, {flown}"))
     try:
         report = flight(folder)
@@ -145,7 +144,7 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
 
 
 def _local_flight(
-    experiment: ResolvedExperiment, mode: str, stream: TextIO, waypoints: int, ready: Ready | None
+    experiment: ResolvedExperiment, mode: str, stream: TextIO, ready: Ready | None
 ) -> Flight:
     """Return a function that flies on this machine and shows the progress on `stream`.
 
@@ -159,7 +158,9 @@ def _local_flight(
         if stream is sys.stderr and not is_live(stream):
             return fly(experiment, mode, folder)
         with contextlib.ExitStack() as stack:
-            view = stack.enter_context(contextlib.closing(FlightView(stream, waypoints)))
+            mission = experiment.mission
+            counted = (0, "waypoint") if ready else (mission.count, mission.unit)
+            view = stack.enter_context(contextlib.closing(FlightView(stream, *counted)))
             session = partial(ready, folder, view.say, stack) if ready else None
             return fly(experiment, mode, folder, view.see, session=session)
 

@@ -9,6 +9,7 @@ loading the file.
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import PurePath
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
@@ -325,7 +326,8 @@ class MissionConfig(Section):
     """Random setpoints in place of waypoints"""
     setpoints: str | None = None
     """CSV file with the columns time_s,x_m,y_m,z_m, in place of waypoints: the position of the
-    setpoint over time, with straight lines between the rows. A robot on the ground needs no z_m. A
+    setpoint over time, with straight lines between the rows. A robot on the ground needs no z_m.
+    The mission ends with the last row; the robot must then be within criteria.settle_m of it. A
     drive by hand writes such a file, drive.csv"""
     carrot: Carrot | None = None
     """Moves the setpoint at limited speed from waypoint to waypoint; null: the setpoint jumps"""
@@ -336,6 +338,18 @@ class MissionConfig(Section):
     def touched(self) -> str | None:
         """Name of the body that the robot has to touch; None without one."""
         return self.touch.body if self.touch else None
+
+    @property
+    def contents(self) -> str:
+        """What the mission flies, in words, such as "7 waypoints"."""
+        if self.setpoints:
+            return f"setpoints of {PurePath(self.setpoints).name}"
+        return f"{self.count} {self.unit}{'s' * (self.count != 1)}"
+
+    @property
+    def unit(self) -> str:
+        """What a mission counts: "waypoint" or "step"; "" for a file of setpoints."""
+        return "" if self.setpoints else "step" if self.steps else "waypoint"
 
     @property
     def count(self) -> int:
@@ -552,9 +566,9 @@ class Criteria(Section):
     """Conditions for the success of a flight."""
 
     settle_m: Positive | None = 0.15
-    """Largest distance from the setpoint in the last 0.5 s of each random step [m]. An oscillation
-    that does not decay fails a mission, too, with or without random steps. null: neither distance
-    nor oscillation is judged"""
+    """Largest distance from the setpoint in the last 0.5 s of each random step, and from the last
+    setpoint of a file when the mission ends [m]. An oscillation that does not decay fails a
+    mission, too, with or without random steps. null: neither distance nor oscillation is judged"""
     time_limit_s: TimeLimit | None = None
     """Time limit of the mission [s], counted from its start; after this time the mission fails.
     null: 3 times the expected time, but at least 60 s"""

@@ -10,8 +10,8 @@ import numpy as np
 from cloudrc.config.schema import Waypoint
 from cloudrc.geometry.scene import is_obstacle
 from cloudrc.metrics.definitions import Holds
-from cloudrc.metrics.flight import Array, Flight, Measure, add_metrics, mean, select
-from cloudrc.rounding import differences
+from cloudrc.metrics.flight import Array, Flight, Measure, add_metrics, finite, mean, select
+from cloudrc.rounding import differences, exceeds
 
 IMPACT_NS = 100_000_000
 """Time from the first touch over which the impulse is summed [ns]: the impact and its bounces."""
@@ -29,6 +29,8 @@ SETTLING_NS = 10_000_000_000
 is no steady error.
 Source: docs/reference/control.md, "Steady state": the slowest variant that settles needs 8 to 15 s
 to stay within 1 cm."""
+FLOWN_TO_THE_END = "done", "leg_timed_out"
+"""Events that end a mission with a file of setpoints after its last row."""
 FAILURES = ("estimator_failed", "predictor_failed", "controller_failed", "horizon_clamped")
 """Counters of cloud that are included in the number of faults."""
 
@@ -69,10 +71,37 @@ def reported(flight: Flight) -> dict[int, int]:
 def _waypoints_reached(flight: Flight) -> float | None:
     """Count the waypoints that teleop reported as reached and the true position confirms."""
     stamps, points = reported(flight), flight.mission.waypoints
-    if flight.mission.steps or flight.mission.setpoints:  # they end after their time, anywhere
+    if flight.mission.steps:  # they end after their time, anywhere
         return flight.count(len(stamps))
+    if flight.mission.setpoints is not None:
+        return flight.count(len(stamps) and missed_end(flight) is None)
     known = (i for i in stamps if i < len(points))
     return flight.count(sum(_was_at(flight, points[i], stamps[i]) for i in known))
+
+
+def _final_error(flight: Flight) -> float | None:
+    """Measure how far the robot was from the last setpoint of a file at the mission's end [m]."""
+    if flight.mission.setpoints is None or flight.ending is None:
+        return None
+    end_ns, event, _ = flight.ending
+    control = flight.control
+    setpoints = control["setpoint"][(control["waypoint"] >= 0) & (control["stamp_ns"] <= end_ns)]
+    if event not in FLOWN_TO_THE_END or not len(setpoints):
+        return None
+    true = flight.true_position(np.array([end_ns]))[0]
+    return finite(float(np.linalg.norm(true - setpoints[-1])))
+
+
+def missed_end(flight: Flight) -> float | None:
+    """Return the distance from the last setpoint of a file [m] if it is above the tolerance.
+
+    As for a waypoint, the noise of the measured positions adds to the tolerance. None: it is not
+    above, or the mission has no such setpoint.
+    """
+    error, tolerance = _final_error(flight), flight.criteria.settle_m
+    if error is None or tolerance is None:
+        return None
+    return error if exceeds(error, tolerance + NOISE * flight.position_noise) else None
 
 
 def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
@@ -188,7 +217,10 @@ def _recorder_dropped(flight: Flight) -> float | None:
 add_metrics(
     "Mission",
     ("waypoints_reached", "1", "Number of waypoints at which the true position stayed within the "
-     "tolerance, plus 3 times the position noise, for the dwell time.", _waypoints_reached),
+     "tolerance, plus 3 times the position noise, for the dwell time. The last row of a "
+     "file of setpoints counts as one.", _waypoints_reached),
+    ("final_error", "m", "Distance from the last setpoint of a file to the true position when the "
+     "mission ended.", _final_error),
     ("obstacle_contacts", "1", "Number of contacts with obstacles. These are all bodies but the "
      "floor and, if the mission has to touch it, the board.",
      lambda flight: flight.count(len(obstacle_contacts(flight)["stamp_ns"]))),

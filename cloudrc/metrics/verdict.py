@@ -6,8 +6,9 @@ The first matching outcome of this list is the verdict:
 - `invalid`: the run had to keep real time but did not, so its numbers mean nothing.
 - `failure`: at least one criterion of success is not met. Each such criterion is listed with time
   and place.
-- `success`: all waypoints were reached within the time limit, the board was touched slowly enough,
-  no pipe was touched, the guard was only in TRACK or HOLD, and world never restarted.
+- `success`: all waypoints, or the last setpoint of a file, were reached within the time limit, the
+  board was touched slowly enough, no pipe was touched, the guard was only in TRACK or HOLD, and
+  world never restarted.
 
 The same rules apply to two kinds of evidence. The report uses the recorded truth
 (`flight_evidence`). Teleop uses telemetry (`Observations`), which arrives late and contains less.
@@ -23,11 +24,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from cloudrc.config.schema import Touch
+from cloudrc.config.setpoints import describe_miss
 from cloudrc.errors import DISK_FULL, DiskFullError
 from cloudrc.messages import Cause, GuardState, Vector
 from cloudrc.metrics import Flight, Number
 from cloudrc.metrics.definitions import real_time_factor
-from cloudrc.metrics.mission import first_touch, obstacle_contacts, reported
+from cloudrc.metrics.mission import first_touch, missed_end, obstacle_contacts, reported
 from cloudrc.metrics.response import steps
 from cloudrc.record.columns import Recording
 from cloudrc.records import REAL_TIME_FACTOR_MIN
@@ -191,7 +193,7 @@ def flight_evidence(
         speed = float(np.linalg.norm(row["tip_velocity"]))
         touch = speed, _moment(flight, int(row["stamp_ns"]))
     return Evidence(
-        waypoints=flight.waypoints,
+        waypoints=0 if flight.mission.setpoints else flight.waypoints,
         reached=0 if reached is None else round(reached.value),
         wanted=flight.mission.touch,
         ending=_ending(flight, interrupted),
@@ -212,6 +214,7 @@ def _violations(flight: Flight) -> Iterator[FlightFailure]:
     yield from plugin_failures(flight.recording)
     if flight.criteria.settle_m is not None:
         yield from _responses(flight, flight.criteria.settle_m)
+        yield from _missed_end(flight, flight.criteria.settle_m)
 
 
 def _ending(flight: Flight, interrupted: bool) -> Ending:
@@ -314,6 +317,13 @@ def _responses(flight: Flight, settle: float) -> Iterator[FlightFailure]:
             "cloud.controller, or choose another cloud.predictor"
         )
         yield FlightFailure("unstable", text, unstable[0].start)
+
+
+def _missed_end(flight: Flight, settle: float) -> Iterator[FlightFailure]:
+    """Yield a failure if a file of setpoints ended farther than `settle` [m] from its last one."""
+    ending, away = flight.ending, missed_end(flight)
+    if away is not None and ending is not None and ending[1] == "done":
+        yield FlightFailure("not_settled", describe_miss(away, settle), *_moment(flight, ending[0]))
 
 
 def _not_real_time(numbers: Mapping[str, Number]) -> str:

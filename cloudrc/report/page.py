@@ -39,6 +39,7 @@ REPEAT = {
 """Whether the run was in virtual time -> text above the command that repeats the run."""
 MAIN = {
     "waypoints_reached": "waypoints reached",
+    "final_error": "from the last setpoint, at the end",
     "duration": "mission took",
     "contact_time": "first touch at",
     "tip_speed": "speed at the first touch",
@@ -56,9 +57,10 @@ SHARES = ("loss_", "late_", "overshoot_")
 
 def main_numbers(numbers: Mapping[str, Number]) -> list[tuple[str, str, str]]:
     """Return label, digits and unit of each number in `MAIN` that was measured."""
-    return [
-        (text, *readable(name, numbers[name])) for name, text in MAIN.items() if name in numbers
-    ]
+    # A mission with a last setpoint has no waypoints.
+    hidden = "waypoints_reached" if "final_error" in numbers else None
+    names = [name for name in MAIN if name in numbers and name != hidden]
+    return [(MAIN[name], *readable(name, numbers[name])) for name in names]
 
 
 def render(

@@ -40,6 +40,8 @@ SOCKET_GONE = (
     "or, if it is a session, with 'cloudrc down'"
 )
 """Says how to stop a robot whose API nobody can reach any more."""
+EVERY_WAYPOINT = "every waypoint reached"
+"""Says what a robot has done in a mission of waypoints that succeeded."""
 UNIX = "unix:"
 VARIABLE = "CLOUDRC_TOKEN_FILE"
 """Environment variable of a command that names the file with the token."""
@@ -217,14 +219,19 @@ def find_mission(api: Api, key: str) -> dict[str, Any] | None:
 
 def describe_mission(mission: Mapping[str, Any]) -> str:
     """Return name, state and waypoint of a mission, and its verdict, as one line of text."""
-    where = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
+    where, goal = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}", EVERY_WAYPOINT
+    if not mission["waypoints"]:
+        where, goal = "setpoints of a file", "setpoints flown to their end"
     name = f" ({mission['name']})" if mission["name"] else ""
-    verdict = f"; {describe_verdict(mission['verdict'])}" if mission["verdict"] else ""
+    verdict = f"; {describe_verdict(mission['verdict'], goal)}" if mission["verdict"] else ""
     return f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}"
 
 
-def describe_verdict(verdict: Mapping[str, Any]) -> str:
-    """Return the outcome of a mission and the reasons, as one line of text."""
+def describe_verdict(verdict: Mapping[str, Any], goal: str = EVERY_WAYPOINT) -> str:
+    """Return the outcome of a mission and the reasons, as one line of text.
+
+    `goal` says what the robot has done if the mission succeeded.
+    """
     failures = [f"{failure['code']}: {failure['text']}" for failure in verdict["failures"]]
-    reasons = "; also ".join(failures) or "every waypoint reached, every criterion met"
+    reasons = "; also ".join(failures) or f"{goal}, every criterion met"
     return f"{verdict['outcome'].upper()}: {reasons}"

@@ -24,6 +24,7 @@ from collections.abc import Callable
 from math import dist
 from typing import TYPE_CHECKING
 
+from cloudrc.config.setpoints import describe_miss
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import Fence
 from cloudrc.messages import (
@@ -313,8 +314,12 @@ class Teleop:
             self._lead(seen, now_ns)
         if self._drives and seen.guard is not TRACK:
             self._select_here()
+        if self._plan.track:
+            self._end_track(seen, now_ns)
+            return
+        done = "over" if self._plan.unit == "step" else "reached"
         while self.state == FLYING and self._is_reached(legs[self.leg], seen, now_ns):
-            self._advance("reached", now_ns)
+            self._advance(done, now_ns)
 
     def handle_deadline(self, now_ns: int) -> None:
         """Check the time limits, move the setpoint along a track, and repeat a request if due."""
@@ -391,8 +396,9 @@ class Teleop:
                 self._is_pending = False
                 self._select_leg(self.leg, now_ns)
             place = "the spawn" if self._plan.start is Start.SPAWN else "here"
-            count = f"waypoints: {len(self._plan.legs)}, judged by the measured position"
-            text = f"mission started from {place}, {count}"
+            text = f"mission started from {place}, {self._plan.contents}"
+            if self._plan.unit == "waypoint":
+                text += ", judged by the measured position"
             self._report("started", 0, text, now_ns)
         if self._was_held or self._plan.by_hand:
             self._hold(now_ns)
@@ -444,9 +450,18 @@ class Teleop:
             motion = Drive(start, begin_ns, (x, y, z), (x, y, z), ACCELERATION, until_ns, *box)
         self._select(Setpoint(position, waypoint=self.leg, motion=motion))
 
+    def _end_track(self, seen: RobotStatus, now_ns: int) -> None:
+        """End the mission after the last setpoint of the track; the robot must be near it."""
+        lasts, last = self._plan.track[-1]
+        if self.state != FLYING or self.elapsed(now_ns) < lasts:
+            return
+        away, limit = dist(seen.position, last), self._plan.legs[0].tolerance
+        if exceeds(away, limit):
+            self._end("leg_timed_out", describe_miss(away, limit), now_ns)
+        else:
+            self._advance(f"flown to their end, {away:.2f} m from the last one", now_ns)
+
     def _is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
-        if self._plan.track:
-            return self.elapsed(now_ns) >= self._plan.track[-1][0]
         rested = self._watch.is_reached(leg, seen, now_ns)
         if not leg.speed:
             return rested
@@ -568,8 +583,10 @@ class Teleop:
     @property
     def where(self) -> str:
         """Place in the mission, for an event's text, such as "on the way to waypoint 1 of 7"."""
-        return f"on the way to {self._leg_name}"
+        return f"on the way {'along the' if self._plan.track else 'to'} {self._leg_name}"
 
     @property
     def _leg_name(self) -> str:
-        return f"waypoint {self.leg + 1} of {len(self._plan.legs)}"
+        if self._plan.track:
+            return "setpoints"
+        return f"{self._plan.unit} {self.leg + 1} of {len(self._plan.legs)}"

@@ -149,7 +149,7 @@ class MissionSummary(_Answer):
     state: Literal["queued", "starting", "flying", "held", "done", "failed", "cancelled"]
     by_hand: bool = _field("Whether an operator drives the robot by hand")
     waypoint: int = _field("Index of the waypoint to which the robot flies, from 0")
-    waypoints: int = _field("Number of waypoints")
+    waypoints: int = _field("Number of waypoints; 0: the mission follows a file of setpoints")
     reached: list[Reached] = _field("The reached waypoints")
     verdict: Verdict | None = _field("Null until the mission has ended")
 

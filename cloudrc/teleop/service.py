@@ -519,7 +519,7 @@ class MissionService:
             evidence = mission.witness.evidence(
                 Ending(event.event, event.text),
                 self._teleop.elapsed(now_ns),
-                waypoints=len(mission.order.plan.legs),
+                waypoints=len(mission.order.plan.waypoints),
                 reached=len(mission.reached),
                 wanted=mission.order.touch,
             )

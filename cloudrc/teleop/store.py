@@ -100,7 +100,7 @@ class MissionRecord:
             "state": self.state,
             "waypoint": self.waypoint,
             "by_hand": self.order.plan.by_hand,
-            "waypoints": len(self.order.plan.legs),
+            "waypoints": len(self.order.plan.waypoints),
             "reached": list(self.reached),
             "verdict": self.verdict,
         }
@@ -109,7 +109,7 @@ class MissionRecord:
         """Return the fields of the API's model `MissionView`."""
         return {
             **self.summary(),
-            "route_m": [leg.position for leg in self.order.plan.legs],
+            "route_m": [leg.position for leg in self.order.plan.waypoints],
             "events": list(self.events),
             "events_left_out": self.happened.total() - len(self.events),
         }

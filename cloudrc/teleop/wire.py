@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from math import nan
+from math import isinf, nan
 from typing import Any, NamedTuple, TypeAlias
 
 from pydantic import TypeAdapter, ValidationError
@@ -52,7 +52,7 @@ class Plan:
     """What a mission flies: its waypoints (`legs`) or its `track`, where it starts, its time limit.
 
     A track gives setpoints at fixed times. A mission with a track has one waypoint, which counts as
-    reached at the end of the track.
+    reached if the robot is within its tolerance of the last setpoint when the track ends.
     """
 
     legs: tuple[Leg, ...]  # in order; at least one
@@ -62,6 +62,23 @@ class Plan:
     track: tuple[
         tuple[float, Vector], ...
     ] = ()  # times [s] and setpoints [m]; none, or two or more
+
+    @property
+    def contents(self) -> str:
+        """What the mission flies, in words, such as "waypoints: 7"."""
+        if self.track:
+            return f"setpoints for {self.track[-1][0]:g} s"
+        return f"{self.unit}s: {len(self.legs)}"
+
+    @property
+    def waypoints(self) -> tuple[Leg, ...]:
+        """The legs, for people; none for a track."""
+        return () if self.track else self.legs
+
+    @property
+    def unit(self) -> str:
+        """Name of each leg: "waypoint", or "step" if only its time counts."""
+        return "step" if isinf(self.legs[0].tolerance) else "waypoint"
 
 
 NO_PLAN = Plan((Leg(ZERO),))

@@ -35,7 +35,7 @@ def test_bad_input_gives_one_line_and_writes_nothing(line, words, folder, refuse
 def test_the_last_line_is_the_report_and_the_folder_is_complete(folder, call):
     lines = call(*FLY, "--seed", "7").out.splitlines()
     assert lines[0].startswith("steps: mode virtual, seed 7, link paper-p3")
-    assert "SUCCESS: every waypoint reached, every criterion met" in lines
+    assert "SUCCESS: every step flown, every criterion met" in lines
     assert ["round", "trip,", "mean"] in [line.split()[:3] for line in lines]
     assert lines[-2] == "replay in 3-D: cloudrc replay runs/steps-virtual-seed7-1"
     page = folder / lines[-1]
@@ -153,6 +153,19 @@ def test_each_later_failure_has_its_time():
     failures = [{"text": "touched pipe_2"}, {"text": "too slow", "time": 3.25}]
     found = {"verdict": "failure", "failures": failures, "numbers": {}}
     assert "  also: too slow (at 3.25 s)" in summary(found, Path("runs/a")).splitlines()
+
+
+@pytest.mark.parametrize(
+    ("found", "goal"),
+    [
+        ({"numbers": {}}, "every waypoint reached"),
+        ({"numbers": {"final_error": {"value": 0.04, "unit": "m"}}}, "0.04 m from the last one"),
+        ({"numbers": {}, "steps": []}, "every step flown"),
+    ],
+)
+def test_a_summary_says_what_the_mission_had_to_do(found, goal):
+    text = summary({"verdict": "success", "failures": [], **found}, Path("runs/a"))
+    assert goal in text.splitlines()[1]
 
 
 def test_a_run_in_real_time_needs_the_extra_of_the_api(monkeypatch, refused):

@@ -313,7 +313,8 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight():
     numbers, notes = measure_all(flight_of(paper()[1]))
     assert (notes, list(numbers)) == ([], sorted(numbers))
     resting = {f"steady_error_{axis}" for axis in "xyz"}
-    assert set(SHIPPED) - set(numbers) == REAL_TIME | OF_RELAYS | resting | {"recorder_dropped"}
+    others = {"recorder_dropped", "final_error"}
+    assert set(SHIPPED) - set(numbers) == REAL_TIME | OF_RELAYS | resting | others
     for name, number in numbers.items():
         assert set(number.unit) <= set("smNB12^/ "), name
         assert number.meaning[0].isupper(), name

@@ -9,6 +9,7 @@ from cloudrc.metrics import SHIPPED, Number
 from cloudrc.metrics.verdict import SLIP_MAX, exit_code, flight_evidence, judge, operator_verdict
 from cloudrc.records import (
     REAL_TIME_FACTOR_MIN,
+    Control,
     Counted,
     Fault,
     GuardChange,
@@ -110,6 +111,40 @@ def test_a_failure_says_what_when_and_where(log, code, text, time):
     assert text in failure.text
     assert failure.time == pytest.approx(time)
     assert failure.place == pytest.approx((time, 0.0, 1.0))
+
+
+def along_setpoints(last, **criteria):
+    """A flight that ends at x = 10 m; its file of setpoints ends at x = `last` [m]."""
+    log = good()
+    log.change(Control, lambda n, c: c._replace(setpoint=(last, 0.0, 1.0), waypoint=0))
+    return log.flight(mission=MissionConfig(setpoints="track.csv"), touch="board", **criteria)
+
+
+@pytest.mark.parametrize(
+    ("last", "settle", "found", "reached"),
+    [
+        (10.0, 0.15, [], 1.0),
+        (10.15, 0.15, [], 1.0),
+        (10.16, 0.15, ["not_settled"], 0.0),
+        (14.0, 0.15, ["not_settled"], 0.0),
+        (14.0, None, [], 1.0),
+    ],
+)
+def test_a_robot_far_from_the_last_setpoint_of_a_file_fails(last, settle, found, reached):
+    flight = along_setpoints(last, settle_m=settle)
+    verdict = judged(flight)
+    assert codes(verdict) == found
+    assert SHIPPED["final_error"].measure(flight) == pytest.approx(last - 10.0, abs=1e-6)
+    assert SHIPPED["waypoints_reached"].measure(flight) == reached
+    if found:
+        assert f"{last - 10.0:.2f} m from the last one" in verdict.failures[0].text
+
+
+def test_setpoints_that_teleop_saw_missed_fail_once():
+    log = ended("leg_timed_out")
+    log.change(Control, lambda n, c: c._replace(setpoint=(14.0, 0.0, 1.0), waypoint=0))
+    verdict = judged(log.flight(mission=MissionConfig(setpoints="track.csv"), touch="board"))
+    assert codes(verdict) == ["leg_timed_out"]
 
 
 @pytest.mark.parametrize(

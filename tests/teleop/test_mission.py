@@ -1,5 +1,7 @@
 """The mission machine and its requests: transitions, early ends, and who may move the robot."""
 
+from math import dist, inf
+
 import pytest
 
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
@@ -83,6 +85,23 @@ def test_a_leg_that_takes_too_long_fails_the_mission():
     flight.step(seconds=0.2)
     assert (flight.state, last_event(flight)) == ("FAILED", "leg_timed_out")
     assert flight.events[-1].text == "waypoint 2 of 2 not reached in 2 s (its time_limit_s)"
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "at", "end"),
+    [(0.2, B, "done"), (0.2, (2.2, 0.0, 1.0), "done"), (inf, AWAY, "done")]
+    + [(0.2, place, "leg_timed_out") for place in (A, AWAY, (2.21, 0.0, 1.0))],
+)
+def test_setpoints_end_on_time_as_a_success_only_near_the_last_one(tolerance, at, end):
+    track = ((0.0, A), (1.0, B), (2.0, B))
+    flight = flying(Plan((Leg(A, tolerance=tolerance, time_limit=inf),), track=track))
+    flight.step(position=B, seconds=1.8)
+    assert flight.state == "FLYING"
+    flight.step(position=at, seconds=0.3)
+    assert last_event(flight) == end
+    texts = " ".join(event.text for event in flight.events)
+    assert f"{dist(at, B):.2f} m from the last one" in texts
+    assert "waypoint" not in texts
 
 
 def test_a_robot_seen_to_hold_gets_the_first_waypoint_at_once():
