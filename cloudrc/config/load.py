@@ -37,7 +37,7 @@ from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import (
     SPEED_MPS,
     Acceleration,
-    Change,
+    ChangeConfig,
     Cloud,
     CloudTime,
     CommandAge,
@@ -530,7 +530,7 @@ def _check_file(key: str, path: str) -> None:
     reuse(("file", key, path), lambda: bool(FILE_READERS.get(key, Path)(Path(path))))
 
 
-CHANGEABLE_KEYS = Change.model_fields.keys() - {"at_s"}
+CHANGEABLE_KEYS = ChangeConfig.model_fields.keys() - {"at_s"}
 """Keys of a direction that an entry of its list `changes` may set."""
 TIME_LINE_KEYS = ("changes", "trace", "blackouts")
 """Keys of a direction that make up its time line: how the link's conditions change over time."""

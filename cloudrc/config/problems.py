@@ -19,6 +19,7 @@ from pydantic_core import ErrorDetails
 
 from cloudrc.config.document import Document, KeyPath
 from cloudrc.errors import BadInputError
+from cloudrc.link.profile import Range
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _TYPES = {
@@ -144,7 +145,10 @@ def _limits(field: FieldInfo) -> Iterator[str]:
 
 def _bounds(part: Any) -> Iterator[Ge | Gt | Le | Lt]:
     """Yield the limits in a field or an annotation."""
-    if isinstance(part, FieldInfo):
+    inner: Iterable[Any]
+    if isinstance(part, Range):
+        inner = part
+    elif isinstance(part, FieldInfo):
         inner = (*part.metadata, part.annotation)
     else:
         inner = (*getattr(part, "__metadata__", ()), *get_args(part))

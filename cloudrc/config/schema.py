@@ -8,6 +8,9 @@ loading the file.
 
 from __future__ import annotations
 
+import ast
+import inspect
+from dataclasses import is_dataclass
 from itertools import pairwise
 from pathlib import PurePath
 from typing import Annotated, Any, Literal, TypeVar
@@ -24,6 +27,15 @@ from pydantic import (
 )
 
 from cloudrc.geometry.fence import Corners, order_of
+from cloudrc.link.profile import (
+    Blackout,
+    Change,
+    DirectionKeys,
+    GilbertElliott,
+    Probability,
+)
+from cloudrc.link.profile import NotNegative as NotNegative
+from cloudrc.link.profile import Positive as Positive
 from cloudrc.messages import TOUCH_NAME_MAX
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -42,9 +54,7 @@ Place = Annotated[
     BeforeValidator(_with_height),
 ]
 """A point; a robot that stays on the ground needs no third number."""
-NotNegative = Annotated[float, Field(ge=0)]
 NotNegatives = tuple[NotNegative, NotNegative, NotNegative]
-Positive = Annotated[float, Field(gt=0)]
 _Constant = Annotated[float, Field(gt=0, le=30)]
 _DeadTime = Annotated[float, Field(ge=0, le=5)]
 Constants = tuple[_Constant, _Constant, _Constant]
@@ -71,7 +81,6 @@ DURATION_MAX = 1_000_000
 """Largest value of a time limit, or of a dwell time in a mission [s]: eleven days."""
 Dwell = Annotated[float, Field(ge=0, le=DURATION_MAX)]
 TimeLimit = Annotated[float, Field(gt=0, le=DURATION_MAX)]
-Probability = Annotated[float, Field(ge=0, le=1)]
 Factor = Annotated[float, Field(ge=0.2, le=5)]
 
 
@@ -89,6 +98,21 @@ WindSpeed = Annotated[float, Field(ge=-20, le=20)]
 Bias = Annotated[float, Field(ge=-90, le=90)]
 
 
+def attribute_docstrings(owner: type) -> dict[str, str]:
+    """Return the text below each attribute of a class: name -> text."""
+    body = ast.parse(inspect.getsource(owner)).body[0]
+    assert isinstance(body, ast.ClassDef)
+    return {
+        name.target.id: inspect.cleandoc(text.value.value)
+        for name, text in pairwise(body.body)
+        if isinstance(name, ast.AnnAssign)
+        and isinstance(name.target, ast.Name)
+        and isinstance(text, ast.Expr)
+        and isinstance(text.value, ast.Constant)
+        and isinstance(text.value.value, str)
+    }
+
+
 class Section(BaseModel):
     """A section of a file: immutable, strictly typed, without unknown keys or infinite numbers."""
 
@@ -100,24 +124,24 @@ class Section(BaseModel):
         use_attribute_docstrings=True,
     )
 
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        """Take the texts of keys that the class has from a plain class."""
+        texts: dict[str, str] = {}
+        for base in cls.__mro__:
+            if is_dataclass(base):
+                texts = attribute_docstrings(base) | texts
+        for key, info in cls.model_fields.items():
+            info.description = info.description or texts.get(key)
+        if texts:
+            cls.model_rebuild(force=True)
 
-class GilbertElliott(Section):
+
+class BurstsConfig(Section, GilbertElliott):
     """Loss in bursts: a two-state Markov chain that takes one step per packet."""
 
-    bad_start: Probability
-    """Chance per packet that the good state turns bad; 0: no burst begins"""
-    bad_end: Probability
-    """Chance per packet that the bad state turns good; a burst has 1 / bad_end packets on average.
-    Must be above 0 if bad_start is above 0"""
-    loss_bad: Probability = 1.0
-    """Chance that a packet is lost in the bad state"""
-    loss_good: Probability = 0.0
-    """Chance that a packet is lost in the good state"""
-    delay_bad_ms: NotNegative = 0.0
-    """Extra one-way delay in the bad state [ms]; netem refuses a value above 0"""
-
     @model_validator(mode="after")
-    def _ends(self) -> GilbertElliott:
+    def _ends(self) -> BurstsConfig:
         if self.bad_start > 0 and self.bad_end == 0:
             raise ValueError("bad_end must be above 0 if bad_start is: else a burst never ends")
         return self
@@ -127,77 +151,28 @@ def _loss_tag(value: Any) -> str:
     return "<bursts>" if isinstance(value, dict | GilbertElliott) else "<chance>"
 
 
-Loss = Annotated[
-    Annotated[Probability, Tag("<chance>")] | Annotated[GilbertElliott, Tag("<bursts>")],
+LossConfig = Annotated[
+    Annotated[Probability, Tag("<chance>")] | Annotated[BurstsConfig, Tag("<bursts>")],
     Discriminator(_loss_tag),
 ]
 
 
-class Blackout(Section):
+class BlackoutConfig(Section, Blackout):
     """An interval in which every packet is lost."""
 
-    start_s: NotNegative
-    """Start, in time since the link came up [s]"""
-    duration_s: Positive
-    """Length [s]"""
 
-
-class Change(Section):
+class ChangeConfig(Section, Change):
     """A change of one direction of the link; a key that is not given keeps its value."""
 
-    at_s: NotNegative
-    """Start, in time since the link came up [s]"""
-    delay_ms: NotNegative | None = None
-    """New mean one-way delay [ms]; null: unchanged"""
-    jitter_ms: NotNegative | None = None
-    """New jitter [ms]; null: unchanged"""
-    loss: Loss | None = None
-    """New loss; null: unchanged"""
-    rate_kbit: Positive | None = None
-    """New rate of the bottleneck [kbit/s]; null: unchanged"""
+    loss: LossConfig | None = None
 
 
-class DirectionConfig(Section):
+class DirectionConfig(Section, DirectionKeys):
     """Network conditions of one direction. All delays are ONE WAY."""
 
-    delay_ms: NotNegative = 0.0
-    """Mean one-way delay [ms]; a round trip is the sum of both directions"""
-    jitter_ms: NotNegative = 0.0
-    """Spread of the delay [ms]. For the distribution uniform it is half the width, for the others
-    the standard deviation. A delay below 0 becomes 0, which raises the mean"""
-    distribution: Literal["uniform", "normal", "pareto", "table"] = "uniform"
-    """Distribution of the jitter; pareto has a long tail; table: the delays in the file `table`"""
-    table: str | None = None
-    """CSV file in the format of `trace`. Its delays, shifted to mean 0 and scaled to `jitter_ms`,
-    are the distribution. Needed with distribution: table"""
-    correlation: Probability = 0.0
-    """Correlation between the jitter of a packet and of the next packet"""
-    loss: Loss = 0.0
-    """Chance that a packet is lost, or a mapping for loss in bursts"""
-    duplicate: Probability = 0.0
-    """Chance that a packet arrives twice; the copy has its own delay"""
-    reorder: Probability = 0.0
-    """Chance that a packet has no delay and so overtakes earlier packets; no effect with
-    keep_order"""
-    corrupt: Probability = 0.0
-    """Chance that one bit of a packet is flipped; the receiver refuses such a packet"""
-    keep_order: bool = False
-    """Whether packets arrive in the order of sending, as from a queue"""
-    rate_kbit: Positive | None = None
-    """Rate of the bottleneck [kbit/s]; each packet counts with 28 bytes of headers;
-    null: no bottleneck"""
-    queue_packets: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
-    """Largest number of packets in the queue of the bottleneck; further packets are dropped"""
-    changes: tuple[Change, ...] = ()
-    """Changes of the conditions over time; at_s must rise from entry to entry"""
-    trace: str | None = None
-    """CSV file with the columns time_s,delay_ms[,loss], which replace the keys delay_ms and loss. A
-    relative path starts at the folder of the file that contains this key"""
-    loop: bool = False
-    """Whether trace, changes and blackouts begin again after the end of the trace; netem refuses
-    true"""
-    blackouts: tuple[Blackout, ...] = ()
-    """Intervals in which every packet is lost; they may overlap"""
+    loss: LossConfig = 0.0
+    changes: tuple[ChangeConfig, ...] = ()
+    blackouts: tuple[BlackoutConfig, ...] = ()
 
     @model_validator(mode="after")
     def _check_table(self) -> DirectionConfig:
@@ -207,7 +182,7 @@ class DirectionConfig(Section):
 
     @field_validator("changes")
     @classmethod
-    def _check_times_rise(cls, changes: tuple[Change, ...]) -> tuple[Change, ...]:
+    def _check_times_rise(cls, changes: tuple[ChangeConfig, ...]) -> tuple[ChangeConfig, ...]:
         for index, (before, after) in enumerate(pairwise(changes), start=1):
             if after.at_s <= before.at_s:
                 raise ValueError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from math import inf, nan
@@ -10,13 +11,12 @@ from typing import Protocol
 
 import numpy as np
 
-from cloudrc.config.schema import Blackout, Change, GilbertElliott
 from cloudrc.drivers.virtual import Clock
 from cloudrc.errors import BadInputError
 from cloudrc.faults.adversary import Lie
 from cloudrc.faults.models import Action, Call, RestartableEndpoint, Tamper, TeleopModel
 from cloudrc.faults.schedule import FaultEvent, Schedule, generator
-from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
 from cloudrc.messages import Command
 from cloudrc.records import Control
 from cloudrc.teleop.service import MissionService
@@ -68,13 +68,13 @@ def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> Direction
             f"{waves[0].kind} cannot be added; choose a profile without changes"
         )
     changes = _changes(profile, waves)
-    with_faults = {
-        "blackouts": (*profile.blackouts, *blackouts),
-        "changes": changes or profile.changes,
-        "duplicate": max(profile.duplicate, schedule.duplicate),
-        "reorder": max(profile.reorder, schedule.reorder),
-    }
-    return profile.model_copy(update=with_faults)
+    return replace(
+        profile,
+        blackouts=(*profile.blackouts, *blackouts),
+        changes=changes or profile.changes,
+        duplicate=max(profile.duplicate, schedule.duplicate),
+        reorder=max(profile.reorder, schedule.reorder),
+    )
 
 
 def _changes(profile: DirectionProfile, waves: list[FaultEvent]) -> tuple[Change, ...]:

@@ -7,8 +7,7 @@ from itertools import pairwise
 from math import inf
 from statistics import median
 
-from cloudrc.config.schema import DirectionConfig
-from cloudrc.link.profile import DirectionProfile, Trace, mean_loss
+from cloudrc.link.profile import DirectionKeys, DirectionProfile, Trace, mean_loss
 
 HEAVY = 0.5
 """Share of packets from which a value may be meant in percent [1]."""
@@ -20,7 +19,7 @@ ROWS_MIN = 10
 """With fewer rows no trace is doubted, as a user may have typed them."""
 
 
-def describe_heavy_shares(direction: DirectionConfig, name: str) -> Iterator[str]:
+def describe_heavy_shares(direction: DirectionKeys, name: str) -> Iterator[str]:
     """Warn in words of each share of packets of which 100 times less may be meant.
 
     `name` is "uplink" or "downlink".
@@ -36,7 +35,7 @@ def describe_heavy_shares(direction: DirectionConfig, name: str) -> Iterator[str
             )
 
 
-def _worst_loss(direction: DirectionConfig) -> tuple[float, str]:
+def _worst_loss(direction: DirectionKeys) -> tuple[float, str]:
     """Return the largest share of packets that are lost in the long run, and when in words."""
     first, later = mean_loss(direction.loss), [c.loss for c in direction.changes if c.loss]
     if isinstance(direction, DirectionProfile) and direction.rows and direction.rows.losses:
@@ -45,7 +44,7 @@ def _worst_loss(direction: DirectionConfig) -> tuple[float, str]:
     return worst, " at times" * (worst > first)
 
 
-def describe_low_rate(direction: DirectionConfig, name: str, needed: float, what: str) -> str:
+def describe_low_rate(direction: DirectionKeys, name: str, needed: float, what: str) -> str:
     """Warn in words of a bottleneck that is slower than `what` needs; "" if there is none.
 
     `needed` is the rate of `what` [bit/s], `name` is "uplink" or "downlink".

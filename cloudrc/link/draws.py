@@ -25,8 +25,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.config.schema import GilbertElliott, Loss
-from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
 
 BLOCK = 256  # number of packets whose random numbers are generated together
 CHAIN_BLOCKS = 64  # number of blocks after which bursts and correlated jitter restart
@@ -60,9 +59,14 @@ class Purpose(IntEnum):
     CORRUPT_BIT = 7
 
 
-def stream_key(seed: int, uplink: bool, epoch: int, kind: int) -> StreamKey:
-    """Return the Philox key for the random numbers of a direction, session and kind of datagram."""
+def stream_key(seed: int, uplink: bool, epoch: int, kind: int, stream: str = "") -> StreamKey:
+    """Return the Philox key for the random numbers of a direction, session and kind of datagram.
+
+    Links with one seed and different names, `stream`, have different random numbers.
+    """
     name = f"cloudrc link {seed} {'up' if uplink else 'down'} {epoch} {kind}"
+    if stream:
+        name += f" {stream}"
     digest = blake2b(name.encode(), digest_size=16).digest()
     return int.from_bytes(digest[:8], "little"), int.from_bytes(digest[8:], "little")
 
@@ -74,12 +78,19 @@ def uniforms(key: StreamKey, purpose: Purpose, block: int) -> Floats:
     Source: J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011: Philox
     4x64-10.
     """
+    values = uniforms_of(key, purpose, block, 1)
+    values.flags.writeable = False
+    return values
+
+
+def uniforms_of(key: StreamKey, purpose: Purpose, block: int, blocks: int) -> Floats:
+    """Draw what `uniforms` draws for each of `blocks` blocks from `block` on, in one array."""
     counter = np.array([block * (BLOCK // _OUTPUTS_PER_COUNT), 0, 0, purpose], dtype=np.uint64)
     generator = np.random.Philox(key=np.array(key, dtype=np.uint64), counter=counter)
     # 52 bits plus one half, so that the result is never 0 or 1.
-    bits = generator.random_raw(BLOCK) >> np.uint64(12)
-    values = (bits.astype(np.float64) + 0.5) * 2.0**-52
-    values.flags.writeable = False
+    values = (generator.random_raw(blocks * BLOCK) >> np.uint64(12)).astype(np.float64)
+    values += 0.5
+    values *= 2.0**-52
     return values
 
 

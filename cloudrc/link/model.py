@@ -14,9 +14,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.config.schema import Loss
 from cloudrc.link.draws import BLOCK, OVERTAKES, Fate, bit_flips, impairments, stream_key
-from cloudrc.link.profile import Conditions, DirectionProfile, Timeline
+from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
 from cloudrc.rounding import differences
 
 HEADER_BYTES = 28  # size of the IPv4 and UDP headers (RFC 791, RFC 768), also on the wire [bytes]
@@ -26,7 +25,8 @@ _TABLES = 64  # number of blocks of impairments that are kept in memory
 class LinkDirection:
     """Model of one direction of the link.
 
-    The random impairment of a packet depends only on seed, direction, epoch, kind and counter. It
+    The random impairment of a packet depends only on seed, stream, direction, epoch, kind and
+    counter. It
     does not depend on the order of calls, or on other datagrams.
 
     If the profile has a `rate` (a bottleneck with a queue) or `keep_order`, the arrival depends
@@ -38,13 +38,20 @@ class LinkDirection:
     """
 
     def __init__(
-        self, profile: DirectionProfile, seed: int, uplink: bool, origin_ns: int = 0
+        self,
+        profile: DirectionProfile,
+        seed: int,
+        uplink: bool,
+        origin_ns: int = 0,
+        *,
+        stream: str = "",
     ) -> None:
         """Create the model; `uplink` is True for world to cloud.
 
-        `origin_ns` is the start of the time line [ns], on the clock of `now_ns` in `send`.
+        `origin_ns` is the start of the time line [ns], on the clock of `now_ns` in `send`. Links
+        with one seed and different names, `stream`, have different random numbers.
         """
-        self._seed, self._uplink = seed, uplink
+        self._seed, self._uplink, self._stream = seed, uplink, stream
         self._origin_ns: int | None = origin_ns
         self._departures: deque[int] = deque()
         self._last_release_ns = 0
@@ -91,8 +98,16 @@ class LinkDirection:
         if len(fate) == 1 and self._plain:  # nearly all packets: save time
             delay_ns = conditions.delay_ns + fate[0]
             return (now_ns + delay_ns if delay_ns > 0 else now_ns,)
+        if len(fate) == 1:
+            arrival = self._arrival(fate[0], conditions, size, now_ns)
+            return () if arrival is None else (arrival,)
         arrivals = [self._arrival(entry, conditions, size, now_ns) for entry in fate]
         return tuple([arrival for arrival in arrivals if arrival is not None])
+
+    @property
+    def only(self) -> Conditions | None:
+        """The conditions, if packets do not act on each other and the conditions never change."""
+        return self._only if self._plain else None
 
     def corrupted(self, epoch: int, kind: int, counter: int, data: bytes) -> bytes:
         """Return the content of a datagram as it arrives: unchanged, or with one bit flipped.
@@ -104,7 +119,7 @@ class LinkDirection:
         flips a bit of the datagram.
         """
         block, index = divmod(counter, BLOCK)
-        key = stream_key(self._seed, self._uplink, epoch, kind)
+        key = stream_key(self._seed, self._uplink, epoch, kind, self._stream)
         place = bit_flips(key, block, self._profile.corrupt).get(index)
         if place is None or not data:
             return data
@@ -146,7 +161,7 @@ class LinkDirection:
         key = (epoch, kind, block, jitter, loss)
         if key in self._fates:
             return self._fates[key]
-        stream = stream_key(self._seed, self._uplink, epoch, kind)
+        stream = stream_key(self._seed, self._uplink, epoch, kind, self._stream)
         if len(self._fates) >= _TABLES:
             del self._fates[next(iter(self._fates))]
         table = self._fates[key] = impairments(stream, block, self._profile, jitter, loss)

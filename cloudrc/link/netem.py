@@ -29,10 +29,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from cloudrc.config.schema import GilbertElliott, Loss
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
 from cloudrc.link.draws import PARETO_CUT, Floats
-from cloudrc.link.profile import Conditions, DirectionProfile, Timeline
+from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline
 from cloudrc.link.relay import Address
 
 USE_RELAY = "use the relay (link.mode=relay, or --shaper relay)"

@@ -1,16 +1,134 @@
-"""Compute the conditions of a link direction over time, in SI units, from its profile.
+"""Define the keys of a link profile, and compute the conditions of a direction over time from them.
 
-All delays are ONE WAY. `config` and `link/traces.py` check the values; this module does not.
+The classes of the keys are plain; the models in `config/schema.py` inherit keys, ranges and texts
+from them. All delays are ONE WAY. `config` and `link/traces.py` check the values; this module does
+not.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from math import inf
-from typing import NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
-from cloudrc.config.schema import DirectionConfig, GilbertElliott, Loss
+
+@dataclass(frozen=True)
+class Range:
+    """The values that a key may have; config checks them."""
+
+    ge: float | None = None  # smallest value, [unit of the key]
+    gt: float | None = None  # every value is larger, [unit of the key]
+    le: float | None = None  # largest value, [unit of the key]
+
+    # Pydantic accepts a class with these two members in place of the ranges of annotated_types,
+    # whose import takes longer than that of the whole link.
+    @property
+    def __is_annotated_types_grouped_metadata__(self) -> Literal[True]:
+        return True
+
+    def __iter__(self) -> Iterator[Any]:
+        import annotated_types
+
+        for name in ("ge", "gt", "le"):
+            if (limit := getattr(self, name)) is not None:
+                yield getattr(annotated_types, name.capitalize())(limit)
+
+
+NotNegative = Annotated[float, Range(ge=0)]
+Positive = Annotated[float, Range(gt=0)]
+Probability = Annotated[float, Range(ge=0, le=1)]
+
+
+@dataclass(frozen=True)
+class GilbertElliott:
+    """Loss in bursts: a two-state Markov chain that takes one step per packet."""
+
+    bad_start: Probability
+    """Chance per packet that the good state turns bad; 0: no burst begins"""
+    bad_end: Probability
+    """Chance per packet that the bad state turns good; a burst has 1 / bad_end packets on average.
+    Must be above 0 if bad_start is above 0"""
+    loss_bad: Probability = 1.0
+    """Chance that a packet is lost in the bad state"""
+    loss_good: Probability = 0.0
+    """Chance that a packet is lost in the good state"""
+    delay_bad_ms: NotNegative = 0.0
+    """Extra one-way delay in the bad state [ms]; netem refuses a value above 0"""
+
+
+Loss: TypeAlias = float | GilbertElliott
+
+
+@dataclass(frozen=True)
+class Blackout:
+    """An interval in which every packet is lost."""
+
+    start_s: NotNegative
+    """Start, in time since the link came up [s]"""
+    duration_s: Positive
+    """Length [s]"""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of one direction of the link; a key that is not given keeps its value."""
+
+    at_s: NotNegative
+    """Start, in time since the link came up [s]"""
+    delay_ms: NotNegative | None = None
+    """New mean one-way delay [ms]; null: unchanged"""
+    jitter_ms: NotNegative | None = None
+    """New jitter [ms]; null: unchanged"""
+    loss: Loss | None = None
+    """New loss; null: unchanged"""
+    rate_kbit: Positive | None = None
+    """New rate of the bottleneck [kbit/s]; null: unchanged"""
+
+
+@dataclass(frozen=True)
+class DirectionKeys:
+    """Network conditions of one direction. All delays are ONE WAY."""
+
+    delay_ms: NotNegative = 0.0
+    """Mean one-way delay [ms]; a round trip is the sum of both directions"""
+    jitter_ms: NotNegative = 0.0
+    """Spread of the delay [ms]. For the distribution uniform it is half the width, for the others
+    the standard deviation. A delay below 0 becomes 0, which raises the mean"""
+    distribution: Literal["uniform", "normal", "pareto", "table"] = "uniform"
+    """Distribution of the jitter; pareto has a long tail; table: the delays in the file `table`"""
+    table: str | None = None
+    """CSV file in the format of `trace`. Its delays, shifted to mean 0 and scaled to `jitter_ms`,
+    are the distribution. Needed with distribution: table"""
+    correlation: Probability = 0.0
+    """Correlation between the jitter of a packet and of the next packet"""
+    loss: Loss = 0.0
+    """Chance that a packet is lost, or a mapping for loss in bursts"""
+    duplicate: Probability = 0.0
+    """Chance that a packet arrives twice; the copy has its own delay"""
+    reorder: Probability = 0.0
+    """Chance that a packet has no delay and so overtakes earlier packets; no effect with
+    keep_order"""
+    corrupt: Probability = 0.0
+    """Chance that one bit of a packet is flipped; the receiver refuses such a packet"""
+    keep_order: bool = False
+    """Whether packets arrive in the order of sending, as from a queue"""
+    rate_kbit: Positive | None = None
+    """Rate of the bottleneck [kbit/s]; each packet counts with 28 bytes of headers;
+    null: no bottleneck"""
+    queue_packets: Annotated[int, Range(ge=1, le=1_000_000)] = 1000
+    """Largest number of packets in the queue of the bottleneck; further packets are dropped"""
+    changes: tuple[Change, ...] = ()
+    """Changes of the conditions over time; at_s must rise from entry to entry"""
+    trace: str | None = None
+    """CSV file with the columns time_s,delay_ms[,loss], which replace the keys delay_ms and loss. A
+    relative path starts at the folder of the file that contains this key"""
+    loop: bool = False
+    """Whether trace, changes and blackouts begin again after the end of the trace; netem refuses
+    true"""
+    blackouts: tuple[Blackout, ...] = ()
+    """Intervals in which every packet is lost; they may overlap"""
 
 
 def mean_loss(loss: Loss) -> float:
@@ -44,7 +162,8 @@ class Trace:
         return self.times[-1] + (self.times[-1] - self.times[0]) / (len(self.times) - 1)
 
 
-class DirectionProfile(DirectionConfig):
+@dataclass(frozen=True)
+class DirectionProfile(DirectionKeys):
     """One direction of a link profile, with the contents of the files that it names.
 
     A negative sum of delay and jitter counts as 0. `keep_order` disables `reorder`. A packet that
@@ -109,7 +228,7 @@ class Timeline:
 def settled(profile: DirectionProfile) -> DirectionProfile:
     """Return the profile with constant conditions: those of the last piece of its time line."""
     last = Timeline(profile).pieces[-1]
-    constant = {
+    constant: dict[str, Any] = {
         "delay_ms": last.delay_ns * 1e-6,
         "jitter_ms": last.jitter * 1e3,
         "loss": 1.0 if last.blackout else last.loss,
@@ -118,7 +237,7 @@ def settled(profile: DirectionProfile) -> DirectionProfile:
         "rows": None,
         "blackouts": (),
     }
-    return profile.model_copy(update=constant)
+    return replace(profile, **constant)
 
 
 def _conditions(profile: DirectionProfile, instant: float) -> Conditions:

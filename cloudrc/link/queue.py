@@ -6,6 +6,7 @@ and no socket.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from heapq import heappop, heappush
 from typing import Any
 
@@ -30,7 +31,7 @@ class PacketQueue:
         """Create an empty queue for at most `capacity` copies of packets; None: without a limit."""
         self._capacity = capacity
         # Time of arrival [ns], a number that keeps the order of equal times, direction, data.
-        self._packets: list[tuple[int, int, LinkDirection, Any]] = []
+        self._packets: list[tuple[int, int, Any, Any]] = []
         self._sent = 0
         self.next_ns = NOTHING_NS
         self.lost = self.overflow = 0
@@ -50,11 +51,18 @@ class PacketQueue:
         """
         kind, epoch, counter = header
         arrivals = link.send(epoch, kind, counter, size, now_ns)
+        if arrivals and link.corrupts:
+            data = link.corrupted(epoch, kind, counter, data)
+        self.put(link, arrivals, data)
+
+    def put(self, link: Any, arrivals: Sequence[int], data: Any) -> None:
+        """Take the copies of a packet that arrive at `arrivals` [ns]; without any, it is lost.
+
+        `link` is the direction that the packet takes, or any other mark for `pop` to return.
+        """
         if not arrivals:
             self.lost += 1
             return
-        if link.corrupts:
-            data = link.corrupted(epoch, kind, counter, data)
         packets = self._packets
         for arrival_ns in arrivals:
             if self._capacity is not None and len(packets) >= self._capacity:
@@ -64,7 +72,7 @@ class PacketQueue:
             heappush(packets, (arrival_ns, self._sent, link, data))
             self.next_ns = packets[0][0]
 
-    def pop(self) -> tuple[int, LinkDirection, Any]:
+    def pop(self) -> tuple[int, Any, Any]:
         """Take the packet that arrives next; at least one must be in flight.
 
         Returns:

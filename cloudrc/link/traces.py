@@ -10,14 +10,21 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import fields
 from math import fsum, inf, sqrt
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from cloudrc.config.schema import DirectionConfig
 from cloudrc.errors import BadInputError
 from cloudrc.files import read
-from cloudrc.link.profile import DirectionProfile, Trace
+from cloudrc.link.profile import (
+    Blackout,
+    Change,
+    DirectionKeys,
+    DirectionProfile,
+    GilbertElliott,
+    Trace,
+)
 from cloudrc.rounding import differences
 
 SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a second
@@ -41,17 +48,27 @@ def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
     return parse_trace(read_lines(path, f"trace {path}", remedy, size_max), str(path))
 
 
-def link_profile(direction: DirectionConfig, file_max: int = SIZE_MAX) -> DirectionProfile:
+def link_profile(direction: DirectionKeys, file_max: int = SIZE_MAX) -> DirectionProfile:
     """Read the files that one direction of a link profile names.
 
     Raise a BadInputError if a file cannot be used or is longer than `file_max` bytes.
     """
     table = direction.distribution == "table" and direction.table
-    return DirectionProfile.model_construct(
-        **dict(direction),
+    return DirectionProfile(
+        **{key.name: _plain(getattr(direction, key.name)) for key in fields(DirectionKeys)},
         rows=read_trace(Path(direction.trace), file_max) if direction.trace else None,
         quantiles=read_table(Path(table), file_max) if table else (),
     )
+
+
+def _plain(value: Any) -> Any:
+    """Return a value of a profile with the plain classes in place of those of the schema."""
+    if isinstance(value, tuple):
+        return tuple(_plain(one) for one in value)
+    for kind in (GilbertElliott, Blackout, Change):
+        if isinstance(value, kind):
+            return kind(**{key.name: _plain(getattr(value, key.name)) for key in fields(kind)})
+    return value
 
 
 def read_lines(path: Path, name: str, remedy: str, size_max: int = SIZE_MAX) -> list[str]:

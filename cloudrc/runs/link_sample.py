@@ -68,7 +68,7 @@ def _profile(name: str) -> tuple[Profile, bool]:
         return load_profile(name), False
     times = read_trace(path).times
     about = f"a trace of {len(times)} rows in {times[-1] - times[0]:.4g} s"
-    return Profile(description=about, uplink=DirectionConfig(trace=str(path))), True
+    return Profile.model_validate({"description": about, "uplink": {"trace": str(path)}}), True
 
 
 def _way(

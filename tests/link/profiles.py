@@ -1,7 +1,8 @@
-"""Profiles in SI units, for short tests. Only changes and blackouts are checked."""
+"""Profiles in SI units, for short tests. They are not checked."""
 
-from cloudrc.config.schema import Blackout, Change, GilbertElliott
-from cloudrc.link.profile import DirectionProfile
+from dataclasses import replace
+
+from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
 
 IN_FILES = {
     "at": ("at_s", 1.0),
@@ -24,12 +25,12 @@ def keys(names, values, more):
 def profile_of(*values, **more):
     """Make the profile of a direction: delay [s], jitter [s], distribution, correlation, loss."""
     names = ("delay", "jitter", "distribution", "correlation", "loss")
-    return DirectionProfile.model_construct(**keys(names, values, more))
+    return DirectionProfile(**keys(names, values, more))
 
 
 def changed(profile, **values):
     """Return a profile with other values."""
-    return profile.model_copy(update=keys((), (), values))
+    return replace(profile, **keys((), (), values))
 
 
 def change(*values, **more):
@@ -44,7 +45,7 @@ def blackout(start, duration):
 
 def in_bursts(bad_start, bad_end, loss_bad=1.0, loss_good=0.0, delay_bad=0.0):
     """Make losses in bursts, also bursts that never end; `delay_bad` is an extra delay [s]."""
-    return GilbertElliott.model_construct(
+    return GilbertElliott(
         bad_start=bad_start,
         bad_end=bad_end,
         loss_bad=loss_bad,

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from cloudrc.config.schema import Blackout, Change, DirectionConfig
+from cloudrc.config.schema import BlackoutConfig, ChangeConfig, DirectionConfig
 from cloudrc.messages import GuardState
 from cloudrc.records import GuardChange, LinkChanged
 from cloudrc.report.figures.marks import HELD, bounds, legend, mark_events
@@ -16,8 +16,8 @@ from tests.metrics.conftest import ONE_PIPE, at, flown
 CALM = DirectionConfig(delay_ms=50.0)
 TIMED = DirectionConfig(
     delay_ms=20.0,
-    changes=(Change(at_s=2.0, delay_ms=90.0), Change(at_s=99.0, delay_ms=9.0)),
-    blackouts=(Blackout(start_s=1.0, duration_s=9.0),),
+    changes=(ChangeConfig(at_s=2.0, delay_ms=90.0), ChangeConfig(at_s=99.0, delay_ms=9.0)),
+    blackouts=(BlackoutConfig(start_s=1.0, duration_s=9.0),),
 )
 
 
@@ -45,7 +45,7 @@ def low(subject, *times):
 
 
 def test_the_band_follows_the_profile():
-    steps = (Change(at_s=5.0, delay_ms=70.0), Change(at_s=9.0, jitter_ms=5.0))
+    steps = (ChangeConfig(at_s=5.0, delay_ms=70.0), ChangeConfig(at_s=9.0, jitter_ms=5.0))
     timed = DirectionConfig(delay_ms=5.0, jitter_ms=20.0, changes=steps)
     # The link started one second before the mission. A delay is never negative.
     assert band(subject_of(uplink=timed), 3.99) == pytest.approx((0.0, 0.025))

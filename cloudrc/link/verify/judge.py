@@ -19,10 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cloudrc.config.schema import GilbertElliott
 from cloudrc.link.draws import Floats
 from cloudrc.link.model import HEADER_BYTES, LinkDirection, Stream, numbers, sample
-from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
+from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mean_loss
 
 RUNS, RUN_LENGTH = 200, 1000
 """Number of simulated links for a band, and number of datagrams on each simulated link. The band is
@@ -286,10 +285,10 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
     twice = profile.duplicate * (1.0 - lost) ** 2 / max(1e-9, 1.0 - single * lost)
     if isinstance(loss, GilbertElliott):
         kept = {"loss_bad": single * loss.loss_bad, "loss_good": single * loss.loss_good}
-        loss = loss.model_copy(update=kept)
+        loss = replace(loss, **kept)
     else:
         loss *= single
-    return profile.model_copy(update={"correlation": 0.0, "loss": loss, "duplicate": twice})
+    return replace(profile, correlation=0.0, loss=loss, duplicate=twice)
 
 
 def told(name: str, asked: float) -> Judgement:

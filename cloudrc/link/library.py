@@ -1,0 +1,271 @@
+"""Open the model of a link for any program: no clock, no socket, no process.
+
+A program asks when each of its packets arrives, in its own time. The answer depends on seed,
+direction, stream, episode and number of the packet alone, so two policies meet the same network.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cloudrc.errors import BadInputError
+from cloudrc.link.draws import (
+    BLOCK,
+    Fate,
+    Floats,
+    Purpose,
+    StreamKey,
+    bit_flips,
+    stream_key,
+    uniforms_of,
+)
+from cloudrc.link.model import LinkDirection, Numbers, numbers, sample
+from cloudrc.link.profile import Conditions, DirectionProfile
+
+KIND = 128
+"""Kind of the packets of other programs; smaller numbers are those of the testbed's datagrams."""
+SEED_MAX = 2**53 - 1
+"""Largest seed of a link, as in an experiment."""
+_PACKETS = 10_000  # of which `expected` is computed
+_CHUNK = 64  # number of blocks that are computed together; their arrays fit into the cache
+
+
+@dataclass(frozen=True)
+class LinkProfile:
+    """Both directions of a link, with the contents of the files that they name."""
+
+    uplink: DirectionProfile
+    downlink: DirectionProfile
+
+
+def read_profile(profile: str | Path | Mapping[str, Any] | LinkProfile) -> LinkProfile:
+    """Read a link profile: the name of a shipped one, the path of a file, or a mapping.
+
+    A mapping has the keys of a file. The files that a profile names are read, too.
+
+    Raises:
+        BadInputError: If there is no such profile, or if it is wrong; the text says what to change.
+    """
+    if isinstance(profile, LinkProfile):
+        return profile
+    # Here, because a program that makes its profile itself needs neither pydantic nor YAML.
+    from cloudrc.config.document import Document, Source
+    from cloudrc.config.load import check_profile, load_profile
+    from cloudrc.link.traces import link_profile
+
+    if isinstance(profile, Mapping):
+        tree = _plain(profile)
+        keys = check_profile(Document(tree, {(): Source("profile", Path())}), "profile")
+    elif isinstance(profile, str | Path):
+        keys = load_profile(profile)
+    else:
+        raise BadInputError(
+            f"a link is the name or path of a profile, or a mapping; not {type(profile).__name__}"
+        )
+    return LinkProfile(link_profile(keys.uplink), link_profile(keys.downlink))
+
+
+def _plain(profile: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a mapping with plain lists and numbers, also in place of those of numpy."""
+
+    def item(value: Any) -> Any:
+        if isinstance(value, np.generic | np.ndarray):
+            return value.tolist()
+        raise TypeError(type(value).__name__)
+
+    try:
+        tree: dict[str, Any] = json.loads(json.dumps(dict(profile), default=item))
+    except (TypeError, ValueError) as error:
+        raise BadInputError(
+            f"the mapping of a link profile holds texts, numbers, lists and mappings, not {error}"
+        ) from None
+    return tree
+
+
+def open(
+    profile: str | Path | Mapping[str, Any] | LinkProfile, seed: int, *, stream: str = ""
+) -> tuple[OneWay, OneWay]:
+    """Open a link; return its uplink and its downlink.
+
+    Args:
+        profile: Name of a shipped profile, path of a file, mapping with the keys of a file, or the
+            result of `read_profile`.
+        seed: Seed of all random numbers, from 0 to 2^53 - 1.
+        stream: Name of the link. Links with one seed and different names share no random numbers:
+            give each robot its name. Flights of the testbed have the empty name.
+
+    Raises:
+        BadInputError: If the profile cannot be used; the text says what to change.
+    """
+    both = read_profile(profile)
+    return OneWay(both.uplink, seed, True, stream=stream), OneWay(
+        both.downlink, seed, False, stream=stream
+    )
+
+
+class OneWay:
+    """One direction of a link: it says when each packet arrives.
+
+    An episode is a use of the link from its start: time begins at 0 ns, and a bottleneck is empty.
+    Packets of a new episode end the old one. If the profile has a rate or `keep_order`, packets
+    must be sent in the order of time.
+
+    Attributes:
+        profile: The conditions.
+    """
+
+    def __init__(
+        self, profile: DirectionProfile, seed: int, uplink: bool, *, stream: str = ""
+    ) -> None:
+        """Open a direction; `seed` and `stream` are those of `cloudrc.link.open`."""
+        if not isinstance(seed, int | np.integer) or not 0 <= seed <= SEED_MAX:
+            raise BadInputError(f"seed {seed!r}: give a whole number from 0 to 2^53 - 1")
+        if not isinstance(stream, str):
+            raise BadInputError(f"stream {stream!r}: give a text, the name of this link")
+        self.profile = profile
+        self._seed, self._uplink, self._stream = int(seed), uplink, stream
+        self._episode = 0
+        self._keyed: tuple[int, StreamKey] = -1, (0, 0)
+        self._link = self._new()
+
+    def send(self, episode: int, number: int, size: int, now_ns: int) -> Fate:
+        """Send one packet; compute when it arrives.
+
+        Args:
+            episode: Number of the episode, at least 0.
+            number: Number of the packet in its episode, at least 0. It selects the random numbers.
+            size: Size of the packet without headers of UDP and IP [bytes]; only a rate needs it.
+            now_ns: Time of sending since the episode began [ns].
+
+        Returns:
+            Times of arrival [ns]: none for a lost packet, two for a duplicated one, of which the
+            second may be the first to arrive. A damaged packet counts as lost.
+        """
+        if episode != self._episode:
+            self._episode, self._link = episode, self._new()
+        arrivals = self._link.send(episode, KIND, number, size, now_ns)
+        if self._link.corrupts and arrivals and self._is_damaged(episode, number):
+            return ()
+        return arrivals
+
+    def table(
+        self,
+        count: int,
+        period: float,
+        *,
+        episode: int = 0,
+        first: int = 0,
+        size: int = 100,
+    ) -> Floats:
+        """Compute the delays of many packets at once, for simulators that work with arrays.
+
+        Equal to `send` for one packet after the other in a new episode: packet n, from `first` on,
+        leaves at n times the period. If two copies arrive, the first counts.
+
+        Args:
+            count: Number of packets.
+            period: Time between two packets [s].
+            episode: Number of the episode.
+            first: Number of the first packet.
+            size: Size of each packet [bytes].
+
+        Returns:
+            The delays [s], shape (count,); NaN for a lost packet.
+        """
+        conditions = self._link.only
+        if conditions and _is_independent(self.profile, conditions):
+            return self._independent(conditions, episode, first, count)
+        period_ns, fresh = round(period * 1e9), self._new()
+        delays = np.full(count, np.nan)
+        for n in range(first, first + count):
+            now_ns = n * period_ns
+            if arrivals := fresh.send(episode, KIND, n, size, now_ns):
+                delays[n - first] = (min(arrivals) - now_ns) * 1e-9
+        if fresh.corrupts:
+            start, end = first // BLOCK, -(-(first + count) // BLOCK)
+            draws = uniforms_of(self._key(episode), Purpose.CORRUPT, start, end - start)
+            delays[draws[first - start * BLOCK :][:count] < self.profile.corrupt] = np.nan
+        return delays
+
+    def expected(self, period: float = 0.01, size: int = 100) -> Numbers:
+        """Compute what the profile asks for: statistics of 10,000 packets from the model.
+
+        The random numbers are not those of the episodes. The packets leave once per `period` [s]
+        from the start of the time line on and have `size` bytes.
+        """
+        link = LinkDirection(
+            self.profile, self._seed, self._uplink, stream=f"{self._stream} expected"
+        )
+        period_ns = round(period * 1e9)
+        return numbers(sample(link, KIND, range(0, _PACKETS * period_ns, period_ns), size))
+
+    def _new(self) -> LinkDirection:
+        return LinkDirection(self.profile, self._seed, self._uplink, stream=self._stream)
+
+    def _is_damaged(self, episode: int, number: int) -> bool:
+        block, index = divmod(number, BLOCK)
+        return index in bit_flips(self._key(episode), block, self.profile.corrupt)
+
+    def _key(self, episode: int) -> StreamKey:
+        if episode != self._keyed[0]:
+            key = stream_key(self._seed, self._uplink, episode, KIND, self._stream)
+            self._keyed = episode, key
+        return self._keyed[1]
+
+    def _independent(self, conditions: Conditions, episode: int, first: int, count: int) -> Floats:
+        """Compute the delays [s] of packets with independent random numbers, shape (count,)."""
+        key, start, end = self._key(episode), first // BLOCK, -(-(first + count) // BLOCK)
+        delays = np.empty((end - start) * BLOCK)
+        for block in range(start, end, _CHUNK):
+            many = min(_CHUNK, end - block)
+            part = delays[(block - start) * BLOCK :][: many * BLOCK]
+            part[:] = self._chunk(conditions, key, block, many)
+        return delays[first - start * BLOCK :][:count]
+
+    def _chunk(self, conditions: Conditions, key: StreamKey, block: int, many: int) -> Floats:
+        """Compute the delays [s] of the packets of `many` blocks, shape (256 many,)."""
+        profile, draw = self.profile, partial(uniforms_of, key, block=block, blocks=many)
+
+        def delays_of(purpose: Purpose) -> Floats:
+            # In these steps, each number is rounded as in `send`.
+            if not conditions.jitter:
+                return np.full(many * BLOCK, float(conditions.delay_ns))
+            found = draw(purpose)
+            found *= 2.0
+            found -= 1.0
+            found *= conditions.jitter * 1e9
+            np.rint(found, out=found)
+            found += conditions.delay_ns
+            return np.maximum(found, 0.0, out=found)
+
+        delays = delays_of(Purpose.DELAY)
+        if profile.reorder:
+            delays[draw(Purpose.REORDER) < profile.reorder] = 0.0
+        if profile.duplicate:
+            hit = draw(Purpose.DUPLICATE) < profile.duplicate
+            delays[hit] = np.minimum(delays, delays_of(Purpose.COPY_DELAY))[hit]
+        delays *= 1e-9
+        for purpose, chance in (
+            (Purpose.LOSS, conditions.loss),
+            (Purpose.CORRUPT, profile.corrupt),
+        ):
+            if chance and isinstance(chance, float):
+                delays[draw(purpose) < chance] = np.nan
+        return delays
+
+
+def _is_independent(profile: DirectionProfile, conditions: Conditions) -> bool:
+    """Return whether a packet's delay is a simple function of random numbers of its own."""
+    return (
+        profile.distribution == "uniform"
+        and not profile.correlation
+        and not conditions.blackout
+        and isinstance(conditions.loss, float)
+    )

@@ -1,0 +1,194 @@
+"""The link as a library: imports, bits of the flights, streams, tables, profiles, bad input."""
+
+import re
+import runpy
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import cloudrc.link
+from cloudrc.config import shipped
+from cloudrc.errors import BadInputError
+from cloudrc.link import DirectionProfile, GilbertElliott, OneWay, PacketQueue, Trace
+from cloudrc.link.library import KIND
+from cloudrc.link.model import LinkDirection
+from cloudrc.tunnel.codec import Kind
+from tests.link.profiles import blackout, change, profile_of
+from tests.link.test_model import profiles
+
+MS = 1_000_000
+LIVELY = profile_of(0.07, 0.04, loss=0.1)
+
+
+def sent(way, count, period_ns=10 * MS, first=0, episode=0):
+    """Return the delays [s] of packets that are sent one by one; NaN if lost."""
+    delays = np.full(count, np.nan)
+    for n in range(count):
+        now_ns = (first + n) * period_ns
+        if arrivals := way.send(episode, first + n, 100, now_ns):
+            delays[n] = (min(arrivals) - now_ns) * 1e-9
+    return delays
+
+
+def test_importing_the_library_takes_no_heavy_package_along():
+    program = (
+        "import sys, cloudrc, cloudrc.link as link; link.OneWay, link.PacketQueue, link.open;"
+        "print({'pydantic', 'mujoco', 'cryptography', 'yaml'} & sys.modules.keys())"
+    )
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert found.stdout == "set()\n", found.stderr
+
+
+def test_a_link_without_a_name_has_the_random_numbers_of_the_testbed():
+    way, model = OneWay(LIVELY, 3, uplink=True), LinkDirection(LIVELY, 3, uplink=True)
+    for n in range(300):
+        assert way.send(2, n, 100, n * MS) == model.send(2, KIND, n, 100, n * MS)
+    assert max(Kind) < KIND
+
+
+@pytest.mark.parametrize("name", shipped.names("profile"))
+def test_every_shipped_profile_opens_and_its_table_is_what_send_tells(name):
+    for table, way in zip(
+        cloudrc.link.open(name, 5, stream="a"), cloudrc.link.open(name, 5, stream="a"), strict=True
+    ):
+        found = table.table(600, 0.01, episode=2, first=100)
+        assert np.array_equal(found, sent(way, 600, first=100, episode=2), equal_nan=True)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    profile=profiles,
+    corrupt=st.sampled_from([0.0, 0.2]),
+    first=st.sampled_from([0, 1, 255, 256, 70_000]),
+    stream=st.sampled_from(["", "robot-2"]),
+)
+def test_a_table_is_what_send_tells_for_every_profile(profile, corrupt, first, stream):
+    profile = replace(profile, corrupt=corrupt)
+    table, way = (OneWay(profile, 7, uplink=False, stream=stream) for _ in range(2))
+    found = table.table(300, 0.01, first=first)
+    assert np.array_equal(found, sent(way, 300, first=first), equal_nan=True)
+
+
+def test_a_long_table_of_independent_delays_has_no_seams():
+    way = OneWay(LIVELY, 1, uplink=True)
+    found = way.table(40_000, 0.001, first=300)
+    assert np.array_equal(found, sent(way, 40_000, MS, first=300), equal_nan=True)
+    assert way.table(0, 0.01).shape == (0,)
+
+
+def test_robots_with_one_seed_and_two_names_share_no_fate():
+    ways = [OneWay(LIVELY, 1, uplink=True, stream=name) for name in ("", "a", "b")]
+    first, second, third = (way.table(2000, 0.01) for way in ways)
+    assert not np.intersect1d(first, second).size
+    assert not np.intersect1d(second, third).size
+
+
+def test_packets_between_others_do_not_change_their_fate():
+    one, other = (OneWay(LIVELY, 1, uplink=True) for _ in range(2))
+    for n in range(100):
+        other.send(1, 1000 + n, 100, n * MS)
+        assert one.send(1, n, 100, n * MS) == other.send(1, n, 100, n * MS)
+
+
+def test_an_episode_begins_with_an_empty_bottleneck_and_at_the_start_of_the_time_line():
+    slow = profile_of(0.01, rate=5e4, changes=(change(0.5, 0.1),))
+    way = OneWay(slow, 1, uplink=True)
+    first = [way.send(1, n, 1000, n * 100 * MS) for n in range(10)]
+    assert first[0][0] < 200 * MS
+    assert first[9][0] > 1700 * MS
+    assert [way.send(2, n, 1000, n * 100 * MS) for n in range(10)] == first
+
+
+def test_a_damaged_packet_is_lost_and_a_copy_that_comes_first_counts():
+    assert np.isnan(OneWay(profile_of(0.01, corrupt=1.0), 1, uplink=True).table(5, 0.01)).all()
+    twice = OneWay(profile_of(0.05, 0.04, duplicate=1.0), 1, uplink=True)
+    for n in range(100):
+        assert (
+            twice.table(1, 0.01, first=n)[0]
+            == (min(twice.send(0, n, 1, 10 * MS * n)) - 10 * MS * n) * 1e-9
+        )
+
+
+def test_packets_in_flight_arrive_in_order_with_their_data():
+    up, down = cloudrc.link.open({"uplink": {"delay_ms": 5}, "downlink": {"delay_ms": 3}}, 1)
+    queue = PacketQueue()
+    queue.put(up, up.send(1, 0, 10, 0), "observation")
+    queue.put(down, down.send(1, 0, 10, 0), "action")
+    queue.put(up, (), "lost")
+    assert [queue.pop() for _ in range(2)] == [
+        (3 * MS, down, "action"),
+        (5 * MS, up, "observation"),
+    ]
+    assert queue.lost == 1
+
+
+def test_the_expected_statistics_are_those_of_the_profile():
+    found = OneWay(LIVELY, 1, uplink=True).expected()
+    assert found.mean == pytest.approx(0.07, abs=1e-3)
+    assert (found.least, found.most) == pytest.approx((0.03, 0.11), abs=1e-4)
+    assert found.loss == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_mapping_is_read_as_a_file_and_has_the_plain_classes(tmp_path):
+    (tmp_path / "delays.csv").write_text("time_s,delay_ms\n0,20\n1,30\n")
+    way = {
+        "delay_ms": np.float64(40),
+        "loss": {"bad_start": 0.1, "bad_end": 0.5},
+        "changes": [{"at_s": 1, "loss": 0.5}],
+        "blackouts": ({"start_s": 2, "duration_s": 1},),
+    }
+    trace = {"trace": str(tmp_path / "delays.csv")}
+    profile = cloudrc.link.read_profile({"uplink": way, "downlink": trace})
+    assert profile.uplink == DirectionProfile(
+        delay_ms=40.0,
+        loss=GilbertElliott(0.1, 0.5),
+        changes=(change(1.0, loss=0.5),),
+        blackouts=(blackout(2.0, 1.0),),
+    )
+    assert profile.downlink.rows == Trace((0.0, 1.0), (0.02, 0.03))
+    (tmp_path / "mine.yaml").write_text("uplink: {trace: delays.csv}\n")
+    (up, _), (same, _) = (cloudrc.link.open(p, 1) for p in (tmp_path / "mine.yaml", profile))
+    assert up.table(3, 1.0) == pytest.approx([0.02, 0.03, 0.03])
+    assert same.profile is profile.uplink
+
+
+@pytest.mark.parametrize(
+    ("profile", "words"),
+    [
+        ("let", "no profile named 'let'.*did you mean lte"),
+        ("./none.yaml", "no such file"),
+        ({"uplink": {"delay": 40}}, "uplink.delay: unknown key; did you mean delay_ms"),
+        ({"uplink": {"loss": 5}}, "uplink.loss: 5: must be a number >= 0 and <= 1"),
+        ({"up": {}}, "up: unknown key"),
+        ({"uplink": {"delay_ms": float("nan")}}, "uplink.delay_ms"),
+        ({"uplink": {"delay_ms": object()}}, "holds texts.*not object"),
+        ({"uplink": {"trace": "none.csv"}}, "none.csv"),
+        (70, "not int"),
+        (None, "not NoneType"),
+    ],
+)
+def test_a_profile_that_cannot_be_used_is_refused_in_one_line(profile, words):
+    with pytest.raises(BadInputError, match=words) as caught:
+        cloudrc.link.open(profile, 1)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "1", 2**53, None])
+def test_a_seed_that_is_none_is_refused(seed):
+    with pytest.raises(BadInputError, match="seed"):
+        cloudrc.link.open("ideal", seed)
+
+
+def test_the_examples_of_the_page_run(tmp_path, capsys):
+    page = (Path(__file__).parents[2] / "docs" / "library.md").read_text()
+    program = tmp_path / "page.py"
+    program.write_text("\n".join(re.findall("```python\n(.*?)```", page, re.DOTALL)))
+    runpy.run_path(str(program))
+    told = re.search(r"print\(arrivals\)  # (\(.*?\)):", page)[1]
+    assert capsys.readouterr().out.startswith(told)
