@@ -170,16 +170,22 @@ def _named(file: Path, folder: Path) -> Iterator[Path]:
     except (OSError, SyntaxError, ValueError, RecursionError):
         return
     for node in nodes:
-        if isinstance(node, ast.Import):
-            for alias in node.names:
+        yield from _named_by(node, file, folder)
+
+
+def _named_by(node: ast.AST, file: Path, folder: Path) -> Iterator[Path]:
+    """Yield the files that one node of the syntax tree of `file` names."""
+    match node:
+        case ast.Import(names=names):
+            for alias in names:
                 yield from _files(folder, alias.name)
-        elif isinstance(node, ast.ImportFrom):
-            above = [*file.parents][: node.level][-1] if node.level else folder
-            for alias in node.names:
-                yield from _files(above, f"{node.module or ''}.{alias.name}".lstrip("."))
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            data = os.path.join(file.parent, node.value)
-            if not os.path.isabs(node.value) and os.path.isfile(data):  # unlike Path, never raises
+        case ast.ImportFrom(module=module, names=names, level=level):
+            above = [*file.parents][:level][-1] if level else folder
+            for alias in names:
+                yield from _files(above, f"{module or ''}.{alias.name}".lstrip("."))
+        case ast.Constant(value=str(text)):
+            data = os.path.join(file.parent, text)
+            if not os.path.isabs(text) and os.path.isfile(data):  # unlike Path, never raises
                 yield Path(data).resolve()
 
 

@@ -89,12 +89,10 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
     see = f"see: {release.kubectl} describe pods -l {selector}"
     until, failing_since, last = time.monotonic() + timeout, None, ""
     while True:
-        states = {each: _state(release, each) for each in COMPONENTS}
-        words = "; ".join(f"{component}: {why}" for component, (why, _) in states.items() if why)
+        words, fatal = _why_not_ready(release)
         if not words:
             return
         now = time.monotonic()
-        fatal = _why_never({each: why for each, (why, bad) in states.items() if bad})
         failing_since = (failing_since or now) if fatal else None
         if failing_since is not None and now - failing_since >= FAILURE_TIME:
             raise ClusterError(f"{fatal}; {see}")
@@ -107,6 +105,13 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
             tell(words)
             last = words
         time.sleep(LOOK_PERIOD)
+
+
+def _why_not_ready(release: Release) -> tuple[str, str]:
+    """Say why the pods of a release are not ready, and why they will never be; "" if not so."""
+    states = {each: _state(release, each) for each in COMPONENTS}
+    words = "; ".join(f"{component}: {why}" for component, (why, _) in states.items() if why)
+    return words, _why_never({each: why for each, (why, bad) in states.items() if bad})
 
 
 def _why_never(causes: Mapping[str, str]) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple
@@ -183,14 +183,7 @@ def quotas(release: Release, pods: dict[str, dict[str, Any]]) -> Iterator[Findin
     from kubernetes import utils
 
     quantity: Any = utils.parse_quantity  # not annotated
-    needed = Counter[str]()
-    for spec in pods.values():
-        for container in [*spec.get("initContainers", []), *spec["containers"]]:
-            for kind, amounts in container.get("resources", {}).items():
-                for resource, amount in amounts.items():
-                    needed[f"{kind}.{resource}"] += quantity(amount)
-    needed |= {"cpu": needed["requests.cpu"], "memory": needed["requests.memory"]}
-    needed |= {"pods": len(pods), "count/pods": len(pods)}
+    needed = _needed(pods, quantity)
     for quota in release.request("list", "resourcequotas"):
         used, hard = quota.status.used or {}, quota.status.hard or {}
 
@@ -208,6 +201,19 @@ def quotas(release: Release, pods: dict[str, dict[str, Any]]) -> Iterator[Findin
             yield Finding(name, "missing", f"the release needs {', '.join(lacks)}", fix)
         else:
             yield Finding(name, "ok", "has enough left for one release")
+
+
+def _needed(pods: dict[str, dict[str, Any]], quantity: Callable[[Any], Any]) -> Counter[str]:
+    """Return what all pods together need: name as in a quota, such as requests.cpu -> amount."""
+    needed = Counter[str]()
+    for spec in pods.values():
+        for container in [*spec.get("initContainers", []), *spec["containers"]]:
+            for kind, amounts in container.get("resources", {}).items():
+                for resource, amount in amounts.items():
+                    needed[f"{kind}.{resource}"] += quantity(amount)
+    needed |= {"cpu": needed["requests.cpu"], "memory": needed["requests.memory"]}
+    needed |= {"pods": len(pods), "count/pods": len(pods)}
+    return needed
 
 
 def _text(amount: Any) -> str:

@@ -403,16 +403,23 @@ def _inline_profile(document: Document) -> None:
     if shipped.is_path(name):
         document.set_value(("link", "profile"), str(source.absolute(name)), source)
     for way in DIRECTIONS:
-        own = document.get("link", way)
-        if isinstance(own, dict | None):
-            document.tree["link"][way] = (file.get(way) or {}) | (own or {})
-            inserted = {
-                ("link", *key): place
-                for key, place in file.sources.items()
-                if key[:1] == (way,) and not (own and key[1:2] and key[1] in own)
-            }
-            document.sources = inserted | document.sources
+        _inline_direction(document, way, file)
     _default_all(document, _implied(profile))
+
+
+def _inline_direction(document: Document, way: str, profile: Document) -> None:
+    """Fill in the values of one direction that the experiment omits, from the file `profile`."""
+    own = document.get("link", way)
+    if not isinstance(own, dict | None):
+        return
+    own = own or {}
+    document.tree["link"][way] = (profile.get(way) or {}) | own
+    inserted = {
+        ("link", *key): place
+        for key, place in profile.sources.items()
+        if key[:1] == (way,) and not (key[1:2] and key[1] in own)
+    }
+    document.sources = inserted | document.sources
 
 
 def _default_all(document: Document, values: dict[KeyPath, float]) -> None:
@@ -503,13 +510,7 @@ def _remove_derived(document: Document, *, new_profile: bool) -> None:
 def _resolve_paths(document: Document) -> list[ConfigProblem]:
     """Make all paths in an experiment or profile absolute, and check the files; return problems."""
     found: list[ConfigProblem] = []
-    ways = [(*above, way) for above in ((), ("link",)) for way in DIRECTIONS]
-    paths = [(*way, key) for way in ways for key in ("trace", "table")]
-    paths += [("mission", "setpoints"), ("world", "robot"), ("world", "scene")]
-    metrics = document.get("report", "metrics")
-    for index in range(len(metrics) if isinstance(metrics, list) else 0):
-        paths.append(("report", "metrics", str(index)))
-    for path in paths:
+    for path in _places_of_files(document):
         name, key, source = document.get(*path), path[-1], document.source(path)
         with _collect(found, path):
             if not isinstance(name, str) or (key.isdecimal() and not plugins.is_path(name)):
@@ -523,6 +524,16 @@ def _resolve_paths(document: Document) -> list[ConfigProblem]:
                 _check_file(key, name)
             document.set_value(path, name, source)
     return found
+
+
+def _places_of_files(document: Document) -> list[KeyPath]:
+    """Return the paths of all keys that may name a file."""
+    ways = [(*above, way) for above in ((), ("link",)) for way in DIRECTIONS]
+    paths: list[KeyPath] = [(*way, key) for way in ways for key in ("trace", "table")]
+    paths += [("mission", "setpoints"), ("world", "robot"), ("world", "scene")]
+    metrics = document.get("report", "metrics")
+    count = len(metrics) if isinstance(metrics, list) else 0
+    return paths + [("report", "metrics", str(index)) for index in range(count)]
 
 
 def _check_file(key: str, path: str) -> None:

@@ -68,19 +68,33 @@ def expectation(model: type[BaseModel], path: KeyPath) -> str:
     kind = field.annotation
     if get_origin(kind) is Literal:
         return f"must be one of {', '.join(map(repr, get_args(kind)))}"
-    words = [_TYPES[plain] for plain in dict.fromkeys(_types(kind)) if plain in _TYPES]
-    if words and words[0].endswith("number"):
-        limits = " and ".join(dict.fromkeys(_limits(field)))
-        share = "(1 % is 0.01)" if limits == ">= 0 and <= 1" else ""
-        words[0] = " ".join([words[0], limits, share]).strip()
-    if any(_models(kind)):
-        words.append("a mapping of keys")
     if _is_list(kind) and not path[-1].isdecimal():
-        fixed = get_origin(kind) is tuple and Ellipsis not in get_args(kind)
-        size, numbers = len(get_args(kind)) if fixed else "", float in _types(kind)
-        words = [" ".join(f"a list{' of' * (fixed or numbers)} {size}".split())]
-        words[0] += " numbers" * numbers + " or null" * (not fixed and NoneType in get_args(kind))
+        words = [_list_words(kind)]
+    else:
+        words = [_TYPES[plain] for plain in dict.fromkeys(_types(kind)) if plain in _TYPES]
+        if words and words[0].endswith("number"):
+            limits = " and ".join(dict.fromkeys(_limits(field)))
+            share = "(1 % is 0.01)" if limits == ">= 0 and <= 1" else ""
+            words[0] = " ".join([words[0], limits, share]).strip()
+        if any(_models(kind)):
+            words.append("a mapping of keys")
     return " ".join(["must be", " or ".join(words), _unit(field)]).strip()
+
+
+def _list_words(kind: Any) -> str:
+    """Describe a list, such as "a list of 3 numbers"; `kind` is its annotation."""
+    fixed = get_origin(kind) is tuple and Ellipsis not in get_args(kind)
+    words = ["a list"]
+    has_numbers = float in _types(kind)
+    if fixed or has_numbers:
+        words.append("of")
+    if fixed:
+        words.append(str(len(get_args(kind))))
+    if has_numbers:
+        words.append("numbers")
+    if not fixed and NoneType in get_args(kind):
+        words.append("or null")
+    return " ".join(words)
 
 
 def _nearest_key(model: type[BaseModel], path: KeyPath) -> str:

@@ -29,33 +29,39 @@ def read_setpoints(path: Path, fence: Fence) -> tuple[TimedPosition, ...]:
     Raise a BadInputError if the file is not usable, or if it leads out of the box in which the
     guard lets the robot fly inside `fence`. A robot that stays on the ground needs no column z_m.
     """
-    name, found, ground = f"setpoints {path}", list[TimedPosition](), fence.ground
-    fits = COLUMNS if ground is None else COLUMNS[:3]
+    name, found = f"setpoints {path}", list[TimedPosition]()
+    fits = COLUMNS if fence.ground is None else COLUMNS[:3]
     columns, rows = read_rows(read_lines(path, name, f"give a CSV file: {','.join(fits)}"), name)
     if columns not in (COLUMNS, fits):
         given = ",".join(columns)[:80] or "missing"
         raise BadInputError(f"{name}, line 1: the columns are {given}; give {','.join(fits)}")
     for row in rows:
-        time, x, y, *heights = map(row.number, columns)
-        z = heights[0] if heights else fence.inner_low[2]
-        if ground is not None and abs(z - ground) > ROUNDING:
-            raise BadInputError(
-                f"{row.where}: z_m is {z:g}, but the robot stays on the ground, at {ground:g}; "
-                "leave the column z_m out"
-            )
+        time, *place = map(row.number, columns)
         if found and time <= found[-1][0]:
             raise BadInputError(
                 f"{row.where}: time_s {time:g} does not rise; sort the rows by time"
             )
-        sides = zip(COLUMNS[1:], fence.inner_low, (x, y, z), fence.inner_high, strict=True)
-        for column, low, at, high in sides:
-            if not low - ROUNDING <= at <= high + ROUNDING:
-                reason = f"the guard flies from {low:g} to {high:g}"
-                raise BadInputError(f"{row.where}: {column} is {at:g}; {reason}; stay inside")
-        found.append((time, (x, y, z)))
+        found.append((time, _position(place, fence, row.where)))
     if len(found) < 2:
         raise BadInputError(f"{name}: has {len(found)} rows; give at least two")
     return tuple((time - found[0][0], position) for time, position in found)
+
+
+def _position(place: Sequence[float], fence: Fence, where: str) -> Vector:
+    """Return the position [m] in the row at `where`; `place` is x and y, and z if it is given."""
+    x, y, *heights = place
+    z = heights[0] if heights else fence.inner_low[2]
+    if fence.ground is not None and abs(z - fence.ground) > ROUNDING:
+        raise BadInputError(
+            f"{where}: z_m is {z:g}, but the robot stays on the ground, at {fence.ground:g}; "
+            "leave the column z_m out"
+        )
+    sides = zip(COLUMNS[1:], fence.inner_low, (x, y, z), fence.inner_high, strict=True)
+    for column, low, at, high in sides:
+        if not low - ROUNDING <= at <= high + ROUNDING:
+            reason = f"the guard flies from {low:g} to {high:g}"
+            raise BadInputError(f"{where}: {column} is {at:g}; {reason}; stay inside")
+    return x, y, z
 
 
 def write_setpoints(setpoints: Iterable[tuple[float, Sequence[float]]], fence: Fence) -> str:

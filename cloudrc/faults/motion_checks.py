@@ -62,18 +62,22 @@ class MotionChecks:
         """
         if was in FLOWN and state is ESTOP:
             self.falls = True
-        margin = self._margin(readings.position)
         if self.falls and state in FLOWN:
             self._check_take_off(readings, now_ns)
         if readings.position[2] < self._facts.low[2]:
             text = f"base at {_show(readings.position)}, below the floor"
             self._note(now_ns, "fence", text)
+        self._check_margin(readings.position, now_ns)
+
+    def _check_margin(self, position: Vector, now_ns: int) -> None:
+        """Check the distance of the base to the fence, and note the smallest."""
+        margin = self._margin(position)
         if margin >= 0.0 and now_ns - self._touched_ns >= THROWN_NS:
             self._is_thrown = False
         may_leave = self.falls or self._is_thrown
         if margin < (-FALL_MAX if may_leave else 0.0):
             how = "fell to" if may_leave else "at"
-            self._note(now_ns, "fence", f"base {how} {_show(readings.position)}")
+            self._note(now_ns, "fence", f"base {how} {_show(position)}")
         if not self.falls and (margin >= 0.0 or not self._is_thrown):
             self._watch.margin = min(self._watch.margin, margin)
 

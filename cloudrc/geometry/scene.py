@@ -14,18 +14,23 @@ data="..."/>`, in metres, world frame. The name of a tube or plate is that of it
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeAlias
 from xml.etree import ElementTree
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import Corners, Fence, order_of
 from cloudrc.messages import Vector
 
+Numerics: TypeAlias = dict[str, str]
+"""Name of a `<numeric>` -> its data."""
 SPAWN: Vector = (0.0, 0.0, 0.1)
 """Position of the base at the start of a mission in the shipped scenes [m], world frame."""
 FLOOR, WORLD = "floor", "world"
 """Names of the body on which the robot stands, and of all geoms in a scene's worldbody."""
+FENCE = "fence"
+"""Name of the numbers that declare the scene's fence."""
 SCENES = Path(__file__).parents[1] / "world" / "scenes"
 
 
@@ -78,36 +83,49 @@ def load_scene(name: str, corners: Corners | None = None) -> Scene:
     `corners` [m] replace those of the scene's fence. Raise a BadInputError if the file does not
     exist, or if its numbers do not have the form in the table at the top of this module.
     """
-    own = Path(name) if name.endswith(".xml") else None
-    path = own or SCENES / f"{name}.xml"
+    is_shipped = not name.endswith(".xml")
+    path = SCENES / f"{name}.xml" if is_shipped else Path(name)
     try:
-        root = ElementTree.parse(path).getroot()
-        numerics = [(n.get("name", ""), n.get("data", "")) for n in root.iterfind("custom/numeric")]
-        names = {body.get("name") for body in root.iter("body")}
-        shapes: list[Tube | Plate] = []
-        floor, fence = 0.0, None
-        for name, data in numerics:
-            if name == FLOOR:
-                (floor,) = _numbers(name, data, 1)
-            elif name == "fence":
-                fence = _fence(_numbers(name, data, 6))
-            elif name in names:
-                shapes.append(_shape(name, data))
-        frame = root.find("./worldbody/frame[@name='spawn']")
-        x, y, z = SPAWN if frame is None else _numbers("spawn", frame.get("pos", "0 0 0"), 3)
+        scene = _read(ElementTree.parse(path).getroot(), path, is_shipped=is_shipped)
     except OSError as error:
         raise BadInputError(f"scene {path.name}: cannot be read: {error.strerror}") from error
     except ElementTree.ParseError as error:
         raise BadInputError(f"scene {path.name}: not readable as XML: {error}") from error
     except ValueError as error:
         raise BadInputError(f"scene {path.name}: {error}") from None
+    return replace(scene, own_fence=Fence(*corners)) if corners else scene
+
+
+def _read(root: ElementTree.Element, path: Path, *, is_shipped: bool) -> Scene:
+    """Read the scene in the file `path`, whose element is `root`."""
+    numerics = {n.get("name", ""): n.get("data", "") for n in root.iterfind("custom/numeric")}
+    shapes = _shapes(root, numerics)
+    (floor,) = _numbers(FLOOR, numerics.get(FLOOR, "0"), 1)
     bodies = {body.get("name") for body in root.iterfind("worldbody/body")}
-    is_complete = own is None and bodies <= {FLOOR, *(name for name, _ in numerics)}
-    own_fence = Fence(*corners) if corners else fence
-    whole = None if is_complete else path
-    tubes = tuple(shape for shape in shapes if isinstance(shape, Tube))
-    plates = tuple(shape for shape in shapes if isinstance(shape, Plate))
-    return Scene(path.stem, tubes, plates, floor, (x, y, z), whole, own_fence)
+    is_complete = is_shipped and bodies <= {FLOOR, *numerics}
+    return Scene(
+        path.stem,
+        tuple(shape for shape in shapes if isinstance(shape, Tube)),
+        tuple(shape for shape in shapes if isinstance(shape, Plate)),
+        floor,
+        _spawn(root),
+        None if is_complete else path,
+        _fence(_numbers(FENCE, numerics[FENCE], 6)) if FENCE in numerics else None,
+    )
+
+
+def _shapes(root: ElementTree.Element, numerics: Numerics) -> list[Tube | Plate]:
+    """Return the tubes and plates of a scene in the order of its file."""
+    names = {body.get("name") for body in root.iter("body")} - {FLOOR, FENCE}
+    return [_shape(name, data) for name, data in numerics.items() if name in names]
+
+
+def _spawn(root: ElementTree.Element) -> Vector:
+    frame = root.find("./worldbody/frame[@name='spawn']")
+    if frame is None:
+        return SPAWN
+    x, y, z = _numbers("spawn", frame.get("pos", "0 0 0"), 3)
+    return x, y, z
 
 
 def _fence(numbers: list[float]) -> Fence:

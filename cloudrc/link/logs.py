@@ -300,7 +300,7 @@ _LOST_WORDS = {
     *("lost", "loss", "timeout", "timed out", "request timed out", "no answer yet"),
 }
 """Words in the delay column that mark a lost packet."""
-_LOST_NUMBERS = (-1.0, -999.0, -9999.0)  # mark a lost packet if no other delay is negative
+_LOST_NUMBERS = {-1.0, -999.0, -9999.0}  # mark a lost packet if no other delay is negative
 _FLAGS = {"false": 0.0, "no": 0.0, "true": 1.0, "yes": 1.0}
 """Word in the loss column -> 1 if the packet was lost."""
 
@@ -453,19 +453,25 @@ def _without_marks(raw: list[Entry], column: str, log: Log, *, has_losses: bool)
 
     With `has_losses`, the log has a column `loss`; then 0 never stands for a lost packet.
     """
-    values = {value for _, value in raw if not isnan(value)}
+    marks = _marks({value for _, value in raw if not isnan(value)}, column, log)
+    if has_losses:
+        marks -= {0.0}
+    for mark in marks:
+        what = f"with {column} {mark:g} taken as lost"
+        log.counts[what] = sum(value == mark for _, value in raw)
+    return [(sent, nan if value in marks else value) for sent, value in raw]
+
+
+def _marks(values: set[float], column: str, log: Log) -> set[float]:
+    """Return the numbers among the `values` of a column that stand for a lost packet."""
     below = {value for value in values if value < 0.0}
-    marks = {value for value in below if len(below) == 1 and value in _LOST_NUMBERS}
+    marks = below & _LOST_NUMBERS if len(below) == 1 else set[float]()
     if below and not marks and log.halved:
         raise BadInputError(
             f"{log.name}: {column} is {min(below):g}, which is no round trip; leave the cell of a "
             "lost packet empty"
         )
-    marks |= {0.0} if not has_losses and looks_lost(values - below) else set()
-    for mark in marks:
-        what = f"with {column} {mark:g} taken as lost"
-        log.counts[what] = sum(value == mark for _, value in raw)
-    return [(sent, nan if value in marks else value) for sent, value in raw]
+    return marks | {0.0} if looks_lost(values - below) else marks
 
 
 _WRAP = 1 << 16
@@ -547,30 +553,46 @@ def _ping_range(
     if the log has several sessions of ping or too many packets, or if the summary does not match
     the number of `replies`.
     """
-    heads = [line for line in others if line.startswith(_HEADS)]
-    ends = [line for line in others if not line.startswith(_HEADS)]
-    totals = [found for line in ends if (found := _SUMMARY.search(line))]
-    unknown = [line for line in ends if not (_EXPECTED.match(line) or _SUMMARY.search(line))]
-    log.counts["other lines left out"] += len(unknown)
-    if (beginnings := max(len(heads), len(totals))) > 1:
-        raise _sessions(f"{beginnings} beginnings or ends", log)
-    for total in totals:
-        sent, received = (int(word) for word in total.groups() if word)
+    head, total = _head_and_summary(others, log)
+    if total is not None:
         # fping begins with 0, and so does a ping whose header has "data bytes".
-        from_0 = first == 0 or "xmt/" in total.string or " data bytes" in "".join(heads)
-        base = 0 if from_0 else 1
-        if received != replies or sent < last - base + 1:
-            raise log.error(
-                f"its summary counts {sent} sent and {received} received, but it has {replies} "
-                f"replies up to number {last}; give the whole log"
-            )
-        first, last = base, base + sent - 1
+        from_0 = first == 0 or "xmt/" in total.string or " data bytes" in head
+        first, last = _summed_up(total, 0 if from_0 else 1, last, replies, log)
     if last - first >= PACKETS_MAX:
         raise log.error(
             f"its sequence numbers span {last - first + 1} packets, more than {PACKETS_MAX}; "
             "give the output of one ping"
         )
     return first, last
+
+
+def _head_and_summary(others: list[str], log: Log) -> tuple[str, re.Match[str] | None]:
+    """Return ping's first line ("" without one) and its summary; count unknown lines in `log`."""
+    heads = [line for line in others if line.startswith(_HEADS)]
+    ends = [line for line in others if not line.startswith(_HEADS)]
+    totals = [found for line in ends if (found := _SUMMARY.search(line))]
+    expected = sum(_EXPECTED.match(line) is not None for line in ends if not _SUMMARY.search(line))
+    log.counts["other lines left out"] += len(ends) - len(totals) - expected
+    if (beginnings := max(len(heads), len(totals))) > 1:
+        raise _sessions(f"{beginnings} beginnings or ends", log)
+    return "".join(heads), totals[0] if totals else None
+
+
+def _summed_up(
+    total: re.Match[str], base: int, last: int, replies: int, log: Log
+) -> tuple[int, int]:
+    """Return the first and last sequence number according to the line `total` of the summary.
+
+    The numbers begin with `base`. Raise a BadInputError if the summary does not match the number of
+    `replies`, or the number `last` that the lines of packets reach.
+    """
+    sent, received = (int(word) for word in total.groups() if word)
+    if received != replies or sent < last - base + 1:
+        raise log.error(
+            f"its summary counts {sent} sent and {received} received, but it has {replies} "
+            f"replies up to number {last}; give the whole log"
+        )
+    return base, base + sent - 1
 
 
 def _sessions(sign: str, log: Log) -> BadInputError:

@@ -132,14 +132,7 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
             f"{place}, line 1: the columns are {','.join(columns)[:200] or 'missing'}; the header "
             "is time_s,delay_ms or time_s,delay_us, and may end in ,loss"
         )
-    found = list[list[float]]()
-    for row in rows:
-        found.append([_number(row, column) for column in ("time_s", delay, "loss")[: len(columns)]])
-        if len(found) > 1 and found[-1][0] <= found[-2][0]:
-            raise BadInputError(
-                f"{row.where}: time_s {found[-1][0]:.12g} does not come after "
-                f"{found[-2][0]:.12g}; sort the rows by time and give each time once"
-            )
+    found = _rising(rows, ["time_s", delay, "loss"][: len(columns)])
     if not found:
         raise BadInputError(f"{place}: no rows; give at least one, for example: 0,45")
     times, delays, *losses = zip(*found, strict=True)
@@ -149,6 +142,19 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
     start = times[0] if times[0] > START_MAX else 0.0
     scaled = tuple(one * _SCALES[delay] for one in delays)
     return Trace(tuple(time - start for time in times), scaled, losses[0] if losses else None)
+
+
+def _rising(rows: Iterable[Row], columns: Sequence[str]) -> list[list[float]]:
+    """Read the numbers of `columns` in each row; the first column is a time, which has to rise."""
+    found = list[list[float]]()
+    for row in rows:
+        found.append([_number(row, column) for column in columns])
+        if len(found) > 1 and found[-1][0] <= found[-2][0]:
+            raise BadInputError(
+                f"{row.where}: time_s {found[-1][0]:.12g} does not come after "
+                f"{found[-2][0]:.12g}; sort the rows by time and give each time once"
+            )
+    return found
 
 
 def write_trace(trace: Trace) -> str:

@@ -526,23 +526,32 @@ def _describe(gaps: list[FilePart]) -> str:
 
 def _changes(file: File) -> Iterator[str]:
     """Describe what another program has removed from a file or added to it."""
-    content = file.content
+    yield from _changed_topics(file)
+    if not file.content.metadata.get(CLOCK):
+        yield "the metadata of cloudrc, which names the clock, is not there"
+    if file.data_ended and not file.gaps:
+        yield from _changed(file.content)
+
+
+def _changed_topics(file: File) -> Iterator[str]:
+    """Describe topics of another layout and topics that are twice in a file.
+
+    Topics that cloudrc does not record are no change: they become a remark of the content.
+    """
     channels = Counter(
         (file.channels[n].topic, ours) for n, ours in file.ours.items() if n in file.channels
     )
     others = {name for name, known in channels if not known}
     if foreign := sorted(others - TOPICS.keys()):
         told = f"has topics that cloudrc does not record: {list_some(foreign)}"
-        content.remarks += (to_one_line(told),)
+        file.content.remarks += (to_one_line(told),)
     if other := sorted(others & TOPICS.keys()):
         yield f"topics of another layout were left out: {', '.join(other)}"
-    twice = [name for (name, known), n in channels.items() if known and n > 1 and name in TOPICS]
-    if double := [name for name in twice if TOPICS[name].end != "either"]:
+    once = {name for name, topic in TOPICS.items() if topic.end != "either"}
+    if double := [
+        name for (name, known), n in channels.items() if known and n > 1 and name in once
+    ]:
         yield f"two robots or two recordings are in one file: {', '.join(double)}"
-    if not content.metadata.get(CLOCK):
-        yield "the metadata of cloudrc, which names the clock, is not there"
-    if file.data_ended and not file.gaps:
-        yield from _changed(content)
 
 
 def _stored_counts(content: Content) -> Counter[str]:

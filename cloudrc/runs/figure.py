@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import nan
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 from cloudrc.errors import BadInputError
 from cloudrc.metrics import scale
@@ -22,6 +22,10 @@ COLUMN = Look(width=3.5)
 """Look of a figure in one column of a page. Source: IEEE conference template."""
 SHOWN = 3
 """Number of metrics that a figure shows by default."""
+CAPTION = (
+    "Median of each point, with its 95 % interval from 6 flights on; success: share and "
+    "Clopper and Pearson's 95 % interval. Open markers: some flights failed."
+)
 Groups = Mapping[str, Sequence[Sequence[Row]]]
 """Name of a line -> flights of each point."""
 Summary = Callable[[Sequence[Row]], tuple[float, float, float]]
@@ -52,57 +56,84 @@ def draw_sweep(
     Raises:
         BadInputError: If the sweep lacks an axis or a metric.
     """
-    known = sorted({name for row in rows if counts(row) for name in row["numbers"]})
-    check_names(names, known)
-    values, x, by, pooled = _choose(rows, x, by)
-    is_numeric = _is_numeric(values[x])
-    along = sorted(values[x]) if is_numeric else values[x]
-    groups = {
-        str(name): [
-            [r for r in rows if r["point"][x] == at and (not by or r["point"][by] == name)]
-            for at in along
-        ]
-        for name in (values[by] if by else [x])
-    }
+    shown = _shown(rows, names)
+    axes = _choose(rows, x, by)
+    is_numeric = _is_numeric(axes.values[axes.x])
+    along = sorted(axes.values[axes.x]) if is_numeric else axes.values[axes.x]
     at = along if is_numeric else range(len(along))
-    panels = [_metric(name, units[name], groups, at) for name in names or
-              [name for name in NUMBERS if name in known][:SHOWN]]  # fmt: skip
+    groups = _grouped(rows, axes, along)
+    panels = [_metric(name, units[name], groups, at) for name in shown]
     if any(row["verdict"] != "success" for row in rows):
         panels.append(Panel("success", "%", _lines(groups, at, _rate)))
-    caption = (
-        "Median of each point, with its 95 % interval from 6 flights on; success: share and "
-        "Clopper and Pearson's 95 % interval. Open markers: some flights failed."
-        + (f" Each point pools all values of {', '.join(pooled)}." if pooled else "")
-    )
-    return draw(panels, x, [] if is_numeric else list(map(str, along)), by, look=look), caption
+    caption = CAPTION
+    if axes.pooled:
+        caption += f" Each point pools all values of {', '.join(axes.pooled)}."
+    ticks = [] if is_numeric else list(map(str, along))
+    return draw(panels, axes.x, ticks, axes.by, look=look), caption
 
 
-def _choose(
-    rows: Sequence[Row], x: str | None, by: str | None
-) -> tuple[dict[str, list[Any]], str, str | None, list[str]]:
-    """Choose the axis of the sweep for the figure's x axis, and the axis with one line per value.
+def _shown(rows: Sequence[Row], names: Sequence[str]) -> Sequence[str]:
+    """Return the metrics to show; raise a BadInputError if no flight has one of the `names`."""
+    known = sorted({name for row in rows if counts(row) for name in row["numbers"]})
+    check_names(names, known)
+    return names or [name for name in NUMBERS if name in known][:SHOWN]
 
-    `x` and `by` are the user's choices of these two, or None. Return the values of each axis, the x
-    axis, the axis of the lines (None if no axis is left), and the other axes.
+
+class _Axes(NamedTuple):
+    """The axes of a sweep, and their roles in the figure."""
+
+    values: dict[str, list[Any]]  # axis -> its values
+    x: str
+    by: str | None  # axis with one line per value; None if no axis is left
+
+    @property
+    def pooled(self) -> list[str]:
+        """The other axes with more than one value, of which each point has all."""
+        values, shown = self.values, (self.x, self.by)
+        return [axis for axis in values if len(values[axis]) > 1 and axis not in shown]
+
+
+def _choose(rows: Sequence[Row], x: str | None, by: str | None) -> _Axes:
+    """Choose the figure's x axis and the axis with one line per value.
+
+    `x` and `by` are the user's choices of these two, or None.
     """
     values = values_of(rows)
     if not values:
         raise BadInputError(
             "this sweep has no axis; give its file a grid, or see its metrics in table.csv"
         )
-    x, by = (axis and new_key(axis) for axis in (x, by))
-    for axis in (x, by):
-        if axis is not None and axis not in values:
-            raise BadInputError(unknown_name_text("axis", axis, sorted(values)))
+    x, by = _known_axis(x, values), _known_axis(by, values)
     free = [axis for axis in values if len(values[axis]) > 1 and axis != by] or list(values)
-    numeric = [axis for axis in free if _is_numeric(values[axis])]
-    x = x or next(iter(numeric), free[0])
+    # Axes with names come first: a median of two predictors says less than one of two delays.
+    names_first = sorted(free, key=lambda axis: _is_numeric(values[axis]))
+    x = x or next((axis for axis in free if _is_numeric(values[axis])), free[0])
     if x == by:
         raise BadInputError(f"--x and --by are both {x}; name two axes, or leave one out")
-    # Axes with names come first: a median of two predictors says less than one of two delays.
-    others = sorted((axis for axis in free if axis != x), key=lambda axis: axis in numeric)
-    by = by or next(iter(others), None)
-    return values, x, by, [axis for axis in free if axis not in (x, by)]
+    by = by or next((axis for axis in names_first if axis != x), None)
+    return _Axes(values, x, by)
+
+
+def _grouped(rows: Sequence[Row], axes: _Axes, along: Sequence[Any]) -> Groups:
+    """Group the flights by line and, within a line, by their value on the x axis."""
+    lines = {axes.x: rows}
+    if axes.by is not None:
+        lines = {str(value): _with(rows, axes.by, value) for value in axes.values[axes.by]}
+    return {name: [_with(line, axes.x, at) for at in along] for name, line in lines.items()}
+
+
+def _with(rows: Sequence[Row], axis: str, value: Any) -> list[Row]:
+    return [row for row in rows if row["point"][axis] == value]
+
+
+def _known_axis(given: str | None, known: Iterable[str]) -> str | None:
+    """Return the present name of the axis that the user gave; raise an error if there is none."""
+    if given is None:
+        return None
+    axis = new_key(given)
+    if axis not in known:
+        raise BadInputError(unknown_name_text("axis", axis, sorted(known)))
+    return axis
 
 
 def _is_numeric(values: Sequence[Any]) -> bool:

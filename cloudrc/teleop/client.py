@@ -188,20 +188,8 @@ def _is_from_api(answer: http.client.HTTPResponse) -> bool:
 
 
 def _refusal(answer: http.client.HTTPResponse, place: str, *, with_token: bool) -> CloudrcError:
-    try:
-        body = json.loads(answer.read())
-        detail, problems = str(body["detail"]), body.get("problems") or []
-    except (OSError, ValueError, TypeError, KeyError, http.client.HTTPException):
-        detail, problems = f"the API answered {answer.status} {answer.reason}", []
-        if answer.status not in RETRY_STATUSES:
-            detail += f": {FOREIGN}"
-    if (answer.status, detail) == (404, "Not Found"):  # for a path, not for a mission
-        detail = f"the API answered 404 {answer.reason}: {FOREIGN}"
-    detail = escape(detail)
-    if len(problems) > 1:
-        parts = ([p[k] for k in ("path", "value", "reason") if p[k]] for p in problems)
-        lines = [escape(": ".join(words)) for words in parts]
-        detail = "\n  ".join([f"the mission has {len(lines)} problems:", *lines])
+    """Return the error for an answer of the API that is no success."""
+    detail = _detail(answer)
     if answer.status == 401:
         which = "does not know this token" if with_token else "asks for a token"
         detail = f"the API {which}; name its file: --token-file FILE or {VARIABLE}"
@@ -209,6 +197,23 @@ def _refusal(answer: http.client.HTTPResponse, place: str, *, with_token: bool) 
     if answer.status in (400, 413, 422):
         return BadInputError(detail)
     return UnreachableError(detail) if answer.status in RETRY_STATUSES else ApiError(detail)
+
+
+def _detail(answer: http.client.HTTPResponse) -> str:
+    """Return the reason that the API gives for a refusal; a line for each of several problems."""
+    status = f"the API answered {answer.status} {answer.reason}"
+    try:
+        body = json.loads(answer.read())
+        detail, problems = str(body["detail"]), body.get("problems") or []
+    except (OSError, ValueError, TypeError, KeyError, http.client.HTTPException):
+        return escape(status if answer.status in RETRY_STATUSES else f"{status}: {FOREIGN}")
+    if (answer.status, detail) == (404, "Not Found"):  # for a path, not for a mission
+        return escape(f"{status}: {FOREIGN}")
+    if len(problems) <= 1:
+        return escape(detail)
+    parts = ([p[k] for k in ("path", "value", "reason") if p[k]] for p in problems)
+    lines = [escape(": ".join(words)) for words in parts]
+    return "\n  ".join([f"the mission has {len(lines)} problems:", *lines])
 
 
 def find_mission(api: Api, key: str) -> dict[str, Any] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -28,6 +28,8 @@ DELAY = (
 )
 TIME = "time since start (s)"
 """Label of the time axis; the report page finds panels over time by this label."""
+Limits: TypeAlias = tuple[Array, Array]
+"""Smallest and largest delay according to a profile at each time [s]."""
 MARGIN = 1.25
 """Ratio of the upper end of the delay axis to the 99.5th percentile of the delays."""
 
@@ -35,41 +37,50 @@ MARGIN = 1.25
 def draw_delay(subject: Subject) -> Figure:
     """Draw the one-way delay of each datagram, and the loop delay with cloud's estimate of it."""
     figure, (one_way, loop) = subject.look.two_panels()
-    flight, time = subject.flight, np.linspace(0.0, subject.flight.duration, 600)
+    time = np.linspace(0.0, subject.flight.duration, 600)
     limits = [bounds(subject, time, uplink=uplink) for uplink in (True, False)]
-
+    known = [each for each in limits if each is not None]
     panel(one_way, "a")
-    shown = []
+    _draw_one_way(one_way, subject, time, known)
+    panel(loop, "b")
+    _draw_loop(loop, subject, time, known)
+    return figure
+
+
+def _draw_one_way(axes: Axes, subject: Subject, time: Array, known: list[Limits]) -> None:
+    """Draw the one-way delays, and over `time` [s] the `known` limits of the profile [s]."""
+    flight, shown = subject.flight, []
     for name, colour in (("uplink", style.UPLINK), ("downlink", style.DOWNLINK)):
         arrivals = flight.during(f"/{name}_delay")
         delay = arrivals["delay"] * 1e3
         if np.isfinite(delay).any():
-            dots(one_way, flight.seconds(arrivals["stamp_ns"]), delay, colour, name)
+            dots(axes, flight.seconds(arrivals["stamp_ns"]), delay, colour, name)
             shown.append(delay)
     if not shown:
         text = "unknown: the two ends\ndo not share a clock"
-        one_way.text(0.5, 0.5, text, ha="center", va="center", transform=one_way.transAxes)
-    known = [each for each in limits if each is not None]
+        axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
     for index, (low, high) in enumerate(known):
-        _fill(one_way, time, low, high, "_" if index else "profile")
+        _fill(axes, time, low, high, "_" if index else "profile")
         shown.append(high * 1e3)
-    _finish_delay(one_way, subject, "one-way delay (ms)", shown)
+    _finish_delay(axes, subject, "one-way delay (ms)", shown)
 
-    panel(loop, "b")
+
+def _draw_loop(axes: Axes, subject: Subject, time: Array, known: list[Limits]) -> None:
+    """Draw the loop delay with cloud's estimate, and the profile's limits if both are `known`."""
+    flight = subject.flight
     echoes, control = round_trips(flight), flight.control
     loop_delay, horizon = echoes["loop_delay"] * 1e3, control["horizon"] * 1e3
-    dots(loop, flight.seconds(echoes["stamp_ns"]), loop_delay, style.SKY, "loop delay")
+    dots(axes, flight.seconds(echoes["stamp_ns"]), loop_delay, style.SKY, "loop delay")
     stamps = flight.seconds(control["stamp_ns"])
-    loop.plot(stamps, horizon, color=style.BLACK, label="estimate", zorder=4)
+    axes.plot(stamps, horizon, color=style.BLACK, label="estimate", zorder=4)
     shown = [loop_delay, horizon]
     if len(known) == 2:
         low, high = (sum(each) for each in zip(*known, strict=True))
-        _fill(loop, time, low, high, "profile")
+        _fill(axes, time, low, high, "profile")
         mean = (low + high) * 1e3 / 2
-        loop.plot(time, mean, color=style.GREEN, lw=0.8, ls="--", label="mean", zorder=3)
+        axes.plot(time, mean, color=style.GREEN, lw=0.8, ls="--", label="mean", zorder=3)
         shown.append(high * 1e3)
-    _finish_delay(loop, subject, "loop delay (ms)", shown)
-    return figure
+    _finish_delay(axes, subject, "loop delay (ms)", shown)
 
 
 def _fill(axes: Axes, time: Array, low: Array, high: Array, label: str) -> None:

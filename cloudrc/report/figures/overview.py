@@ -234,14 +234,19 @@ def draw(subject: Subject) -> Figure:
     axes.plot(*view.project(steps).T, lw=0)  # invisible, but labels avoid it
     for points in corners:
         axes.plot(*view.project(points).T, lw=0)
-    for row in stage.rows:
-        place = view.project(path[row])
-        if stage.is_tiny:
-            axes.plot(*place, "o", ms=9, mfc="none", mec=GREY, mew=0.6, zorder=6)
-        free_label(axes, f"{flight.seconds(flight.truth['stamp_ns'][row]):.1f} s", place)
+    _label_times(axes, stage, flight)
     if stage.is_tiny:
         _draw_inset(axes, stage, subject)
     return figure
+
+
+def _label_times(axes: Axes, stage: _Stage, flight: Flight) -> None:
+    """Write the time at each place of the robot that is drawn; mark a tiny robot by a circle."""
+    for row in stage.rows:
+        place = stage.view.project(stage.path[row])
+        if stage.is_tiny:
+            axes.plot(*place, "o", ms=9, mfc="none", mec=GREY, mew=0.6, zorder=6)
+        free_label(axes, f"{flight.seconds(flight.truth['stamp_ns'][row]):.1f} s", place)
 
 
 def _draw_floor(axes: Axes, stage: _Stage) -> None:
