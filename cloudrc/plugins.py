@@ -47,9 +47,10 @@ PACKAGES = {
     "onboard": "cloudrc.robots.onboard",
     "motion": "",
     "metrics": "",
+    "policies": "",
 }
 """Kind of plug-in -> package that contains cloudrc's plug-ins of this kind; "" if there is none:
-cloudrc's metrics are functions, and models of motion are files of robots."""
+cloudrc's metrics are functions, models of motion are files of robots, policies those of users."""
 SHOWN_MAX = 60
 """Largest length of a wrong value's representation in a message [characters]."""
 STACK_MAX = 4000
@@ -291,7 +292,7 @@ def _entries(kind: str, path: tuple[str, ...]) -> dict[str, EntryPoint]:
 
 
 def _one(kind: str) -> str:
-    return kind.removesuffix("s")
+    return "policy" if kind == "policies" else kind.removesuffix("s")
 
 
 def _explain(error: BaseException) -> str:

@@ -55,6 +55,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         *("cloud.motion", "endpoint", "geometry.vectors", "tunnel", "config", "plugins", "teleop"),
     },
     "teleop": {"config", "files", "geometry", "metrics"},
+    "policy": {"plugins"},
     "exposition": {"metrics.definitions"},
     "drivers": {"endpoint", "tunnel", "link", "exposition", "files", "record", "teleop"},
     "record": {"endpoint", "files"},
@@ -115,9 +116,10 @@ RESERVED: dict[str, tuple[str, ...]] = {
         *("exercise/scoring", "runs/doctor", "runs/link_under_test"),
     ),
     "multiprocessing": ("drivers/", "runs/workers"),
-    "concurrent": ("cli/", "runs/workers", "cluster/", "teleop/"),
+    "concurrent": ("cli/", "runs/workers", "cluster/", "teleop/", "policy/serve"),
     **dict.fromkeys(("secrets", "uuid"), ("console/", "drivers/", "cluster/", "cli/")),
-    "websockets": ("console/handed",),
+    "websockets": ("console/handed", "policy/"),
+    "msgpack": ("policy/codec",),
     **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),
 }
 # Imported package -> its name in pyproject.toml.

@@ -14,6 +14,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "kube": ("kubernetes",),
     "api": ("fastapi", "uvicorn"),
     "console": ("viser",),
+    "policy": ("msgpack", "websockets"),
 }
 """Name of an extra in pyproject.toml -> the modules that it installs."""
 MODES: dict[str, tuple[str, ...]] = {

@@ -1,0 +1,63 @@
+"""`cloudrc policy`: serve a policy for robots and evaluations."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+
+from cloudrc.cli.output import print_line
+from cloudrc.cli.parser import add_verbs, whole_number
+from cloudrc.runs.interrupts import interrupt_on_signals
+from cloudrc.runs.requirements import require
+
+VERBS = {"serve": "serve a Python policy over openpi's wire, until Ctrl-C"}
+KEY_VARIABLE = "CLOUDRC_POLICY_KEY"
+"""Environment variable with the API key of a policy's server, for the server and for clients."""
+EPILOG = f"""\
+examples:
+  cloudrc policy serve ./expert.py --port 8000
+  {KEY_VARIABLE}=... cloudrc policy serve ./expert.py --host 0.0.0.0
+
+expert.py has a function infer(observation), which returns
+{{"actions": array of shape (H, A)}}, and may have reset(), which is called when a
+client connects. Or it has build(), which returns an object with these methods.
+GET /healthz answers OK. If {KEY_VARIABLE} is set, clients must send this
+API key."""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    (serve,) = add_verbs(parser, VERBS).values()
+    add = serve.add_argument
+    add("policy", metavar="POLICY", help="a Python file with infer(observation)")
+    about = "address to listen at (default: 127.0.0.1)"
+    add("--host", default="127.0.0.1", metavar="HOST", help=about)
+    about = "port to listen at; 0: any free port (default: 8000)"
+    add("--port", type=whole_number(0, 65_535), default=8000, metavar="N", help=about)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Serve until the user interrupts."""
+    require("a policy's server", ("policy",))
+    from cloudrc.drivers.realtime import show_address
+    from cloudrc.policy.serve import serve_policy
+    from cloudrc.processes.ports import warn_if_exposed
+
+    interrupt_on_signals()
+    host, stdout = options.host, sys.stdout
+    warn_if_exposed((host, options.port))
+
+    def ready(port: int) -> None:
+        url = f"ws://{show_address((host, port))}"
+        print_line(f"policy {options.policy}: {url}", stdout)  # a policy's own output is elsewhere
+
+    serve_policy(
+        options.policy,
+        host,
+        options.port,
+        ready=ready,
+        tell=lambda text: print_line(f"cloudrc: {text}", sys.stderr),
+        key=os.environ.get(KEY_VARIABLE, ""),
+    )
+    return 0

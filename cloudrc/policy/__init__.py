@@ -1,0 +1,6 @@
+"""The wire of openpi's policies: observations up, chunks of actions down, over a WebSocket.
+
+The server speaks first: one map, its metadata. Then the client sends an observation and the server
+answers with actions, in turns. Each message is a binary frame with one msgpack map. An error is a
+text frame, after which the server closes the connection.
+"""

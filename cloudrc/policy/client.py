@@ -1,0 +1,181 @@
+"""Ask a policy's server over a WebSocket."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any
+from urllib.parse import urlsplit
+
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
+from websockets.sync.client import ClientConnection, connect
+
+from cloudrc.errors import BadInputError, CloudrcError, describe_error, to_one_line
+from cloudrc.policy.codec import MESSAGE_MAX, WireError, pack, unpack
+
+START_LIMIT = 60.0
+"""Time limit for the metadata and for the first answer of a server [s]: it loads weights."""
+ANSWER_LIMIT = 30.0
+"""Time limit for each further answer [s]."""
+CLOSE_LIMIT = 0.5
+"""Time for which a client waits for the server's end of a connection [s]."""
+RETRY_PERIOD = 0.1
+"""Time between two attempts to connect to a server that does not listen yet [s]."""
+
+
+class PolicyServerError(CloudrcError):
+    """A policy's server does not answer, or its answer is wrong."""
+
+    exit_code = 5
+
+
+class SilentServerError(PolicyServerError):
+    """A policy's server does not listen, has closed the connection, or did not answer in time."""
+
+
+def check_url(url: str) -> str:
+    """Return the address of a policy's server; raise a BadInputError if it is none."""
+    try:
+        parts = urlsplit(url)
+        valid = parts.scheme in ("ws", "wss") and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        valid = False
+    if not valid:
+        raise BadInputError(
+            f"'{url}' is no address of a policy's server; give scheme, host and port, such as "
+            "ws://127.0.0.1:8000"
+        )
+    return url
+
+
+class PolicyClient:
+    """One connection to a policy's server.
+
+    After a failure, also a late answer, the connection is closed: the answer would be taken for
+    that of the next observation.
+
+    Attributes:
+        url: Address of the server.
+        metadata: What the server has said about itself.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        key: str = "",
+        start_limit: float = START_LIMIT,
+        answer_limit: float = ANSWER_LIMIT,
+        patience: float = 0.0,
+    ) -> None:
+        """Connect, and read the metadata.
+
+        Args:
+            url: Address of the server, such as ws://127.0.0.1:8000.
+            key: API key; "" for none.
+            start_limit: Time limit for the metadata and for the first answer [s].
+            answer_limit: Time limit for each further answer [s].
+            patience: Time in which a server that is being started begins to listen [s].
+        """
+        self.url = check_url(url)
+        self._limit, self._answer_limit = start_limit, answer_limit
+        self._connection: ClientConnection | None = self._connect(key, patience)
+        self.metadata = self._receive("metadata")
+
+    def __enter__(self) -> PolicyClient:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def infer(self, observation: Mapping[str, Any]) -> dict[Any, Any]:
+        """Send an observation and return the answer; raise a PolicyServerError without one."""
+        if self._connection is None:
+            raise SilentServerError(f"{self.url}: the connection is closed; connect again")
+        try:
+            self._connection.send(pack(observation))
+        except ConnectionClosed:
+            pass  # the server may have said why: an error's text is still to be read
+        except WireError as error:
+            raise PolicyServerError(f"{self.url}: {error}") from None
+        answer = self._receive("answer")
+        self._limit = self._answer_limit
+        return answer
+
+    def close(self) -> None:
+        """Close the connection."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
+
+    def _connect(self, key: str, patience: float) -> ClientConnection:
+        headers = {"Authorization": f"Api-Key {key}"} if key else None
+        deadline = time.monotonic() + patience
+        while True:
+            try:
+                return connect(
+                    self.url,
+                    additional_headers=headers,
+                    compression=None,
+                    max_size=MESSAGE_MAX,
+                    open_timeout=self._limit,
+                    close_timeout=CLOSE_LIMIT,
+                    ping_interval=None,  # a server that computes answers no ping
+                    proxy=None,
+                )
+            except ConnectionError as error:
+                if time.monotonic() >= deadline:
+                    text = f"{self.url}: nobody listens there ({error.strerror or error})"
+                    raise SilentServerError(f"{text}; start the policy's server") from None
+                time.sleep(RETRY_PERIOD)
+            except TimeoutError:
+                raise self._silent("the server does not accept the connection") from None
+            except InvalidStatus as error:
+                code = error.response.status_code
+                raise PolicyServerError(f"{self.url}: {_explain_status(code)}") from None
+            except (OSError, EOFError, InvalidHandshake, InvalidURI) as error:
+                text = describe_error(error).partition(": ")[2] or describe_error(error)
+                raise PolicyServerError(f"{self.url}: no connection: {text}") from None
+
+    def _receive(self, what: str) -> dict[Any, Any]:
+        assert self._connection is not None
+        try:
+            frame = self._connection.recv(timeout=self._limit)
+        except TimeoutError:
+            self.close()
+            raise self._silent(f"no {what}") from None
+        except ConnectionClosed as error:
+            self.close()
+            raise SilentServerError(f"{self.url}: {_explain_end(error, what)}") from None
+        if isinstance(frame, str):
+            self.close()
+            last = to_one_line(frame.strip()[-2000:].rpartition("\n")[2]) or "an empty text"
+            raise PolicyServerError(f"{self.url}: the server sent an error: {last}")
+        try:
+            return unpack(frame)
+        except WireError as error:
+            self.close()
+            raise PolicyServerError(f"{self.url}: the {what} cannot be read: {error}") from None
+
+    def _silent(self, text: str) -> SilentServerError:
+        return SilentServerError(f"{self.url}: {text} within {self._limit:g} s")
+
+
+def _explain_status(code: int) -> str:
+    if code in (401, 403):
+        return f"the server refuses the API key ({code}); set CLOUDRC_POLICY_KEY"
+    return f"the server answers with HTTP status {code}; is it a policy's server?"
+
+
+def _explain_end(error: ConnectionClosed, what: str) -> str:
+    if error.rcvd is None:
+        return f"the server ended before its {what}"
+    reason = to_one_line(error.rcvd.reason)
+    why = f"{error.rcvd.code} {reason}".strip()
+    return f"the server closed the connection before its {what} ({why})"

@@ -1,0 +1,71 @@
+"""Load a policy from a file of the user."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.plugins import check_failure, find, is_path, locate, refuse_failure, stack_of
+
+
+class PolicyFailedError(CloudrcError):
+    """A policy raised an exception, or its answer is no chunk of actions.
+
+    Attributes:
+        stack: The failure's stack as Python prints it; "" if nothing was raised.
+    """
+
+    exit_code = 5
+
+    def __init__(self, text: str, stack: str = "") -> None:
+        super().__init__(text)
+        self.stack = stack
+
+
+class LoadedPolicy:
+    """A policy of the user in this process: the functions `infer` and, if there is one, `reset`."""
+
+    def __init__(self, name: str) -> None:
+        """Load the file `name`, which has `infer` itself or a `build()` that returns a policy."""
+        self.name = name
+        if not is_path(name):
+            raise BadInputError(f"policy '{name}': name a Python file, such as ./{name}.py")
+        policy = find("policies", name, look=False)
+        if build := getattr(policy, "build", None):
+            with refuse_failure(f"policy '{name}' cannot be built"):
+                policy = build()
+        self._infer = getattr(policy, "infer", None)
+        if not callable(self._infer):
+            raise BadInputError(
+                f"policy '{name}' has no function infer(observation); write one that returns "
+                '{"actions": array of shape (H, A)}'
+            )
+        reset = getattr(policy, "reset", None)
+        self._reset: Callable[[], Any] | None = reset if callable(reset) else None
+        metadata = getattr(policy, "metadata", None)
+        self.metadata: dict[str, Any] = dict(metadata) if isinstance(metadata, Mapping) else {}
+
+    @property
+    def has_state(self) -> bool:
+        """Whether the policy has a `reset`: then it serves one episode at a time."""
+        return self._reset is not None
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        if self._reset is not None:
+            self._call("reset", self._reset)
+
+    def infer(self, observation: dict[Any, Any]) -> Any:
+        """Return the policy's answer; raise a PolicyFailedError if it raises."""
+        return self._call("infer", self._infer, observation)
+
+    def _call(self, name: str, function: Any, *arguments: Any) -> Any:
+        what = f"policy '{self.name}': {name}() failed"
+        try:
+            return function(*arguments)
+        except BaseException as error:
+            check_failure(error, what)
+            stack = stack_of(error)
+            last = stack.rpartition("\n")[2]
+            raise PolicyFailedError(f"{what}: {last} ({locate(error)})", stack) from error

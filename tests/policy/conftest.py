@@ -1,0 +1,83 @@
+"""Servers of policies for tests: ours, and one like openpi's, which behaves as a test says."""
+
+import asyncio
+import threading
+from contextlib import contextmanager, suppress
+
+import msgpack
+import numpy as np
+import pytest
+from websockets.sync.server import serve
+
+from cloudrc.policy.serve import PolicyServer
+
+POLICY = """
+import numpy as np
+
+def infer(observation):
+    return {"actions": np.ones((2, 3)) * observation["state"]}
+"""
+
+
+@contextmanager
+def serving(path, log=None, key=""):
+    """Serve the policy of a file with our server in a thread; yield its URL."""
+    ready, opened = threading.Event(), []
+    server = PolicyServer(str(path), (log if log is not None else []).append, key)
+
+    async def run():
+        def tell(port):
+            opened.extend((port, asyncio.get_running_loop(), asyncio.current_task()))
+            ready.set()
+
+        with suppress(asyncio.CancelledError):
+            await server.run("127.0.0.1", 0, tell)
+
+    thread = threading.Thread(target=asyncio.run, args=[run()], daemon=True)
+    thread.start()
+    assert ready.wait(10)
+    port, loop, task = opened
+    try:
+        yield f"ws://127.0.0.1:{port}"
+    finally:
+        loop.call_soon_threadsafe(task.cancel)
+        thread.join(10)
+
+
+@pytest.fixture
+def policy(tmp_path):
+    """Write the file of a policy; return its path."""
+
+    def write(source=POLICY):
+        path = tmp_path / "expert.py"
+        path.write_text(source)
+        return path
+
+    return write
+
+
+def actions(value, shape=(1, 4)):
+    array = np.full(shape, value)
+    data = {b"__ndarray__": True, b"data": array.tobytes(), b"dtype": array.dtype.str}
+    return msgpack.packb({"actions": {**data, b"shape": array.shape}})
+
+
+@contextmanager
+def stock_like(answer, metadata=b"\x80"):
+    """Serve as openpi does: `answer(connection, frame)` returns the frame to send, or None."""
+
+    def handle(connection):
+        if metadata is not None:
+            connection.send(metadata)
+        for frame in connection:
+            if (sent := answer(connection, frame)) is not None:
+                connection.send(sent)
+
+    with serve(handle, "127.0.0.1", 0, compression=None, max_size=None) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        try:
+            yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        finally:
+            server.shutdown()
+            thread.join(10)

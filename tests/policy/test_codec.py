@@ -1,0 +1,125 @@
+"""The codec of openpi's wire: what passes, and what is refused."""
+
+import msgpack
+import numpy as np
+import pytest
+
+from cloudrc.policy import codec
+from cloudrc.policy.codec import WireError, pack, unpack
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.arange(12, dtype="<f4").reshape(3, 4),
+        np.arange(6, dtype=">i2").reshape(2, 3).T,
+        np.zeros((2, 3, 3), np.uint8),
+        np.zeros((0, 7)),
+        np.array(1.5),
+        np.array([True, False]),
+        np.array(["pick", "place it"]),
+        np.array([b"ab", b"c"]),
+    ],
+    ids=lambda array: f"{array.dtype}{array.shape}",
+)
+def test_an_array_arrives_as_it_was(array):
+    found = unpack(pack({"a": array}))["a"]
+    assert found.dtype == array.dtype
+    assert np.array_equal(found, array)
+    assert found.flags.writeable
+
+
+def test_scalars_texts_and_nested_values_arrive_as_they_were():
+    message = {"x": np.float32(0.1), "n": 3, "prompt": "é", "in": {"a": [1, None, {"b": 2.5}]}}
+    found = unpack(pack(message))
+    assert found == message
+    assert type(found["x"]) is np.float32
+
+
+def test_the_bytes_are_those_of_openpi():
+    """Its client names the parts of an array in bytes, not in text."""
+    found = msgpack.unpackb(pack({"a": np.ones((1, 2), "<f4")}))["a"]
+    data = np.ones(2, "<f4").tobytes()
+    assert found == {b"__ndarray__": True, b"data": data, b"dtype": "<f4", b"shape": [1, 2]}
+
+
+class Tensor:
+    def __array__(self, dtype=None, copy=None):
+        return np.ones(2)
+
+
+def test_what_numpy_converts_is_sent_as_an_array():
+    assert unpack(pack({"a": Tensor()}))["a"].tolist() == [1.0, 1.0]
+
+
+RECORD = np.zeros(2, [("a", "f4")])
+
+
+@pytest.mark.parametrize(
+    "value",
+    [np.array([{}], object), RECORD, RECORD[0], np.ones(2, complex), object(), 1 << 70, {1, 2}],
+    ids=lambda value: type(value).__name__,
+)
+def test_other_values_are_not_sent(value):
+    with pytest.raises(WireError):
+        pack({"a": value})
+
+
+def array(**change):
+    found = {"__ndarray__": True, "data": bytes(8), "dtype": "<f4", "shape": [2]} | change
+    return {key.encode(): value for key, value in found.items()}
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"dtype": "|O"}, "refused"),
+        ({"dtype": "<c8"}, "refused"),
+        ({"dtype": "|V4"}, "refused"),
+        ({"dtype": "f4,f4"}, "refused"),
+        ({"dtype": "<M8[s]"}, "refused"),
+        ({"dtype": "no type"}, "no type"),
+        ({"dtype": "f" * 100}, "no type"),
+        ({"dtype": 7}, "no type"),
+        ({"dtype": "<U0"}, "refused"),
+        ({"shape": [3]}, "8 bytes, not 12"),
+        ({"shape": [1 << 40, 1 << 40]}, "8 bytes"),
+        ({"shape": [-2]}, "shape"),
+        ({"shape": [2.0]}, "shape"),
+        ({"shape": [True, True]}, "shape"),
+        ({"shape": [1] * 40}, "shape"),
+        ({"shape": 2}, "shape"),
+        ({"data": "text"}, "bytes"),
+        ({"data": None}, "bytes"),
+    ],
+)
+def test_a_wrong_array_is_refused(change, text):
+    with pytest.raises(WireError, match=text):
+        unpack(msgpack.packb({"a": array(**change)}))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\xc1",
+        b"\x80\x80",
+        b"\x81\x90\x01",
+        b"\x91\x01",
+        b"\x81\xa1a\xa1\xff",
+        msgpack.packb({"a": msgpack.ExtType(5, b"x")}),
+        msgpack.packb({"a": {b"__npgeneric__": True, b"data": "x", b"dtype": "<f4"}}),
+        msgpack.packb({"a": {b"__npgeneric__": True, b"data": 1, b"dtype": "O"}}),
+        b"\x91" * 5000 + b"\x00",
+    ],
+    ids=range(10),
+)
+def test_bytes_that_are_no_map_are_refused(data):
+    with pytest.raises(WireError):
+        unpack(data)
+
+
+def test_a_message_beyond_the_limit_is_not_sent(monkeypatch):
+    monkeypatch.setattr(codec, "MESSAGE_MAX", 100)
+    with pytest.raises(WireError, match="limit is 100"):
+        pack({"a": np.zeros(100)})
