@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 FAILED_MARK = "*"
 """Mark of a number in a table if some of its flights failed."""
@@ -11,6 +12,13 @@ FAILED_NOTE = (
     f"{FAILED_MARK} contains flights that failed: a robot that hardly moves has small errors, too"
 )
 """Note below a table with such a mark."""
+Paint: TypeAlias = Callable[[str, str], str]
+"""Function that returns a text in a colour of the terminal, such as "red"."""
+
+
+def plain(text: str, colour: str) -> str:
+    """Return a text without a colour."""
+    return text
 
 
 def escape(text: str) -> str:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import output_argument, print_or_drop, print_result, warn
 from cloudrc.cli.parser import read_count
@@ -15,7 +14,6 @@ from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.renamed import new_name
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import MODES, require
-from cloudrc.text import FAILED_MARK, FAILED_NOTE, format_number, table
 
 if TYPE_CHECKING:
     from cloudrc.runs.compare import Pairs
@@ -33,10 +31,6 @@ examples:
   cloudrc compare cloud.estimator=running_mean cloud.estimator=split \\
     --set link.profile=handover --number delay_estimate_error_rms
   cloudrc compare last_sample constant_velocity --in runs/sweep-steps-1"""
-TITLES = (
-    *("number", "A median", "B median", "B - A", "95 % interval", "B lower in", "p", "p sign"),
-    *("decided", "unit"),
-)
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,6 +60,7 @@ def execute(options: argparse.Namespace) -> int:
     """Compare A and B, print the result, and return the exit code: 0 if all flights were flown."""
     interrupt_on_signals()
     from cloudrc.runs.compare import compare, of_sweep
+    from cloudrc.runs.compare_text import as_text
 
     stopped = None
     if options.set and options.sweep:
@@ -108,106 +103,3 @@ def _fly_both(options: argparse.Namespace) -> tuple[Pairs, CloudrcError | None]:
     with closing(SweepView(stream, f"{head}, {flights} flights", flights)) as view:
         pairs, stopped = fly_pairs(sides, options.seeds, flights, view.see)
     return Pairs(pairs, unit_of, f"experiment {options.experiment}"), stopped
-
-
-def as_text(document: Mapping[str, Any]) -> str:
-    """Format the result of a comparison: a table and, in the last lines, the conclusion."""
-    from cloudrc.runs.compare import LEFT_OUT
-
-    body = [_row(name, entry) for name, entry in document["numbers"].items()]
-    success, left_out = document["success"], document["left_out"]
-    rates = [
-        "{} {} of {} ({:.0%} .. {:.0%})".format(
-            side.upper(), success[side], success["count"], *success[f"{side}_interval"]
-        )
-        for side in "ab"
-    ]
-    lines = [
-        *(f"{side.upper()}: {document[side]}" for side in "ab"),
-        f"of {document['of']}; pairs: {document['pairs']}"
-        + (f"; {left_out} left out with {LEFT_OUT}" if left_out else ""),
-        *("", table([TITLES, *body], right=(1, 2, 3)), ""),
-        f"success: {', '.join(rates)}, p = {success['p_mcnemar']:.2g}",
-        document["method"],
-        *([FAILED_NOTE] if any(_failed(entry) for entry in document["numbers"].values()) else []),
-        *("", _answer(document)),
-    ]
-    return "\n".join(lines)
-
-
-def _row(name: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
-    factor, unit = _scaled(entry)
-    values = [format_number(entry[key] * factor) for key in ("a_median", "b_median", "difference")]
-    for place, side in enumerate("ab"):
-        values[place] += FAILED_MARK if entry[f"{side}_failed"] else ""
-    between = " .. ".join(format_number(bound * factor) for bound in entry["interval"] or ())
-    return (
-        *(name, *values, between or "-", f"{entry['lower']} of {entry['count']}"),
-        *(f"{entry['p_wilcoxon']:.2g}", f"{entry['p_sign']:.2g}"),
-        *("yes" if entry["decided"] else f"no: {_needed(entry)}", unit),
-    )
-
-
-def _failed(entry: Mapping[str, Any]) -> str:
-    """Return in words how many flights behind a number failed; "" if none did."""
-    failed = [
-        f"{entry[f'{side}_failed']} of {side.upper()}'s" for side in "ab" if entry[f"{side}_failed"]
-    ]
-    return f"{' and '.join(failed)} {entry['count']} flights failed" if failed else ""
-
-
-def _scaled(entry: Mapping[str, Any]) -> tuple[float, str]:
-    from cloudrc.metrics import scale
-
-    return scale(entry["unit"], max(abs(entry["a_median"]), abs(entry["b_median"])))
-
-
-def _needed(entry: Mapping[str, Any]) -> str:
-    needed = entry["pairs_needed"]
-    if needed is None:
-        return "more pairs needed" if entry["difference"] else "no effect seen"
-    return f"about {needed} pairs needed" if needed <= 1000 else "above 1000 pairs needed"
-
-
-def _answer(document: Mapping[str, Any]) -> str:
-    """Say how B changes the first metric, and whether A or B succeeds significantly more often."""
-    success, text = document["success"], ""
-    if success["decided"]:
-        more, less = "ba" if success["b"] > success["a"] else "ab"
-        text = (
-            f"{more.upper()} succeeds more often: in {success[more]} of {success['count']} flights,"
-            f" {less.upper()} in {success[less]}, p = {success['p_mcnemar']:.2g}.\n"
-        )
-    if not document["numbers"]:
-        return f"{text}No pair has one of the default numbers; name one with --number."
-    name, entry = next(iter(document["numbers"].items()))
-    p, count = f"p = {entry['p_wilcoxon']:.2g}", entry["count"]
-    if not entry["decided"]:
-        return (
-            f"{text}Undecided: {name} after {count} pairs, {p}; {_needed(entry)}.{_cautions(entry)}"
-        )
-    sign, word = (1, "higher") if entry["difference"] > 0 else (-1, "lower")
-    factor, unit = _scaled(entry)
-    size, low, high = (
-        format_number(sign * value * factor)
-        for value in (entry["difference"], *entry["interval"][::sign])
-    )
-    return (
-        f"{text}B has a {word} {name}: by {size}{unit and ' '}{unit} ({low} .. {high}), {p}, "
-        f"in {entry[word]} of {count} pairs.{_cautions(entry)}"
-    )
-
-
-def _cautions(entry: Mapping[str, Any]) -> str:
-    """Say what weakens the answer about a metric, each in a sentence after a space."""
-    from cloudrc.statistics import LEVEL
-
-    text = ""
-    if entry["decided"] and entry["p_sign"] >= LEVEL:
-        text += (
-            " This holds if the differences are symmetric; the sign test, which does not assume "
-            f"it, does not confirm it (p = {entry['p_sign']:.2g})."
-        )
-    if failed := _failed(entry):
-        text += f" {failed}, and their numbers count."
-    return text

@@ -6,11 +6,8 @@ import argparse
 
 from cloudrc.cli.output import output_argument, paint, print_result
 from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.runs.doctor import Survey, all_checks
+from cloudrc.runs.doctor import Survey, all_checks, as_text, blocking
 from cloudrc.runs.requirements import MODES
-from cloudrc.text import table
-
-COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,21 +34,8 @@ def execute(options: argparse.Namespace) -> int:
     values, settings = tuple(options.values), tuple(options.set)
     asked = Survey(options.context, options.namespace, options.cluster, values, settings)
     mode, checks = options.mode, list(all_checks(options.mode, asked))
-    blocking = [check.name for check in checks if check.state == "missing" and mode in check.modes]
-    code = MissingPrerequisiteError.exit_code if blocking else 0
-    found, text = [check._asdict() for check in checks], list[str]()
-    for title, needed in ((f"Needed for mode {mode}:", True), ("Good to know:", False)):
-        block = [check for check in checks if (mode in check.modes) is needed]
-        lines = table([(check.state, check.name, check.found) for check in block]).splitlines()
-        text.append(title)
-        for check, line in zip(block, lines, strict=True):
-            state = paint(check.state, COLOURS[check.state])
-            text.append(f"  {line.replace(check.state, state, 1)}")
-            if check.fix:
-                text.append(f"           -> {check.fix}")
-        text.append("")
-    can = f"cannot run: {', '.join(blocking)}" if blocking else "can run"
-    text.append(paint(f"Mode {mode} {can}.", "red" if blocking else "green"))
-    document = {"mode": mode, "ready": not blocking, "checks": found}
-    print_result(options.output, document, "\n".join(text))
-    return code
+    lacking = blocking(mode, checks)
+    found = [check._asdict() for check in checks]
+    document = {"mode": mode, "ready": not lacking, "checks": found}
+    print_result(options.output, document, as_text(mode, checks, paint))
+    return MissingPrerequisiteError.exit_code if lacking else 0

@@ -46,6 +46,7 @@ def execute(options: argparse.Namespace) -> int:
     """Print both answers; return 0, or 1 if no value is stable (or, without that, none settles)."""
     interrupt_on_signals()
     require("margin", MODES["virtual"])
+    from cloudrc.runs.margin_text import as_text
     from cloudrc.runs.trials import QUESTIONS, Asked, Trials, describe, questions
 
     trials = Trials(
@@ -63,15 +64,14 @@ def execute(options: argparse.Namespace) -> int:
     for name in QUESTIONS:
         found[name] = _search(options, trials, name) if name in asked else None
     document = describe(trials, found)
-    lines = [_answer(name, each, trials) for name, each in found.items()]
-    if "large_step" in document:
-        lines.insert(1, _large(document["large_step"]))
-    print_result(options.output, document, "\n" + "\n".join(map(escape, lines)))
+    lines = as_text(document, found, trials).splitlines()
+    print_result(options.output, document, "\n".join(["", *map(escape, lines)]))
     return 0 if document[f"{asked[0]}_up_to"] is not None else 1
 
 
 def _search(options: argparse.Namespace, trials: Trials, question: str) -> ValueRange:
     """Search the answer to a question, and print each value that is tried."""
+    from cloudrc.runs.margin_text import result
     from cloudrc.runs.stability import SCENE, SMALL
     from cloudrc.runs.trials import QUESTIONS
 
@@ -81,48 +81,7 @@ def _search(options: argparse.Namespace, trials: Trials, question: str) -> Value
     print_or_drop(escape(f"{text}, seeds 1 to {options.seeds}"), stream)
 
     def see(number: int, trial: Trial) -> None:
-        line = f"  {trials.name(number):<26}{_result(question, trial)}"
+        line = f"  {trials.name(number):<26}{result(question, trial)}"
         print_or_drop(escape(line), stream)
 
     return trials.search(question, see)
-
-
-def _answer(name: str, found: ValueRange | None, trials: Trials) -> str:
-    """Return the answer to one question in one line."""
-    if found is None:
-        return f"{name}: not asked, because the step does not depend on this key"
-    if found.first is None or found.last is None:
-        first = trials.bottom
-        failed = _result(name, trials.trial(name, first))
-        return f"no value {_verb(name)}; {trials.name(first)} fails: {failed}"
-    start = f" from {trials.name(found.first)}" if found.below is not None else ""
-    text = f"{name}{start} up to {trials.name(found.last)}"
-    if found.above is None:
-        text += f", {trials.top_why}"
-    for number in (found.above, found.below):
-        if number is not None:
-            failed = _result(name, trials.trial(name, number))
-            text += f"; fails at {trials.name(number)}: {failed}"
-    for first, last in found.elsewhere:
-        reach = trials.name(first) + (f" to {trials.name(last)}" if last > first else "")
-        text += f"; beyond values that fail, {reach} {_verb(name)}, too"
-    return text
-
-
-def _verb(name: str) -> str:
-    return "is stable" if name == "stable" else "settles"
-
-
-def _result(question: str, trial: Trial) -> str:
-    if trial[question]:
-        return "yes"
-    where = f", seed {trial['seed']}" if "seed" in trial else ""
-    return f"{trial['code']}{where}: {trial['text'].partition(';')[0]}"
-
-
-def _large(large: Trial) -> str:
-    """Say whether a step of 1 m dies out at the largest stable value, and whether it saturates."""
-    dies = "dies out, too" if large["stable"] else f"does not die out ({large['text']})"
-    text = f"with this value a step of {large['size_m']:g} m per axis {dies}; the guard's speed cap"
-    cap, share = f"of {large['speed_max_mps']:.3g} m/s", large.get("speed_limited", 0.0)
-    return f"{text} {cap} shortens " + (f"{share:.1%} of the commands" if share else "no command")

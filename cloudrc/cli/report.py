@@ -14,9 +14,8 @@ from cloudrc.cli.output import output_argument, paint, print_line, print_result
 from cloudrc.cli.parser import figure_arguments
 from cloudrc.errors import BadInputError
 from cloudrc.runs.requirements import missing, require
-from cloudrc.text import escape, table
+from cloudrc.text import escape
 
-COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
 EPILOG = """\
 examples:
   cloudrc report runs/latest
@@ -73,36 +72,13 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def summary(report: Mapping[str, Any], folder: Path) -> str:
-    """Summarize a report as text: verdict, failures, main numbers and path of report.html."""
-    from cloudrc.metrics import METRIC_NOTE, Number
-    from cloudrc.report.page import main_numbers
+    """Summarize a report as text, and say where the replay and the page are."""
+    from cloudrc.report.summary import summarize
 
-    outcome, failures = report["verdict"], report["failures"]
-    first = failures[0]["text"] if failures else f"{_goal(report)}, every criterion met"
-    lines = ["", f"{paint(outcome.upper(), COLOURS[outcome])}: {escape(first)}"]
-    for failure in failures[1:]:
-        when = f" (at {failure['time']:.2f} s)" if "time" in failure else ""
-        lines.append(escape(f"  also: {failure['text']}{when}"))
-    numbers = {
-        name: Number(entry["value"], entry["unit"], "") for name, entry in report["numbers"].items()
-    }
-    rows = [(f"  {label}", digits, unit) for label, digits, unit in main_numbers(numbers)]
-    lines += ["", table(rows, right=[1]) if rows else "  no numbers: nothing was flown"]
-    own = [note for note in report.get("notes", ()) if note.startswith(METRIC_NOTE)]
-    lines += [paint(f"  {escape(note)}", "yellow") for note in own]
-    if "fault_count" in numbers and numbers["fault_count"].value:
-        count = numbers["fault_count"].value
-        lines.append(paint(f"  faults noted in flight: {count:.0f}, see the report", "yellow"))
     how = f"pip install 'cloudrc[console]', then cloudrc replay {folder}"
     replay = f"replay in 3-D: {how if missing('console') else f'cloudrc replay {folder}'}"
-    return "\n".join([*lines, "", escape(replay), escape(str(folder / "report.html"))])
-
-
-def _goal(report: Mapping[str, Any]) -> str:
-    """Return what the robot has done in a mission that succeeded."""
-    if (end := report["numbers"].get("final_error")) is not None:
-        return f"setpoints flown to their end, {end['value']:.2f} m from the last one"
-    return "every step flown" if "steps" in report else "every waypoint reached"
+    page = str(folder / "report.html")
+    return "\n".join(["", summarize(report, paint), "", escape(replay), escape(page)])
 
 
 def print_traceback(options: argparse.Namespace, report: Mapping[str, Any]) -> None:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections import Counter
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any
 
 from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.mission import TERMINATION_LOG
@@ -24,12 +22,10 @@ from cloudrc.cli.output import (
 from cloudrc.cli.progress import PlanView, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.cluster.pods import refuse_local_files
-from cloudrc.config.document import write_yaml
-from cloudrc.config.overrides import parse_settings
 from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, describe_error
 from cloudrc.files import write_atomically
 from cloudrc.metrics.verdict import EXIT_CODES
-from cloudrc.runs import store, sweep
+from cloudrc.runs import seeds, store, sweep
 from cloudrc.runs.experiment import load, refuse_seed
 from cloudrc.runs.flight import Row
 from cloudrc.runs.folder import new_folder
@@ -38,7 +34,7 @@ from cloudrc.runs.lock import lock_folder
 from cloudrc.runs.pods import PodSettings, fly_in_pods
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.runs.workers import map_in_order, take_each
-from cloudrc.text import FAILED_MARK, FAILED_NOTE, escape, format_number, table
+from cloudrc.text import escape
 
 
 def run(options: argparse.Namespace) -> int:
@@ -76,7 +72,7 @@ def _run_locked(
         again = f"cloudrc sweep run {options.file} --out {folder}{flags}"
         print_line(f"cloudrc: {stopped}; to continue: {again}", sys.stderr)
     name = store.TABLE if len(rows) == len(grid.flights) else store.SUMMARY
-    text = f"\n{_verdicts(rows.values())}\n\n{escape(str(folder / name))}"
+    text = f"\n{sweep.count_verdicts(rows.values())}\n\n{escape(str(folder / name))}"
     print_result(options.output, store.read_summary(folder), text)
     if stopped:
         return stopped.exit_code
@@ -119,13 +115,8 @@ def fly_again(options: argparse.Namespace) -> int:
 def print_status(options: argparse.Namespace) -> int:
     """Print how many flights of a sweep are done, and how many succeeded per value of an axis."""
     flights, rows, values = sweep.count_successes(options.folder)
-    text = f"{len(rows)} of {flights} flights are done: {_verdicts(rows)}"
-    cells = [(each["axis"], store.as_text(each["value"]), f"{each['success']}/{each['flights']}")
-             for each in values]  # fmt: skip
-    if cells:
-        text += f"\n\n{table([('axis', 'value', 'success'), *cells], right=(2,))}"
     document = {"flights": flights, "rows": len(rows), "axes": values}
-    print_result(options.output, document, text)
+    print_result(options.output, document, sweep.status_text(flights, rows, values))
     return 0
 
 
@@ -148,11 +139,6 @@ def draw_figure(options: argparse.Namespace) -> int:
         write_atomically(path, files[kind])
         print_or_drop(escape(str(path)))
     return 0
-
-
-def _verdicts(rows: Iterable[Row]) -> str:
-    counts = Counter(row["verdict"] for row in rows)
-    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items())[::-1]) or "none"
 
 
 # Sweeps in pods, which run `cloudrc sweep rows`.
@@ -206,25 +192,6 @@ def _leave_message(text: str) -> None:
 # `cloudrc run --seeds N`.
 
 
-def as_table(summary: Mapping[str, Any], planned: int = 0) -> str:
-    """Format the result of `summarise` as a table; the last line counts the successful runs.
-
-    `planned` is the number of runs to fly, if it is larger than that of the runs that have flown.
-    """
-    rows = [("number", "median", "95 % interval", "unit")]
-    for name, entry in summary["numbers"].items():
-        between = " .. ".join(map(format_number, entry["interval"] or ())) or "-"
-        unit = "" if entry["unit"] == "1" else entry["unit"]
-        note = "" if entry["count"] == summary["count"] else f"  ({entry['count']} runs)"
-        mark = FAILED_MARK if entry["failed"] else ""
-        rows.append((name, format_number(entry["median"]) + mark, between, unit + note))
-    method = sweep.METHOD if summary["count"] >= 6 else "an interval needs 6 seeds or more"
-    if any(entry["failed"] for entry in summary["numbers"].values()):
-        method += f"\n{FAILED_NOTE}"
-    count = planned or summary["count"]
-    return f"{table(rows, right=(1, 2))}\n\n{method}\ndone {summary['done']}/{count}"
-
-
 def fly_seeds(options: argparse.Namespace) -> int:
     """Fly seeds 1 to N and print one table; return 0 if all runs succeed.
 
@@ -235,11 +202,8 @@ def fly_seeds(options: argparse.Namespace) -> int:
     warn(experiment)
     name = experiment.name
     folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds", "latest-sweep")
-    settings = {".".join(path): each.value for path, each in parse_settings(options.set).items()}
-    file = {"experiment": options.experiment, "set": settings, "seeds": options.seeds}
-    (folder / store.FILE).write_text(write_yaml(file | {"folder": str(Path.cwd())}), "utf-8")
-    grid, seen = read_grid(folder / store.FILE), list[Row]()
-    work = [*grid.flights.values()]
+    grid = seeds.write_grid(folder, options.experiment, options.set, options.seeds)
+    seen, count = list[Row](), len(grid.flights)
     head = f"{name}: mode virtual, seeds 1 to {options.seeds}, link {experiment.link.profile}"
     for_people = options.output == "table"
     make, stream = (SeedsView, sys.stdout) if for_people else (SweepView, sys.stderr)
@@ -250,19 +214,20 @@ def fly_seeds(options: argparse.Namespace) -> int:
         if not any("traceback" in earlier for earlier in seen[:-1]):
             print_traceback(options, row)
 
-    with closing(make(stream, head, len(work))) as view:
-        flown = map_in_order(sweep.fly_seed, work, len(work))
-        _, stopped = sweep.keep(flown, folder, grid, None, store.begin(folder, grid), see)
+    with closing(make(stream, head, count)) as view:
+        _, stopped = sweep.keep(
+            seeds.fly_seeds(grid), folder, grid, None, store.begin(folder, grid), see
+        )
     if stopped:
-        text = f"\ncloudrc: {stopped}: {len(seen)} of {len(work)} seeds are finished"
+        text = f"\ncloudrc: {stopped}: {len(seen)} of {count} seeds are finished"
         print_or_drop(text, sys.stderr)
     document = {
         **{"experiment": name, "mode": "virtual", "interrupted": bool(stopped)},
         "overrides": list(options.set),
-        **sweep.summarise(seen, store.read_summary(folder)["units"]),
+        **seeds.summarise(seen, store.read_summary(folder)["units"]),
         "runs": [{key: row[key] for key in ("seed", "verdict", "key", "text")} for row in seen],
     }
-    text = f"\n{as_table(document, len(work))}\n\n{folder / store.SUMMARY}"
+    text = f"\n{seeds.as_table(document, count)}\n\n{folder / store.SUMMARY}"
     print_result(options.output, document, text)
     if stopped:
         return stopped.exit_code

@@ -7,12 +7,13 @@ import os
 import platform
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple
 
 from cloudrc.drivers.machine import interpreter, usable_cores
 from cloudrc.errors import CloudrcError
 from cloudrc.runs.requirements import EXTRAS, MODES, missing
+from cloudrc.text import Paint, plain, table
 
 FLYING, CLUSTER = ("local", "virtual"), ("cluster",)
 PROGRAMS = {
@@ -32,6 +33,10 @@ STEPS_PROGRAM = (
     "from cloudrc.config.schema import World; from cloudrc.robots.build import describe_steps; "
     "print(describe_steps(World()))"
 )
+
+
+COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
+"""State of a check -> its colour."""
 
 
 class Check(NamedTuple):
@@ -144,3 +149,28 @@ def _cluster(asked: Survey) -> Iterator[Check]:
         if not fix:
             fix = MAKE_CLUSTER if name != "survey" else "correct the values given to this command"
         yield _check(name, False, found, fix, CLUSTER)
+
+
+def blocking(mode: str, checks: Sequence[Check]) -> list[str]:
+    """Return the names of the checks because of which a mode cannot run."""
+    return [check.name for check in checks if check.state == "missing" and mode in check.modes]
+
+
+def as_text(mode: str, checks: Sequence[Check], paint: Paint = plain) -> str:
+    """Format checks for people: first those that the mode needs; the last line tells if it runs."""
+    needed = [check for check in checks if mode in check.modes]
+    others = [check for check in checks if mode not in check.modes]
+    lines = [f"Needed for mode {mode}:", *_lines(needed, paint), ""]
+    lines += ["Good to know:", *_lines(others, paint), ""]
+    lacking = blocking(mode, checks)
+    can = f"cannot run: {', '.join(lacking)}" if lacking else "can run"
+    return "\n".join([*lines, paint(f"Mode {mode} {can}.", "red" if lacking else "green")])
+
+
+def _lines(checks: Sequence[Check], paint: Paint) -> Iterator[str]:
+    lines = table([(check.state, check.name, check.found) for check in checks]).splitlines()
+    for check, line in zip(checks, lines, strict=True):
+        state = paint(check.state, COLOURS[check.state])
+        yield f"  {line.replace(check.state, state, 1)}"
+        if check.fix:
+            yield f"           -> {check.fix}"

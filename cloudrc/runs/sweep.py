@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import statistics
+from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -10,14 +10,12 @@ from typing import Any, NamedTuple
 
 from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError
 from cloudrc.runs import store
-from cloudrc.runs.flight import Row, counts, fly_point, measure
+from cloudrc.runs.flight import Row, fly_point
 from cloudrc.runs.fly import fly
 from cloudrc.runs.grid import Grid, SweepPoint, read_flight
 from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.source import code_hash
-from cloudrc.statistics import median_interval
-
-METHOD = "95 % interval of the median, by order statistics"
+from cloudrc.text import table
 
 
 class Work(NamedTuple):
@@ -145,32 +143,19 @@ def count_successes(folder: Path) -> tuple[int, list[Row], list[dict[str, Any]]]
     return summary["flights"], rows, values
 
 
-def fly_seed(flight: SweepPoint) -> Row:
-    """Fly once; return the row of results, such as the verdict. An exception ends the command."""
-    return flight.row(measure(flight.experiment))
+def count_verdicts(rows: Iterable[Row]) -> str:
+    """Return how many flights have which verdict, such as "9 success, 1 failure"."""
+    numbers = Counter(row["verdict"] for row in rows)
+    return ", ".join(f"{n} {verdict}" for verdict, n in sorted(numbers.items())[::-1]) or "none"
 
 
-def summarise(rows: Sequence[Row], units: Mapping[str, str]) -> dict[str, Any]:
-    """Count all runs and successful runs; compute the median of each measurement.
-
-    Each median has a confidence interval. A run whose plug-in failed is counted, but its
-    measurements are left out. `units`: metric -> unit.
-    """
-    valid = [row for row in rows if counts(row)]
-    names = dict.fromkeys(name for row in valid for name in row["numbers"])
-    done = sum(row["verdict"] == "success" for row in rows)
-    numbers = {name: _summarise_one(valid, name, units[name]) for name in names}
-    return {"done": done, "count": len(rows), "method": METHOD, "numbers": numbers}
-
-
-def _summarise_one(rows: Iterable[Row], name: str, unit: str) -> dict[str, Any]:
-    """Return median and interval of a measurement, of how many runs, and how many had failed."""
-    having = [row for row in rows if name in row["numbers"]]
-    found = [row["numbers"][name] for row in having]
-    return {
-        "median": statistics.median(found),
-        "interval": median_interval(found),
-        "unit": unit,
-        "count": len(found),
-        "failed": sum(row["verdict"] != "success" for row in having),
-    }
+def status_text(flights: int, rows: Sequence[Row], values: Sequence[Mapping[str, Any]]) -> str:
+    """Format the result of `count_successes` for people."""
+    text = f"{len(rows)} of {flights} flights are done: {count_verdicts(rows)}"
+    if not values:
+        return text
+    cells = [("axis", "value", "success")]
+    for each in values:
+        share = f"{each['success']}/{each['flights']}"
+        cells.append((each["axis"], store.as_text(each["value"]), share))
+    return f"{text}\n\n{table(cells, right=(2,))}"

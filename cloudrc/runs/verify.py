@@ -27,10 +27,17 @@ from cloudrc.link.netem import check, find_netems
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import link_profile
 from cloudrc.link.verify import DEFAULT
-from cloudrc.link.verify.causes import Findings, find_causes, read_evidence, read_metrics
+from cloudrc.link.verify.causes import (
+    Findings,
+    find_causes,
+    in_unit,
+    read_evidence,
+    read_metrics,
+)
 from cloudrc.link.verify.judge import Flow, Judgement, Measurement, look_twice, verdict_of
 from cloudrc.link.verify.probe import PROBE, plan_probes
 from cloudrc.runs.link_under_test import LOOPBACK, WAYS, Way, inside, measure, run_link
+from cloudrc.text import Paint, escape, plain, table
 from cloudrc.tunnel.codec import SIZES
 
 RELEASE_TIMEOUT = 270.0  # default time limit for the verdict on a release [s]
@@ -42,6 +49,12 @@ KEYS = ("asked", "measured", "low", "high")
 """Values of a row, in the order of the table's columns."""
 VERDICTS = {"off": "not believed", "open": "undecided", "ok": "believed"}
 """Worst verdict on any quantity of the link -> verdict on the whole link."""
+MEANINGS = {
+    "not believed": ("red", "does not match its profile"),
+    "undecided": ("yellow", "needs more --seconds, or cannot be judged: see the notes"),
+    "believed": ("green", "matches its profile"),
+}
+"""Verdict on a link -> its colour, and what it means."""
 Tell: TypeAlias = Callable[[str], None]
 Report: TypeAlias = dict[str, Any]
 Pods: TypeAlias = Mapping[str, Sequence[str]]
@@ -245,3 +258,23 @@ def _as_json(row: Judgement) -> dict[str, Any]:
 def _known(values: Mapping[str, Any]) -> dict[str, Any]:
     unknown = (None, "", (), inf, -inf)
     return {key: one for key, one in values.items() if one not in unknown and one == one}
+
+
+def as_text(report: Report, paint: Paint = plain) -> str:
+    """Format a report: a table per direction, notes, causes and, in the last line, the verdict."""
+    lines = [escape(f"{report['link']}: {report['shaper']}")]
+    for way, found in report["directions"].items():
+        rows = [[way, "asked", "measured", "allowed", "verdict"], *map(_cells, found["rows"])]
+        lines += ["", escape(f"{way}: {found['probes']}"), table(rows, [1, 2, 3])]
+    causes = [f"  {one['way']}: {one['text']}  [{one['code']}]" for one in report["causes"]]
+    lines += ["", *map(escape, [*report["notes"], *causes])]
+    partly = any(NOT_JUDGED in note for note in report["notes"]) and report["verdict"] == "believed"
+    colour, text = MEANINGS[report["verdict"]]
+    text += f", except what is {NOT_JUDGED} (above)" * partly
+    return "\n".join([*lines, paint(f"{report['verdict'].upper()}: the link {text}", colour)])
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    values = (row.get(key, nan) for key in KEYS)
+    asked, measured, low, high = (in_unit(value, row["unit"]) for value in values)
+    return [f"  {row['name']}", asked, measured, f"{low} .. {high}", row["verdict"]]

@@ -6,13 +6,12 @@ from math import nan
 
 import pytest
 
-from cloudrc.cli.link_verify import as_text
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.errors import TimedOutError
 from cloudrc.records import LinkChecked
 from cloudrc.runs import verify
-from cloudrc.runs.verify import find_experiment, verify_release
+from cloudrc.runs.verify import as_text, find_experiment, verify_release
 
 PAGE = {"shaper": "relay", "reason": "", "interface": "eth0", "netems": {}}
 MEASURED = {"ok": 0.0451, "open": 0.0451, "off": 0.0902}

@@ -18,14 +18,13 @@ import pytest
 from cloudrc import assembly
 from cloudrc.assembly import assemble
 from cloudrc.cli.sweep import _shard
-from cloudrc.cli.sweep_run import as_table
 from cloudrc.cluster import batch
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.runs import sweep as sweeps
 from cloudrc.runs.grid import pack, read_grid
 from cloudrc.runs.lock import lock_folder
 from cloudrc.runs.store import read_rows
-from cloudrc.runs.sweep import fly_row, summarise
+from cloudrc.runs.sweep import fly_row
 from cloudrc.source import code_hash
 from tests.cli.conftest import KEYS, SHORT
 from tests.conftest import wait_until
@@ -524,23 +523,6 @@ def test_each_metric_that_fails_is_told_once_and_to_programs(broken_metrics, cal
 def test_a_sweep_tells_a_metric_that_fails_once(broken_metrics, write_sweep, call):
     file = write_sweep(ONE, seeds=2, set={"report.metrics": broken_metrics})
     assert call("sweep run --out grid", file).out.count("metric met_a failed: SystemExit") == 1
-
-
-def test_numbers_may_be_missing_and_failed_plugins_do_not_count():
-    failed = flown("failure", "plugin_failed", x=9.0)
-    rows = [flown(x=1.0), flown("failure", y=2.0), flown(x=3.0), failed]
-    summary = summarise(rows, {"x": "m", "y": "1"})
-    assert (summary["done"], summary["count"]) == (2, 4)
-    assert (summary["numbers"]["x"]["median"], summary["numbers"]["x"]["count"]) == (2.0, 2)
-    assert "(2 runs)" in as_table(summary)
-
-
-def test_a_median_with_flights_that_failed_is_marked():
-    rows = [flown(x=1.0), flown("failure", "not_settled", x=5e-7)]
-    shown = as_table(summarise(rows, {"x": "m"}))
-    assert "0.5000*" in shown
-    assert "* contains flights that failed" in shown
-    assert "*" not in as_table(summarise(rows[:1], {"x": "m"}))
 
 
 @pytest.mark.process

@@ -7,10 +7,10 @@ from importlib.metadata import EntryPoint
 import pytest
 
 from cloudrc import plugins
-from cloudrc.cli.list import describe_all
 from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
 from cloudrc.metrics import SHIPPED, measure_all
+from cloudrc.runs.catalogue import describe_all
 from cloudrc.runs.flight import fly_point
 from tests.cli.conftest import KEYS
 from tests.metrics.conftest import straight_flight

@@ -6,11 +6,10 @@ from contextlib import contextmanager
 
 import pytest
 
-from cloudrc.cli.link_verify import as_text
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.runs import link_under_test
 from cloudrc.runs.link_under_test import DEVICE, HOSTS, run_link
-from cloudrc.runs.verify import find_experiment, make_plans, make_report, probe_link
+from cloudrc.runs.verify import as_text, find_experiment, make_plans, make_report, probe_link
 
 pytestmark = pytest.mark.netem
 ASKED = ("delay_ms=400", "jitter_ms=80")  # far above what an emulated machine adds

@@ -1,0 +1,47 @@
+"""Summarize a report in a few lines of text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from cloudrc.metrics import METRIC_NOTE, Number
+from cloudrc.report.page import main_numbers
+from cloudrc.text import Paint, escape, plain, table
+
+COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
+
+
+def summarize(report: Mapping[str, Any], paint: Paint = plain) -> str:
+    """Summarize a report as text: verdict, failures, main numbers and warnings."""
+    numbers = {
+        name: Number(entry["value"], entry["unit"], "") for name, entry in report["numbers"].items()
+    }
+    rows = [(f"  {label}", digits, unit) for label, digits, unit in main_numbers(numbers)]
+    shown = table(rows, right=[1]) if rows else "  no numbers: nothing was flown"
+    return "\n".join([*_verdict(report, paint), "", shown, *_warnings(report, paint)])
+
+
+def _verdict(report: Mapping[str, Any], paint: Paint) -> Iterable[str]:
+    outcome, failures = report["verdict"], report["failures"]
+    first = failures[0]["text"] if failures else f"{_goal(report)}, every criterion met"
+    yield f"{paint(outcome.upper(), COLOURS[outcome])}: {escape(first)}"
+    for failure in failures[1:]:
+        when = f" (at {failure['time']:.2f} s)" if "time" in failure else ""
+        yield escape(f"  also: {failure['text']}{when}")
+
+
+def _goal(report: Mapping[str, Any]) -> str:
+    """Return what the robot has done in a mission that succeeded."""
+    if (end := report["numbers"].get("final_error")) is not None:
+        return f"setpoints flown to their end, {end['value']:.2f} m from the last one"
+    return "every step flown" if "steps" in report else "every waypoint reached"
+
+
+def _warnings(report: Mapping[str, Any], paint: Paint) -> Iterable[str]:
+    for note in report.get("notes", ()):
+        if note.startswith(METRIC_NOTE):
+            yield paint(f"  {escape(note)}", "yellow")
+    faults = report["numbers"].get("fault_count", {"value": 0})["value"]
+    if faults:
+        yield paint(f"  faults noted in flight: {faults:.0f}, see the report", "yellow")
