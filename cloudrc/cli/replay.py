@@ -32,11 +32,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Write the page, open it in the browser, and print its path."""
     require("a replay", ("world", "record", "console"))
-    from cloudrc.config.hull import known_hull
-    from cloudrc.config.scene import scene_of
     from cloudrc.files import write_atomically
-    from cloudrc.metrics import Flight
     from cloudrc.report.attached import read_flight
+    from cloudrc.report.flown import flight_of
     from cloudrc.report.replay import write_page
 
     run: Path = options.run
@@ -44,11 +42,9 @@ def execute(options: argparse.Namespace) -> int:
     if options.out and os.path.lexists(out):
         raise BadInputError(f"{out}: already there; name another file with --out")
     recording, experiment = read_flight(run)
-    scene = scene_of(experiment.world)
-    hull = known_hull(experiment.world.robot)
-    flight = Flight(recording, experiment.criteria, experiment.mission, scene, hull)
     try:
-        write_atomically(out, write_page(flight, experiment).encode())
+        page = write_page(flight_of(recording, experiment), experiment)
+        write_atomically(out, page.encode())
     except BadInputError as error:
         raise BadInputError(f"{run}: no replay: {error}") from error
     if not options.no_open and not open_page(out.absolute().as_uri()):

@@ -174,15 +174,16 @@ def load_experiment(
     """Load an experiment by name or path, and import and check its plug-ins.
 
     `settings` override values of the file; they may be texts `key=value`. Without `build`, the
-    plug-ins are not imported. If the experiment is `flown` already, its mission is not compared
-    with the scene. Raise a BadInputError that lists the experiment's problems.
+    plug-ins are not imported. If the experiment is `flown` already, its files may be missing or
+    changed, and its values count as they are: robot, scene and mission are not compared. Raise a
+    BadInputError that lists the experiment's problems.
     """
     name = str(name)
     document = shipped.read("experiment", name, Path())
     changes = settings if isinstance(settings, dict) else overrides.parse_settings(settings)
     inner = {path: value for path, value in changes.items() if _is_inside_name(path)}
     _default(document, ("name",), Path(name).stem)
-    if _has_all_values(document):
+    if _has_all_values(document) and not flown:
         _remove_derived(document, new_profile=bool(changes.keys() & _PROFILE_KEYS))
     outer = {path: value for path, value in changes.items() if path not in inner}
     overrides.apply_overrides(document, outer, build=build)
@@ -202,39 +203,36 @@ def load_experiment(
     _keep_setpoints(document, inner)
     if isinstance(names := document.get("report", "metrics"), str):  # one metric without a list
         document.tree["report"]["metrics"] = [names]
-    found += _resolve_paths(document)
+    lost = _resolve_paths(document)
     found += overrides.resolve_plugins(document, build=build)
+    if flown:
+        bounds = _no_bounds(document) or _bounds(document, [])
+    else:
+        found += lost
+        bounds = _bounds(document, found)
     experiment = problems.validate(
-        document,
-        ResolvedExperiment,
-        name,
-        found,
-        described=Experiment,
-        context=_bounds(document, found),
+        document, ResolvedExperiment, name, found, described=Experiment, context=bounds
     )
-    return _judge(document, experiment, name, flown=flown)
+    return experiment if flown else _judge(document, experiment, name)
 
 
-def _judge(
-    document: Document, experiment: ResolvedExperiment, name: str, *, flown: bool
-) -> ResolvedExperiment:
+def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> ResolvedExperiment:
     """Complete an experiment with what depends on its scene and robot.
 
-    Unless the experiment is `flown` already, raise a BadInputError if the mission does not fit.
+    Raise a BadInputError if the mission does not fit.
     """
     mission = experiment.mission
     scene = scene_of(experiment.world)
-    if not flown:
-        robot, found = known_robot(experiment.world.robot), list[ConfigProblem]()
-        with _collect(found, ("world", "tuning")):
-            parameters(robot, experiment.world)
-        mission = put_on_ground(mission, scene) if robot.planar else mission
-        found += _check_flown(mission, scene, experiment.world.robot)
-        problems.raise_problems(document, found, name)
+    robot, found = known_robot(experiment.world.robot), list[ConfigProblem]()
+    with _collect(found, ("world", "tuning")):
+        parameters(robot, experiment.world)
+    mission = put_on_ground(mission, scene) if robot.planar else mission
+    found += _check_fit(mission, scene, experiment.world.robot)
+    problems.raise_problems(document, found, name)
     return experiment.model_copy(update={"mission": mission})
 
 
-def _check_flown(mission: MissionConfig, scene: Scene, robot: str) -> list[ConfigProblem]:
+def _check_fit(mission: MissionConfig, scene: Scene, robot: str) -> list[ConfigProblem]:
     """List the problems of a mission in a scene, with their paths in the experiment."""
     planar = known_robot(robot).planar
 
@@ -461,6 +459,16 @@ def bounds_of(world: World) -> Bounds:
     """Return what robot and scene of an experiment tell about the limits of the guard."""
     scene = scene_of(world)
     return Bounds(known_robot(world.robot).guard, fence_of(scene).room(scene.spawn))
+
+
+def _no_bounds(document: Document) -> Bounds | None:
+    """Return bounds that allow the limits that the file gives; None if it does not give all."""
+    speed, acceleration = (
+        document.get("guard", key) for key in ("speed_max_mps", "acceleration_max_mps2")
+    )
+    if not isinstance(speed, int | float) or not isinstance(acceleration, int | float):
+        return None
+    return Bounds(DEFAULT_LIMITS, inf)
 
 
 def _bounds(document: Document, found: list[ConfigProblem]) -> Bounds:

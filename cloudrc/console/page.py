@@ -124,8 +124,8 @@ class Page:
 
         shapes = read_shapes(experiment.world)
         self._planar = shapes.planar
-        self._scene = FlightScene(self._server, experiment, shapes, ASPECT)
         self._surroundings = scene_of(experiment.world)
+        self._scene = FlightScene(self._server, experiment, shapes, self._surroundings, ASPECT)
         gui = self._server.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_WIDTH)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.geometry.clearance import CLEARANCE_SHOWN, Array
-from cloudrc.geometry.scene import FLOOR, Scene, load_scene
+from cloudrc.geometry.scene import FLOOR, Scene
 from cloudrc.geometry.shapes import Rgba, Shapes, Surface, merged
 from cloudrc.geometry.tubes import rims, wall
 from cloudrc.messages import Vector
@@ -59,6 +59,7 @@ class FlightScene:
         server: viser.ViserServer,
         experiment: ResolvedExperiment,
         shapes: Shapes,
+        geometry: Scene,
         aspect: float = 1.5,
     ) -> None:
         """Add the static shapes, and the robot at its spawn.
@@ -66,13 +67,9 @@ class FlightScene:
         The first view shows the whole mission in a window whose width is at least `aspect` [1]
         times its height.
 
-        `shapes` are those of robot and scene.
-
-        Raises:
-            BadInputError: If the scene is missing.
+        `shapes` are those of robot and scene, `geometry` has the numbers of the scene.
         """
         self._scene = server.scene
-        geometry = load_scene(experiment.world.scene)
         # Without a graphics card, shadows cost more than ten times the rest of a picture.
         self._scene.configure_default_lights(cast_shadow=False)
         self._add_surroundings(shapes, geometry)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import TypeAlias
 
@@ -78,6 +79,16 @@ def fence_of(scene: Scene) -> Fence:
     return Fence((ax - SPACE, ay - SPACE, ground), (bx + SPACE, by + SPACE, bz + SPACE))
 
 
+def without_file(scene: Scene) -> Scene:
+    """Return a scene with all its bodies and its fence, of which nothing has to be read again.
+
+    Raises:
+        BadInputError: If MuJoCo cannot read the scene.
+    """
+    solids, fence = _compiled(scene)[1], fence_of(scene)
+    return replace(scene, path=None, own_fence=fence, solids=solids)
+
+
 def known(scene: Scene) -> bool:
     """Return whether `obstacles` returns all obstacles of a scene."""
     return scene.path is None or find_spec("mujoco") is not None
@@ -85,7 +96,7 @@ def known(scene: Scene) -> bool:
 
 def _compiled(scene: Scene) -> tuple[tuple[str, ...], tuple[Solid, ...]]:
     if scene.path is None or not known(scene):
-        return (), ()
+        return (), scene.solids
     from cloudrc.geometry.compiled import read_bodies
 
     bodies = read_bodies(scene.path)

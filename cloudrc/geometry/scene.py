@@ -21,6 +21,7 @@ from xml.etree import ElementTree
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import Corners, Fence, order_of
+from cloudrc.geometry.solids import Solid
 from cloudrc.messages import Vector
 
 Numerics: TypeAlias = dict[str, str]
@@ -67,6 +68,7 @@ class Scene:
     spawn: Vector = SPAWN  # position of the base at the start of a mission [m], world frame
     path: Path | None = None  # of the file if it may have more bodies; None: this is all it has
     own_fence: Fence | None = None  # fence that is declared; None: see `obstacles.fence_of`
+    solids: tuple[Solid, ...] = ()  # of a recorded scene without `path`: its other bodies
 
 
 def is_obstacle(body: str, *, touch: str | None) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +84,8 @@ def _to_hull(solid: Solid, local: Array) -> Array:
     return distance
 
 
+SHAPES = get_args(Shape)
+"""The shapes that a solid may have."""
 _DISTANCES = {
     "box": _to_box,
     "sphere": _to_sphere,

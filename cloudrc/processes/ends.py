@@ -18,7 +18,6 @@ from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
 from cloudrc.drivers.realtime import Address, Peer, bind
 from cloudrc.drivers.teleop import RemoteTeleop, UnixPeer
 from cloudrc.files import warn_if_readable
-from cloudrc.geometry.shapes import SHAPES_FILE
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import SIZE_MAX, link_profile
 from cloudrc.link.verify.judge import Flow
@@ -96,7 +95,7 @@ def open_end(settings: EndSettings, name: str) -> tuple[ResolvedExperiment, Iden
     link = settings.route.with_name(STATE_FILE)
     with listening("--listen", settings.listen):
         peer = Peer(bind(settings.listen), settings.route)
-    attached = _shapes(experiment) if name == "world" else {}
+    attached = _flown(experiment) if name == "world" else {}
     recorder = open_recorder(settings.record, settings.record_max, name, clock, attached)
     end = EndProcess(
         end=name,
@@ -112,11 +111,11 @@ def open_end(settings: EndSettings, name: str) -> tuple[ResolvedExperiment, Iden
     return experiment, Identity(clock, os.urandom(16), keys.ring), end
 
 
-def _shapes(experiment: ResolvedExperiment) -> dict[str, bytes]:
-    """Return the file to attach to a recording: what robot and scene look like."""
-    from cloudrc.world.shapes import read_shapes
+def _flown(experiment: ResolvedExperiment) -> dict[str, bytes]:
+    """Return the files to attach to a recording: what its report needs of robot and scene."""
+    from cloudrc.world.shapes import flown_files
 
-    return {SHAPES_FILE: read_shapes(experiment.world).to_bytes()}
+    return flown_files(experiment.world)
 
 
 def open_recorder(

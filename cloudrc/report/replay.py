@@ -19,7 +19,7 @@ from cloudrc.console.scene import FlightScene
 from cloudrc.errors import BadInputError
 from cloudrc.metrics import Flight
 from cloudrc.metrics.mission import reported
-from cloudrc.report.shapes import flown_shapes
+from cloudrc.report.flown import flown_shapes
 
 RATE = 25.0
 """Number of frames per second of flight time."""
@@ -65,7 +65,8 @@ def write_page(flight: Flight, experiment: ResolvedExperiment) -> str:
 def _record(server: viser.ViserServer, flight: Flight, experiment: ResolvedExperiment) -> str:
     """Record the flight in the scene of a server; return viser's page with the player."""
     shapes = flown_shapes(flight.recording, experiment)
-    scene, duration = FlightScene(server, experiment, shapes), max(flight.duration, 1e-3)
+    scene = FlightScene(server, experiment, shapes, flight.scene)
+    duration = max(flight.duration, 1e-3)
     truth, control, applied = flight.truth, flight.control, flight.applied
     times = np.linspace(0.0, duration, int(min(duration * RATE, FRAMES_MAX)) + 1)
     true, asked, predicted = (

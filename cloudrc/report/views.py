@@ -17,9 +17,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from cloudrc.config.hull import known_hull
 from cloudrc.config.load import ResolvedExperiment
-from cloudrc.config.scene import scene_of
 from cloudrc.geometry.shapes import Shapes, Surface
 from cloudrc.geometry.tubes import wall
 from cloudrc.metrics import Flight
@@ -28,7 +26,7 @@ from cloudrc.metrics.flight import Array, Columns, select
 from cloudrc.record.columns import Recording
 from cloudrc.record.content import Message
 from cloudrc.record.ros import encode_view, header, part
-from cloudrc.report.shapes import flown_shapes
+from cloudrc.report.flown import flight_of, flown_shapes
 
 _Colour: TypeAlias = tuple[float, float, float, float]
 _Shape: TypeAlias = tuple[Any, ...]  # arguments of `_marker`, from `name` on
@@ -52,19 +50,17 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]
     Raises:
         BadInputError: If the scene of the experiment cannot be read.
     """
-    scene, truth = scene_of(experiment.world), recording["/ground_truth"]
+    flight, truth = flight_of(recording, experiment), recording["/ground_truth"]
     if not len(truth):
         return []
-    hull = known_hull(experiment.world.robot)
-    flight = Flight(recording, experiment.criteria, experiment.mission, scene, hull)
     poses, control = _thin({name: truth[name] for name in truth.names}), _thin(flight.control)
     first_ns = int(truth["stamp_ns"][0])
     bodies = flown_shapes(recording, experiment)
     shapes = _robot(bodies)
     size = min(GOAL_SIZE, bodies.size / 4) if bodies.robot else GOAL_SIZE
     shapes.append(("setpoint", SPHERE, "setpoint", size, GOAL))
-    shapes += [_solid(tube.name, "world", [wall(tube, GLASS, 24)]) for tube in scene.tubes]
-    shapes += _obstacles(bodies, {tube.name for tube in scene.tubes})
+    shapes += [_solid(tube.name, "world", [wall(tube, GLASS, 24)]) for tube in flight.scene.tubes]
+    shapes += _obstacles(bodies, {tube.name for tube in flight.scene.tubes})
     if len(path := poses["position"]) > 1:
         shapes.append(("path", LINE_STRIP, "world", 0.02, PATH, path))
     markers = [_marker(number, first_ns, *shape) for number, shape in enumerate(shapes)]

@@ -11,19 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cloudrc.config.hull import known_hull
 from cloudrc.config.load import ResolvedExperiment
-from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import read, write_atomically
-from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.obstacles import known, obstacles
 from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
 from cloudrc.report.document import Assessment, Run, environment_document, write_json
-from cloudrc.report.shapes import flown_shapes
+from cloudrc.report.flown import flight_of, flown_shapes, flown_world
 
 if TYPE_CHECKING:
     from cloudrc.report.figures.style import Look
@@ -41,9 +38,7 @@ def assess(
     `own` are names or paths of the user's metrics, whose files are executed. Metric files that only
     the experiment names are not executed, because somebody else may have written them.
     """
-    scene = scene_of(experiment.world)
-    hull = known_hull(experiment.world.robot)
-    flight = Flight(recording, experiment.criteria, experiment.mission, scene, hull)
+    flight = flight_of(recording, experiment)
     numbers, metric_notes = measure_all(flight, own)
     real_time, stopped = run.mode != "virtual", run.interrupted or bool(recording.note)
     evidence = flight_evidence(flight, numbers, real_time=real_time, interrupted=stopped)
@@ -118,7 +113,7 @@ def write_report(
     document = assessment.document
     write_json(folder / "report.json", document)
     environment = _environment(folder / "environment.json", assessment)
-    if driven := _driven(assessment.flight, steered_in(experiment.world)):
+    if driven := _driven(assessment):
         write_atomically(folder / DRIVE_FILE, driven.encode())
     if page:
         _write_page(folder, assessment, environment, look)
@@ -135,8 +130,9 @@ def _environment(path: Path, assessment: Assessment) -> dict[str, Any]:
     return document
 
 
-def _driven(flight: Flight, fence: Fence) -> str:
+def _driven(assessment: Assessment) -> str:
     """Return the setpoints of the operator's drive by hand, as CSV; "" if nobody drove."""
+    flight = assessment.flight
     mission, control = flight.during("/mission"), flight.control
     begins_ns = mission["stamp_ns"][mission["event"] == "driving"]
     if not len(begins_ns):
@@ -147,6 +143,7 @@ def _driven(flight: Flight, fence: Fence) -> str:
         return ""
     times = (control["stamp_ns"][rows] - begins_ns[0]) * 1e-9
     setpoints = zip(times.tolist(), control["setpoint"][rows].tolist(), strict=True)
+    fence = flown_world(flight.recording, assessment.experiment).steered
     return write_setpoints(setpoints, fence)
 
 

@@ -18,7 +18,6 @@ from cloudrc import assembly
 from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.drivers.local import LINK_FOLDER, LocalRun
 from cloudrc.errors import CloudrcError, InterruptedRunError, machine_error
-from cloudrc.geometry.shapes import SHAPES_FILE
 from cloudrc.link.follow import prepare_link
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.record.merge import merge
@@ -86,13 +85,13 @@ def _record_virtual(
     of the report to mission.mcap.
     """
     from cloudrc.robots.build import describe_steps
-    from cloudrc.world.shapes import read_shapes
+    from cloudrc.world.shapes import flown_files
 
     store, interrupted, see = RecordStore(), False, _interruptible(see)
     # Record during the flight, so that the recording is kept if the run or its report fails.
     with McapWriter(folder / "mission.mcap", clock="world", code=code_hash()) as writer:
         at_start = attachments(folder)  # the experiment, also for a copy that is cut short
-        at_start[SHAPES_FILE] = read_shapes(experiment.world).to_bytes()
+        at_start |= flown_files(experiment.world)
         for name, data in at_start.items():
             writer.attach(name, data)
 

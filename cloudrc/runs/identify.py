@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from cloudrc.config.load import read_experiment
-from cloudrc.config.robot import is_planar
 from cloudrc.errors import BadInputError
 from cloudrc.metrics import velocity_loop
 from cloudrc.metrics.velocity_loop import DT, INPUT, OUTPUT, Fit
 from cloudrc.record.columns import Recording
+from cloudrc.report.flown import flown_world
 from cloudrc.runs.session import refuse_under_way
 
 __all__ = ["INPUT", "OUTPUT", "describe", "identify"]
@@ -30,8 +30,9 @@ def identify(run: Path) -> tuple[list[Fit], float]:
     path = run / "mission.mcap" if run.is_dir() else run
     if not path.exists():
         refuse_under_way(path.parent)
-    given, measured = velocity_loop.series(Recording.read(path), str(path))
-    axes = "xy" if _is_planar(path.parent) else "xyz"
+    recording = Recording.read(path)
+    given, measured = velocity_loop.series(recording, str(path))
+    axes = "xy" if _is_planar(recording, path.parent) else "xyz"
     fits = [
         velocity_loop.identify(given[:, axis], measured[:, axis], f"{path}: {name}")
         for axis, name in enumerate(axes)
@@ -41,10 +42,11 @@ def identify(run: Path) -> tuple[list[Fit], float]:
     return fits, len(given) * DT
 
 
-def _is_planar(folder: Path) -> bool:
-    """Return whether the robot of a run stays on the ground; False if the run has no experiment."""
+def _is_planar(recording: Recording, folder: Path) -> bool:
+    """Return whether the robot of a run stays on the ground; False if nothing says so."""
     try:
-        return is_planar(read_experiment(folder / "config.yaml", flown=True).world.robot)
+        experiment = read_experiment(folder / "config.yaml", flown=True)
+        return flown_world(recording, experiment).planar
     except BadInputError:
         return False
 

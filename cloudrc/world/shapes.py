@@ -7,13 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.config.robot import find_robot
+from cloudrc.config.flown import FLOWN_FILE, FlownWorld
+from cloudrc.config.hull import known_hull
+from cloudrc.config.robot import find_robot, is_planar
+from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of
 from cloudrc.geometry import shapes
 from cloudrc.geometry.compiled import mujoco
 from cloudrc.geometry.scene import FLOOR
-from cloudrc.geometry.shapes import Rgba, Shapes, Surface
+from cloudrc.geometry.shapes import SHAPES_FILE, Rgba, Shapes, Surface
 from cloudrc.world.scene import bodies_of_geoms, compile_model
 
 _GEOM = mujoco.mjtGeom
@@ -34,6 +37,16 @@ def read_shapes(world: World) -> Shapes:
     """
     robot = find_robot(world.robot)
     return shapes_of(compile_model(robot.model, file_of(world.scene)), planar=robot.planar)
+
+
+def flown_files(world: World) -> dict[str, bytes]:
+    """Return what to attach to a recording, name -> content: what a report needs of the world.
+
+    Raises:
+        BadInputError: If robot or scene are missing or unsuitable.
+    """
+    flown = FlownWorld(scene_of(world), known_hull(world.robot), is_planar(world.robot))
+    return {SHAPES_FILE: read_shapes(world).to_bytes(), FLOWN_FILE: flown.to_bytes()}
 
 
 def shapes_of(model: Any, *, planar: bool) -> Shapes:

@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from cloudrc import renamed
 from cloudrc.config import document, shipped
 from cloudrc.config.document import parse_value
 from cloudrc.config.load import dump, fingerprint, load_experiment, load_profile, read_experiment
+from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import SCENES, load_scene
 from cloudrc.link.traces import link_profile
@@ -250,3 +252,24 @@ def test_a_flight_that_is_over_need_not_fit_its_scene(tmp_path):
     with pytest.raises(BadInputError, match="post"):
         read_experiment("hover", settings)
     assert read_experiment("hover", settings, flown=True).world.scene.endswith("mine.xml")
+
+
+def test_a_flight_that_is_over_needs_no_files_and_keeps_its_limits(tmp_path):
+    files = [tmp_path / name for name in ("robot", "mine.xml", "trace.csv", "path.csv")]
+    robot, scene, trace, path = files
+    shutil.copytree(find_robot("rover").model.parent, robot)
+    shutil.copy(SCENES / "pillars.xml", scene)
+    trace.write_text("time_s,delay_ms\n0,30\n5,40\n")
+    path.write_text("time_s,x_m,y_m\n0,0,0\n5,0.2,0\n")
+    keys = ("world.robot", "world.scene", "link.uplink.trace", "mission.setpoints")
+    settings = [f"{key}={file}" for key, file in zip(keys, files, strict=True)]
+    flown = load_experiment("pillars", settings)
+    (tmp_path / "config.yaml").write_text(dump(flown))
+    text = (robot / "robot.yaml").read_text()
+    (robot / "robot.yaml").write_text(text.replace("speed_max_mps: ", "speed_max_mps: 0."))
+    assert read_experiment(tmp_path / "config.yaml", flown=True) == flown
+    for file in files:
+        file.rename(file.with_name(f"{file.name}.away"))
+    assert read_experiment(tmp_path / "config.yaml", flown=True) == flown
+    with pytest.raises(BadInputError, match="3 problems"):
+        read_experiment(tmp_path / "config.yaml")

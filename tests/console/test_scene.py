@@ -6,6 +6,7 @@ import pytest
 import viser
 
 from cloudrc.config.load import load_experiment
+from cloudrc.config.scene import scene_of
 from cloudrc.console.scene import FlightScene, clearance_colours
 from cloudrc.geometry.clearance import CLEARANCE_SHOWN
 from cloudrc.world.shapes import read_shapes
@@ -21,7 +22,8 @@ def server():
 def shown(server, name, *sets):
     """Show an experiment; return the scene, and its nodes by name."""
     experiment = load_experiment(name, sets)
-    scene = FlightScene(server, experiment, read_shapes(experiment.world))
+    world = experiment.world
+    scene = FlightScene(server, experiment, read_shapes(world), scene_of(world))
     return scene, server.scene._handle_from_node_name
 
 

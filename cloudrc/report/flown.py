@@ -1,0 +1,55 @@
+"""Find the robot and the scene of a flight: what the recording has of them, else their files."""
+
+from __future__ import annotations
+
+from cloudrc.config.flown import FLOWN_FILE, FlownWorld
+from cloudrc.config.hull import known_hull
+from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.robot import is_planar
+from cloudrc.config.scene import scene_of
+from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.geometry.shapes import SHAPES_FILE, Shapes
+from cloudrc.metrics import Flight
+from cloudrc.record.columns import Recording
+
+
+def flight_of(recording: Recording, experiment: ResolvedExperiment) -> Flight:
+    """Return a flight for metrics and figures; raise errors as `flown_world` does."""
+    flown = flown_world(recording, experiment)
+    return Flight(recording, experiment.criteria, experiment.mission, flown.scene, flown.hull)
+
+
+def flown_world(recording: Recording, experiment: ResolvedExperiment) -> FlownWorld:
+    """Return the numbers of the robot and the scene of a flight.
+
+    They are those that the recording contains. A recording of an older version, and a recording in
+    memory, has none; then they are those of the files that the experiment names.
+
+    Raises:
+        BadInputError: If the numbers in the recording are not readable or, in a recording without
+            them, if the files are missing or unsuitable.
+    """
+    if (data := recording.attachments.get(FLOWN_FILE)) is not None:
+        return FlownWorld.from_bytes(data)
+    world = experiment.world
+    return FlownWorld(scene_of(world), known_hull(world.robot), is_planar(world.robot))
+
+
+def flown_shapes(recording: Recording, experiment: ResolvedExperiment) -> Shapes:
+    """Return the shapes of the robot and the scene of a flight.
+
+    They are those that the recording contains. A recording of an older version has none; then they
+    are those of the files that the experiment names, or none without MuJoCo.
+
+    Raises:
+        BadInputError: If the shapes in the recording are not readable or, in a recording without
+            shapes, if the files are missing or unsuitable.
+    """
+    if (data := recording.attachments.get(SHAPES_FILE)) is not None:
+        return Shapes.from_bytes(data)
+    try:
+        from cloudrc.world.shapes import read_shapes
+
+        return read_shapes(experiment.world)
+    except MissingPrerequisiteError:
+        return Shapes()

@@ -1,0 +1,164 @@
+"""A run is drawn and reported from its recording, without the user's files of robot and scene."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from cloudrc.config.flown import FLOWN_FILE, FlownWorld
+from cloudrc.config.hull import hull_of
+from cloudrc.config.load import load_experiment
+from cloudrc.config.robot import find_robot
+from cloudrc.config.shipped import file_of
+from cloudrc.errors import BadInputError
+from cloudrc.geometry.clearance import clearance_per_obstacle
+from cloudrc.geometry.obstacles import obstacles
+from cloudrc.geometry.scene import load_scene
+from cloudrc.geometry.shapes import SHAPES_FILE
+from cloudrc.record.columns import Recording
+from cloudrc.report.flown import flown_shapes, flown_world
+from cloudrc.runs.fly import fly
+from cloudrc.world.shapes import read_shapes
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Fly the user's own rover; return the folders of the run and of the user's files."""
+    files = tmp_path_factory.mktemp("mine")
+    shutil.copytree(find_robot("rover").model.parent, files / "robot")
+    shutil.copy(file_of("pillars"), files / "scene.xml")
+    folder = tmp_path_factory.mktemp("run")
+    sets = (
+        f"world.robot={files / 'robot'}",
+        f"world.scene={files / 'scene.xml'}",
+        "mission.waypoints=[{position_m: [0.5, 0.5], dwell_s: 0.0}]",
+    )
+    experiment = load_experiment("pillars", sets)
+    fly(experiment, "virtual", folder, page=False)
+    return folder, files, experiment
+
+
+def test_the_recording_has_the_shapes_and_a_copy_keeps_them(run, tmp_path):
+    folder, _, experiment = run
+    recording = Recording.read(folder / "mission.mcap")
+    wanted = read_shapes(experiment.world).to_bytes()
+    assert recording.attachments[SHAPES_FILE] == wanted
+    recording.write(tmp_path / "copy.mcap")
+    assert Recording.read(tmp_path / "copy.mcap").attachments[SHAPES_FILE] == wanted
+
+
+def test_the_recordings_own_shapes_count_and_not_those_of_changed_files(run):
+    folder, files, experiment = run
+    recording, model = Recording.read(folder / "mission.mcap"), files / "robot" / "robot.xml"
+    before, text = flown_shapes(recording, experiment), model.read_text()
+    model.write_text(
+        text.replace('name="mast" type="cylinder" size=".02', 'type="cylinder" size=".2')
+    )
+    try:
+        assert flown_shapes(recording, experiment).to_bytes() == before.to_bytes()
+        recording.attachments.clear()
+        assert flown_shapes(recording, experiment).to_bytes() != before.to_bytes()
+    finally:
+        model.write_text(text)
+
+
+def measured(folder):
+    """Return the numbers of a report; the last bit depends on how the memory is laid out."""
+    numbers = json.loads((folder / "report.json").read_text())["numbers"]
+    return {name: float(f"{number['value']:.9g}") for name, number in numbers.items()}
+
+
+def test_a_report_is_that_of_the_flight_without_the_users_files(run, call):
+    folder, files, _ = run
+    before = measured(folder)
+    away = files.rename(files.with_name("away"))
+    try:
+        call("report", folder)
+        call("replay --no-open", folder)
+    finally:
+        away.rename(files)
+    assert measured(folder) == before
+    assert "min_clearance_flight" in before
+    assert "No replay in 3-D" not in (folder / "report.html").read_text()
+
+
+def test_a_report_is_that_of_the_flight_after_the_users_files_have_changed(run, call):
+    folder, files, _ = run
+    before = measured(folder)
+    changed = {
+        files / "robot" / "robot.yaml": ("hull_m: 0", "hull_m: 1"),
+        files / "scene.xml": ("</worldbody>", '<body name="x"><geom size="2"/></body></worldbody>'),
+    }
+    texts = {file: file.read_text() for file in changed}
+    for file, (old, new) in changed.items():
+        assert old in texts[file]
+        file.write_text(texts[file].replace(old, new))
+    try:
+        call("report", folder)
+    finally:
+        for file, text in texts.items():
+            file.write_text(text)
+    assert measured(folder) == before
+
+
+def test_a_recording_without_the_numbers_of_the_world_needs_the_users_files(run):
+    folder, files, experiment = run
+    recording = Recording.read(folder / "mission.mcap")
+    recorded = flown_world(recording, experiment)
+    del recording.attachments[FLOWN_FILE]
+    assert repr(flown_world(recording, experiment).scene.tubes) == repr(recorded.scene.tubes)
+    away = files.rename(files.with_name("away"))
+    try:
+        with pytest.raises(BadInputError, match="No such file"):
+            flown_world(recording, experiment)
+    finally:
+        away.rename(files)
+
+
+@pytest.fixture
+def flown(tmp_path):
+    """A world with one solid of each shape."""
+    sizes = {"box": ".1 .2 .3", "sphere": ".1", "capsule": ".1 .2", "cylinder": ".1 .2"}
+    sizes |= {"ellipsoid": ".1 .2 .3", "plane": "1 1 .1"}
+    geoms = [
+        f'<body name="{shape}" pos="{n} 1 2" euler="10 20 30">'
+        f'<geom type="{shape}" size="{size}"/></body>'
+        for n, (shape, size) in enumerate(sizes.items())
+    ]
+    corners = "0 0 0 1 0 0 0 1 0 0 0 1"
+    mesh = f'<asset><mesh name="m" vertex="{corners}"/></asset>'
+    geoms.append('<body name="mesh" pos="5 5 5"><geom type="mesh" mesh="m"/></body>')
+    text = file_of("pipes").read_text().replace("<worldbody>", f"{mesh}<worldbody>")
+    path = tmp_path / "mine.xml"
+    path.write_text(text.replace("</worldbody>", "".join(geoms) + "</worldbody>"))
+    return FlownWorld(load_scene(str(path)), hull_of("pelican"), planar=False)
+
+
+def test_robot_and_scene_are_kept_exactly(flown):
+    read = FlownWorld.from_bytes(flown.to_bytes())
+    assert read.to_bytes() == flown.to_bytes()
+    places, level = np.random.default_rng(1).uniform(-3, 6, (50, 3)), [[1.0, 0.0, 0.0, 0.0]] * 50
+    found = [
+        clearance_per_obstacle(obstacles(each.scene, touch="board"), places, level, each.hull.few)
+        for each in (flown, read)
+    ]
+    assert found[0].shape[1] == 10  # three tubes and seven bodies
+    assert (found[0] == found[1]).all()
+    assert read.steered == flown.steered
+
+
+@pytest.mark.parametrize("data", [b"", b"[]", b"{}", b'{"scene": 1, "hull": null, "planar": 0}'])
+def test_a_damaged_file_is_refused(data):
+    with pytest.raises(BadInputError, match="is not readable"):
+        FlownWorld.from_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [(b'"box"', b'"box2"'), (b'"faces"', b'"f"'), (b'"radii": [', b'"radii": [1,')]
+)
+def test_a_file_with_wrong_parts_is_refused(flown, old, new):
+    data = flown.to_bytes()
+    assert old in data
+    with pytest.raises(BadInputError, match="use the original recording"):
+        FlownWorld.from_bytes(data.replace(old, new))
