@@ -77,7 +77,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "warnings": {"assembly", "config", "link", "robots", "tunnel"},
     "api": {"runs", "cluster", "config", "metrics", "record", "report"},
     "processes": EVERYTHING,
-    "exercise": {"cloud", "config", "drivers", "plugins", "runs"},
+    "exercise": {"cloud", "config", "drivers", "files", "plugins", "runs"},
     "faults": EVERYTHING,
     "cli": EVERYTHING,
     "__main__": {"cli"},

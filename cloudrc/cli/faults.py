@@ -19,7 +19,7 @@ from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.text import escape, table
 
 if TYPE_CHECKING:
-    from cloudrc.faults.measures import Outcome, Scenario
+    from cloudrc.faults.measures import Outcome
 
 EPILOG = """\
 examples:
@@ -126,7 +126,8 @@ def run(options: argparse.Namespace) -> int:
         scenario = chosen[len(faults)]
         faults.append(scenario.as_json(outcome))
         if options.output == "table":
-            _print_outcome(scenario, outcome, options.all)
+            for line in scenario.as_lines(outcome, paint, briefly=options.all):
+                print(line)
 
     run_seed = partial(run_fault, seed=options.seed)
     flown = map_in_order(run_seed, [each.name for each in chosen], options.jobs)
@@ -140,17 +141,6 @@ def run(options: argparse.Namespace) -> int:
         print(text, file=sys.stderr, flush=True)
         return stopped.exit_code
     return FAILED if failed else 0
-
-
-def _print_outcome(scenario: Scenario, outcome: Outcome, briefly: bool) -> None:
-    word = paint(outcome.word, "green" if outcome.passed else "red")
-    sha = f"  {outcome.sha256[:12]}" if outcome.sha256 else ""
-    print(f"{word:8} {scenario.id:4} {scenario.name:26} {outcome.seconds:6.1f} s{sha}")
-    if outcome.error:
-        print(f"           {escape(outcome.error)}")
-    for check in outcome.checks:
-        if not (briefly and check.passed):
-            print(f"         {'' if check.passed else 'x '}{escape(check.show())}")
 
 
 def fly_file(options: argparse.Namespace) -> int:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Sequence
-from math import isnan
 from pathlib import Path
 
 from cloudrc.cli.output import format_document, output_argument, print_result
 from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
 from cloudrc.runs.requirements import require
-from cloudrc.text import escape, table
+from cloudrc.text import escape
 
 EPILOG = """\
 examples:
@@ -33,7 +31,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Fit the model, write it to a file, and print it."""
     require("identify", ("record",))
-    from cloudrc.runs.identify import INPUT, OUTPUT, describe, identify
+    from cloudrc.runs.identify import as_text, describe, identify
 
     out = options.out
     if os.path.lexists(out):
@@ -41,17 +39,5 @@ def execute(options: argparse.Namespace) -> int:
     fits, seconds = identify(options.run)
     document = describe(fits, seconds)
     write_atomically(out, f"{format_document(document, 'yaml')}\n".encode())
-    head = f"velocity loop from {document['seconds']} s, input {INPUT}, output {OUTPUT}"
-    rows: list[Sequence[str]] = [
-        ("axis", "time constant [s]", "dead time [s]", "gain", "explained")
-    ]
-    for name, fit in zip("xyz", fits, strict=True):
-        if isnan(fit.share):
-            rows.append((name, "stays on the ground", "", "", ""))
-            continue
-        cells = [f"{v:.3f} ± {h:.3f}" for v, h in zip(*fit[:2], strict=True)]
-        rows.append((name, *cells, f"{fit.share:.1%}"))
-    shown = table(rows, right=(1, 2, 3, 4))
-    text = f"{head}\n\n{shown}\n\n± : 95 % interval\n{escape(str(out))}"
-    print_result(options.output, document, text)
+    print_result(options.output, document, f"{as_text(fits, seconds)}\n{escape(str(out))}")
     return 0

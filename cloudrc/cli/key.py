@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 
 from cloudrc.cli.output import print_line
@@ -35,18 +34,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run `key new` (make or rotate a key) or `key drop` (remove the previous key)."""
-    from cloudrc.drivers.keyfile import read_keys
-    from cloudrc.files import write_atomically
-    from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
+    from cloudrc.drivers.keyfile import drop_previous, make_or_rotate
 
-    path, makes = options.file, options.verb == "new"
-    old = None if makes and not path.exists() else read_keys(path, "")
-    if makes or old is None:
-        keys = KeySet(Key(os.urandom(KEY_SIZE)), old.current if old else None)
+    path = options.file
+    if options.verb == "new":
+        keys = make_or_rotate(path)
         said = f", beside {keys.previous.name} until 'cloudrc key drop'" if keys.previous else ""
     else:
-        keys, said = KeySet(old.current), " is the only key"
-    target = Path(os.path.realpath(path))  # keep a symbolic link: replace the file it points to
-    write_atomically(target, write(keys).encode("ascii"), 0o600)
+        keys, said = drop_previous(path), " is the only key"
     print_line(f"key {keys.current.name}{said}: {path}")
     return 0

@@ -9,10 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
-from collections.abc import Callable
-from math import isnan, nan
 from pathlib import Path
-from statistics import fmean
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import release_arguments
@@ -22,10 +19,10 @@ from cloudrc.errors import BadInputError
 from cloudrc.files import naming
 from cloudrc.link.verify import DEFAULT
 from cloudrc.runs.requirements import require
-from cloudrc.text import escape, table
+from cloudrc.text import escape
 
 if TYPE_CHECKING:
-    from cloudrc.link.model import Numbers
+    pass
 
 EPILOG = """\
 examples:
@@ -152,7 +149,7 @@ def show(options: argparse.Namespace) -> int:
         raise BadInputError(f"-o {output}: not a picture; end its name in .png, .svg or .pdf")
     refuse_other_file(output, PICTURES[output.suffix[1:]])
     from cloudrc.report.figures.link import render_link
-    from cloudrc.runs.link_sample import SampleSettings, sample_profile
+    from cloudrc.runs.link_sample import SampleSettings, sample_profile, statistics_table
 
     settings = settings_from(options, SampleSettings)
     about, ways = sample_profile(
@@ -164,32 +161,6 @@ def show(options: argparse.Namespace) -> int:
     with naming(output):
         output.write_bytes(picture)
     print(title)
-    print(_table({name: numbers for name, (_, numbers) in ways.items()}))
+    print(statistics_table({name: numbers for name, (_, numbers) in ways.items()}))
     print_line(str(output))
     return 0
-
-
-_STATISTICS: dict[str, tuple[str, float, Callable[[Numbers], float]]] = {
-    "mean": ("ms", 1e3, lambda one: one.mean),
-    "standard deviation": ("ms", 1e3, lambda one: one.deviation),
-    "least": ("ms", 1e3, lambda one: one.least),
-    "median": ("ms", 1e3, lambda one: one.median),
-    "99 %": ("ms", 1e3, lambda one: one.p99),
-    "most": ("ms", 1e3, lambda one: one.most),
-    "correlation with the next": ("", 1.0, lambda one: one.correlation),
-    "overtaken by a later one": ("%", 1e2, lambda one: one.overtaken),
-    "duplicated": ("%", 1e2, lambda one: one.duplicated),
-    "lost": ("%", 1e2, lambda one: one.loss),
-    "lost in a row, mean": ("", 1.0, lambda one: fmean(one.runs) if one.runs else nan),
-    "lost in a row, most": ("", 1.0, lambda one: max(one.runs, default=0)),
-}
-"""Name of a statistic -> unit, factor from SI to this unit, and function that gives the value."""
-
-
-def _table(counted: dict[str, Numbers]) -> str:
-    rows = [["one way", *(counted if len(counted) > 1 else ("",)), ""]]
-    for name, (unit, scale, value) in _STATISTICS.items():
-        values = [value(one) for one in counted.values()]
-        cells = ["-" if isnan(number) else f"{number * scale:.4g}" for number in values]
-        rows.append([name, *cells, unit])
-    return table(rows, right=range(1, len(counted) + 1))

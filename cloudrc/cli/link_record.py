@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import refuse_other_file
-from cloudrc.files import naming
 
 if TYPE_CHECKING:
-    from cloudrc.link.logs import Packets
+    pass
 
 EPILOG = """\
 sources:
@@ -50,7 +49,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Read the delays from SOURCE, write a trace per direction, and print a summary of each."""
     from cloudrc.link.traces import HEAD
-    from cloudrc.runs.link_trace import LogSettings, read_packets
+    from cloudrc.runs.link_trace import LogSettings, read_packets, write_trace_file
 
     source, output = options.source, options.output
     settings = LogSettings(options.direction, options.halve_rtt, options.trust_units)
@@ -61,27 +60,5 @@ def execute(options: argparse.Namespace) -> int:
     for path in paths.values():
         refuse_other_file(path, HEAD, source)
     for way, packets in found.items():
-        _write(packets, paths[way], way)
+        print("\n".join(write_trace_file(packets, paths[way], way)))
     return 0
-
-
-def _write(packets: Packets, path: Path, direction: str) -> None:
-    from cloudrc.link.logs import trace_of
-    from cloudrc.link.model import numbers
-    from cloudrc.link.traces import write_trace
-
-    with naming(path):
-        path.write_text(write_trace(trace_of(packets)), encoding="utf-8")
-    found, count = numbers(packets), len(packets.delays)
-    mean, deviation = found.mean * 1e3, found.deviation * 1e3
-    seconds = packets.sent[-1] - packets.sent[0]
-    what = "half of each round trip" if packets.halved else "one way"
-    print(
-        f"{path}: {count} packets in {seconds:.1f} s, {what} {mean:.4g} ± "
-        f"{deviation:.3g} ms (mean, standard deviation), {found.loss:.3g} lost"
-        + "".join(f"; {note}" for note in packets.notes)
-    )
-    print(f"  replay:   --set link.profile=ideal --set link.{direction}.trace={path}")
-    if deviation:
-        print(f"  or draw:  {{delay_ms: {mean:.4g}, jitter_ms: {deviation:.3g}, ", end="")
-        print(f"distribution: table, table: {path.name}}}")

@@ -6,20 +6,18 @@ import argparse
 import secrets
 import sys
 from dataclasses import asdict, replace
-from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import flown_release, release_arguments
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
 from cloudrc.cli.output import output_argument, print_line, print_result
 from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.text import escape, table
+from cloudrc.text import escape
 
 if TYPE_CHECKING:
     from cloudrc.cluster.link import LinkParts
-    from cloudrc.link.state import LinkState
 
 EPILOG = """\
 where:
@@ -37,8 +35,6 @@ examples:
 KEY is a key of a direction in a profile file. With --profile, time lines start
 anew; single values leave them running. The change is recorded. It lasts until
 the next change, the end of the run, or 'helm upgrade'."""
-COLUMNS = ("delay_ms", "jitter_ms", "distribution", "loss", "rate_kbit")
-"""Keys of a direction that have columns of their own; the column OTHER shows all other keys."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,7 +51,7 @@ def execute(options: argparse.Namespace) -> int:
     """Change the link as the flags say, and print the new state of the link."""
     began, number = monotonic(), secrets.token_hex(4)
     from cloudrc.drivers.local import LINK_FOLDER
-    from cloudrc.runs.link_change import set_here
+    from cloudrc.runs.link_change import set_here, states_table
 
     if (found := find_local_run(options)) is not None:
         run = found.folder
@@ -78,9 +74,8 @@ def execute(options: argparse.Namespace) -> int:
         print_line(f"cloudrc: note: {text}", sys.stderr)
     links = {state.direction: asdict(state) for state in states}
     document = {"change": number, "seconds": round(took, 3), "links": links}
-    heads = ("DIRECTION", "SHAPER", "DELAY", "JITTER", "LOSS", "RATE", "OTHER")
     said = escape(f"{where}: in force after {took:.1f} s")
-    print_result(options.output, document, f"{table([heads, *map(_row, states)])}\n{said}")
+    print_result(options.output, document, f"{states_table(states)}\n{said}")
     return 0
 
 
@@ -98,26 +93,3 @@ def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
         except MissingPrerequisiteError as error:
             raise no_run_error(options, error, "--run") from None
         raise
-
-
-def _row(state: LinkState) -> tuple[str, ...]:
-    asked, own = state.asked, state.profile.get(state.direction, {})
-    delay, jitter, loss, rate = (
-        asked.get(key) or 0.0 for key in ("delay", "jitter", "loss", "rate")
-    )
-    others = (_describe(key, own[key]) for key in own if key not in COLUMNS)
-    return (
-        state.direction,
-        state.shaper,
-        f"{delay * 1e3:g} ms",
-        f"{jitter * 1e3:g} ms" + (f" {own.get('distribution', 'uniform')}" if jitter else ""),
-        f"{loss * 100:.3g} %",
-        f"{rate * 1e-3:g} kbit/s" if rate else "-",
-        ", ".join(others) or "-",
-    )
-
-
-def _describe(key: str, value: Any) -> str:
-    if isinstance(value, list):
-        return f"{len(value)} {key}"
-    return f"{key} {Path(value).name if isinstance(value, str) else value}"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import sys
 
-from cloudrc.cli.cluster_flags import cluster_arguments
-from cloudrc.cli.output import output_argument, paint, print_result
+from cloudrc.cli.cluster_flags import cluster_arguments, release_from_flags
+from cloudrc.cli.output import output_argument, paint, print_line, print_result
 from cloudrc.errors import BadInputError
 from cloudrc.runs.catalogue import KINDS, as_text, describe_all
 
@@ -30,9 +31,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Print name and description of each plug-in or shipped file of one kind, or of all kinds."""
     if options.what == RELEASES:
-        from cloudrc.cli.releases import list_releases
-
-        return list_releases(options)
+        return _list_releases(options)
     if options.context or options.namespace:
         raise BadInputError(f"--context and --namespace are for 'cloudrc list {RELEASES}'")
     found = {kind: describe_all(kind) for kind in ([options.what] if options.what else KINDS)}
@@ -41,4 +40,18 @@ def execute(options: argparse.Namespace) -> int:
         for kind, lines in found.items()
     }
     print_result(options.output, entries, as_text(found, paint))
+    return 0
+
+
+def _list_releases(options: argparse.Namespace) -> int:
+    """Print the releases of all namespaces, or of the namespace that the flags name."""
+    release = release_from_flags(options)
+    from cloudrc.cluster import fleet
+
+    found = fleet.list_releases(
+        release,
+        everywhere=not options.namespace,
+        tell=lambda text: print_line(f"cloudrc: note: {text}", sys.stderr),
+    )
+    print_result(options.output, {"releases": found}, fleet.as_text(found))
     return 0

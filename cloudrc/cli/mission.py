@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from cloudrc.cli.cluster_flags import flown_release, release_arguments, timeout_argument
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
@@ -24,7 +24,14 @@ from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.missions import MissionFollower, read_mission
 from cloudrc.teleop.client import Api, describe_mission, describe_verdict, mission_path
-from cloudrc.text import describe_point, escape, table
+from cloudrc.teleop.telling import (
+    describe_event,
+    describe_history,
+    describe_robot,
+    describe_stay,
+    missions_table,
+)
+from cloudrc.text import escape
 
 if TYPE_CHECKING:
     from cloudrc.cluster.client import Release
@@ -193,15 +200,10 @@ def _list(options: argparse.Namespace, api: Api) -> int:
     if options.output != "table":
         print_result(options.output, {"missions": missions}, "")
         return 0
-    rows = [("ID", "NAME", "STATE", "WAYPOINTS", "VERDICT")]
-    for each in missions:
-        done = f"{len(each['reached'])}/{each['waypoints']}"
-        verdict = describe_verdict(each["verdict"]) if each["verdict"] else ""
-        rows.append((each["id"], each["name"], each["state"], done, verdict))
     if api.place or not missions:
         _say(api, "missions, the oldest first" if missions else "no missions yet")
     if missions:
-        print(table(rows))
+        print(missions_table(missions))
     return 0
 
 
@@ -213,11 +215,11 @@ def _status(options: argparse.Namespace, api: Api) -> int:
     mission = state if options.id else state["mission"]
     _say(api, describe_mission(mission) if mission else "no mission is under way")
     if options.id:
-        _print_history(state)
+        _print_lines(describe_history(state))
         return 0
     if state["queue"]:
         print_line(f"waiting: {', '.join(state['queue'])}")
-    _print_robot(state["seen"], state["cloud_age_s"])
+    _print_lines(describe_robot(state["seen"], state["cloud_age_s"]))
     return 0
 
 
@@ -226,7 +228,7 @@ def _cancel(options: argparse.Namespace, api: Api) -> int:
     if mission is None:
         raise BadInputError("no mission is under way; 'cloudrc mission list' shows all")
     cancelled = api.post(f"{mission_path(mission['id'])}/cancel")
-    _say(api, f"{_describe_stay(api)}; {describe_mission(cancelled)}")
+    _say(api, f"{_stay(api)}; {describe_mission(cancelled)}")
     return 0
 
 
@@ -234,13 +236,13 @@ def _logs(options: argparse.Namespace, api: Api) -> int:
     if options.follow:
         for event in api.events():
             if not options.id or event["mission"] == options.id:
-                _print_events([event])
+                print_line(describe_event(event))
     elif options.id:
-        _print_history(api.get(mission_path(options.id)))
+        _print_lines(describe_history(api.get(mission_path(options.id))))
     else:
         ids = [mission["id"] for mission in api.get("/v1/missions")["missions"]]
         events = [event for each in ids for event in api.get(mission_path(each))["events"]]
-        _print_events(sorted(events, key=lambda event: int(event["id"])))
+        _print_lines(map(describe_event, sorted(events, key=lambda event: int(event["id"]))))
     return 0
 
 
@@ -255,22 +257,14 @@ def _order(options: argparse.Namespace, api: Api) -> int:
             _say(api, f"the drive ends, and the robot holds; mission {mission['id']} is then done")
             return 0
         action = f"flying to waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
-        action = _describe_stay(api) if options.verb == "hold" else action
+        action = _stay(api) if options.verb == "hold" else action
     _say(api, f"{action}; {describe_mission(mission)}")
     return 0
 
 
-def _describe_stay(api: Api) -> str:
-    """Describe where the robot stays after a command, or which mission it flies now."""
+def _stay(api: Api) -> str:
     with suppress(CloudrcError):
-        state = api.get("/v1/state")
-        mission, seen = state["mission"], state["seen"]
-        if mission is not None and mission["state"] != "held":
-            return f"mission {mission['id']} continues"
-        if seen is not None and seen["guard"] == "GROUND":
-            return "waiting on the ground"
-        if seen is not None:
-            return f"holding at {describe_point(seen['position_m'])}"
+        return describe_stay(api.get("/v1/state"))
     return "holding"
 
 
@@ -320,35 +314,9 @@ VERBS: dict[str, tuple[str, Callable[[argparse.Namespace, Api], int]]] = {
 """Verb -> help line, and function that carries it out."""
 
 
-def _print_robot(seen: dict[str, Any] | None, cloud_age: float | None) -> None:
-    """Print the robot's newest known state, and the age of cloud's last message [s]."""
-    heard = "never" if cloud_age is None else f"{cloud_age:.1f} s ago"
-    if seen is None:
-        print(f"no telemetry from the robot yet; is the link up? last message from cloud: {heard}")
-        return
-    where = describe_point(seen["position_m"])
-    if seen["guard_for_s"] is None:
-        print_line(f"no telemetry for {seen['age_s']:.1f} s; last message from cloud: {heard}")
-        print_line(
-            f"last seen {seen['age_s']:.1f} s ago at {where} m, with the guard in {seen['guard']}: "
-            f"{seen['cause']}"
-        )
-    else:
-        rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
-        print_line(f"robot at {where} m, seen {seen['age_s']:.2f} s ago{rtt}")
-        print_line(f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s: {seen['cause']}")
-    print_line(f"next: {seen['next_step']}")
-
-
-def _print_history(mission: dict[str, Any]) -> None:
-    if left_out := mission.get("events_left_out", 0):
-        print_line(f"{mission['id']:<4}{left_out} earlier events are not shown")
-    _print_events(mission["events"])
-
-
-def _print_events(events: Iterable[dict[str, Any]]) -> None:
-    for event in events:
-        print_line(f"{event['mission']:<4}{event['time_s']:8.2f} s  {event['text']}")
+def _print_lines(lines: Iterable[str]) -> None:
+    for line in lines:
+        print_line(line)
 
 
 def _release(options: argparse.Namespace) -> Release:

@@ -37,7 +37,6 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Copy a damaged recording; print which share of the data was kept, and the known losses."""
     require("a recovery", ("record",))
-    from cloudrc.record.reader import LISTED_MAX
     from cloudrc.record.recovery import recover
     from cloudrc.report.attached import attached_views
 
@@ -46,16 +45,6 @@ def execute(options: argparse.Namespace) -> int:
     if os.path.lexists(target):
         raise BadInputError(f"{target}: already there; name another file with --to")
     recovery = recover(source, target, attached_views)
-    kept = ", ".join(f"{count} {kind}" for kind, count in recovery.kept.items() if count)
-    lines = [f"kept {recovery.share:.1%}: {kept}"]
-    lines.append("topics: " + ", ".join(f"{name} {n}" for name, n in recovery.topics.items()))
-    lines += [f"lossy: {note}" for note in recovery.notes]
-    lines += [f"the recording {remark}" for remark in recovery.remarks]
-    if len(recovery.dropped) > LISTED_MAX:  # the note lists only some
-        counts = {name: "?" if n is None else n for name, n in recovery.dropped.items()}
-        lines.append("dropped: " + ", ".join(f"{name} {n}" for name, n in counts.items()))
-    if recovery.derived:
-        lines.append(f"made again from the other topics: {', '.join(recovery.derived)}")
-    text = "\n".join(map(escape, [*lines, str(target)]))
+    text = "\n".join(map(escape, [*recovery.as_lines(), str(target)]))
     print_result(options.output, {"file": str(target), **asdict(recovery)}, text)
     return 0 if recovery.complete else LOSSY

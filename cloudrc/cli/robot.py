@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from cloudrc.cli.output import (
     PICTURES,
@@ -17,7 +15,6 @@ from cloudrc.cli.parser import add_verbs
 from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
 from cloudrc.runs.requirements import missing, require
-from cloudrc.text import table
 
 VERBS = {"check": "say what a robot is, fly it in virtual time, and say what must change"}
 PICTURE = "check.png"
@@ -51,13 +48,13 @@ def execute(options: argparse.Namespace) -> int:
     name = shipped.model_path("robot", f"{Path(given).resolve()}" if is_own else given, Path.cwd())
     picture = options.picture or (Path(name) / PICTURE if is_own else None)
     kind = _kind_of(picture)
-    from cloudrc.robots.check import check
+    from cloudrc.robots.check import check, facts_table
 
     facts, changes = check(name)
     note = _draw(name, picture, kind, required=options.picture is not None)
     document = {"robot": given, "ok": not changes, "changes": changes, "facts": facts}
     lines = [f"must change: {each}" for each in changes] or ["nothing must change"]
-    text = "\n".join([table(_rows(facts)), "", *lines, *note])
+    text = "\n".join([facts_table(facts), "", *lines, *note])
     print_result(options.output, document, text)
     return BadInputError.exit_code if changes else 0
 
@@ -85,23 +82,3 @@ def _draw(name: str, picture: Path | None, kind: str, *, required: bool) -> list
 
     write_atomically(picture, draw_robot(read_surfaces(name), kind))
     return [f"picture: {picture}"]
-
-
-def _rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the rows of the table for people."""
-    rows = [(key, _shown(value)) for key, value in facts.items() if key != "parameters"]
-    at = next(number for number, row in enumerate(rows) if row[0] == "onboard") + 1
-    own = [(f"  {key}", _shown(value)) for key, value in facts["parameters"].items()]
-    return [*rows[:at], *own, *rows[at:]]
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.3g}"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_shown(each)}" for key, each in value.items() if each is not None)
-    if isinstance(value, list | tuple):
-        return ", ".join(map(_shown, value)) or "none"
-    return "from the model" if value is None else str(value)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from cloudrc.errors import BadInputError
-from cloudrc.files import read, version
+from cloudrc.files import read, version, write_atomically
 from cloudrc.records import Fault
-from cloudrc.tunnel.keys import KeyRing, KeySet, parse
+from cloudrc.tunnel.keys import KEY_SIZE, Key, KeyRing, KeySet, parse, write
 
 PERIOD_NS = 500_000_000
 """Time between two checks whether the file has changed [ns]; a check costs one system call."""
@@ -62,3 +63,20 @@ def read_keys(path: Path, named: str = "--key ") -> KeySet:
     except ValueError as error:
         reason = str(error).removeprefix(f"{path}: ")
     raise BadInputError(f"{named}{path}: {reason}; make one: cloudrc key new FILE")
+
+
+def make_or_rotate(path: Path) -> KeySet:
+    """Write a new key into a file; a key that the file has becomes its second one."""
+    old = read_keys(path, "").current if path.exists() else None
+    return _write(path, KeySet(Key(os.urandom(KEY_SIZE)), old))
+
+
+def drop_previous(path: Path) -> KeySet:
+    """Remove the second key from a file; raise the errors of `read_keys`."""
+    return _write(path, KeySet(read_keys(path, "").current))
+
+
+def _write(path: Path, keys: KeySet) -> KeySet:
+    target = Path(os.path.realpath(path))  # keep a symbolic link: replace the file it points to
+    write_atomically(target, write(keys).encode("ascii"), 0o600)
+    return keys

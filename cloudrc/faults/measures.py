@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import operator
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import pairwise
@@ -19,6 +19,7 @@ from cloudrc.record.columns import Recording
 from cloudrc.records import CommandApplied, Fault, GuardChange, Record, SessionOpened
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
+from cloudrc.text import Paint, escape, plain
 
 Relation: TypeAlias = Literal["<=", ">=", "=="]
 _COMPARE = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
@@ -125,6 +126,17 @@ class Scenario:
         except Exception as error:  # the other scenarios still run
             outcome.error = describe_error(error)
         return outcome
+
+    def as_lines(self, outcome: Outcome, paint: Paint = plain, *, briefly: bool) -> Iterator[str]:
+        """Describe one result of this scenario in lines, `briefly` without the checks it passed."""
+        word = paint(outcome.word, "green" if outcome.passed else "red")
+        sha = f"  {outcome.sha256[:12]}" if outcome.sha256 else ""
+        yield f"{word:8} {self.id:4} {self.name:26} {outcome.seconds:6.1f} s{sha}"
+        if outcome.error:
+            yield f"           {escape(outcome.error)}"
+        for check in outcome.checks:
+            if not (briefly and check.passed):
+                yield f"         {'' if check.passed else 'x '}{escape(check.show())}"
 
     def as_json(self, outcome: Outcome) -> dict[str, Any]:
         """Return one result of this scenario as values for a JSON document."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.content import Message
-from cloudrc.record.reader import File, list_some
+from cloudrc.record.reader import LISTED_MAX, File, list_some
 from cloudrc.record.topics import VIEWS
 
 LOSSY_SHARE_MAX = 0.999
@@ -32,6 +32,20 @@ class Recovery:
     notes: list[str]  # what is missing or doubtful, in words
     remarks: list[str]  # what else was noticed, in words; it does no harm
     index_is_new: bool  # whether the old file had no readable index
+
+    def as_lines(self) -> list[str]:
+        """Describe in lines what is in the new file, and what is lost."""
+        kept = ", ".join(f"{count} {kind}" for kind, count in self.kept.items() if count)
+        lines = [f"kept {self.share:.1%}: {kept}"]
+        lines.append("topics: " + ", ".join(f"{name} {n}" for name, n in self.topics.items()))
+        lines += [f"lossy: {note}" for note in self.notes]
+        lines += [f"the recording {remark}" for remark in self.remarks]
+        if len(self.dropped) > LISTED_MAX:  # the note lists only some
+            counts = {name: "?" if n is None else n for name, n in self.dropped.items()}
+            lines.append("dropped: " + ", ".join(f"{name} {n}" for name, n in counts.items()))
+        if self.derived:
+            lines.append(f"made again from the other topics: {', '.join(self.derived)}")
+        return lines
 
 
 def recover(

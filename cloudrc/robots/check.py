@@ -6,6 +6,7 @@ velocity, and brakes.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import dist, hypot
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Vector
 from cloudrc.robots.build import build_robot, controller, onboard_values
 from cloudrc.robots.onboard._airframe import thrust_to_weight
+from cloudrc.text import table
 from cloudrc.world.guard.limits import REACTION
 from cloudrc.world.robot import STEP, Robot
 from cloudrc.world.scene import ROBOT_PREFIX, compile_model
@@ -194,3 +196,23 @@ def _judge(robot: RobotFiles, motion: CheckFlight) -> list[str]:
             f"with {motion.braking:.2f} m/s^2; set it to {fits:g} or less"
         )
     return found
+
+
+def facts_table(facts: Mapping[str, Any]) -> str:
+    """Format the facts that `check` returns for people."""
+    rows = [(key, _shown(value)) for key, value in facts.items() if key != "parameters"]
+    at = next(number for number, row in enumerate(rows) if row[0] == "onboard") + 1
+    own = [(f"  {key}", _shown(value)) for key, value in facts["parameters"].items()]
+    return table([*rows[:at], *own, *rows[at:]])
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_shown(each)}" for key, each in value.items() if each is not None)
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_shown, value)) or "none"
+    return "from the model" if value is None else str(value)

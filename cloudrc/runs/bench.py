@@ -8,21 +8,25 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
 from cloudrc.assembly import assemble
-from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.errors import CloudrcError
 from cloudrc.records import Record
+from cloudrc.robots.build import describe_steps
+from cloudrc.runs.flight import fly_point
+from cloudrc.text import table
 from cloudrc.world.simulator import replay
 
 STEP = 0.002
 """Time step of the physics [s]."""
 LIMIT_NS = 120_000_000_000
 """Time limit of a measured flight, in its virtual time [ns]."""
-LOOP = "closed loop, records in memory"
+RAW, LOOP = "raw mj_step", "closed loop, records in memory"
 
 
 def measure(parts: dict[str, Callable[[], Callable[[], int]]], repeats: int) -> dict[str, float]:
@@ -73,3 +77,40 @@ def flight(experiment: ResolvedExperiment) -> Callable[[], int]:
         return round(run.now_ns * 1e-9 / STEP)
 
     return play
+
+
+def bench(repeats: int) -> dict[str, Any]:
+    """Measure the replay of the physics, the loop, and a flight of a sweep, each `repeats` times.
+
+    Return the figures of each by its name, and which step flew.
+    """
+    experiment = load_experiment("paper")
+    replayed = replay_of(experiment)
+    count = replayed()
+    parts = {
+        RAW: lambda: replayed,
+        LOOP: lambda: flight(experiment),
+        "flight of a sweep, with its numbers": lambda: lambda: (fly_point(experiment), count)[1],
+    }
+    costs = measure(parts, repeats)
+    figures = {
+        name: {
+            "us_per_step": cost * 1e6,
+            "ratio": costs[RAW] / cost,
+            "real_time_factor": STEP / cost,
+        }
+        for name, cost in costs.items()
+    }
+    return {"physics_steps": describe_steps(experiment.world), **figures}
+
+
+def as_text(document: Mapping[str, Any]) -> str:
+    """Format the result of `bench` for people."""
+    rows = [("experiment paper, mode virtual", "us a step", "ratio to raw", "x real time")]
+    for name, each in document.items():
+        if name != "physics_steps":
+            cost, ratio = f"{each['us_per_step']:.2f}", f"{each['ratio']:.3f}"
+            rows.append((name, cost, ratio, f"{each['real_time_factor']:.0f}"))
+    steps = document["physics_steps"]
+    text = f"'{RAW}' ended in the same bits as the flight; steps of the flight: {steps}"
+    return f"{table(rows, right=(1, 2, 3))}\n\n{text}"

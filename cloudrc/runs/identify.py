@@ -16,8 +16,8 @@ from cloudrc.metrics.velocity_loop import DT, INPUT, OUTPUT, Fit
 from cloudrc.record.columns import Recording
 from cloudrc.report.flown import flown_world
 from cloudrc.runs.session import refuse_under_way
+from cloudrc.text import table
 
-__all__ = ["INPUT", "OUTPUT", "describe", "identify"]
 NAMES = ("time_constant", "dead_time", "gain")
 
 
@@ -74,3 +74,16 @@ def describe(fits: Sequence[Fit], seconds: float) -> dict[str, Any]:
     shares = [_rounded(fit.share) for fit in fits]
     more = {"seconds": round(seconds, 2), "input": INPUT, "output": OUTPUT}
     return {**values, "half_width_95": halves, "explained": shares, **more}
+
+
+def as_text(fits: Sequence[Fit], seconds: float) -> str:
+    """Format the model of each axis for people; `seconds` is the recording's duration [s]."""
+    head = f"velocity loop from {round(seconds, 2)} s, input {INPUT}, output {OUTPUT}"
+    rows = [("axis", "time constant [s]", "dead time [s]", "gain", "explained")]
+    for name, fit in zip("xyz", fits, strict=True):
+        if isnan(fit.share):
+            rows.append((name, "stays on the ground", "", "", ""))
+            continue
+        constant, dead, gain = (f"{v:.3f} ± {h:.3f}" for v, h in zip(*fit[:2], strict=True))
+        rows.append((name, constant, dead, gain, f"{fit.share:.1%}"))
+    return f"{head}\n\n{table(rows, right=(1, 2, 3, 4))}\n\n± : 95 % interval"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from cloudrc.config.document import Document, write_yaml
 from cloudrc.config.load import DIRECTIONS, Edit, edit_profile
@@ -21,6 +22,10 @@ from cloudrc.link.state import (
     from_text,
     write_change,
 )
+from cloudrc.text import table
+
+COLUMNS = ("delay_ms", "jitter_ms", "distribution", "loss", "rate_kbit")
+"""Keys of a direction that have columns of their own; the column OTHER shows all other keys."""
 
 
 def read_states(folder: Path) -> list[LinkState]:
@@ -68,3 +73,32 @@ def _change(folder: Path, way: str, url: str, request: bytes, number: str) -> Li
         text = f"the {way} did not apply the change within {APPLY_LIMIT:g} s"
         raise TimedOutError(f"{text}; see {log}")
     return state
+
+
+def states_table(states: Sequence[LinkState]) -> str:
+    """Return a table with a row per direction of a link."""
+    heads = ("DIRECTION", "SHAPER", "DELAY", "JITTER", "LOSS", "RATE", "OTHER")
+    return table([heads, *map(_row, states)])
+
+
+def _row(state: LinkState) -> tuple[str, ...]:
+    asked, own = state.asked, state.profile.get(state.direction, {})
+    delay, jitter, loss, rate = (
+        asked.get(key) or 0.0 for key in ("delay", "jitter", "loss", "rate")
+    )
+    others = (_describe(key, own[key]) for key in own if key not in COLUMNS)
+    return (
+        state.direction,
+        state.shaper,
+        f"{delay * 1e3:g} ms",
+        f"{jitter * 1e3:g} ms" + (f" {own.get('distribution', 'uniform')}" if jitter else ""),
+        f"{loss * 100:.3g} %",
+        f"{rate * 1e-3:g} kbit/s" if rate else "-",
+        ", ".join(others) or "-",
+    )
+
+
+def _describe(key: str, value: Any) -> str:
+    if isinstance(value, list):
+        return f"{len(value)} {key}"
+    return f"{key} {Path(value).name if isinstance(value, str) else value}"

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
+from math import isnan, nan
 from pathlib import Path
+from statistics import fmean
 from typing import TypeAlias
 
 from cloudrc.config.load import load_profile
@@ -17,6 +19,7 @@ from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers, sample
 from cloudrc.link.profile import DirectionProfile, Timeline, Trace
 from cloudrc.link.traces import link_profile, read_lines, read_trace
 from cloudrc.report.figures.link import DirectionSample
+from cloudrc.text import table
 from cloudrc.tunnel.codec import SIZES, Kind
 
 PACKETS_MAX = 10_000_000
@@ -112,3 +115,30 @@ def _send(profile: DirectionProfile, uplink: bool, seed: int, sent_ns: Sequence[
 
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
     return sample(LinkDirection(profile, seed, uplink), kind, sent_ns, SIZES[kind])
+
+
+STATISTICS: dict[str, tuple[str, float, Callable[[Numbers], float]]] = {
+    "mean": ("ms", 1e3, lambda one: one.mean),
+    "standard deviation": ("ms", 1e3, lambda one: one.deviation),
+    "least": ("ms", 1e3, lambda one: one.least),
+    "median": ("ms", 1e3, lambda one: one.median),
+    "99 %": ("ms", 1e3, lambda one: one.p99),
+    "most": ("ms", 1e3, lambda one: one.most),
+    "correlation with the next": ("", 1.0, lambda one: one.correlation),
+    "overtaken by a later one": ("%", 1e2, lambda one: one.overtaken),
+    "duplicated": ("%", 1e2, lambda one: one.duplicated),
+    "lost": ("%", 1e2, lambda one: one.loss),
+    "lost in a row, mean": ("", 1.0, lambda one: fmean(one.runs) if one.runs else nan),
+    "lost in a row, most": ("", 1.0, lambda one: max(one.runs, default=0)),
+}
+"""Name of a statistic -> unit, factor from SI to this unit, and function that gives the value."""
+
+
+def statistics_table(counted: Mapping[str, Numbers]) -> str:
+    """Format the statistics of each direction of a link for people."""
+    rows = [["one way", *(counted if len(counted) > 1 else ("",)), ""]]
+    for name, (unit, scale, value) in STATISTICS.items():
+        values = [value(one) for one in counted.values()]
+        cells = ["-" if isnan(number) else f"{number * scale:.4g}" for number in values]
+        rows.append([name, *cells, unit])
+    return table(rows, right=range(1, len(counted) + 1))

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.errors import BadInputError
+from cloudrc.files import naming
 from cloudrc.link.logs import (
     Direction,
     Log,
@@ -21,8 +22,10 @@ from cloudrc.link.logs import (
     read_irtt,
     read_ping,
     refuse_others,
+    trace_of,
 )
-from cloudrc.link.traces import read_lines
+from cloudrc.link.model import numbers
+from cloudrc.link.traces import read_lines, write_trace
 from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
@@ -127,3 +130,23 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
 
 def _columns(table: Table, *names: str) -> Iterator[tuple[float, ...]]:
     return zip(*(table[name].tolist() for name in names), strict=True)
+
+
+def write_trace_file(packets: Packets, path: Path, direction: Direction) -> list[str]:
+    """Write packets as a trace; describe it, and how a profile can use it, in lines."""
+    with naming(path):
+        path.write_text(write_trace(trace_of(packets)), encoding="utf-8")
+    found, count = numbers(packets), len(packets.delays)
+    mean, deviation = found.mean * 1e3, found.deviation * 1e3
+    seconds = packets.sent[-1] - packets.sent[0]
+    what = "half of each round trip" if packets.halved else "one way"
+    lines = [
+        f"{path}: {count} packets in {seconds:.1f} s, {what} {mean:.4g} ± "
+        f"{deviation:.3g} ms (mean, standard deviation), {found.loss:.3g} lost"
+        + "".join(f"; {note}" for note in packets.notes),
+        f"  replay:   --set link.profile=ideal --set link.{direction}.trace={path}",
+    ]
+    if deviation:
+        drawn = f"{{delay_ms: {mean:.4g}, jitter_ms: {deviation:.3g}, "
+        lines.append(f"  or draw:  {drawn}distribution: table, table: {path.name}}}")
+    return lines

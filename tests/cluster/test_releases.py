@@ -90,7 +90,7 @@ def test_the_releases_of_all_namespaces_are_listed(api, call, monkeypatch):
     def answers(release):
         yield Mock(get=lambda path: {"mission": missions[release.name]})
 
-    monkeypatch.setattr("cloudrc.cli.releases.release_api", answers)
+    monkeypatch.setattr("cloudrc.cluster.fleet.release_api", answers)
     rows = json.loads(call("list releases -o json").out)["releases"]
     assert [list(row.values()) for row in rows] == [
         ["a", "demo", "pelican", "40 ms, loss / 0 ms", "ready", "m3 flying 2/7"],
@@ -103,7 +103,7 @@ def test_the_releases_of_all_namespaces_are_listed(api, call, monkeypatch):
 
 def test_a_release_that_does_not_answer_is_listed(api, call, monkeypatch):
     release_in(api, "a", "demo", ready=False)
-    monkeypatch.setattr("cloudrc.cli.releases.release_api", Mock(side_effect=ClusterError("gone")))
+    monkeypatch.setattr("cloudrc.cluster.fleet.release_api", Mock(side_effect=ClusterError("gone")))
     captured = call("list releases")
     assert captured.out.splitlines()[1].split()[-1] == "?"
     assert "release 'a' in namespace 'demo': gone" in captured.err

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from cloudrc import exercise
-from cloudrc.cli import exercise as command
 from cloudrc.cli.main import main
 from cloudrc.exercise import checks, scoring
+from cloudrc.exercise import files as written
 from cloudrc.exercise.hand_in import FILES, HandIn
 from cloudrc.exercise.remote import HandInError, Remote
 from tests.conftest import wait_until
@@ -249,7 +249,7 @@ def test_new_files_on_a_full_disk_are_named_and_none_is_left(tmp_path, monkeypat
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
         path.write_bytes(data)
 
-    monkeypatch.setattr(command, "write_atomically", write)
+    monkeypatch.setattr(written, "write_atomically", write)
     said = f"disk_full: {tmp_path / 'a/predictor.py'}: free some space, or choose another place\n"
     assert refused("class new", tmp_path / "a", code=3).endswith(said)
     assert [*(tmp_path / "a").iterdir()] == []

@@ -1,0 +1,65 @@
+"""List the releases of a cluster, each with its link, its state and its mission."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+
+from cloudrc.cluster.client import ClusterError, Release
+from cloudrc.cluster.missions import release_api
+from cloudrc.cluster.releases import look, namespace_exists, no_release
+from cloudrc.errors import CloudrcError
+from cloudrc.text import table
+
+HEADS = ("NAME", "NAMESPACE", "ROBOT", "LINK", "STATE", "MISSION")
+AT_ONCE = 8
+"""Number of releases that are asked for their mission at the same time."""
+UNKNOWN = "?"
+"""Mission of a release whose API does not answer."""
+
+
+def list_releases(
+    here: Release, *, everywhere: bool, tell: Callable[[str], None]
+) -> list[dict[str, str]]:
+    """Describe the releases in the namespace of `here`, or in all namespaces.
+
+    `tell` receives a note if only that namespace may be listed, and why a mission is not known.
+    Raise a ClusterError if the releases may not be listed, or if the namespace does not exist.
+    """
+    try:
+        found = look(here, everywhere=everywhere)
+    except ClusterError as error:
+        if not everywhere:
+            raise
+        tell(f"only the releases {here.where}: {error}")
+        found = look(here, everywhere=False)
+    if not (found or everywhere or namespace_exists(here)):
+        raise no_release(here)
+    places = [replace(here, namespace=each.namespace, name=each.name) for each in found]
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        missions = pool.map(partial(_mission_of, tell=tell), places)
+    rows = [(*each, mission) for each, mission in zip(found, missions, strict=True)]
+    keys = [head.lower() for head in HEADS]
+    return [dict(zip(keys, row, strict=True)) for row in rows]
+
+
+def as_text(releases: Sequence[dict[str, str]]) -> str:
+    """Format the result of `list_releases` for people."""
+    if not releases:
+        return "no releases; install one: helm install"
+    return table([HEADS, *(tuple(each.values()) for each in releases)])
+
+
+def _mission_of(release: Release, tell: Callable[[str], None]) -> str:
+    """Describe the mission under way on a release; "-" for none, `UNKNOWN` without an answer."""
+    try:
+        with release_api(release) as api:
+            mission = api.get("/v1/state")["mission"]
+    except CloudrcError as error:
+        tell(f"release '{release.name}' {release.where}: {error}")
+        return UNKNOWN
+    if mission is None:
+        return "-"
+    return f"{mission['id']} {mission['state']} {len(mission['reached'])}/{mission['waypoints']}"
