@@ -188,6 +188,18 @@ class ConfigProblem(NamedTuple):
         return ": ".join(part for part in (".".join(self.path), self.value, self.reason) if part)
 
 
+class ProblemsError(BadInputError):
+    """Problems of an experiment that no document shows; who knows their sources may name them."""
+
+    def __init__(self, problems: Sequence[ConfigProblem]) -> None:
+        """Set the problems; their paths begin at the top of the experiment."""
+        super().__init__(problems)  # pickle passes these arguments to the parent process
+        self.problems = tuple(problems)
+
+    def __str__(self) -> str:
+        return "; ".join(map(str, self.problems))
+
+
 def from_pydantic(
     error: ValidationError, model: type[BaseModel], prefix: KeyPath = (), limit: int | None = None
 ) -> list[ConfigProblem]:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from math import isfinite
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc import plugins
+from cloudrc.config.document import KeyPath
 from cloudrc.config.overrides import build_plugin, check_plugin, default_parameters
+from cloudrc.config.problems import ConfigProblem, ProblemsError
 from cloudrc.config.robot import RobotFiles, find_robot, parameters
 from cloudrc.config.scene import steered_in
 from cloudrc.config.schema import PlugIn, World
@@ -137,7 +140,7 @@ def _make_parts(world: World) -> Parts:
     try:
         plugin = plugins.find(KIND, choice.name)  # the build below uses the same import of the file
     except BadInputError as error:
-        raise BadInputError(f"{_source_of(world, '')}: {error}") from error
+        raise ProblemsError([_problem(world, (), str(error))]) from error
     onboard = _build_onboard(world, where, choice, parameters(robot, world), nominal)
     true = compile_true(robot.model, scene, nominal, world.plant)
     if not robot.planar:
@@ -172,23 +175,32 @@ def _build_onboard(
     """Build an onboard controller for a compiled `MjModel`; errors name the files in `where`."""
     choice = PlugIn.model_validate({**given, "name": choice.name})
     if found := check_plugin(KIND, choice):
-        listed = "; ".join(f"{_source_of(world, each.path[0])}.{each}" for each in found)
-        raise BadInputError(f"{listed} (controller of {world.robot}: {choice.name})")
+        by = f" (controller of {world.robot}: {choice.name})"
+        raise ProblemsError([_problem(world, p.path, f"{p._replace(path=())}{by}") for p in found])
     try:
         return build_plugin(KIND, choice, model=model)  # type: ignore[no-any-return]
     except BadInputError as error:
-        named = next((key for key in given if key in str(error)), None)
-        place = where if named is None else _source_of(world, named)
-        raise BadInputError(f"{place}: {error}") from error
+        named = next((key for key in given if re.search(rf"\b{key}\b", str(error))), None)
+        if named is None:
+            problem = ConfigProblem(("world", "robot"), "", f"{where}: {error}")
+        else:
+            problem = _problem(world, (named,), str(error))
+        raise ProblemsError([problem]) from error
 
 
-def _source_of(world: World, parameter: str) -> str:
-    """Return where a parameter of the onboard controller is set; "" asks for the controller."""
-    if parameter in (world.onboard.model_extra or {}):
-        return "world.onboard"
+def _problem(world: World, path: KeyPath, reason: str) -> ConfigProblem:
+    """Return a problem at the key that gives a parameter of the onboard controller.
+
+    `path` is the parameter, and the keys inside its value; () means the controller itself.
+    """
+    if path and path[0] in (world.onboard.model_extra or {}):
+        return ConfigProblem(("world", "onboard", *path), "", reason)
     file = world.robot if world.robot.endswith(".xml") else f"{world.robot}/{ROBOT_FILE}"
-    tuning = find_robot(world.robot).tunings.get(world.tuning or "", ())
-    return f"{file}: tunings.{world.tuning}" if parameter in tuning else f"{file}: onboard"
+    if path and path[0] in find_robot(world.robot).tunings.get(world.tuning or "", ()):
+        key, place = "tuning", ("tunings", str(world.tuning), *path)
+    else:
+        key, place = "robot", ("onboard", *path)
+    return ConfigProblem(("world", key), "", f"{file}: {'.'.join(place)}: {reason}")
 
 
 def _check_lift(world: World, where: str, model: Any) -> None:
@@ -197,13 +209,15 @@ def _check_lift(world: World, where: str, model: Any) -> None:
     if ratio is None or ratio >= THRUST_TO_WEIGHT_MIN:
         return
     hint = "give it more thrust or less mass"
+    key = "robot"
     if not world.is_nominal:
-        where = "world.plant"
+        key, where = "plant", ""
         hint = "lower mass_factor or payload_kg, or raise actuator_factor"
-    raise BadInputError(
-        f"{where}: the thrust-to-weight ratio of {world.robot} is {ratio:.2f}, so it cannot lift "
+    reason = (
+        f"the thrust-to-weight ratio of {world.robot} is {ratio:.2f}, so it cannot lift "
         f"off safely; it must be at least {THRUST_TO_WEIGHT_MIN:g}: {hint}"
     )
+    raise ProblemsError([ConfigProblem(("world", key), where, reason)])
 
 
 def _build_actuators(plugin: Any, model: Any, given: dict[str, Any]) -> Actuators:
@@ -235,9 +249,9 @@ def _check_onboard(onboard: Onboard, size: int | None) -> None:
 
 def _refuse_wind(world: World, plugin: Any) -> None:
     """Raise the error about a wind that would not move the robot."""
-    text = f"world.wind: {world.robot} has actuators without drag, so wind would not move it; "
+    text = f"{world.robot} has actuators without drag, so wind would not move it; "
     if hasattr(plugin, "actuators"):
         known = inspect.signature(plugin.actuators).parameters
         keys = [f"world.onboard.{name}" for name in list(known)[2:]]
         text += f"set {' and '.join(keys)} above 0, or "
-    raise BadInputError(f"{text}leave the wind out")
+    raise ProblemsError([ConfigProblem(("world", "wind"), "", f"{text}leave the wind out")])

@@ -25,8 +25,8 @@ from cloudrc import files, metrics, plugin_file, plugins, source
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, Source, read_document
 from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files
-from cloudrc.config.overrides import KINDS, collect_settings
-from cloudrc.config.problems import ConfigProblem, validate
+from cloudrc.config.overrides import KINDS, Settings, collect_settings
+from cloudrc.config.problems import ConfigProblem, ProblemsError, validate
 from cloudrc.config.reuse import reuse, reuse_results
 from cloudrc.config.robot import files_of
 from cloudrc.config.schema import Section
@@ -267,14 +267,20 @@ def _resolve(experiment: str, entries: Iterable[_Entry]) -> ResolvedExperiment:
     resolved = load_experiment(experiment, settings)
     try:
         check_world(resolved.world)
-    except BadInputError as error:
-        key = str(error).partition(": ")[0]
-        if setting := settings.get(tuple(key.split("."))):
-            raise BadInputError(f"{setting.source.label}: {error}") from error
-        raise
+    except ProblemsError as error:
+        lines = [f"{_label(settings, problem)}{problem}" for problem in error.problems]
+        raise BadInputError("; ".join(lines)) from error
     own = resolved.report.metrics
     reuse(("metrics", own), lambda: metrics.check(own))
     return resolved
+
+
+def _label(settings: Settings, problem: ConfigProblem) -> str:
+    """Return the place of the setting that caused a problem, as "FILE:LINE: "; "" if none did."""
+    path = problem.path
+    paths = [path[:length] for length in range(len(path), 0, -1)]
+    paths += [key for key in settings if key[: len(path)] == path]  # of a part of the value
+    return next((f"{settings[key].source.label}: " for key in paths if key in settings), "")
 
 
 def pack(flights: Iterable[SweepPoint]) -> bytes:

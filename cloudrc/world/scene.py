@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from cloudrc.config.problems import ConfigProblem, ProblemsError
 from cloudrc.config.schema import Plant
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.compiled import compile_error, mujoco, read_scene
@@ -61,10 +62,12 @@ def compile_true(robot: Path, scene: Path, nominal: Any, plant: Plant) -> Any:
         return nominal
     factors = plant.actuator_factor
     if isinstance(factors, tuple) and len(factors) != nominal.nu:
-        raise BadInputError(
-            f"world.plant.actuator_factor: has {len(factors)} factors, but {robot} has "
-            f"{nominal.nu} actuators; give as many, or one number for all"
+        reason = (
+            f"has {len(factors)} factors, but {robot} has {nominal.nu} actuators; give as many, or "
+            "one number for all"
         )
+        path = "world", "plant", "actuator_factor"
+        raise ProblemsError([ConfigProblem(path, "", reason)])
     fuse = not (FUSES_WRONG and _has_joints(nominal))
     model = _compile(robot, scene, true_inertia(plant, _inertia(nominal)), fuse=fuse)
     _scale_moving_parts(model, plant)

@@ -124,6 +124,13 @@ def test_relative_paths_start_at_the_file(write_sweep, tmp_path, monkeypatch):
     assert read_grid(path).file["folder"] == str(tmp_path)
 
 
+DRIVES = {
+    **{"world.robot": "rover", "mission.steps.range_m": [1, 1, 0]},
+    "mission.steps.centre_m": [0, 0, 0.1],
+}
+"""A robot without drag, and steps on the ground."""
+
+
 @pytest.mark.parametrize(
     ("keys", "reason"),
     [
@@ -133,6 +140,12 @@ def test_relative_paths_start_at_the_file(write_sweep, tmp_path, monkeypatch):
         ({"grid": {"gains": {"low": 3}}}, "grid.gains: must be a list of values, or names"),
         ({"grid": {"cloud.predictor": ["last_sampl"]}}, "did you mean last_sample?"),
         ({"grid": {"world.onboard.tilt": [1, 2]}}, "world.onboard.tilt: unknown key; known here"),
+        ({"grid": {"world.onboard.gain_p.2": [8, "x"]}}, "gain_p.2: 'x': must be a number"),
+        ({"grid": {"world.plant.payload_kg": [0, 9]}}, "world.plant: the thrust-to-weight ratio"),
+        (
+            {"grid": {"wind": {"x": DRIVES | {"world.wind.gust_mps": 1}}}},
+            "world.wind: rover has actuators without drag",
+        ),
         ({"set": {"seed": 1}}, "seed: give the seeds with the key 'seeds'"),
         ({"grid": {"duration": {"one": {}}}}, "grid.duration: is the name of another column"),
         ({"grid": {"link.uplink.x": [1], "link.both.x": [1]}}, "link.both.x: is set twice"),

@@ -39,7 +39,10 @@ def test_the_drag_of_robot_yaml_reaches_the_rotors(own_robot):
     [
         ("drag: 0.1", "drag: unknown key; did you mean drag_s_per_m?"),
         ("tilt_max_deg: steep", "tilt_max_deg"),
-        ("tilt_max_deg: 90", "robot.yaml: onboard: .*tilt_max_deg: 90 is not above 0 and up to 60"),
+        (
+            "tilt_max_deg: 90",
+            "robot.yaml: onboard.tilt_max_deg: .*tilt_max_deg: 90 is not above 0 and up to 60",
+        ),
     ],
 )
 def test_a_wrong_parameter_is_refused_by_its_name(own_robot, keys, message):
@@ -60,7 +63,7 @@ def test_a_wrong_parameter_is_refused_by_its_name(own_robot, keys, message):
         (
             "onboard: multirotor",
             {"world.onboard.tilt_max_deg": -3},
-            "^world.onboard: onboard 'multirotor' cannot be built: tilt_max_deg: -3",
+            "^world.onboard.tilt_max_deg: onboard 'multirotor' cannot be built: tilt_max_deg: -3",
         ),
     ],
 )
