@@ -36,10 +36,10 @@ class GuardState(IntEnum):
     HOLD = 2
     """No command is fresh: the robot brakes, then holds its position with onboard sensors only."""
     LAND = 3
-    """The robot descends slowly and stops its rotors at touch-down. LAND lasts until the operator
+    """The robot descends slowly and switches off at touch-down. LAND lasts until the operator
     acknowledges."""
     ESTOP = 4
-    """The rotors were stopped at once. ESTOP lasts until the operator acknowledges."""
+    """The robot was switched off at once. ESTOP lasts until the operator acknowledges."""
 
 
 class Cause(IntEnum):
@@ -113,6 +113,10 @@ class Odometry(NamedTuple):
     angular_velocity_body: Annotated[Vector, "rad/s", "of the base, body frame"]
 
 
+SENSORS_MAX = 16
+"""Largest number of a robot's own sensors."""
+
+
 class Telemetry(NamedTuple):
     """Message from world to cloud, at 100 Hz.
 
@@ -122,7 +126,7 @@ class Telemetry(NamedTuple):
 
     stamp_ns: Annotated[int, "ns", "stamp of its odometry, world's clock"]
     odometry: Odometry  # measured pose and twist, with sensor noise if configured
-    tip_force: Annotated[float, "N", "on the arm's tip"]
+    sensors: tuple[float, ...]  # of the robot's own sensors, in the order of `robot.yaml`
     echo_stamp_ns: Annotated[
         int, "ns", "stamp of the newest command applied, cloud's clock; -1 if none"
     ]
@@ -131,7 +135,7 @@ class Telemetry(NamedTuple):
     mission: Annotated[int, "", "number of the last operator's request that world obeyed"]
     guard: Annotated[GuardState, "", STATES]
     obstacle_contacts: Annotated[int, "", "contacts with obstacles that began in this mission"] = 0
-    touch_speed: Annotated[float, "m/s", "of the tip's first contact with the board, or NaN"] = nan
+    touch_speed: Annotated[float, "m/s", "of the mission's first touch, or NaN"] = nan
     mission_id: Annotated[int, "", "identity of the mission started last; 0 if none"] = 0
     reached: Annotated[int, "", f"waypoints reached; {MISSION_OVER} if the mission is over"] = 0
     cause: Annotated[Cause, "", CAUSES] = Cause.SPAWN  # after touch-down in LAND, of the landing

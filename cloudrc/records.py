@@ -93,10 +93,31 @@ class GroundTruth(NamedTuple):
 
     stamp_ns: int
     odometry: Odometry  # true pose and twist
-    tip_force: Annotated[float, "N", "on the arm's tip"]
-    tip_force_peak: Annotated[float, "N", "largest of all physics steps since the row before"]
-    tip_impulse: Annotated[float, "N s", "force times time since the row before"]
     reference: Annotated[Vector, "m/s", "after the guard's caps, world frame"]
+
+
+class ContactForce(NamedTuple):
+    """Made by world at each odometry sample: true force on the probe. Topic /contact_force.
+
+    Only a robot whose probe has a touch sensor has this record.
+    """
+
+    stamp_ns: int
+    force: Annotated[float, "N", "on the robot's probe"]
+    force_peak: Annotated[float, "N", "largest of all physics steps since the row before"]
+    impulse: Annotated[float, "N s", "force times time since the row before"]
+
+
+class SensorRead(NamedTuple):
+    """Made by world at each odometry sample: what one of the robot's own sensors shows.
+
+    Topic /sensor. Telemetry carries these values to cloud.
+    """
+
+    stamp_ns: int
+    name: Annotated[str, "", "name of the sensor in robot.yaml"]
+    unit: Annotated[str, "", "unit of the value, as robot.yaml says"]
+    value: Annotated[float, "see unit", "what the sensor shows"]
 
 
 class Arrival(NamedTuple):
@@ -146,11 +167,15 @@ class Contact(NamedTuple):
     """
 
     stamp_ns: int
-    body: Annotated[str, "", "touched body of the scene: pipe_1, board, floor"]
+    body: Annotated[str, "", "touched body of the scene, such as floor"]
     position: Annotated[Vector, "m", "of the base, world frame"]
     velocity: Annotated[Vector, "m/s", "of the base just before the contact, world frame"]
-    tip_velocity: Annotated[Vector, "m/s", "of the tip just before the contact, world frame"]
-    tip: Annotated[bool, "", "true if the arm's tip touched, false for any other part"]
+    touch_velocity: Annotated[
+        Vector,
+        "m/s",
+        "of the probe (without one: of the base) just before the contact, world frame",
+    ]
+    by_probe: Annotated[bool, "", "true if the probe touched, or if the robot has no probe"]
 
 
 class SessionOpened(NamedTuple):
@@ -275,7 +300,7 @@ class Lateness(NamedTuple):
 
 
 Record: TypeAlias = (
-    (TelemetrySent | GroundTruth | Arrival | CommandApplied | GuardChange | Contact)
-    | (SessionOpened | Control | PlanFollowed | MissionEvent | Fault | Counted)
-    | (LinkChanged | LinkChecked | Lateness)
+    (TelemetrySent | GroundTruth | ContactForce | SensorRead | Arrival | CommandApplied)
+    | (GuardChange | Contact | SessionOpened | Control | PlanFollowed | MissionEvent)
+    | (Fault | Counted | LinkChanged | LinkChecked | Lateness)
 )

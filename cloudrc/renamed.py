@@ -1,8 +1,10 @@
-"""Old names of failure codes, metrics, columns and keys: older files and users still have them."""
+"""Old names of codes, events, metrics, columns and keys: older files and users still have them."""
 
 from __future__ import annotations
 
 import logging
+import re
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -10,8 +12,19 @@ NEW_NAMES = {
     "pipe_touched": "obstacle_touched",
     "board_not_touched": "not_touched",
     "pipe_contacts": "obstacle_contacts",
+    "board_touched": "touched",
+    "tip_speed": "touch_speed",
 }
-"""Old name -> new name."""
+"""Old name -> new name of codes, events and metrics."""
+NEW_COLUMNS = {
+    "pipe_contacts": "obstacle_contacts",
+    "tip": "by_probe",
+    "tip_force": "force",
+    "tip_force_peak": "force_peak",
+    "tip_impulse": "impulse",
+    "tip_velocity": "touch_velocity",
+}
+"""Old name -> new name of the columns of a recording."""
 NEW_KEYS = {
     "world.low_level": "world.onboard",
     "world.plant.thrust_factor": "world.plant.actuator_factor",
@@ -22,10 +35,13 @@ NEW_KEYS = {
 @cache
 def new_name(name: str) -> str:
     """Return the present name of what a user calls `name`; log once if that is the old name."""
-    new = NEW_NAMES.get(name, name)
-    if new != name:
-        _log(name, new)
-    return new
+    return _told(name, NEW_NAMES)
+
+
+@cache
+def new_column(name: str) -> str:
+    """Return the present name of a column; log once if `name` is the old name."""
+    return _told(name, NEW_COLUMNS)
 
 
 @cache
@@ -38,15 +54,29 @@ def new_key(key: str) -> str:
     return key
 
 
+def _told(name: str, table: Mapping[str, str]) -> str:
+    new = table.get(name, name)
+    if new != name:
+        _log(name, new)
+    return new
+
+
 def _log(old: str, new: str) -> None:
     logging.getLogger("cloudrc").warning("%s is called %s now", old, new)
 
 
 def with_new_names(text: str) -> str:
     """Replace the old names in a text that cloudrc has written."""
-    for old, new in NEW_NAMES.items():
-        text = text.replace(old, new)
-    return text
+    return _replace(text, NEW_NAMES)
+
+
+def with_new_columns(definition: str) -> str:
+    """Replace the old names of columns in the definition of a message's type."""
+    return _replace(definition, NEW_COLUMNS)
+
+
+def _replace(text: str, table: Mapping[str, str]) -> str:
+    return re.sub(r"\w+", lambda word: table.get(word[0], word[0]), text)
 
 
 OLD_BODY = "board"

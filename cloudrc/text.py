@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeAlias
 
 FAILED_MARK = "*"
 """Mark of a number in a table if some of its flights failed."""
@@ -29,6 +29,16 @@ def escape(text: str) -> str:
 def describe_point(position: Sequence[float | None]) -> str:
     """Format a position [m]; an unknown coordinate, None, becomes a question mark."""
     return f"({', '.join('?' if value is None else f'{value:.2f}' for value in position)})"
+
+
+def describe_sensors(sensors: Sequence[Mapping[str, Any]]) -> str:
+    """Format what a robot's own sensors show, as the API tells it; "" without sensors."""
+    shown = (
+        f"{each['name']} {'?' if each['value'] is None else format(each['value'], '.3g')} "
+        f"{each['unit']}"
+        for each in sensors
+    )
+    return ", ".join(shown)
 
 
 def format_number(value: float) -> str:

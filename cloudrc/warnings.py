@@ -79,14 +79,16 @@ def _directions(experiment: ResolvedExperiment) -> dict[str, DirectionProfile]:
 
 def _low_rates(experiment: ResolvedExperiment) -> Iterator[str]:
     """Yield a warning for each direction whose bottleneck is slower than its packets need."""
+    from cloudrc.config.robot import known_robot
     from cloudrc.link.doubts import describe_low_rate
     from cloudrc.link.model import HEADER_BYTES
     from cloudrc.messages import plan_length
-    from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
+    from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES
 
     command = COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
+    telemetry = TELEMETRY_SIZES[len(known_robot(experiment.world.robot).sensors)]
     needs = (
-        ("uplink", "telemetry", SIZES[Kind.TELEMETRY], experiment.world.odometry_rate_hz),
+        ("uplink", "telemetry", telemetry, experiment.world.odometry_rate_hz),
         ("downlink", "the stream of commands", command, experiment.cloud.command_rate_hz),
     )
     for name, what, size, rate in needs:

@@ -4,11 +4,13 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
-from cloudrc.renamed import NEW_NAMES, new_key, new_name
+from cloudrc.record.columns import Recording
+from cloudrc.renamed import NEW_NAMES, new_column, new_key, new_name
 from cloudrc.runs.grid import read_grid
 from cloudrc.runs.trials import Asked, Trials
 
@@ -26,6 +28,7 @@ def old(tmp_path, monkeypatch):
     shutil.copytree(OLD, tmp_path / "old")
     monkeypatch.chdir(tmp_path / "old")
     new_name.cache_clear()
+    new_column.cache_clear()
     return tmp_path / "old"
 
 
@@ -33,11 +36,22 @@ def test_an_old_recording_gives_the_numbers_and_failures_that_it_gave(old, call,
     before = json.loads((OLD / "recording" / "report.json").read_bytes())
     said = call("report recording -o json", code=1)
     after = json.loads(said.out)
-    assert after["records_sha256"] == before["records_sha256"]
     codes, found = ([each["code"] for each in one["failures"]] for one in (before, after))
     assert found == [NEW_NAMES.get(code, code) for code in codes]
     assert "obstacle_touched" in found
     assert after["numbers"]["obstacle_contacts"] == before["numbers"]["pipe_contacts"]
+
+
+def test_every_topic_of_an_old_recording_is_read_with_its_present_columns():
+    recording = Recording.read(OLD / "recording" / "mission.mcap")
+    assert recording.note == ""
+    assert len(recording["/telemetry"]) == len(recording["/odometry"]) > 50
+    assert len(recording["/contact_force"]) == len(recording["/ground_truth"]) > 50
+    assert recording["/contact_force"]["force_peak"].max() == 0.0, "a wall is no touch of the probe"
+    assert not recording["/contact"]["by_probe"].any()
+    speed = np.linalg.norm(recording["/contact"]["touch_velocity"], axis=1)
+    assert (speed > 0.1).any()
+    assert len(recording["/sensor"]) == 0
 
 
 @pytest.mark.parametrize("rows", ["flight.during('/telemetry')", "flight.recording['/telemetry']"])

@@ -48,7 +48,7 @@ _STAMPS = {
      "100 Hz by default, in a session"):
         "/odometry /telemetry",
     ("instant of the physics step", "100 Hz, or the rate of the odometry if it is higher"):
-        "/ground_truth /contact_force /reference",
+        "/ground_truth /contact_force /sensor /reference",
     ("arrival at cloud", "once per telemetry that arrives"): "/uplink_delay",
     ("arrival at world", "once per command that arrives"): "/downlink_delay",
     ("first physics step that follows the command", "once per command applied"): "/command_applied",
@@ -76,6 +76,9 @@ OPEN = {
     "config": "the first 12 digits of the SHA-256 of the process's configuration with all "
     "defaults. On one machine this includes the defaults of plug-ins, as `config_sha256` in "
     "report.json; in a cluster it does not",
+    "sensor": "the name in `robot.yaml`",
+    "unit": "the unit in `robot.yaml`",
+    "body": "the name of the body in the scene",
 }
 """Label of a metric that has too many values for a list -> description of the values."""
 COPIED = ("profile", "mission")

@@ -64,13 +64,13 @@ def make_robot_status(
     than `telemetry`. `delay` is the uplink delay of the previous telemetry [s], NaN if unknown.
     """
     # fmt: off
-    stamp_ns, odometry, _, echo_ns, hold_ns, slip_ns, mission, guard, *rest = telemetry
+    stamp_ns, odometry, sensors, echo_ns, hold_ns, slip_ns, mission, guard, *rest = telemetry
     _, position, orientation, velocity, _ = odometry
     obstacles, touch, mission_id, reached, cause = rest
     age_ns = NEVER_NS if echo_ns == NEVER_NS else hold_ns
     return _new(RobotStatus, (
         epoch, position, guard, mission, world, obstacles, touch, slip_ns, mission_id, reached,
-        cause, stamp_ns, orientation, velocity, age_ns, delay, control,
+        cause, stamp_ns, orientation, velocity, age_ns, delay, control, sensors,
     ))
     # fmt: on
 

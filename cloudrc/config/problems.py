@@ -50,10 +50,14 @@ def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPat
 
 
 def field_at(model: type[BaseModel], path: KeyPath) -> FieldInfo | None:
-    """Find the field of the schema at `path`; None if there is no such field."""
-    field, models = None, [model]
+    """Find the field of the schema at `path`; None if there is no such field.
+
+    Below a mapping of any names, the field is that of the mapping.
+    """
+    field, models, is_name = None, [model], False
     for key in path:
-        if not key.isdecimal():
+        is_name = not is_name and field is not None and get_origin(field.annotation) is dict
+        if not key.isdecimal() and not is_name:
             found = [inner.model_fields[key] for inner in models if key in inner.model_fields]
             field = found[0] if found else None
             models = [inner for info in found for inner in _models(info.annotation)]
@@ -124,6 +128,8 @@ def _types(annotation: Any) -> Iterator[Any]:
     arguments = [argument for argument in get_args(annotation) if argument is not Ellipsis]
     if hasattr(annotation, "__metadata__"):
         arguments = arguments[:1]
+    if get_origin(annotation) is dict:  # the keys are names
+        arguments = arguments[1:]
     if not arguments:
         yield annotation
     for argument in arguments:
@@ -282,10 +288,11 @@ _REASONS: Mapping[str, str] = {
 
 def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> ConfigProblem:
     kind, keys = detail["type"], tuple(map(str, detail["loc"]))
-    # Drop the tags of unions, such as <name>: they are not keys. Keep an unknown key unchanged.
+    # Drop the tags of unions, such as <name>, and the tag of names: they are not keys. Keep an
+    # unknown key unchanged.
     unknown = keys[-1:] if kind == "extra_forbidden" else ()
     known = keys[: len(keys) - len(unknown)]
-    path = tuple(key for key in known if not key.startswith("<")) + unknown
+    path = tuple(key for key in known if not key.startswith("<") and key != "[key]") + unknown
     if kind == "unprintable":
         reason = detail["msg"]
     elif kind in _REASONS:

@@ -6,12 +6,13 @@ folders in `cloudrc/robots/`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from cloudrc.config import shipped
 from cloudrc.config.document import read_document
@@ -30,6 +31,7 @@ from cloudrc.config.schema import (
     World,
 )
 from cloudrc.errors import BadInputError
+from cloudrc.messages import SENSORS_MAX
 from cloudrc.plugins import is_path, unknown_name_text
 
 Braking = Annotated[float, Field(ge=0.1, le=10)]
@@ -74,6 +76,31 @@ class Response(Parameters):
     """Velocity per commanded velocity [1]"""
 
 
+def _check_name(name: str) -> str:
+    if not re.fullmatch("[a-z][a-z0-9_]{0,39}", name):
+        raise ValueError("a name has small letters, digits and _, begins with a letter, at most 40")
+    return name
+
+
+def _check_unit(unit: str) -> str:
+    if not 0 < len(unit.strip()) == len(unit) <= 16 or not unit.isprintable():
+        raise ValueError("must be text of 1 to 16 characters, such as N, rad/s or 1")
+    return unit
+
+
+class SensorConfig(Section):
+    """A sensor of the robot's own."""
+
+    unit: Annotated[str, AfterValidator(_check_unit)]
+    """Unit of its value, such as N or rad/s; 1 without a unit"""
+    sensor: Annotated[str, Field(min_length=1)]
+    """Name of a sensor of the model that shows one number"""
+
+
+SensorName = Annotated[str, AfterValidator(_check_name)]
+Sensors = Annotated[dict[SensorName, SensorConfig], Field(max_length=SENSORS_MAX)]
+
+
 class RobotFile(Section):
     """The file `robot.yaml`."""
 
@@ -105,6 +132,9 @@ class RobotFile(Section):
     probe: Annotated[str, Field(min_length=1)] | None = None
     """Name of a sphere, a site of the model: with it the robot touches what a mission has to touch.
     A touch sensor at this site measures the force. null: any part of the robot touches"""
+    sensors: Sensors = Field(default_factory=dict)
+    """The robot's own sensors, at most 16: name -> unit, and sensor of the model. Telemetry carries
+    their values to cloud"""
     hull_points: str | None = None
     """Python file with spheres in place of the ball of hull_m: its functions `few` and `dense`
     return rows x, y, z, radius [m], body frame, for the distance from obstacles and for the check
@@ -136,6 +166,7 @@ class RobotFiles:
     response: Response | None = None  # first-order model of the velocity loop
     motion: str | None = None  # path of a Python file with a better model
     probe: str | None = None  # site with which the robot touches; None: any part of it touches
+    sensors: Mapping[str, SensorConfig] = field(default_factory=dict)  # the robot's own
 
 
 def find_robot(name: str) -> RobotFiles:
@@ -163,6 +194,7 @@ def find_robot(name: str) -> RobotFiles:
         response=robot.response,
         motion=motion,
         probe=robot.probe,
+        sensors=robot.sensors,
     )
 
 

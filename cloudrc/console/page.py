@@ -31,6 +31,7 @@ from cloudrc.console.steering import SLIDERS, Steering, is_drive
 from cloudrc.geometry.clearance import Array
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.messages import ZERO, Quaternion, Vector
+from cloudrc.text import describe_sensors
 
 SLOW_PERIOD = 0.3
 """Time between two updates of the page, except for the moving bodies [s]."""
@@ -224,6 +225,8 @@ class Page:
             f"Last command: {'none' if age == inf else f'{age:.2f} s ago'}",
             f"Mission: {doing}",
         ]
+        if shown := describe_sensors((state.get("seen") or {}).get("sensors", ())):
+            lines.append(f"Sensors: {shown}")
         if silence > STALE:
             lines[0] = f"**No telemetry for {silence:.1f} s**, last: {lines[0]}"
         text, is_refusal, at = self._steering.answer

@@ -18,7 +18,7 @@ from cloudrc.console.steering import Steering
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Vector
 from cloudrc.teleop.client import Api, describe_mission
-from cloudrc.text import describe_point, escape
+from cloudrc.text import describe_point, describe_sensors, escape
 
 SPEED = 0.5
 """Speed along each axis while its key is held [m/s]."""
@@ -194,6 +194,8 @@ def _lines(steering: Steering, api: Api, note: str) -> list[str]:
             f"next: {seen['next_step']}",
             f"guard: {seen['cause']}, seen {seen['age_s']:.1f} s ago, round trip {rtt}",
         ]
+        if shown := describe_sensors(seen["sensors"]):
+            lines.append(f"sensors: {shown}")
     lines.insert(1, f"refused: {text}" if is_refusal else text)
     lines[1:1] = [note] if note else []
     lines.append(describe_mission(mission) if mission else "no mission is under way")

@@ -42,6 +42,7 @@ from cloudrc.records import (
     MissionEvent,
     PlanFollowed,
     Record,
+    SensorRead,
     SessionOpened,
     TelemetrySent,
 )
@@ -186,7 +187,10 @@ class WorldEnd(End):
 
     def _on_groundtruth(self, record: GroundTruth) -> None:
         self._values["cloudrc_position_meters"] = record.odometry.position
-        self._values["cloudrc_tip_force_newtons"] = record.tip_force
+
+    def _on_sensorread(self, record: SensorRead) -> None:
+        _, name, unit, value = record
+        self._set("cloudrc_sensor_value", name, {unit: value})
 
     def _on_commandapplied(self, record: CommandApplied) -> None:
         self._basis_ns = record.basis_stamp_ns
@@ -211,8 +215,16 @@ class WorldEnd(End):
         values["cloudrc_guard_holds_total"] = self._holds.count
 
     def _on_contact(self, record: Contact) -> None:
-        contacts = self._values["cloudrc_contacts_total"]
-        contacts[record.body if record.body in contacts else "obstacle"] += 1
+        count = self._values["cloudrc_contacts_total"].get(record.body, 0)
+        self._set("cloudrc_contacts_total", record.body, count + 1)
+
+    def _set(self, metric: str, label: str, value: Any) -> None:
+        """Set one value of a metric whose label may have any value."""
+        known = self._values[metric]
+        if label in known:
+            known[label] = value
+        else:  # a new dict: another thread may read the old one
+            self._values[metric] = {**known, label: value}
 
     def _on_lateness(self, record: Lateness) -> None:
         super()._on_lateness(record)

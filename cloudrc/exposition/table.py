@@ -39,8 +39,6 @@ GUARD_CAUSES = {cause: cause.words.partition(",")[0] for cause in Cause}
 MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")
 """States of a mission; the value of `cloudrc_mission_state` is the index of the state."""
 MISSION_OUTCOMES = ("done", "cancelled", *FAILURES, "other")
-BODIES = ("floor", "board", "obstacle")
-"""Kinds of bodies that the robot can touch; an obstacle is any body but the first two."""
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
 """Outcomes of a datagram at the relay; `cloudrc.link.relay.Relay.counts` explains them."""
 RELEASE_PERCENTILES = ("50", "99", "99.9")
@@ -111,7 +109,7 @@ cloudrc_sessions_refused_total = busy: Sessions refused because another cloud co
 cloudrc_downlink_delay_seconds: One-way delay from cloud to world, late datagrams included; absent
     unless both ends prove that they share a clock.
 cloudrc_position_meters[axis]: True position of the base, world frame.
-cloudrc_tip_force_newtons: Force on the touch sensor at the arm's tip.
+cloudrc_sensor_value[sensor, unit]: What one of the robot's own sensors shows, in its unit.
 cloudrc_command_age_seconds: Age of the current command in TRACK, sampled every period: time since
     the odometry from which cloud computed the command, on world's clock.
 cloudrc_guard_state: State of the guard: {numbered(GUARD_STATES)}.
@@ -123,7 +121,8 @@ cloudrc_guard_limited_total[limit] = limited_*: Commands that a limit changed; f
     the fence, physics steps in which it changed the velocity.
 cloudrc_guard_held_seconds_total: Time in these HOLDs (`hold_time` in the report).
 cloudrc_guard_starts_refused_total = start_refused: Mission starts refused in LAND or ESTOP.
-cloudrc_contacts_total[body]: Contacts of the robot with bodies of the scene, by kind of body.
+cloudrc_contacts_total[body]: Contacts of the robot with bodies of the scene, by body; absent
+    before the first one.
 cloudrc_real_time_factor: Simulated time divided by machine time over the last 10 s; below 0.95 a
     run is invalid.
 cloudrc_world_slip_seconds_total: Time by which world's clock has fallen behind the machine's clock.
@@ -194,7 +193,7 @@ cloudrc_dns_errors_total = unresolved: Failed look-ups of the peer's name; the l
 """
 """All metrics, in blocks: the processes that expose them, then name[labels] = count: meaning."""
 _LABELS: Mapping[str, Labels] = {
-    **dict.fromkeys(("version", "config"), ()),
+    **dict.fromkeys(("version", "config", "sensor", "unit", "body"), ()),
     "role": ROLES,
     "direction": DIRECTIONS,
     "axis": AXES,
@@ -203,7 +202,6 @@ _LABELS: Mapping[str, Labels] = {
     "state": GUARD_STATES,
     "cause": tuple(dict.fromkeys(GUARD_CAUSES.values())),
     "limit": LIMITS,
-    "body": BODIES,
     "shaper": ("relay", "netem"),
     "mode": ("auto", "relay", "netem"),
     "cloudrc_datagrams_total outcome": OUTCOMES,

@@ -48,7 +48,7 @@ class ContactChecks:
 
     def _is_allowed(self, state: GuardState, touch: Contact, now_ns: int) -> bool:
         """Return whether the robot may touch a body in this state."""
-        if touch.body == self._facts.touch and touch.tip:
+        if touch.body == self._facts.touch and touch.by_probe:
             return True
         # A landing that is acknowledged just above an obstacle cannot stop in time.
         lands = state is LAND or (state is HOLD and now_ns - self._landed_ns <= BRAKE_NS)

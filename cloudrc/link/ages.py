@@ -9,11 +9,12 @@ from collections.abc import Iterable
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
+from cloudrc.config.robot import known_robot
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.queue import PacketQueue
 from cloudrc.link.traces import link_profile
 from cloudrc.messages import plan_length
-from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
+from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES, Kind
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
@@ -61,7 +62,7 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
     up = _Way(
         _always_up(experiment, uplink=True),
         Kind.TELEMETRY,
-        SIZES[Kind.TELEMETRY],
+        TELEMETRY_SIZES[len(known_robot(experiment.world.robot).sensors)],
         experiment.world.odometry_rate_hz,
     )
     down = _Way(

@@ -24,7 +24,7 @@ from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording, Table
 from cloudrc.records import UNDER_WAY
-from cloudrc.renamed import new_name
+from cloudrc.renamed import new_column
 
 Array: TypeAlias = NDArray[Any]
 Columns: TypeAlias = dict[str, Array]
@@ -208,7 +208,7 @@ class _Columns(Columns):
     """Columns by name; the old name of a column finds it, too."""
 
     def __missing__(self, name: str) -> Array:
-        if (new := new_name(name)) == name:
+        if (new := new_column(name)) == name:
             raise KeyError(name)
         return self[new]
 

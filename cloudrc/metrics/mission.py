@@ -39,7 +39,7 @@ def first_touch(flight: Flight) -> dict[str, Array] | None:
     """Return the first row of /contact in which the robot touches what it has to, or None."""
     contact = flight.during("/contact")
     touches = np.flatnonzero(
-        (contact["body"] == flight.mission.touched) & contact["tip"].astype(bool)
+        (contact["body"] == flight.mission.touched) & contact["by_probe"].astype(bool)
     )
     return select(contact, touches[0]) if len(touches) else None
 
@@ -124,9 +124,9 @@ def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
 
 
 def _of_touch(measure: Callable[[Flight, dict[str, Array]], float | None]) -> Measure:
-    """Make a metric that applies `measure` to the first touch of the board.
+    """Make a metric that applies `measure` to the first touch of what the mission has to touch.
 
-    The metric is None if the robot never touches the board.
+    The metric is None if the robot never touches it.
     """
 
     def measured(flight: Flight) -> float | None:
@@ -139,12 +139,12 @@ def _of_touch(measure: Callable[[Flight, dict[str, Array]], float | None]) -> Me
 @_of_touch
 def _peak_force(flight: Flight, touch: dict[str, Array]) -> float | None:
     """Find the largest contact force [N]; it depends on the simulator's contact parameters."""
-    force = flight.during("/contact_force")["tip_force_peak"]
+    force = flight.during("/contact_force")["force_peak"]
     return float(force.max()) if len(force) else None
 
 
 @_of_touch
-def _impulse(flight: Flight, touch: dict[str, Array]) -> float:
+def _impulse(flight: Flight, touch: dict[str, Array]) -> float | None:
     """Integrate the force of the impact over time [N s].
 
     Unlike the peak force, the impulse does not depend on the simulator's contact parameters.
@@ -152,8 +152,10 @@ def _impulse(flight: Flight, touch: dict[str, Array]) -> float:
     Source: docs/reference/plant.md, "Contact".
     """
     force = flight.during("/contact_force")
+    if not len(force["stamp_ns"]):
+        return None
     since_ns = force["stamp_ns"] - touch["stamp_ns"]
-    return float(force["tip_impulse"][(since_ns >= 0) & (since_ns < IMPACT_NS)].sum())
+    return float(force["impulse"][(since_ns >= 0) & (since_ns < IMPACT_NS)].sum())
 
 
 @_of_touch
@@ -168,7 +170,7 @@ def _steady_force(flight: Flight, touch: dict[str, Array]) -> float | None:
     if touch["stamp_ns"] > begin_ns:
         return None
     force = flight.during("/contact_force")
-    return mean(force["tip_force"][force["stamp_ns"] >= begin_ns])
+    return mean(force["force"][force["stamp_ns"] >= begin_ns])
 
 
 def obstacle_contacts(flight: Flight) -> dict[str, Array]:
@@ -181,7 +183,7 @@ def obstacle_contacts(flight: Flight) -> dict[str, Array]:
 def _steady_error(flight: Flight, axis: int) -> float | None:
     """Average the distance from setpoint to true position [m] along x, y or z (`axis` 0, 1 or 2).
 
-    None if the flight is shorter than 15 s, or if in its last 15 s the setpoint moved or the arm
+    None if the flight is shorter than 15 s, or if in its last 15 s the setpoint moved or the probe
     touched something.
     """
     control, force = flight.control, flight.during("/contact_force")
@@ -190,7 +192,7 @@ def _steady_error(flight: Flight, axis: int) -> float | None:
     begin_ns = flight.end_ns - RESTING_NS
     settling_ns = begin_ns - SETTLING_NS
     still = control["setpoint"][control["stamp_ns"] >= settling_ns]
-    touched = (force["tip_force"][force["stamp_ns"] >= settling_ns] > 0).any()
+    touched = (force["force"][force["stamp_ns"] >= settling_ns] > 0).any()
     too_short = settling_ns < flight.start_ns
     if too_short or touched or not len(still) or (still != still[-1]).any():
         return None
@@ -222,16 +224,16 @@ add_metrics(
     ("final_error", "m", "Distance from the last setpoint of a file to the true position when the "
      "mission ended.", _final_error),
     ("obstacle_contacts", "1", "Number of contacts with obstacles. These are all bodies but the "
-     "floor and, if the mission has to touch it, the board.",
+     "floor and the body that the mission has to touch.",
      lambda flight: flight.count(len(obstacle_contacts(flight)["stamp_ns"]))),
-    ("contact_time", "s", "Time from the start of the mission to the arm's first touch of the "
-     "board.", _of_touch(lambda flight, touch: float(flight.seconds(touch["stamp_ns"])))),
-    ("tip_speed", "m/s", "Speed of the arm's tip just before it first touches the board.",
-     _of_touch(lambda flight, touch: float(np.linalg.norm(touch["tip_velocity"])))),
-    ("peak_contact_force", "N", "Largest force on the arm's tip in any physics step.", _peak_force),
-    ("contact_impulse", "N s", "Force on the arm's tip times time, over the first 0.1 s of the "
+    ("contact_time", "s", "Time from the start of the mission to the first touch of what it has "
+     "to touch.", _of_touch(lambda flight, touch: float(flight.seconds(touch["stamp_ns"])))),
+    ("touch_speed", "m/s", "Speed of the probe (without one: of the base) just before this touch.",
+     _of_touch(lambda flight, touch: float(np.linalg.norm(touch["touch_velocity"])))),
+    ("peak_contact_force", "N", "Largest force on the probe in any physics step.", _peak_force),
+    ("contact_impulse", "N s", "Force on the probe times time, over the first 0.1 s of the "
      "first touch.", _impulse),
-    ("steady_contact_force", "N", "Mean force on the arm's tip over the last 2 s of the mission.",
+    ("steady_contact_force", "N", "Mean force on the probe over the last 2 s of the mission.",
      _steady_force),
     *((f"steady_error_{name}", "m", f"Mean distance from the setpoint along {name} over the last "
        "5 s of a hover.", partial(_steady_error, axis=axis)) for axis, name in enumerate("xyz")),

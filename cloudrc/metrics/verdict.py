@@ -6,9 +6,9 @@ The first matching outcome of this list is the verdict:
 - `invalid`: the run had to keep real time but did not, so its numbers mean nothing.
 - `failure`: at least one criterion of success is not met. Each such criterion is listed with time
   and place.
-- `success`: all waypoints, or the last setpoint of a file, were reached within the time limit, the
-  board was touched slowly enough, no pipe was touched, the guard was only in TRACK or HOLD, and
-  world never restarted.
+- `success`: all waypoints, or the last setpoint of a file, were reached within the time limit, what
+  the mission has to touch was touched slowly enough, no obstacle was touched, the guard was only in
+  TRACK or HOLD, and world never restarted.
 
 The same rules apply to two kinds of evidence. The report uses the recorded truth
 (`flight_evidence`). Teleop uses telemetry (`Observations`), which arrives late and contains less.
@@ -190,7 +190,7 @@ def flight_evidence(
     criteria, end_ns = flight.criteria, flight.end_ns
     reached, touch = numbers.get("waypoints_reached"), None
     if row := first_touch(flight):
-        speed = float(np.linalg.norm(row["tip_velocity"]))
+        speed = float(np.linalg.norm(row["touch_velocity"]))
         touch = speed, _moment(flight, int(row["stamp_ns"]))
     return Evidence(
         waypoints=0 if flight.mission.setpoints else flight.waypoints,
@@ -367,21 +367,21 @@ class Observations:
 
     obstacle_contacts: int = 0  # number of contacts with obstacles
     first_contact: str = ""  # the first of them in words: when, where, next to what
-    touch_speed: float | None = None  # of the arm's tip at its first touch of the board [m/s]
+    touch_speed: float | None = None  # of the first touch of what the mission has to touch [m/s]
     slip_ns: int = 0  # time by which world's clock fell behind while teleop ran [ns]
 
-    def news(self, before: Observations, elapsed: float) -> Iterator[tuple[str, str]]:
+    def news(self, before: Observations, elapsed: float, body: str) -> Iterator[tuple[str, str]]:
         """Yield event name and text of each contact since the earlier observations `before`.
 
-        `elapsed` is the present mission time [s].
+        `elapsed` is the present mission time [s]. `body` is what the mission has to touch.
         """
         if self.obstacle_contacts > before.obstacle_contacts:
             first = not before.obstacle_contacts
             where = self.first_contact if first else f"again, at {elapsed:.2f} s"
             yield "obstacle_touched", f"the robot touched an obstacle {where}"
         if self.touch_speed != before.touch_speed:
-            text = f"board touched at {elapsed:.2f} s with {self.touch_speed:.2f} m/s"
-            yield "board_touched", text
+            text = f"{body} touched at {elapsed:.2f} s with {self.touch_speed:.2f} m/s"
+            yield "touched", text
 
     def evidence(self, ending: Ending, elapsed: float, **known: Any) -> Evidence:
         """Return the evidence on a mission that ended at mission time `elapsed` [s].

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc import assembly
 from cloudrc.config.load import ResolvedExperiment, load_experiment, read_experiment
+from cloudrc.config.robot import known_robot
 from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.machine import clock_id
 from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
@@ -27,7 +28,7 @@ from cloudrc.plugins import apart
 from cloudrc.processes.ports import listening, open_exporter, warn
 from cloudrc.runs.requirements import require
 from cloudrc.source import code_hash
-from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
+from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES, Kind
 from cloudrc.tunnel.end import Identity
 
 if TYPE_CHECKING:
@@ -169,7 +170,9 @@ def link_monitor(experiment: ResolvedExperiment, *, uplink: bool, trusted: bool)
     """
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
     rate = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
-    size = SIZES[kind] if uplink else COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
+    size = COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
+    if uplink:
+        size = TELEMETRY_SIZES[len(known_robot(experiment.world.robot).sensors)]
     flow = Flow(experiment.seed, uplink, kind, size)
     computes, file_max = experiment.cloud.compute_ms > 0, SIZE_MAX if trusted else TRACE_MAX
     check = LinkMonitor(uplink, flow, period=1.0 / rate, computes=computes, file_max=file_max)

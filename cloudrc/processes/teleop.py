@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from cloudrc import assembly
 from cloudrc.config.hull import hull_of
 from cloudrc.config.load import ResolvedExperiment, read_experiment
-from cloudrc.config.robot import is_planar
+from cloudrc.config.robot import is_planar, known_robot
 from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.drivers.link_news import LinkNews
 from cloudrc.drivers.process import Feed, GracefulStop, StopSignal
@@ -73,8 +73,10 @@ def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
         book = _open_store(settings.journal, stop, server.bridge)
         if book is not None:  # None: stopped while another teleop process locked the journal
             opened.callback(book.close)
-            hull = hull_of(experiment.world.robot)
-            service = MissionService(book, steered_in(experiment.world), scene, hull)
+            world = experiment.world
+            hull, sensors = hull_of(world.robot), known_robot(world.robot).sensors
+            units = {name: each.unit for name, each in sensors.items()}
+            service = MissionService(book, steered_in(world), scene, hull, units)
             if settings.start:
                 touch = experiment.mission.touch
                 order = Order(assembly.build_plan(experiment), experiment.name, touch=touch)

@@ -33,10 +33,10 @@ from mcap.writer import MCAP0_MAGIC
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file
 from cloudrc.record.content import Content
-from cloudrc.record.ros import is_known
+from cloudrc.record.ros import converter
 from cloudrc.record.topics import TOPICS, VIEWS
 from cloudrc.record.writer import CHANGED, CLOCK, COUNTS, MISSING
-from cloudrc.renamed import with_new_names
+from cloudrc.renamed import with_new_columns
 
 UNPACKED_MAX = 64
 """Largest ratio of a recording's size in memory to its size in the file; a file below 1 MiB counts
@@ -199,7 +199,8 @@ class File:
         self.read = Counter[int]()  # channel -> number of messages, also of other programs
         self.statistics: mcap.Statistics | None = None
         self.channels: dict[int, mcap.Channel] = {}
-        self.ours: dict[int, bool] = {}  # whether cloudrc records a channel's topic in this layout
+        # Channel -> converter of its messages; None if cloudrc does not record its topic so.
+        self.ours: dict[int, Callable[[bytes], bytes] | None] = {}
         self._schemas: dict[int, mcap.Schema] = {}
         self._sequences = array("L")
         self._room = UNPACKED_MAX * max(self.size, 1 << 20)
@@ -376,14 +377,15 @@ class File:
             self._take_room(MESSAGE_COST)
             self.read[record.channel_id] += 1
             if record.channel_id not in self.ours:
-                self.ours[record.channel_id] = self._is_ours(self.channels.get(record.channel_id))
-            if not self.ours[record.channel_id]:
+                self.ours[record.channel_id] = self._converter(self.channels.get(record.channel_id))
+            convert = self.ours[record.channel_id]
+            if convert is None:
                 return
             topic = self.channels[record.channel_id].topic
             if topic in VIEWS:
                 content.views.append((topic, record.log_time, record.data))
             else:
-                content.messages.append((topic, record.log_time, record.data))
+                content.messages.append((topic, record.log_time, convert(record.data)))
                 self._sequences.append(record.sequence)
         elif isinstance(record, mcap.Schema):
             self._schemas[record.id] = record
@@ -394,15 +396,15 @@ class File:
         elif isinstance(record, mcap.Attachment):
             content.attachments[record.name] = record.data
 
-    def _is_ours(self, channel: mcap.Channel | None) -> bool:
-        """Check whether a channel's topic and layout are those that cloudrc records."""
+    def _converter(self, channel: mcap.Channel | None) -> Callable[[bytes], bytes] | None:
+        """Return the converter of a channel's messages; None if cloudrc does not record them so."""
         if channel is None:  # its definition is lost
-            return False
+            return None
         topic, schema = TOPICS.get(channel.topic), self._schemas.get(channel.schema_id)
         ros_type = topic.ros_type if topic else VIEWS.get(channel.topic)
         if schema is None or ros_type is None or schema.name != ros_type:
-            return False
-        return is_known(ros_type, with_new_names(schema.data.decode("utf-8", "replace")))
+            return None
+        return converter(ros_type, with_new_columns(schema.data.decode("utf-8", "replace")))
 
     def _sort(self) -> None:
         messages = self.content.messages
@@ -539,7 +541,9 @@ def _changed_topics(file: File) -> Iterator[str]:
     Topics that cloudrc does not record are no change: they become a remark of the content.
     """
     channels = Counter(
-        (file.channels[n].topic, ours) for n, ours in file.ours.items() if n in file.channels
+        (file.channels[n].topic, convert is not None)
+        for n, convert in file.ours.items()
+        if n in file.channels
     )
     others = {name for name, known in channels if not known}
     if foreign := sorted(others - TOPICS.keys()):

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from typing import Any, TypeAlias
 
@@ -71,16 +72,50 @@ for _name in _NAMES:
     definition(_name), type_hash(_name), STORE.get_msgdef(_name)
 
 
-def is_known(ros_type: str, text: str) -> bool:
-    """Check whether a type's definition from a file has the layout that `decode` expects."""
+def converter(ros_type: str, text: str) -> Callable[[bytes], bytes] | None:
+    """Return a function that gives a file's messages the layout that `decode` expects.
+
+    `text` is the definition of the type in the file. A type of cloudrc may have further fields
+    there, as in a file of another version; they are left out. The result is None for any other
+    difference.
+    """
     if text == definition(ros_type):
-        return True
+        return _as_they_are
     try:
         found = get_types_from_msg(text, ros_type)
     except Exception:  # rosbags' parser may raise anything on a foreign text
-        return False
+        return None
     known = STORE.fielddefs
-    return all(name in known and known[name][1] == found[name][1] for name in found)
+    others = {name for name in found if name not in known or known[name][1] != found[name][1]}
+    if not others:
+        return _as_they_are
+    fields = [field for field in found[ros_type][1] if field in known[ros_type][1]]
+    if others != {ros_type} or ros_type not in _OWN or fields != known[ros_type][1]:
+        return None
+    return _without_other_fields(ros_type, found)
+
+
+def _as_they_are(data: bytes) -> bytes:
+    return data
+
+
+def _without_other_fields(ros_type: str, found: Any) -> Callable[[bytes], bytes]:
+    """Return a function that leaves out the fields of a message that only the type in `found` has.
+
+    It returns malformed bytes as they are; `decode` refuses them.
+    """
+    store, make = get_typestore(Stores.ROS2_JAZZY), _type[ros_type]
+    store.register({ros_type: found[ros_type]})
+    names = [name for name, _ in STORE.fielddefs[ros_type][1]]
+
+    def convert(data: bytes) -> bytes:
+        with suppress(Exception):  # rosbags may raise anything on malformed bytes
+            message = store.deserialize_cdr(data, ros_type)
+            kept = make(*[getattr(message, name) for name in names])
+            return bytes(STORE.serialize_cdr(kept, ros_type, little_endian=True))
+        return data
+
+    return convert
 
 
 _SECOND_NS = 1_000_000_000

@@ -94,15 +94,16 @@ _TABLE = (
         "Measured pose and twist, as sent to cloud, world's clock",
         parts=("telemetry.odometry.",)),
     Topic("/telemetry", "cloudrc_msgs/msg/Telemetry", rec.TelemetrySent, "world",
-        "Telemetry sent to cloud, without the pose and twist, world's clock",
+        "Telemetry sent to cloud, without pose, twist and the robot's own sensors, world's clock",
         parts=("", "telemetry.")),
     Topic("/ground_truth", "nav_msgs/msg/Odometry", rec.GroundTruth, "world",
         "True pose and twist, world's clock", parts=("odometry.",)),
-    Topic("/contact_force", "cloudrc_msgs/msg/ContactForce", rec.GroundTruth, "world",
-        "Force on the touch sensor at the tip of the arm, world's clock",
-        "tip_force tip_force_peak tip_impulse"),
+    Topic("/contact_force", "cloudrc_msgs/msg/ContactForce", rec.ContactForce, "world",
+        "Force on the touch sensor of the robot's probe, world's clock. Only with such a sensor"),
+    Topic("/sensor", "cloudrc_msgs/msg/SensorRead", rec.SensorRead, "world",
+        "Value of one of the robot's own sensors, world's clock. Telemetry carries it to cloud"),
     Topic("/reference", "geometry_msgs/msg/TwistStamped", rec.GroundTruth, "world",
-        "Velocity that the guard lets the low-level controller follow, world's clock", "reference"),
+        "Velocity that the guard lets the onboard controller follow, world's clock", "reference"),
     Topic("/uplink_delay", "cloudrc_msgs/msg/Arrival", rec.Arrival, "cloud",
         "A telemetry datagram arrived at cloud, in time or late, cloud's clock",
         "epoch counter delay used"),
@@ -153,7 +154,7 @@ _TABLE = (
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 """Name -> topic, for every topic of a recording."""
 
-ADDED = ("/plan",)
+ADDED = ("/plan", "/sensor")
 """Topics that recordings of version 0.1.0 lack; without rows they do not change a hash."""
 
 VIEWS: dict[str, str] = {

@@ -42,7 +42,7 @@ MAIN = {
     "final_error": "from the last setpoint, at the end",
     "duration": "mission took",
     "contact_time": "first touch at",
-    "tip_speed": "speed at the first touch",
+    "touch_speed": "speed at the first touch",
     "steady_contact_force": "steady contact force",
     "min_clearance": "least clearance",
     "rtt_mean": "round trip, mean",

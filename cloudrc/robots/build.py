@@ -22,6 +22,7 @@ from cloudrc.messages import Vector
 from cloudrc.robots.onboard._airframe import thrust_to_weight
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.onboard import Accelerator, Actuators, Direct, Onboard
+from cloudrc.world.own_sensors import OwnSensor, find_sensors
 from cloudrc.world.plant import Wind
 from cloudrc.world.robot import STEP, Robot
 from cloudrc.world.scene import compile_model, compile_true
@@ -47,6 +48,7 @@ class Parts(NamedTuple):
     onboard: Onboard
     actuators: Actuators
     probe: str | None  # site with which the robot touches; None: any part of it touches
+    sensors: tuple[OwnSensor, ...]
 
 
 def check_robot(world: World) -> None:
@@ -60,15 +62,17 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     Raises:
         BadInputError: If the robot does not compile, or if it cannot move as `world` says.
     """
-    model, plugin, onboard, actuators, probe = _make_parts(world)
+    model, plugin, onboard, actuators, probe, sensors = _make_parts(world)
     robot = find_robot(world.robot)
     guard = Guard(limits, steered_in(world), robot.guard)
     faster = _accelerator(world, plugin)
     if faster is not None and faster.make is not None:
-        return faster.make(Simulator(model, actuators, wind, probe), onboard, guard)  # type: ignore[no-any-return]
+        simulator = Simulator(model, actuators, wind, probe, sensors)
+        return faster.make(simulator, onboard, guard)  # type: ignore[no-any-return]
     if not isinstance(actuators, Direct):
         actuators = WatchedActuators(actuators, model.nu)
-    return Robot(Simulator(model, actuators, wind, probe), WatchedOnboard(onboard), guard)
+    simulator = Simulator(model, actuators, wind, probe, sensors)
+    return Robot(simulator, WatchedOnboard(onboard), guard)
 
 
 def controller(robot: RobotFiles, model: Any) -> PlugIn:
@@ -149,24 +153,33 @@ def _make_parts(world: World) -> Parts:
     _check_onboard(onboard, nominal.nu if isinstance(actuators, Direct) else None)
     if world.wind.blows and isinstance(actuators, Direct):
         _refuse_wind(world, plugin)
-    return Parts(true, plugin, onboard, actuators, _find_probe(robot, choice, nominal))
+    try:
+        probe, sensors = _find_probe(robot, choice, nominal)
+    except BadInputError as error:
+        raise BadInputError(f"{world.robot}/{ROBOT_FILE}: {error}") from error
+    return Parts(true, plugin, onboard, actuators, probe, sensors)
 
 
-def _find_probe(robot: RobotFiles, choice: PlugIn, model: Any) -> str | None:
-    """Return the site with which a robot touches; None if any part of it touches.
+def _find_probe(
+    robot: RobotFiles, choice: PlugIn, model: Any
+) -> tuple[str | None, tuple[OwnSensor, ...]]:
+    """Return the site with which a robot touches, or None, and the robot's own sensors.
 
-    A model without `robot.yaml` that has the Pelican's controller has its probe, too.
+    A model without `robot.yaml` that has the Pelican's controller has its probe and its sensors,
+    too, if the model has such parts.
     """
-    if robot.probe is not None:
-        find_site(model, robot.probe)
-        return robot.probe
     pelican = find_robot("pelican")
     if robot.onboard is not None or choice != pelican.onboard:
-        return None
+        if robot.probe is not None:
+            find_site(model, robot.probe)
+        return robot.probe, find_sensors(model, robot.sensors)
+    probe: str | None = None
+    sensors: tuple[OwnSensor, ...] = ()
     with suppress(BadInputError):
         find_site(model, pelican.probe or "")
-        return pelican.probe
-    return None
+        probe = pelican.probe
+        sensors = find_sensors(model, pelican.sensors)
+    return probe, sensors
 
 
 def _build_onboard(

@@ -99,7 +99,6 @@ def _read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
     """Return the facts that need no motion."""
     base = model.jnt_bodyid[0]
     ratio = thrust_to_weight(model) if not robot.planar else None
-    names = [model.sensor(n).name.removeprefix(ROBOT_PREFIX) for n in range(model.nsensor)]
     size = _size(model)
     return {
         "model": str(robot.model),
@@ -115,7 +114,7 @@ def _read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
         "size_m": size,
         "hull_m": robot.hull or size,
         "has_response": robot.response is not None,
-        "sensors": names,
+        "sensors": {name: each.unit for name, each in robot.sensors.items()},
     }
 
 
@@ -212,7 +211,8 @@ def _shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.3g}"
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_shown(each)}" for key, each in value.items() if each is not None)
+        told = (f"{key} {_shown(each)}" for key, each in value.items() if each is not None)
+        return ", ".join(told) or "none"
     if isinstance(value, list | tuple):
         return ", ".join(map(_shown, value)) or "none"
     return "from the model" if value is None else str(value)

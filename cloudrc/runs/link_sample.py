@@ -20,7 +20,7 @@ from cloudrc.link.profile import DirectionProfile, Timeline, Trace
 from cloudrc.link.traces import link_profile, read_lines, read_trace
 from cloudrc.report.figures.link import DirectionSample
 from cloudrc.text import table
-from cloudrc.tunnel.codec import SIZES, Kind
+from cloudrc.tunnel.codec import SIZES, TELEMETRY_SIZES, Kind
 
 PACKETS_MAX = 10_000_000
 RANGES: dict[str, tuple[float, float]] = {
@@ -113,8 +113,10 @@ def _row_times(trace: Trace) -> list[int]:
 
 def _send(profile: DirectionProfile, uplink: bool, seed: int, sent_ns: Sequence[int]) -> Stream:
 
-    kind = Kind.TELEMETRY if uplink else Kind.COMMAND
-    return sample(LinkDirection(profile, seed, uplink), kind, sent_ns, SIZES[kind])
+    kind, size = Kind.COMMAND, SIZES[Kind.COMMAND]
+    if uplink:
+        kind, size = Kind.TELEMETRY, TELEMETRY_SIZES[1]  # a robot with one sensor of its own
+    return sample(LinkDirection(profile, seed, uplink), kind, sent_ns, size)
 
 
 STATISTICS: dict[str, tuple[str, float, Callable[[Numbers], float]]] = {

@@ -16,6 +16,7 @@ model: robot.xml          # MJCF; the base has a free joint
 onboard: multirotor       # or diff_drive, or ./onboard.py with a function build(model)
 # planar: true            # for a robot that stays on the ground
 # hull_m: 0.4             # radius of the ball about the base that holds the robot [m]
+# sensors: {height: {unit: m, sensor: range}}            # own values, from sensors of the model
 guard: {acceleration_max_mps2: 4, braking_mps2: 3}     # 'cloudrc robot check' measures the braking
 # response:               # for predictors; 'cloudrc identify RUN' fits it to a flight
 #   time_constant: [0.2, 0.2, 0.1]

@@ -20,6 +20,7 @@ from cloudrc.cluster.client import Release
 from cloudrc.cluster.pods import METRICS, NO_PROXY, find_pod, forwarded
 from cloudrc.config import shipped
 from cloudrc.config.load import ResolvedExperiment, read_experiment
+from cloudrc.config.robot import known_robot
 from cloudrc.config.schema import Experiment, Profile
 from cloudrc.drivers.programs import run_tool
 from cloudrc.errors import BadInputError, TimedOutError
@@ -38,7 +39,7 @@ from cloudrc.link.verify.judge import Flow, Judgement, Measurement, look_twice, 
 from cloudrc.link.verify.probe import PROBE, plan_probes
 from cloudrc.runs.link_under_test import LOOPBACK, WAYS, Way, inside, measure, run_link
 from cloudrc.text import Paint, escape, plain, table
-from cloudrc.tunnel.codec import SIZES
+from cloudrc.tunnel.codec import SIZES, TELEMETRY_SIZES, Kind
 
 RELEASE_TIMEOUT = 270.0  # default time limit for the verdict on a release [s]
 COUNTS_WAIT = 1.3  # after the last probe: processes update their counts once a second [s]
@@ -126,8 +127,10 @@ def make_plans(
         BadInputError: If netem cannot realise the profile; the text names the direction.
     """
     plans, netem = {}, shaper == "netem"
+    sensors = known_robot(experiment.world.robot).sensors
+    sizes = SIZES | {int(Kind.TELEMETRY): TELEMETRY_SIZES[len(sensors)]}
     for way, (_, _, kind) in WAYS.items():
-        flow = Flow(experiment.seed, way == "uplink", PROBE, SIZES[kind])
+        flow = Flow(experiment.seed, way == "uplink", PROBE, sizes[kind])
         profile = link_profile(getattr(experiment, way))
         try:
             if netem:

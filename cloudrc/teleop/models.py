@@ -81,7 +81,7 @@ class DriveRequest(Section):
 
 EXAMPLES: dict[type[Section], dict[str, Any]] = {
     MissionRequest: {
-        "name": "to the board",
+        "name": "to the wall",
         "start": "spawn",
         "time_limit_s": 60.0,
         "waypoints": [
@@ -132,7 +132,7 @@ class Event(_Answer):
     event: str = _field(
         "queued, starting, started, reached, held, resumed, goto, driving, operator_lost, "
         "restarted, new_session, no_telemetry, telemetry_again, guard_holds, hold_over, "
-        "link_changed, board_touched, obstacle_touched, paused; at the end done, cancelled, "
+        "link_changed, touched, obstacle_touched, paused; at the end done, cancelled, "
         f"{', '.join(FAILURES)}"
     )
     waypoint: int = _field("Index of the waypoint, from 0")
@@ -168,6 +168,14 @@ class MissionList(_Answer):
     missions: list[MissionSummary] = _field("Oldest first")
 
 
+class SensorView(_Answer):
+    """One of the robot's own sensors."""
+
+    name: str = _field("Name in robot.yaml")
+    value: float | None = _field("What it shows, in its unit; null if that is no number")
+    unit: str = _field("Unit in robot.yaml")
+
+
 class Seen(_Answer):
     """The newest telemetry."""
 
@@ -181,11 +189,12 @@ class Seen(_Answer):
     next_step: str = _field("What the robot does next, or what the operator has to do")
     obstacle_contacts: int = _field("Number of contacts with obstacles in the mission")
     touch_speed_mps: float | None = _field(
-        "Speed of the arm's tip at its first touch of the board [m/s]"
+        "Speed of the first touch of what the mission has to touch [m/s]"
     )
+    sensors: list[SensorView] = _field("The robot's own sensors, in the order of robot.yaml")
     horizon_s: float | None = _field("Prediction horizon of cloud's last command [s]")
-    rtt_s: float | None = _field("Last round trip, without the waiting time on board [s]")
-    loop_delay_s: float | None = _field("Last round trip, with the waiting time on board [s]")
+    rtt_s: float | None = _field("Last round trip, without the waiting time at the robot [s]")
+    loop_delay_s: float | None = _field("Last round trip, with the waiting time at the robot [s]")
 
 
 class StateView(_Answer):
@@ -201,7 +210,7 @@ class Stopped(_Answer):
     """Answer to a command for an emergency stop; the robot may not have received the stop yet."""
 
     id: str | None = _field("The mission that was under way and has failed")
-    state: Literal["stopping"] = _field("Lasts until the guard on board is in ESTOP")
+    state: Literal["stopping"] = _field("Lasts until the robot's guard is in ESTOP")
 
 
 class Acknowledged(_Answer):

@@ -6,7 +6,7 @@ has restarted. If an emergency stop has not reached the robot, the new process s
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from math import hypot, inf
@@ -107,11 +107,15 @@ class MissionService:
         fence: Fence,
         scene: Scene | None = None,
         hull: Hull = NO_SIZE,
+        units: Mapping[str, str] | None = None,
     ) -> None:
         """Begin with the missions in the store `book`, in a scene with `fence`.
 
         With a `scene`, the service refuses straight ways of the robot's `hull` through obstacles.
+        `units` are the names of the robot's own sensors, in the order of telemetry, and their units
+        (None: no sensors).
         """
+        self._units = tuple((units or {}).items())
         self._scene, self._hull = scene, hull
         self._outputs: list[Output | Fault] = []
         self.book, self._teleop, self._fence = book, Teleop(fence, book.has_ended), fence
@@ -298,7 +302,8 @@ class MissionService:
                 touch_speed=finite_or_none(seen.touch_speed),
                 slip_ns=known.slip_ns + (seen.slip_ns - before.slip_ns if before else 0),
             )
-            for event, text in mission.witness.news(known, self._teleop.elapsed(now_ns)):
+            time, touch = self._teleop.elapsed(now_ns), mission.order.touch
+            for event, text in mission.witness.news(known, time, touch.body if touch else ""):
                 self._note(mission, event, text, now_ns)
             if before is not None and before.epoch != seen.epoch:
                 text = f"cloud has a new session; the mission is {mission.state}"
@@ -359,11 +364,21 @@ class MissionService:
             "next_step": next_step(seen.guard, age, cloud_age, state),
             "obstacle_contacts": seen.obstacle_contacts,
             "touch_speed_mps": finite_or_none(seen.touch_speed),
+            "sensors": self._sensors(seen),
             "horizon_s": control and finite_or_none(control.horizon),
             "rtt_s": control and finite_or_none(control.rtt),
             "loop_delay_s": control and finite_or_none(control.loop_delay),
         }
         return shown
+
+    def _sensors(self, seen: RobotStatus) -> list[dict[str, Any]]:
+        """Return the robot's own sensors; none if world's robot.yaml is another one."""
+        if len(seen.sensors) != len(self._units):
+            return []
+        return [
+            {"name": name, "value": finite_or_none(value), "unit": unit}
+            for (name, unit), value in zip(self._units, seen.sensors, strict=True)
+        ]
 
     @property
     def _inherits_stop(self) -> MissionRecord | None:

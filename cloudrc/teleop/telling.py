@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from cloudrc.teleop.client import describe_verdict
-from cloudrc.text import describe_point, table
+from cloudrc.text import describe_point, describe_sensors, table
 
 
 def missions_table(missions: Sequence[Mapping[str, Any]]) -> str:
@@ -39,6 +39,8 @@ def describe_robot(seen: Mapping[str, Any] | None, cloud_age: float | None) -> I
         rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
         yield f"robot at {where} m, seen {seen['age_s']:.2f} s ago{rtt}"
         yield f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s: {seen['cause']}"
+        if shown := describe_sensors(seen["sensors"]):
+            yield f"sensors: {shown}"
     yield f"next: {seen['next_step']}"
 
 

@@ -97,7 +97,7 @@ class RobotStatus(NamedTuple):
     mission: int  # number of the last operator request that world has acted on; 0 if none
     world: str = ""  # identifies world's process; a restart of world changes it
     obstacle_contacts: int = 0  # number of contacts with obstacles in the mission
-    touch_speed: float = nan  # of the arm's tip at the mission's first touch of the board [m/s]
+    touch_speed: float = nan  # of the first touch of what the mission has to touch [m/s]
     slip_ns: int = 0  # lag of world's clock behind its machine's clock [ns]
     mission_id: int = 0  # number of the mission of the last start request; 0 if none
     reached: int = 0  # waypoints that world has stored as reached, or `MISSION_OVER`
@@ -108,6 +108,7 @@ class RobotStatus(NamedTuple):
     command_age_ns: int = NEVER_NS  # age of the last applied command [ns]; `NEVER_NS` if none
     uplink_delay: float = nan  # of the telemetry before `control` [s]; NaN without a common clock
     control: Control | None = None  # last command of the session; None before the first
+    sensors: tuple[float, ...] = ()  # of the robot's own sensors, in the order of `robot.yaml`
 
 
 QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
@@ -160,7 +161,13 @@ def read_line(line: bytes) -> RobotStatus | None:
     """Decode a line of `write_line`; raise ValueError if it is malformed."""
 
     def with_nan(part: dict[str, Any]) -> dict[str, Any]:
-        return {k: nan if v is None and k != "control" else v for k, v in part.items()}
+        known = {key: value for key, value in part.items() if value is not None or key == "control"}
+        lists = {
+            key: [nan if each is None else each for each in value]
+            for key, value in known.items()
+            if isinstance(value, list)
+        }
+        return dict.fromkeys(part, nan) | known | lists
 
     tree = json.loads(line, object_hook=with_nan)
     return None if tree is None else _STATUS.validate_python(tree)

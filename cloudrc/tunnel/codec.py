@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc.messages import (
     NEVER_NS,
+    SENSORS_MAX,
     TOUCH_NAME_MAX,
     Cause,
     Command,
@@ -91,7 +92,7 @@ _BODIES = {
     Kind.ACCEPT: struct.Struct("<16s16s16sx"),
     Kind.CHALLENGE: struct.Struct("<13s36x"),  # as long as the hello that answers it
     Kind.BUSY: struct.Struct("<16sx"),
-    Kind.TELEMETRY: struct.Struct("<q3d4d3d3ddqqqIdIQHBB"),
+    Kind.TELEMETRY: struct.Struct("<q3d4d3d3dqqqIdIQHBB"),
     Kind.COMMAND: struct.Struct("<qqq3dd"),
     Kind.OPERATOR: struct.Struct("<IBBQHq"),
     Kind.ALIVE: struct.Struct(""),
@@ -106,18 +107,23 @@ SIZES = {int(kind): HEADER_SIZE + size + TAG_SIZE for kind, size in BODY_SIZES.i
 _GUARD_STATES, _CAUSES = tuple(GuardState), tuple(Cause)
 _new = tuple.__new__  # makes a named tuple four times as fast as its class does
 _PLANNED, _VELOCITY = struct.Struct("<q"), struct.Struct("<3f")
+_SENSORS = tuple(struct.Struct(f"<{n}d") for n in range(SENSORS_MAX + 1))
 COMMAND_SIZES = tuple(
     SIZES[Kind.COMMAND] + (_PLANNED.size + n * _VELOCITY.size if n else 0)
     for n in range(PLAN_MAX + 1)
 )
 """Number of velocities in a command's plan -> size of the datagram [bytes]."""
+TELEMETRY_SIZES = tuple(SIZES[Kind.TELEMETRY] + each.size for each in _SENSORS)
+"""Number of the robot's own sensors -> size of a datagram of telemetry [bytes]."""
 _sizes_of: dict[int, Container[int]] = {
     **{kind: (size,) for kind, size in SIZES.items()},
+    int(Kind.TELEMETRY): frozenset(TELEMETRY_SIZES),
     int(Kind.COMMAND): frozenset(COMMAND_SIZES),
     int(Kind.OPERATOR): range(SIZES[Kind.OPERATOR], SIZES[Kind.OPERATOR] + TOUCH_NAME_MAX + 1),
 }
 """Kind -> valid sizes of its datagrams [bytes]."""
-_COMMAND_KIND = int(Kind.COMMAND)  # looking up a member of an enum is slow
+# Looking up a member of an enum is slow.
+_COMMAND_KIND, _TELEMETRY_KIND = int(Kind.COMMAND), int(Kind.TELEMETRY)
 _unpack_header: Callable[[bytes], Header] = _HEADER.unpack_from
 
 
@@ -126,7 +132,9 @@ def datagram_size(data: Datagram) -> int:
     if type(data) is not Passed:
         return len(data)
     kind, _, _, message = data
-    return COMMAND_SIZES[len(message.plan)] if kind == _COMMAND_KIND else SIZES[kind]
+    if kind == _COMMAND_KIND:
+        return COMMAND_SIZES[len(message.plan)]
+    return TELEMETRY_SIZES[len(message.sensors)] if kind == _TELEMETRY_KIND else SIZES[kind]
 
 
 def encode_header(kind: int, direction: int, epoch: int, counter: int) -> bytes:
@@ -172,14 +180,14 @@ def encode_telemetry(telemetry: Telemetry) -> bytes:
     """Encode the body of a TELEMETRY datagram."""
     # fmt: off
     (
-        stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, guard, obstacles, touch,
+        stamp_ns, odometry, sensors, echo_ns, hold_ns, slip_ns, mission, guard, obstacles, touch,
         mission_id, reached, cause,
     ) = telemetry
     _, (px, py, pz), (qw, qx, qy, qz), (vx, vy, vz), (rx, ry, rz) = odometry
     return _TELEMETRY.pack(
-        stamp_ns, px, py, pz, qw, qx, qy, qz, vx, vy, vz, rx, ry, rz, force, echo_ns, hold_ns,
-        slip_ns, mission, touch, obstacles, mission_id, reached, guard, cause,
-    )
+        stamp_ns, px, py, pz, qw, qx, qy, qz, vx, vy, vz, rx, ry, rz, echo_ns, hold_ns, slip_ns,
+        mission, touch, obstacles, mission_id, reached, guard, cause,
+    ) + _SENSORS[len(sensors)].pack(*sensors)
     # fmt: on
 
 
@@ -187,16 +195,17 @@ def decode_telemetry(body: bytes) -> Telemetry:
     """Decode the body of a TELEMETRY datagram; its floats may have any value, even NaN."""
     # fmt: off
     (
-        stamp_ns, px, py, pz, qw, qx, qy, qz, vx, vy, vz, rx, ry, rz, force, echo_ns, hold_ns,
-        slip_ns, mission, touch, obstacles, mission_id, reached, guard, cause,
-    ) = _TELEMETRY.unpack(body)
+        stamp_ns, px, py, pz, qw, qx, qy, qz, vx, vy, vz, rx, ry, rz, echo_ns, hold_ns, slip_ns,
+        mission, touch, obstacles, mission_id, reached, guard, cause,
+    ) = _TELEMETRY.unpack_from(body)
+    sensors = _SENSORS[(len(body) - _TELEMETRY.size) // 8].unpack_from(body, _TELEMETRY.size)
     if guard >= len(_GUARD_STATES) or cause >= len(_CAUSES):
         raise DecodeError("malformed")
     odometry = _new(
         Odometry, (stamp_ns, (px, py, pz), (qw, qx, qy, qz), (vx, vy, vz), (rx, ry, rz))
     )
     return _new(Telemetry, (
-        stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, _GUARD_STATES[guard],
+        stamp_ns, odometry, sensors, echo_ns, hold_ns, slip_ns, mission, _GUARD_STATES[guard],
         obstacles, touch, mission_id, reached, _CAUSES[cause],
     ))
     # fmt: on

@@ -32,8 +32,10 @@ from cloudrc.records import (
     Arrival,
     CommandApplied,
     Contact,
+    ContactForce,
     Counted,
     GroundTruth,
+    SensorRead,
     SessionOpened,
     TelemetrySent,
 )
@@ -74,7 +76,7 @@ class WorldEndpoint(TunnelEnd):
         odometry_period_ns: int = ODOMETRY_PERIOD_NS,
         start_ns: int = 0,
     ) -> None:
-        """Connect a robot with stopped rotors to the tunnel; there is no session yet.
+        """Connect a robot that is switched off to the tunnel; there is no session yet.
 
         With `newest_wins`, a command that arrives after a newer command is dropped.
         `odometry_period_ns` is the time between two odometry samples [ns], a multiple of the step.
@@ -191,10 +193,12 @@ class WorldEndpoint(TunnelEnd):
     def _sample(self, now_ns: int) -> None:
         """Record the true state and new guard changes and contacts; send telemetry if it is due."""
         simulator, guard, records = self.robot.simulator, self.robot.guard, self._records
-        tip_force = simulator.tip_force()
-        truth = simulator.truth(now_ns)
-        forces = (tip_force, *simulator.take_tip_force())
-        records.append(_new(GroundTruth, (now_ns, truth, *forces, guard.reference)))
+        truth, shown = simulator.truth(now_ns), simulator.read_sensors()
+        records.append(_new(GroundTruth, (now_ns, truth, guard.reference)))
+        if (force := simulator.take_contact_force()) is not None:
+            records.append(_new(ContactForce, (now_ns, *force)))
+        for (name, unit, _), value in zip(simulator.sensors, shown, strict=True):
+            records.append(_new(SensorRead, (now_ns, name, unit, value)))
         if (failure := self.robot.failure) is not None:
             text = f"{failure}; the guard stopped the robot; fix the file"
             self._tell("onboard_failed", text, failure.stamp_ns, failure.trace)
@@ -212,7 +216,7 @@ class WorldEndpoint(TunnelEnd):
             known = (
                 now_ns,
                 self._sensors.measure(truth),
-                tip_force,
+                shown,
                 self._echo_stamp_ns,
                 now_ns - self._applied_ns if self._applied_ns >= 0 else 0,
                 self._slip_ns,
@@ -268,8 +272,8 @@ class WorldEndpoint(TunnelEnd):
     def _note_touch(self, touch: Contact) -> None:
         if is_obstacle(touch.body, touch=self._touch):
             self._obstacles += 1
-        if touch.body == self._touch and touch.tip and isnan(self._touch_speed):
-            self._touch_speed = hypot(*touch.tip_velocity)
+        if touch.body == self._touch and touch.by_probe and isnan(self._touch_speed):
+            self._touch_speed = hypot(*touch.touch_velocity)
 
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
         """Carry out an operator request; ignore repeated and old requests.

@@ -6,6 +6,7 @@ quarter of the time of a numpy slice assignment.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import dist
 from struct import Struct
 from typing import Any
@@ -18,6 +19,7 @@ from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import ZERO, Odometry, Vector
 from cloudrc.records import Contact
 from cloudrc.world.onboard import Actuators, Commands, Inputs
+from cloudrc.world.own_sensors import OwnSensor, find_force
 from cloudrc.world.plant import Wind
 from cloudrc.world.readings import Readings
 from cloudrc.world.scene import ROBOT_PREFIX, bodies_of_geoms
@@ -44,8 +46,9 @@ class Simulator:
         dt: Duration of a step [s].
         steps: Number of steps since the last reset.
         contacts: Number of contacts in the last step.
-        tip_force_peak: Largest force on the arm's tip since the last call of `take_tip_force` [N].
-        tip_impulse: Integral over time of the force on the tip since that call [N s].
+        sensors: The robot's own sensors, those of its `robot.yaml`.
+        force_peak: Largest force on the probe since the last call of `take_contact_force` [N].
+        impulse: Integral over time of the force on the probe since that call [N s].
         touches: Contacts that began since the last call of `take_contacts`.
         actuators: Physics of the robot's actuators.
         tape: Inputs of every step since the last reset, for `replay`; None unless a caller sets
@@ -58,10 +61,12 @@ class Simulator:
         actuators: Actuators,
         wind: Wind | None = None,
         probe: str | None = None,
+        sensors: Sequence[OwnSensor] = (),
     ) -> None:
         """Put the robot of a compiled `MjModel` at its spawn; without `wind` the air is at rest.
 
         `probe` is the name of the site with which the robot touches; None: any part touches.
+        `sensors` are the robot's own sensors.
 
         Raises:
             BadInputError: If the model has no such site.
@@ -77,14 +82,16 @@ class Simulator:
 
         self._qpos, self._qvel = memoryview(data.qpos), memoryview(data.qvel)
         self._ctrl, self._applied = memoryview(data.ctrl), memoryview(data.qfrc_applied)
-        self._sensors: memoryview[float] = memoryview(data.sensordata)
-        self._tip = -1 if probe is None else find_site(model, probe)
-        self._tip_sensor = _force_sensor(model, self._tip)
-        self._tip_offset: Vector = ZERO
-        self._tip_radius = -1.0
-        if self._tip >= 0:
-            self._tip_offset = tuple(model.site_pos[self._tip].tolist())
-            self._tip_radius = float(model.site_size[self._tip, 0])
+        self._sensordata: memoryview[float] = memoryview(data.sensordata)
+        self.sensors = tuple(sensors)
+        self._addresses = [each.address for each in sensors]
+        self._probe = -1 if probe is None else find_site(model, probe)
+        self._force_address = find_force(model, self._probe)
+        self._probe_offset: Vector = ZERO
+        self._probe_radius = -1.0
+        if self._probe >= 0:
+            self._probe_offset = tuple(model.site_pos[self._probe].tolist())
+            self._probe_radius = float(model.site_size[self._probe, 0])
         self._bodies = bodies_of_geoms(model)
         self._gap_steps = round(TOUCH_GAP / self.dt)
         self.reset()
@@ -95,12 +102,12 @@ class Simulator:
         mujoco.mj_forward(self.model, self.data)
         self.actuators.reset()
         self.steps = self.contacts = 0
-        self.tip_force_peak = self.tip_impulse = 0.0
+        self.force_peak = self.impulse = 0.0
         if self.tape is not None:
             self.tape.clear()
         self.touches: list[Contact] = []
         # The robot stands on the floor: only after a flight is the next contact a new contact.
-        self._last_touch: dict[tuple[str, bool], int] = {("floor", self._tip < 0): 0}
+        self._last_touch: dict[tuple[str, bool], int] = {("floor", self._probe < 0): 0}
         self._readings: Readings | None = None
 
     def step(self, commands: Commands) -> None:
@@ -127,20 +134,20 @@ class Simulator:
     def take_over(
         self,
         speeds: Commands,
-        tip_force_peak: float,
-        tip_impulse: float,
+        force_peak: float,
+        impulse: float,
         contacts: int,
         steps: int,
         before: Readings | None,
     ) -> None:
         """Take over the state after steps that other code has run on `data`.
 
-        `speeds` are those of the actuators. `tip_force_peak` [N],
-        `tip_impulse` [N s], `contacts` and `steps` are the new values of the attributes. If
-        `before`, the readings before the last step, is given, store the contacts of that step.
+        `speeds` are those of the actuators. `force_peak` [N], `impulse` [N s],
+        `contacts` and `steps` are the new values of the attributes. If `before`, the readings
+        before the last step, is given, store the contacts of that step.
         """
         self.actuators.speeds, self._readings = speeds, None
-        self.tip_force_peak, self.tip_impulse = tip_force_peak, tip_impulse
+        self.force_peak, self.impulse = force_peak, impulse
         self.contacts, self.steps = contacts, steps
         if before:
             self._note_contacts(before)
@@ -165,14 +172,21 @@ class Simulator:
         """Time since the robot's last contact, or since the last reset [s]."""
         return (self.steps - max(self._last_touch.values())) * self.dt
 
-    def tip_force(self) -> float:
-        """Return the normal force on the arm's tip at the beginning of the last step [N]."""
-        return self._sensors[self._tip_sensor] if self._tip_sensor >= 0 else 0.0
+    def read_sensors(self) -> tuple[float, ...]:
+        """Return what the robot's own sensors show, each in its unit, in the order of `sensors`."""
+        values = self._sensordata
+        return tuple([values[address] for address in self._addresses])
 
-    def take_tip_force(self) -> tuple[float, float]:
-        """Return the tip's peak force [N] and impulse [N s] since the last call; reset both."""
-        found = self.tip_force_peak, self.tip_impulse
-        self.tip_force_peak = self.tip_impulse = 0.0
+    def take_contact_force(self) -> tuple[float, float, float] | None:
+        """Return the normal force on the probe, its peak and its impulse; None without a sensor.
+
+        The force [N] is that at the beginning of the last step. Peak [N] and impulse [N s] are
+        those since the last call of this method, which resets both.
+        """
+        if self._force_address is None:
+            return None
+        found = self._sensordata[self._force_address], self.force_peak, self.impulse
+        self.force_peak = self.impulse = 0.0
         return found
 
     def take_contacts(self) -> list[Contact]:
@@ -195,14 +209,15 @@ class Simulator:
         return physics, self.data.qacc_warmstart.copy()
 
     def _feel(self, contacts: int, before: Readings) -> None:
-        """Update force and impulse on the arm's tip after a step, and store new contacts.
+        """Update force and impulse on the probe after a step, and store new contacts.
 
         `contacts` is the number of contacts in the step; `before` has the readings before the step.
         """
-        force = self.tip_force()
-        self.tip_impulse += force * self.dt
-        if force > self.tip_force_peak:
-            self.tip_force_peak = force
+        if self._force_address is not None:
+            force = self._sensordata[self._force_address]
+            self.impulse += force * self.dt
+            if force > self.force_peak:
+                self.force_peak = force
         # Check at once if the number of contacts has changed, else only every few steps.
         if contacts and (contacts != self.contacts or self.steps % CONTACT_CHECK_STEPS == 0):
             self._note_contacts(before)
@@ -211,7 +226,7 @@ class Simulator:
     def _note_contacts(self, before: Readings) -> None:
         """Store the new contacts, with the robot's motion `before` the step of the simulation."""
         contact = self.data.contact
-        tip = self.data.site_xpos[self._tip].tolist() if self._tip >= 0 else ZERO
+        probe = self.data.site_xpos[self._probe].tolist() if self._probe >= 0 else ZERO
         pairs, places = contact.geom.tolist(), contact.pos.tolist()
         for (first, second), place, is_near in zip(
             pairs, places, contact.exclude.tolist(), strict=True
@@ -219,12 +234,12 @@ class Simulator:
             if is_near:  # not nearer than the `gap` of a geom
                 continue
             body = self._bodies[first] or self._bodies[second]
-            by_tip = self._tip < 0 or dist(place, tip) <= self._tip_radius
-            last = self._last_touch.get((body, by_tip))
+            by_probe = self._probe < 0 or dist(place, probe) <= self._probe_radius
+            last = self._last_touch.get((body, by_probe))
             if last is None or self.steps - last > self._gap_steps:
-                motion = before.position, before.velocity, _velocity_at(before, self._tip_offset)
-                self.touches.append(Contact(0, body, *motion, by_tip))
-            self._last_touch[body, by_tip] = self.steps
+                motion = before.position, before.velocity, _velocity_at(before, self._probe_offset)
+                self.touches.append(Contact(0, body, *motion, by_probe))
+            self._last_touch[body, by_probe] = self.steps
 
 
 def find_site(model: Any, name: str) -> int:
@@ -236,13 +251,6 @@ def find_site(model: Any, name: str) -> int:
         has = ", ".join(filter(None, own)) or "none"
         raise BadInputError(f"probe: {name}: the robot has no such site; its sites: {has}")
     return number
-
-
-def _force_sensor(model: Any, site: int) -> int:
-    """Return where the touch sensor at a site writes; -1 if there is none."""
-    at_site = (model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH) & (model.sensor_objid == site)
-    found = np.flatnonzero(at_site)
-    return int(model.sensor_adr[found[0]]) if len(found) else -1
 
 
 def _velocity_at(readings: Readings, offset: Vector) -> Vector:

@@ -80,7 +80,7 @@ def records(seconds=30.0, track_s=(1.0, None)):
             if stamp_ns == round(at_s * 1e9):
                 yield GuardChange(stamp_ns, state, "")
         truth = Odometry(stamp_ns, ZERO, UPRIGHT, tuple(v), ZERO)
-        yield GroundTruth(stamp_ns, truth, 0.0, 0.0, 0.0, tuple(u))
+        yield GroundTruth(stamp_ns, truth, tuple(u))
 
 
 def test_only_the_flight_under_commands_counts():

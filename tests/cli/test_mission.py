@@ -216,8 +216,16 @@ def test_the_token_file_comes_from_flag_or_environment(api, folder, monkeypatch,
 
 
 SEEN = {"position_m": [1.0, 2.0, 0.7], "rtt_s": 0.09, "guard": "TRACK", "cause": "fresh command"}
-OLD = {**SEEN, "age_s": 3.2, "guard_for_s": None, "next_step": "wait"}
-NEW = {**SEEN, "age_s": 0.02, "guard_for_s": 4.5, "next_step": "the robot flies"}
+BATTERY = {"name": "battery", "value": 11.913, "unit": "V"}
+RANGE = {"name": "range", "value": None, "unit": "m"}
+OLD = {**SEEN, "sensors": [], "age_s": 3.2, "guard_for_s": None, "next_step": "wait"}
+NEW = {
+    **SEEN,
+    "sensors": [BATTERY, RANGE],
+    "age_s": 0.02,
+    "guard_for_s": 4.5,
+    "next_step": "the robot flies",
+}
 
 
 @pytest.mark.parametrize(
@@ -227,7 +235,8 @@ NEW = {**SEEN, "age_s": 0.02, "guard_for_s": 4.5, "next_step": "the robot flies"
                     "last seen 3.2 s ago at (1.00, 2.00, 0.70) m, with the guard in TRACK: "
                     "fresh command", "next: wait"]),
         (NEW, 0.02, ["robot at (1.00, 2.00, 0.70) m, seen 0.02 s ago, round trip 90 ms",
-                     "guard TRACK for 4.5 s: fresh command", "next: the robot flies"]),
+                     "guard TRACK for 4.5 s: fresh command",
+                     "sensors: battery 11.9 V, range ? m", "next: the robot flies"]),
         (None, None, ["no telemetry from the robot yet; is the link up? "
                       "last message from cloud: never"]),
     ],

@@ -75,7 +75,7 @@ def test_a_file_gets_the_first_rate_soon_and_then_one_per_period(monkeypatch):
 def test_events_are_plain_lines_or_wrapped_on_a_terminal():
     file, terminal = io.StringIO(), Terminal()
     odometry = Odometry(0, (-1.0, 2.5, -0.0004), UPRIGHT, ZERO, ZERO)
-    before = Telemetry(0, odometry, 0.0, -1, 0, 0, 0, GuardState.TRACK)
+    before = Telemetry(0, odometry, (), -1, 0, 0, 0, GuardState.TRACK)
     seen = TelemetrySent(1_000_000_000, 1, 1, before._replace(mission_id=7))
     reached = MissionEvent(5_850_000_000, "reached", 1, "waypoint 2 of 7 reached")
     hold = GuardChange(6_000_000_000, GuardState.HOLD, "command age 0.252 s above 0.250 s")

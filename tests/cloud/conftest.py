@@ -15,7 +15,7 @@ THERE = Setpoint((2.0, 2.0, 3.0))
 def telemetry(stamp_ms, echo_ms=None, hold_ms=0):
     odometry = Odometry(stamp_ms * MS, HERE, UPRIGHT, ZERO, ZERO)
     echo_ns = NEVER_NS if echo_ms is None else echo_ms * MS
-    return Telemetry(stamp_ms * MS, odometry, 0.0, echo_ns, hold_ms * MS, 0, 1, GuardState.TRACK)
+    return Telemetry(stamp_ms * MS, odometry, (), echo_ns, hold_ms * MS, 0, 1, GuardState.TRACK)
 
 
 def loop(estimator=None, predictor=None, controller=None, heard_ms=None, echo_ms=None, **limits):

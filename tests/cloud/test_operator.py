@@ -45,6 +45,7 @@ def test_a_status_has_the_values_of_its_telemetry():
         "guard": ESTOP,
         "obstacle_contacts": 8,
         "touch_speed": 0.9,
+        "sensors": (11.9,),
     }
     values |= {"mission_id": 10, "reached": 11, "cause": Cause.STOPPED}
     telemetry = told(0.1, velocity=(1.0, 2.0, 3.0), **values, echo_hold_ns=7).telemetry

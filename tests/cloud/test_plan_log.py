@@ -22,7 +22,7 @@ def log():
 
 def told(at_ms, echo_ms, guard=GuardState.TRACK):
     odometry = Odometry(round(at_ms * MS), ZERO, UPRIGHT, ZERO, ZERO)
-    return Telemetry(odometry.stamp_ns, odometry, 0.0, echo_ms * MS, 0, 0, 1, guard)
+    return Telemetry(odometry.stamp_ns, odometry, (), echo_ms * MS, 0, 0, 1, guard)
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,9 @@ def test_limits_and_hull_are_read_and_have_defaults(read):
     assert (robot.guard.braking_mps2, robot.guard.speed_max_mps, robot.hull) == (2.0, 1.5, 0.35)
 
 
+SEVENTEEN = f"sensors: {{{', '.join(f'a{n}: {{unit: m, sensor: a}}' for n in range(17))}}}"
+
+
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
@@ -62,6 +65,17 @@ def test_limits_and_hull_are_read_and_have_defaults(read):
         ("hull_m: 350", "hull_m: 350: must be a number > 0 and <= 10"),
         ("probe: ''", "probe: '': must be"),
         ("probe: 3", "probe: 3: must be text"),
+        ("sensors: [range]", "sensors: ['range']: must be a mapping of keys"),
+        ("sensors: {range: m}", "sensors.range: 'm': must be a mapping of keys"),
+        ("sensors: {range: {sensor: a}}", "sensors.range.unit: is missing; must be text"),
+        (
+            "sensors: {range: {unit: m, sensor: a, scale: 2}}",
+            "sensors.range.scale: unknown key; known here: unit, sensor",
+        ),
+        ("sensors: {unit: {unit: 3, sensor: a}}", "sensors.unit.unit: 3: must be text"),
+        ("sensors: {a: {unit: '', sensor: a}}", "sensors.a.unit: must be text of 1 to 16"),
+        ("sensors: {My range: {unit: m, sensor: a}}", "sensors.My range: a name has small letters"),
+        (SEVENTEEN, "sensors: must have at most 16 entries"),
         ("hull: 0.3", "hull: unknown key; did you mean hull_m [m]?"),
     ],
 )

@@ -19,6 +19,7 @@ from cloudrc.records import (
     Lateness,
     LinkChecked,
     MissionEvent,
+    SensorRead,
     SessionOpened,
     TelemetrySent,
 )
@@ -32,7 +33,7 @@ def told(at, position=(0.0, 0.0, 1.0), velocity=ZERO, **fields):
     """Make the record of telemetry of `at` [s]."""
     odometry = Odometry(round(at * 1e9), position, UPRIGHT, velocity, ZERO)
     whole = {"echo_stamp_ns": -1, "echo_hold_ns": 0, "slip_ns": 0, "mission": 0, "touch_speed": 0.0}
-    whole |= {"stamp_ns": odometry.stamp_ns, "odometry": odometry, "tip_force": 0.0}
+    whole |= {"stamp_ns": odometry.stamp_ns, "odometry": odometry, "sensors": ()}
     telemetry = Telemetry(**{**whole, "guard": GuardState.TRACK, **fields})
     return TelemetrySent(telemetry.stamp_ns, 0, 0, telemetry)
 
@@ -131,8 +132,17 @@ def test_guard_and_contacts_are_counted():
     assert value(live, "cloudrc_guard_state") == GuardState.LAND
     for state in ("hold", "land"):  # a touch-down repeats LAND
         assert value(live, "cloudrc_guard_transitions_total", state) == 1
-    found = {body: value(live, "cloudrc_contacts_total", body) for body in table.BODIES}
-    assert found == {"board": 1, "obstacle": 3, "floor": 0}
+    assert live.read()["cloudrc_contacts_total"] == {(body,): 1 for body in bodies}
+    live.see([Contact(0, "chair", ZERO, ZERO, ZERO, True)])
+    assert value(live, "cloudrc_contacts_total", "chair") == 2
+
+
+def test_each_own_sensor_of_the_robot_has_a_value_and_a_robot_without_has_none():
+    live = LiveMetrics("world")
+    assert "cloudrc_sensor_value" not in live.read()
+    live.see([SensorRead(0, "battery", "V", 11.9), SensorRead(0, "range", "m", math.nan)])
+    live.see([SensorRead(1, "battery", "V", 11.8)])
+    assert live.read()["cloudrc_sensor_value"] == {("battery", "V"): 11.8}
 
 
 def test_changes_of_the_guard_are_counted_by_cause():

@@ -7,7 +7,6 @@ import pytest
 
 from cloudrc.exposition import table
 from cloudrc.exposition.table import METRICS, MetricKind
-from cloudrc.geometry.scene import FLOOR
 from cloudrc.teleop.wire import QUEUED, STATES
 from tools.docs import OPEN
 
@@ -27,9 +26,8 @@ def test_a_metric_keeps_the_rules(metric):
     assert not metric.labels.keys() & reserved, "promtool refuses them"
 
 
-def test_states_and_bodies_are_those_of_the_robot():
+def test_states_are_those_of_missions():
     assert {"idle", *STATES.values()} == {QUEUED, *table.MISSION_STATES}
-    assert {FLOOR, "board"} < set(table.BODIES)
 
 
 def test_every_count_of_the_ends_is_a_metric():

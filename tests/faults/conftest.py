@@ -51,9 +51,9 @@ class FakeRobot:
             command = Command(0, basis_ns, 0, ZERO, 0.0, (ZERO,) * plan, basis_ns)
             self.observer.see_command(command, rejection, self.now_ns)
 
-    def touch(self, body, *, tip=False):
+    def touch(self, body, *, by_probe=False):
         """Let a contact begin in the next step."""
-        self.simulator.touches.append(Contact(0, body, self.position, ZERO, ZERO, tip))
+        self.simulator.touches.append(Contact(0, body, self.position, ZERO, ZERO, by_probe))
 
     def put(self, velocity=ZERO, touch_age=float("inf")):
         """Let the robot move [m/s], and have touched something some time ago [s]."""

@@ -169,9 +169,9 @@ ENDING = (IMPOSSIBLE, step(LAND), *RELEASE)
 @pytest.mark.parametrize(
     ("kinds", "story"),
     [
-        (set(), (touch("board", tip=True), step(TRACK))),
+        (set(), (touch("board", by_probe=True), step(TRACK))),
         ({"collision"}, (touch("board"), step(TRACK))),
-        ({"collision"}, (touch("pipe_1", tip=True), step(TRACK))),
+        ({"collision"}, (touch("pipe_1", by_probe=True), step(TRACK))),
         ({"collision"}, (touch("pipe_1"), step(GROUND))),
         # A robot that comes down may touch what is below, until it flies again.
         (set(), (IMPOSSIBLE, touch("pipe_3"), step(LAND), touch("floor"), step(LAND))),

@@ -39,8 +39,9 @@ def bare_robot():
     guard.configure_mock(command_age_max_ns=250 * MS, counts=Counter(), changes=[], reference=ZERO)
     guard.accept_command.return_value = None
     truth = lambda now_ns: Odometry(now_ns, ZERO, UPRIGHT, ZERO, ZERO)  # noqa: E731
-    simulator = Mock(tip_force=lambda: 0.0, truth=truth, touches=[])
-    simulator.take_tip_force.return_value = (0.0, 0.0)
+    simulator = Mock(truth=truth, touches=[], sensors=())
+    simulator.read_sensors.return_value = ()
+    simulator.take_contact_force.return_value = None
     run = lambda tick_ns, stop_ns: stop_ns  # noqa: E731
     return Mock(guard=guard, simulator=simulator, observers=[], run=run)
 

@@ -112,7 +112,7 @@ def test_what_a_mission_touches_is_no_obstacle(talk, touch, counted, speed):
     ask(talk, 2, Request.END)
     talk.request(3, Request.START, Start.HERE, mission_id=7, touch=touch)
     for body in ("pillar", "board", "floor", "world"):
-        talk.world.robot.simulator.touches.append(Contact(0, body, ZERO, ZERO, ZERO, tip=True))
+        talk.world.robot.simulator.touches.append(Contact(0, body, ZERO, ZERO, ZERO, by_probe=True))
     talk.wait(20)
     telemetry = talk.take(TelemetrySent)[-1].telemetry
     assert telemetry.obstacle_contacts == counted

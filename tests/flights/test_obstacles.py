@@ -74,7 +74,7 @@ def test_the_board_is_an_obstacle_if_the_mission_need_not_touch_it(flown_into, c
     codes = [each.code for each in found.verdict.failures]
     counted = found.flight.during("/telemetry")["obstacle_contacts"][-1]
     assert (codes.count("obstacle_touched"), counted > 0) == (not contact, not contact)
-    assert ("tip_speed" in found.numbers) == contact
+    assert ("touch_speed" in found.numbers) == contact
 
 
 def test_two_bodies_are_told_apart(flown_into):

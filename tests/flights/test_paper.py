@@ -21,7 +21,7 @@ def test_the_paper_flies(profile, seed):
     # 28 s, and 0.1 s for estimates without bias: a longer horizon damps the approach.
     assert n["contact_time"] - n["start_delay"] <= 28.1
     assert n["min_clearance"] >= 0.14
-    assert n["tip_speed"] <= 0.15
+    assert n["touch_speed"] <= 0.15
     assert 0.1 <= n["steady_contact_force"] <= 0.5
     assert n["hold_count"] == 0
     assert n["waypoints_reached"] == 7

@@ -18,6 +18,7 @@ from cloudrc.records import (
     Arrival,
     CommandApplied,
     Contact,
+    ContactForce,
     GroundTruth,
     GuardChange,
     MissionEvent,
@@ -107,14 +108,15 @@ def flown(path=straight):
 
 def _step(log, counter, stamp, path):
     odometry = Odometry(stamp, path((stamp - START) / SECOND), UPRIGHT, (1.0, 0.0, 0.0), ZERO)
-    telemetry = Telemetry(stamp, odometry, 0.0, 0, 0, 0, 1, GuardState.TRACK)
+    telemetry = Telemetry(stamp, odometry, (), 0, 0, 0, 1, GuardState.TRACK)
     arrival, applied = stamp + round(UPLINK * SECOND), stamp + round(DOWNLINK * SECOND)
     basis = stamp - round(UPLINK * SECOND)
     x, y, z = path((applied - START) / SECOND)
     measured = path((basis - START) / SECOND)
     log.world += [
         TelemetrySent(stamp, 2, counter, telemetry),
-        GroundTruth(stamp, odometry, 0.0, 0.0, 0.0, ZERO),
+        GroundTruth(stamp, odometry, ZERO),
+        ContactForce(stamp, 0.0, 0.0, 0.0),
         Arrival(applied, False, 2, counter, DOWNLINK, True),
         CommandApplied(applied, 2, counter, basis, ZERO),
     ]
@@ -132,30 +134,28 @@ def straight_flight():
     return flown().flight()
 
 
-def touch(seconds, body="board", *, tip=True):
-    """Make a contact with the tip at 0.15 m/s."""
-    return Contact(at(seconds), body, straight(seconds), ZERO, (0.12, 0.09, 0.0), tip)
+def touch(seconds, body="board", *, by_probe=True):
+    """Make a contact with the probe at 0.15 m/s."""
+    return Contact(at(seconds), body, straight(seconds), ZERO, (0.12, 0.09, 0.0), by_probe)
 
 
 def good():
-    """Log a flight whose tip touches the board slowly."""
+    """Log a flight whose probe touches the board slowly."""
     log = flown()
     log.world.append(touch(8))
     return log
 
 
 def pressing(log, since, force):
-    """Apply a force to the tip from a time on [s since the start]; the peak is 10 N higher."""
+    """Apply a force to the probe from a time on [s since the start]; the peak is 10 N higher."""
 
-    def press(n, truth):
-        if truth.stamp_ns < at(since):
-            return truth
+    def press(n, row):
+        if row.stamp_ns < at(since):
+            return row
         newton = force(n)
-        return truth._replace(
-            tip_force=newton, tip_force_peak=newton + 10, tip_impulse=newton * PERIOD / SECOND
-        )
+        return ContactForce(row.stamp_ns, newton, newton + 10, newton * PERIOD / SECOND)
 
-    log.change(GroundTruth, press)
+    log.change(ContactForce, press)
 
 
 @cache

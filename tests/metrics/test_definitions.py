@@ -214,7 +214,7 @@ def test_the_error_of_an_estimate_is_equal_live_and_in_the_report():
     log.world.append(GuardChange(flight.start_ns, GuardState.TRACK, ""))
     for each in {r.basis_stamp_ns: r for r in periods}.values():
         known = Odometry(each.basis_stamp_ns, each.measured, UPRIGHT, ZERO, ZERO)
-        log.world.append(GroundTruth(known.stamp_ns, known, 0.0, 0.0, 0.0, ZERO))
+        log.world.append(GroundTruth(known.stamp_ns, known, ZERO))
     live.see(periods)
     found = live.read()
     square = found["cloudrc_estimate_error_square_meters_total"][()]

@@ -55,8 +55,8 @@ OF_RELAYS = {
 def contact():
     log = flown()
     # Contacts of the floor, of a rotor, and later ones are not the tip's first touch.
-    log.world += [touch(6, "floor"), touch(7, tip=False), touch(8), touch(9)]
-    log.world.append(touch(3, "pipe_1", tip=False))
+    log.world += [touch(6, "floor"), touch(7, by_probe=False), touch(8), touch(9)]
+    log.world.append(touch(3, "pipe_1", by_probe=False))
     pressing(log, 8, lambda n: 0.1 if n % 2 else 0.3)
     return log.flight(ONE_PIPE, touch="board")
 
@@ -218,14 +218,14 @@ NUMBERS = {
         **dict.fromkeys(("hold_count", "hold_time", "fault_count", "obstacle_contacts"), 0.0),
         **{f"{name}_{way}": 0.0 for name in ("loss", "late") for way in WAYS},
         # No board contact, no pipe, no rest, no real time, no relay.
-        **dict.fromkeys(("contact_time", "tip_speed", "steady_contact_force", "contact_impulse")),
+        **dict.fromkeys(("contact_time", "touch_speed", "steady_contact_force", "contact_impulse")),
         **dict.fromkeys(("peak_contact_force", "min_clearance", "min_clearance_flight")),
         **dict.fromkeys(("steady_error_x", "recorder_dropped")),
         **dict.fromkeys(REAL_TIME | OF_RELAYS | TRAFFIC),
     },
     contact: {
         "contact_time": approx(8.0),
-        "tip_speed": approx(0.15),
+        "touch_speed": approx(0.15),
         "peak_contact_force": 10.3,
         "contact_impulse": approx(0.02, abs=3e-3),  # 0.2 N over 0.1 s
         "steady_contact_force": approx(0.2, abs=3e-3),

@@ -54,7 +54,7 @@ def without_end(log):
 
 
 def met(speed):
-    touched = touch(8)._replace(tip_velocity=(speed, 0.0, 0.0))
+    touched = touch(8)._replace(touch_velocity=(speed, 0.0, 0.0))
     return world(touched, log=flown)
 
 

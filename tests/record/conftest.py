@@ -64,10 +64,12 @@ def world_records(count, start_ns=0):
         position, velocity = (0.01 * n, math.sin(n), 1.0), (1.0, math.cos(n), 0.1)
         turn = (math.cos(n), 0.0, 0.0, math.sin(n))
         odometry = Odometry(now, position, turn, velocity, (0.0, 0.1, 0.2))
-        telemetry = Telemetry(now, odometry, 0.1, now - 5, 7, 0, 1, GuardState.TRACK)
+        telemetry = Telemetry(now, odometry, (0.1,), now - 5, 7, 0, 1, GuardState.TRACK)
         records += [
             rec.TelemetrySent(now, 1, n, telemetry),
-            rec.GroundTruth(now, odometry, 0.2, 0.3, 0.001, velocity),
+            rec.GroundTruth(now, odometry, velocity),
+            rec.ContactForce(now, 0.2, 0.3, 0.001),
+            rec.SensorRead(now, "battery", "V", 11.9),
         ]
         if n >= 3:
             records += [

@@ -10,6 +10,7 @@ from cloudrc.runs.grid import read_grid
 from tests.robots.conftest import CONTROLLER
 
 HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
+SENSORS = "sensors: {contact_force: {unit: N, sensor: tip}}"
 CLIMBS = """
 from cloudrc.robots.pelican.onboard import actuators, build as published
 
@@ -22,7 +23,7 @@ def build(model, climb_mps: float = 0.0):
 
 
 def test_a_folder_with_the_same_files_flies_the_same_flight(own_robot):
-    mine = own_robot(f"onboard: {CONTROLLER}")
+    mine = own_robot(f"onboard: {CONTROLLER}\nprobe: tip\n{SENSORS}")
     flights = [cloudrc.fly("hover", HOVER | {"world.robot": r}) for r in ("pelican", str(mine))]
     assert flights[0].verdict == "success"
     assert flights[0].records_sha256 == flights[1].records_sha256

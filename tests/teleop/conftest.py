@@ -37,6 +37,7 @@ PELICAN = hull_of("pelican")
 A, B, C = (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (3.0, 0.0, 1.0)
 AWAY = (0.0, -5.0, 1.0)
 ID = 7
+UNITS = {"battery": "V", "range": "m"}
 THREE = Plan((Leg(A, dwell=0.0), Leg(B, dwell=0.0), Leg(C, dwell=0.0)), Start.HERE)
 FROM_SPAWN = Plan(THREE.legs)
 PLAN = Plan((Leg(A, yaw=0.3), Leg(B, tolerance=0.2, dwell=0.0), Leg(C)))
@@ -52,6 +53,7 @@ class Flight:
         self.onboard = (0, 0)  # mission's number and waypoints reached, as world keeps them
         self.guard, self.cause = GuardState.GROUND, Cause.SPAWN
         self.obstacle_contacts, self.touch_speed, self.slip_ns = 0, float("nan"), 0
+        self.sensors = ()
         self.uplink = self.downlink = True
         self.first_shown_ns = {}  # number of a request -> when telemetry first showed it
         self.said, self.said_at = [], []
@@ -78,6 +80,7 @@ class Flight:
             *(self.epoch, self.position, self.guard, self.mission, self.world),
             *(self.obstacle_contacts, self.touch_speed, self.slip_ns),
             mission_id=self.onboard[0], reached=self.onboard[1], cause=self.cause,
+            sensors=self.sensors,
         )  # fmt: skip
 
     def see(self):
@@ -207,7 +210,7 @@ class ServiceFlight(Flight):
     def restart_teleop(self):
         """Start a new service with the missions on the disk."""
         self.killed_before = self.killed_after = None  # number of a commit
-        self.teleop = MissionService(self.stored(), FENCE, self.scene, PELICAN)
+        self.teleop = MissionService(self.stored(), FENCE, self.scene, PELICAN, UNITS)
 
     def stored(self):
         """Return the store that a new process reads from the disk."""

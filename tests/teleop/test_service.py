@@ -339,7 +339,7 @@ def test_what_the_robot_touched_decides(seen, codes, exit_code, restarted):
             codes, exit_code = [], 0
     vars(flight).update(seen)
     flight.step(seconds=0.05)
-    assert ("board_touched" in flight.names(mission_id)) == ("touch_speed" in seen)
+    assert ("touched" in flight.names(mission_id)) == ("touch_speed" in seen)
     play(flight, "A B C")
     verdict = flight.view(mission_id)["verdict"]
     assert verdict["exit_code"] == exit_code
@@ -420,6 +420,16 @@ def test_the_state_has_its_cause_and_its_duration():
 )
 def test_what_comes_next_follows_from_the_guard_and_the_mission(guard, mission, said):
     assert said in next_step(guard, 0.0, 0.0, mission)
+
+
+@pytest.mark.parametrize("values", [(11.9, nan), (11.9,), ()])
+def test_the_state_names_the_sensors_and_says_nothing_about_those_of_another_robot(values):
+    flight = ServiceFlight()
+    flight.sensors = values
+    flight.step()
+    known = [("battery", 11.9, "V"), ("range", None, "m")] if len(values) == 2 else []
+    names = "name", "value", "unit"
+    assert shown(flight)["sensors"] == [dict(zip(names, each, strict=True)) for each in known]
 
 
 def test_a_silent_robot_is_told_from_a_silent_cloud():

@@ -1,6 +1,7 @@
 """Datagrams between cloud and teleop: every message comes back as it was, nothing else does."""
 
 import json
+from math import nan
 
 import pytest
 from hypothesis import given, settings
@@ -27,12 +28,19 @@ def test_a_message_comes_back_as_it_was(message):
 @pytest.mark.parametrize("known", [None, control(0.1)])
 def test_a_status_comes_back_from_its_line(known):
     status = RobotStatus(
-        1, (0.0, 0.0, 1.0), GuardState.TRACK, 7, cause=Cause.COMMAND, control=known
+        1,
+        (0.0, 0.0, 1.0),
+        GuardState.TRACK,
+        7,
+        cause=Cause.COMMAND,
+        control=known,
+        sensors=(11.9, nan),
     )
     line = write_line(status)
     assert repr(read_line(line)) == repr(status)
     tree = json.loads(line, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert (tree["touch_speed"], tree["position"]) == (None, [0.0, 0.0, 1.0])
+    assert tree["sensors"] == [11.9, None]
     assert read_line(write_line(None)) is None
 
 

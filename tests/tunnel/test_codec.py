@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from cloudrc.link.verify.probe import PROBE
 from cloudrc.messages import (
+    SENSORS_MAX,
     Cause,
     Command,
     GuardState,
@@ -23,9 +24,10 @@ floats = st.floats(allow_nan=False)
 vectors = st.tuples(floats, floats, floats)
 odometries = st.builds(Odometry, stamps, vectors, st.tuples(*[floats] * 4), vectors, vectors)
 unsigned = {bits: st.integers(0, 2**bits - 1) for bits in (16, 32, 63, 64)}
+sensors = st.lists(floats, max_size=SENSORS_MAX).map(tuple)
 telemetries = st.builds(
     Telemetry,
-    *(stamps, odometries, floats, stamps, stamps, stamps, unsigned[32]),
+    *(stamps, odometries, sensors, stamps, stamps, stamps, unsigned[32]),
     *(st.sampled_from(GuardState), unsigned[32], floats, unsigned[64], unsigned[16]),
     st.sampled_from(Cause),
 ).map(lambda t: t._replace(odometry=t.odometry._replace(stamp_ns=t.stamp_ns)))
@@ -96,6 +98,7 @@ def test_every_wrong_length_direction_and_version_is_refused(kind):
     longer = {
         Kind.COMMAND: {len(whole) + 8 + 12 * n for n in range(1, 81)},
         Kind.OPERATOR: {len(whole) + n for n in range(1, 65)},
+        Kind.TELEMETRY: {len(whole) + 8 * n for n in range(1, 17)},
     }.get(kind, set())
     assert max(longer, default=0) <= codec.DATAGRAM_MAX <= 1200
     for length in {*range(1300), 2048} - longer - {len(whole)}:

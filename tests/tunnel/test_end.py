@@ -13,7 +13,7 @@ from tests.flights.conftest import CLOCK, ring
 COMMAND = Command(1, 2, 3, (0.5, -0.5, 0.25), 0.0)
 PLANNED = COMMAND._replace(plan=((1.0, 0.0, 0.5), ZERO), planned_ns=7)
 TELEMETRY = Telemetry(
-    5, Odometry(5, ZERO, UPRIGHT, ZERO, ZERO), 0.0, 1, 2, 0, 0, GuardState.TRACK, touch_speed=0.0
+    5, Odometry(5, ZERO, UPRIGHT, ZERO, ZERO), (0.5,), 1, 2, 0, 0, GuardState.TRACK, touch_speed=0.0
 )
 
 

@@ -58,7 +58,7 @@ def test_a_changed_robot_touches_what_the_model_touches(scene_at):
     for robot in robots:
         for _ in range(400):
             robot.step((0.0,) * 4)
-    first, second = ([(touch.body, touch.tip) for touch in one.touches] for one in robots)
+    first, second = ([(touch.body, touch.by_probe) for touch in one.touches] for one in robots)
     assert first[0] == second[0] == ("pipe_1", False)
     assert robots[1].readings.position[2] > 0.2, "it lies in the pipe"
 

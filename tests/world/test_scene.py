@@ -67,7 +67,7 @@ def test_staves_are_tangent_to_the_pipe(pipes, pipe):
 def test_what_the_robot_touches(scene_at, place, touched):
     simulator = simulate("pelican", scene_at(*place))
     simulator.step(STOPPED)
-    assert {(touch.body, touch.tip) for touch in simulator.take_contacts()} == touched
+    assert {(touch.body, touch.by_probe) for touch in simulator.take_contacts()} == touched
 
 
 BODIES = """

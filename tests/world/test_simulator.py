@@ -67,7 +67,7 @@ def test_it_stands_at_its_spawn_and_falls_from_the_air(scene_at):
     assert simulator.readings.position == pytest.approx((0, 0, 0.1), abs=1e-3)
     assert simulator.take_contacts() == []
     assert falling.readings.velocity[2] == pytest.approx(-9.8066 * 0.2, rel=1e-4)
-    assert falling.tip_force() == 0.0
+    assert falling.take_contact_force() == (0.0, 0.0, 0.0)
 
 
 def test_a_velocity_is_followed(scene_at):
@@ -95,7 +95,7 @@ def test_the_tape_replays_to_the_same_bits_through_contact(scene_at, before):
     # The tape starts before the tip touches the board, or while it presses on it.
     simulator, low_level = simulate("pelican", scene_at(8.0, -6.42, 0.9)), LowLevel()
     fly(simulator, low_level, (0.2, 0.0, 0.0), before)
-    assert (simulator.tip_force() > 0.0) == (before > 1.0)
+    assert (simulator.take_contact_force()[0] > 0.0) == (before > 1.0)
     start, simulator.tape = simulator.state(), []
     touches = fly(simulator, low_level, (0.2, 0.05, 0.0), 2.0)
     assert [touch.body for touch in touches] == ["board"] * (before < 1.0)
@@ -121,28 +121,30 @@ def at_the_board(scene_at):
 def test_the_tip_touches_the_board_and_again_after_0_1_s_without(at_the_board):
     simulator, low_level = at_the_board
     (touch,) = fly(simulator, low_level, (0.2, 0.0, 0.0), 2.0)
-    assert (touch.body, touch.tip) == ("board", True)
+    assert (touch.body, touch.by_probe) == ("board", True)
     # A level robot would be at 8.135; nose down by 2 deg, the tip is 6 mm farther ahead.
     assert touch.position[0] == pytest.approx(8.132, abs=0.005)
     assert 0.05 < touch.velocity[0] < 0.25
-    assert touch.tip_velocity[0] == pytest.approx(touch.velocity[0], abs=0.03)
+    assert touch.touch_velocity[0] == pytest.approx(touch.velocity[0], abs=0.03)
     assert fly(simulator, low_level, (-0.2, 0.0, 0.0), 1.0) == []
-    assert simulator.tip_force() == 0.0
+    assert simulator.take_contact_force()[0] == 0.0
     (again,) = fly(simulator, low_level, (0.2, 0.0, 0.0), 2.0)
-    assert (again.body, again.tip) == ("board", True)
+    assert (again.body, again.by_probe) == ("board", True)
 
 
-def test_peak_force_and_impulse_of_the_tip_include_every_step(at_the_board):
+def test_peak_force_and_impulse_of_the_probe_include_every_step(at_the_board):
     simulator, low_level = at_the_board
-    peaks, every = [], []
+    taken, every = [], []
     for _ in range(100):
         for _ in range(5):
             fly(simulator, low_level, (0.2, 0.0, 0.0), simulator.dt)
-            every.append(simulator.tip_force())
-        peaks.append(simulator.take_tip_force())
-    assert max(peak for peak, _ in peaks) == max(every) > 10.0
-    assert sum(impulse for _, impulse in peaks) == pytest.approx(sum(every) * simulator.dt)
-    assert simulator.take_tip_force() == (0.0, 0.0)
+            every.append(float(simulator.data.sensordata[0]))
+        taken.append(simulator.take_contact_force())
+    force, peak, impulse = zip(*taken, strict=True)
+    assert force == tuple(every[4::5])
+    assert max(peak) == max(every) > 10.0
+    assert sum(impulse) == pytest.approx(sum(every) * simulator.dt)
+    assert simulator.take_contact_force() == (every[-1], 0.0, 0.0)
 
 
 def test_the_floor_is_a_new_contact_only_after_a_flight():
@@ -151,5 +153,5 @@ def test_the_floor_is_a_new_contact_only_after_a_flight():
         simulator.step(STOPPED)
     assert fly(simulator, low_level, (0.0, 0.0, 0.5), 1.0) == []
     landing = fly(simulator, low_level, (0.0, 0.0, -0.5), 2.0)
-    assert [(touch.body, touch.tip) for touch in landing] == [("floor", False)]
+    assert [(touch.body, touch.by_probe) for touch in landing] == [("floor", False)]
     assert landing[0].velocity[2] == pytest.approx(-0.5, abs=0.1)

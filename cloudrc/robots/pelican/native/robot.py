@@ -56,7 +56,8 @@ UNUSED_WITHOUT_CONTACTS = sum(
     int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{part}", 0))  # old versions lack the last two
     for part in ("CONTACT", "CONSTRAINT", "SENSOR", "SPRING", "DAMPER")
 )
-"""Parts of MuJoCo that do nothing while the robot touches nothing."""
+"""Parts of MuJoCo that do nothing while the robot touches nothing: its usual sensor is a touch
+sensor."""
 _CONSTANTS = {
     rotors: "thrust_coefficient torque_ratio drag_coefficient arm height",
     low_level: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
@@ -105,6 +106,9 @@ def make_state(simulator: Simulator, controller: LowLevel, guard: Guard) -> Step
     tip_force = data.sensordata[model.sensor(f"{ROBOT_PREFIX}tip").adr[0] :]
     free_model = copy(model)
     free_model.opt.disableflags |= UNUSED_WITHOUT_CONTACTS
+    touch = model.sensor_adr[model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH]
+    if not {sensor.address for sensor in simulator.sensors} <= {*touch.tolist()}:
+        free_model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
     obstacles, radius = _obstacles(model, data)
     library = _mujoco_library()
     timer = ctypes.addressof(ctypes.c_void_p.in_dll(library, "mjcb_time"))
@@ -280,9 +284,9 @@ class NativeRobot(Robot):
     def _give(self, reference: Vector, wanted: Vector, track_ns: int) -> None:
         """Copy the robot's state and the arguments to the C structure, before steps in C."""
         simulator = self.simulator
-        tip = simulator.tip_force_peak, simulator.tip_impulse
+        force = simulator.force_peak, simulator.impulse
         counts = simulator.contacts, simulator.steps
-        _pack_track(self._flight, _TRACK, *reference, *wanted, track_ns, *tip, *counts)
+        _pack_track(self._flight, _TRACK, *reference, *wanted, track_ns, *force, *counts)
         if not self._in_c:
             integral, error = self._low_level.integral, self._low_level.error
             memory = (*integral, *(error or integral), error is not None)

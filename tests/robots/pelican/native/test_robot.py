@@ -68,7 +68,8 @@ class Pilot(Flight):
         simulator, guard = self.robot.simulator, self.guard
         self.seen += [simulator.readings, simulator.actuators.speeds, simulator.steps]
         self.seen += [guard.state, guard.reference, dict(guard.counts)]
-        self.seen += [simulator.take_tip_force(), simulator.take_contacts()]
+        self.seen += [(simulator.take_contact_force(), simulator.read_sensors())]
+        self.seen += [simulator.take_contacts()]
 
 
 def scaled(seed, scale):
