@@ -16,8 +16,16 @@ from io import BufferedReader, FileIO
 from pathlib import Path
 from typing import IO
 
+from cloudrc.errors import BadInputError
+
 SIZE_MAX = 1 << 20
 """Default size limit of a file that is read [bytes]: the size limit of a ConfigMap."""
+PICTURES = {
+    "png": re.compile(rb"\x89PNG\r\n\x1a\n"),
+    "svg": re.compile(rb"(<\?xml[^>]*>\s*)?<(!DOCTYPE )?svg\b"),
+    "pdf": re.compile(rb"%PDF-"),
+}
+"""Kind of a picture -> how its files begin."""
 _TOKEN = re.compile(rb"[!-~]{16,512}")
 
 
@@ -175,3 +183,21 @@ def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
     """Replace a file in one step, with the permissions `mode` minus umask; may raise an OSError."""
     with atomic_file(path, mode) as file:
         file.write(data)
+
+
+def refuse_other_file(
+    path: Path, own: re.Pattern[bytes], source: Path | None = None, flag: str = "-o"
+) -> None:
+    """Raise a BadInputError if writing to `path` would replace what cloudrc has not written.
+
+    A file may be replaced if it begins as files of this kind do (`own`) and is not its `source`,
+    or if it is empty. Writing to a device or
+    a pipe replaces nothing. `flag` names another file, for the error.
+    """
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        start = file.read(256)
+    is_source = source is not None and path.samefile(source)
+    if is_source or (start and own.match(start) is None):
+        raise BadInputError(f"{path}: already there; name another file with {flag}")

@@ -7,13 +7,12 @@ start Python.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import importlib.util
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from cloudrc.cli.output import STDOUT
-from cloudrc.errors import CloudrcError, MissingPrerequisiteError
+from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.files import naming
 
 EPILOG = """\
@@ -58,8 +57,9 @@ def execute(options: argparse.Namespace) -> int:
 
     from cloudrc.cli.parser import COMMANDS, build_parser
     from cloudrc.config import shipped
+    from cloudrc.runs.catalogue import settings
 
-    keys = list(_settings())
+    keys = list(settings())
     of_link = [key.removeprefix("link.") for key in keys if key.startswith("link.")]
     candidates = {
         "EXPERIMENT": _candidates("experiment", shipped.names("experiment"), files=True),
@@ -78,44 +78,6 @@ def execute(options: argparse.Namespace) -> int:
     if options.shell == "bash":
         print(JOINED)
     return 0
-
-
-def _settings() -> Iterator[str]:
-    """Yield the completions of `--set`: KEY=NAME if the key accepts names, KEY= if it does not."""
-    from cloudrc import plugins
-    from cloudrc.config import problems, shipped
-    from cloudrc.config.overrides import KINDS, parameter_names
-    from cloudrc.config.schema import Experiment
-
-    named = {f"cloud.{key}": plugins.names(kind) for key, kind in KINDS.items()}
-    named |= {"link.profile": shipped.names("profile"), "mission": shipped.names("mission")}
-    named |= {f"world.{kind}": shipped.names(kind) for kind in ("robot", "scene")}
-    keys = {".".join(path) for path, _ in problems.leaves(Experiment) if "0" not in path}
-    for key, kind in KINDS.items():
-        for name in named[f"cloud.{key}"]:
-            keys |= {f"cloud.{key}.{parameter}" for parameter in parameter_names(kind, name)}
-    of_robots, named["world.tuning"] = _of_robots()
-    keys |= of_robots
-    keys |= {key.replace("uplink", "both") for key in keys if key.startswith("link.uplink.")}
-    yield from (f"{key}=" for key in sorted(keys - set(named)) if not key.endswith(".name"))
-    yield from sorted(f"{key}={name}" for key, names in named.items() for name in names)
-
-
-def _of_robots() -> tuple[set[str], list[str]]:
-    """Return the keys of the onboard controllers of shipped robots, and the names of tunings."""
-    from cloudrc.config import shipped
-    from cloudrc.config.overrides import default_parameters
-    from cloudrc.config.robot import find_robot
-
-    keys, tunings = set[str](), set[str]()
-    for robot in map(find_robot, shipped.names("robot")):
-        tunings |= robot.tunings.keys()
-        with contextlib.suppress(
-            CloudrcError
-        ):  # without MuJoCo, some controllers have no signature
-            assert robot.onboard is not None
-            keys |= default_parameters("onboard", robot.onboard.name).keys()
-    return {f"world.onboard.{key}" for key in keys}, sorted(tunings)
 
 
 def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
-from collections.abc import Sequence
 from pathlib import Path
 from secrets import token_hex
 from typing import TYPE_CHECKING, Any
@@ -36,11 +34,6 @@ first browser steers, the others read; every page has STOP. Keys: arrows fly
 along x and y, W and S up and down, while they are held; Space holds; Shift+X
 stops the rotors. No key turns the robot: the published onboard controller holds
 the yaw at 0."""
-LINK_SET = "link set "
-"""Start of a line that a pod's console prints to request a change of the link."""
-OWN_S = 150.0
-"""Time for which the page in a pod shows a requested value of the link [s]. Afterwards the page
-shows the value in the profile's file, which Kubernetes has updated by then."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -121,42 +114,10 @@ def _local(options: argparse.Namespace) -> ConsoleTarget:
 
 
 def _in_pod(options: argparse.Namespace) -> ConsoleTarget:
-    """Return the flight of the pod in which this process runs.
+    from cloudrc.console.in_pod import flight_of_pod
 
-    The pod has no right to change the link. Therefore this process prints the changes that the
-    operator asks for, and `cloudrc console --cluster` carries them out with its user's rights.
-    """
-    from cloudrc.config.load import load_link
-    from cloudrc.console.access import page_token
-    from cloudrc.console.serve import ConsoleTarget
-    from cloudrc.console.steering import LinkControl
-
-    own: dict[str, tuple[float, float]] = {}  # key -> last requested value, and when [s]
-
-    def read() -> dict[str, Any]:
-        link = load_link(options.profile, options.config)
-        tree = link.model_dump(mode="json", exclude_defaults=True)
-        for key, (value, at) in own.items():
-            if time.monotonic() - at < OWN_S:
-                way, _, name = key.partition(".")
-                tree[way] = {**tree.get(way, {}), name: value}
-        return tree
-
-    def change(settings: Sequence[str]) -> None:
-        pairs = (setting.split("=") for setting in settings)
-        own.update({key: (float(value), time.monotonic()) for key, value in pairs})
-        print_line(f"{LINK_SET}{' '.join(settings)}")
-
-    given = given_token(options)
-    operator = given or str
-    note = " requested; only 'cloudrc console --cluster' carries it out"
-    return ConsoleTarget(
-        options.config,
-        Api(options.api, operator),
-        LinkControl(read, change, note),
-        has_ended=lambda: False,
-        token=(lambda: page_token(operator())) if given else None,
-    )
+    token = given_token(options)
+    return flight_of_pod(options.config, options.profile, options.api, token, print_line)
 
 
 def _show_release(options: argparse.Namespace) -> int:
@@ -169,6 +130,7 @@ def _show_release(options: argparse.Namespace) -> int:
     from cloudrc.cluster.link import keep, read_link, send
     from cloudrc.cluster.pods import follow_page, operator_token
     from cloudrc.console.access import PARAMETER, page_token
+    from cloudrc.console.in_pod import LINK_SET
 
     def ready(address: str) -> None:
         given = given_token(options)

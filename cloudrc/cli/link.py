@@ -10,19 +10,15 @@ import argparse
 import importlib
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import release_arguments
-from cloudrc.cli.output import PICTURES, output_argument, print_line, refuse_other_file
+from cloudrc.cli.output import output_argument, print_line
 from cloudrc.cli.parser import add_verbs, settings_from
 from cloudrc.errors import BadInputError
-from cloudrc.files import naming
+from cloudrc.files import PICTURES, naming, refuse_other_file
 from cloudrc.link.verify import DEFAULT
 from cloudrc.runs.requirements import require
 from cloudrc.text import escape
-
-if TYPE_CHECKING:
-    pass
 
 EPILOG = """\
 examples:

@@ -8,12 +8,8 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from cloudrc.cli.output import refuse_other_file
-
-if TYPE_CHECKING:
-    pass
+from cloudrc.files import refuse_other_file
 
 EPILOG = """\
 sources:

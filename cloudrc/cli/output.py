@@ -9,10 +9,9 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from cloudrc.errors import DISK_FULL, BadInputError
+from cloudrc.errors import DISK_FULL
 from cloudrc.files import naming
 from cloudrc.text import escape
 
@@ -26,35 +25,11 @@ TABLE = "table"
 STDOUT = "the output (stdout)"
 """Place of the output in errors."""
 
-PICTURES = {
-    "png": re.compile(rb"\x89PNG\r\n\x1a\n"),
-    "svg": re.compile(rb"(<\?xml[^>]*>\s*)?<(!DOCTYPE )?svg\b"),
-    "pdf": re.compile(rb"%PDF-"),
-}
-"""Kind of a picture -> how its files begin."""
-
 
 def output_argument(parser: argparse.ArgumentParser, what: str = "output format") -> None:
     """Declare the flag `--output`; `what` is its help text."""
     forms, about = (TABLE, "json", "yaml"), f"{what} (default: table)"
     parser.add_argument("-o", "--output", choices=forms, default=TABLE, help=about)
-
-
-def refuse_other_file(
-    path: Path, own: re.Pattern[bytes], source: Path | None = None, flag: str = "-o"
-) -> None:
-    """Raise a BadInputError if writing to `path` would replace what the command has not written.
-
-    A file may be replaced if it begins as the command's own files (`own`) and is not its `source`,
-    or if it is empty. A device or a pipe replaces nothing.
-    """
-    if not path.is_file():
-        return
-    with path.open("rb") as file:
-        start = file.read(256)
-    is_source = source is not None and path.samefile(source)
-    if is_source or (start and own.match(start) is None):
-        raise BadInputError(f"{path}: already there; name another file with {flag}")
 
 
 def format_document(document: object, form: str) -> str:

@@ -6,15 +6,11 @@ import argparse
 import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import output_argument, print_result
 from cloudrc.errors import BadInputError
 from cloudrc.runs.requirements import require
 from cloudrc.text import escape
-
-if TYPE_CHECKING:
-    pass
 
 LOSSY = 1
 """Exit code if the copy lacks data of the recording."""

@@ -6,14 +6,12 @@ import argparse
 from pathlib import Path
 
 from cloudrc.cli.output import (
-    PICTURES,
     output_argument,
     print_result,
-    refuse_other_file,
 )
 from cloudrc.cli.parser import add_verbs
 from cloudrc.errors import BadInputError
-from cloudrc.files import write_atomically
+from cloudrc.files import PICTURES, refuse_other_file, write_atomically
 from cloudrc.runs.requirements import missing, require
 
 VERBS = {"check": "say what a robot is, fly it in virtual time, and say what must change"}

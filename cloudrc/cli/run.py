@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -123,8 +123,18 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
         facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
         flown = "session" if ready else experiment.mission.contents
         print_or_drop(escape(f"{experiment.name}: {facts}, {flown}"))
-    try:
+    with _place_of_recording(folder):
         report = flight(folder)
+    print_traceback(options, report)
+    print_result(options.output, report, summary(report, folder))
+    return 0 if ready else exit_code(report)
+
+
+@contextlib.contextmanager
+def _place_of_recording(folder: Path) -> Iterator[None]:
+    """Say where the recording is if the flight inside the `with` block fails or is interrupted."""
+    try:
+        yield
     except (CloudrcError, KeyboardInterrupt) as error:
         nothing = isinstance(error, NothingFlownError)  # the regular end of a session by a signal
         if isinstance(error, BadInputError) and is_interrupted() and not nothing:
@@ -135,12 +145,6 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
                 text += f"; 'cloudrc report {folder}' writes its report"
             print_line(text, sys.stderr)
         raise error
-    finally:
-        if in_cluster and options.out is None and folder.exists():
-            point_to(folder, "latest")
-    print_traceback(options, report)
-    print_result(options.output, report, summary(report, folder))
-    return 0 if ready else exit_code(report)
 
 
 def _local_flight(
@@ -179,4 +183,11 @@ def _cluster_flight(
     def tell(text: str) -> None:
         print_line(f"  {text}", stream)
 
-    return lambda folder: fly_in_cluster(experiment, folder, release, options.timeout, tell)
+    def flight(folder: Path) -> dict[str, Any]:
+        try:
+            return fly_in_cluster(experiment, folder, release, options.timeout, tell)
+        finally:
+            if options.out is None and folder.exists():
+                point_to(folder, "latest")
+
+    return flight

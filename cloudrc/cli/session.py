@@ -21,7 +21,7 @@ from cloudrc.cli.find_run import run_argument
 from cloudrc.cli.output import print_line
 from cloudrc.cli.processes import CliCommand
 from cloudrc.cli.run import experiment_arguments, fly_once
-from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, NothingFlownError
+from cloudrc.errors import CloudrcError, NothingFlownError
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.text import escape
@@ -128,22 +128,13 @@ def _console(folder: Path, say: Say) -> Iterator[None]:
 
 def _down(options: argparse.Namespace) -> int:
     """End a session, and print the path of its report."""
-    from cloudrc.drivers.local import SESSION, end_session, flight_files
+    from cloudrc.drivers.local import end_session
     from cloudrc.runs.session import last_mission
-    from cloudrc.runs.under_way import ask_if_unclear, short
+    from cloudrc.runs.under_way import find_session, short
 
-    sessions = [run for run, flight in flight_files().items() if flight.kind == SESSION]
-    if options.run is not None:
-        run = options.run.resolve()
-        if run not in sessions:
-            raise BadInputError(f"--run {options.run}: no session runs there")
-    elif not sessions:
-        text = "start one: cloudrc up; a flight of 'cloudrc run' ends by Ctrl-C there"
-        raise MissingPrerequisiteError(f"no session runs here; {text}")
-    else:
-        if note := ask_if_unclear(sessions, steers=True):
-            print_line(f"cloudrc: {note}", sys.stderr)
-        (run,) = sessions
+    run, note = find_session(options.run)
+    if note:
+        print_line(f"cloudrc: {note}", sys.stderr)
     end_session(run, DOWN_LIMIT)
     name = short(run)
     if (run / "report.json").exists():

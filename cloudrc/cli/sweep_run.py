@@ -12,18 +12,16 @@ from pathlib import Path
 from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.mission import TERMINATION_LOG
 from cloudrc.cli.output import (
-    PICTURES,
     print_line,
     print_or_drop,
     print_result,
-    refuse_other_file,
     warn,
 )
 from cloudrc.cli.progress import PlanView, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.cluster.pods import refuse_local_files
 from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, describe_error
-from cloudrc.files import write_atomically
+from cloudrc.files import PICTURES, refuse_other_file, write_atomically
 from cloudrc.metrics.verdict import EXIT_CODES
 from cloudrc.runs import seeds, store, sweep
 from cloudrc.runs.experiment import load, refuse_seed

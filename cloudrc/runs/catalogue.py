@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 
+from cloudrc.errors import CloudrcError
 from cloudrc.text import Paint, plain, table
 
 PLUGINS = ("estimators", "predictors", "controllers", "metrics")
@@ -56,3 +58,50 @@ def as_text(found: Mapping[str, Mapping[str, str]], paint: Paint = plain) -> str
             rows.append(("  ./FILE.py", "Your own: --set report.metrics=./FILE.py"))
         blocks.append(f"{paint(kind, 'bold')}\n{table(rows)}")
     return "\n\n".join(blocks)
+
+
+def settings() -> Iterator[str]:
+    """Yield the beginning of each setting: KEY=NAME if the key takes names, else KEY=."""
+    from cloudrc.config import problems
+    from cloudrc.config.overrides import KINDS as PLUGIN_KINDS
+    from cloudrc.config.overrides import parameter_names
+    from cloudrc.config.schema import Experiment
+
+    named = _named_keys()
+    keys = {".".join(path) for path, _ in problems.leaves(Experiment) if "0" not in path}
+    for key, kind in PLUGIN_KINDS.items():
+        for name in named[f"cloud.{key}"]:
+            keys |= {f"cloud.{key}.{parameter}" for parameter in parameter_names(kind, name)}
+    of_robots, named["world.tuning"] = _of_robots()
+    keys |= of_robots
+    keys |= {key.replace("uplink", "both") for key in keys if key.startswith("link.uplink.")}
+    yield from (f"{key}=" for key in sorted(keys - set(named)) if not key.endswith(".name"))
+    yield from sorted(f"{key}={name}" for key, names in named.items() for name in names)
+
+
+def _named_keys() -> dict[str, Sequence[str]]:
+    """Return the keys whose values are names of something shipped: key -> names."""
+    from cloudrc import plugins
+    from cloudrc.config import shipped
+    from cloudrc.config.overrides import KINDS as PLUGIN_KINDS
+
+    named: dict[str, Sequence[str]] = {
+        f"cloud.{key}": plugins.names(kind) for key, kind in PLUGIN_KINDS.items()
+    }
+    named |= {"link.profile": shipped.names("profile"), "mission": shipped.names("mission")}
+    return named | {f"world.{kind}": shipped.names(kind) for kind in ("robot", "scene")}
+
+
+def _of_robots() -> tuple[set[str], list[str]]:
+    """Return the keys of the onboard controllers of shipped robots, and the names of tunings."""
+    from cloudrc.config import shipped
+    from cloudrc.config.overrides import default_parameters
+    from cloudrc.config.robot import find_robot
+
+    keys, tunings = set[str](), set[str]()
+    for robot in map(find_robot, shipped.names("robot")):
+        tunings |= robot.tunings.keys()
+        with suppress(CloudrcError):  # without MuJoCo, some controllers have no signature
+            assert robot.onboard is not None
+            keys |= default_parameters("onboard", robot.onboard.name).keys()
+    return {f"world.onboard.{key}" for key in keys}, sorted(tunings)

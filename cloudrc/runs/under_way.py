@@ -7,8 +7,8 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
-from cloudrc.drivers.local import LINK_LOG, under_way
-from cloudrc.errors import BadInputError
+from cloudrc.drivers.local import LINK_LOG, SESSION, flight_files, under_way
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.runs.folder import RUNS
 
 
@@ -55,6 +55,27 @@ def find_run(run: Path | None, *, steers: bool = True, flag: str = "--run ") -> 
         return RunInFlight(run, url)
     note = ask_if_unclear(flights, steers=steers, flag=flag)
     return next((RunInFlight(Path(short(run)), url, note) for run, url in flights.items()), None)
+
+
+def find_session(run: Path | None) -> tuple[Path, str]:
+    """Find the session that a user means: the one in the folder `run`, else the only one here.
+
+    Return its folder, and what to tell the user about the choice ("" for nothing).
+
+    Raises:
+        BadInputError: If no session runs in `run`, or if it is unclear which one is meant.
+        MissingPrerequisiteError: If no session runs here.
+    """
+    sessions = [folder for folder, flight in flight_files().items() if flight.kind == SESSION]
+    if run is not None:
+        if run.resolve() not in sessions:
+            raise BadInputError(f"--run {run}: no session runs there")
+        return run.resolve(), ""
+    if not sessions:
+        text = "start one: cloudrc up; a flight of 'cloudrc run' ends by Ctrl-C there"
+        raise MissingPrerequisiteError(f"no session runs here; {text}")
+    note = ask_if_unclear(sessions, steers=True)
+    return sessions[0], note
 
 
 def ask_if_unclear(candidates: Collection[Path], *, steers: bool, flag: str = "--run ") -> str:
