@@ -129,11 +129,19 @@ class ResolvedGuard(GuardConfig):
             )
         return speed_max
 
-    @field_validator("acceleration_max_mps2", mode="before")
+    @field_validator("acceleration_max_mps2", mode="wrap")
     @classmethod
-    def _limit_acceleration(cls, given: Any, info: ValidationInfo) -> Any:
+    def _limit_acceleration(
+        cls, given: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo
+    ) -> float:
         robot = info.context.robot if info.context else DEFAULT_LIMITS
-        return robot.acceleration_max_mps2 if given is None else given
+        most: float = robot.acceleration_max_mps2
+        acceleration: float = most if given is None else check(given)
+        if info.context and acceleration > most + 1e-6:
+            raise ValueError(
+                f"must be at most {most:g} m/s^2, the largest acceleration of the robot"
+            )
+        return acceleration
 
 
 class ResolvedCloud(Cloud):
@@ -468,7 +476,7 @@ def _no_bounds(document: Document) -> Bounds | None:
     )
     if not isinstance(speed, int | float) or not isinstance(acceleration, int | float):
         return None
-    return Bounds(DEFAULT_LIMITS, inf)
+    return Bounds(DEFAULT_LIMITS.model_copy(update={"acceleration_max_mps2": inf}), inf)
 
 
 def _bounds(document: Document, found: list[ConfigProblem]) -> Bounds:

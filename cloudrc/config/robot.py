@@ -209,7 +209,7 @@ def parameters(robot: RobotFiles, world: World) -> dict[str, Any]:
         if world.tuning not in robot.tunings:
             what, known = f"tuning of {world.robot}", sorted(robot.tunings)
             text = unknown_name_text(what, world.tuning, known)
-            raise BadInputError(text if known else f"{text}; leave world.tuning out, or set null")
+            raise BadInputError(f"{text}; leave world.tuning out, or set null, for no tuning")
         tuning = robot.tunings[world.tuning]
     published = {} if robot.onboard is None else robot.onboard.model_extra or {}
     return {**published, **tuning, **(world.onboard.model_extra or {})}

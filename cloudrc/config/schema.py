@@ -420,6 +420,20 @@ class World(Section):
     odometry_rate_hz: Literal[20, 25, 50, 100, 125, 250, 500] = 100
     """Rate of the odometry for cloud [Hz]. The true state is recorded at 100 Hz or more"""
 
+    @field_validator("fence_m", mode="before")
+    @classmethod
+    def _read_corners(cls, given: Any) -> Any:
+        if given is None:
+            return None
+        parts = given if isinstance(given, list | tuple) else []
+        sizes = [len(each) if isinstance(each, list | tuple) else 0 for each in parts]
+        if sizes == [3, 3]:
+            return tuple(map(tuple, parts))
+        example = "[x, y, z], [x, y, z]"
+        if sizes == [0] * 6:
+            example = f"{list(parts[:3])}, {list(parts[3:])}"
+        raise ValueError(f"must be two corners, [{example}], or null [m]")
+
     @field_validator("fence_m")
     @classmethod
     def _check_fence(cls, corners: Corners | None) -> Corners | None:
@@ -451,7 +465,7 @@ class GuardConfig(Section):
     is 250 and plan_max_s is 0"""
     acceleration_max_mps2: Acceleration | None = None
     """Largest acceleration of the velocity that the onboard controller follows [m/s^2]. null: that
-    of the robot, for the Pelican 12"""
+    of the robot, for the Pelican 12; a larger value is refused"""
     yaw_rate_max_radps: Speed = 1.0
     """Cap on the commanded yaw rate [rad/s]; a faster command is shortened"""
     hold_max_s: HoldTime = 60.0

@@ -49,7 +49,7 @@ def read(kind: str, name: str, folder: Path) -> Document:
     Raise a BadInputError if this is not possible.
     """
     if not is_path(name):
-        check_name(kind, name)
+        check_name(kind, name, folder)
         return read_document(FOLDERS[kind] / f"{name}.yaml", f"{name}.yaml")
     path = folder / os.path.expanduser(name)
     if not os.path.exists(path):  # unlike Path.exists, no exception for an invalid name
@@ -60,10 +60,27 @@ def read(kind: str, name: str, folder: Path) -> Document:
     return document
 
 
-def check_name(kind: str, name: str) -> None:
-    """Raise a BadInputError if no shipped file of this kind has that name."""
+def check_name(kind: str, name: str, folder: Path | None = None) -> None:
+    """Raise a BadInputError if no shipped file of this kind has that name.
+
+    The text suggests a file or folder of the user in `folder` with this name, if there is one.
+    """
     if name not in (available := reuse(("names", kind), lambda: names(kind))):
-        raise BadInputError(unknown_name_text(kind, name, available))
+        text = unknown_name_text(kind, name, available)
+        if folder is not None and (own := _own_file(kind, name, folder)):
+            text = f"no shipped {kind} named {name!r}; for your own, give its path: ./{own}"
+        raise BadInputError(text)
+
+
+def _own_file(kind: str, name: str, folder: Path) -> str:
+    """Return the name of a file or folder of this kind in `folder`; "" if there is none."""
+    endings = {"scene": [".xml"], "robot": ["", ".xml"]}.get(kind, [".yaml", ".yml"])
+    for own in [f"{name}{ending}" for ending in endings]:
+        path = folder / own
+        found = path if own != name else path / ROBOT_FILE
+        if os.path.isfile(found):
+            return own
+    return ""
 
 
 def model_path(kind: str, name: str, folder: Path) -> str:
@@ -73,7 +90,7 @@ def model_path(kind: str, name: str, folder: Path) -> str:
     BadInputError if the name or the file does not exist.
     """
     if not (is_path(name) or name.endswith(".xml")):
-        check_name(kind, name)
+        check_name(kind, name, folder)
         return name
     path = Path(os.path.realpath(folder / os.path.expanduser(name)))
     if kind == "robot" and os.path.isdir(path):

@@ -158,6 +158,10 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("world.plant.actuator_factor=x", "actuator_factor: 'x': must be a number >= 0.2"),
         ("world.onboard=3", "world.onboard: 3: must be a mapping of keys"),
         ("world.tuning=slow", "no tuning of pelican named 'slow'; available: fast"),
+        (
+            "world.tuning=none",
+            "available: fast; leave world.tuning out, or set null, for no tuning",
+        ),
         ("world.tuning=3", "world.tuning: 3: must be text or null"),
         ("world.tuning=fast world.robot=x2x", "no robot named 'x2x'"),
         ("cloud.compute_deviation_ms=1", "needs compute_ms"),
@@ -206,3 +210,24 @@ def test_an_invalid_file_of_setpoints_is_one_line(tmp_path, rows, said):
     text = refused("hover", f"mission.setpoints={tmp_path / 'drive.csv'}")
     assert said in text
     assert "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("key", "name", "own"),
+    [
+        ("world.robot", "bot2", "bot2/robot.yaml"),
+        ("world.robot", "bot2", "bot2.xml"),
+        ("world.scene", "hall", "hall.xml"),
+        ("mission", "round", "round.yaml"),
+        ("link.profile", "sea", "sea.yml"),
+    ],
+)
+def test_a_file_of_the_user_without_its_path_is_suggested(tmp_path, monkeypatch, key, name, own):
+    monkeypatch.chdir(tmp_path)
+    assert f"named {name!r}; available: " in refused("paper", f"{key}={name}")
+    (tmp_path / own).parent.mkdir(exist_ok=True)
+    (tmp_path / own).touch()
+    path = own.removesuffix("/robot.yaml")
+    assert f"named {name!r}; for your own, give its path: ./{path}" in refused(
+        "paper", f"{key}={name}"
+    )

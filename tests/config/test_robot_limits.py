@@ -56,6 +56,16 @@ def test_a_speed_above_that_of_the_robot_is_refused_in_one_line():
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(("robot", "most"), [(FLIES, "12"), (DRIVES, "2")])
+def test_an_acceleration_above_that_of_the_robot_is_refused_in_one_line(robot, most):
+    load_experiment("steps", [*robot, f"guard.acceleration_max_mps2={most}"])
+    with pytest.raises(BadInputError) as error:
+        load_experiment("steps", [*robot, f"guard.acceleration_max_mps2={most}.1"])
+    said = f"guard.acceleration_max_mps2: must be at most {most} m/s^2, the largest acceleration"
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
 def test_another_robot_in_a_resolved_experiment_brings_its_own_limits(tmp_path):
     file = tmp_path / "again.yaml"
     file.write_text(dump(load_experiment("pillars")))

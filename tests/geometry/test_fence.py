@@ -105,7 +105,9 @@ def test_a_wrong_fence_of_a_scene_is_one_line(own, numbers, words):
         ("[[3, 3, 2], [-3, -3, 0]]", "fence_m: .*x, y, z must rise"),
         ("[[-3, -3, 0], [3, 3, .5]]", "fence_m: 6 x 6 x 0.5 m: too small"),
         ("[[1, -3, 0], [3, 3, 2]]", "fence_m: .*the spawn.*is outside"),
-        ("lab", "fence_m: 'lab'"),
+        ("lab", r"fence_m: must be two corners, \[\[x, y, z\], \[x, y, z\]\], or null"),
+        ("[-3, -3, 0, 3, 3, 2]", r"must be two corners, \[\[-3, -3, 0\], \[3, 3, 2\]\], or null"),
+        ("[[a, 0, 0], [1, 1, 1]]", "fence_m.0.0: 'a': must be a number"),
     ],
 )
 def test_a_wrong_world_fence_m_is_named(corners, words):
