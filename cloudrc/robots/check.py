@@ -6,20 +6,22 @@ velocity, and brakes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from math import dist, hypot
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.problems import ProblemsError
 from cloudrc.config.robot import RobotFiles, find_robot
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of
+from cloudrc.errors import BadInputError
 from cloudrc.geometry.shapes import Surface
 from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Vector
-from cloudrc.robots.build import build_robot, controller, onboard_values
+from cloudrc.robots.build import build_robot, check_robot, controller, onboard_values
 from cloudrc.robots.onboard._airframe import thrust_to_weight
 from cloudrc.text import table
 from cloudrc.world.guard.limits import REACTION
@@ -71,10 +73,13 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
     """
     world = World.model_validate({"robot": name, "scene": SCENE})
     robot = find_robot(name)
-    body = build_robot(world, ResolvedGuard.model_validate({}))
+    try:
+        body = build_robot(world, ResolvedGuard.model_validate({}))
+    except ProblemsError as error:  # no experiment has chosen the robot
+        raise BadInputError("; ".join(problem.reason for problem in error.problems)) from error
     model = compile_model(robot.model, file_of(SCENE))
     facts = _read_facts(world, robot, model)
-    changes = _judge_hull(robot, facts["size_m"])
+    changes = [*_judge_hull(robot, facts["size_m"]), *_judge_tunings(robot, world)]
     try:
         motion = _move(body, robot)
     except OnboardFailedError as error:
@@ -127,6 +132,17 @@ def _judge_hull(robot: RobotFiles, size: float) -> list[str]:
     if robot.hull is None or robot.hull >= size - 1e-3:
         return []
     return [f"robot.yaml: hull_m is {robot.hull:g}, but the geoms reach {size:.3f} m from the base"]
+
+
+def _judge_tunings(robot: RobotFiles, world: World) -> Iterator[str]:
+    """Yield what must change in the tunings, which an experiment may choose."""
+    for name in robot.tunings:
+        try:
+            check_robot(world.model_copy(update={"tuning": name}))
+        except ProblemsError as error:
+            yield from (problem.reason for problem in error.problems)
+        except BadInputError as error:
+            yield str(error)
 
 
 def _move(body: Robot, robot: RobotFiles) -> CheckFlight:
