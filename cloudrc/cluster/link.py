@@ -92,16 +92,16 @@ def _running_pods(found: list[Any]) -> dict[str, str]:
     return {pod["metadata"]["labels"].get(label): pod["metadata"]["name"] for pod in pods}
 
 
-PIPE = """\
+CARRIER = """\
 import socket, sys
-pipe = socket.socket(socket.AF_UNIX)
+link = socket.socket(socket.AF_UNIX)
 try:
-    pipe.connect(sys.argv[1])
+    link.connect(sys.argv[1])
 except OSError as error:
     sys.exit(f"error: no link answers here: {error};")
-pipe.sendall(sys.stdin.buffer.read())
-pipe.shutdown(socket.SHUT_WR)
-while data := pipe.recv(65536):
+link.sendall(sys.stdin.buffer.read())
+link.shutdown(socket.SHUT_WR)
+while data := link.recv(65536):
     sys.stdout.buffer.write(data)
 """
 """Program for Python in a link container: carries its input to a Unix socket, the answer back."""
@@ -112,7 +112,7 @@ def ask(release: Release, pod: str, request: bytes) -> LinkState:
 
     Raise a ValueError or a BadInputError as `read_answer`, a ClusterError if kubectl fails.
     """
-    words = ["python", "-I", "-S", "-c", PIPE, f"{FOLDER}/{SOCKET}"]
+    words = ["python", "-I", "-S", "-c", CARRIER, f"{FOLDER}/{SOCKET}"]
     command = [*release.flags, "exec", "--stdin", pod, "--container=link", "--", *words]
     return read_answer(run("kubectl", command, given=request.decode()).encode())
 

@@ -66,9 +66,15 @@ class Programs:
         ended.
         """
         if self._tc is None:
-            pipe, merged = subprocess.PIPE, subprocess.STDOUT
+            channel, merged = subprocess.PIPE, subprocess.STDOUT
             self._tc = subprocess.Popen(
-                _BATCH, 1, stdin=pipe, stdout=pipe, stderr=merged, text=True, env=self._environment
+                _BATCH,
+                1,
+                stdin=channel,
+                stdout=channel,
+                stderr=merged,
+                text=True,
+                env=self._environment,
             )
         assert self._tc.stdin is not None
         assert self._tc.stdout is not None

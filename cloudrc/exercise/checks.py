@@ -154,8 +154,8 @@ CHECKS: dict[str, tuple[Formula | Exam, ...]] = {
         Exam("steps", 10, "steps", "paper-p3", "iae_mean", 1.8, 4.0),
     ),
     "together": (
-        Exam("pipes, paper-p2", 10, "paper", "paper-p2", "waypoints_reached", 7, 0),
-        Exam("pipes, satellite", 15, "paper", "satellite", "waypoints_reached", 7, 0),
+        Exam("paper, paper-p2", 10, "paper", "paper-p2", "waypoints_reached", 7, 0),
+        Exam("paper, satellite", 15, "paper", "satellite", "waypoints_reached", 7, 0),
     ),
 }
 """Part, or all parts together -> its checks; 100 points in total."""

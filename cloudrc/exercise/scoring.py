@@ -42,12 +42,12 @@ class Process:
         self._limit, self._wait = limit, limit * patience
         self._until = time.monotonic() + self._wait
         self._unread, self._number, self._lost = b"", 0, ""
-        pipe, nowhere = subprocess.PIPE, subprocess.DEVNULL
+        channel, nowhere = subprocess.PIPE, subprocess.DEVNULL
         self._process = subprocess.Popen(
             interpreter("-m", hand_in.__name__, str(folder), str(limit)),
             start_new_session=True,
-            stdin=pipe,
-            stdout=pipe,
+            stdin=channel,
+            stdout=channel,
             stderr=nowhere,
         )
 
@@ -107,10 +107,10 @@ class Process:
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
-        for pipe in (self._process.stdin, self._process.stdout):
+        for stream in (self._process.stdin, self._process.stdout):
             with suppress(OSError):
-                if pipe is not None:
-                    pipe.close()
+                if stream is not None:
+                    stream.close()
 
 
 def _files_of(calls: Sequence[Any]) -> str:

@@ -319,7 +319,7 @@ async def hold(bridge: Bridged) -> Any:
 
 @router.post("/resume", response_model=models.MissionView)
 async def resume(bridge: Bridged) -> Any:
-    """Fly straight to the next waypoint; the answer is 409 if a pipe's wall is in the way."""
+    """Fly straight to the next waypoint; the answer is 409 if an obstacle is in the way."""
     return await bridge.move(MissionService.resume)
 
 

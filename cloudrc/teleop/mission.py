@@ -245,7 +245,7 @@ class Teleop:
         self._end("cancelled", text, now_ns)
 
     def stop(self, now_ns: int) -> None:
-        """Stop the rotors at once in any state, and drop all earlier requests to the robot.
+        """Switch the robot off at once in any state, and drop all earlier requests to the robot.
 
         Teleop sends `ALARM` to cloud until telemetry shows ESTOP. Cloud then sends the request
         ESTOP to the robot.

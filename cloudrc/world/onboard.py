@@ -15,8 +15,7 @@ from cloudrc.messages import Vector
 from cloudrc.world.readings import Readings
 
 Commands: TypeAlias = tuple[float, ...]
-"""One value for each actuator, in the order of the robot's model, such as the speeds of rotors or
-wheels [rad/s]."""
+"""One value for each actuator, in the order of the robot's model, such as speeds [rad/s]."""
 Inputs: TypeAlias = tuple[float, ...]
 """Input to MuJoCo in one step: one value for each actuator of the model, such as a thrust [N], then
 further forces at the base's origin: a force in the world frame [N] and a torque in the body frame
@@ -51,7 +50,7 @@ class Onboard(Protocol):
 
 
 class Actuators(Protocol):
-    """Physics of the actuators, for example of rotors with lag and drag.
+    """Physics of the actuators, for example their lag and their drag.
 
     Attributes:
         speeds: What the actuators do at present, in the order and the units of `Commands`.

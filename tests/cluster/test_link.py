@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from cloudrc.cluster.client import ClusterError
-from cloudrc.cluster.link import PIPE, with_files
+from cloudrc.cluster.link import CARRIER, with_files
 from cloudrc.drivers.link_control import ControlServer
 from cloudrc.errors import BadInputError
 from cloudrc.link.control import put_request, read_answer
@@ -179,7 +179,7 @@ DOCUMENT = json.dumps({"change.json": NOTE, "profile.yaml": "uplink: {trace: t}\
 
 
 def through_pipe(path, request):
-    words = [sys.executable, "-I", "-S", "-c", PIPE, str(path)]
+    words = [sys.executable, "-I", "-S", "-c", CARRIER, str(path)]
     return subprocess.run(words, input=request, capture_output=True)
 
 

@@ -9,7 +9,9 @@ import numpy as np
 
 from cloudrc import assembly
 from cloudrc.config.hull import hull_of
+from cloudrc.config.load import load_experiment
 from cloudrc.config.mission_check import check_mission
+from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import MissionConfig
 from cloudrc.faults import measures
 from cloudrc.faults.adversary import Lie
@@ -17,7 +19,7 @@ from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.measures import Outcome, fly_safely, refused, scenario
 from cloudrc.faults.schedule import FaultEvent, Schedule, Way, generator
 from cloudrc.geometry.obstacles import fence_of
-from cloudrc.geometry.scene import Tube, load_scene
+from cloudrc.geometry.scene import Tube
 from cloudrc.messages import Command, GuardState, Vector
 from cloudrc.records import CommandApplied, Control, Fault
 from cloudrc.tunnel.handshake import BUSY_TEXT
@@ -200,8 +202,8 @@ def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
     expects="the whole mission is refused before the flight",
 )
 def _impossible(outcome: Outcome, seed: int) -> None:
-    scene, first = load_scene("pipes"), (0.5, 0.0, 0.8)
-    robot = hull_of("pelican").dense
+    experiment, first = load_experiment("paper"), (0.5, 0.0, 0.8)
+    scene, robot = scene_of(experiment.world), hull_of(experiment.world.robot).dense
     points: dict[str, Vector] = {
         "1 m behind a wall of the fence": (fence_of(scene).high[0] + 1.0, 0.0, 1.0),
         "far below the floor": (0.0, 0.0, -5.0),
@@ -218,7 +220,7 @@ def _impossible(outcome: Outcome, seed: int) -> None:
         try:
             waypoints = tuple({"position_m": point} for point in way)
             mission = MissionConfig.model_validate(
-                {"waypoints": waypoints, "touch": {"body": "board"}}
+                {"waypoints": waypoints, "touch": experiment.mission.touch}
             )
             problems = [str(each) for each in check_mission(mission, scene, robot)]
         except ValueError as error:

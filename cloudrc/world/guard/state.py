@@ -396,7 +396,7 @@ class Guard:
                 state = GROUND if self._descent.acknowledged else LAND
                 self._enter(state, now_ns, Cause.DOWN)
                 self._flies, self.reference = False, ZERO
-                self._take_off.forget(stopped=True)  # the robot may slide off a pipe
+                self._take_off.forget(stopped=True)  # the robot may slide off an obstacle
         if self.state is HOLD and self._take_off.may_end(readings):
             self._enter(GROUND, now_ns, Cause.NOT_OFF)
 
