@@ -45,6 +45,7 @@ PACKAGES = {
     "predictors": "cloudrc.cloud.predictors",
     "controllers": "cloudrc.cloud.controllers",
     "onboard": "cloudrc.robots.onboard",
+    "executors": "cloudrc.gym.executors",
     "motion": "",
     "metrics": "",
     "policies": "",
@@ -57,7 +58,7 @@ STACK_MAX = 4000
 """Largest length of a failure's stack in the recording [characters]."""
 METHODS = {
     **{"estimators": "horizon", "predictors": "predict", "controllers": "update"},
-    **{"onboard": "update", "motion": "__call__"},
+    **{"onboard": "update", "motion": "__call__", "executors": "action"},
 }
 """Kind of plug-in -> the method that every plug-in of this kind defines."""
 

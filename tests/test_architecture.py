@@ -73,6 +73,10 @@ MAY_IMPORT: dict[str, set[str]] = {
         *("metrics", "plugin_file", "plugins", "record", "report", "robots", "statistics"),
         *("teleop", "tunnel", "warnings", "world"),
     },
+    "gym": {
+        *("assembly", "cloud", "config", "drivers", "endpoint", "link", "plugins", "record"),
+        *("report", "runs"),
+    },
     "assembly": EVERYTHING,
     "warnings": {"assembly", "config", "link", "robots", "tunnel"},
     "api": {"runs", "cluster", "config", "metrics", "record", "report"},
@@ -103,6 +107,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "fcntl": ("drivers/local", "console/serve", "runs/lock"),
     "matplotlib": ("report/",),
     "viser": ("console/", "report/replay"),
+    "gymnasium": ("gym/",),
     "mcap": ("record/",),
     "rosbags": ("record/",),
     "kubernetes": ("cluster/",),
@@ -290,6 +295,7 @@ MAY_SAY = {
     "config/schema.py": ({"pelican", "pipe"}, "shipped robot, scene and mission are defaults"),
     "cli/mission.py": ({"pipe"}, "a shipped mission is an example"),
     "cli/session.py": ({"pipe"}, "a shipped mission is an example"),
+    "gym/registration.py": ({"pipe"}, "an environment has the name of a shipped mission"),
 }
 OPERATING_SYSTEM = {"PIPE", "BrokenPipeError"}
 

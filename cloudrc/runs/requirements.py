@@ -15,6 +15,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "api": ("fastapi", "uvicorn"),
     "console": ("viser",),
     "policy": ("msgpack", "websockets"),
+    "gym": ("gymnasium",),
 }
 """Name of an extra in pyproject.toml -> the modules that it installs."""
 MODES: dict[str, tuple[str, ...]] = {

@@ -1,0 +1,21 @@
+"""Environments of gymnasium whose policy is at the other end of a link, in virtual time.
+
+The import registers `cloudrc/Networked-v0`, `cloudrc/Steps-v0` and `cloudrc/Pipes-v0`.
+"""
+
+from cloudrc.errors import MissingPrerequisiteError
+
+try:
+    import gymnasium as _gymnasium  # noqa: F401
+except ImportError:
+    raise MissingPrerequisiteError(
+        "cloudrc.gym needs gymnasium (not installed); run: pip install 'cloudrc[gym]'"
+    ) from None
+
+from cloudrc.gym.networked import Networked
+from cloudrc.gym.registration import register
+from cloudrc.gym.vector import NetworkedVector
+
+__all__ = ["Networked", "NetworkedVector", "register"]
+
+register()

@@ -1,0 +1,62 @@
+"""Executors choose the action that a robot executes in each tick, from answers that arrive late.
+
+An answer is a chunk: actions for successive ticks, the first for the tick of the observation. Each
+executor is a plug-in in a file of its own. The file defines `build(**parameters)`, which returns an
+`Executor`; all parameters are annotated.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+
+class Chunk(NamedTuple):
+    """What the policy sends: the actions for successive ticks."""
+
+    number: int  # tick in which the policy answered
+    basis: int  # tick of the observation that the policy had
+    actions: tuple[Any, ...]  # as the environment takes them
+
+
+class Executor:
+    """Chooses the robot's action; it runs on the robot, but for `sent` and `prefix`.
+
+    Attributes:
+        needs_chunk: Whether single actions make no sense.
+        repeats: Whether the policy answers in every tick, also if it has seen nothing new.
+        basis: Tick of the observation from which the last chosen action was computed.
+    """
+
+    needs_chunk = True
+    repeats = True
+    basis = -1
+
+    def begin(self, ticks_late: int, period_ns: int) -> None:
+        """Begin an episode: the robot has sent the observation of tick 0.
+
+        Args:
+            ticks_late: Expected time from an observation to its answer, rounded up to ticks.
+            period_ns: Time of a tick [ns].
+        """
+
+    def asks(self, tick: int) -> bool:
+        """Return whether the robot sends the observation of this tick; by default, of each."""
+        return True
+
+    def sent(self, chunk: Chunk) -> None:
+        """Note, on the side of the policy, that it has sent an answer."""
+
+    def prefix(self, basis: int) -> list[Any]:
+        """Return, on the side of the policy, the actions before its answer to an observation.
+
+        They are for the ticks from `basis` on, that of the observation. By default, none are known.
+        """
+        return []
+
+    def receive(self, chunk: Chunk, tick: int) -> None:
+        """Take an answer that arrived before or at this tick. An older one may come later."""
+        raise NotImplementedError
+
+    def action(self, tick: int) -> Any:
+        """Return the action of this tick, and set `basis`; None if there is none."""
+        raise NotImplementedError

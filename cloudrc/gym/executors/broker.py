@@ -1,0 +1,54 @@
+"""Executor: play a whole chunk from its beginning, then ask for the next one and wait for it.
+
+This is what a client does that asks only when its chunk is used up.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cloudrc.gym.executors import Chunk, Executor
+
+
+class Broker(Executor):
+    """One observation leaves per chunk. If no answer comes, the robot asks again."""
+
+    repeats = False
+
+    def __init__(self, patience: float) -> None:
+        """Wait for `patience` [s] before asking again."""
+        self._patience = patience
+
+    def begin(self, ticks_late: int, period_ns: int) -> None:
+        """Forget the last episode; the observation of tick 0 is the first question."""
+        self._chunk, self._start = Chunk(-1, -1, ()), 0
+        self._asked, self._waits = 0, self._patience * 1e9 / period_ns
+
+    def asks(self, tick: int) -> bool:
+        """Return whether the chunk is used up and no question is under way."""
+        is_used_up = tick >= self._start + len(self._chunk.actions)
+        is_open = self._asked > self._chunk.basis and tick - self._asked < self._waits
+        if is_used_up and not is_open:
+            self._asked = tick
+            return True
+        return False
+
+    def receive(self, chunk: Chunk, tick: int) -> None:
+        """Play the answer from now on, if it is new."""
+        if chunk.basis > self._chunk.basis:
+            self._chunk, self._start = chunk, tick
+
+    def action(self, tick: int) -> Any:
+        """Return the next action of the chunk."""
+        _, self.basis, actions = self._chunk
+        place = tick - self._start
+        return actions[place] if place < len(actions) else None
+
+
+def build(patience: float = 1.0) -> Broker:
+    """Make the executor.
+
+    Args:
+        patience: Time without an answer after which the robot asks again [s].
+    """
+    return Broker(patience)

@@ -1,0 +1,31 @@
+"""Executor: action i of an answer belongs to the i-th tick after its observation, however late."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cloudrc.gym.executors import Chunk, Executor
+
+
+class TimeIndexed(Executor):
+    """The answer to the newest observation wins. What came too late for its tick is skipped."""
+
+    def begin(self, ticks_late: int, period_ns: int) -> None:
+        """Forget the last episode."""
+        self._chunk = Chunk(-1, -1, ())
+
+    def receive(self, chunk: Chunk, tick: int) -> None:
+        """Take the answer if its observation is newer, or if it is the second to the same one."""
+        if (chunk.basis, chunk.number) > (self._chunk.basis, self._chunk.number):
+            self._chunk = chunk
+
+    def action(self, tick: int) -> Any:
+        """Return the action that the policy meant for this tick."""
+        _, self.basis, actions = self._chunk
+        place = tick - self.basis
+        return actions[place] if place < len(actions) else None
+
+
+def build() -> TimeIndexed:
+    """Make the executor."""
+    return TimeIndexed()

@@ -1,0 +1,105 @@
+"""Put a link between an environment and its policy: a wrapper for any gymnasium environment."""
+
+from __future__ import annotations
+
+from typing import Any, Unpack
+
+import gymnasium
+from gymnasium.utils import RecordConstructorArgs
+
+from cloudrc.gym.options import (
+    Options,
+    Profile,
+    answer_space,
+    connect,
+    describe_answer,
+    step_time,
+)
+from cloudrc.gym.values import checker, copied
+
+
+class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """An environment whose policy is at the other end of a link, in virtual time.
+
+    The world never waits: one step of the environment takes `dt`, and observations and actions that
+    are late are late. Rewards and the end of an episode are those of the world, told at once.
+    Nothing else leaks: the observation, and the environment's info with it, are the newest that
+    have arrived. The fate of a packet depends on seed, stream, direction, episode and tick alone,
+    so that another policy meets the same network.
+
+    `info["cloudrc"]` tells the ages of the observation and of the executed action [s], whether the
+    robot had no action (`held`), and what was lost. At the end of an episode it has a summary,
+    `episode`, with delays and losses: asked by the profile, and measured.
+
+    Attributes:
+        world_info: The environment's own info of the last step, without any delay: for whoever
+            judges the episode, not for the policy.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        link: Profile = "ideal",
+        seed: int = 0,
+        *,
+        dt: float | None = None,
+        stream: str = "",
+        **options: Unpack[Options],
+    ) -> None:
+        """Wrap an environment.
+
+        Args:
+            env: The environment.
+            link: Name of a shipped link profile, path of a file, or mapping with its keys.
+            seed: Seed of the network. `reset(seed=...)` seeds the environment, and selects the
+                episode of the network, too.
+            compute: Time that the policy needs for an answer [s]; or a pair, mean and standard
+                deviation of a gamma distribution. While it computes, the policy cannot answer.
+            chunk: Number of actions in an answer, for the ticks from the observation's on; None:
+                an answer is a single action.
+            executor: How the robot executes answers: "newest", "time_indexed", "prefix", "broker",
+                or the path of a file.
+            hold: What the robot executes in a tick without an action: "repeat", the last action, or
+                "start", the action `start`.
+            start: Action before the first answer arrives; None: 0, or what is nearest to it;
+                "answer": the robot waits for the first answer, and the episode begins then.
+            observation_bytes: Size of an observation on the wire [bytes]; None: that of its arrays.
+            action_bytes: Size of an answer on the wire [bytes]; likewise.
+            dt: Time of a step [s]; None: that of the environment.
+            stream: Name of the robot; robots with one seed and two names share no random numbers.
+
+        Raises:
+            cloudrc.errors.BadInputError: If a value cannot be used; the text says what to change.
+        """
+        RecordConstructorArgs.__init__(self, link=link, seed=seed, dt=dt, stream=stream, **options)
+        gymnasium.Wrapper.__init__(self, env)
+        self.dt = step_time(env, dt)
+        both, chunk = (env.observation_space, env.action_space), options.get("chunk")
+        (self._loop,) = connect(both, self.dt, link, seed, (stream,), **options)
+        self.action_space, self._split = answer_space(env.action_space, chunk)
+        self._check = checker(self.action_space, describe_answer(chunk))
+        self.world_info: dict[str, Any] = {}
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode; the policy has the first observation at once."""
+        observation, self.world_info = self.env.reset(seed=seed, options=options)
+        self._loop.begin(seed, observation, self.world_info)
+        return self._seen()
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Send the policy's answer, and step the world with what the robot executes."""
+        self._check(action)
+        loop = self._loop
+        executed = loop.act(self._split(action))
+        observation, reward, terminated, truncated, self.world_info = self.env.step(executed)
+        loop.observe(observation, self.world_info)
+        seen, info = self._seen()
+        if terminated or truncated:
+            info["cloudrc"]["episode"] = loop.summary()
+        return seen, reward, terminated, truncated, info
+
+    def _seen(self) -> tuple[Any, dict[str, Any]]:
+        observation, info = self._loop.seen
+        return copied(observation), {**info, "cloudrc": self._loop.told()}

@@ -1,0 +1,167 @@
+"""Check and complete how an environment and its policy are connected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from math import isfinite, nan
+from pathlib import Path
+from typing import Any, TypeAlias, TypedDict
+
+import gymnasium
+from gymnasium.vector.utils import batch_space, iterate
+
+from cloudrc import plugins
+from cloudrc.errors import BadInputError
+from cloudrc.gym.executors import Executor
+from cloudrc.gym.loop import RemoteLoop, Settings
+from cloudrc.gym.values import checker, copied, neutral, size_of
+from cloudrc.link.library import LinkProfile, read_profile
+
+Profile: TypeAlias = str | Path | Mapping[str, Any] | LinkProfile
+CHUNK_MAX = 10_000
+"""Largest number of actions in an answer."""
+ANSWER = "answer"
+"""Start of an episode: the robot waits for the first answer."""
+
+
+class Options(TypedDict, total=False):
+    """Further arguments of `Networked`, which describes them."""
+
+    compute: float | tuple[float, float]
+    chunk: int | None
+    executor: str | Path
+    hold: str
+    start: Any
+    observation_bytes: int | None
+    action_bytes: int | None
+
+
+def connect(
+    spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]],
+    dt: float,
+    link: Profile,
+    seed: int,
+    streams: Iterable[str],
+    *,
+    compute: float | tuple[float, float] = 0.0,
+    chunk: int | None = None,
+    executor: str | Path = "newest",
+    hold: str = "repeat",
+    start: Any = None,
+    observation_bytes: int | None = None,
+    action_bytes: int | None = None,
+) -> list[RemoteLoop]:
+    """Connect a robot of each of the `streams` with its policy.
+
+    `spaces` are those of an observation and of an action; `dt` is the time of a step [s].
+    """
+    observations, actions = spaces
+    _refuse_wrong(hold, chunk, {"observation": observation_bytes, "action": action_bytes})
+    waits = isinstance(start, str) and start == ANSWER
+    if start is None or waits:
+        start = neutral(actions)
+    else:
+        checker(actions, f"as start= an action, or {ANSWER!r}")(start)
+    if observation_bytes is None:
+        observation_bytes = size_of(observations.sample())
+    if action_bytes is None:
+        action_bytes = size_of(start) * (chunk or 1)
+    settings = Settings(
+        link=read_profile(link),
+        seed=seed,
+        dt=dt,
+        compute=compute_times(compute),
+        repeats=hold == "repeat",
+        start=copied(start),
+        waits=waits,
+        observation_bytes=observation_bytes,
+        action_bytes=action_bytes,
+    )
+    return [
+        RemoteLoop(settings, find_executor(executor, chunked=chunk is not None), stream)
+        for stream in streams
+    ]
+
+
+def _refuse_wrong(hold: str, chunk: int | None, sizes: Mapping[str, int | None]) -> None:
+    if hold not in ("repeat", "start"):
+        raise BadInputError(f"hold {hold!r}: give 'repeat' or 'start'")
+    if chunk is not None and (type(chunk) is not int or not 1 <= chunk <= CHUNK_MAX):
+        raise BadInputError(
+            f"chunk {chunk!r}: give None or the number of actions in an answer, up to {CHUNK_MAX}"
+        )
+    for name, size in sizes.items():
+        if size is not None and (type(size) is not int or size < 0):
+            raise BadInputError(f"{name}_bytes {size!r}: give a number of bytes, or None")
+
+
+def step_time(env: Any, given: float | None) -> float:
+    """Return the time of a step of an environment [s], unless `given` [s].
+
+    It is the environment's `dt` or `tau`, or that of a frame which it renders.
+    """
+    base = env.unwrapped
+    # The environments of a vector know their step; metadata may have the rate of a film.
+    base = base.envs[0].unwrapped if getattr(base, "envs", ()) else base
+    found: Any = given
+    for name in ("step_dt", "dt", "tau"):
+        found = getattr(base, name, None) if found is None else found
+    if found is None and (rate := (env.metadata or {}).get("render_fps")):
+        found = 1.0 / rate
+    try:
+        number = nan if found is None else float(found)
+    except (TypeError, ValueError):
+        number = nan
+    if not (isfinite(number) and 0.0 < number <= 3600.0):
+        told = "has no time step" if found is None else f"has the time step {found!r}"
+        raise BadInputError(f"the environment {told}; give dt=, the time of a step in seconds")
+    return number
+
+
+def compute_times(compute: float | tuple[float, float]) -> tuple[float, float]:
+    """Return mean and standard deviation of a compute time [s], given as a number or as both."""
+    both = compute if isinstance(compute, tuple | list) else (compute, 0.0)
+    try:
+        mean, deviation = (float(each) for each in both)
+    except (TypeError, ValueError):
+        mean = deviation = nan
+    if not (0.0 <= mean <= 3600.0 and 0.0 <= deviation <= 3600.0) or (deviation and not mean):
+        raise BadInputError(
+            f"compute {compute!r}: give the time for an answer in seconds, or its mean and its "
+            "standard deviation, such as (0.05, 0.02)"
+        )
+    return mean, deviation
+
+
+def answer_space(
+    space: gymnasium.Space[Any], chunk: int | None
+) -> tuple[gymnasium.Space[Any], Callable[[Any], tuple[Any, ...]]]:
+    """Return the space of an answer, and a function that copies an answer into its actions."""
+    if chunk is None:
+        return space, lambda action: (copied(action),)
+    batched = batch_space(space, chunk)
+    return batched, lambda answer: tuple(iterate(batched, copied(answer)))
+
+
+def describe_answer(chunk: int | None) -> str:
+    """Say what an answer is, in words."""
+    return "one action" if chunk is None else f"a chunk of {chunk} actions"
+
+
+def find_executor(name: str | Path, *, chunked: bool) -> Executor:
+    """Build an executor by name or path; raise a BadInputError if it does not fit."""
+    found = str(name)
+    if not plugins.is_path(found):
+        found = found.replace("-", "_")
+    executor = plugins.load("executors", found)
+    if not isinstance(executor, Executor):
+        raise BadInputError(
+            f"executor {found!r}: build() returned {type(executor).__name__}; return an Executor "
+            "of cloudrc.gym.executors"
+        )
+    if executor.needs_chunk and not chunked:
+        raise BadInputError(
+            f"executor {found!r} plays chunks of actions: give chunk=, the number of actions in "
+            "an answer"
+        )
+    return executor

@@ -1,0 +1,207 @@
+"""The testbed's own robots as environments: a policy flies them in place of the cloud's controller.
+
+World, guard, tunnel and missions are those of every flight in virtual time. So the true path is,
+bit by bit, that of a flight whose controller sends the same commands.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from math import dist
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from cloudrc.assembly import assemble, build_links, flight_limit
+from cloudrc.cloud.controllers import Controller, ControlOutput
+from cloudrc.cloud.loop import ControlLoop
+from cloudrc.cloud.planar import Planar
+from cloudrc.config.load import load_experiment
+from cloudrc.drivers.virtual import VirtualRun
+from cloudrc.errors import BadInputError
+from cloudrc.messages import Datagram, Odometry, Setpoint
+from cloudrc.record.columns import Recording, RecordStore
+from cloudrc.report.document import Run
+from cloudrc.report.write import assess
+from cloudrc.runs.requirements import SIM, require
+
+if TYPE_CHECKING:
+    from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.endpoint import Endpoint
+
+NEVER_NS = 1 << 62
+"""Time of the cloud's next period while it waits for the policy [ns]."""
+SEED_MAX = 2**31
+"""Random seeds of episodes are below this number."""
+OWN = {
+    "link.profile": "ideal",
+    "cloud.predictor": "last_sample",
+    "cloud.estimator": "running_mean",
+    "cloud.controller": "pid",
+    "cloud.plan_s": 0,
+    "cloud.compute_ms": 0,
+}
+"""Settings of every environment: the network and the controller are the policy's affair."""
+
+
+class _Policy(Controller):
+    """Controller that commands what the policy has decided."""
+
+    def __init__(self) -> None:
+        self.output = ControlOutput((0.0, 0.0, 0.0), 0.0)
+        self.setpoint: Setpoint | None = None  # that of the last command
+
+    def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
+        self.setpoint = setpoint
+        return self.output
+
+
+class _Waiting:
+    """A cloud that handles one of its periods per step, and then waits for the policy."""
+
+    def __init__(self, cloud: Endpoint) -> None:
+        self._cloud, self.may = cloud, False
+        self.receive_datagram = cloud.receive_datagram
+        self.take_records = cloud.take_records
+
+    def next_deadline_ns(self) -> int:
+        return self._cloud.next_deadline_ns() if self.may else NEVER_NS
+
+    def handle_deadline(self, now_ns: int) -> None:
+        self.may = False
+        self._cloud.handle_deadline(now_ns)
+
+    def take_datagrams(self) -> list[Datagram]:
+        return self._cloud.take_datagrams()
+
+
+class _Flight:
+    """One flight, period by period of the cloud."""
+
+    def __init__(self, experiment: ResolvedExperiment) -> None:
+        self.experiment = experiment
+        self.policy, self.store = _Policy(), RecordStore()
+
+        def make_loop(estimator: Any, predictor: Any, controller: Any, **keys: Any) -> ControlLoop:
+            own = Planar(self.policy) if isinstance(controller, Planar) else self.policy
+            return ControlLoop(estimator, predictor, own, **keys)
+
+        world, self.cloud, self.teleop, _ = assemble(experiment, make_loop)
+        self._waiting = _Waiting(self.cloud)
+        self._run = VirtualRun(world, self._waiting, *build_links(experiment))
+        self._period_ns = round(1e9 / experiment.cloud.command_rate_hz)
+        self._fly(self.cloud.next_deadline_ns())
+
+    @property
+    def now_ns(self) -> int:
+        """Time since the start [ns]."""
+        return self._run.now_ns
+
+    def step(self) -> None:
+        """Handle the cloud's period, and everything before its next one."""
+        self._waiting.may = True
+        self._fly(self._run.now_ns + self._period_ns)
+
+    def _fly(self, until_ns: int) -> None:
+        self._run.fly(lambda: False, until_ns, self.store.add)
+
+
+class RobotEnv(gymnasium.Env[Any, Any]):
+    """A robot of the testbed with its guard and a mission; a step is one command, 10 ms.
+
+    An action is the velocity in x, y and z [m/s], world frame, and the yaw rate [rad/s]. An
+    observation is the newest odometry and the setpoint: position [m], orientation as a quaternion
+    wxyz, velocity [m/s], angular velocity in the body frame [rad/s], position of the setpoint [m]
+    and its yaw [rad]. The reward of a step is minus the distance from the setpoint [m].
+
+    An episode ends with its mission. Then `info` has the `verdict` of the flight, its `failures`,
+    `is_success` and the `numbers` of the report. `reset(seed=...)` is the seed of the experiment.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(
+        self,
+        experiment: str = "steps",
+        robot: str | None = None,
+        settings: Mapping[str, Any] | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """Load an experiment by name or path.
+
+        Args:
+            experiment: Name of a shipped experiment, or path of a file.
+            robot: Name of a shipped robot, or path; None: that of the experiment.
+            settings: Further changes, as with `--set`: key -> value. The link is always ideal.
+            render_mode: None; a flight is drawn by its report.
+        """
+        require("a robot of the testbed as an environment", SIM)
+        texts = {**(settings or {}), **OWN, **({"world.robot": robot} if robot else {})}
+        self.render_mode = render_mode
+        self._experiment = load_experiment(
+            experiment, [f"{key}={json.dumps(value, default=str)}" for key, value in texts.items()]
+        )
+        guard = self._experiment.guard
+        most = np.array([guard.speed_max_mps] * 3 + [guard.yaw_rate_max_radps])
+        self.action_space = spaces.Box(-most, most, dtype=np.float64)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (17,), dtype=np.float64)
+        self.dt = 1.0 / self._experiment.cloud.command_rate_hz
+        self._limit_ns = flight_limit(self._experiment) * 1e9
+        self.flight: _Flight | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin a flight; return when the cloud is about to send its first command."""
+        super().reset(seed=seed)
+        own = int(self.np_random.integers(SEED_MAX)) if seed is None else seed
+        experiment = self._experiment.model_copy(update={"seed": own})
+        first, periods = _Flight(experiment), 0
+        while first.policy.setpoint is None:
+            first.step()
+            periods += 1
+        self.flight = _Flight(experiment)
+        for _ in range(periods - 1):
+            self.flight.step()
+        self.flight.policy.setpoint = first.policy.setpoint
+        return self._observe(self.flight)[0], {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Command a velocity and a yaw rate for one period of the cloud."""
+        flight = self.flight
+        if flight is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != (4,) or not np.isfinite(values).all():
+            raise BadInputError(f"action {action!r}: give 4 finite numbers: vx, vy, vz, yaw rate")
+        x, y, z, yaw_rate = values.tolist()
+        flight.policy.output = ControlOutput((x, y, z), yaw_rate)
+        flight.step()
+        observation, distance = self._observe(flight)
+        ended = flight.teleop.over
+        late = not ended and flight.now_ns >= self._limit_ns
+        info = self._judge(flight) if ended or late else {}
+        return observation, -distance, ended, late, info
+
+    def _observe(self, flight: _Flight) -> tuple[Any, float]:
+        """Return the observation, and the distance from the setpoint [m]."""
+        telemetry, setpoint = flight.cloud.telemetry, flight.policy.setpoint
+        assert telemetry is not None, "a command follows telemetry"
+        assert setpoint is not None, "reset() waits for the first setpoint"
+        _, position, orientation, velocity, turn = telemetry.odometry
+        parts = (*position, *orientation, *velocity, *turn, *setpoint.position, setpoint.yaw)
+        return np.array(parts), dist(position, setpoint.position)
+
+    def _judge(self, flight: _Flight) -> dict[str, Any]:
+        """Judge the flight as its report does."""
+        recording, run = Recording(records=flight.store), Run("virtual", "virtual")
+        found = assess(recording, flight.experiment, run)
+        return {
+            "verdict": found.verdict.outcome,
+            "failures": [failure.code for failure in found.verdict.failures],
+            "is_success": found.verdict.outcome == "success",
+            "numbers": {name: number.value for name, number in found.numbers.items()},
+        }

@@ -1,0 +1,162 @@
+"""Put a link between each robot of a vector environment and its policy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Unpack
+
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
+
+from cloudrc.errors import BadInputError
+from cloudrc.gym.options import (
+    Options,
+    Profile,
+    answer_space,
+    connect,
+    describe_answer,
+    step_time,
+)
+from cloudrc.gym.values import checker, copied
+
+FINAL = "final_obs", "final_info"
+"""What a vector environment that resets in the same step tells about the ended episode."""
+
+
+class NetworkedVector(VectorWrapper[Any, Any, Any, Any, Any]):
+    """A vector environment in which each robot has a link of its own.
+
+    It is to a vector environment what `Networked` is to an environment. Robot n has the stream
+    `STREAM/n`, so that the robots share no random numbers. Each way of automatic reset is
+    understood; a new episode of one robot begins with an idle link.
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        link: Profile = "ideal",
+        seed: int = 0,
+        *,
+        dt: float | None = None,
+        stream: str = "",
+        **options: Unpack[Options],
+    ) -> None:
+        """Wrap a vector environment; the arguments are those of `Networked`.
+
+        `dt` is the time of a step [s].
+        """
+        super().__init__(env)
+        space, chunk = env.single_action_space, options.get("chunk")
+        names = [f"{stream}/{robot}" for robot in range(env.num_envs)]
+        both = env.single_observation_space, space
+        self._loops = connect(both, _step_time(env, dt), link, seed, names, **options)
+        self.single_action_space, self._split = answer_space(space, chunk)
+        self.action_space = batch_space(self.single_action_space, env.num_envs)
+        words = f"for each of {env.num_envs} robots {describe_answer(chunk)}"
+        self._check = checker(self.action_space, words)
+        self._mode = _autoreset_mode(env)
+        self._ended = np.zeros(env.num_envs, dtype=bool)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Any = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode of each robot, or of those in `options["reset_mask"]`."""
+        mask = (options or {}).get("reset_mask")
+        chosen = np.ones(self.num_envs, dtype=bool) if mask is None else mask.copy()
+        seeds: Any = seed
+        observations, infos = self.env.reset(seed=seeds, options=options)
+        if seed is None:
+            seeds = [None] * self.num_envs
+        elif isinstance(seed, int | np.integer):
+            seeds = [seed + n for n in range(self.num_envs)]
+        parts = iterate(self.env.observation_space, observations)
+        for n, observation in enumerate(parts):
+            if chosen[n]:
+                self._loops[n].begin(seeds[n], observation, _part(infos, n))
+        self._ended &= ~chosen
+        return self._seen([{}] * self.num_envs)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Send each policy's answer, and step the world with what the robots execute."""
+        self._check(actions)
+        space = self.env.single_action_space
+        answers = iterate(self.action_space, actions)
+        executed = [
+            loop.act(self._split(answer)) for loop, answer in zip(self._loops, answers, strict=True)
+        ]
+        batch = _batch(space, executed)
+        observations, rewards, terminated, truncated, infos = self.env.step(batch)
+        ends = np.logical_or(terminated, truncated)
+        finals = [
+            self._observe(n, observation, _part(infos, n), bool(ends[n]))
+            for n, observation in enumerate(iterate(self.env.observation_space, observations))
+        ]
+        self._ended = ends
+        seen, told = self._seen(finals)
+        return seen, rewards, terminated, truncated, told
+
+    def _observe(
+        self, n: int, observation: Any, info: dict[str, Any], has_ended: bool
+    ) -> dict[str, Any]:
+        """Move robot n to its next tick; return what is told at once about an ended episode."""
+        loop = self._loops[n]
+        if self._mode is AutoresetMode.NEXT_STEP and self._ended[n]:
+            loop.begin(None, observation, info)
+            return {}
+        if not (has_ended and self._mode is AutoresetMode.SAME_STEP):
+            loop.observe(observation, info)
+            return {"cloudrc": {"episode": loop.summary()}} if has_ended else {}
+        final = {key: info.pop(key) for key in FINAL if key in info}
+        loop.observe(final.get("final_obs", observation), info)
+        told = {"cloudrc": {"episode": loop.summary()}}
+        final["final_info"] = {**final.get("final_info", {}), **told}
+        loop.begin(None, observation, info)
+        return final
+
+    def _seen(self, finals: Sequence[dict[str, Any]]) -> tuple[Any, dict[str, Any]]:
+        """Return the newest observations and infos that the policies have."""
+        seen, infos = list[Any](), dict[str, Any]()
+        for n, loop in enumerate(self._loops):
+            observation, info = loop.seen
+            seen.append(copied(observation))
+            told = loop.told() | finals[n].get("cloudrc", {})
+            self._add_info(infos, {**info, **finals[n], "cloudrc": told}, n)
+        return _batch(self.env.single_observation_space, seen), infos
+
+
+def _batch(space: Any, values: Sequence[Any]) -> Any:
+    """Return the values of all robots, each of `space`, as the vector environment has them."""
+    made: Any = create_empty_array(space, len(values))
+    return concatenate(space, values, made)
+
+
+def _step_time(env: VectorEnv[Any, Any, Any], given: float | None) -> float:
+    if given is None and isinstance(env.unwrapped, AsyncVectorEnv):
+        raise BadInputError(
+            "environments in other processes do not tell their time step; give dt=, the time of a "
+            "step in seconds"
+        )
+    return step_time(env, given)
+
+
+def _autoreset_mode(env: VectorEnv[Any, Any, Any]) -> AutoresetMode:
+    mode = (env.metadata or {}).get("autoreset_mode")
+    if isinstance(mode, AutoresetMode):
+        return mode
+    known = ", ".join(f"AutoresetMode.{each.name}" for each in AutoresetMode)
+    raise BadInputError(
+        f"the vector environment does not say when it resets a robot: its metadata has "
+        f"autoreset_mode {mode!r}; set it to one of {known}"
+    )
+
+
+def _part(infos: Mapping[str, Any], n: int) -> dict[str, Any]:
+    """Return the info of robot n from the infos of all."""
+    found = {}
+    for key, value in infos.items():
+        mask = infos.get(f"_{key}")
+        if key.startswith("_") or (mask is not None and not mask[n]):
+            continue
+        found[key] = _part(value, n) if isinstance(value, Mapping) else value[n]
+    return found

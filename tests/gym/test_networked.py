@@ -1,0 +1,337 @@
+"""A link between any environment and its policy: ticks, delays, repeatability, bad input."""
+
+import hashlib
+import subprocess
+import sys
+from itertools import pairwise
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+
+from cloudrc.errors import BadInputError
+from cloudrc.gym import Networked
+from cloudrc.gym.values import neutral
+from tests.gym.envs import Counter, Mixed, both_ways
+
+SHAKY = both_ways(70, 50, jitter_ms=40, loss=0.1)
+
+
+def equal(one, other):
+    """Return whether two nested values are equal bit by bit."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(equal, one, other))
+    one, other = np.asarray(one), np.asarray(other)
+    return one.dtype == other.dtype and one.tobytes() == other.tobytes()
+
+
+def digest(env, seed=4, steps=150, gain=1.0):
+    """Fly one episode with a policy that acts on what it sees; return a hash of all it is told."""
+    found = hashlib.sha256()
+    observation, info = env.reset(seed=seed)
+    for _ in range(steps):
+        action = np.clip(gain * observation[:1], -1, 1).astype(np.float32)
+        observation, reward, ended, late, info = env.step(action)
+        found.update(observation.tobytes() + np.float64(reward).tobytes())
+        found.update(repr(sorted(info["cloudrc"].items())).encode())
+        if ended or late:
+            break
+    return found.hexdigest()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: gymnasium.make("Pendulum-v1"),
+        lambda: gymnasium.make("CartPole-v1"),
+        lambda: gymnasium.make("InvertedPendulum-v5"),
+        lambda: gymnasium.make("Reacher-v5"),
+        Mixed,
+    ],
+)
+def test_an_ideal_link_changes_no_bit(make):
+    bare, env = make(), Networked(make())
+    bare.action_space.seed(7)
+    assert equal(bare.reset(seed=3)[0], env.reset(seed=3)[0])
+    for _ in range(60):
+        action = bare.action_space.sample()
+        expected, found = bare.step(action), env.step(action)
+        told = found[4].pop("cloudrc")
+        assert equal(expected[:4], found[:4])
+        assert expected[4].keys() == found[4].keys()
+        assert all(equal(expected[4][key], found[4][key]) for key in found[4])
+        assert (told["observation_age"], told["action_age"], told["held"]) == (0.0, 0.0, False)
+        if expected[2] or expected[3]:
+            break
+
+
+@pytest.mark.parametrize("dt", [0.01, 1 / 30, 1 / 3, 0.0125])
+@pytest.mark.parametrize(("up", "down"), [(0, 0), (3, 0), (0, 4), (2, 5)])
+def test_a_delay_of_n_steps_is_exactly_n(dt, up, down):
+    env = Networked(Counter(), both_ways(up * dt * 1e3, down * dt * 1e3), dt=dt)
+    observation, _ = env.reset()
+    for tick in range(1, 60):
+        observation, reward, _, _, info = env.step(np.array([tick], np.float32))
+        assert (observation[0], reward) == (max(0, tick - up), tick)
+        assert info["count"] == observation[0]
+        assert info["cloudrc"]["observation_age"] == pytest.approx(min(tick, up) * dt)
+    executed = [float(each[0]) for each in env.unwrapped.executed]
+    assert executed == [0.0] * down + [float(n) for n in range(1, 60 - down)]
+    assert info["cloudrc"]["action_age"] == pytest.approx((up + down) * dt)
+
+
+def test_one_seed_gives_one_flight_and_another_seed_another():
+    def flown(link_seed, **options):
+        return digest(Networked(gymnasium.make("Pendulum-v1"), SHAKY, link_seed), **options)
+
+    assert flown(1) == flown(1)
+    assert flown(1) != flown(2)
+    assert flown(1) != flown(1, seed=5)
+
+
+def fates(env, policy, steps=200):
+    """Return what was lost up to each tick."""
+    env.reset(seed=2)
+    told = [env.step(policy(n))[4]["cloudrc"] for n in range(steps)]
+    return [(each["lost_uplink"], each["lost_downlink"], each["observation_age"]) for each in told]
+
+
+def test_another_policy_meets_the_same_network():
+    link = both_ways(30, 20, jitter_ms=25, loss=0.2)
+    zero = fates(Networked(Counter(), link, 1), lambda n: np.zeros(1, np.float32))
+    other = fates(Networked(Counter(), link, 1), lambda n: np.full(1, n, np.float32))
+    assert zero == other
+    assert zero[-1][0] > 10
+
+
+def test_a_seed_of_the_environment_selects_the_network_and_later_episodes_have_others():
+    def losses(env, seed):
+        env.reset(seed=seed)
+        told = [env.step(np.zeros(1, np.float32))[4]["cloudrc"] for _ in range(100)]
+        return [each["lost_uplink"] for each in told]
+
+    env = Networked(Counter(), SHAKY, 1)
+    first, second, again = losses(env, 3), losses(env, None), losses(env, 3)
+    assert first == again != second
+    assert losses(env, None) == second
+    assert losses(env, 4) != first
+    assert losses(Networked(Counter(), SHAKY, 1, stream="b"), 3) != first
+
+
+def test_nothing_that_is_told_changes_afterwards():
+    env = Networked(Counter(), both_ways(20, 0))
+    seen = [env.reset()[0]] + [env.step(np.zeros(1, np.float32))[0] for _ in range(6)]
+    seen[4][0] = 99.0
+    assert [float(each[0]) for each in seen] == [0, 0, 0, 1, 99, 3, 4]
+    assert float(env.step(np.zeros(1, np.float32))[0][0]) == 5.0
+
+
+def test_an_action_that_the_policy_changes_later_is_flown_as_it_was_sent():
+    env, action = Networked(Counter(), both_ways(0, 20)), np.zeros(1, np.float32)
+    env.reset()
+    for _ in range(5):
+        action += 1
+        env.step(action)
+    assert [float(each[0]) for each in env.unwrapped.executed] == [0, 0, 1, 2, 3]
+
+
+def executed(link=None, steps=6, **options):
+    """Return the actions of a policy that sends 1, 2, 3..., as the robot executes them."""
+    env = Networked(Counter(), link or both_ways(0, 20), **options)
+    env.reset()
+    for n in range(1, steps + 1):
+        env.step(np.array([n], np.float32))
+    return [float(each[0]) for each in env.unwrapped.executed]
+
+
+def test_before_the_first_answer_the_robot_executes_start_or_waits():
+    assert executed() == [0, 0, 1, 2, 3, 4]
+    assert executed(start=np.array([7], np.float32)) == [7, 7, 1, 2, 3, 4]
+    assert executed(start="answer") == [1, 1, 1, 2, 3, 4]
+
+
+def test_without_an_answer_the_robot_repeats_its_action_or_executes_start():
+    silent = {"downlink": {"blackouts": [{"start_s": 0.02, "duration_s": 0.02}]}}
+    assert executed(silent) == [1, 2, 2, 2, 5, 6]
+    assert executed(silent, hold="start") == [1, 2, 0, 0, 5, 6]
+    again = executed(silent, hold="start", start=np.array([9], np.float32))
+    assert again == [1, 2, 9, 9, 5, 6]
+
+
+def test_a_policy_that_computes_answers_later_and_less_often():
+    ideal = both_ways(0, 0)
+    assert executed(ideal, compute=0.01) == [0, 1, 2, 3, 4, 5]
+    assert executed(ideal, compute=0.02) == [0, 0, 1, 1, 3, 3]
+    slow = executed(ideal, steps=300, compute=(0.02, 0.01))
+    assert slow == executed(ideal, steps=300, compute=(0.02, 0.01))
+    assert len(set(slow)) < 200
+
+
+def test_a_late_answer_never_replaces_a_newer_one():
+    found = executed(both_ways(0, 50, jitter_ms=50), steps=300)
+    assert all(later >= before for before, later in pairwise(found))
+    assert len(set(found)) < 290
+
+
+def test_the_end_of_an_episode_is_told_at_once_with_asked_against_measured():
+    env = Networked(Counter(limit=400), SHAKY, 1)
+    env.reset()
+    ended = False
+    while not ended:
+        observation, reward, ended, _, info = env.step(np.zeros(1, np.float32))
+    assert (reward, env.world_info) == (400.0, {"count": 400})
+    assert observation[0] < 400
+    summary = info["cloudrc"]["episode"]
+    assert summary["ticks"] == 400
+    for way, delay in (("uplink", 0.07), ("downlink", 0.05)):
+        found = summary[way]
+        assert found["delay_asked"] == pytest.approx(delay, abs=1e-3)
+        assert found["delay_measured"] == pytest.approx(delay, abs=5e-3)
+        assert found["loss_asked"] == pytest.approx(0.1, abs=0.01)
+        assert found["loss_measured"] == pytest.approx(0.1, abs=0.05)
+    assert summary["observation_age_mean"] > 0.04
+    assert summary["action_age_mean"] > 0.09
+
+
+def test_a_bottleneck_sees_the_sizes_of_observations_and_answers():
+    slow = both_ways(0, 0, rate_kbit=1000)
+    env = Networked(Counter(), slow, observation_bytes=10_000 - 28, action_bytes=2_500 - 28)
+    env.reset()
+    told = [env.step(np.zeros(1, np.float32))[4]["cloudrc"] for _ in range(20)]
+    assert told[-1]["observation_age"] == pytest.approx(0.18)  # 80 ms a packet: the second
+    assert Networked(Counter(), slow)._loop._up._size == 8
+
+
+def test_the_time_step_is_that_of_the_environment():
+    assert Networked(gymnasium.make("Pendulum-v1")).dt == 0.05  # its film has 30 frames a second
+    assert Networked(gymnasium.make("CartPole-v1")).dt == 0.02
+    assert Networked(gymnasium.make("MountainCar-v0")).dt == 1 / 30
+    assert Networked(Counter(), dt=0.5).dt == 0.5
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of the bare environments
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("Pendulum-v1", {"link": "lte", "compute": 0.02}),
+        ("CartPole-v1", {"link": "paper-p3", "chunk": 4, "executor": "time_indexed"}),
+        ("CartPole-v1", {"link": SHAKY, "chunk": 8, "executor": "prefix"}),
+    ],
+)
+def test_gymnasium_accepts_the_wrapper_and_makes_it_again(name, options):
+    env = Networked(gymnasium.make(name), **options)
+    check_env(env, skip_render_check=True)
+    again = gymnasium.make(env.spec)
+    assert again.action_space == env.action_space
+    env = gymnasium.make("cloudrc/Networked-v0", env=name, **options)
+    check_env(env, skip_render_check=True)
+
+
+def test_a_name_that_gymnasium_knows_after_the_import_alone():
+    program = (
+        "import gymnasium;"
+        "env = gymnasium.make('cloudrc.gym:cloudrc/Networked-v0', env='CartPole-v1', link='lte');"
+        "print(env.reset(seed=1)[1]['cloudrc']['observation_age'])"
+    )
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert found.stdout == "0.0\n", found.stderr
+
+
+def test_importing_the_wrapper_takes_no_heavy_package_along():
+    program = (
+        "import sys, cloudrc.gym;"
+        "print({'pydantic', 'mujoco', 'cryptography', 'yaml', 'torch'} & sys.modules.keys())"
+    )
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert found.stdout == "set()\n", found.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"link": "let"}, "no profile named 'let'.*did you mean lte"),
+        ({"seed": -1}, "seed -1"),
+        ({"compute": -0.1}, "compute -0.1: give the time"),
+        ({"compute": "fast"}, "compute 'fast'"),
+        ({"compute": (0.0, 0.1)}, "compute"),
+        ({"compute": (0.1, 0.1, 0.1)}, "compute"),
+        ({"chunk": 0}, "chunk 0: give None or the number"),
+        ({"chunk": 2.5}, "chunk 2.5"),
+        ({"chunk": True}, "chunk True"),
+        ({"executor": "newst"}, "no executor named 'newst'.*did you mean newest"),
+        ({"executor": "prefix"}, "executor 'prefix' plays chunks of actions: give chunk="),
+        ({"executor": "./none.py"}, "there is no such file"),
+        ({"hold": "zero"}, "hold 'zero': give 'repeat' or 'start'"),
+        ({"start": np.zeros(3)}, r"of shape \(3,\); give as start= an action"),
+        ({"start": "answr"}, "start= an action, or 'answer'"),
+        ({"observation_bytes": -1}, "observation_bytes -1"),
+        ({"action_bytes": 2.0}, "action_bytes 2.0"),
+        ({"dt": 0.0}, "the time step 0.0; give dt="),
+        ({"dt": "10 ms"}, "give dt="),
+        ({"stream": 3}, "stream 3"),
+    ],
+)
+def test_an_argument_that_cannot_be_used_is_refused_in_one_line(options, words):
+    with pytest.raises(BadInputError, match=words) as caught:
+        Networked(Counter(), **{"link": "ideal", **options})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("space", "chunk", "action", "words"),
+    [
+        (None, None, None, "the action is NoneType; give one action"),
+        (None, None, {"move": 1}, "the action is dict"),
+        (None, None, np.zeros(2), r"ndarray of shape \(2,\); give one action, in Box"),
+        (None, 4, np.zeros(1), "give a chunk of 4 actions"),
+        (None, 4, np.zeros((3, 1)), r"of shape \(3, 1\)"),
+        (None, 4, [[1.0], [1.0, 2.0], [1.0], [1.0]], "the action is list"),
+        (spaces.Discrete(2), None, None, "NoneType"),
+        (spaces.Discrete(2), None, np.zeros(1, int), r"of shape \(1,\)"),
+        (spaces.Discrete(2), 4, 1, "the action is int; give a chunk of 4"),
+        (spaces.Dict(a=spaces.Discrete(2)), None, {"b": 1}, "the action is dict"),
+        (spaces.Dict(a=spaces.Discrete(2)), None, 1, "the action is int"),
+        (spaces.Dict(a=spaces.Discrete(2)), 3, None, "the action is NoneType"),
+        (spaces.Tuple((spaces.Discrete(2),)), None, None, "NoneType"),
+    ],
+)
+def test_an_action_of_another_form_is_refused_in_one_line(space, chunk, action, words):
+    env = Networked(Counter(space), chunk=chunk)
+    env.reset()
+    with pytest.raises(BadInputError, match=words) as caught:
+        env.step(action)
+    assert "\n" not in str(caught.value)
+    assert env.unwrapped.executed == []
+
+
+def test_a_step_before_the_first_reset_is_refused():
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        Networked(Counter()).step(np.zeros(1, np.float32))
+
+
+def test_an_environment_without_a_time_step_asks_for_one():
+    class Timeless(Counter):
+        dt = None
+
+    with pytest.raises(BadInputError, match="has no time step; give dt="):
+        Networked(Timeless())
+
+
+def test_the_neutral_action_is_in_its_space():
+    space = spaces.Dict(
+        a=spaces.Box(np.array([1.0, -2.0]), np.array([3.0, 2.0]), dtype=np.float64),
+        b=spaces.Tuple((spaces.Discrete(3, start=-1), spaces.MultiDiscrete([2, 2]))),
+        c=spaces.MultiBinary(3),
+    )
+    assert space.contains(neutral(space))
+    assert neutral(space)["a"].tolist() == [1.0, 0.0]
+    with pytest.raises(BadInputError, match="Text has no neutral action; give start="):
+        Networked(Counter(spaces.Text(5)))
+    env = Networked(Counter(spaces.Text(5)), start="abc")
+    env.reset()
+    env.step("xyz")
+    assert env.unwrapped.executed == ["xyz"]

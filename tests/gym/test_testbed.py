@@ -1,0 +1,74 @@
+"""The testbed's robots as environments fly the true path of its flights, bit by bit."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+import cloudrc
+import cloudrc.gym
+from cloudrc.errors import BadInputError
+from cloudrc.gym import Networked
+from cloudrc.record.columns import Recording
+
+SHORT = {"mission": {"steps": {"count": 2}}}
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "experiment", "settings"),
+    [
+        ("cloudrc/Steps-v0", {"settings": SHORT}, "steps", SHORT),
+        ("cloudrc/Pipes-v0", {}, "paper", {}),
+        (
+            "cloudrc/Steps-v0",
+            {"robot": "x2", "settings": SHORT},
+            "steps",
+            {"world.robot": "x2"} | SHORT,
+        ),
+        ("cloudrc/Steps-v0", {"experiment": "pillars"}, "pillars", {}),
+    ],
+)
+def test_the_same_actions_fly_the_true_path_of_a_flight(name, options, experiment, settings):
+    flight = cloudrc.fly(experiment, {"link.profile": "ideal", **settings}, seed=3)
+    env = Networked(gymnasium.make(name, **options), "ideal")
+    observation, _ = env.reset(seed=3)
+    assert env.observation_space.contains(observation)
+    sent = flight["/cmd_vel"]
+    for velocity, yaw_rate in zip(sent["command"], sent["yaw_rate"], strict=True):
+        observation, reward, ended, _, info = env.step(np.array([*velocity, yaw_rate]))
+        if ended:
+            break
+    assert ended
+    assert (info["verdict"], info["is_success"]) == (flight.verdict, flight.verdict == "success")
+    assert reward == -np.linalg.norm(observation[:3] - observation[13:16])
+    truth = flight["/ground_truth"]
+    flown = Recording(records=env.unwrapped.flight.store)["/ground_truth"]
+    count = len(flown["stamp_ns"])
+    assert count > len(truth["stamp_ns"]) - 20  # a flight goes on for up to 100 ms
+    for column in ("position", "orientation_wxyz", "velocity", "angular_velocity_body"):
+        assert truth[column][:count].tobytes() == flown[column].tobytes()
+
+
+def test_a_seed_selects_the_steps_and_a_flight_can_be_repeated():
+    env = gymnasium.make("cloudrc/Steps-v0")
+
+    def fly(seed):
+        observation, _ = env.reset(seed=seed)
+        rewards = [env.step(np.array([0.1, 0, 0.2, 0]))[1] for _ in range(50)]
+        return observation.tolist(), rewards
+
+    assert fly(1) == fly(1) != fly(2)
+    assert env.reset(seed=1)[0].tolist() != env.reset()[0].tolist()
+
+
+def test_what_a_robot_cannot_fly_is_refused():
+    with pytest.raises(BadInputError, match=r"no robot named 'pelikan'.*did you mean pelican"):
+        gymnasium.make("cloudrc/Steps-v0", robot="pelikan")
+    with pytest.raises(BadInputError, match="wrold"):
+        gymnasium.make("cloudrc/Steps-v0", settings={"wrold.robot": "x2"})
+    env = gymnasium.make("cloudrc/Steps-v0").unwrapped
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(4))
+    env.reset(seed=1)
+    for action in (np.zeros(3), np.array([np.nan, 0, 0, 0]), None):
+        with pytest.raises(BadInputError, match="give 4 finite numbers"):
+            env.step(action)

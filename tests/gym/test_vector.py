@@ -1,0 +1,124 @@
+"""Vector environments: each robot has a link of its own, in each way of automatic reset."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from cloudrc.errors import BadInputError
+from cloudrc.gym import Networked, NetworkedVector
+from tests.gym.envs import Counter, Mixed, both_ways
+
+LINK = both_ways(40, 30, jitter_ms=30, loss=0.1)
+
+
+def cartpoles(mode, robots=3):
+    arguments = {"autoreset_mode": mode}
+    return gymnasium.make_vec("CartPole-v1", robots, "sync", vector_kwargs=arguments)
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_an_ideal_link_changes_no_bit(mode):
+    bare, env = cartpoles(mode), NetworkedVector(cartpoles(mode), "ideal")
+    assert np.array_equal(bare.reset(seed=3)[0], env.reset(seed=3)[0])
+    rng = np.random.default_rng(0)
+    for _ in range(80):
+        actions = rng.integers(0, 2, 3)
+        expected, found = bare.step(actions), env.step(actions)
+        assert all(np.array_equal(expected[n], found[n]) for n in range(4))
+        if "final_obs" in expected[4]:
+            for one, other in zip(expected[4]["final_obs"], found[4]["final_obs"], strict=True):
+                assert one is other is None or np.array_equal(one, other)
+        mask = expected[2] | expected[3]
+        if mode is AutoresetMode.DISABLED and mask.any():
+            options = ({"reset_mask": mask.copy()} for _ in range(2))
+            first, second = (each.reset(options=next(options)) for each in (bare, env))
+            assert np.array_equal(first[0], second[0])
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_a_robot_of_a_vector_flies_as_alone_with_its_stream(mode):
+    def count():
+        return Counter(limit=25)
+
+    env = NetworkedVector(SyncVectorEnv([count] * 2, autoreset_mode=mode), LINK, 5)
+    alone = [Networked(count(), LINK, 5, stream=f"/{robot}") for robot in range(2)]
+    env.reset(seed=8)
+    for n, one in enumerate(alone):
+        one.reset(seed=8 + n)
+    ended = False
+    for step in range(70):
+        actions = np.full((2, 1), step, np.float32)
+        observations, rewards, ends, _, infos = env.step(actions)
+        for n, one in enumerate(alone):
+            if ended and mode is AutoresetMode.NEXT_STEP:
+                found, told = one.reset()
+            else:
+                found, reward, over, _, told = one.step(actions[n])
+                assert (reward, over) == (rewards[n], ends[n])
+                if over and mode is AutoresetMode.SAME_STEP:
+                    final = infos["final_info"]["cloudrc"]["episode"]["ticks"]
+                    assert final[n] == told["cloudrc"]["episode"]["ticks"] == 25
+                    found, told = one.reset()
+            assert np.array_equal(found, observations[n])
+            assert infos["count"][n] == told["count"]
+            assert infos["cloudrc"]["lost_uplink"][n] == told["cloudrc"]["lost_uplink"]
+        ended = bool(ends[0])
+
+
+def test_robots_share_no_network():
+    env = NetworkedVector(SyncVectorEnv([Counter] * 3), LINK, 1)
+    env.reset()
+    lost = [env.step(np.zeros((3, 1), np.float32))[4]["cloudrc"]["lost_uplink"] for _ in range(200)]
+    first, second, third = np.array(lost).T
+    assert not np.array_equal(first, second)
+    assert not np.array_equal(second, third)
+
+
+def test_chunks_and_spaces_of_every_kind():
+    env = NetworkedVector(SyncVectorEnv([Mixed] * 2), LINK, chunk=3, executor="time_indexed")
+    bare = SyncVectorEnv([Mixed] * 2)
+    observation, _ = env.reset(seed=1)
+    assert env.observation_space == bare.observation_space
+    assert env.observation_space.contains(observation)
+    env.action_space.seed(0)
+    for _ in range(20):
+        observation, *_ = env.step(env.action_space.sample())
+    assert env.observation_space.contains(observation)
+
+
+def test_gymnasium_makes_a_vector_by_name():
+    env = gymnasium.make_vec("cloudrc/Networked-v0", 4, env="Pendulum-v1", link="lte", seed=2)
+    assert isinstance(env, NetworkedVector)
+    observations, infos = env.reset(seed=1)
+    assert observations.shape == (4, 3)
+    assert infos["cloudrc"]["observation_age"].tolist() == [0.0] * 4
+    with pytest.raises(BadInputError, match=r"env 'Pendulun-v1': .*Did you mean: `Pendulum`"):
+        gymnasium.make_vec("cloudrc/Networked-v0", 4, env="Pendulun-v1")
+    with pytest.raises(BadInputError, match="env 'None-v0'"):
+        gymnasium.make("cloudrc/Networked-v0", env="None-v0")
+
+
+def test_what_does_not_fit_a_vector_is_refused_in_one_line():
+    env = SyncVectorEnv([Counter] * 2)
+    env.metadata = {}
+    with pytest.raises(BadInputError, match="does not say when it resets a robot"):
+        NetworkedVector(env)
+    ready = NetworkedVector(SyncVectorEnv([Counter] * 2), chunk=3)
+    ready.reset()
+    with pytest.raises(BadInputError, match="for each of 2 robots a chunk of 3 actions"):
+        ready.step(np.zeros((2, 1)))
+    with pytest.raises(BadInputError, match="NoneType"):
+        ready.step(None)
+
+
+def test_environments_in_other_processes_need_a_time_step():
+    made = gymnasium.make_vec("CartPole-v1", 1, "async")
+    try:
+        with pytest.raises(BadInputError, match="do not tell their time step; give dt="):
+            NetworkedVector(made)
+        env = NetworkedVector(made, "lte", dt=0.02)
+        env.reset(seed=1)
+        assert env.step(np.zeros(1, int))[0].shape == (1, 4)
+    finally:
+        made.close()
