@@ -5,13 +5,16 @@ World and cloud do not import each other. Drivers use them only through `cloudrc
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from math import degrees, dist, inf, radians
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cloudrc.cloud.controllers import Controller
+from cloudrc.cloud.controllers.remote import ControllerChannel, OutsideController
 from cloudrc.cloud.endpoint import CloudEndpoint, ComputeTime
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
@@ -22,11 +25,13 @@ from cloudrc.config.overrides import build_plugin, build_predictor
 from cloudrc.config.robot import facts, is_planar
 from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
+from cloudrc.errors import ControllerLostError
 from cloudrc.geometry.fence import Fence
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
 from cloudrc.messages import Start
 from cloudrc.plugins import apart
+from cloudrc.records import CONTROLLER_LOST, Fault
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.wire import Leg, Plan
 from cloudrc.tunnel.end import Identity
@@ -63,12 +68,14 @@ VIRTUAL_RING = KeyRing(KeySet(Key(b"nothing is secret in one process")))
 
 
 def assemble(
-    experiment: ResolvedExperiment, make_loop: Callable[..., ControlLoop] = ControlLoop
+    experiment: ResolvedExperiment,
+    make_loop: Callable[..., ControlLoop] = ControlLoop,
+    channel: ControllerChannel | None = None,
 ) -> tuple[WorldEndpoint, CloudEndpoint, Teleop, VirtualRun]:
     """Build world, cloud and teleop, and connect them for a flight in virtual time.
 
-    The mission starts with the flight; `Teleop.over` tells when it is over. `make_loop` is that of
-    `build_cloud`.
+    The mission starts with the flight; `Teleop.over` tells when it is over. `make_loop` and
+    `channel` are those of `build_cloud`.
     """
     from cloudrc.drivers.virtual import CPU_CLOCK, Clock, VirtualRun
 
@@ -86,6 +93,7 @@ def assemble(
         lambda: own.at(0),
         cpu_clock=CPU_CLOCK,
         make_loop=make_loop,
+        channel=channel,
     )
     return world, cloud, teleop, VirtualRun(world, cloud, *links, cloud_clock=own)
 
@@ -110,13 +118,39 @@ def fly(
 
     Every 100 ms of virtual time, call `see` with the new records of world and of cloud, both on
     world's clock. `make_loop` is that of `build_cloud`.
+
+    Raise a ControllerLostError if a program outside controls the robot and is lost.
     """
-    _, _, teleop, run = assemble(experiment, make_loop)
+    with _lock_step(experiment) as channel:
+        _, _, teleop, run = assemble(experiment, make_loop, channel)
+        lost = list[ControllerLostError]()
 
-    def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
-        see(from_world, run.on_world_clock(from_cloud))
+        def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
+            see(from_world, run.on_world_clock(from_cloud))
+            if channel is not None:
+                lost.extend(lost_controller(from_cloud))
 
-    run.fly(lambda: teleop.over, round(flight_limit(experiment) * 1e9), sink)
+        limit_ns = round(flight_limit(experiment) * 1e9)
+        run.fly(lambda: teleop.over or bool(lost), limit_ns, sink)
+    if lost:
+        raise lost[0]
+
+
+def _lock_step(experiment: ResolvedExperiment) -> AbstractContextManager[ControllerChannel | None]:
+    """Connect to the program outside that controls the robot; without one, yield None."""
+    controller = build_controller(experiment)
+    if not isinstance(controller, OutsideController):
+        return nullcontext()
+    from cloudrc.drivers.remote import LockStep
+
+    return LockStep(controller.url, controller.start_limit)
+
+
+def lost_controller(records: Iterable[Record]) -> Iterator[ControllerLostError]:
+    """Yield the faults in cloud's records with which a flight ends, as errors."""
+    for record in records:
+        if isinstance(record, Fault) and record.code in CONTROLLER_LOST:
+            yield ControllerLostError(record.code, record.text)
 
 
 def step_code(experiment: ResolvedExperiment) -> str:
@@ -171,16 +205,18 @@ def build_cloud(
     *,
     cpu_clock: Callable[[], int] | None = None,
     make_loop: Callable[..., ControlLoop] = ControlLoop,
+    channel: ControllerChannel | None = None,
 ) -> CloudEndpoint:
     """Build cloud: plug-ins, and cloud's end of the tunnel.
 
     `teleop` provides the setpoints. `clock` returns cloud's monotonic time [ns]. In virtual time,
     `cpu_clock` returns the processor time of this thread [ns], which delays commands if
     `cloud.compute_measured` is set. `make_loop` is called in place of `ControlLoop`, for example to
-    make a loop that lies.
+    make a loop that lies. `channel` leads to a program outside that controls the robot.
     """
     cloud = experiment.cloud
-    controller = build_plugin("controllers", cloud.controller)
+    controller = build_controller(experiment)
+    remote = controller if isinstance(controller, OutsideController) else None
     if is_planar(experiment.world.robot):
         controller = Planar(controller)
     loop = make_loop(
@@ -194,6 +230,8 @@ def build_cloud(
         period_ns=round(SECOND_NS / cloud.command_rate_hz),
         plan=cloud.plan_s,
     )
+    if remote is not None and channel is not None:
+        remote.connect(channel, loop.period_ns * 1e-9, loop.counts)
     cpu_clock = cpu_clock if cloud.compute_measured else None
     compute = None
     if cloud.compute_ms or cpu_clock:
@@ -204,6 +242,12 @@ def build_cloud(
     return CloudEndpoint(
         loop, teleop, identity, newest_wins=newest_wins, compute=compute, start_ns=clock()
     )
+
+
+def build_controller(experiment: ResolvedExperiment) -> Controller:
+    """Build the controller of an experiment."""
+    controller: Controller = build_plugin("controllers", experiment.cloud.controller)
+    return controller
 
 
 def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDirection]:

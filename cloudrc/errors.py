@@ -59,6 +59,20 @@ class TimedOutError(CloudrcError):
     exit_code = 4
 
 
+class ControllerLostError(CloudrcError):
+    """The program that controls the robot from outside is silent or answers wrongly."""
+
+    exit_code = 5
+
+    def __init__(self, code: str, text: str) -> None:
+        """Set the `code` for programs, one of `records.CONTROLLER_LOST`, and the text for users."""
+        super().__init__(code, text)  # pickle passes these arguments to the parent process
+        self.code = code
+
+    def __str__(self) -> str:
+        return str(self.args[1])
+
+
 class InterruptedRunError(CloudrcError):
     """The user interrupted the run before there was a result to report."""
 

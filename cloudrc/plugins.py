@@ -34,6 +34,7 @@ from typing import Any, TextIO, cast
 from cloudrc.errors import (
     BadInputError,
     CloudrcError,
+    ControllerLostError,
     OutOfMemoryError,
     describe_error,
     to_one_line,
@@ -127,9 +128,10 @@ def check_failure(error: BaseException, what: str) -> None:
     """Return if `error`, which a plug-in raised, is the plug-in's failure; else raise.
 
     Everything is, also SystemExit, except Ctrl-C, which is the user's, and a lack of memory, which
-    is the machine's: no result may depend on it. `what` names the plug-in in the error's text.
+    is the machine's: no result may depend on it; and except the loss of a program outside, which
+    ends a flight. `what` names the plug-in in the error's text.
     """
-    if isinstance(error, KeyboardInterrupt | OutOfMemoryError):
+    if isinstance(error, KeyboardInterrupt | OutOfMemoryError | ControllerLostError):
         raise error
     if isinstance(error, MemoryError):
         text = f"{what}: memory ran out ({describe_error(error)})"

@@ -238,6 +238,10 @@ FAILURES = (
 )
 """Events that end a mission as a failure."""
 
+CONTROLLER_LOST = ("controller_silent", "controller_invalid")
+"""Codes of faults with which a flight ends, because a program outside that controls the robot does
+not answer, or its answers are wrong."""
+
 
 class MissionEvent(NamedTuple):
     """Made by cloud: an event of the mission. Topic /mission.
@@ -269,7 +273,7 @@ class Fault(NamedTuple):
         str,
         "",
         "one word, for example estimator_failed, predictor_failed, controller_failed, "
-        "onboard_failed, recorder, link_check, wall_clock, late",
+        f"onboard_failed, {', '.join(CONTROLLER_LOST)}, recorder, link_check, wall_clock, late",
     ]
     text: Annotated[str, "", "what is wrong, where, what to do"]
     traceback: Annotated[str, "", "of a plug-in's first failure, else empty"] = ""

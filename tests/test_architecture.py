@@ -36,7 +36,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "plugin_file": set(),
     "tunnel": {"endpoint"},
     "link": {"config", "files", "exposition", "metrics.definitions", "tunnel"},
-    "config": {"plugins", "geometry", "link", "files"},
+    "config": {"plugins", "geometry", "link", "files", "policy.address"},
     "world": {
         "endpoint",
         "tunnel",
@@ -55,9 +55,13 @@ MAY_IMPORT: dict[str, set[str]] = {
         *("cloud.motion", "endpoint", "geometry.vectors", "tunnel", "config", "plugins", "teleop"),
     },
     "teleop": {"config", "files", "geometry", "metrics"},
-    "policy": {"plugins"},
+    "policy": {"plugins", "policy.address"},
+    "policy.address": set(),
     "exposition": {"metrics.definitions"},
-    "drivers": {"endpoint", "tunnel", "link", "exposition", "files", "record", "teleop"},
+    "drivers": {
+        *("endpoint", "tunnel", "link", "exposition", "files", "policy", "policy.address"),
+        *("record", "teleop"),
+    },
     "record": {"endpoint", "files"},
     "metrics": {"metrics.definitions", "record", "config", "geometry", "plugins"},
     "metrics.definitions": set(),  # live metrics import it in every process, with no heavy library

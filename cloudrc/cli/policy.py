@@ -5,15 +5,19 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from pathlib import Path
 
 from cloudrc.cli.output import print_line
 from cloudrc.cli.parser import add_verbs, whole_number
+from cloudrc.drivers.process import StopSignal
+from cloudrc.policy.address import KEY_VARIABLE
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import require
 
-VERBS = {"serve": "serve a Python policy over openpi's wire, until Ctrl-C"}
-KEY_VARIABLE = "CLOUDRC_POLICY_KEY"
-"""Environment variable with the API key of a policy's server, for the server and for clients."""
+VERBS = {
+    "serve": "serve a Python policy over openpi's wire, until Ctrl-C",
+    "drive": "ask a remote controller for cloud (started by 'run --mode local')",
+}
 EPILOG = f"""\
 examples:
   cloudrc policy serve ./expert.py --port 8000
@@ -28,7 +32,7 @@ API key."""
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    (serve,) = add_verbs(parser, VERBS).values()
+    serve, drive = add_verbs(parser, VERBS).values()
     add = serve.add_argument
     add("policy", metavar="POLICY", help="a Python file with infer(observation)")
     about = "address to listen at (default: 127.0.0.1)"
@@ -36,9 +40,27 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     about = "port to listen at; 0: any free port (default: 8000)"
     add("--port", type=whole_number(0, 65_535), default=8000, metavar="N", help=about)
 
+    about = "experiment file (YAML)"
+    drive.add_argument("--config", type=Path, metavar="FILE", required=True, help=about)
+    about = "folder of the sockets of 'cloudrc cloud --teleop DIR'"
+    drive.add_argument("--socket", type=Path, metavar="DIR", required=True, help=about)
+    about = "write status for a supervisor to stdout (default: events only)"
+    drive.add_argument("--feed", action="store_true", help=about)
+
 
 def execute(options: argparse.Namespace) -> int:
-    """Serve until the user interrupts."""
+    """Serve a policy, or ask a remote controller, until the user interrupts."""
+    if options.verb == "drive":
+        stop = StopSignal()
+        require("a remote controller", ("policy",))
+        from cloudrc.processes.ends import run_remote
+
+        run_remote(options.config, options.socket, stop, watched=options.feed)
+        return 0
+    return _serve(options)
+
+
+def _serve(options: argparse.Namespace) -> int:
     require("a policy's server", ("policy",))
     from cloudrc.drivers.realtime import show_address
     from cloudrc.policy.serve import serve_policy

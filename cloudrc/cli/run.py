@@ -52,6 +52,7 @@ examples:
   cloudrc run paper --mode virtual --set link.profile=satellite
   cloudrc run steps --seeds 10 --set cloud.predictor=last_sample
   cloudrc run my.yaml --mode virtual --set cloud.predictor=./my_predictor.py
+  cloudrc run --set cloud.controller=remote --with "node controller.js"
   cloudrc run --mode cluster --context kind-cloudrc -n demo --release demo
   cloudrc run runs/latest/config.yaml --mode virtual     the same run again
 
@@ -67,6 +68,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mode", choices=MODES, help=about)
     about = "fly seeds 1 to N on all cores and print a table"
     many.add_argument("--seeds", type=read_count, metavar="N", help=about)
+    about = "start this program with the flight, and end it with it: a remote controller"
+    parser.add_argument("--with", dest="beside", default="", metavar="CMD", help=about)
     output_argument(parser, "json, yaml: print only the report")
     release_arguments(parser, DEFAULT_RELEASE)
     timeout_argument(parser)
@@ -90,12 +93,23 @@ def execute(options: argparse.Namespace) -> int:
     mode = options.mode or ("virtual" if options.seeds else "local")
     if options.seeds and mode != "virtual":
         raise BadInputError(f"--seeds flies in virtual time; leave out --mode {mode}")
+    if options.beside:
+        _check_beside(options, mode)
     require(f"mode {mode}", MODES[mode])
     if options.seeds:
         from cloudrc.cli.sweep_run import fly_seeds
 
         return fly_seeds(options)
     return fly_once(options, mode)
+
+
+def _check_beside(options: argparse.Namespace, mode: str) -> None:
+    from cloudrc.drivers.companion import split_command
+
+    if options.seeds or mode == "cluster":
+        other = "--seeds" if options.seeds else "--mode cluster"
+        raise BadInputError(f"--with starts a program for one flight here; leave out {other}")
+    split_command(options.beside)
 
 
 def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None) -> int:
@@ -116,7 +130,8 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
     if in_cluster:
         flight = _cluster_flight(experiment, options, stream)
     else:
-        flight = _local_flight(experiment, mode, stream, ready)
+        beside = getattr(options, "beside", "")
+        flight = _local_flight(experiment, mode, stream, ready, beside)
     name = f"{experiment.name}-{'session' if ready else mode}-seed{experiment.seed}"
     folder = new_folder(options.out, name, "" if in_cluster else "latest")
     if not for_programs:
@@ -148,25 +163,25 @@ def _place_of_recording(folder: Path) -> Iterator[None]:
 
 
 def _local_flight(
-    experiment: ResolvedExperiment, mode: str, stream: TextIO, ready: Ready | None
+    experiment: ResolvedExperiment, mode: str, stream: TextIO, ready: Ready | None, beside: str
 ) -> Flight:
     """Return a function that flies on this machine and shows the progress on `stream`.
 
     With `ready`, the function flies a session, in which teleop waits for missions. It calls `ready`
-    when all processes are ready.
+    when all processes are ready. `beside` is the command of a program that runs with the flight.
     """
     from cloudrc.cli.progress import FlightView
     from cloudrc.runs.fly import fly
 
     def flight(folder: Path) -> dict[str, Any]:
         if stream is sys.stderr and not is_live(stream):
-            return fly(experiment, mode, folder)
+            return fly(experiment, mode, folder, beside=beside)
         with contextlib.ExitStack() as stack:
             mission = experiment.mission
             counted = (0, "waypoint") if ready else (mission.count, mission.unit)
             view = stack.enter_context(contextlib.closing(FlightView(stream, *counted)))
             session = partial(ready, folder, view.say, stack) if ready else None
-            return fly(experiment, mode, folder, view.see, session=session)
+            return fly(experiment, mode, folder, view.see, session=session, beside=beside)
 
     return flight
 

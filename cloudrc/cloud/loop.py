@@ -28,7 +28,7 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.plan_log import PlanLog
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.cloud.results import check_estimate, check_output, is_fit, refuse, to_vector
-from cloudrc.errors import describe_error
+from cloudrc.errors import ControllerLostError, describe_error
 from cloudrc.messages import (
     NEVER_NS,
     PLAN_STEP_NS,
@@ -291,6 +291,9 @@ class ControlLoop:
     def _steer(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
         try:
             return check_output(self._controller.update(estimate, setpoint, dt))
+        except ControllerLostError as error:  # the flight ends when its driver sees the fault
+            self.faults.append(Fault(self._now_ns, error.code, str(error)))
+            return STAND_STILL
         except BaseException as error:
             self._note("controller", error)
             return STAND_STILL

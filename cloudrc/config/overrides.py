@@ -36,6 +36,8 @@ from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.renamed import new_key
 
+REMOTE = "remote"
+"""Name of the controller that asks a program outside."""
 KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "controllers"}
 """Key under `cloud` -> kind of plug-in."""
 GIVEN = {("onboard", "model"), ("predictors", "robot")}
@@ -297,8 +299,11 @@ def _complete(
     if kind != "estimators":
         with plugins.refuse_failure(f"{path[-1]} {name!r}: its reset() failed"):
             plugin.reset()
-    if kind == "predictors" and document.get("cloud", "plan_s"):
-        _check_model(plugin, name)
+    if document.get("cloud", "plan_s"):
+        if kind == "predictors":
+            _check_model(plugin, name)
+        if kind == "controllers" and name == REMOTE:
+            raise BadInputError(f"'{REMOTE}' cannot plan ahead; set cloud.plan_s to 0")
     return values
 
 

@@ -16,6 +16,7 @@ from pathlib import PurePath
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -37,6 +38,7 @@ from cloudrc.link.profile import (
 from cloudrc.link.profile import NotNegative as NotNegative
 from cloudrc.link.profile import Positive as Positive
 from cloudrc.messages import TOUCH_NAME_MAX
+from cloudrc.policy.address import check_url
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Point = tuple[Finite, Finite, Finite]
@@ -54,6 +56,8 @@ Place = Annotated[
     BeforeValidator(_with_height),
 ]
 """A point; a robot that stays on the ground needs no third number."""
+ServerUrl = Annotated[str, AfterValidator(check_url)]
+"""Address of a policy's server, such as ws://127.0.0.1:8000."""
 NotNegatives = tuple[NotNegative, NotNegative, NotNegative]
 _Constant = Annotated[float, Field(gt=0, le=30)]
 _DeadTime = Annotated[float, Field(ge=0, le=5)]

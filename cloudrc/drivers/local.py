@@ -32,11 +32,11 @@ from cloudrc.drivers.machine import Deadline, interpreter
 from cloudrc.drivers.process import PARENT, READY, from_line
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.teleop import PATH_MAX
-from cloudrc.errors import InvalidRunError, TimedOutError
+from cloudrc.errors import ControllerLostError, InvalidRunError, TimedOutError
 from cloudrc.files import make_own_folder, who_may_write
 from cloudrc.link.follow import PROFILE
 from cloudrc.link.state import STATE_FILE
-from cloudrc.records import Fault, Record
+from cloudrc.records import CONTROLLER_LOST, Fault, Record
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
 
 START_LIMIT = 60.0
@@ -65,6 +65,8 @@ JOURNAL_FILE = "missions.journal"
 """File in a session's folder: teleop's store of the missions."""
 LINK_LOG = "uplink.log"
 """File in the folder of every run in real time."""
+CONTROLLER = "controller"
+"""Name of the process that asks a controller outside."""
 RUN, SESSION = "run", "session"
 """Kinds of flights: a run (`cloudrc run`) ends with its mission, a session with `cloudrc down`."""
 
@@ -208,6 +210,9 @@ class LocalRun:
         folder: Path,
         see: Callable[[list[Record]], None],
         session: Callable[[str, dict[str, str]], None] | None = None,
+        *,
+        remote: bool = False,
+        lost: Callable[[list[Record]], None] = lambda records: None,
     ) -> None:
         """Prepare a run in `folder`; start no process yet.
 
@@ -218,7 +223,11 @@ class LocalRun:
         If `session` is given, the run is a session: teleop waits for missions, all processes serve
         metrics, and the recordings contain only the flights. When all processes are ready,
         `session` gets the API's address and a mapping: process -> HOST:PORT of its metrics.
+
+        With `remote`, a sixth process asks a controller outside. `lost` gets the same records as
+        `see`, and raises a ControllerLostError if this controller is lost.
         """
+        self._remote, self._lost = remote, lost
         self._folder, self._see, self._session = folder, see, session
         self._metrics: dict[str, str] = {}
         self.announcement = contextlib.ExitStack()
@@ -285,6 +294,9 @@ class LocalRun:
         origin_ns = time.monotonic_ns()  # one start for both directions
         start_link("uplink", "world", "cloud")
         start_link("downlink", "cloud", "world")
+        if self._remote:
+            self._start(CONTROLLER, "policy", "drive", socket=sockets)
+            self._wait_until_ready()
         start_end("cloud", "downlink", teleop=sockets)
         self._wait_until_ready()
         if session:
@@ -316,7 +328,9 @@ class LocalRun:
         teleop = next(child for child in self._children if child.name == "teleop")
         heard_from = time.monotonic()
         while teleop.process.poll() is None:
-            self._see(self._listen())
+            records = self._listen()
+            self._see(records)
+            self._lost(records)
             now = time.monotonic()  # before the deadline looks for a pause: `now` contains none
             if deadline.passed():
                 raise TimedOutError(f"the flight was ended after {limit:g} s, its limit")
@@ -353,6 +367,9 @@ class LocalRun:
                 continue
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
             said = child.log.read_text(errors="replace").strip() or "it left no message"
+            if child.name == CONTROLLER and code == ControllerLostError.exit_code:
+                text = said.splitlines()[-1].removeprefix("cloudrc: error: ")
+                raise ControllerLostError(CONTROLLER_LOST[0], text)
             raise InvalidRunError(
                 f"the {child.name} process died in flight ({how}): {said.splitlines()[-1]}; "
                 f"see {child.log}"

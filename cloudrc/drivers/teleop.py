@@ -47,15 +47,16 @@ Make = Callable[[int], None]
 """Function that makes the calls that other threads have queued, at a time [ns], monotonic clock."""
 
 
-class UnixPeer:
-    """Exchanges messages with another process over two Unix sockets."""
+class UnixDatagrams:
+    """Exchanges datagrams with another process over two Unix sockets."""
 
-    def __init__(self, own: Path, other: Path) -> None:
+    def __init__(self, own: Path, other: Path, size_max: int = DATAGRAM_MAX) -> None:
         """Bind the path `own`, in place of an earlier process's socket; send to the path `other`.
 
-        Raise a BadInputError if `own` cannot be bound.
+        `size_max` is the size limit of a datagram [bytes]. Raise a BadInputError if `own` cannot be
+        bound.
         """
-        self._other = str(other)
+        self._other, self._size_max = str(other), size_max
         if len(bytes(own)) > PATH_MAX:
             raise BadInputError(f"--socket: {own} is longer than {PATH_MAX} bytes; choose another")
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -68,25 +69,23 @@ class UnixPeer:
             self._socket.close()
             raise BadInputError(f"--socket: cannot make {own}: {error.strerror}") from error
 
-    def receive(self) -> list[Message | None]:
-        """Return the messages that have arrived.
+    def fileno(self) -> int:
+        """Return the descriptor of the socket, to wait for datagrams."""
+        return self._socket.fileno()
 
-        None in the list stands for an empty datagram, a sign of life of the other process.
-        """
-        messages: list[Message | None] = []
+    def receive_data(self) -> list[bytes]:
+        """Return the datagrams that have arrived."""
+        arrived: list[bytes] = []
         with suppress(BlockingIOError):
-            while len(messages) < DRAIN_MAX:
-                data = self._socket.recv(DATAGRAM_MAX)
-                with suppress(ValueError):
-                    messages.append(decode(data) if data else None)
-        return messages
+            while len(arrived) < DRAIN_MAX:
+                arrived.append(self._socket.recv(self._size_max))
+        return arrived
 
-    def send(self, message: Message | None) -> bool:
-        """Send a message (None: an empty datagram, a sign of life); return whether it was accepted.
+    def send_data(self, data: bytes) -> bool:
+        """Send a datagram; return whether it was accepted.
 
         False means that the other process does not run, or that the queue of its socket is full.
         """
-        data = b"" if message is None else encode(message)
         try:
             self._socket.sendto(data, self._other)
         except OSError:  # the other process does not run, or its queue is full
@@ -96,6 +95,28 @@ class UnixPeer:
     def close(self) -> None:
         """Close the socket, but keep the socket file, which may already belong to a new process."""
         self._socket.close()
+
+
+class UnixPeer(UnixDatagrams):
+    """Exchanges the messages of teleop and cloud with the other process."""
+
+    def receive(self) -> list[Message | None]:
+        """Return the messages that have arrived.
+
+        None in the list stands for an empty datagram, a sign of life of the other process.
+        """
+        messages: list[Message | None] = []
+        for data in self.receive_data():
+            with suppress(ValueError):
+                messages.append(decode(data) if data else None)
+        return messages
+
+    def send(self, message: Message | None) -> bool:
+        """Send a message (None: an empty datagram, a sign of life); return whether it was accepted.
+
+        False means that the other process does not run, or that the queue of its socket is full.
+        """
+        return self.send_data(b"" if message is None else encode(message))
 
 
 class RemoteTeleop:

@@ -32,7 +32,7 @@ from cloudrc.metrics.definitions import real_time_factor
 from cloudrc.metrics.mission import first_touch, missed_end, obstacle_contacts, reported
 from cloudrc.metrics.response import steps
 from cloudrc.record.columns import Recording
-from cloudrc.records import REAL_TIME_FACTOR_MIN
+from cloudrc.records import CONTROLLER_LOST, REAL_TIME_FACTOR_MIN
 from cloudrc.rounding import exceeds, format_beside
 
 SLIP_MAX = 0.25
@@ -220,6 +220,10 @@ def _violations(flight: Flight) -> Iterator[FlightFailure]:
 def _ending(flight: Flight, interrupted: bool) -> Ending:
     if flight.ending is not None:
         return Ending(*flight.ending[1:])
+    faults = flight.recording["/fault"]
+    for code, text in zip(faults["code"], faults["text"], strict=True):
+        if code in CONTROLLER_LOST:  # the runner ends a flight with this fault
+            return Ending(str(code), str(text))
     if interrupted and flight.end_ns is None:
         return Ending("interrupted", "the run was stopped before the mission started")
     if any(words in flight.recording.note for words in DISK_FULL.values()):

@@ -6,12 +6,12 @@ import time
 from collections.abc import Mapping
 from types import TracebackType
 from typing import Any
-from urllib.parse import urlsplit
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
 from websockets.sync.client import ClientConnection, connect
 
 from cloudrc.errors import BadInputError, CloudrcError, describe_error, to_one_line
+from cloudrc.policy.address import KEY_VARIABLE, check_url
 from cloudrc.policy.codec import MESSAGE_MAX, WireError, pack, unpack
 
 START_LIMIT = 60.0
@@ -32,21 +32,6 @@ class PolicyServerError(CloudrcError):
 
 class SilentServerError(PolicyServerError):
     """A policy's server does not listen, has closed the connection, or did not answer in time."""
-
-
-def check_url(url: str) -> str:
-    """Return the address of a policy's server; raise a BadInputError if it is none."""
-    try:
-        parts = urlsplit(url)
-        valid = parts.scheme in ("ws", "wss") and bool(parts.hostname) and parts.port != 0
-    except ValueError:
-        valid = False
-    if not valid:
-        raise BadInputError(
-            f"'{url}' is no address of a policy's server; give scheme, host and port, such as "
-            "ws://127.0.0.1:8000"
-        )
-    return url
 
 
 class PolicyClient:
@@ -78,7 +63,10 @@ class PolicyClient:
             answer_limit: Time limit for each further answer [s].
             patience: Time in which a server that is being started begins to listen [s].
         """
-        self.url = check_url(url)
+        try:
+            self.url = check_url(url)
+        except ValueError as error:
+            raise BadInputError(str(error)) from None
         self._limit, self._answer_limit = start_limit, answer_limit
         self._connection: ClientConnection | None = self._connect(key, patience)
         self.metadata = self._receive("metadata")
@@ -169,7 +157,7 @@ class PolicyClient:
 
 def _explain_status(code: int) -> str:
     if code in (401, 403):
-        return f"the server refuses the API key ({code}); set CLOUDRC_POLICY_KEY"
+        return f"the server refuses the API key ({code}); set {KEY_VARIABLE}"
     return f"the server answers with HTTP status {code}; is it a policy's server?"
 
 

@@ -32,7 +32,8 @@ class LoadedPolicy:
         if not is_path(name):
             raise BadInputError(f"policy '{name}': name a Python file, such as ./{name}.py")
         policy = find("policies", name, look=False)
-        if build := getattr(policy, "build", None):
+        build = getattr(policy, "build", None)
+        if build is not None and not hasattr(policy, "infer"):
             with refuse_failure(f"policy '{name}' cannot be built"):
                 policy = build()
         self._infer = getattr(policy, "infer", None)

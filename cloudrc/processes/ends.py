@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
-from contextlib import closing, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc import assembly
+from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.config.load import ResolvedExperiment, load_experiment, read_experiment
 from cloudrc.config.robot import known_robot
 from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.machine import clock_id
 from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
 from cloudrc.drivers.realtime import Address, Peer, bind
-from cloudrc.drivers.teleop import RemoteTeleop, UnixPeer
+from cloudrc.drivers.teleop import RemoteTeleop, UnixDatagrams, UnixPeer
+from cloudrc.errors import BadInputError
 from cloudrc.files import warn_if_readable
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import SIZE_MAX, link_profile
@@ -33,6 +35,7 @@ from cloudrc.tunnel.end import Identity
 
 if TYPE_CHECKING:
     from cloudrc.drivers.recording import Recorder
+    from cloudrc.drivers.remote import RemoteLink
 
 TRACE_MAX = 2 << 20
 """Maximum size of a trace file whose name comes from the link process [bytes]. World and cloud do
@@ -68,9 +71,11 @@ def run_cloud(settings: EndSettings, teleop_folder: Path, stop: StopSignal) -> N
     """Run cloud until `stop`; `teleop_folder` has the sockets between cloud and teleop."""
     experiment, identity, end = open_end(settings, "cloud")
     paths = teleop_folder / "cloud.sock", teleop_folder / "teleop.sock"
-    with closing(UnixPeer(*paths)) as peer:
+    with closing(UnixPeer(*paths)) as peer, _remote_link(experiment, teleop_folder) as channel:
         teleop = RemoteTeleop(peer, time.monotonic_ns())
-        cloud = assembly.build_cloud(experiment, identity, teleop, time.monotonic_ns)
+        cloud = assembly.build_cloud(
+            experiment, identity, teleop, time.monotonic_ns, channel=channel
+        )
 
         def flies() -> bool:
             return cloud.guard is GuardState.TRACK
@@ -78,6 +83,40 @@ def run_cloud(settings: EndSettings, teleop_folder: Path, stop: StopSignal) -> N
         ends = GracefulStop(stop, lambda: not flies(), FORWARD_LIMIT_NS)
         with apart():
             end.run(cloud, ends, flies)
+
+
+@contextmanager
+def _remote_link(experiment: ResolvedExperiment, folder: Path) -> Iterator[RemoteLink | None]:
+    """Open the way to the driver of a controller outside; without such a controller, yield None."""
+    controller = assembly.build_controller(experiment)
+    if not isinstance(controller, OutsideController):
+        yield None
+        return
+    require("a remote controller", ("policy",))
+    from cloudrc.drivers.remote import DATAGRAM_MAX, RemoteLink, sockets_of
+
+    own, other = sockets_of(folder)
+    with closing(UnixDatagrams(own, other, DATAGRAM_MAX)) as peer:
+        period = 1.0 / experiment.cloud.command_rate_hz
+        yield RemoteLink(peer, period, controller.start_limit)
+
+
+def run_remote(config: Path, folder: Path, stop: StopSignal, *, watched: bool) -> None:
+    """Run the driver of a controller outside until `stop`.
+
+    `folder` has the sockets between cloud and the driver. A supervisor reads the feed if it is
+    `watched`.
+    """
+    from cloudrc.drivers.remote import DATAGRAM_MAX, RemoteDriver, sockets_of
+
+    feed = Feed.on_stdout(watched=watched)
+    controller = assembly.build_controller(load_experiment(str(config)))
+    if not isinstance(controller, OutsideController):
+        raise BadInputError(f"{config}: cloud.controller is not remote")
+    other, own = sockets_of(folder)
+    with closing(UnixDatagrams(own, other, DATAGRAM_MAX)) as peer:
+        driver = RemoteDriver(peer, controller.url, controller.start_limit)
+        driver.run(feed.alive_while(stop))
 
 
 def open_end(settings: EndSettings, name: str) -> tuple[ResolvedExperiment, Identity, EndProcess]:

@@ -7,10 +7,11 @@ from contextlib import suppress
 
 from cloudrc import metrics
 from cloudrc.config.load import ResolvedExperiment, load_experiment
-from cloudrc.config.overrides import parse_settings
+from cloudrc.config.overrides import REMOTE, parse_settings
 from cloudrc.config.reuse import reuse
 from cloudrc.config.schema import Parameters, World
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.runs.requirements import require
 from cloudrc.warnings import advise
 
 ADVISED_MAX = 50
@@ -46,6 +47,12 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
             "cloud.clock_offset_s and cloud.clock_drift_ppm act in virtual time only, elsewhere "
             "the machine's clock counts; use --mode virtual, or leave them out"
         )
+    if experiment.cloud.controller.name == REMOTE:
+        if mode == "cluster":
+            raise BadInputError(
+                f"cloud.controller {REMOTE} flies on this machine only; use --mode virtual or local"
+            )
+        require("a remote controller", ("policy",))
     if mode != "cluster":
         check_world(experiment.world)
 

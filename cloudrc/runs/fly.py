@@ -16,8 +16,10 @@ from typing import Any, TypeAlias
 
 from cloudrc import assembly
 from cloudrc.config.load import ResolvedExperiment, dump
+from cloudrc.config.overrides import REMOTE
+from cloudrc.drivers.companion import companion
 from cloudrc.drivers.local import LINK_FOLDER, LocalRun
-from cloudrc.errors import CloudrcError, InterruptedRunError, machine_error
+from cloudrc.errors import CloudrcError, ControllerLostError, InterruptedRunError, machine_error
 from cloudrc.link.follow import prepare_link
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.record.merge import merge
@@ -45,6 +47,7 @@ def fly(
     *,
     page: bool = True,
     session: Session | None = None,
+    beside: str = "",
 ) -> dict[str, Any]:
     """Fly in mode "virtual" or "local"; write all files into `folder`, and return the report.
 
@@ -53,16 +56,35 @@ def fly(
 
     With `session`, teleop waits for missions, and the report is that of the last one. When all
     processes are ready, `session` gets the API's address and process -> HOST:PORT of its metrics.
+
+    `beside` is a command: a program that runs during the flight, such as a remote controller.
     """
     record = _record_virtual if mode == "virtual" else partial(_record_local, session=session)
     own = experiment.report.metrics
     try:
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
-        with record(experiment, folder, see) as flown:
+        with _beside(beside, experiment, folder), record(experiment, folder, see) as flown:
             return write_report(folder, *flown, own=own, page=page)
     except OSError as error:
         error.filename = str(error.filename or folder)
         raise machine_error(error) or error from error
+
+
+def _beside(
+    command: str, experiment: ResolvedExperiment, folder: Path
+) -> contextlib.AbstractContextManager[None]:
+    """Run `command` during the flight; wait until it listens if it is the remote controller."""
+    if not command:
+        return contextlib.nullcontext()
+    controller = experiment.cloud.controller
+    url = str((controller.model_extra or {})["url"]) if controller.name == REMOTE else ""
+    return companion(command, folder, url)
+
+
+def _raise_if_lost(records: list[Record]) -> None:
+    """Raise the error with which a flight ends if a controller outside is lost."""
+    for error in assembly.lost_controller(records):
+        raise error
 
 
 def _interruptible(see: See) -> See:
@@ -88,6 +110,7 @@ def _record_virtual(
     from cloudrc.world.shapes import flown_files
 
     store, interrupted, see = RecordStore(), False, _interruptible(see)
+    lost: ControllerLostError | None = None
     # Record during the flight, so that the recording is kept if the run or its report fails.
     with McapWriter(folder / "mission.mcap", clock="world", code=code_hash()) as writer:
         at_start = attachments(folder)  # the experiment, also for a copy that is cut short
@@ -105,9 +128,12 @@ def _record_virtual(
             assembly.fly(experiment, sink)
         except KeyboardInterrupt:
             interrupted = True
+        except ControllerLostError as error:
+            lost = error
         try:
             steps = describe_steps(experiment.world)
-            run = Run("virtual", "virtual", interrupted, assembly.virtual_notes(experiment), steps)
+            notes = (*assembly.virtual_notes(experiment), *([str(lost)] if lost else ()))
+            run = Run("virtual", "virtual", interrupted, notes, steps)
             writer.note(run.metadata)
             recording = Recording(records=store, metadata={CODE: code_hash()}, attachments=at_start)
             writer.write_views(views(recording, experiment))
@@ -115,6 +141,8 @@ def _record_virtual(
         finally:
             for name, data in attachments(folder).items() - at_start.items():
                 writer.attach(name, data)
+    if lost:
+        raise lost
 
 
 @contextlib.contextmanager
@@ -131,7 +159,13 @@ def _record_local(
     from cloudrc.robots.build import describe_steps
 
     prepare_link(folder / LINK_FOLDER, experiment)
-    local = LocalRun(folder, _interruptible(see), session=session)
+    local = LocalRun(
+        folder,
+        _interruptible(see),
+        session=session,
+        remote=experiment.cloud.controller.name == REMOTE,
+        lost=_raise_if_lost,
+    )
     broken, interrupted = None, True
     try:
         local.fly(inf if session else assembly.flight_limit(experiment))

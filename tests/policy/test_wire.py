@@ -14,7 +14,7 @@ from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import connect
 
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.policy.client import PolicyClient, PolicyServerError, SilentServerError, check_url
+from cloudrc.policy.client import PolicyClient, PolicyServerError, SilentServerError
 from cloudrc.policy.load import LoadedPolicy
 from tests.policy.conftest import actions, serving, stock_like
 
@@ -162,7 +162,7 @@ def test_a_policy_is_named_by_the_path_of_its_file(name):
 )
 def test_an_address_that_is_none_is_refused(url):
     with pytest.raises(BadInputError, match="give scheme, host and port"):
-        check_url(url)
+        PolicyClient(url)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,112 @@
+"""Controller: a program outside of cloudrc, which answers over a WebSocket.
+
+It gets the predicted odometry and the setpoint, and answers with the velocities of this period and
+of the following ones.
+
+Source: docs/remote.md, "The messages".
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, Protocol, TypeAlias
+
+from cloudrc.cloud.controllers import Controller, ControlOutput
+from cloudrc.config.schema import Positive, ServerUrl
+from cloudrc.errors import ControllerLostError
+from cloudrc.messages import ZERO, Odometry, Setpoint
+
+Answer: TypeAlias = tuple[float, Sequence[Sequence[float]]]
+"""Age of the answered observation [s], and the rows vx, vy, vz [m/s], world frame, yaw rate [rad/s]
+for its period and the following ones."""
+STAND_STILL = ControlOutput(ZERO, 0.0)
+ROUNDING = 1e-6
+"""Part of a period by which an answer may be younger than a whole period, and count as one [1]."""
+
+
+class ControllerChannel(Protocol):
+    """The way to the program: in lock step in virtual time, through a process in real time."""
+
+    def begin(self) -> None:
+        """Begin an episode: the next observation is the first of a session or mission."""
+
+    def exchange(self, observation: dict[str, Any]) -> Answer | None:
+        """Send an observation; return the newest answer that may still be flown, or None.
+
+        Raises:
+            ControllerLostError: If the program is silent for too long, or its answer is wrong.
+        """
+
+
+class OutsideController(Controller):
+    """Asks a program for each command; stands still while it has no valid answer."""
+
+    def __init__(self, url: str, start_limit: float) -> None:
+        self.url, self.start_limit = url, start_limit
+        self._channel: ControllerChannel | None = None
+        self._period = 0.0
+        self._counts: Counter[str] = Counter()
+        self._lost = self._flies = False
+
+    def connect(self, channel: ControllerChannel, period: float, counts: Counter[str]) -> None:
+        """Use `channel` for the flight.
+
+        `period` is the time between two commands [s]. Gaps between answers are counted in `counts`.
+        """
+        self._channel, self._period, self._counts = channel, period, counts
+
+    def reset(self) -> None:
+        """Begin an episode at the start of a session or mission."""
+        self._flies = False
+        if self._channel is not None:
+            self._channel.begin()
+
+    def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
+        """Return the command of the newest answer for this period; `dt` is the period [s].
+
+        Raises:
+            ControllerLostError: Once, if the program is lost: the flight has to end.
+        """
+        if self._lost or self._channel is None:
+            return STAND_STILL
+        try:
+            answer = self._channel.exchange(_observe(estimate, setpoint, dt))
+        except ControllerLostError:
+            self._lost = True
+            raise
+        if answer is None:
+            if self._flies:
+                self._counts["controller_gaps"] += 1
+            self._flies = False
+            return STAND_STILL
+        self._flies = True
+        age, rows = answer
+        x, y, z, yaw_rate = rows[min(int(age / self._period + ROUNDING), len(rows) - 1)]
+        return ControlOutput((x, y, z), yaw_rate)
+
+
+def _observe(estimate: Odometry, setpoint: Setpoint, dt: float) -> dict[str, Any]:
+    return {
+        "stamp_ns": estimate.stamp_ns,
+        "position": estimate.position,
+        "orientation_wxyz": estimate.orientation_wxyz,
+        "velocity": estimate.velocity,
+        "angular_velocity": estimate.angular_velocity_body,
+        "setpoint/position": setpoint.position,
+        "setpoint/velocity": setpoint.velocity,
+        "setpoint/yaw": setpoint.yaw,
+        "period_s": dt,
+    }
+
+
+def build(
+    url: ServerUrl = "ws://127.0.0.1:8000", start_limit_s: Positive = 60.0
+) -> OutsideController:
+    """Make the controller.
+
+    Args:
+        url: Address of the program, such as ws://127.0.0.1:8000.
+        start_limit_s: Time limit for the first answer of an episode [s].
+    """
+    return OutsideController(url, start_limit_s)

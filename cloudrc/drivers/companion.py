@@ -1,0 +1,128 @@
+"""Start a program of the user with a flight, and end it with the flight."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from cloudrc.errors import BadInputError, ControllerLostError, to_one_line
+from cloudrc.records import CONTROLLER_LOST
+
+LOG_FILE = "with.log"
+"""File in the run's folder: what the program prints."""
+START_LIMIT = 60.0
+"""Time limit for the program to listen [s]: it may load weights."""
+STOP_LIMIT = 1.5
+"""Time limit for the program to end after SIGTERM [s]; then it is killed."""
+LOOK_PERIOD = 0.1
+"""Time between two looks whether the program listens [s]."""
+
+
+@contextmanager
+def companion(command: str, folder: Path, url: str = "") -> Iterator[None]:
+    """Run `command` during the block; its output goes to `LOG_FILE` in `folder`.
+
+    With `url`, the address of a policy's server, first wait until somebody listens there. At the
+    end of the block, the program and all its children are ended.
+
+    Raises:
+        BadInputError: If the program cannot be started.
+        ControllerLostError: If nobody listens in time, or if the block raises it. Its text tells
+            whether the program has ended.
+    """
+    log = folder / LOG_FILE
+    program = _start(command, log)
+    try:
+        if url:
+            _wait_for(url, program, log)
+        yield
+    except ControllerLostError as error:
+        if (code := program.poll()) is None:
+            raise
+        raise ControllerLostError(error.code, f"{error}; {_how(code, log)}") from None
+    finally:
+        _end(program)
+
+
+def split_command(command: str) -> list[str]:
+    """Return the words of a command; raise a BadInputError if it cannot be started."""
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise BadInputError(f"--with '{command}': no command: {error}") from None
+    if not words or shutil.which(words[0]) is None:
+        program = words[0] if words else ""
+        raise BadInputError(f"--with '{command}': there is no program '{program}' here")
+    return words
+
+
+def _start(command: str, log: Path) -> subprocess.Popen[bytes]:
+    with log.open("wb") as output:
+        output.write(f"$ {command}\n".encode(errors="replace"))
+        output.flush()
+        try:
+            return subprocess.Popen(
+                split_command(command),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # its children are in its group, which is ended
+            )
+        except OSError as error:
+            text = f"--with '{command}': cannot be started: {error.strerror or error}"
+            raise BadInputError(text) from None
+
+
+def _wait_for(url: str, program: subprocess.Popen[bytes], log: Path) -> None:
+    deadline = time.monotonic() + START_LIMIT
+    while not _listens(url):
+        if program.poll() is not None:
+            raise ControllerLostError(CONTROLLER_LOST[0], f"{url}: nobody listens there")
+        if time.monotonic() >= deadline:
+            text = f"{url}: nobody listens there {START_LIMIT:g} s after the start of the program"
+            raise ControllerLostError(CONTROLLER_LOST[0], f"{text} of --with; see {log}")
+        time.sleep(LOOK_PERIOD)
+
+
+def _listens(url: str) -> bool:
+    """Return whether somebody accepts connections, whatever the answer is."""
+    parts = urlsplit(url)
+    port = parts.port or (443 if parts.scheme == "wss" else 80)
+    with closing(http.client.HTTPConnection(parts.hostname or "", port, timeout=1.0)) as asked:
+        try:
+            asked.connect()
+        except OSError:
+            return False
+        with suppress(OSError, http.client.HTTPException):
+            asked.request("GET", "/healthz")
+            asked.getresponse().read()
+    return True
+
+
+def _how(code: int, log: Path) -> str:
+    said = log.read_text(errors="replace").strip().splitlines()[-1]
+    how = f"signal {-code}" if code < 0 else f"exit code {code}"
+    return f"the program of --with has ended ({how}): {to_one_line(said)}; see {log}"
+
+
+def _end(program: subprocess.Popen[bytes]) -> None:
+    """End the program and its group; its children may outlive it."""
+    _signal(program, signal.SIGTERM)
+    with suppress(subprocess.TimeoutExpired):
+        program.wait(STOP_LIMIT)
+    _signal(program, signal.SIGKILL)
+    program.wait()
+
+
+def _signal(program: subprocess.Popen[bytes], number: int) -> None:
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(program.pid, number)

@@ -1,0 +1,23 @@
+"""The address and the API key of a policy's server."""
+
+from __future__ import annotations
+
+from urllib.parse import urlsplit
+
+KEY_VARIABLE = "CLOUDRC_POLICY_KEY"
+"""Environment variable with the API key of a policy's server, for the server and for clients."""
+
+
+def check_url(url: str) -> str:
+    """Return the address of a policy's server; raise a ValueError if it is none."""
+    try:
+        parts = urlsplit(url)
+        valid = parts.scheme in ("ws", "wss") and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        valid = False
+    if not valid:
+        raise ValueError(
+            f"'{url}' is no address of a policy's server; give scheme, host and port, such as "
+            "ws://127.0.0.1:8000"
+        )
+    return url

@@ -1,0 +1,285 @@
+"""A program outside controls the robot over a WebSocket, in lock step in virtual time."""
+
+import json
+import socket
+import threading
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from cloudrc import assembly
+from cloudrc.cloud.controllers.remote import OutsideController
+from cloudrc.config.load import load_experiment
+from cloudrc.drivers import remote
+from cloudrc.errors import BadInputError, ControllerLostError
+from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
+from cloudrc.policy.codec import unpack
+from cloudrc.record.columns import Recording, RecordStore
+from cloudrc.runs.experiment import check_mode
+from cloudrc.runs.fly import fly
+from tests.policy.conftest import actions, serving, stock_like
+
+SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 0.5}]", "mission.touch=null")
+PID = """
+from cloudrc.cloud.controllers.pid import build
+from cloudrc.messages import Odometry, Setpoint
+
+controller = build()
+
+def reset():
+    controller.reset()
+
+def infer(seen):
+    turn, rate = tuple(seen["orientation_wxyz"]), tuple(seen["angular_velocity"])
+    estimate = Odometry(
+        seen["stamp_ns"], tuple(seen["position"]), turn, tuple(seen["velocity"]), rate
+    )
+    target = tuple(seen["setpoint/position"])
+    setpoint = Setpoint(target, seen["setpoint/yaw"], velocity=tuple(seen["setpoint/velocity"]))
+    output = controller.update(estimate, setpoint, seen["period_s"])
+    return {"actions": [[*output.velocity, output.yaw_rate], [9, 9, 9, 9]]}
+"""
+
+
+def experiment(url, *settings, name="paper", short=SHORT):
+    controller = json.dumps({"name": "remote", "url": url})
+    return load_experiment(name, [*short, f"cloud.controller={controller}", *settings])
+
+
+def true_path(flown):
+    store = RecordStore()
+    assembly.fly(flown, store.add)
+    truth = Recording(records=store)["/ground_truth"]
+    return np.column_stack((truth["stamp_ns"], truth["position"], truth["velocity"]))
+
+
+def test_the_served_pid_flies_the_path_of_the_built_in_one_bit_by_bit(policy):
+    with serving(policy(PID)) as url:
+        served = true_path(experiment(url))
+    assert np.array_equal(served, true_path(load_experiment("paper", SHORT)))
+    assert len(served) > 100
+
+
+def test_a_remote_controller_drives_a_robot_on_the_ground(policy):
+    """Its vertical velocity does not count there."""
+    source = PID.replace("[[*output.velocity,", "[[*output.velocity[:2], 3.0,")
+    way = ["mission.waypoints=[{position_m: [0.5, 0], dwell_s: 0.5}]", "criteria.time_limit_s=20"]
+    with serving(policy(source)) as url:
+        served = true_path(experiment(url, name="pillars", short=way))
+    own = true_path(load_experiment("pillars", way))
+    assert np.array_equal(served, own)
+
+
+def lost(answer, tmp_path, metadata=b"\x80", settings=()):
+    """Fly with a server that behaves as `answer`; return the error and the report."""
+    with stock_like(answer, metadata) as url, pytest.raises(ControllerLostError) as raised:
+        fly(experiment(url, *settings), "virtual", tmp_path, page=False)
+    assert url in str(raised.value)
+    assert "\n" not in str(raised.value)
+    assert raised.value.exit_code == 5
+    assert (tmp_path / "mission.mcap").stat().st_size > 1000
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["verdict"], report["failures"][0]["code"]) == ("failure", raised.value.code)
+    return raised.value
+
+
+def after(count, last):
+    """Answer `count` observations with zeros, then as `last` does."""
+    left = iter(range(count))
+
+    def answer(connection, frame):
+        if next(left, None) is not None:
+            return actions(0.0)
+        return last(connection) if callable(last) else last
+
+    return answer
+
+
+@pytest.mark.parametrize(
+    ("last", "code", "text"),
+    [
+        (actions(np.nan), "controller_invalid", "not finite"),
+        (actions(np.inf), "controller_invalid", "not finite"),
+        (actions(0.0, (4,)), "controller_invalid", r"shape \(4,\), not \(H, 4\)"),
+        (actions(0.0, (1, 3)), "controller_invalid", r"shape \(1, 3\), not \(H, 4\)"),
+        (actions(0.0, (0, 4)), "controller_invalid", "shape"),
+        (actions(0.0, (1, 1, 4)), "controller_invalid", "shape"),
+        (b"\x81\xa6action\x01", "controller_invalid", "no key 'actions'"),
+        (b"\x91\x01", "controller_invalid", "cannot be read"),
+        ("Traceback\nValueError: no", "controller_invalid", "ValueError: no"),
+        (lambda link: link.close(1011), "controller_silent", "closed the connection"),
+        (lambda link: link.socket.shutdown(socket.SHUT_RDWR), "controller_silent", "ended before"),
+    ],
+    ids=range(11),
+)
+def test_a_wrong_answer_in_flight_ends_it_with_one_line_and_a_recording(tmp_path, last, code, text):
+    error = lost(after(20, last), tmp_path)
+    assert error.code == code
+    with pytest.raises(ControllerLostError, match=text):
+        raise error
+
+
+def test_a_late_answer_in_flight_ends_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(remote, "VIRTUAL_LIMIT", 0.05)
+    ended = threading.Event()
+    error = lost(after(20, lambda link: ended.wait(0.3) and None), tmp_path)
+    assert error.code == "controller_silent"
+    assert "no answer within 0.05 s" in str(error)
+
+
+def test_the_first_answer_has_a_limit_of_its_own(tmp_path):
+    ended = threading.Event()
+    settings = ["cloud.controller.start_limit_s=0.05"]
+    error = lost(after(0, lambda link: ended.wait(0.3) and None), tmp_path, settings=settings)
+    assert "no answer within 0.05 s" in str(error)
+
+
+def test_nobody_listening_ends_a_flight_before_it_begins(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        url = f"ws://127.0.0.1:{taken.getsockname()[1]}"
+    with pytest.raises(ControllerLostError, match="nobody listens") as raised:
+        fly(experiment(url), "virtual", tmp_path, page=False)
+    assert raised.value.code == "controller_silent"
+
+
+@pytest.mark.parametrize("url", ["127.0.0.1:8000", "http://h:1", "ws://", "", "ws://h:0"])
+def test_a_wrong_address_is_refused_when_the_experiment_is_read(url):
+    with pytest.raises(BadInputError, match=r"cloud\.controller\.url: .*ws://127"):
+        experiment(url)
+
+
+def test_a_remote_controller_makes_no_plans_and_flies_here_only():
+    with pytest.raises(BadInputError, match="cannot plan ahead"):
+        experiment("ws://h:1", "cloud.plan_s=0.4", "cloud.predictor=kalman")
+    with pytest.raises(BadInputError, match="on this machine only"):
+        check_mode(experiment("ws://h:1"), "cluster")
+
+
+class Peer:
+    """A driver of a remote controller that answers as a test says."""
+
+    def __init__(self):
+        self.sent, self.arrived = [], []
+
+    def send_data(self, data):
+        self.sent.append(unpack(data))
+
+    def receive_data(self):
+        arrived, self.arrived = self.arrived, []
+        return [remote.pack(each) for each in arrived]
+
+
+class RealTime:
+    """A remote controller in real time, on the clock of a test."""
+
+    def __init__(self, monkeypatch, start_limit=60.0):
+        self.now_ns, self.peer, self.counts = 10**9, Peer(), Counter()
+        monkeypatch.setattr(remote.time, "monotonic_ns", lambda: self.now_ns)
+        self.controller = OutsideController("ws://h:1", start_limit)
+        link = remote.RemoteLink(self.peer, 0.01, start_limit)
+        self.controller.connect(link, 0.01, self.counts)
+        self.controller.reset()
+
+    def answer(self, *xs, late=0, **more):
+        """Answer the observation `late` before the newest with a row for each velocity in x."""
+        asked = self.peer.sent[-1 - late]
+        rows = {"rows": [[x, 0.0, 0.0, 0.0] for x in xs]} if xs else {}
+        head = {"episode": asked["episode"], "sent_ns": asked["sent_ns"]}
+        self.peer.arrived.append({**head, **rows, **more})
+
+    def step(self, count=1):
+        """Take `count` periods; return the velocities along x."""
+        found = []
+        for _ in range(count):
+            estimate = Odometry(self.now_ns, ZERO, UPRIGHT, ZERO, ZERO)
+            output = self.controller.update(estimate, Setpoint(ZERO), 0.01)
+            found.append(output.velocity[0])
+            self.now_ns += 10_000_000
+        return found
+
+
+@pytest.fixture
+def flight(monkeypatch):
+    return RealTime(monkeypatch)
+
+
+def test_in_real_time_each_row_of_an_answer_belongs_to_its_period(flight):
+    assert flight.step() == [0.0]
+    flight.answer(1.0, 2.0, 3.0, 4.0)
+    assert flight.step(4) == [2.0, 3.0, 4.0, 4.0]
+
+
+def test_in_real_time_the_newest_answer_wins(flight):
+    flight.step(3)
+    flight.answer(1.0)
+    assert flight.step() == [1.0]
+    flight.answer(7.0, late=3)
+    assert flight.step() == [1.0]
+
+
+def test_a_silent_program_freezes_the_reference_and_may_come_back(flight):
+    flight.step()
+    flight.answer(1.0)
+    flown = flight.step(40)
+    assert flown == [1.0] * 21 + [0.0] * 19  # one row and .2 s, from the time of its observation
+    flight.step(440)
+    flight.answer(2.0)
+    assert flight.step(2) == [2.0, 2.0]
+    assert flight.counts == {"controller_gaps": 1}
+
+
+def test_a_program_silent_for_5_s_ends_the_flight_and_says_why(flight):
+    flight.step()
+    flight.answer(1.0)
+    flight.step(22)
+    flight.answer(trouble="ws://h:1: nobody listens there")
+    with pytest.raises(ControllerLostError, match="for 5 s: ws://h:1: nobody listens") as raised:
+        flight.step(510)
+    assert raised.value.code == "controller_silent"
+    assert flight.step(3) == [0.0] * 3  # raised once
+
+
+def test_answers_that_are_always_too_late_end_the_flight(flight):
+    def answer_late():
+        flight.answer(1.0, late=29)
+        return flight.step()
+
+    flight.step(30)
+    with pytest.raises(ControllerLostError, match="too slow"):
+        assert all(answer_late() == [0.0] for _ in range(600))
+
+
+def test_the_first_answer_may_take_until_the_start_limit(monkeypatch):
+    flight = RealTime(monkeypatch, start_limit=20.0)
+    assert flight.step(1999) == [0.0] * 1999
+    assert not flight.counts
+    with pytest.raises(ControllerLostError, match="for 20 s"):
+        flight.step(3)
+
+
+def test_a_wrong_answer_in_real_time_ends_the_flight_at_once(flight):
+    flight.step()
+    flight.answer(invalid="ws://h:1: 'actions' has values that are not finite")
+    with pytest.raises(ControllerLostError, match="not finite") as raised:
+        flight.step()
+    assert raised.value.code == "controller_invalid"
+
+
+def test_answers_of_an_earlier_mission_do_not_count(flight):
+    flight.step()
+    flight.controller.reset()
+    flight.answer(1.0)
+    assert flight.step() == [0.0]
+    flight.answer(2.0)
+    assert flight.step() == [2.0]
+
+
+def test_a_pause_of_the_loop_is_no_silence_of_the_program(flight):
+    flight.step()
+    flight.answer(1.0)
+    flight.step(3)
+    flight.now_ns += 10**10
+    assert flight.step() == [0.0]
+    flight.answer(2.0)
+    assert flight.step() == [2.0]
