@@ -76,7 +76,8 @@ def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
             world = experiment.world
             hull, sensors = hull_of(world.robot), known_robot(world.robot).sensors
             units = {name: each.unit for name, each in sensors.items()}
-            service = MissionService(book, steered_in(world), scene, hull, units)
+            limit = experiment.guard.speed_max_mps
+            service = MissionService(book, steered_in(world), scene, hull, units, speed_max=limit)
             if settings.start:
                 touch = experiment.mission.touch
                 order = Order(assembly.build_plan(experiment), experiment.name, touch=touch)

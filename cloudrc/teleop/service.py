@@ -108,13 +108,17 @@ class MissionService:
         scene: Scene | None = None,
         hull: Hull = NO_SIZE,
         units: Mapping[str, str] | None = None,
+        *,
+        speed_max: float = SPEED_MAX,
     ) -> None:
         """Begin with the missions in the store `book`, in a scene with `fence`.
 
         With a `scene`, the service refuses straight ways of the robot's `hull` through obstacles.
         `units` are the names of the robot's own sensors, in the order of telemetry, and their units
-        (None: no sensors).
+        (None: no sensors). `speed_max` is the guard's speed limit [m/s]: a drive by hand is not
+        faster, and never faster than `SPEED_MAX`.
         """
+        self._drive_max = min(speed_max, SPEED_MAX)
         self._units = tuple((units or {}).items())
         self._scene, self._hull = scene, hull
         self._outputs: list[Output | Fault] = []
@@ -233,7 +237,7 @@ class MissionService:
         """
         pause_ns, self._driven_ns = now_ns - self._driven_ns, now_ns
         x, y, z = velocity
-        scale = SPEED_MAX / max(hypot(x, y, z), SPEED_MAX)
+        scale = self._drive_max / max(hypot(x, y, z), self._drive_max)
         velocity = (scale * x, scale * y, scale * z)
         rests = not any(velocity)
         self._interrupted = self._interrupted and not rests and pause_ns <= HEARTBEAT_NS

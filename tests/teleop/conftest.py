@@ -201,16 +201,16 @@ class Disk(sqlite3.Connection):
 class ServiceFlight(Flight):
     """Flight with a `MissionService` in place of `Teleop`; the service can be restarted."""
 
-    def __init__(self, scene=None):
+    def __init__(self, scene=None, **how):
         super().__init__()
-        self.scene, self.full, self.mark = scene, False, 0
+        self.scene, self.full, self.mark, self.how = scene, False, 0, how
         self.image, self.commits = None, 0  # the disk after the last commit; attempts to commit
         self.restart_teleop()
 
     def restart_teleop(self):
         """Start a new service with the missions on the disk."""
         self.killed_before = self.killed_after = None  # number of a commit
-        self.teleop = MissionService(self.stored(), FENCE, self.scene, PELICAN, UNITS)
+        self.teleop = MissionService(self.stored(), FENCE, self.scene, PELICAN, UNITS, **self.how)
 
     def stored(self):
         """Return the store that a new process reads from the disk."""

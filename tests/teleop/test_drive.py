@@ -103,6 +103,15 @@ def test_the_first_request_takes_off_from_here(driven):
     assert reference(driven).velocity == pytest.approx((1.5, 0.0, 0.0))
 
 
+@pytest.mark.parametrize(("limit", "fastest"), [(0.8, 0.8), (6.0, 1.5)])
+def test_a_drive_is_not_faster_than_the_guard_allows(limit, fastest):
+    flight = ServiceFlight(speed_max=limit)
+    flight.step()
+    press(flight)
+    press(flight, (9.0, 0.0, 0.0))
+    assert reference(flight).velocity == pytest.approx((fastest, 0.0, 0.0))
+
+
 def test_without_requests_the_setpoint_brakes_and_rests(driven):
     last_ns = driven.now_ns - 10 * PERIOD_NS
     driven.step(seconds=0.4)
