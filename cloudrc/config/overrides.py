@@ -40,7 +40,9 @@ REMOTE = "remote"
 """Name of the controller that asks a program outside."""
 KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "controllers"}
 """Key under `cloud` -> kind of plug-in."""
-GIVEN = {("onboard", "model"), ("predictors", "robot")}
+BRAKING = "braking_mps2"
+"""Argument of an onboard controller's `build`: the braking in `guard` of robot.yaml [m/s^2]."""
+GIVEN = {("onboard", "model"), ("onboard", BRAKING), ("predictors", "robot")}
 """Kind of plug-in and argument of its `build` that cloudrc gives, not the user."""
 _DEFAULTS = {
     **Experiment().model_dump(mode="json"),

@@ -46,7 +46,7 @@ class RobotLimits(Section):
     the robot stops in time"""
     acceleration_max_mps2: Acceleration = 12.0
     """Largest acceleration of the velocity that the robot can follow [m/s^2]; default of
-    guard.acceleration_max_mps2"""
+    guard.acceleration_max_mps2. With the onboard controller multirotor, the default is 4"""
     braking_mps2: Braking = 3.0
     """Deceleration that the braking robot always reaches or exceeds [m/s^2]. The guard computes
     the braking distance from it; a wheel has no more than the friction of its tyre, about 10"""
@@ -57,9 +57,12 @@ class RobotLimits(Section):
 
 DEFAULT_LIMITS = RobotLimits()
 """Limits of a robot that flies."""
-MODEL_ALONE = RobotLimits(acceleration_max_mps2=4.0)
-"""Limits of a model without `robot.yaml`. At a tilt of 35 degrees a multirotor has 6.9 m/s^2. With
-more than 4 m/s^2 on one axis, it would not brake another axis in time, above all while it sinks."""
+GENERAL = "multirotor"
+"""Onboard controller of a model without `robot.yaml` that is not like the Pelican."""
+OF_GENERAL = RobotLimits(acceleration_max_mps2=4.0)
+"""Limits of a robot with this onboard controller, if its robot.yaml does not say them. At a tilt of
+35 degrees a multirotor has 6.9 m/s^2. With more than 4 m/s^2 on one axis, it would not brake
+another axis in time, above all while it sinks."""
 
 
 class Response(Parameters):
@@ -175,14 +178,16 @@ def find_robot(name: str) -> RobotFiles:
     Raise a BadInputError if its `robot.yaml` is invalid.
     """
     if name.endswith(".xml"):
-        return RobotFiles(Path(name), None, guard=MODEL_ALONE)
+        return RobotFiles(Path(name), None, guard=OF_GENERAL)
     folder = Path(name) if shipped.is_path(name) else shipped.FOLDERS["robot"] / name
     file = folder / shipped.ROBOT_FILE
     label = str(file) if shipped.is_path(name) else f"{name}/{shipped.ROBOT_FILE}"
     robot = validate(read_document(file, label), RobotFile, label)
     onboard = _absolute(robot.onboard, folder)
     stop = robot.guard.stop or ("brake" if robot.planar else "land")
-    limits = robot.guard.model_copy(update={"stop": stop})
+    usual = OF_GENERAL if onboard.name == GENERAL else DEFAULT_LIMITS
+    given = robot.guard.model_dump(exclude_unset=True)
+    limits = usual.model_copy(update={**given, "stop": stop})
     tunings = {key: tuning.model_extra or {} for key, tuning in robot.tunings.items()}
     model = folder / robot.model
     motion = robot.motion and str((folder / robot.motion).resolve())

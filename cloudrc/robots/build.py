@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc import plugins
 from cloudrc.config.document import KeyPath
-from cloudrc.config.overrides import build_plugin, check_plugin, default_parameters
+from cloudrc.config.overrides import BRAKING, build_plugin, check_plugin, default_parameters
 from cloudrc.config.problems import ConfigProblem, ProblemsError
-from cloudrc.config.robot import RobotFiles, find_robot, parameters
+from cloudrc.config.robot import GENERAL, RobotFiles, find_robot, parameters
 from cloudrc.config.scene import steered_in
 from cloudrc.config.schema import PlugIn, World
 from cloudrc.config.shipped import ROBOT_FILE, file_of
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 KIND = "onboard"
 """Kind of plug-in."""
-GENERAL = PlugIn(name="multirotor")
-"""Onboard controller of a model without `robot.yaml` that is not like the Pelican."""
 THRUST_TO_WEIGHT_MIN = 1.5
 """Smallest ratio of the largest thrust to the weight [1]: a tilted robot still climbs."""
 
@@ -88,7 +86,7 @@ def controller(robot: RobotFiles, model: Any) -> PlugIn:
     try:
         check_fit(model)
     except BadInputError:
-        return GENERAL
+        return PlugIn(name=GENERAL)
     pelican = find_robot("pelican").onboard
     assert pelican is not None
     return pelican
@@ -145,7 +143,7 @@ def _make_parts(world: World) -> Parts:
         plugin = plugins.find(KIND, choice.name)  # the build below uses the same import of the file
     except BadInputError as error:
         raise ProblemsError([_problem(world, (), str(error))]) from error
-    onboard = _build_onboard(world, where, choice, parameters(robot, world), nominal)
+    onboard = _build_onboard(world, where, choice, robot, nominal)
     true = compile_true(robot.model, scene, nominal, world.plant)
     if not robot.planar:
         _check_lift(world, where, true)
@@ -183,15 +181,19 @@ def _find_probe(
 
 
 def _build_onboard(
-    world: World, where: str, choice: PlugIn, given: dict[str, Any], model: Any
+    world: World, where: str, choice: PlugIn, robot: RobotFiles, model: Any
 ) -> Onboard:
     """Build an onboard controller for a compiled `MjModel`; errors name the files in `where`."""
+    given = parameters(robot, world)
     choice = PlugIn.model_validate({**given, "name": choice.name})
     if found := check_plugin(KIND, choice):
         by = f" (controller of {world.robot}: {choice.name})"
         raise ProblemsError([_problem(world, p.path, f"{p._replace(path=())}{by}") for p in found])
     try:
-        return build_plugin(KIND, choice, model=model)  # type: ignore[no-any-return]
+        more = {}
+        if BRAKING in plugins.signature(KIND, choice.name).parameters:
+            more = {BRAKING: robot.guard.braking_mps2}
+        return build_plugin(KIND, choice, model=model, **more)  # type: ignore[no-any-return]
     except BadInputError as error:
         named = next((key for key in given if re.search(rf"\b{key}\b", str(error))), None)
         if named is None:

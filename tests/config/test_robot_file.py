@@ -34,7 +34,7 @@ def test_a_robot_lands_unless_it_is_planar_or_says_that_it_brakes(read, keys, st
 def test_limits_and_hull_are_read_and_have_defaults(read):
     assert read().guard.model_dump() == {
         "speed_max_mps": None,
-        "acceleration_max_mps2": 12.0,
+        "acceleration_max_mps2": 4.0,
         "braking_mps2": 3.0,
         "stop": "land",
     }

@@ -41,6 +41,19 @@ def test_limits_are_those_of_the_robot_unless_the_experiment_lowers_them(
     assert guard.acceleration_max_mps2 == acceleration
 
 
+@pytest.mark.parametrize(
+    ("limits", "most"),
+    [
+        ("{}", 4.0),
+        ("{braking_mps2: 2}", 4.0),
+        ("{acceleration_max_mps2: 6}", 6.0),
+    ],
+)
+def test_a_multirotor_may_accelerate_as_a_model_alone_unless_it_says_more(own_robot, limits, most):
+    guard = load_experiment("steps", [own_robot(limits), *FLIES]).guard
+    assert guard.acceleration_max_mps2 == most
+
+
 def test_a_robot_that_brakes_less_gets_a_lower_speed_cap(own_robot):
     settings = [own_robot("{braking_mps2: 1.5}"), *FLIES]
     # v 0.45 s + v^2 / 3 = 8.7 m

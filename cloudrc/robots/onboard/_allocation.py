@@ -16,9 +16,6 @@ from cloudrc.robots.onboard._airframe import Airframe, span
 from cloudrc.world.onboard import Commands
 from cloudrc.world.plant import Array
 
-BRAKE = 3.0
-"""Deceleration that a robot must reach when it stops a descent [m/s^2]. The guard's stop rule
-assumes it."""
 TURN_MIN, YAW_MIN = 10.0, 0.2
 """Smallest angular acceleration about x and y, and about z, that a robot must reach in hover
 [rad/s^2]. With less, it cannot tilt in time to brake, or hardly turns."""
@@ -36,11 +33,12 @@ class Allocation:
         yaw_max: Largest angular acceleration about z in hover, in both directions [rad/s^2].
     """
 
-    def __init__(self, frame: Airframe) -> None:
+    def __init__(self, frame: Airframe, braking: float) -> None:
         """Invert the wrench of `frame`.
 
         The inverse prefers small controls, relative to their ranges. Raise a BadInputError if the
-        actuators cannot hold the robot in hover, with enough room to brake and to turn.
+        actuators cannot hold the robot in hover, with enough room to turn, and to stop a descent
+        with the deceleration `braking` [m/s^2].
         """
         width = span(frame)
         wrench = frame.wrench if frame.steers_yaw else frame.wrench[:3]
@@ -49,7 +47,7 @@ class Allocation:
         still = np.zeros_like(lift)
         turns = np.array((turn_x, turn_y, *(turn_z or [still]))).T @ frame.inertia
         hover = frame.gravity * thrust
-        share = _check_hover(frame, hover)
+        share = _check_hover(frame, hover, braking)
         self.acceleration_max = frame.gravity / share if share else inf
         room = np.minimum(frame.high - hover, hover - frame.low)[:, None]
         some = TINY * abs(turns).max(axis=0) + TINY**2  # instead of a division by 0
@@ -130,7 +128,7 @@ class Allocation:
         )
 
 
-def _check_hover(frame: Airframe, hover: Array) -> float:
+def _check_hover(frame: Airframe, hover: Array, braking: float) -> float:
     """Return the share [1] of the largest thrust that hover needs; refuse a robot without room."""
     share = 0.0
     for name, value, low, high in zip(frame.names, hover, frame.low, frame.high, strict=True):
@@ -144,11 +142,12 @@ def _check_hover(frame: Airframe, hover: Array) -> float:
                 "directions right?"
             )
         share = max(share, float(need / most))
-    most = frame.gravity / (frame.gravity + BRAKE)
+    most = frame.gravity / (frame.gravity + braking)
     if share > most:
         raise BadInputError(
             f"hover needs {100.0 * share:.0f} % of the thrust; above {100.0 * most:.0f} % a robot "
-            f"cannot brake a descent: is the mass of {frame.mass:g} kg right (kg, not g)?"
+            f"cannot brake a descent with {braking:g} m/s^2 (guard.braking_mps2): is the mass of "
+            f"{frame.mass:g} kg right (kg, not g)?"
         )
     spin = float(frame.wrench[3] @ hover / frame.inertia[2, 2])
     if abs(spin) > TINY * frame.gravity:

@@ -43,6 +43,8 @@ THRUST_MIN = 0.3
 """Smallest commanded vertical force relative to the weight [1]: the robot can still turn."""
 THRUST_MAX = 2.5
 """Largest commanded force relative to the weight [1]."""
+BRAKING = 3.0
+"""Deceleration that the guard expects of a robot whose robot.yaml does not say it [m/s^2]."""
 YAW_LEAD_MAX = 0.5
 """Largest difference between the yaw reference and the yaw [rad]."""
 TINY = 1e-9
@@ -221,6 +223,7 @@ def build(
     yaw_bandwidth_radps: float | None = None,
     tilt_max_deg: float = 35.0,
     drag_s_per_m: float = 0.0,
+    braking_mps2: float = BRAKING,
 ) -> Multirotor:
     """Make the controller for the compiled `MjModel` of a robot in its scene.
 
@@ -239,12 +242,14 @@ def build(
         drag_s_per_m: Drag of the rotors, which `actuators` simulates and the controller does not
             know: force relative to the thrust of a rotor and to the velocity of its hub across its
             axis [s/m]. Default: no drag.
+        braking_mps2: Deceleration that the guard expects [m/s^2]; a robot without the thrust to
+            stop a descent with it is refused. It comes from `guard` in robot.yaml.
 
     Raises:
         BadInputError: If the controller cannot fly the model, or a value does not fit.
     """
     frame = read_airframe(model, steers_yaw=yaw_bandwidth_radps != 0.0)
-    allocation = Allocation(frame)
+    allocation = Allocation(frame, braking_mps2)
     lag = frame.lag or TINY
     if lag > LAG_MAX:
         raise BadInputError(f"an actuator has a lag (dynprm) of {lag:g} s, above {LAG_MAX:g} s")
@@ -257,10 +262,7 @@ def build(
     velocity = _checked("velocity", velocity_bandwidth_radps, velocity, 0.5 * attitude)
     yaw = min(YAW_RADPS, 2.0 * sqrt(allocation.yaw_max), 0.5 * attitude)
     yaw = _checked("yaw", yaw_bandwidth_radps, yaw, attitude) if frame.steers_yaw else 0.0
-    if not 0.0 < tilt_max_deg <= TILT_MAX_MAX:
-        raise BadInputError(f"tilt_max_deg: {tilt_max_deg:g} is not above 0 and up to 60")
-    if not 0.0 <= drag_s_per_m < inf:
-        raise BadInputError(f"drag_s_per_m: {drag_s_per_m:g} is not 0 or more")
+    _check_ranges(tilt_max_deg, drag_s_per_m)
     gains = Gains(velocity, attitude, yaw, radians(tilt_max_deg))
     return Multirotor(frame, allocation, gains, model.opt.timestep)
 
@@ -271,6 +273,13 @@ def actuators(model: Any, dt: float, *, drag_s_per_m: float = 0.0) -> Actuators:
     `dt` is the duration of a step [s]. `drag_s_per_m` is the drag [s/m] as in `build`.
     """
     return RotorDrag(model, drag_s_per_m) if drag_s_per_m else Direct(model.nu)
+
+
+def _check_ranges(tilt_max_deg: float, drag_s_per_m: float) -> None:
+    if not 0.0 < tilt_max_deg <= TILT_MAX_MAX:
+        raise BadInputError(f"tilt_max_deg: {tilt_max_deg:g} is not above 0 and up to 60")
+    if not 0.0 <= drag_s_per_m < inf:
+        raise BadInputError(f"drag_s_per_m: {drag_s_per_m:g} is not 0 or more")
 
 
 def _checked(name: str, wanted: float | None, default: float, most: float) -> float:

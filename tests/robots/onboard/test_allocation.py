@@ -23,7 +23,7 @@ def parts(request):
         turns = np.linalg.solve(frame.inertia, (turn_x, turn_y, turn_z))
         return np.array((force / frame.mass, *turns))
 
-    return frame, Allocation(frame), accelerations
+    return frame, Allocation(frame, 3.0), accelerations
 
 
 def test_the_controls_make_what_is_asked(parts):

@@ -1,5 +1,7 @@
 """A folder with a model and `onboard: multirotor` is a robot that flies in the testbed."""
 
+from contextlib import nullcontext
+
 import pytest
 
 import cloudrc
@@ -7,10 +9,12 @@ from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.robots.build import build_robot
 from cloudrc.robots.onboard._drag import RotorDrag
-from tests.robots.onboard.conftest import nano
+from tests.robots.onboard.conftest import nano, robot, x_layout
 
 HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
 MODEL = nano().replace('pos="0 0 2"', "")
+WEAK = robot(x_layout(0.14, 0.17, 0.02, 6.0), 1.3, ".03 .025 .05").replace('pos="0 0 2"', "")
+"""Its thrust is 1.9 times its weight."""
 
 
 def test_a_nano_flies_also_if_it_is_heavier_than_its_model(own_robot):
@@ -73,3 +77,12 @@ def test_a_wrong_onboard_controller_is_refused_where_it_is_chosen(
     mine = own_robot(text, MODEL)
     with pytest.raises(BadInputError, match=message):
         cloudrc.fly("hover", HOVER | {"world.robot": str(mine)} | settings)
+
+
+@pytest.mark.parametrize(("braking", "error"), [(3, None), (10, BadInputError)])
+def test_a_robot_that_cannot_brake_as_its_robot_yaml_says_is_refused(own_robot, braking, error):
+    mine = own_robot(f"onboard: multirotor\nguard: {{braking_mps2: {braking}}}", WEAK)
+    experiment = load_experiment("hover", ["world.scene=empty", f"world.robot={mine}"])
+    text = r"with 10 m/s\^2 \(guard\.braking_mps2\)"
+    with pytest.raises(error, match=text) if error else nullcontext():
+        build_robot(experiment.world, experiment.guard)
