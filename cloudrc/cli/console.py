@@ -74,8 +74,6 @@ def execute(options: argparse.Namespace) -> int:
     if options.cluster or options.context or options.namespace or options.release:
         return _show_release(options)
     require("the console", ("console", "world"))
-    if options.config and not (options.api and options.profile):
-        raise BadInputError("--config is for the chart's container: give --api and --profile, too")
     flight = _in_pod(options) if options.config else _local(options)
     from cloudrc.console.serve import serve
 
@@ -114,6 +112,8 @@ def _local(options: argparse.Namespace) -> ConsoleTarget:
 
 
 def _in_pod(options: argparse.Namespace) -> ConsoleTarget:
+    if not (options.api and options.profile):
+        raise BadInputError("--config is for the chart's container: give --api and --profile, too")
     from cloudrc.console.in_pod import flight_of_pod
 
     token = given_token(options)

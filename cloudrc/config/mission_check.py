@@ -154,20 +154,28 @@ def _check_parts(mission: MissionConfig) -> ConfigProblem | None:
             reason = "a mission has setpoints, or waypoints, steps and a carrot; delete one"
             return ConfigProblem(("setpoints",), "", reason)
         return None
-    if mission.carrot is None:
-        for index, waypoint in enumerate(mission.waypoints):
-            if waypoint.speed_mps is not None:
-                reason = "is the speed of a carrot; give the mission a carrot, or delete it"
-                path = ("waypoints", str(index), "speed_mps")
-                return ConfigProblem(path, f"{waypoint.speed_mps:g}", reason)
-    elif mission.steps is not None:
-        return ConfigProblem(("carrot",), "", "impossible with steps; delete it, or give waypoints")
+    if problem := _check_carrot(mission):
+        return problem
     if mission.steps is not None and mission.waypoints:
         reason = "a mission has waypoints or steps, not both; delete one"
         return ConfigProblem(("steps",), "", reason)
     if mission.steps is None and not mission.waypoints:
         reason = "none given; give at least one, or steps or setpoints"
         return ConfigProblem(("waypoints",), "", reason)
+    return None
+
+
+def _check_carrot(mission: MissionConfig) -> ConfigProblem | None:
+    """Return the problem of a carrot with steps, or of its speed without a carrot."""
+    if mission.carrot is not None:
+        if mission.steps is None:
+            return None
+        return ConfigProblem(("carrot",), "", "impossible with steps; delete it, or give waypoints")
+    for index, waypoint in enumerate(mission.waypoints):
+        if waypoint.speed_mps is not None:
+            reason = "is the speed of a carrot; give the mission a carrot, or delete it"
+            path = ("waypoints", str(index), "speed_mps")
+            return ConfigProblem(path, f"{waypoint.speed_mps:g}", reason)
     return None
 
 

@@ -75,12 +75,18 @@ def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
             if each in found:
                 raise BadInputError(f"{source.label} {key}: is set twice; keep one of them")
             found[each] = Setting(value, source._replace(is_setting=True))
-    for path, depth in [(each, n) for each in found for n in range(1, len(each))]:
+    for path in found:
+        _refuse_second(path, found)
+    return {path: found[path] for path in sorted(found, key=len)}
+
+
+def _refuse_second(path: KeyPath, found: Settings) -> None:
+    """Raise a BadInputError if the value of a setting above `path` sets the key `path`, too."""
+    for depth in range(1, len(path)):
         above = found.get(path[:depth])
         if above and reduce(child, path[depth:], above.value) is not None:
             both = f"{'.'.join(path)}: is set twice, also by {'.'.join(path[:depth])}"
             raise BadInputError(f"{found[path].source.label} {both}; keep one of them")
-    return {path: found[path] for path in sorted(found, key=len)}
 
 
 def _directions(path: KeyPath) -> list[KeyPath]:
@@ -118,9 +124,9 @@ def apply_overrides(document: Document, settings: Settings, *, build: bool = Fal
             _check_index(document, path[:depth], source)
             default = child(default, key)
             present = document.get(*path[:depth])
-            node = _beginning(default) if present is None else present
-            if build and present is None and _is_parameter(path[:depth]):
-                node = _default_of_parameter(document, path[:depth])
+            node = present
+            if present is None:
+                node = _beginning(document, path[:depth], default, build=build)
             if path[0] == "cloud" and path[1] in KINDS and depth == 2 and isinstance(node, str):
                 node = {"name": node}  # not by `set_value`: the name keeps its source
                 document.tree["cloud"][key] = node
@@ -132,11 +138,13 @@ def apply_overrides(document: Document, settings: Settings, *, build: bool = Fal
         document.set_value(path, copy.deepcopy(value), source)
 
 
-def _beginning(default: Any) -> Any:
-    """Return what to change if the document has no value, from the value's default.
+def _beginning(document: Document, path: KeyPath, default: Any, *, build: bool) -> Any:
+    """Return what to change if the document has no value at `path`, from the value's default.
 
     A section begins empty: its defaults would look like values that somebody has set.
     """
+    if build and _is_parameter(path):
+        return _default_of_parameter(document, path)
     return {} if isinstance(default, dict) else copy.deepcopy(default)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,15 +37,18 @@ class Recovery:
         """Describe in lines what is in the new file, and what is lost."""
         kept = ", ".join(f"{count} {kind}" for kind, count in self.kept.items() if count)
         lines = [f"kept {self.share:.1%}: {kept}"]
-        lines.append("topics: " + ", ".join(f"{name} {n}" for name, n in self.topics.items()))
+        lines.append(f"topics: {_list(self.topics)}")
         lines += [f"lossy: {note}" for note in self.notes]
         lines += [f"the recording {remark}" for remark in self.remarks]
         if len(self.dropped) > LISTED_MAX:  # the note lists only some
-            counts = {name: "?" if n is None else n for name, n in self.dropped.items()}
-            lines.append("dropped: " + ", ".join(f"{name} {n}" for name, n in counts.items()))
+            lines.append(f"dropped: {_list(self.dropped)}")
         if self.derived:
             lines.append(f"made again from the other topics: {', '.join(self.derived)}")
         return lines
+
+
+def _list(counts: Mapping[str, int | None]) -> str:
+    return ", ".join(f"{name} {'?' if n is None else n}" for name, n in counts.items())
 
 
 def recover(

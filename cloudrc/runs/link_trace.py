@@ -102,15 +102,7 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
         raise log.error(
             f"no rows on {missing}, so no {direction}; give the run's folder or its mission.mcap"
         )
-    delays: dict[tuple[float, float], float] = {}
-    for epoch, counter, delay in _columns(arrivals, "epoch", "counter", "delay"):
-        if isnan(delay):
-            raise log.error(
-                "its ends did not share a clock, so one-way delays are not known; record a run in "
-                "local mode, or measure with irtt"
-            )
-        log.counts["duplicates left out"] += (epoch, counter) in delays
-        delays[epoch, counter] = min(delay, delays.get((epoch, counter), delay))
+    delays = _delays(arrivals, log)
     rows = list(_columns(sent, "stamp_ns", "epoch", "counter"))
     # The receiver may refuse datagrams sent before its session opened or near the session's end.
     # The link did not lose these datagrams: leave them out.
@@ -126,6 +118,20 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     unknown = len(rows) - len(log.entries)
     log.counts["left out, sent before the session was open or in its last 2 s"] += unknown
     return log.packets()
+
+
+def _delays(arrivals: Table, log: Log) -> dict[tuple[float, float], float]:
+    """Return epoch and counter of each datagram that arrived -> its delay [s]."""
+    delays: dict[tuple[float, float], float] = {}
+    for epoch, counter, delay in _columns(arrivals, "epoch", "counter", "delay"):
+        if isnan(delay):
+            raise log.error(
+                "its ends did not share a clock, so one-way delays are not known; record a run in "
+                "local mode, or measure with irtt"
+            )
+        log.counts["duplicates left out"] += (epoch, counter) in delays
+        delays[epoch, counter] = min(delay, delays.get((epoch, counter), delay))
+    return delays
 
 
 def _columns(table: Table, *names: str) -> Iterator[tuple[float, ...]]:

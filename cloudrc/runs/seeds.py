@@ -74,13 +74,18 @@ def as_table(summary: Mapping[str, Any], planned: int = 0) -> str:
     """
     rows = [("number", "median", "95 % interval", "unit")]
     for name, entry in summary["numbers"].items():
-        between = " .. ".join(map(format_number, entry["interval"] or ())) or "-"
-        unit = "" if entry["unit"] == "1" else entry["unit"]
-        note = "" if entry["count"] == summary["count"] else f"  ({entry['count']} runs)"
-        mark = FAILED_MARK if entry["failed"] else ""
-        rows.append((name, format_number(entry["median"]) + mark, between, unit + note))
+        rows.append(_row(name, entry, summary["count"]))
     method = METHOD if summary["count"] >= 6 else "an interval needs 6 seeds or more"
     if any(entry["failed"] for entry in summary["numbers"].values()):
         method += f"\n{FAILED_NOTE}"
     count = planned or summary["count"]
     return f"{table(rows, right=(1, 2))}\n\n{method}\ndone {summary['done']}/{count}"
+
+
+def _row(name: str, entry: Mapping[str, Any], count: int) -> tuple[str, str, str, str]:
+    """Return the row of a number; `count` is that of all runs."""
+    between = " .. ".join(map(format_number, entry["interval"] or ())) or "-"
+    unit = "" if entry["unit"] == "1" else entry["unit"]
+    note = "" if entry["count"] == count else f"  ({entry['count']} runs)"
+    mark = FAILED_MARK if entry["failed"] else ""
+    return name, format_number(entry["median"]) + mark, between, unit + note

@@ -183,6 +183,15 @@ def verify_release(title: str, pods: Pods, limit: float = RELEASE_TIMEOUT) -> Re
     Raises:
         TimedOutError: If world or cloud does not answer in time.
     """
+    seen = _await_verdicts(pods, limit)
+    if silent := [receiver for way, (_, receiver, _) in WAYS.items() if way not in seen]:
+        text = f"{' and '.join(silent)} did not answer within {limit:g} s: are the pods ready?"
+        raise TimedOutError(text)
+    return make_report(title, {way: _findings(seen[way], pods[WAYS[way][0]][1]) for way in WAYS})
+
+
+def _await_verdicts(pods: Pods, limit: float) -> dict[str, Any]:
+    """Return the newest answer about each direction, once both are decided or after `limit` [s]."""
     deadline, seen = time.monotonic() + limit, dict[str, Any]()
     while True:
         time.sleep(POLL_PERIOD)
@@ -191,11 +200,7 @@ def verify_release(title: str, pods: Pods, limit: float = RELEASE_TIMEOUT) -> Re
                 seen[way] = json.loads(page)
         decided = {found["verdict"] for found in seen.values()} <= {"ok", "off"}
         if (decided and len(seen) == len(WAYS)) or time.monotonic() >= deadline:
-            break
-    if silent := [receiver for way, (_, receiver, _) in WAYS.items() if way not in seen]:
-        text = f"{' and '.join(silent)} did not answer within {limit:g} s: are the pods ready?"
-        raise TimedOutError(text)
-    return make_report(title, {way: _findings(seen[way], pods[WAYS[way][0]][1]) for way in WAYS})
+            return seen
 
 
 def fetch(url: str) -> str:

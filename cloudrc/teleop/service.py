@@ -298,17 +298,7 @@ class MissionService:
         if before is None or (before.world, before.guard) != (seen.world, seen.guard):
             self._guard_ns = now_ns
         if mission is not None and (mission.number, mission.world) == (seen.mission_id, seen.world):
-            known = mission.witness
-            mission.witness = replace(
-                known,
-                obstacle_contacts=seen.obstacle_contacts,
-                first_contact=known.first_contact or self._describe_contact(seen, now_ns),
-                touch_speed=finite_or_none(seen.touch_speed),
-                slip_ns=known.slip_ns + (seen.slip_ns - before.slip_ns if before else 0),
-            )
-            time, touch = self._teleop.elapsed(now_ns), mission.order.touch
-            for event, text in mission.witness.news(known, time, touch.body if touch else ""):
-                self._note(mission, event, text, now_ns)
+            self._witness(mission, seen, now_ns)
             if before is not None and before.epoch != seen.epoch:
                 text = f"cloud has a new session; the mission is {mission.state}"
                 self._note(mission, "new_session", f"{text} {self._teleop.where}", now_ns)
@@ -318,6 +308,20 @@ class MissionService:
                 self._note(mission, event, text, now_ns)
         self._teleop.see(seen, now_ns)
         self._collect(now_ns)
+
+    def _witness(self, mission: MissionRecord, seen: RobotStatus, now_ns: int) -> None:
+        """Note what telemetry shows about contacts, touches and slips in a mission."""
+        before, known = self.seen, mission.witness
+        mission.witness = replace(
+            known,
+            obstacle_contacts=seen.obstacle_contacts,
+            first_contact=known.first_contact or self._describe_contact(seen, now_ns),
+            touch_speed=finite_or_none(seen.touch_speed),
+            slip_ns=known.slip_ns + (seen.slip_ns - before.slip_ns if before else 0),
+        )
+        time, touch = self._teleop.elapsed(now_ns), mission.order.touch
+        for event, text in mission.witness.news(known, time, touch.body if touch else ""):
+            self._note(mission, event, text, now_ns)
 
     def handle_deadline(self, now_ns: int) -> None:
         """Start a waiting mission, check time limits, and repeat the messages that are due."""
@@ -340,24 +344,24 @@ class MissionService:
 
     def state(self, now_ns: int) -> dict[str, Any]:
         """Return the state of missions and robot in the form of the API's `StateView`."""
-        mission, seen, heard_ns = self._current, self.seen, self._heard_ns
+        mission, heard_ns = self._current, self._heard_ns
         cloud_age = None if heard_ns is None else (now_ns - heard_ns) * 1e-9
-        shown: dict[str, Any] = {
+        return {
             "mission": mission.summary() if mission is not None else None,
             "queue": [waits.id for waits in self.book.open() if waits is not mission],
             "cloud_age_s": cloud_age,
-            "seen": None,
+            "seen": None if cloud_age is None else self._seen_view(now_ns, cloud_age),
         }
-        if seen is None or cloud_age is None:
-            return shown
-        age, state = (now_ns - self._seen_ns) * 1e-9, mission.state if mission else None
-        control = seen.control
-        if mission is not None and state == HELD:
-            by_hand = (e["event"] for e in reversed(mission.events) if e["event"] in STEERED)
-            last, pause_ns = next(by_hand, ""), now_ns - self._driven_ns
-            back = last == "operator_lost" and pause_ns <= HEARTBEAT_NS
-            state = DRIVEN if last == "driving" or back else HELD
-        shown["seen"] = {
+
+    def _seen_view(self, now_ns: int, cloud_age: float) -> dict[str, Any] | None:
+        """Return what telemetry shows, as the API's `SeenView`; None before the first telemetry.
+
+        `cloud_age` is the age of cloud's last message [s].
+        """
+        if (seen := self.seen) is None:
+            return None
+        age, control = (now_ns - self._seen_ns) * 1e-9, seen.control
+        return {
             "age_s": age,
             "epoch": seen.epoch,
             "world": seen.world,
@@ -365,7 +369,7 @@ class MissionService:
             "guard": seen.guard.name,
             "cause": seen.cause.words,
             "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
-            "next_step": next_step(seen.guard, age, cloud_age, state),
+            "next_step": next_step(seen.guard, age, cloud_age, self._steered_state(now_ns)),
             "obstacle_contacts": seen.obstacle_contacts,
             "touch_speed_mps": finite_or_none(seen.touch_speed),
             "sensors": self._sensors(seen),
@@ -373,7 +377,16 @@ class MissionService:
             "rtt_s": control and finite_or_none(control.rtt),
             "loop_delay_s": control and finite_or_none(control.loop_delay),
         }
-        return shown
+
+    def _steered_state(self, now_ns: int) -> str | None:
+        """Return the state of the mission under way; DRIVEN while somebody drives the robot."""
+        mission = self._current
+        if mission is None or mission.state != HELD:
+            return mission.state if mission else None
+        by_hand = (e["event"] for e in reversed(mission.events) if e["event"] in STEERED)
+        last, pause_ns = next(by_hand, ""), now_ns - self._driven_ns
+        back = last == "operator_lost" and pause_ns <= HEARTBEAT_NS
+        return DRIVEN if last == "driving" or back else HELD
 
     def _sensors(self, seen: RobotStatus) -> list[dict[str, Any]]:
         """Return the robot's own sensors; none if world's robot.yaml is another one."""

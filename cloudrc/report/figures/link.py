@@ -73,11 +73,7 @@ def _draw_delay(axes: Axes, way: DirectionSample, colour: str, top: float) -> No
         time = np.linspace(0.0, duration, 2000)
         low, high = (1e3 * bound for bound in marks.band(delays, time))
         axes.fill_between(time, low, high, color=style.LIGHT, lw=0, zorder=1, label="profile")
-    shown = [blackout for blackout in way.asked.blackouts if blackout.start_s < duration]
-    for index, blackout in enumerate(shown):  # draw a short blackout as wide as a line
-        end = blackout.start_s + max(blackout.duration_s, duration / 300)
-        label = "_" if index else "blackout"
-        axes.axvspan(blackout.start_s, end, color=BLACKOUT, lw=0, zorder=1.5, label=label)
+    _draw_blackouts(axes, way, duration)
     thin = slice(None, None, max(1, len(way.sent) // DOTS))
     dots(axes, way.sent[thin], way.delays[thin] * 1e3, colour, "packet")
     lost = way.sent[np.isnan(way.delays)]
@@ -91,6 +87,15 @@ def _draw_delay(axes: Axes, way: DirectionSample, colour: str, top: float) -> No
     axes.set_xlabel("time since the link started (s)")
     axes.set_ylabel("one-way delay (ms)")
     legend_above(axes, 4)
+
+
+def _draw_blackouts(axes: Axes, way: DirectionSample, duration: float) -> None:
+    """Draw the blackouts that begin within the `duration` of the axis [s]."""
+    shown = [blackout for blackout in way.asked.blackouts if blackout.start_s < duration]
+    for index, blackout in enumerate(shown):  # draw a short blackout as wide as a line
+        end = blackout.start_s + max(blackout.duration_s, duration / 300)
+        label = "_" if index else "blackout"
+        axes.axvspan(blackout.start_s, end, color=BLACKOUT, lw=0, zorder=1.5, label=label)
 
 
 def _draw_tail(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:

@@ -24,6 +24,20 @@ Facts: TypeAlias = dict[str, tuple[ArrayLike, ArrayLike]]
 
 def check_fit(model: Any) -> None:
     """Raise a BadInputError that lists how a compiled model differs too much from the Pelican."""
+    _check_parts(model)
+    wanted = _wanted()
+    differs = [
+        f"{name} is {_words(have)}, not {_words(wanted[name][0])}"
+        + (f" +- {_words(slack)}" if np.any(slack := wanted[name][1]) else "")
+        for name, (have, _) in _facts(model).items()
+        if not np.all(np.abs(np.subtract(have, wanted[name][0])) <= np.add(wanted[name][1], 1e-9))
+    ]
+    if differs:
+        raise BadInputError(f"the onboard controller is not made for it: {'; '.join(differs)}")
+
+
+def _check_parts(model: Any) -> None:
+    """Raise a BadInputError if the model has other parts than the Pelican, or drag of the air."""
     for option in ("density", "viscosity"):
         if value := getattr(model.opt, option):
             raise BadInputError(
@@ -42,15 +56,6 @@ def check_fit(model: Any) -> None:
             raise BadInputError(f"needs a {kind} named tip") from None
     if (model.nq, model.nv) != (7, 6):
         raise BadInputError("nothing but the robot's base may move")
-    wanted = _wanted()
-    differs = [
-        f"{name} is {_words(have)}, not {_words(wanted[name][0])}"
-        + (f" +- {_words(slack)}" if np.any(slack := wanted[name][1]) else "")
-        for name, (have, _) in _facts(model).items()
-        if not np.all(np.abs(np.subtract(have, wanted[name][0])) <= np.add(wanted[name][1], 1e-9))
-    ]
-    if differs:
-        raise BadInputError(f"the onboard controller is not made for it: {'; '.join(differs)}")
 
 
 @cache
