@@ -38,7 +38,7 @@ COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python
 DRAWING := glfw pyopengl mujoco-studio
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process process-shared process-alone e2e e2e-full test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link pictures results docs dist images kind-load lock clean
+.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link pictures results docs dist images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -65,6 +65,12 @@ e2e: $(VENV)/dev ## fly on a new kind cluster, or on that of KUBECONFIG (KEEP=1 
 
 e2e-full: $(VENV)/dev ## as e2e, with all faults on the cluster and a new Secret: minutes
 	$(bin)/pytest -m e2e tests/e2e $(if $(KEEP),--keep)
+
+test-tun: $(VENV)/dev ## run the tests of two programs in namespaces; needs root or user namespaces
+	$(bin)/pytest -m 'tun and not full' tests/link/exec
+
+smoke-tun: $(VENV)/dev ## of these the few that every push runs
+	$(bin)/pytest -m 'tun and smoke' tests/link/exec
 
 # Without root or sch_netem, pytest ends with 3; make turns every failure into 2.
 test-netem: $(VENV)/dev ## run the tests of netem in the kernel; needs root and sch_netem
@@ -106,7 +112,7 @@ mutants: $(VENV)/dev ## mutate guard, tunnel and store, list the mutants that te
 NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults.json \
 	search-adversarial.json $(ROBOTS:%=search-%.json) search-random.json \
 	link.json mujoco-oldest.json mujoco-newest.json) \
-	mutants night-netem e2e-full $(EVIDENCE)/index.md
+	mutants night-tun night-netem e2e-full $(EVIDENCE)/index.md
 
 nightly: export CLOUDRC_EVIDENCE = $(CURDIR)/$(EVIDENCE)
 nightly: $(VENV)/dev ## run every test, search and bench; writes build/evidence (needs what e2e needs)
@@ -114,7 +120,7 @@ nightly: $(VENV)/dev ## run every test, search and bench; writes build/evidence 
 	$(MAKE) --jobs=1 --keep-going $(NIGHT)
 
 $(EVIDENCE)/tests.xml:
-	$(bin)/pytest -n auto -m 'not process and not e2e and not netem' --junitxml=$@
+	$(bin)/pytest -n auto -m 'not process and not e2e and not netem and not tun' --junitxml=$@
 
 $(EVIDENCE)/process.xml:
 	REQUIRE_ALL=1 $(bin)/pytest -m process --junitxml=$@
@@ -145,7 +151,10 @@ $(EVIDENCE)/mujoco-%.json:
 $(EVIDENCE)/index.md:
 	$(bin)/python -m tools.evidence $(EVIDENCE)
 
-.PHONY: night-netem
+.PHONY: night-tun night-netem
+night-tun:
+	$(bin)/pytest -m tun tests/link/exec
+
 night-netem:
 	@if unshare --net tc qdisc add dev lo root netem delay 1ms; then $(MAKE) test-netem-full; \
 		else echo "no sch_netem for this user here: 'make test-netem-full' is left out"; fi

@@ -101,14 +101,17 @@ ALWAYS = {
 RESERVED: dict[str, tuple[str, ...]] = {
     "mujoco": ("world/", "geometry/compiled"),
     # The simulator packs forces into MuJoCo's buffers; this is the fastest way.
-    "struct": ("tunnel/codec", "record/", "world/simulator", "robots/pelican/native/robot"),
+    "struct": (
+        *("tunnel/codec", "record/", "world/simulator", "robots/pelican/native/robot"),
+        "link/exec/namespace",
+    ),
     "yaml": ("config/", "link/", "record/", "report/", "cli/", "cluster/"),
     "pydantic": (
         *("config/", "link/", "cli/", "teleop/", "runs/", "report/folder"),
         *("drivers/process", "faults/schedule"),
     ),
     **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("teleop/api", "teleop/auth")),
-    "fcntl": ("drivers/local", "console/serve", "runs/lock"),
+    "fcntl": ("drivers/local", "console/serve", "link/exec/namespace", "runs/lock"),
     "matplotlib": ("report/",),
     "viser": ("console/", "report/replay"),
     "gymnasium": ("gym/",),
@@ -122,7 +125,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     # A compiler makes the machine code of the usual step.
     "subprocess": (
         *("drivers/", "cli/", "cluster/", "robots/pelican/native/library"),
-        *("exercise/scoring", "runs/doctor", "runs/link_under_test"),
+        *("exercise/scoring", "link/exec/holder", "runs/doctor", "runs/link_under_test"),
     ),
     "multiprocessing": ("drivers/", "runs/workers"),
     "concurrent": ("cli/", "runs/workers", "cluster/", "teleop/", "policy/serve"),

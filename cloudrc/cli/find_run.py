@@ -22,7 +22,7 @@ def run_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def find_local_run(
-    options: argparse.Namespace, *, steers: bool = True, flag: str = "--run "
+    options: argparse.Namespace, *, steers: bool = True, flag: str = "--run ", links: bool = False
 ) -> RunInFlight | None:
     """Find the run in flight that a command means; None if its flags name a cluster.
 
@@ -35,7 +35,7 @@ def find_local_run(
         return None
     if in_cluster:
         raise BadInputError("--run names a run here, the other flags a cluster; give one")
-    found = find_run(options.run, steers=steers, flag=flag)
+    found = find_run(options.run, steers=steers, flag=flag, links=links)
     if found is not None and found.note:
         print_line(f"cloudrc: {found.note}", sys.stderr)
     return found

@@ -36,6 +36,7 @@ VERBS = {
     "record": "turn measured delays into a trace that a profile can replay",
     "verify": "check by measurement that a link does what its profile says",
     "set": "change the link during a flight",
+    "exec": "run two programs with the link between them",
     "run": "shape one direction of the link until SIGTERM",
 }
 """Verb -> its line in the help."""

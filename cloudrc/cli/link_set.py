@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 where:
-  a run on this machine ('cloudrc up', 'cloudrc run'): found automatically, or
-  named by --run
+  a run on this machine ('cloudrc up', 'cloudrc run', 'cloudrc link exec'):
+  found automatically, or named by --run
   a release in a cluster: if --context, -n or --release is given, or if there is
   no run on this machine; always with 'kubectl cloudrc link set'
   If several runs fly, or ./runs/latest has ended, name the flight by a flag.
@@ -53,7 +53,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.drivers.local import LINK_FOLDER
     from cloudrc.runs.link_change import set_here, states_table
 
-    if (found := find_local_run(options)) is not None:
+    if (found := find_local_run(options, links=True)) is not None:
         run = found.folder
         folder, asked = run / LINK_FOLDER, (options.profile, options.settings)
         edit, states = set_here(folder, found.url, *asked, number)

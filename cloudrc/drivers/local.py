@@ -67,8 +67,10 @@ LINK_LOG = "uplink.log"
 """File in the folder of every run in real time."""
 CONTROLLER = "controller"
 """Name of the process that asks a controller outside."""
-RUN, SESSION = "run", "session"
-"""Kinds of flights: a run (`cloudrc run`) ends with its mission, a session with `cloudrc down`."""
+RUN, SESSION, LINK = "run", "session", "link"
+"""Kinds of flights: a run (`cloudrc run`) ends with its mission, a session with `cloudrc down`. A
+link between two programs (`cloudrc link exec`) is no flight, but commands find it in the same way.
+"""
 
 
 def flights_folder() -> Path:
@@ -88,7 +90,7 @@ class FlightFile(NamedTuple):
     """What a flight file tells other commands about a flight, besides the folder of the run."""
 
     api: str  # address of the operator's API
-    kind: str  # RUN or SESSION
+    kind: str  # RUN, SESSION or LINK
     pid: int  # process id of the supervisor
 
 
@@ -97,7 +99,7 @@ def announced(run: Path, api: str, kind: str = RUN) -> Iterator[str]:
     """Keep a flight file during the `with` block; yield "", or the reason if this is impossible.
 
     The file tells other commands `run`, the folder of the run; `api`, the address of the operator's
-    API; and `kind`, RUN or SESSION.
+    API; and `kind`, RUN, SESSION or LINK.
     """
     about = FlightFile(api, kind, os.getpid())._asdict()
     flight = json.dumps({"schemaVersion": 1, "run": str(run.resolve()), **about})
@@ -128,9 +130,14 @@ def _write_flight_file(path: Path, flight: str, stack: contextlib.ExitStack) -> 
     new.rename(path)
 
 
-def under_way() -> dict[Path, str]:
-    """Return the flights of this user: folder of the run -> address of its API."""
-    return {run: flight.api for run, flight in flight_files().items()}
+def under_way(*, links: bool = False) -> dict[Path, str]:
+    """Return the flights of this user: folder of the run -> address of its API.
+
+    With `links`, also return the links between two programs, which have no API.
+    """
+    return {
+        run: flight.api for run, flight in flight_files().items() if links or flight.kind != LINK
+    }
 
 
 def flight_files() -> dict[Path, FlightFile]:

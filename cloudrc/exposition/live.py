@@ -286,11 +286,13 @@ class CloudEnd(End):
 
 
 class LinkMetrics:
-    """Metrics of a process that shapes one direction of the link."""
+    """Metrics of a process that shapes one direction of the link, or both."""
 
     def __init__(self, values: Values) -> None:
         self.tell: Callable[[], str] = lambda: "{}\n"  # content of /link.json, the shaper's state
         self._values = values
+        self._modes = dict[str, dict[str, dict[str, float]]]()
+        self._delays = dict[str, float]()
 
     def shaped(self, shaper: str, direction: str, mode: str, delay: float) -> None:
         """Store which `shaper` ("relay" or "netem") shapes the direction.
@@ -298,8 +300,13 @@ class LinkMetrics:
         `mode` is the value of the key `link.mode`. `delay` is the mean delay that the profile now
         requests [s].
         """
-        self._values["cloudrc_link_info"] = {shaper: {direction: {mode: 1.0}}}
-        self._values["cloudrc_link_delay_seconds"] = {direction: delay}
+        for modes in self._modes.values():
+            modes.pop(direction, None)  # of the shaper before
+        self._modes.setdefault(shaper, {})[direction] = {mode: 1.0}
+        self._delays[direction] = delay
+        # Copies: another thread may read them.
+        self._values["cloudrc_link_info"] = {one: dict(ways) for one, ways in self._modes.items()}
+        self._values["cloudrc_link_delay_seconds"] = dict(self._delays)
 
 
 NO_WAYPOINT = -1

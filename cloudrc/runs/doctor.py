@@ -11,7 +11,8 @@ from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple
 
 from cloudrc.drivers.machine import interpreter, usable_cores
-from cloudrc.errors import CloudrcError
+from cloudrc.drivers.namespaces import ProgramEnd
+from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.runs.requirements import EXTRAS, MODES, missing
 from cloudrc.text import Paint, plain, table
 
@@ -75,7 +76,7 @@ def all_checks(mode: str, survey: Survey) -> Iterator[Check]:
     yield Check("python", "ok", platform.python_version(), "", tuple(MODES))
     yield from map(packages, EXTRAS)
     physics, steps = said(program)
-    yield from (mujoco_steps(physics), native_steps(steps), _cores())
+    yield from (mujoco_steps(physics), native_steps(steps), _cores(), namespaces())
     for name, (fix, modes) in PROGRAMS.items():
         path = shutil.which(name)
         yield _check(name, path is not None, path or "not in PATH", fix, modes)
@@ -117,6 +118,17 @@ def said(program: subprocess.Popen[str]) -> tuple[str, str]:
     reason = (stderr.strip().splitlines() or [f"exit code {program.returncode}"])[-1]
     first, second, *_ = [*stdout.splitlines(), reason, reason]
     return first, second
+
+
+def namespaces() -> Check:
+    """Check whether `cloudrc link exec` can make network namespaces here."""
+    try:
+        end = ProgramEnd("client")
+    except MissingPrerequisiteError as error:
+        found, _, fix = str(error).partition("; ")
+        return _check("link exec", False, found, fix)
+    end.close()
+    return _check("link exec", True, f"network namespaces, by {end.way}", "")
 
 
 def _cores() -> Check:

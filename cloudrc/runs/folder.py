@@ -13,15 +13,16 @@ RUNS = Path("runs")
 """Folder for runs, in the working folder."""
 
 
-def new_folder(out: Path | None, name: str, link: str = "latest") -> Path:
+def new_folder(out: Path | None, name: str, link: str = "latest", *, flag: str = "--out") -> Path:
     """Make the folder of a run: `out`, or the next free `runs/<name>-<n>`.
 
     Without `out`, point the symbolic link `runs/<link>` to the new folder; "" for no link. Raise a
-    BadInputError if `out` exists and is not an empty folder, or if no folder can be made.
+    BadInputError if `out` exists and is not an empty folder, or if no folder can be made. `flag` is
+    the flag that gave `out`.
     """
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise BadInputError(
-            f"--out {out}: already exists; name a new folder, runs are never overwritten"
+            f"{flag} {out}: already exists; name a new folder, runs are never overwritten"
         )
     try:
         if out is not None:
@@ -34,7 +35,7 @@ def new_folder(out: Path | None, name: str, link: str = "latest") -> Path:
                 folder.mkdir()
                 break
     except OSError as error:
-        where = f"--out {out}" if out else f"{RUNS}/ in the working folder"
+        where = f"{flag} {out}" if out else f"{RUNS}/ in the working folder"
         text = f"{where}: cannot be made: {error.strerror}; name a writable folder with --out"
         raise BadInputError(text) from error
     if link:

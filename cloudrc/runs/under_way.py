@@ -27,7 +27,9 @@ def short(path: Path) -> str:
     return str(path.relative_to(here) if is_inside else path)
 
 
-def find_run(run: Path | None, *, steers: bool = True, flag: str = "--run ") -> RunInFlight | None:
+def find_run(
+    run: Path | None, *, steers: bool = True, flag: str = "--run ", links: bool = False
+) -> RunInFlight | None:
     """Find the run in flight that a user means: `run`, else the only one.
 
     If the user's newest run here, ./runs/latest, has ended, a command that changes a flight rejects
@@ -37,6 +39,7 @@ def find_run(run: Path | None, *, steers: bool = True, flag: str = "--run ") -> 
         run: Folder of the run; None if the user names none.
         steers: Whether the command changes the flight.
         flag: Flag that names a run, for the texts of errors; "" for a positional argument.
+        links: Whether the command can also use a link between two programs.
 
     Returns:
         The run; None if no run is in flight.
@@ -47,7 +50,7 @@ def find_run(run: Path | None, *, steers: bool = True, flag: str = "--run ") -> 
     """
     # The URL comes from this user's flight files, never from the run's folder: a run's folder may
     # come from somebody else and name a foreign server.
-    flights = under_way()
+    flights = under_way(links=links)
     if run is not None:
         url = flights.get(Path(os.path.realpath(run)))
         if url is None:

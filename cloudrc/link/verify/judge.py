@@ -26,6 +26,7 @@ from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mea
 RUNS, RUN_LENGTH = 200, 1000
 """Number of simulated links for a band, and number of datagrams on each simulated link. The band is
 scaled for measurements with another number of datagrams."""
+ASKED_RUNS = 20  # number of simulated links for the values that a profile asks for
 TAIL = 1e-3  # share of correct links below a band, and share above it, in [0, 1]
 SAME_DELAYS, SAME_LOSSES = 0.5, 0.97
 """Limits above which a link counts as a relay with the predicted random numbers: correlation of
@@ -177,7 +178,21 @@ class Measurement:
         only the requested value and the verdict "told". `first` is the counter of the first
         datagram in the session `epoch`.
         """
-        expected = self.expected(measured, epoch, first)
+        return self._judge(measured, self.expected(measured, epoch, first))
+
+    def judge_applied(self, applied: Stream, measured: Stream) -> list[Judgement]:
+        """Judge a measured stream by what the link has computed for the same packets."""
+        return self._judge(measured, self._expect([applied]))
+
+    def asked(self) -> dict[str, float]:
+        """Return the mean quantities of links with other random numbers, by name."""
+        seeds = range(-ASKED_RUNS, 0)  # the seed of an experiment is not negative
+        links = [
+            replace(self, flow=self.flow._replace(seed=seed)).draw(self.sent) for seed in seeds
+        ]
+        return {name: band[0] for name, band in self._expect(links).bands.items()}
+
+    def _judge(self, measured: Stream, expected: Expected) -> list[Judgement]:
         found = self.quantities(measured, expected.pooled)
         rows = [expected.judge(name, found[name]) for name in found if name in expected.bands]
         if len(measured.sent) < FEWEST:

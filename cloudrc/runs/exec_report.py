@@ -1,0 +1,125 @@
+"""Report on a link between two programs: the verdict on each direction, and a recording."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from math import nan
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cloudrc.files import naming
+from cloudrc.link.exec.relay import LOGGED_MAX
+from cloudrc.link.exec.verdict import judge_packets, recording
+from cloudrc.link.verify.causes import LATE, Findings, ShaperFacts, in_unit
+from cloudrc.link.verify.judge import FEWEST
+from cloudrc.runs.verify import Report, make_report
+from cloudrc.text import table
+
+if TYPE_CHECKING:
+    from cloudrc.runs.exec_link import ExecLink
+    from cloudrc.runs.link_exec import ExecOutcome, ExecSettings
+
+WAITED = 0.01
+"""Share of packets that were read behind a full batch, above which the relay lacks CPU time."""
+MEANINGS = {
+    "believed": "the link did what its profile says",
+    "not believed": "the link did not do what its profile says",
+    "undecided": f"a verdict needs {FEWEST} packets in each direction",
+}
+
+
+def make_exec_report(settings: ExecSettings, outcome: ExecOutcome, link: ExecLink) -> Report:
+    """Judge both directions; return the content of link.json."""
+    judged = {
+        name: judge_packets(one.way.log, one.period)
+        for name, one in link.directions.items()
+        if one.way
+    }
+    late = link.counts().get("release_error_p99_ns", 0) * 1e-9
+    findings = {}
+    for name, rows in judged.items():
+        facts = _facts(link, name, late)
+        findings[name] = Findings([row for _, row in rows], facts, _packets(link, name))
+    report = make_report(link.cause, findings)
+    for name, rows in judged.items():
+        asked = {row.name: value for value, row in rows}
+        for row in report["directions"][name]["rows"]:
+            row["applied"] = row.pop("asked")
+            if (value := asked[row["name"]]) == value:
+                row["asked"] = value
+    states = {name: asdict(one.state) for name, one in link.directions.items() if one.state}
+    return {
+        "schemaVersion": 1,
+        **report,
+        "seed": link.seed,
+        "programs": {
+            name: {"command": getattr(settings, name), "exit_code": outcome.codes.get(name)}
+            for name in ("server", "client")
+        },
+        "interrupted": outcome.interrupted,
+        "counts": link.counts(),
+        "states": states,
+    }
+
+
+def _packets(link: ExecLink, name: str) -> str:
+    one = link.directions[name]
+    assert one.way is not None
+    count = one.way.received - one.period.first
+    since = ", since the last change" if one.period.first else ""
+    return f"{count} packets{since}"
+
+
+def _facts(link: ExecLink, name: str, late: float) -> ShaperFacts:
+    one = link.directions[name]
+    assert one.way is not None
+    signs = (
+        (late > LATE, f"1 % of packets left later than {in_unit(late, 's')}"),
+        (one.way.waited > WAITED * one.way.received, f"{one.way.waited} packets waited to be read"),
+        (one.unread > 0, f"{one.unread} packets not read in time"),
+    )
+    starved = ", ".join(text for holds, text in signs if holds)
+    return ShaperFacts(shaper="relay", starved=starved)
+
+
+def as_text(report: Report) -> str:
+    """Format a report: a table per direction, causes and, in the last line, the verdict."""
+    lines = list[str]()
+    for way, found in report["directions"].items():
+        head = [way, "asked", "applied", "measured", "allowed", "verdict"]
+        lines += [
+            f"{way}: {found['probes']}",
+            table([head, *map(_cells, found["rows"])], [1, 2, 3]),
+        ]
+        if starved := found["evidence"].get("starved"):
+            lines.append(f"  the relay lacks CPU time: {starved}")
+    p50, p99 = (report["counts"].get(f"release_error_{one}_ns", 0) * 1e-9 for one in ("p50", "p99"))
+    late = f"packets left {in_unit(p50, 's')} (median) or {in_unit(p99, 's')} (99 %) late"
+    lines.append(late)
+    lines += [f"  {one['way']}: {one['text']}  [{one['code']}]" for one in report["causes"]]
+    verdict = report["verdict"]
+    return "\n".join([*lines, f"{verdict.upper()}: {MEANINGS[verdict]}"])
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    names = ("asked", "applied", "measured", "low", "high")
+    values = [in_unit(row.get(name, nan), row["unit"]) for name in names]
+    return [f"  {row['name']}", *values[:3], f"{values[3]} .. {values[4]}", row["verdict"]]
+
+
+def write_report(folder: Path, report: Report, link: ExecLink) -> None:
+    """Write link.json, and a recording of the packets of each direction."""
+    path = folder / "link.json"
+    with naming(path):
+        path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    for name, one in link.directions.items():
+        assert one.way is not None
+        assert one.state is not None
+        path = folder / f"{name}.csv"
+        with naming(path), path.open("w", encoding="utf-8") as file:
+            if one.way.received > LOGGED_MAX:
+                file.write(f"# the first {LOGGED_MAX} of {one.way.received} packets\n")
+            origin_ns = one.way.log.sent[0] if len(one.way.log) else 0
+            file.writelines(f"{line}\n" for line in recording(one.way.log, origin_ns))

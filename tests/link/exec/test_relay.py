@@ -1,0 +1,217 @@
+"""The relay between two programs, over sockets in place of TUN devices, and its verdict."""
+
+import os
+import socket
+
+import numpy as np
+import pytest
+
+from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.link.exec import listening, namespace
+from cloudrc.link.exec import relay as module
+from cloudrc.link.exec.relay import LOST, PacketLog, TunRelay, TunWay
+from cloudrc.link.exec.verdict import Period, judge_packets, recording
+from cloudrc.link.library import KIND
+from cloudrc.link.model import LinkDirection
+from tests.link.profiles import profile_of
+
+MS = 1_000_000
+PACKET = b"\x45" + bytes(99)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that stands still while the relay waits for packets: 1 us for each reading."""
+    time = {"now": 0}
+
+    def read():
+        time["now"] += 1_000
+        return time["now"]
+
+    monkeypatch.setattr(module, "monotonic_ns", read)
+    return time
+
+
+@pytest.fixture
+def joined():
+    """Return a function that makes a relay, and the programs' sides of both devices."""
+    opened = []
+
+    def make(uplink, downlink=None):
+        pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2)]
+        opened.extend(one for pair in pairs for one in pair)
+        for inside, own in pairs:
+            inside.setblocking(False)
+            own.setblocking(False)
+        client, server = (own.fileno() for _, own in pairs)
+        ways = {
+            "uplink": TunWay(LinkDirection(uplink, 1, True), client, server),
+            "downlink": TunWay(LinkDirection(downlink or uplink, 1, False), server, client),
+        }
+        return TunRelay(ways), pairs[0][0], pairs[1][0]
+
+    yield make
+    for one in opened:
+        one.close()
+
+
+def test_a_packet_leaves_when_it_is_due_and_not_before(joined, clock):
+    relay, client, server = joined(profile_of(0.020))
+    client.send(PACKET)
+    relay.step(0.0)
+    assert relay.in_flight == 1
+    with pytest.raises(BlockingIOError):
+        server.recv(2000)
+    clock["now"] += 21 * MS
+    relay.step(0.0)
+    assert server.recv(2000) == PACKET
+    log = relay.ways["uplink"].log
+    assert log.due[0] - log.sent[0] == 20 * MS
+    assert 0 <= log.left[0] - log.due[0] < 2 * MS
+    assert relay.ways["downlink"].received == 0
+
+
+def test_the_relay_asks_the_model_for_packets_by_their_numbers_and_sizes(joined, clock):
+    """The same packets meet the same fates as in `cloudrc.link.open`."""
+    profile = profile_of(0.005, 0.004, loss=0.3)
+    relay, client, _ = joined(profile)
+    for _ in range(40):
+        client.send(PACKET)
+        relay.step(0.0)
+    log, model = relay.ways["uplink"].log, LinkDirection(profile, 1, True)
+    for number, sent_ns in enumerate(log.sent):
+        fate = model.send(1, KIND, number, len(PACKET) - 28, sent_ns)
+        assert log.due[number] == (fate[0] if fate else LOST)
+    assert relay.ways["uplink"].lost == list(log.due).count(LOST) > 0
+
+
+def test_packets_from_before_the_start_are_dropped(joined, clock):
+    relay, client, server = joined(profile_of(0.0))
+    client.send(b"early")
+    relay.drain()
+    client.send(PACKET)
+    relay.step(0.0)
+    assert server.recv(2000) == PACKET
+
+
+def test_more_packets_in_flight_than_memory_are_dropped_and_counted(joined, clock, monkeypatch):
+    monkeypatch.setattr(module, "IN_FLIGHT_BYTES", 3 * len(PACKET))
+    relay, client, _ = joined(profile_of(1.0))
+    for _ in range(10):
+        client.send(PACKET)
+    relay.step(0.0)
+    assert (relay.in_flight, relay.ways["uplink"].overflow) == (4, 6)
+
+
+def test_only_the_first_packets_of_a_long_run_are_recorded(joined, clock, monkeypatch):
+    monkeypatch.setattr(module, "LOGGED_MAX", 3)
+    relay, client, server = joined(profile_of(0.0))
+    for _ in range(5):
+        client.send(PACKET)
+    relay.step(0.0)
+    assert [server.recv(2000) for _ in range(5)] == [PACKET] * 5
+    assert len(relay.ways["uplink"].log) == 3
+
+
+def log_of(profile, late_ns=0, count=2000):
+    """Make the log of a relay that adds `late_ns` to each packet [ns]."""
+    log, model = PacketLog(), LinkDirection(profile, 7, True)
+    for number in range(count):
+        sent_ns = number * 10 * MS
+        fate = model.send(1, KIND, number, 72, sent_ns)
+        log.sent.append(sent_ns)
+        log.size.append(100)
+        log.due.append(fate[0] if fate else LOST)
+        log.left.append(fate[0] + late_ns if fate else LOST)
+        log.copies.append(len(fate))
+    return log
+
+
+def verdicts(log, profile, first=0):
+    rows = judge_packets(log, Period(profile, 7, True, first, 0))
+    return {row.name: row.verdict for _, row in rows}
+
+
+def test_a_relay_that_keeps_its_times_is_believed():
+    profile = profile_of(0.040, 0.010, loss=0.02)
+    rows = judge_packets(log_of(profile, 20_000), Period(profile, 7, True, 0, 0))
+    assert {row.verdict for _, row in rows} == {"ok"}
+    asked = {row.name: value for value, row in rows}
+    assert asked["mean"] == pytest.approx(0.040, abs=5e-4)
+    assert asked["loss"] == pytest.approx(0.02, abs=5e-3)
+
+
+def test_a_late_relay_is_not_believed():
+    profile = profile_of(0.040, 0.010)
+    assert verdicts(log_of(profile, 5 * MS), profile)["mean"] == "off"
+
+
+def test_a_relay_that_loses_packets_by_itself_is_not_believed():
+    profile = profile_of(0.040)
+    log = log_of(profile)
+    for number in range(0, 2000, 10):
+        log.copies[number] = 0
+    assert verdicts(log, profile)["loss"] == "off"
+
+
+def test_few_packets_give_no_verdict_and_none_give_no_row():
+    profile = profile_of(0.040)
+    assert set(verdicts(log_of(profile, count=100), profile).values()) == {"open"}
+    assert judge_packets(PacketLog(), Period(profile, 7, True, 0, 0)) == []
+
+
+def test_a_limited_rate_has_no_asked_delay_because_the_programs_fill_the_queue():
+    profile = profile_of(0.040, rate=100_000.0)
+    rows = judge_packets(log_of(profile), Period(profile, 7, True, 0, 0))
+    assert all(np.isnan(value) for value, _ in rows)
+
+
+def test_a_recording_is_a_log_that_link_record_reads(tmp_path, call):
+    path = tmp_path / "uplink.csv"
+    log = log_of(profile_of(0.040, 0.010, loss=0.1), count=500)
+    path.write_text("\n".join(recording(log, 0)) + "\n")
+    lost = list(log.due).count(LOST) / 500
+    said = call(f"link record {path} -o {tmp_path / 'trace.csv'}").out
+    assert f"{lost:.3g} lost" in said
+
+
+TCP = """\
+  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid  timeout inode
+   0: 0100007F:1F90 00000000:0000 0A 00000000:00000000 00:00000000 00000000     0        0 1
+   1: 0100007F:1F91 0100007F:1F90 01 00000000:00000000 00:00000000 00000000     0        0 2
+"""
+TCP6 = TCP.replace("0100007F:1F90 00000000", "00000000000000000000000000000000:1F40 00000000")
+
+
+@pytest.mark.skipif(os.sys.byteorder != "little", reason="the table is of a little-endian machine")
+def test_listening_sockets_are_read_from_the_kernels_tables(monkeypatch):
+    texts = {"tcp": TCP, "tcp6": TCP6}
+
+    def read_text(path, encoding):
+        if path.name not in texts:
+            raise FileNotFoundError(path)  # IPv6 is off
+        return texts[path.name]
+
+    monkeypatch.setattr(listening.Path, "read_text", read_text)
+    assert listening.listening_at() == [("127.0.0.1", 8080), ("::", 8000)]
+    assert [listening.is_loopback(host) for host in ("127.0.0.1", "::1", "::", "0.0.0.0")] == [
+        True,
+        True,
+        False,
+        False,
+    ]
+
+
+def test_a_machine_that_refuses_namespaces_names_the_relay_without_privileges(monkeypatch):
+    def refuse(flags):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(namespace, "_unshare", refuse)
+    with pytest.raises(MissingPrerequisiteError, match="cloudrc relay tcp"):
+        namespace.enter()
+
+
+def test_a_missing_tun_device_says_what_to_allow(monkeypatch):
+    monkeypatch.setattr(namespace, "TUN", "/dev/net/no-such-device")
+    with pytest.raises(MissingPrerequisiteError, match=r"modprobe tun.*cloudrc relay tcp"):
+        namespace.open_device(namespace.ADDRESSES["client"])
