@@ -11,6 +11,7 @@ import numpy as np
 
 from cloudrc.metrics.definitions import WINDOW_MAX, DatagramTally
 from cloudrc.metrics.flight import Flight, add_metrics, finite, mean, select
+from cloudrc.record.columns import Recording, Table
 
 WAYS = {"uplink": "from world to cloud", "downlink": "from cloud to world"}
 """Direction -> words for the direction in the description of a metric."""
@@ -18,8 +19,6 @@ SENT = {"uplink": "/telemetry", "downlink": "/delay_estimate"}
 """Direction -> topic with one row for each datagram that is sent in this direction."""
 SENDER = {"uplink": "world", "downlink": "cloud"}
 """Direction -> the end that sends in this direction."""
-SETTLING_NS = 2_000_000_000
-"""Time after sending from which on a missing datagram counts as lost [ns]."""
 PERCENTILES = {"p50": "median", "p99": "99th percentile", "p999": "99.9th percentile"}
 COUNTS = {
     "relay_overflow": "that the relay dropped because its queue was full.",
@@ -39,16 +38,35 @@ def _late(flight: Flight, way: str) -> float | None:
     return float(np.mean(~used.astype(bool))) if len(used) else None
 
 
+def transit_ns(recording: Recording, way: str) -> int:
+    """Return the longest time from sending to arrival of a datagram [ns]; 0 if none arrived.
+
+    A datagram that is missing after this time counts as lost. If it was sent in this time before
+    the end, the recording cannot tell whether it would still have arrived. So no datagram of this
+    time counts, arrived or not. An offset between two clocks is in the result, as in all arrivals.
+    """
+    sent, arrivals = recording[SENT[way]], recording[f"/{way}_delay"]
+    sent_ns = dict(zip(_names(sent), sent["stamp_ns"].tolist(), strict=True))
+    latest_first = list(zip(_names(arrivals), arrivals["stamp_ns"].tolist(), strict=True))[::-1]
+    arrived_ns = dict(latest_first)  # of a repeated datagram, the first arrival remains
+    return max((arrived_ns[one] - sent_ns[one] for one in arrived_ns if one in sent_ns), default=0)
+
+
+def _names(datagrams: Table) -> list[tuple[int, int]]:
+    """Return session and number of each datagram."""
+    return list(zip(datagrams["epoch"].tolist(), datagrams["counter"].tolist(), strict=True))
+
+
 def loss(flight: Flight, way: str) -> float | None:
     """Compute the share of the datagrams sent during the flight that never arrived [1].
 
-    Datagrams of the last SETTLING_NS of the recording may still arrive and are left out.
+    Datagrams that may still arrive after the end of the recording do not count (`transit_ns`).
     """
     sent, arrivals = flight.during(SENT[way]), flight.recording[f"/{way}_delay"]
     world = flight.recording["/telemetry"]["stamp_ns"]
     if not len(world):
         return None
-    sent = select(sent, sent["stamp_ns"] <= world[-1] - SETTLING_NS)
+    sent = select(sent, sent["stamp_ns"] < world[-1] - transit_ns(flight.recording, way))
     tally = DatagramTally(WINDOW_MAX)
     for epoch in np.unique(sent["epoch"]).tolist():
         counters = sent["counter"][sent["epoch"] == epoch]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import isnan, nan
+from math import inf, isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -93,7 +93,7 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     If a datagram arrived twice, the shorter delay counts. Raise a BadInputError that names `path`
     if the recording has no one-way delays.
     """
-    from cloudrc.metrics.link import SENT, SETTLING_NS
+    from cloudrc.metrics.link import SENT, transit_ns
 
     log, sent_topic, topic = Log(str(path)), SENT[direction], f"/{direction}_delay"
     sent, arrivals = recording[sent_topic], recording[topic]
@@ -104,19 +104,21 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
         )
     delays = _delays(arrivals, log)
     rows = list(_columns(sent, "stamp_ns", "epoch", "counter"))
-    # The receiver may refuse datagrams sent before its session opened or near the session's end.
-    # The link did not lose these datagrams: leave them out.
-    latest_first = reversed(list(_columns(arrivals, "epoch", "stamp_ns")))
-    opened_ns = {epoch: stamp_ns for epoch, stamp_ns in latest_first}  # the first arrival remains
+    # The link did not lose what the receiver refused before its session was open, and what may
+    # still arrive after the end. All datagrams of these times are left out, also those that
+    # arrived: if they alone remained, the trace would lose too few.
+    latest_first = reversed(list(_columns(arrivals, "epoch", "counter")))
+    first = {epoch: counter for epoch, counter in latest_first}  # the first arrival remains
     last_ns = {epoch: stamp_ns for stamp_ns, epoch, _ in rows}
+    longest_ns = transit_ns(recording, direction)
     log.entries = [
         ((stamp_ns - rows[0][0]) * 1e-9, delays.get((epoch, counter), nan))
         for stamp_ns, epoch, counter in rows
-        if (epoch, counter) in delays
-        or opened_ns.get(epoch, stamp_ns) < stamp_ns <= last_ns[epoch] - SETTLING_NS
+        if counter >= first.get(epoch, inf) and stamp_ns < last_ns[epoch] - longest_ns
     ]
     unknown = len(rows) - len(log.entries)
-    log.counts["left out, sent before the session was open or in its last 2 s"] += unknown
+    last = f"in its last {longest_ns * 1e-6:.4g} ms"
+    log.counts[f"left out, sent before the session was open or {last}"] += unknown
     return log.packets()
 
 

@@ -1,0 +1,95 @@
+"""A trace of a run, and its report, have the losses of the link, also near the end."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cloudrc.metrics import SHIPPED
+from cloudrc.records import Arrival
+from cloudrc.runs.link_trace import one_way
+from tests.metrics.conftest import DONE, END, PERIOD, SECOND, START, UPLINK, flown
+
+TRANSIT = round(UPLINK * SECOND)
+ALL = (END - START + SECOND) // PERIOD + 1
+
+
+def losing(lost):
+    """Log a flight whose uplink loses the datagrams of which `lost` tells by number and time [s].
+
+    The times are those of sending, since the start of the mission.
+    """
+    log = flown()
+
+    def keep(_, arrival):
+        sent = (arrival.stamp_ns - TRANSIT - START) / SECOND
+        return None if arrival.uplink and lost(arrival.counter, sent) else arrival
+
+    log.change(Arrival, keep)
+    return log
+
+
+def ended(log, at_ns):
+    """End the recording of a log at a stamp [ns]."""
+    for records in (log.world, log.cloud):
+        records[:] = [each for each in records if each.stamp_ns <= at_ns]
+    return log
+
+
+def trace(log):
+    return one_way(log.flight().recording, Path("flight"), "uplink")
+
+
+def loss(log, way="uplink"):
+    return SHIPPED[f"loss_{way}"].measure(log.flight())
+
+
+def test_a_trace_has_all_datagrams_of_a_time_or_none():
+    """Half of them arrive, in every part of the flight."""
+    found = trace(losing(lambda counter, sent: counter % 2))
+    assert np.mean(np.isnan(found.delays)) == pytest.approx(0.5, abs=2e-3)
+    assert len(found.delays) >= ALL - 3, "only those of the last 50 ms are left out"
+    assert " ".join(found.notes).startswith("2 left out")
+
+
+def test_a_trace_begins_with_the_datagram_that_opened_the_session():
+    found = trace(losing(lambda counter, sent: counter < 10 or counter % 2))
+    assert np.mean(np.isnan(found.delays)) == pytest.approx(0.5, abs=2e-3)
+    assert found.sent[0] == pytest.approx(10 * PERIOD / SECOND)
+
+
+@pytest.mark.parametrize("span", [(9.0, 9.5), (9.5, 10.0), (8.2, 8.6)])
+def test_the_loss_counts_a_blackout_shortly_before_the_end(span):
+    first, last = span
+    log = losing(lambda counter, sent: first <= sent < last)
+    whole = (DONE - START) // PERIOD
+    expected = (last - first) * SECOND / PERIOD / whole
+    assert loss(log) == pytest.approx(expected, rel=0.05)
+    assert loss(ended(log, DONE + TRANSIT)) == pytest.approx(expected, rel=0.05)
+    assert loss(log, "downlink") == 0
+
+
+def test_datagrams_under_way_at_the_end_do_not_count():
+    log = ended(flown(), DONE)
+    assert loss(log) == loss(log, "downlink") == 0
+    assert not np.isnan(trace(log).delays).any()
+
+
+def test_a_repeated_datagram_that_arrives_much_later_hides_no_loss():
+    log = losing(lambda counter, sent: 7.0 <= sent < 8.0)
+    first = next(each for each in log.cloud if isinstance(each, Arrival) and each.uplink)
+    log.cloud.append(first._replace(stamp_ns=DONE, used=False))
+    assert loss(ended(log, DONE + TRANSIT)) == pytest.approx(0.1, rel=0.05)
+
+
+def test_a_direction_without_arrivals_lost_everything():
+    assert loss(losing(lambda counter, sent: True)) == 1.0
+
+
+def test_an_offset_between_the_clocks_changes_no_loss():
+    """Cloud's stamps are 30 ms early, as after an uncertain estimate of the offset."""
+    log = losing(lambda counter, sent: 9.0 <= sent < 9.5)
+    for index, each in enumerate(log.cloud):
+        log.cloud[index] = each._replace(stamp_ns=each.stamp_ns - 3 * SECOND // 100)
+    assert loss(log) == pytest.approx(0.05, rel=0.05)
+    assert loss(log, "downlink") == 0
