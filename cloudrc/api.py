@@ -32,7 +32,7 @@ from cloudrc.metrics.verdict import FlightFailure
 from cloudrc.record.columns import Recording, Table
 from cloudrc.runs.experiment import advice_on, check_mode, load
 from cloudrc.runs.flight import fly_in_memory
-from cloudrc.runs.folder import new_folder, point_to
+from cloudrc.runs.folder import point_to, run_folder
 from cloudrc.runs.requirements import MODES, require
 
 if TYPE_CHECKING:
@@ -185,7 +185,7 @@ def _fly_in_cluster(
     refuse_local_files(experiment)
     release = connect(place.context, place.namespace, place.release)
     refuse_flight(release)
-    folder = _folder(experiment, "cluster", out, "")  # the pods may refuse to fly
+    folder = run_folder(experiment, "cluster", None if out is None else Path(out))
     report = fly_in_cluster(experiment, folder, release, place.timeout)
     if out is None:
         point_to(folder, "latest")
@@ -195,13 +195,8 @@ def _fly_in_cluster(
 def _fly_here(experiment: ResolvedExperiment, mode: str, out: str | Path | None) -> Result:
     from cloudrc.runs.fly import fly
 
-    folder = _folder(experiment, mode, out, "latest")
+    folder = run_folder(experiment, mode, None if out is None else Path(out))
     return _read(experiment, folder, fly(experiment, mode, folder))
-
-
-def _folder(experiment: ResolvedExperiment, mode: str, out: str | Path | None, link: str) -> Path:
-    name = f"{experiment.name}-{mode}-seed{experiment.seed}"
-    return new_folder(None if out is None else Path(out), name, link)
 
 
 def _read(experiment: ResolvedExperiment, folder: Path, report: Mapping[str, Any]) -> Result:
@@ -262,12 +257,8 @@ def sweep(
 def _fly_sweep(grid: Grid, out: Path | None, temporary: Path, jobs: int) -> SweepTable:
     from cloudrc.runs import store
     from cloudrc.runs import sweep as work
-    from cloudrc.runs.lock import lock_folder
 
-    folder = out or temporary
-    if not store.is_begun(folder):
-        folder = new_folder(folder, "sweep")
-    with lock_folder(folder) as warning:
+    with work.open_folder(out or temporary, "sweep") as (folder, warning):
         if warning:
             warnings.warn(warning, stacklevel=3)
         begun = work.begin(grid, folder)

@@ -27,7 +27,7 @@ from cloudrc.cli.output import (
 from cloudrc.cli.parser import read_count, whole_number
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.errors import BadInputError, CloudrcError, NothingFlownError
-from cloudrc.runs.folder import new_folder, point_to
+from cloudrc.runs.folder import point_to, run_folder
 from cloudrc.runs.interrupts import interrupt_on_signals, is_interrupted
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.text import escape
@@ -132,8 +132,7 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
     else:
         beside = getattr(options, "beside", "")
         flight = _local_flight(experiment, mode, stream, ready, beside)
-    name = f"{experiment.name}-{'session' if ready else mode}-seed{experiment.seed}"
-    folder = new_folder(options.out, name, "" if in_cluster else "latest")
+    folder = run_folder(experiment, "session" if ready else mode, options.out)
     if not for_programs:
         facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
         flown = "session" if ready else experiment.mission.contents

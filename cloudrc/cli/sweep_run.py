@@ -20,7 +20,7 @@ from cloudrc.cli.output import (
 from cloudrc.cli.progress import PlanView, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.cluster.pods import refuse_local_files
-from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, describe_error
+from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import PICTURES, refuse_other_file, write_atomically
 from cloudrc.metrics.verdict import EXIT_CODES
 from cloudrc.runs import seeds, store, sweep
@@ -28,7 +28,6 @@ from cloudrc.runs.experiment import load, refuse_seed
 from cloudrc.runs.flight import Row
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.grid import Grid, SweepPoint, read_grid, unpack
-from cloudrc.runs.lock import lock_folder
 from cloudrc.runs.pods import PodSettings, fly_in_pods
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.runs.workers import map_in_order, take_each
@@ -37,12 +36,9 @@ from cloudrc.text import escape
 
 def run(options: argparse.Namespace) -> int:
     """Fly the flights of a sweep whose results or recordings are missing; return the exit code."""
-    grid, folder, (shard, count) = _read(options), options.out, options.shard or (None, 1)
-    if options.shard and not folder.exists():
-        folder.mkdir(parents=True, exist_ok=True)  # another shard may be faster
-    elif folder is None or not store.is_begun(folder):
-        folder = new_folder(folder, f"sweep-{options.file.stem}", "latest-sweep")
-    with lock_folder(folder, shard, count) as warning:
+    grid, (shard, count) = _read(options), options.shard or (None, 1)
+    name = f"sweep-{options.file.stem}"
+    with sweep.open_folder(options.out, name, shard, count) as (folder, warning):
         if warning:
             print_line(f"cloudrc: warning: {warning}", sys.stderr)
         return _run_locked(options, grid, folder, shard, count)
@@ -103,9 +99,7 @@ def fly_again(options: argparse.Namespace) -> int:
     report = sweep.fly_into(options.folder / key, flight, page=True)
     print_traceback(options, report)
     print_or_drop(summary(report, options.folder / key))
-    if row["records_sha256"] != report["records_sha256"]:
-        why = "other records, though no file of its key has changed: the processor or a package has"
-        raise InvalidRunError(f"{key}: {why}, or a plug-in uses what is in no key")
+    sweep.check_repeated(row, report)
     print_or_drop("\nthe records are those of the sweep", sys.stderr)
     return 0
 

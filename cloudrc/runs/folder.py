@@ -6,11 +6,24 @@ import contextlib
 import itertools
 import logging
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cloudrc.errors import BadInputError
 
+if TYPE_CHECKING:
+    from cloudrc.config.load import ResolvedExperiment
+
 RUNS = Path("runs")
 """Folder for runs, in the working folder."""
+
+
+def run_folder(experiment: ResolvedExperiment, mode: str, out: Path | None) -> Path:
+    """Make the folder of a run, as `new_folder` does; `mode` is a mode, or "session".
+
+    The pods of a cluster may refuse to fly, so that `runs/latest` points to their run only later.
+    """
+    name = f"{experiment.name}-{mode}-seed{experiment.seed}"
+    return new_folder(out, name, "" if mode == "cluster" else "latest")
 
 
 def new_folder(out: Path | None, name: str, link: str = "latest", *, flag: str = "--out") -> Path:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +13,9 @@ from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError
 from cloudrc.runs import store
 from cloudrc.runs.flight import Row, fly_point
 from cloudrc.runs.fly import fly
+from cloudrc.runs.folder import new_folder
 from cloudrc.runs.grid import Grid, SweepPoint, read_flight
+from cloudrc.runs.lock import lock_folder
 from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.source import code_hash
 from cloudrc.text import table
@@ -24,6 +27,24 @@ class Work(NamedTuple):
     mine: list[SweepPoint]  # flights of this shard, or of the whole sweep
     missing: list[SweepPoint]  # those of them without a row, or without a wanted recording
     before: dict[str, Row]  # key -> row of the flights that are in the folder
+
+
+@contextmanager
+def open_folder(
+    out: Path | None, name: str, shard: int | None = None, count: int = 1
+) -> Iterator[tuple[Path, str]]:
+    """Lock the folder of a sweep: `out`, or a new one in `runs/` whose name begins with `name`.
+
+    `shard` is a number from 1 to `count`, or None for the whole sweep. Yield the folder, and a
+    warning if it has no locks ("" for none).
+    """
+    if out is not None and shard and not out.exists():
+        out.mkdir(parents=True, exist_ok=True)  # another shard may be faster
+    elif out is None or not store.is_begun(out):
+        out = new_folder(out, name, "latest-sweep")
+    folder = out
+    with lock_folder(folder, shard, count) as warning:
+        yield folder, warning
 
 
 def begin(
@@ -128,6 +149,13 @@ def find_flight(folder: Path, begin: str) -> tuple[Row, SweepPoint]:
             why = "the experiment or a file of a plug-in, trace, robot or scene has changed since"
         raise InvalidRunError(f"{key}: {why}; fly the sweep again")
     return row, flight
+
+
+def check_repeated(row: Row, report: Mapping[str, Any]) -> None:
+    """Raise an InvalidRunError if the repeated flight of a row has other records."""
+    if row["records_sha256"] != report["records_sha256"]:
+        why = "other records, though no file of its key has changed: the processor or a package has"
+        raise InvalidRunError(f"{row['key']}: {why}, or a plug-in uses what is in no key")
 
 
 def count_successes(folder: Path) -> tuple[int, list[Row], list[dict[str, Any]]]:
