@@ -120,10 +120,13 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
     """
     from cloudrc.metrics.verdict import exit_code
     from cloudrc.runs.experiment import check_mode, load
+    from cloudrc.runs.own_files import describe_changes
 
     experiment = load(options.experiment, options.set, options.seed)
     check_mode(experiment, mode)
     warn(experiment)
+    if changes := describe_changes(options.experiment, experiment):
+        print_line(f"cloudrc: warning: {changes}", sys.stderr)
     in_cluster, for_programs = mode == "cluster", options.output != "table"
     stream = sys.stderr if for_programs else sys.stdout
     # First prepare the flight: if that fails, no folder must be left.

@@ -271,5 +271,6 @@ def files_of(name: str) -> list[Path]:
         return [Path(name)]
     robot = find_robot(name)
     onboard = robot.onboard.name if robot.onboard else ""
-    own = [Path(file) for file in (onboard, robot.motion) if file and is_path(file)]
+    named = onboard, robot.motion, robot.hull_points
+    own = [Path(file) for file in named if file and is_path(file)]
     return [Path(name) / shipped.ROBOT_FILE, robot.model, *own]

@@ -7,7 +7,7 @@ import os
 import platform
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +21,8 @@ from cloudrc.metrics.verdict import FlightVerdict
 SCHEMA_VERSION = 1
 RUN = "run"
 """Metadata key of mission.mcap: facts about the run, as JSON."""
+ENVIRONMENT_FILE, FILES = "environment.json", "files"
+"""Name of the file about the machine of a flight, and its key for the hashes of files."""
 PACKAGES = (
     *("cloudrc", "mujoco", "numpy", "pydantic", "pyyaml", "cryptography", "mcap", "rosbags"),
     "matplotlib",
@@ -37,6 +39,8 @@ class Run:
     interrupted: bool = False  # whether the user stopped the run
     notes: tuple[str, ...] = ()  # sentences for the reader of the report
     physics_steps: str = ""  # code of the physics steps, such as "C (compiled by cc)"; "": unknown
+    # Dotted key of each of the user's files -> hash of its content before the flight.
+    files: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -107,11 +111,14 @@ def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
     return _known({"method": method, "uncertainty": known})
 
 
-def environment_document(physics_steps: str = "", code: str | None = None) -> dict[str, Any]:
+def environment_document(
+    physics_steps: str = "", code: str | None = None, files: Mapping[str, str] | None = None
+) -> dict[str, Any]:
     """Describe the software and hardware of this machine, without names of users and hosts.
 
     `physics_steps` names the code of the physics steps, such as "C (compiled by cc)"; "" if this is
-    unknown. `code` is a hash of the sources that have flown; None if this is unknown.
+    unknown. `code` is a hash of the sources that have flown; None if this is unknown. `files` are
+    the hashes of the user's files, by key.
     """
     packages = {}
     for name in PACKAGES:
@@ -129,6 +136,7 @@ def environment_document(physics_steps: str = "", code: str | None = None) -> di
         "cores": os.cpu_count(),
         **({"code": code} if code else {}),
         **({"physics_steps": physics_steps} if physics_steps else {}),
+        **({FILES: dict(files)} if files else {}),
     }
 
 

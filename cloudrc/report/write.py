@@ -19,7 +19,13 @@ from cloudrc.geometry.obstacles import known, obstacles
 from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
-from cloudrc.report.document import Assessment, Run, environment_document, write_json
+from cloudrc.report.document import (
+    ENVIRONMENT_FILE,
+    Assessment,
+    Run,
+    environment_document,
+    write_json,
+)
 from cloudrc.report.flown import flight_of, flown_shapes, flown_world
 
 if TYPE_CHECKING:
@@ -112,7 +118,7 @@ def write_report(
     assessment = assess(recording, experiment, run, own)
     document = assessment.document
     write_json(folder / "report.json", document)
-    environment = _environment(folder / "environment.json", assessment)
+    environment = _environment(folder / ENVIRONMENT_FILE, assessment)
     if driven := _driven(assessment):
         write_atomically(folder / DRIVE_FILE, driven.encode())
     if page:
@@ -125,7 +131,8 @@ def _environment(path: Path, assessment: Assessment) -> dict[str, Any]:
     with suppress(OSError, ValueError, RecursionError):
         if not path.is_symlink() and isinstance(known := json.loads(read(path)), dict):
             return known
-    document = environment_document(assessment.run.physics_steps, assessment.code)
+    run = assessment.run
+    document = environment_document(run.physics_steps, assessment.code, run.files)
     write_json(path, document)
     return document
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import heapq
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from math import inf
 from operator import attrgetter
@@ -29,6 +30,7 @@ from cloudrc.report.document import Run
 from cloudrc.report.views import views
 from cloudrc.report.write import attachments, write_report
 from cloudrc.runs.interrupts import raise_if_interrupted
+from cloudrc.runs.own_files import hash_files
 from cloudrc.runs.session import read_last_mission
 from cloudrc.source import code_hash
 
@@ -63,8 +65,11 @@ def fly(
     own = experiment.report.metrics
     try:
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+        files = hash_files(experiment)  # now: the user may edit them during the flight
         with _beside(beside, experiment, folder), record(experiment, folder, see) as flown:
-            return write_report(folder, *flown, own=own, page=page)
+            recording, resolved, run = flown
+            run = replace(run, files=files)
+            return write_report(folder, recording, resolved, run, own=own, page=page)
     except OSError as error:
         error.filename = str(error.filename or folder)
         raise machine_error(error) or error from error

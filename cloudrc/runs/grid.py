@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from pydantic import Field
 
-from cloudrc import files, metrics, plugin_file, plugins, source
+from cloudrc import files, metrics, plugins, source
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, Source, read_document
 from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files
@@ -31,10 +31,10 @@ from cloudrc.config.reuse import reuse, reuse_results
 from cloudrc.config.robot import files_of
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.model_files import model_files
 from cloudrc.renamed import new_key
 from cloudrc.runs.experiment import check_world
 from cloudrc.runs.flight import Row
+from cloudrc.runs.own_files import hashes
 
 SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
 """Largest seed, and largest number of seeds."""
@@ -180,21 +180,9 @@ def _everything(point: ResolvedExperiment) -> bytes:
     named = [*local_files(values).values()] if '"/' in json.dumps(values) else []
     named += map(str, files_of(point.world.robot))
     code = [_code(kind, getattr(point.cloud, key).name) for key, kind in KINDS.items()]
-    hashes = {file: each for path in named for file, each in _hashes(path)}
-    everything = {**values, "cloudrc": source.code_hash(), "code": code, "files": hashes}
+    contents = {file: each for path in named for file, each in hashes(path)}
+    everything = {**values, "cloudrc": source.code_hash(), "code": code, "files": contents}
     return json.dumps(everything, sort_keys=True).encode()
-
-
-def _hashes(path: str) -> list[tuple[str, str]]:
-    """Return the paths and hashes of a file, and of the files that it needs.
-
-    A plug-in needs the modules that it imports. A robot or scene needs the files that it names.
-    """
-    needs = model_files if path.endswith(".xml") else plugin_file.sources
-    return reuse(
-        ("hashes", path),
-        lambda: [(str(file), sha256(file.read_bytes()).hexdigest()) for file in needs(Path(path))],
-    )
 
 
 @cache

@@ -1,0 +1,69 @@
+"""Hash the user's files that an experiment names, and find those that changed since a flight."""
+
+from __future__ import annotations
+
+import json
+from hashlib import sha256
+from pathlib import Path
+
+from cloudrc import plugin_file
+from cloudrc.config.load import ResolvedExperiment, absolute_paths, local_files, read_experiment
+from cloudrc.config.reuse import reuse
+from cloudrc.config.robot import files_of
+from cloudrc.errors import BadInputError
+from cloudrc.files import read
+from cloudrc.geometry.model_files import model_files
+from cloudrc.report.document import ENVIRONMENT_FILE, FILES
+
+DIGITS = 12
+"""Number of hexadecimal digits of a hash."""
+
+
+def hashes(path: str) -> list[tuple[str, str]]:
+    """Return the paths and hashes of a file, and of the files that it needs.
+
+    A plug-in needs the modules that it imports. A robot or scene needs the files that it names.
+    """
+    needs = model_files if path.endswith(".xml") else plugin_file.sources
+    return reuse(
+        ("hashes", path),
+        lambda: [(str(file), sha256(file.read_bytes()).hexdigest()) for file in needs(Path(path))],
+    )
+
+
+def hash_files(experiment: ResolvedExperiment) -> dict[str, str]:
+    """Return the dotted key of each of the user's files -> hash of the file and what it needs."""
+    named = {key: [path] for key, path in local_files(experiment.model_dump(mode="json")).items()}
+    if robot := files_of(experiment.world.robot):
+        named["world.robot"] = [str(file) for file in robot]
+    return {key: _hash(paths) for key, paths in named.items()}
+
+
+def _hash(paths: list[str]) -> str:
+    contents = sorted({content for path in paths for _, content in hashes(path)})
+    return sha256("".join(contents).encode()).hexdigest()[:DIGITS]
+
+
+def describe_changes(name: str, experiment: ResolvedExperiment) -> str:
+    """Say which files of a run have changed since its flight; "" if none has.
+
+    `name` is that of the experiment, such as the path of the config.yaml of a run. Files that the
+    `experiment` does not take from there do not count.
+    """
+    config = Path(name)
+    try:
+        flown = json.loads(read(config.with_name(ENVIRONMENT_FILE)))[FILES]
+        before = absolute_paths(read_experiment(config, flown=True).model_dump(mode="json"))
+        now = absolute_paths(experiment.model_dump(mode="json"))
+        same = {key for key in flown if key in before and before[key] == now.get(key)}
+    except (OSError, ValueError, LookupError, TypeError, RecursionError, BadInputError):
+        return ""
+    found = {key: each for key, each in hash_files(experiment).items() if key in same}
+    changes = [
+        f"{key} (then {flown[key]}, now {each})"
+        for key, each in found.items()
+        if each != flown[key]
+    ]
+    if not changes:
+        return ""
+    return f"changed since the flight of {config.parent}: {', '.join(changes)}; results may differ"

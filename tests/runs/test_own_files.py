@@ -1,0 +1,74 @@
+"""A run is repeated from its config.yaml: files that changed since its flight are named."""
+
+import json
+import shutil
+
+import pytest
+
+from cloudrc.config.load import load_experiment
+from cloudrc.config.robot import find_robot
+from cloudrc.config.shipped import file_of
+from cloudrc.runs.fly import fly
+from cloudrc.runs.own_files import describe_changes, hash_files
+
+PREDICTOR = "from cloudrc.cloud.predictors import Predictor as build\n"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Fly with files of one's own; return the config.yaml of the run, and the folder of files."""
+    files, folder = tmp_path_factory.mktemp("mine"), tmp_path_factory.mktemp("run")
+    shutil.copytree(find_robot("rover").model.parent, files / "robot")
+    shutil.copy(file_of("pillars"), files / "scene.xml")
+    (files / "mine.py").write_text(PREDICTOR)
+    sets = (
+        f"world.robot={files / 'robot'}",
+        f"world.scene={files / 'scene.xml'}",
+        f"cloud.predictor={files / 'mine.py'}",
+        "mission.waypoints=[{position_m: [0.1, 0], dwell_s: 0.0}]",
+    )
+    fly(load_experiment("pillars", sets), "virtual", folder, page=False)
+    return folder / "config.yaml", files
+
+
+@pytest.mark.parametrize(
+    ("file", "key"),
+    [
+        ("robot/robot.yaml", "world.robot"),
+        ("robot/robot.xml", "world.robot"),
+        ("scene.xml", "world.scene"),
+        ("mine.py", "cloud.predictor.name"),
+    ],
+)
+def test_a_changed_file_is_named_with_both_hashes(run, file, key):
+    config, files = run
+    path, experiment = files / file, load_experiment(config)
+    assert describe_changes(str(config), experiment) == ""
+    before, then = path.read_text(), hash_files(experiment)[key]
+    path.write_text(before + {".py": "# new\n", ".xml": "<!-- new -->"}.get(path.suffix, "# new\n"))
+    try:
+        text, now = describe_changes(str(config), experiment), hash_files(experiment)[key]
+    finally:
+        path.write_text(before)
+    assert f"{key} (then {then}, now {now})" in text
+    assert text.count("then") == 1
+    assert "\n" not in text
+
+
+def test_files_that_a_setting_replaces_do_not_count(run, tmp_path):
+    config, _ = run
+    (tmp_path / "other.py").write_text(PREDICTOR + "# other\n")
+    settings = ["world.robot=rover", f"cloud.predictor={tmp_path / 'other.py'}"]
+    assert describe_changes(str(config), load_experiment(config, settings)) == ""
+
+
+@pytest.mark.parametrize(
+    "content", [None, "[", "{}", '{"files": 3}', '{"files": {"world.robot": 1}}']
+)
+def test_a_run_that_does_not_say_its_files_is_repeated_without_a_word(run, tmp_path, content):
+    config, _ = run
+    copy = shutil.copy(config, tmp_path / "config.yaml")
+    if content is not None:
+        (tmp_path / "environment.json").write_text(content)
+    text = describe_changes(str(copy), load_experiment(copy))
+    assert text == "" or json.loads(content)["files"] == {"world.robot": 1}
