@@ -1,7 +1,8 @@
 """Define all Prometheus metrics: name, type, meaning, labels, and the processes that expose them.
 
 Names follow the rules of Prometheus: prefix `cloudrc_`, base units, `_total` at the end of
-counters. Each label has a fixed set of values, so one pod has fewer than 200 series.
+counters. Each label has a fixed set of values, or few: a robot has at most 16 sensors, and touches
+few bodies. So one pod has fewer than 200 series.
 """
 
 from __future__ import annotations

@@ -152,32 +152,28 @@ def _make_parts(world: World) -> Parts:
     if world.wind.blows and isinstance(actuators, Direct):
         _refuse_wind(world, plugin)
     try:
-        probe, sensors = _find_probe(robot, choice, nominal)
+        probe = _find_probe(robot, choice, nominal)
+        sensors = find_sensors(nominal, robot.sensors)
     except BadInputError as error:
         raise BadInputError(f"{world.robot}/{ROBOT_FILE}: {error}") from error
     return Parts(true, plugin, onboard, actuators, probe, sensors)
 
 
-def _find_probe(
-    robot: RobotFiles, choice: PlugIn, model: Any
-) -> tuple[str | None, tuple[OwnSensor, ...]]:
-    """Return the site with which a robot touches, or None, and the robot's own sensors.
+def _find_probe(robot: RobotFiles, choice: PlugIn, model: Any) -> str | None:
+    """Return the site with which a robot touches; None if any part of it touches.
 
-    A model without `robot.yaml` that has the Pelican's controller has its probe and its sensors,
-    too, if the model has such parts.
+    A model without `robot.yaml` that has the Pelican's controller has its probe, too.
     """
+    if robot.probe is not None:
+        find_site(model, robot.probe)
+        return robot.probe
     pelican = find_robot("pelican")
     if robot.onboard is not None or choice != pelican.onboard:
-        if robot.probe is not None:
-            find_site(model, robot.probe)
-        return robot.probe, find_sensors(model, robot.sensors)
-    probe: str | None = None
-    sensors: tuple[OwnSensor, ...] = ()
+        return None
     with suppress(BadInputError):
         find_site(model, pelican.probe or "")
-        probe = pelican.probe
-        sensors = find_sensors(model, pelican.sensors)
-    return probe, sensors
+        return pelican.probe
+    return None
 
 
 def _build_onboard(

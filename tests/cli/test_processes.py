@@ -155,6 +155,15 @@ def test_the_link_is_expected_to_carry_the_plans(plan_s, size, monkeypatch):
     assert monitor.call_args.args[1].size == size
 
 
+@pytest.mark.parametrize(("robot", "size"), [("nano", 196), ("pelican", 204)])
+def test_the_link_is_expected_to_carry_the_robots_own_sensors(robot, size, monkeypatch):
+    monitor = Mock()
+    monkeypatch.setattr("cloudrc.processes.ends.LinkMonitor", monitor)
+    experiment = load_experiment("hover", [f"world.robot={robot}"])
+    ends.link_monitor(experiment, uplink=True, trusted=False)
+    assert monitor.call_args.args[1].size == size
+
+
 def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
     path = tmp_path / "trace.csv"
     monkeypatch.setattr(LinkMonitor, "begin", lambda self, asked: None)

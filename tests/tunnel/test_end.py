@@ -34,6 +34,8 @@ def peer_bytes(kind, message):
         (Kind.COMMAND, COMMAND, codec.decode_command),
         (Kind.COMMAND, PLANNED, codec.decode_command),
         (Kind.TELEMETRY, TELEMETRY, codec.decode_telemetry),
+        (Kind.TELEMETRY, TELEMETRY._replace(sensors=()), codec.decode_telemetry),
+        (Kind.TELEMETRY, TELEMETRY._replace(sensors=(0.5,) * 16), codec.decode_telemetry),
     ],
 )
 def test_a_message_arrives_the_same_with_and_without_bytes(kind, message, decode):
