@@ -75,9 +75,9 @@ def test_an_end_stopped_at_its_start_completes_its_recording(end, key, tmp_path,
     """The handlers are set first: as the first process of a container, an end needs them."""
     build = getattr(assembly, f"build_{end}")
 
-    def stop_and_build(*arguments):
+    def stop_and_build(*arguments, **named):
         os.kill(os.getpid(), signal.SIGTERM)
-        return build(*arguments)
+        return build(*arguments, **named)
 
     monkeypatch.setattr(assembly, f"build_{end}", stop_and_build)
     (tmp_path / "key").chmod(0o644)
