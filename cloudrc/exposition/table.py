@@ -155,6 +155,8 @@ cloudrc_commands_frozen_total = frozen: Commands of zero velocity, because the r
     newer command.
 cloudrc_plugin_failures_total[plugin] = *_failed: Plug-in calls that raised, or returned a wrong
     value.
+cloudrc_controller_gaps_total = controller_gaps: Times that the program of cloud.controller remote
+    was silent for 0.2 s, so that the robot stood still.
 cloudrc_words_dropped_total = words_dropped: Messages of teleop that cloud dropped, because
     they were for another session or no request number was left.
 cloudrc_loop_missed_periods_total = missed_periods: Periods without a command because the loop was
@@ -226,7 +228,7 @@ _BUCKETS: Mapping[str, tuple[float, ...]] = {
     },
     # The nominal period is 10 ms.
     "cloudrc_loop_period_seconds": (0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1),
-    "cloudrc_loop_lateness_seconds": (0.0001, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05, 0.1),
+    "cloudrc_loop_lateness_seconds": (0.0001, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05),
 }
 """Name of a histogram -> upper bounds of its buckets [s]."""
 
