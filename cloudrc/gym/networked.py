@@ -7,6 +7,7 @@ from typing import Any, Unpack
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
+from cloudrc.errors import BadInputError
 from cloudrc.gym.options import (
     Options,
     Profile,
@@ -71,6 +72,11 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         Raises:
             cloudrc.errors.BadInputError: If a value cannot be used; the text says what to change.
         """
+        if not isinstance(env, gymnasium.Env):
+            raise BadInputError(
+                f"env is {type(env).__name__}: give an environment of gymnasium, as "
+                "gymnasium.make returns it; for a vector there is NetworkedVector"
+            )
         RecordConstructorArgs.__init__(self, link=link, seed=seed, dt=dt, stream=stream, **options)
         gymnasium.Wrapper.__init__(self, env)
         self.dt = step_time(env, dt)

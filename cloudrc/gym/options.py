@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeAlias, TypedDict
 
 import gymnasium
+import numpy as np
 from gymnasium.vector.utils import batch_space, iterate
 
 from cloudrc import plugins
@@ -86,13 +87,17 @@ def connect(
 def _refuse_wrong(hold: str, chunk: int | None, sizes: Mapping[str, int | None]) -> None:
     if hold not in ("repeat", "start"):
         raise BadInputError(f"hold {hold!r}: give 'repeat' or 'start'")
-    if chunk is not None and (type(chunk) is not int or not 1 <= chunk <= CHUNK_MAX):
+    if chunk is not None and not (_is_whole(chunk) and 1 <= chunk <= CHUNK_MAX):
         raise BadInputError(
             f"chunk {chunk!r}: give None or the number of actions in an answer, up to {CHUNK_MAX}"
         )
     for name, size in sizes.items():
-        if size is not None and (type(size) is not int or size < 0):
+        if size is not None and not (_is_whole(size) and size >= 0):
             raise BadInputError(f"{name}_bytes {size!r}: give a number of bytes, or None")
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def step_time(env: Any, given: float | None) -> float:

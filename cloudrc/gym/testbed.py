@@ -20,6 +20,7 @@ from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.planar import Planar
 from cloudrc.config.load import load_experiment
+from cloudrc.config.schema import Link
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Datagram, Odometry, Setpoint
@@ -139,11 +140,15 @@ class RobotEnv(gymnasium.Env[Any, Any]):
             render_mode: None; a flight is drawn by its report.
         """
         require("a robot of the testbed as an environment", SIM)
+        for key in settings or {}:
+            if key.partition(".")[0] == "link":
+                raise BadInputError(f"{key}: the network is that of the wrapper Networked")
         texts = {**(settings or {}), **OWN, **({"world.robot": robot} if robot else {})}
         self.render_mode = render_mode
-        self._experiment = load_experiment(
+        loaded = load_experiment(
             experiment, [f"{key}={json.dumps(value, default=str)}" for key, value in texts.items()]
         )
+        self._experiment = loaded.model_copy(update={"link": Link(profile="ideal")})
         guard = self._experiment.guard
         most = np.array([guard.speed_max_mps] * 3 + [guard.yaw_rate_max_radps])
         self.action_space = spaces.Box(-most, most, dtype=np.float64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
@@ -20,11 +20,16 @@ from cloudrc.gym.options import (
 )
 from cloudrc.gym.values import checker, copied
 
+if TYPE_CHECKING:
+    _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]
+else:
+    _Wrapper = VectorWrapper  # of which gymnasium 1.2 knows no types
+
 FINAL = "final_obs", "final_info"
 """What a vector environment that resets in the same step tells about the ended episode."""
 
 
-class NetworkedVector(VectorWrapper[Any, Any, Any, Any, Any]):
+class NetworkedVector(_Wrapper):
     """A vector environment in which each robot has a link of its own.
 
     It is to a vector environment what `Networked` is to an environment. Robot n has the stream
@@ -46,6 +51,11 @@ class NetworkedVector(VectorWrapper[Any, Any, Any, Any, Any]):
 
         `dt` is the time of a step [s].
         """
+        if not isinstance(env, VectorEnv):
+            raise BadInputError(
+                f"env is {type(env).__name__}: give a vector environment of gymnasium, as "
+                "gymnasium.make_vec returns it; for a single one there is Networked"
+            )
         super().__init__(env)
         space, chunk = env.single_action_space, options.get("chunk")
         names = [f"{stream}/{robot}" for robot in range(env.num_envs)]

@@ -152,6 +152,7 @@ def test_before_the_first_answer_the_robot_executes_start_or_waits():
     assert executed() == [0, 0, 1, 2, 3, 4]
     assert executed(start=np.array([7], np.float32)) == [7, 7, 1, 2, 3, 4]
     assert executed(start="answer") == [1, 1, 1, 2, 3, 4]
+    assert executed(both_ways(0, 0), start="answer", compute=0.02) == [1, 1, 1, 2, 2, 4]
 
 
 def test_without_an_answer_the_robot_repeats_its_action_or_executes_start():
@@ -169,6 +170,14 @@ def test_a_policy_that_computes_answers_later_and_less_often():
     slow = executed(ideal, steps=300, compute=(0.02, 0.01))
     assert slow == executed(ideal, steps=300, compute=(0.02, 0.01))
     assert len(set(slow)) < 200
+
+
+def test_a_late_observation_never_replaces_a_newer_one():
+    env = Networked(Counter(), both_ways(50, 0, jitter_ms=50))
+    env.reset()
+    seen = [float(env.step(np.zeros(1, np.float32))[0][0]) for _ in range(300)]
+    assert all(later >= before for before, later in pairwise(seen))
+    assert len(set(seen)) < 290
 
 
 def test_a_late_answer_never_replaces_a_newer_one():

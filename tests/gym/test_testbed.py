@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 import cloudrc
 import cloudrc.gym
@@ -48,6 +49,21 @@ def test_the_same_actions_fly_the_true_path_of_a_flight(name, options, experimen
         assert truth[column][:count].tobytes() == flown[column].tobytes()
 
 
+def test_the_link_of_an_experiment_is_left_out(tmp_path):
+    mine = "mission: hover\nlink: {uplink: {delay_ms: 90}, downlink: {loss: 0.5}}\n"
+    (tmp_path / "mine.yaml").write_text(mine)
+    env = gymnasium.make("cloudrc/Steps-v0", experiment=str(tmp_path / "mine.yaml"))
+    env.reset(seed=1)
+    before = env.unwrapped.flight.now_ns
+    env.step(np.zeros(4))
+    assert env.unwrapped.flight.cloud.telemetry.odometry.stamp_ns == before + 10_000_000
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # an observation has no bounds
+def test_gymnasium_accepts_a_robot():
+    check_env(gymnasium.make("cloudrc/Steps-v0").unwrapped, skip_render_check=True)
+
+
 def test_a_seed_selects_the_steps_and_a_flight_can_be_repeated():
     env = gymnasium.make("cloudrc/Steps-v0")
 
@@ -65,6 +81,8 @@ def test_what_a_robot_cannot_fly_is_refused():
         gymnasium.make("cloudrc/Steps-v0", robot="pelikan")
     with pytest.raises(BadInputError, match="wrold"):
         gymnasium.make("cloudrc/Steps-v0", settings={"wrold.robot": "x2"})
+    with pytest.raises(BadInputError, match="the network is that of the wrapper Networked"):
+        gymnasium.make("cloudrc/Steps-v0", settings={"link.uplink.delay_ms": 50})
     env = gymnasium.make("cloudrc/Steps-v0").unwrapped
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(4))

@@ -112,13 +112,18 @@ def test_what_does_not_fit_a_vector_is_refused_in_one_line():
         ready.step(None)
 
 
+def test_single_environments_and_vectors_have_a_wrapper_each():
+    with pytest.raises(BadInputError, match="for a single one there is Networked"):
+        NetworkedVector(Counter())
+    for other in (SyncVectorEnv([Counter]), "CartPole-v1", None):
+        with pytest.raises(BadInputError, match="for a vector there is NetworkedVector"):
+            Networked(other)
+
+
 def test_environments_in_other_processes_need_a_time_step():
-    made = gymnasium.make_vec("CartPole-v1", 1, "async")
-    try:
-        with pytest.raises(BadInputError, match="do not tell their time step; give dt="):
-            NetworkedVector(made)
-        env = NetworkedVector(made, "lte", dt=0.02)
-        env.reset(seed=1)
-        assert env.step(np.zeros(1, int))[0].shape == (1, 4)
-    finally:
-        made.close()
+    with pytest.raises(BadInputError, match=r"do not tell their time step; give dt="):
+        NetworkedVector(gymnasium.make_vec("CartPole-v1", 1, "async"))
+    env = NetworkedVector(gymnasium.make_vec("CartPole-v1", 1, "async"), "lte", dt=0.02)
+    env.reset(seed=1)
+    assert env.step(np.zeros(1, int))[0].shape == (1, 4)
+    env.close()

@@ -8,15 +8,15 @@ from cloudrc.gym.executors import Chunk, Executor
 
 
 class TimeIndexed(Executor):
-    """The answer to the newest observation wins. What came too late for its tick is skipped."""
+    """The newest answer wins. An action that comes too late for its tick is skipped."""
 
     def begin(self, ticks_late: int, period_ns: int) -> None:
         """Forget the last episode."""
         self._chunk = Chunk(-1, -1, ())
 
     def receive(self, chunk: Chunk, tick: int) -> None:
-        """Take the answer if its observation is newer, or if it is the second to the same one."""
-        if (chunk.basis, chunk.number) > (self._chunk.basis, self._chunk.number):
+        """Take the answer if it is newer than the present one."""
+        if chunk.number > self._chunk.number:
             self._chunk = chunk
 
     def action(self, tick: int) -> Any:
