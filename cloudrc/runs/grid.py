@@ -7,12 +7,9 @@ checked before the first flight.
 from __future__ import annotations
 
 import gzip
-import inspect
 import json
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 from hashlib import sha256
 from itertools import chain, product
 from math import prod
@@ -21,11 +18,11 @@ from typing import Any, NamedTuple, TypeAlias
 
 from pydantic import Field
 
-from cloudrc import files, metrics, plugins, source
+from cloudrc import files, metrics, source
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, Source, read_document
 from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files
-from cloudrc.config.overrides import KINDS, Settings, collect_settings
+from cloudrc.config.overrides import Settings, collect_settings
 from cloudrc.config.problems import ConfigProblem, ProblemsError, validate
 from cloudrc.config.reuse import reuse, reuse_results
 from cloudrc.config.robot import files_of
@@ -34,6 +31,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.renamed import new_key
 from cloudrc.runs.experiment import check_world
 from cloudrc.runs.flight import Row
+from cloudrc.runs.installed import installed_code
 from cloudrc.runs.own_files import hashes
 
 SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
@@ -179,23 +177,10 @@ def _everything(point: ResolvedExperiment) -> bytes:
     values = point.model_dump(mode="json")
     named = [*local_files(values).values()] if '"/' in json.dumps(values) else []
     named += map(str, files_of(point.world.robot))
-    code = [_code(kind, getattr(point.cloud, key).name) for key, kind in KINDS.items()]
     contents = {file: each for path in named for file, each in hashes(path)}
-    everything = {**values, "cloudrc": source.code_hash(), "code": code, "files": contents}
+    code = {"cloudrc": source.code_hash(), "installed": installed_code(point)}
+    everything = {**values, **code, "files": contents}
     return json.dumps(everything, sort_keys=True).encode()
-
-
-@cache
-def _code(kind: str, name: str) -> str:
-    """Return the SHA-256 of the source file of plug-in `name`; "" if there is no such file.
-
-    Also return "" if `name` is a path, because the caller hashes this file with all other files.
-    """
-    with suppress(TypeError, OSError):
-        if not plugins.is_path(name):
-            file = inspect.getfile(plugins.find(kind, name))
-            return sha256(Path(file).read_bytes()).hexdigest()
-    return ""
 
 
 def _key(everything: bytes, seed: int) -> str:
@@ -278,13 +263,16 @@ def pack(flights: Iterable[SweepPoint]) -> bytes:
     the index of the point and the seed. Equal flights give equal bytes.
     """
     points: dict[int, int] = {}  # identity of a resolved point -> its index
-    shown, chosen = [], []
-    for flight in flights:
-        if id(flight.resolved) not in points:
-            points[id(flight.resolved)] = len(points)
-            shown.append([flight.point, flight.resolved.model_dump(mode="json")])
-        chosen.append([points[id(flight.resolved)], flight.seed])
-    text = json.dumps({"code": source.code_hash(), "points": shown, "flights": chosen})
+    shown, chosen, installed = [], [], dict[str, str]()
+    with reuse_results():
+        for flight in flights:
+            if id(flight.resolved) not in points:
+                points[id(flight.resolved)] = len(points)
+                shown.append([flight.point, flight.resolved.model_dump(mode="json")])
+                installed |= installed_code(flight.resolved)
+            chosen.append([points[id(flight.resolved)], flight.seed])
+    code = {"code": source.code_hash(), "installed": installed}
+    text = json.dumps({**code, "points": shown, "flights": chosen})
     return gzip.compress(text.encode(), mtime=0)
 
 
@@ -297,9 +285,13 @@ def unpack(path: Path) -> list[SweepPoint]:
         content = json.loads(gzip.decompress(files.read(path)))
         _refuse_other_code(content["code"])
         points = list[tuple[dict[str, Any], ResolvedExperiment, bytes]]()
-        for point, values in content["points"]:
-            resolved = ResolvedExperiment.model_validate_json(json.dumps(values))
-            points.append((point, resolved, _everything(resolved)))
+        installed = dict[str, str]()
+        with reuse_results():
+            for point, values in content["points"]:
+                resolved = ResolvedExperiment.model_validate_json(json.dumps(values))
+                points.append((point, resolved, _everything(resolved)))
+                installed |= installed_code(resolved)
+        _refuse_other_plugins(content["installed"], installed)
         chosen = ((*points[index], seed) for index, seed in content["flights"])
         return [
             SweepPoint(_key(everything, seed), point, seed, resolved)
@@ -315,3 +307,10 @@ def _refuse_other_code(code: str) -> None:
     if code != (own := source.code_hash()):
         text = f"the flights come from code {code}, this image has code {own}"
         raise BadInputError(f"{text}; build the image from the code that runs this command")
+
+
+def _refuse_other_plugins(theirs: dict[str, str], own: dict[str, str]) -> None:
+    """Raise a BadInputError if this image has other installed plug-ins than the flights need."""
+    if other := sorted(name for name in theirs.keys() | own if theirs.get(name) != own.get(name)):
+        text = f"this image has another version of {', '.join(other)}, or lacks it"
+        raise BadInputError(f"{text}; install the same packages here and in the image")

@@ -4,7 +4,6 @@ A file of flights gives the same flights in a pod that has none of the user's fi
 """
 
 import gzip
-import inspect
 import re
 from collections import Counter
 from pathlib import Path
@@ -15,7 +14,6 @@ from cloudrc.assembly import build_links
 from cloudrc.config import document, load, overrides, scene
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import SCENES
-from cloudrc.runs import grid as grids
 from cloudrc.runs.grid import pack, read_flight, read_grid, unpack
 from cloudrc.source import code_hash
 from tests.runs.conftest import SHORT
@@ -52,22 +50,6 @@ def test_equal_flights_have_equal_keys_however_they_are_written(write_sweep):
     assert all(len(key) == 16 for key in keys)
     delays = {"far": {"link.uplink.delay_ms": 40, "link.downlink.delay_ms": 40.0}}
     assert list(read_grid(write_sweep({"delay": delays}, seeds=2)).flights) == keys[:2]
-
-
-def test_a_key_depends_on_the_code_of_a_named_plugin(write_sweep, monkeypatch, tmp_path):
-    """A user may edit a predictor in a clone, and then continue a sweep."""
-    path, found = write_sweep({"cloud.predictor": ["last_sample", "constant_velocity"]}), []
-    (tmp_path / "edited.py").write_text("# edited")
-    real = inspect.getfile
-    for name in ("", "last_sample"):
-        grids._code.cache_clear()
-        monkeypatch.setattr(inspect, "getfile", lambda module, edited=name: str(
-            tmp_path / "edited.py" if module.__name__.endswith(f".{edited}") else real(module)
-        ))  # fmt: skip
-        found.append([*read_grid(path).flights])
-    grids._code.cache_clear()
-    assert found[0][0] != found[1][0]
-    assert found[0][1] == found[1][1]
 
 
 @pytest.mark.parametrize("key", ["robot", "scene"])
