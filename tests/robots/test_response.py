@@ -106,7 +106,7 @@ def test_a_parameter_that_the_model_does_not_have_is_one_line(robot, predictor, 
             "time_constant.0: 220: must be a number > 0 and <= 30",
         ),
         ("response: 3", "response: 3: must be null or a mapping of keys"),
-        ("tunings: {fast: 3}", "tunings.fast: 3: is not valid"),
+        ("tunings: {fast: 3}", "tunings.fast: 3: must be a mapping of keys"),
         ("motion: 3", "motion: 3: must be text or null"),
     ],
 )
