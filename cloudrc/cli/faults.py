@@ -118,7 +118,7 @@ def run(options: argparse.Namespace) -> int:
     from cloudrc.faults.search import run_fault
 
     if isinstance(options.name, Path):
-        return fly_file(options)
+        return run_file(options)
     chosen = SCENARIOS if options.all else (find(options.name),)
     faults: list[dict[str, Any]] = []
 
@@ -143,23 +143,16 @@ def run(options: argparse.Namespace) -> int:
     return FAILED if failed else 0
 
 
-def fly_file(options: argparse.Namespace) -> int:
+def run_file(options: argparse.Namespace) -> int:
     """Fly the schedule of faults in a file; return 1 if the flight breaks a safety invariant."""
-    from cloudrc.faults.schedule import load
-    from cloudrc.faults.trial import fly
+    from cloudrc.faults.trial import fly_file
 
     if options.seed != 1:
         raise BadInputError("--seed belongs to named faults, not to a schedule's file")
-    schedule = load(options.name)
-    try:
-        finding = fly(schedule, keep=True)
-    except BadInputError as error:  # an unknown profile or policy
-        raise BadInputError(f"{options.name}: {error}") from error
+    finding = fly_file(options.name)
     breaches = [breach._asdict() for breach in finding.breaches]
-    lines = [escape(f"{at.time:8.3f} s  {at.kind}: {at.text}") for at in finding.breaches]
-    lines.append(f"{'FAILED' if breaches else 'passed'}  records {finding.sha256[:16]}")
     document = {"records_sha256": finding.sha256, "breaches": breaches}
-    print_result(options.output, document, "\n".join(lines))
+    print_result(options.output, document, finding.as_text())
     return FAILED if breaches else 0
 
 

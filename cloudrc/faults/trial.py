@@ -8,17 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
-from cloudrc.errors import describe_error
+from cloudrc.errors import BadInputError, describe_error
 from cloudrc.faults.facts import LATCHED
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.invariants import Breach
 from cloudrc.faults.measures import events_of_missions, held
-from cloudrc.faults.schedule import Schedule
+from cloudrc.faults.schedule import Schedule, load
 from cloudrc.messages import GuardState
 from cloudrc.records import GuardChange, Record
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.wire import QUEUED
+from cloudrc.text import escape
 
 INVARIANTS = {
     "collision": "collisions",
@@ -59,6 +61,21 @@ class TrialResult:
     def kinds(self) -> set[str]:
         """Names of the broken invariants, such as "fence"."""
         return {breach.kind for breach in self.breaches}
+
+    def as_text(self) -> str:
+        """Describe the breaches, one per line, and in the last line the result."""
+        lines = [escape(f"{at.time:8.3f} s  {at.kind}: {at.text}") for at in self.breaches]
+        word = "FAILED" if self.breaches else "passed"
+        return "\n".join([*lines, f"{word}  records {self.sha256[:16]}"])
+
+
+def fly_file(path: Path) -> TrialResult:
+    """Fly the schedule of faults in a file; raise a BadInputError that names it if it is wrong."""
+    schedule = load(path)
+    try:
+        return fly(schedule, keep=True)
+    except BadInputError as error:  # an unknown profile or policy
+        raise BadInputError(f"{path}: {error}") from error
 
 
 def fly(schedule: Schedule, *, keep: bool = False) -> TrialResult:

@@ -1,0 +1,69 @@
+"""Check a robot: its facts, a flight, what must change, and its picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from cloudrc.config import shipped
+from cloudrc.errors import BadInputError
+from cloudrc.files import PICTURES, refuse_other_file, write_atomically
+from cloudrc.robots.check import check, facts_table, read_surfaces
+from cloudrc.runs.requirements import missing, require
+
+PICTURE = "check.png"
+"""Name of the picture in the folder of a robot."""
+
+
+def check_robot(given: str, picture: Path | None = None) -> tuple[dict[str, Any], str]:
+    """Check a robot, and draw it.
+
+    Args:
+        given: Name of a shipped robot, or path of a folder or an .xml file.
+        picture: File for the picture; by default `PICTURE` in a folder of the user's own.
+
+    Returns:
+        The result as values for JSON; and a note about the picture, "" without one.
+
+    Raises:
+        BadInputError: If the robot does not compile or does not hold the contract, or if the
+            picture's kind is unknown or its file belongs to somebody else.
+    """
+    is_own = Path(given).is_dir() and (given not in shipped.names("robot") or "/" in given)
+    name = shipped.model_path("robot", f"{Path(given).resolve()}" if is_own else given, Path.cwd())
+    place = picture or (Path(name) / PICTURE if is_own else None)
+    kind = _kind_of(place)
+    facts, changes = check(name)
+    note = _draw(name, place, kind, required=picture is not None)
+    return {"robot": given, "ok": not changes, "changes": changes, "facts": facts}, note
+
+
+def as_text(document: Mapping[str, Any], note: str) -> str:
+    """Format the result of `check_robot` for people."""
+    lines = [f"must change: {each}" for each in document["changes"]] or ["nothing must change"]
+    return "\n".join([facts_table(document["facts"]), "", *lines, *([note] if note else [])])
+
+
+def _kind_of(picture: Path | None) -> str:
+    if picture is None:
+        return ""
+    kind = picture.suffix.removeprefix(".")
+    if kind not in PICTURES:
+        known = ", ".join(f".{each}" for each in PICTURES)
+        raise BadInputError(f"--picture {picture}: no kind of picture; use one of {known}")
+    refuse_other_file(picture, PICTURES[kind], flag="--picture")
+    return kind
+
+
+def _draw(name: str, picture: Path | None, kind: str, *, required: bool) -> str:
+    """Write the picture of a robot; return a note about it."""
+    if picture is None:
+        return ""
+    if not required and missing("report"):
+        return "no picture: cloudrc[report] is not installed"
+    require("a picture", ("report",))
+    from cloudrc.report.robot_picture import draw_robot
+
+    write_atomically(picture, draw_robot(read_surfaces(name), kind))
+    return f"picture: {picture}"
