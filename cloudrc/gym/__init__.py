@@ -13,9 +13,9 @@ except ImportError:
     ) from None
 
 from cloudrc.gym.networked import Networked
-from cloudrc.gym.registration import register
+from cloudrc.gym.registration import register as _register
 from cloudrc.gym.vector import NetworkedVector
 
-__all__ = ["Networked", "NetworkedVector", "register"]
+__all__ = ["Networked", "NetworkedVector"]
 
-register()
+_register()

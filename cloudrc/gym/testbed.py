@@ -39,6 +39,10 @@ SEED_MAX = 2**31
 """Random seeds of episodes are below this number."""
 OWN = {
     "link.profile": "ideal",
+    "cloud.clock_drift_ppm": 0,
+    "cloud.clock_offset_s": 0,
+    "cloud.compute_deviation_ms": 0,
+    "cloud.compute_measured": False,
     "cloud.predictor": "last_sample",
     "cloud.estimator": "running_mean",
     "cloud.controller": "pid",
@@ -143,6 +147,8 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         for key in settings or {}:
             if key.partition(".")[0] == "link":
                 raise BadInputError(f"{key}: the network is that of the wrapper Networked")
+            if key in OWN:
+                raise BadInputError(f"{key}: the policy stands in its place; leave it out")
         texts = {**(settings or {}), **OWN, **({"world.robot": robot} if robot else {})}
         self.render_mode = render_mode
         loaded = load_experiment(

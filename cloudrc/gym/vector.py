@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 else:
     _Wrapper = VectorWrapper  # of which gymnasium 1.2 knows no types
 
-FINAL = "final_obs", "final_info"
-"""What a vector environment that resets in the same step tells about the ended episode."""
-
 
 class NetworkedVector(_Wrapper):
     """A vector environment in which each robot has a link of its own.
@@ -117,12 +114,12 @@ class NetworkedVector(_Wrapper):
         if not (has_ended and self._mode is AutoresetMode.SAME_STEP):
             loop.observe(observation, info)
             return {"cloudrc": {"episode": loop.summary()}} if has_ended else {}
-        final = {key: info.pop(key) for key in FINAL if key in info}
-        loop.observe(final.get("final_obs", observation), info)
-        told = {"cloudrc": {"episode": loop.summary()}}
-        final["final_info"] = {**final.get("final_info", {}), **told}
+        last = info.pop("final_obs", observation), info.pop("final_info", {})
+        loop.observe(*last)
+        seen, about = loop.seen
+        told = {**loop.told(), "episode": loop.summary()}
         loop.begin(None, observation, info)
-        return final
+        return {"final_obs": seen, "final_info": {**about, "cloudrc": told}}
 
     def _seen(self, finals: Sequence[dict[str, Any]]) -> tuple[Any, dict[str, Any]]:
         """Return the newest observations and infos that the policies have."""

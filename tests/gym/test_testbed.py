@@ -49,8 +49,9 @@ def test_the_same_actions_fly_the_true_path_of_a_flight(name, options, experimen
         assert truth[column][:count].tobytes() == flown[column].tobytes()
 
 
-def test_the_link_of_an_experiment_is_left_out(tmp_path):
+def test_network_and_cloud_of_an_experiment_are_left_out(tmp_path):
     mine = "mission: hover\nlink: {uplink: {delay_ms: 90}, downlink: {loss: 0.5}}\n"
+    mine += "cloud: {compute_ms: 9, compute_deviation_ms: 3, clock_offset_s: 5, plan_s: 0.5}\n"
     (tmp_path / "mine.yaml").write_text(mine)
     env = gymnasium.make("cloudrc/Steps-v0", experiment=str(tmp_path / "mine.yaml"))
     env.reset(seed=1)
@@ -83,6 +84,8 @@ def test_what_a_robot_cannot_fly_is_refused():
         gymnasium.make("cloudrc/Steps-v0", settings={"wrold.robot": "x2"})
     with pytest.raises(BadInputError, match="the network is that of the wrapper Networked"):
         gymnasium.make("cloudrc/Steps-v0", settings={"link.uplink.delay_ms": 50})
+    with pytest.raises(BadInputError, match=r"cloud\.predictor: the policy stands in its place"):
+        gymnasium.make("cloudrc/Steps-v0", settings={"cloud.predictor": "kalman"})
     env = gymnasium.make("cloudrc/Steps-v0").unwrapped
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(4))

@@ -59,6 +59,8 @@ def test_a_robot_of_a_vector_flies_as_alone_with_its_stream(mode):
                 if over and mode is AutoresetMode.SAME_STEP:
                     final = infos["final_info"]["cloudrc"]["episode"]["ticks"]
                     assert final[n] == told["cloudrc"]["episode"]["ticks"] == 25
+                    assert np.array_equal(infos["final_obs"][n], found)
+                    assert infos["final_info"]["count"][n] == told["count"]
                     found, told = one.reset()
             assert np.array_equal(found, observations[n])
             assert infos["count"][n] == told["count"]
