@@ -265,7 +265,6 @@ def build_plan(experiment: ResolvedExperiment) -> Plan:
         experiment.seed,
         fence=steered_in(experiment.world),
         speed_max=experiment.guard.speed_max_mps,
-        settle=experiment.criteria.settle_m,
     )
 
 
@@ -276,17 +275,16 @@ def mission_plan(
     *,
     fence: Fence,
     speed_max: float = inf,
-    settle: float | None = None,
 ) -> Plan:
     """Convert a valid mission to a plan for teleop.
 
     `time_limit` is the time limit of the mission [s]; None: as long as the mission may need. `seed`
     is the seed of random setpoints, `fence` that of the scene, `speed_max` the guard's speed limit
-    [m/s]. `settle` is the largest distance from the last setpoint of a file [m]; None: any.
+    [m/s].
     """
     track = read_setpoints(Path(mission.setpoints), fence) if mission.setpoints else ()
     if track:
-        legs: tuple[Leg, ...] = (Leg(track[0][1], tolerance=settle or inf, time_limit=inf),)
+        legs: tuple[Leg, ...] = (Leg(track[0][1], tolerance=inf, time_limit=inf),)
         needed = LEG_FACTOR * track[-1][0]
     elif mission.steps is not None:
         legs = _step_legs(mission.steps, seed)

@@ -12,7 +12,6 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import Fence
 from cloudrc.link.traces import read_lines, read_rows
 from cloudrc.messages import Vector
-from cloudrc.rounding import format_beside
 
 COLUMNS = ["time_s", "x_m", "y_m", "z_m"]
 DRIVE_FILE = "drive.csv"
@@ -74,12 +73,3 @@ def write_setpoints(setpoints: Iterable[tuple[float, Sequence[float]]], fence: F
     inside = {f"{time:.6f}": np.clip(at, low, high) for time, at in setpoints}
     lines = (f"{time},{x:.6g},{y:.6g},{z:.6g}" for time, (x, y, z) in inside.items())
     return "\n".join([",".join(COLUMNS), *lines, ""])
-
-
-def describe_miss(away: float, limit: float) -> str:
-    """Say that a mission ended `away` [m] from its last setpoint, farther than the limit [m]."""
-    return (
-        f"setpoints flown to their end, but the robot was {format_beside(away, limit)} m from the "
-        f"last one, above criteria.settle_m {limit:g} m; give the robot time there: repeat the "
-        "last row with a later time_s"
-    )

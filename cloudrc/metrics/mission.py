@@ -29,8 +29,6 @@ SETTLING_NS = 10_000_000_000
 is no steady error.
 Source: docs/reference/control.md, "Steady state": the slowest variant that settles needs 8 to 15 s
 to stay within 1 cm."""
-FLOWN_TO_THE_END = "done", "leg_timed_out"
-"""Events that end a mission with a file of setpoints after its last row."""
 FAILURES = ("estimator_failed", "predictor_failed", "controller_failed", "horizon_clamped")
 """Counters of cloud that are included in the number of faults."""
 
@@ -86,7 +84,7 @@ def _final_error(flight: Flight) -> float | None:
     end_ns, event, _ = flight.ending
     control = flight.control
     setpoints = control["setpoint"][(control["waypoint"] >= 0) & (control["stamp_ns"] <= end_ns)]
-    if event not in FLOWN_TO_THE_END or not len(setpoints):
+    if event != "done" or not len(setpoints):
         return None
     true = flight.true_position(np.array([end_ns]))[0]
     return finite(float(np.linalg.norm(true - setpoints[-1])))

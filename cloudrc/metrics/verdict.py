@@ -24,7 +24,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from cloudrc.config.schema import Touch
-from cloudrc.config.setpoints import describe_miss
 from cloudrc.errors import DISK_FULL, DiskFullError
 from cloudrc.messages import Cause, GuardState, Vector
 from cloudrc.metrics import Flight, Number
@@ -326,8 +325,14 @@ def _responses(flight: Flight, settle: float) -> Iterator[FlightFailure]:
 def _missed_end(flight: Flight, settle: float) -> Iterator[FlightFailure]:
     """Yield a failure if a file of setpoints ended farther than `settle` [m] from its last one."""
     ending, away = flight.ending, missed_end(flight)
-    if away is not None and ending is not None and ending[1] == "done":
-        yield FlightFailure("not_settled", describe_miss(away, settle), *_moment(flight, ending[0]))
+    if away is None or ending is None:
+        return
+    text = (
+        f"setpoints flown to their end, but the robot was {format_beside(away, settle)} m from the "
+        f"last one, above criteria.settle_m {settle:g} m; give the robot time there: repeat the "
+        "last row with a later time_s"
+    )
+    yield FlightFailure("not_settled", text, *_moment(flight, ending[0]))
 
 
 def _not_real_time(numbers: Mapping[str, Number]) -> str:

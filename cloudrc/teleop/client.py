@@ -40,7 +40,7 @@ SOCKET_GONE = (
     "or, if it is a session, with 'cloudrc down'"
 )
 """Says how to stop a robot whose API nobody can reach any more."""
-EVERY_WAYPOINT = "every waypoint reached"
+ALL_MET = "every waypoint reached, every criterion met"
 """Says what a robot has done in a mission of waypoints that succeeded."""
 UNIX = "unix:"
 VARIABLE = "CLOUDRC_TOKEN_FILE"
@@ -224,19 +224,19 @@ def find_mission(api: Api, key: str) -> dict[str, Any] | None:
 
 def describe_mission(mission: Mapping[str, Any]) -> str:
     """Return name, state and waypoint of a mission, and its verdict, as one line of text."""
-    where, goal = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}", EVERY_WAYPOINT
+    where, met = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}", ALL_MET
     if not mission["waypoints"]:
-        where, goal = "setpoints of a file", "setpoints flown to their end"
+        where, met = "setpoints of a file", "flown to the end; the report judges how near"
     name = f" ({mission['name']})" if mission["name"] else ""
-    verdict = f"; {describe_verdict(mission['verdict'], goal)}" if mission["verdict"] else ""
+    verdict = f"; {describe_verdict(mission['verdict'], met)}" if mission["verdict"] else ""
     return f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}"
 
 
-def describe_verdict(verdict: Mapping[str, Any], goal: str = EVERY_WAYPOINT) -> str:
+def describe_verdict(verdict: Mapping[str, Any], met: str = ALL_MET) -> str:
     """Return the outcome of a mission and the reasons, as one line of text.
 
-    `goal` says what the robot has done if the mission succeeded.
+    `met` says what the robot has done if the mission succeeded.
     """
     failures = [f"{failure['code']}: {failure['text']}" for failure in verdict["failures"]]
-    reasons = "; also ".join(failures) or f"{goal}, every criterion met"
+    reasons = "; also ".join(failures) or met
     return f"{verdict['outcome'].upper()}: {reasons}"

@@ -51,8 +51,8 @@ class Leg:
 class Plan:
     """What a mission flies: its waypoints (`legs`) or its `track`, where it starts, its time limit.
 
-    A track gives setpoints at fixed times. A mission with a track has one waypoint, which counts as
-    reached if the robot is within its tolerance of the last setpoint when the track ends.
+    A track gives setpoints at fixed times. A mission with a track has one leg, which counts as
+    reached at the end of the track.
     """
 
     legs: tuple[Leg, ...]  # in order; at least one

@@ -140,11 +140,12 @@ def test_a_robot_far_from_the_last_setpoint_of_a_file_fails(last, settle, found,
         assert f"{last - 10.0:.2f} m from the last one" in verdict.failures[0].text
 
 
-def test_setpoints_that_teleop_saw_missed_fail_once():
-    log = ended("leg_timed_out")
+def test_setpoints_that_were_not_flown_to_their_end_fail_for_that_reason_alone():
+    log = ended("timed_out")
     log.change(Control, lambda n, c: c._replace(setpoint=(14.0, 0.0, 1.0), waypoint=0))
-    verdict = judged(log.flight(mission=MissionConfig(setpoints="track.csv"), touch="board"))
-    assert codes(verdict) == ["leg_timed_out"]
+    flight = log.flight(mission=MissionConfig(setpoints="track.csv"), touch="board")
+    assert codes(judged(flight)) == ["timed_out"]
+    assert SHIPPED["final_error"].measure(flight) is None
 
 
 @pytest.mark.parametrize(
