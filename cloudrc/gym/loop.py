@@ -105,6 +105,7 @@ class RemoteLoop:
 
     Attributes:
         seen: The newest observation that the policy has, and the environment's info about it.
+        compute: Time for the next answers [s], in place of that of the settings; None: the latter.
     """
 
     def __init__(self, settings: Settings, executor: Executor, stream: str = "") -> None:
@@ -117,6 +118,7 @@ class RemoteLoop:
         self._stream, self._episode = stream, -1
         self._compute_ns = round(settings.compute[0] * 1e9)
         self._late: int | None = None
+        self.compute: float | None = None
         self.seen: list[Any] = [None, {}]
 
     def begin(self, seed: int | None, observation: Any, info: Mapping[str, Any]) -> None:
@@ -198,6 +200,8 @@ class RemoteLoop:
 
     def _time_to_compute(self, tick: int) -> int:
         """Return how long the policy computes the answer of a tick [ns]."""
+        if self.compute is not None:
+            return round(self.compute * 1e9)
         mean, deviation = self._settings.compute
         if not deviation:
             return self._compute_ns

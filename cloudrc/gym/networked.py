@@ -86,6 +86,19 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._check = checker(self.action_space, describe_answer(chunk))
         self.world_info: dict[str, Any] = {}
 
+    @property
+    def compute(self) -> float | None:
+        """Time for the next answers [s], for whoever measures it; None: as the argument says."""
+        return self._loop.compute
+
+    @compute.setter
+    def compute(self, time: float | None) -> None:
+        self._loop.compute = time
+
+    def summary(self) -> dict[str, Any]:
+        """Return what `info["cloudrc"]["episode"]` has, also before the end of an episode."""
+        return self._loop.summary()
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:

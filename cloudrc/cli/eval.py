@@ -1,0 +1,167 @@
+"""`cloudrc eval`: measure whether a policy survives a network."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cloudrc.cli.output import output_argument, print_line, print_result
+from cloudrc.cli.parser import COUNT_MAX, number, read_count
+from cloudrc.errors import BadInputError
+from cloudrc.runs.folder import new_folder
+from cloudrc.runs.interrupts import interrupt_on_signals
+from cloudrc.runs.lock import lock_folder
+from cloudrc.runs.requirements import require
+from cloudrc.text import escape
+
+if TYPE_CHECKING:
+    from cloudrc.eval.setup import Episode, EvalSetup
+
+EPILOG = """\
+examples:
+  cloudrc eval --env CartPole-v1 --policy ./law.py --rtt 0,80 --success-at 500
+  cloudrc eval --env Pendulum-v1 --policy ws://gpu:8000 --link lte --seeds 50
+  cloudrc eval --env Meta-World/MT1 --env-arg env_name=reach-v3 \\
+      --policy ./expert.py --link lte --rtt 0,80 --executor newest,time-indexed
+
+law.py has a function infer(observation), as for 'cloudrc policy serve'. The
+environment and its packages are yours. Each condition has the same seeds. With
+--out DIR of an earlier call, only missing episodes are played."""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    add = parser.add_argument
+    about = "environment of gymnasium: its id, or MODULE:ID"
+    add("--env", required=True, metavar="ID", help=about)
+    about = "argument of the environment; repeatable"
+    add("--env-arg", action="append", default=[], metavar="KEY=VALUE", help=about)
+    about = "a Python file, or the address of a server (ws://...)"
+    add("--policy", required=True, metavar="POLICY", help=about)
+    about = "link profile, a name or a file (default: ideal)"
+    add("--link", default="ideal", metavar="PROFILE", help=about)
+    about = "mean round trips in ms, such as 0,40,80 (default: the profile's)"
+    add("--rtt", type=_round_trips, default=(None,), metavar="MS,...", help=about)
+    about = "ways to execute answers, such as newest,prefix (default: newest)"
+    add("--executor", default="newest", metavar="NAME,...", help=about)
+    about = "time for an answer in s: a number, MEAN,DEVIATION, a file, 'measured'"
+    add("--compute", default="0", metavar="TIME", help=f"{about} (default: 0)")
+    about = "seeds 1 to N of each condition (default: 20)"
+    add("--seeds", type=read_count, default=20, metavar="N", help=about)
+    about = "file from the environment's observation to the policy's (YAML)"
+    add("--map", type=Path, metavar="FILE", help=about)
+    about = "smallest return of a success (default: what the info says)"
+    add("--success-at", type=float, metavar="RETURN", help=about)
+    about = "time of a step in s, if the environment does not tell it"
+    add("--dt", type=number(1e-6, 3600, "seconds"), metavar="S", help=about)
+    about = "longest episode in steps (default: 10000)"
+    add("--max-steps", type=read_count, default=10_000, metavar="N", help=about)
+    about = "parallel processes for a policy in a file (default: one per core)"
+    add("--jobs", type=read_count, default=COUNT_MAX, metavar="N", help=about)
+    about = "folder (default: a new one in runs/); if it has rows, play the others"
+    add("--out", type=Path, metavar="DIR", help=about)
+    output_argument(parser)
+
+
+def _round_trips(text: str) -> tuple[float, ...]:
+    read = number(0, 60_000, "ms")
+    return tuple(dict.fromkeys(read(each.strip()) for each in text.split(",")))
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Play what is missing, write the report, and print the table."""
+    interrupt_on_signals()
+    needed = ["gym", "report", *(["policy"] if "://" in options.policy else [])]
+    require("an evaluation", needed)
+    from cloudrc.eval import results
+    from cloudrc.eval.episode import check_environment
+    from cloudrc.eval.page import write_page
+
+    setup, episodes = _read(options)
+    check_environment(setup, episodes)
+    folder = options.out
+    if folder is None or not results.is_begun(folder):
+        folder = new_folder(folder, f"eval-{Path(setup.env).name}", "latest-eval")
+    stream = sys.stdout if options.output == "table" else sys.stderr
+    with lock_folder(folder), closing(_Progress(stream, len(episodes))) as progress:
+        try:
+            rows, stopped = results.play_missing(
+                folder, setup, episodes, options.jobs, progress.see
+            )
+        except Exception:
+            if results.is_begun(folder):
+                print_line(
+                    f"the rows are kept; the same call with --out {folder} goes on", sys.stderr
+                )
+            raise
+        if stopped:
+            print_line(f"cloudrc: {stopped}; to continue, add --out {folder}", sys.stderr)
+            return stopped.exit_code
+        outcomes = results.summarize(rows)
+        document = results.write(folder, setup, outcomes)
+        page = write_page(folder, setup, outcomes)
+    told = results.describe_success(setup, outcomes)
+    text = f"{results.as_text(outcomes)}\n\nsuccess: {told}\n{escape(str(page))}"
+    print_result(options.output, document, text)
+    return 0
+
+
+def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
+    """Check the flags; return the evaluation and its episodes."""
+    from cloudrc.eval.setup import (
+        Episode,
+        EvalSetup,
+        check_setup,
+        link_at,
+        read_compute,
+        read_env_args,
+        read_mapped,
+    )
+
+    executors = list(dict.fromkeys(each.strip() for each in options.executor.split(",")))
+    setup = EvalSetup(
+        options.env,
+        options.policy,
+        read_env_args(options.env_arg),
+        options.link,
+        read_compute(options.compute),
+        read_mapped(options.map),
+        options.success_at,
+        options.dt,
+        options.max_steps,
+    )
+    check_setup(setup)
+    for rtt in options.rtt:
+        link_at(setup.link, rtt)
+    if not all(executors):
+        raise BadInputError(f"--executor {options.executor}: a name is missing")
+    episodes = [
+        Episode(rtt, executor, seed)
+        for executor in executors
+        for rtt in options.rtt
+        for seed in range(1, options.seeds + 1)
+    ]
+    return setup, episodes
+
+
+class _Progress:
+    """One line that counts the episodes, on a terminal."""
+
+    def __init__(self, stream: Any, count: int) -> None:
+        self._stream, self._count, self._done = stream, count, 0
+
+    def see(self, row: dict[str, Any]) -> None:
+        """Count a row."""
+        self._done += 1
+        if self._stream.isatty():
+            print(
+                f"\r{self._done} of {self._count} episodes", end="", file=self._stream, flush=True
+            )
+
+    def close(self) -> None:
+        """End the line."""
+        if self._done and self._stream.isatty():
+            print(file=self._stream)

@@ -1,0 +1,287 @@
+"""Play one episode of an environment with a policy at the other end of a link."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from hashlib import sha256
+from math import isfinite
+from statistics import fmean
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from cloudrc.errors import BadInputError, CloudrcError, describe_error
+from cloudrc.eval.setup import FILE, MEASURED, Episode, EvalSetup, link_at, read_times
+from cloudrc.gym import Networked
+from cloudrc.plugins import locate
+from cloudrc.policy.actions import PolicyAnswerError, read_actions
+from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
+from cloudrc.policy.observation import observe
+from cloudrc.source import code_hash
+
+SUCCESS = ("success", "is_success")
+"""Keys of an environment's info that tell whether the task is done; in this order."""
+Ask = Callable[[dict[str, Any]], Any]
+"""Function that returns a policy's answer to its observation."""
+
+
+class Played(NamedTuple):
+    """What happened in an episode."""
+
+    total: float  # sum of the rewards [1]
+    steps: int
+    success: bool | None  # None: the environment does not tell
+    stale: int  # steps in which the robot had no action of an answer
+    jumps: list[float]  # change of the action from one answer to the next, at each change [1]
+    loop: dict[str, Any]  # summary of the loop
+    records_sha256: str
+
+
+class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Sees what the world does, which no delay changes: executed actions, states, rewards."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.digest = sha256()
+        self.action: Any = None
+
+    def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        observation, info = self.env.reset(**given)
+        self._note(observation)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Execute an action."""
+        self.action = action
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._note(action, observation, float(reward))
+        return observation, reward, terminated, truncated, info
+
+    def _note(self, *values: Any) -> None:
+        for value in values:
+            if isinstance(value, Mapping):
+                self._note(*value.values())
+            elif isinstance(value, tuple | list):
+                self._note(*value)
+            else:
+                self.digest.update(np.asarray(value).tobytes())
+
+
+def play(episode: Episode, setup: EvalSetup, identity: Mapping[str, Any]) -> dict[str, Any]:
+    """Play an episode; return its row. Raise a CloudrcError if policy or environment fail."""
+    with make_env(setup) as env, asking(setup) as ask:
+        found = _play(episode, setup, env, ask)
+    up, down = found.loop["uplink"], found.loop["downlink"]
+    numbers = {
+        "return": found.total,
+        "steps": found.steps,
+        "success": None if found.success is None else int(found.success),
+        "stale_share": found.stale / found.steps,
+        "observation_age": found.loop["observation_age_mean"],
+        "action_age": found.loop["action_age_mean"],
+        "seam_jump": fmean(found.jumps) if found.jumps else None,
+        **{f"{name}_uplink": up[name] for name in ("delay_asked", "delay_measured")},
+        **{f"{name}_downlink": down[name] for name in ("delay_asked", "delay_measured")},
+        **{"loss_uplink": up["loss_measured"], "loss_downlink": down["loss_measured"]},
+    }
+    judged = {None: "done", True: "success", False: "failure"}
+    return {
+        "key": episode.key(identity),
+        "point": episode.point,
+        "seed": episode.seed,
+        "verdict": judged[found.success],
+        "failures": [],
+        "text": "",
+        "numbers": {k: v for k, v in numbers.items() if v is not None and isfinite(v)},
+        "records_sha256": found.records_sha256 if setup.is_repeatable else "",
+        "code": code_hash(),
+    }
+
+
+@contextmanager
+def make_env(setup: EvalSetup) -> Iterator[gymnasium.Env[Any, Any]]:
+    """Make the environment; raise a BadInputError if that fails."""
+    words = dict(setup.env_args)
+    try:
+        env = gymnasium.make(setup.env, **words)
+    except CloudrcError:
+        raise
+    except Exception as error:
+        raise BadInputError(f"--env {setup.env}: {describe_error(error)}") from error
+    try:
+        yield env
+    except CloudrcError:
+        raise
+    except Exception as error:
+        text = f"--env {setup.env}: the environment failed: {describe_error(error)}"
+        raise BadInputError(f"{text} ({locate(error)})") from error
+    finally:
+        env.close()
+
+
+@contextmanager
+def asking(setup: EvalSetup) -> Iterator[Ask]:
+    """Begin an episode of the policy; yield the function that asks it."""
+    if not setup.is_remote:
+        policy = _load(setup.policy)
+        policy.reset()
+        yield policy.infer
+        return
+    import os
+
+    from cloudrc.policy.address import KEY_VARIABLE
+    from cloudrc.policy.client import PolicyClient
+
+    with PolicyClient(setup.policy, key=os.environ.get(KEY_VARIABLE, "")) as client:
+        yield client.infer
+
+
+@cache  # it may have to load weights
+def _load(name: str) -> LoadedPolicy:
+    return LoadedPolicy(name)
+
+
+class _Policy:
+    """A policy that answers with chunks of one size, in the form of the action space."""
+
+    def __init__(self, ask: Ask, setup: EvalSetup, space: spaces.Space[Any]) -> None:
+        self._ask, self._setup, self._space = ask, setup, space
+        self._width = width_of(space)
+        self._count: int | None = None
+        self.duration = 0.0  # of the last answer [s]
+
+    def __call__(self, observation: Any, prefix: list[Any]) -> NDArray[Any]:
+        """Return the chunk of actions for an observation."""
+        asked = observe(observation, self._setup.mapped)
+        if prefix:
+            asked["prefix"] = np.array(prefix).reshape(len(prefix), -1)
+        start = time.perf_counter()
+        answer = self._ask(asked)
+        self.duration = time.perf_counter() - start
+        try:
+            actions = read_actions(answer, self._width)
+            if self._count not in (None, len(actions)):
+                raise PolicyAnswerError(f"a chunk of {len(actions)} actions after {self._count}")
+        except PolicyAnswerError as error:
+            raise PolicyFailedError(f"policy '{self._setup.policy}': {error}") from None
+        self._count = len(actions)
+        return as_actions(actions, self._space)
+
+
+def width_of(space: spaces.Space[Any]) -> int:
+    """Return the number of values of an action; raise a BadInputError for a space without one."""
+    if isinstance(space, spaces.Box | spaces.MultiDiscrete | spaces.MultiBinary):
+        return int(np.prod(space.shape))
+    if isinstance(space, spaces.Discrete):
+        return 1
+    raise BadInputError(
+        f"--env: its actions are {type(space).__name__}, which no policy's chunk has; use an "
+        "environment whose actions are numbers"
+    )
+
+
+def as_actions(actions: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
+    """Return a chunk, shape (H, A), as the space's actions have it; integers are rounded."""
+    if not isinstance(space, spaces.Box):
+        actions = np.rint(actions)
+    shaped: NDArray[Any] = actions.reshape(len(actions), *(space.shape or ()))
+    return shaped.astype(space.dtype)
+
+
+def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask: Ask) -> Played:
+    witness, policy = _Witness(env), _Policy(ask, setup, env.action_space)
+    observation, _ = witness.reset(seed=episode.seed)
+    chunk = policy(observation, [])  # the first answer, whose size the link has to know
+    world = _connect(witness, episode, setup, len(chunk), policy.duration)
+    witness.digest = sha256()
+    observation, info = world.reset(seed=episode.seed)
+    times, fresh = _times(setup), True
+    total, steps, stale, told = 0.0, 0, 0, dict[str, Any]()
+    jumps, before, basis, success = list[float](), None, -1, None
+    while steps < setup.max_steps:
+        about = info["cloudrc"]
+        if not about["busy"] and (fresh or about.get("prefix")) and steps:
+            chunk = policy(observation, about.get("prefix", []))
+        world.compute = times(episode.seed + steps, policy.duration)
+        seen_at = steps - round(about["observation_age"] / world.dt)
+        observation, reward, terminated, truncated, info = world.step(chunk)
+        steps, total = steps + 1, total + float(reward)
+        about = info["cloudrc"]
+        fresh = steps - round(about["observation_age"] / world.dt) > seen_at
+        stale += about["held"]
+        if isfinite(about["action_age"]) and not about["held"]:
+            now = steps - 1 - round(about["action_age"] / world.dt)
+            if before is not None and now != basis:
+                jumps.append(float(np.linalg.norm(np.subtract(witness.action, before))))
+            basis = now
+        before = witness.action
+        success = _success(success, world.world_info)
+        if terminated or truncated:
+            told = about["episode"]
+            break
+    if setup.success_at is not None:
+        success = total >= setup.success_at
+    told = told or world.summary()
+    return Played(total, steps, success, stale, jumps, told, witness.digest.hexdigest())
+
+
+def _connect(
+    env: gymnasium.Env[Any, Any], episode: Episode, setup: EvalSetup, count: int, duration: float
+) -> Networked:
+    """Put the link between environment and policy, whose chunks have `count` actions.
+
+    `duration` is that of its first answer [s].
+    """
+    compute: Any = setup.compute
+    if isinstance(compute, tuple) and compute[0] == FILE:
+        compute = fmean(read_times(str(compute[1])))
+    elif isinstance(compute, tuple) and compute[0] == MEASURED:
+        compute = duration
+    return Networked(
+        env,
+        link_at(setup.link, episode.rtt_ms),
+        episode.seed,
+        dt=setup.dt,
+        compute=compute,
+        chunk=count,
+        executor=episode.executor,
+        start="answer",  # a robot does nothing before its policy has answered
+    )
+
+
+def _times(setup: EvalSetup) -> Callable[[int, float], float | None]:
+    """Return a function that returns the time for an answer [s], by its number and duration [s]."""
+    if isinstance(setup.compute, tuple) and setup.compute[0] == MEASURED:
+        return lambda number, duration: duration
+    if isinstance(setup.compute, tuple) and setup.compute[0] == FILE:
+        times = read_times(str(setup.compute[1]))
+        return lambda number, duration: times[number % len(times)]
+    return lambda number, duration: None
+
+
+def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
+    """Return whether the task was done in any step so far; None if the info never told."""
+    for key in SUCCESS:
+        if key in info:
+            return bool(known) or bool(np.all(info[key]))
+    return known
+
+
+def check_environment(setup: EvalSetup, episodes: list[Episode]) -> None:
+    """Raise a BadInputError if environment, policy file or executors cannot be used.
+
+    The call comes before a folder is made. A server is not asked.
+    """
+    with make_env(setup) as env:
+        width_of(env.action_space)
+        for executor in dict.fromkeys(each.executor for each in episodes):
+            Networked(env, dt=setup.dt, chunk=1, executor=executor)
+    if not setup.is_remote:
+        _load(setup.policy)

@@ -1,0 +1,200 @@
+"""What an evaluation plays: an environment, a policy, and the conditions of the network."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from hashlib import sha256
+from math import isfinite
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from cloudrc.config.document import parse_value, read_document
+from cloudrc.errors import BadInputError
+from cloudrc.link.library import LinkProfile, read_profile
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.plugin_file import sources
+from cloudrc.plugins import is_path
+from cloudrc.policy.address import check_url
+from cloudrc.policy.observation import Mapped
+
+Compute: TypeAlias = float | tuple[float, float] | tuple[str, str]
+"""Time for an answer [s]: constant; or mean and deviation; or (FILE, name) or (MEASURED, "")."""
+FILE, MEASURED = "file", "measured"
+COMPUTE_MAX = 3600.0
+"""Largest time for an answer [s]."""
+
+
+@dataclass(frozen=True)
+class EvalSetup:
+    """An evaluation without its conditions; all fields are plain values, for worker processes."""
+
+    env: str  # id of gymnasium
+    policy: str  # path of a file, or address of a server
+    env_args: tuple[tuple[str, Any], ...] = ()
+    link: str = "ideal"  # profile, by name or path
+    compute: Compute = 0.0
+    mapped: tuple[Mapped, ...] = ()  # how an observation becomes the policy's; (): as it is
+    success_at: float | None = None  # smallest return of a success [1]; None: what the info says
+    dt: float | None = None  # time of a step [s]; None: that of the environment
+    max_steps: int = 10_000  # longest episode
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether a server computes the actions."""
+        return "://" in self.policy
+
+    @property
+    def is_repeatable(self) -> bool:
+        """Whether no clock of this machine counts."""
+        return self.compute[:1] != (MEASURED,) if isinstance(self.compute, tuple) else True
+
+    def identity(self) -> dict[str, Any]:
+        """Return all that the result of an episode depends on, but its condition and seed."""
+        told = asdict(self)
+        if not self.is_remote:
+            told["policy"] = _hash_of(sources(Path(self.policy)))
+        if is_path(self.link):
+            told["link"] = _hash_of([Path(self.link)])
+        if isinstance(self.compute, tuple) and self.compute[0] == FILE:
+            told["compute"] = _hash_of([Path(str(self.compute[1]))])
+        return told
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode: a condition, and the seed of environment and network."""
+
+    rtt_ms: float | None  # mean round trip [ms]; None: that of the profile
+    executor: str
+    seed: int
+
+    @property
+    def point(self) -> dict[str, Any]:
+        """The condition without its seed."""
+        return {"rtt_ms": self.rtt_ms, "executor": self.executor}
+
+    def key(self, identity: Mapping[str, Any]) -> str:
+        """Return the name of the row: equal keys mean equal episodes."""
+        own = _hash_of([Path(self.executor)]) if is_path(self.executor) else ""
+        text = json.dumps([identity, self.point, own, self.seed], sort_keys=True, default=str)
+        return sha256(text.encode()).hexdigest()[:16]
+
+
+def _hash_of(files: list[Path]) -> str:
+    total = sha256()
+    for path in sorted(files):
+        total.update(f"{path.name}\n{sha256(path.read_bytes()).hexdigest()}\n".encode())
+    return total.hexdigest()
+
+
+def check_setup(setup: EvalSetup) -> None:
+    """Raise a BadInputError if policy or compute file cannot be used."""
+    if setup.is_remote:
+        try:
+            check_url(setup.policy)
+        except ValueError as error:
+            raise BadInputError(f"--policy: {error}") from None
+    elif not is_path(setup.policy) or not Path(setup.policy).is_file():
+        raise BadInputError(
+            f"--policy {setup.policy}: there is no such file; give a Python file, such as "
+            "./expert.py, or the address of a server, such as ws://127.0.0.1:8000"
+        )
+    if isinstance(setup.compute, tuple) and setup.compute[0] == FILE:
+        read_times(str(setup.compute[1]))
+
+
+def link_at(profile: str, rtt_ms: float | None) -> LinkProfile:
+    """Return a link profile with the mean round trip `rtt_ms` [ms]; None: as it is.
+
+    The two delays keep the ratio of the profile. Jitter, loss and rate stay, but no jitter is
+    larger than its delay, which would raise the mean.
+    """
+    link = read_profile(profile)
+    if rtt_ms is None:
+        return link
+    both = link.uplink, link.downlink
+    if any(way.rows or way.changes for way in both):
+        raise BadInputError(
+            f"--rtt: the delays of the profile '{profile}' change over time; leave --rtt out, or "
+            "choose a profile with constant delays"
+        )
+    whole = sum(way.delay_ms for way in both)
+    share = link.uplink.delay_ms / whole if whole else 0.5
+
+    def at(way: DirectionProfile, delay: float) -> DirectionProfile:
+        return replace(way, delay_ms=delay, jitter_ms=min(way.jitter_ms, delay))
+
+    return LinkProfile(at(link.uplink, share * rtt_ms), at(link.downlink, (1 - share) * rtt_ms))
+
+
+def read_compute(text: str) -> Compute:
+    """Read the time for an answer: a number [s], "MEAN,DEVIATION" [s], "measured", or a file."""
+    if text == MEASURED:
+        return MEASURED, ""
+    try:
+        numbers = [float(each) for each in text.split(",")]
+    except ValueError:
+        return FILE, text
+    if len(numbers) > 2 or not all(0.0 <= each <= COMPUTE_MAX for each in numbers):
+        raise BadInputError(
+            f"--compute {text}: give the time for an answer in seconds, its mean and standard "
+            "deviation (0.05,0.02), a file with one time per line, or 'measured'"
+        )
+    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+
+
+def read_times(path: str) -> tuple[float, ...]:
+    """Read the times of a file [s]: the last column of a CSV file; a head is skipped."""
+    try:
+        rows = [row for row in csv.reader(Path(path).read_text().splitlines()) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        why = getattr(error, "strerror", None) or "it is no text"
+        raise BadInputError(f"--compute {path}: cannot be read: {why}") from None
+    found = list[float]()
+    for number, row in enumerate(rows, start=1):
+        try:
+            time = float(row[-1])
+        except ValueError:
+            if number == 1:
+                continue
+            raise BadInputError(f"--compute {path}: line {number} has no number") from None
+        if not (isfinite(time) and 0.0 <= time <= COMPUTE_MAX):
+            raise BadInputError(f"--compute {path}: line {number}: {time} is no time in seconds")
+        found.append(time)
+    if not found:
+        raise BadInputError(f"--compute {path}: has no times")
+    return tuple(found)
+
+
+def read_env_args(texts: list[str]) -> tuple[tuple[str, Any], ...]:
+    """Read arguments of an environment, given as KEY=VALUE; a value is YAML."""
+    found = dict[str, Any]()
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not (equals and key.isidentifier()):
+            raise BadInputError(f"--env-arg {text}: give KEY=VALUE, such as env_name=reach-v3")
+        found[key] = parse_value(value, f"--env-arg {key}")
+    return tuple(sorted(found.items()))
+
+
+def read_mapped(path: Path | None) -> tuple[Mapped, ...]:
+    """Read the map from an environment's observation to that of a policy; () without a file."""
+    if path is None:
+        return ()
+    found, example = list[Mapped](), "observation/state: agent_pos, or prompt: {value: go}"
+    for key, value in read_document(path, path.name).tree.items():
+        if isinstance(value, str) and value:
+            found.append(Mapped(str(key), value))
+        elif isinstance(value, Mapping) and value.keys() == {"value"}:
+            found.append(Mapped(str(key), None, value["value"]))
+        else:
+            raise BadInputError(
+                f"{path}: {key}: give the place in the environment's observation, or a value; for "
+                f"example {example}"
+            )
+    if not found:
+        raise BadInputError(f"{path}: has no keys; for example {example}")
+    return tuple(found)

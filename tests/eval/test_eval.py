@@ -1,0 +1,367 @@
+"""Evaluations: episodes over a link, their rows, tables and pages."""
+
+import json
+from hashlib import sha256
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+from cloudrc.cli.main import main
+from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.eval import results
+from cloudrc.eval.episode import as_actions, play, width_of
+from cloudrc.eval.setup import (
+    Episode,
+    EvalSetup,
+    check_setup,
+    link_at,
+    read_compute,
+    read_env_args,
+    read_mapped,
+)
+from cloudrc.policy.observation import Mapped, observe
+from tests.policy.conftest import serving, stock_like
+
+LAW = """
+import numpy as np
+
+def decide(x, speed, angle, turn):
+    return int(10.0 * angle + 2.0 * turn + 0.1 * x + 0.3 * speed > 0.0)
+
+def infer(observation):
+    return {"actions": [[decide(*observation["observation/state"])]] * 2}
+"""
+SHAKY = """
+import numpy as np
+def infer(observation):
+    x, y, speed = observation["observation/state"]
+    return {"actions": np.full((3, 1), -2.0 * y - 0.5 * speed)}
+"""
+
+
+@pytest.fixture
+def law(tmp_path):
+    def write(source=LAW):
+        path = tmp_path / "law.py"
+        path.write_text(source)
+        return str(path)
+
+    return write
+
+
+def bare(env_id, decide, seed):
+    """Play without cloudrc; return the return and the hash of the world."""
+    env, digest, total = gymnasium.make(env_id), sha256(), 0.0
+    observation, _ = env.reset(seed=seed)
+    digest.update(observation.tobytes())
+    ended = False
+    while not ended:
+        action = decide(observation)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        for value in (action, observation, float(reward)):
+            digest.update(np.asarray(value).tobytes())
+        total, ended = total + float(reward), terminated or truncated
+    env.close()
+    return total, digest.hexdigest()
+
+
+def stand(observation):
+    x, speed, angle, turn = observation
+    return np.int64(10.0 * angle + 2.0 * turn + 0.1 * x + 0.3 * speed > 0.0)
+
+
+def swing(observation):
+    _, y, speed = observation
+    return np.full((1,), -2.0 * y - 0.5 * speed).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "source", "decide"),
+    [("CartPole-v1", LAW, stand), ("Pendulum-v1", SHAKY, swing)],
+    ids=["CartPole", "Pendulum"],
+)
+def test_an_ideal_link_without_compute_time_changes_no_bit_in_a_file_or_behind_a_socket(
+    law, env_id, source, decide
+):
+    path, episode = law(source), Episode(None, "newest", 3)
+    rows = [play(episode, EvalSetup(env_id, path), {})]
+    with serving(path) as url:
+        rows.append(play(episode, EvalSetup(env_id, url), {}))
+    for row in rows:
+        assert (row["numbers"]["return"], row["records_sha256"]) == bare(env_id, decide, 3)
+
+
+def test_a_long_round_trip_makes_the_pole_fall_and_the_ages_are_those_of_the_link(law):
+    setup = EvalSetup("CartPole-v1", law(), success_at=500)
+    near, far = (play(Episode(rtt, "newest", 1), setup, {}) for rtt in (0.0, 200.0))
+    assert (near["verdict"], far["verdict"]) == ("success", "failure")
+    assert near["numbers"]["observation_age"] == 0.0
+    assert far["numbers"]["delay_measured_uplink"] == pytest.approx(0.1)
+    assert far["numbers"]["delay_asked_uplink"] == pytest.approx(0.1)
+
+
+def test_the_way_to_execute_chunks_decides(law):
+    """A chunk that simulates its own actions stands if each action is executed in its step."""
+    source = LAW + (
+        "def infer(observation):\n"
+        "    x, speed, angle, turn = observation['observation/state']\n"
+        "    return {'actions': [[decide(x, speed, angle + i * 0.0, turn)] for i in range(8)]}\n"
+    )
+    setup = EvalSetup("CartPole-v1", law(source), success_at=500)
+    rows = [play(Episode(0.0, name, 1), setup, {}) for name in ("newest", "broker")]
+    assert [row["verdict"] for row in rows] == ["success", "failure"]
+    assert rows[1]["numbers"]["observation_age"] > 0.02
+
+
+@pytest.mark.parametrize("compute", [0.06, (0.06, 0.0), ("file", "times.csv")])
+def test_the_time_for_an_answer_is_charged(law, compute, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "times.csv").write_text("answer,seconds\n1,0.06\n2,0.06\n")
+    late = play(Episode(0.0, "newest", 1), EvalSetup("CartPole-v1", law(), compute=compute), {})
+    now = play(Episode(0.0, "newest", 1), EvalSetup("CartPole-v1", law()), {})
+    assert now["numbers"]["action_age"] == 0.0
+    assert late["numbers"]["action_age"] > 0.03
+
+
+def test_a_measured_time_leaves_no_hash(law):
+    setup = EvalSetup("CartPole-v1", law(), compute=("measured", ""))
+    row = play(Episode(0.0, "newest", 1), setup, {})
+    assert row["records_sha256"] == ""
+    assert not setup.is_repeatable
+
+
+def test_the_same_episode_repeats_bit_by_bit_and_another_seed_is_another(law):
+    setup = EvalSetup("CartPole-v1", law(), link="lossy")
+    first, again, other = (play(Episode(None, "newest", s), setup, {}) for s in (1, 1, 2))
+    assert first == again
+    assert first["records_sha256"] != other["records_sha256"]
+
+
+class Task(gymnasium.Env):
+    """Tells in one step that the task is done, under the key `key`."""
+
+    dt = 0.1
+    action_space = gymnasium.spaces.Box(-1, 1, (2,))
+    observation_space = gymnasium.spaces.Dict({"eye": gymnasium.spaces.Box(0, 255, (2,), np.uint8)})
+    metadata = {"render_modes": []}  # noqa: RUF012
+    render_mode = None
+
+    def __init__(self, key="success", fails=False):
+        self.key, self.fails = key, fails
+
+    def reset(self, *, seed=None, options=None):
+        self.count = 0
+        return {"eye": np.zeros(2, np.uint8)}, {}
+
+    def step(self, action):
+        if self.fails:
+            raise RuntimeError("the simulator broke")
+        self.count += 1
+        info = {self.key: np.float64(self.count == 3)}
+        return {"eye": np.zeros(2, np.uint8)}, 1.0, self.count == 5, False, info
+
+
+gymnasium.register("Task-v0", Task)
+STILL = "def infer(observation):\n    return {'actions': [[0.0, 0.0]]}\n"
+
+
+@pytest.mark.parametrize(
+    ("key", "verdict"), [("success", "success"), ("is_success", "success"), ("other", "done")]
+)
+def test_a_success_is_what_the_info_says_in_any_step(law, key, verdict):
+    setup = EvalSetup("Task-v0", law(STILL), (("key", key),))
+    assert play(Episode(None, "newest", 1), setup, {})["verdict"] == verdict
+
+
+def test_an_episode_without_an_end_is_cut(law):
+    setup = EvalSetup("Pendulum-v1", law(SHAKY), max_steps=7)
+    assert play(Episode(None, "newest", 1), setup, {})["numbers"]["steps"] == 7
+
+
+def test_a_failing_environment_is_one_line(law):
+    setup = EvalSetup("Task-v0", law(STILL), (("fails", True),))
+    with pytest.raises(BadInputError, match="environment failed: RuntimeError: the simulator"):
+        play(Episode(None, "newest", 1), setup, {})
+
+
+def test_spaces_without_numbers_are_refused_and_integers_are_rounded():
+    with pytest.raises(BadInputError, match="Dict"):
+        width_of(gymnasium.spaces.Dict({}))
+    discrete = gymnasium.spaces.Discrete(3)
+    assert as_actions(np.array([[0.9], [2.0]]), discrete).tolist() == [1, 2]
+
+
+def test_the_map_makes_the_policys_observation(tmp_path):
+    path = tmp_path / "map.yaml"
+    path.write_text("observation/state: robot.pose\nprompt: {value: go}\nall: .\n")
+    mapped, seen = read_mapped(path), {"robot": {"pose": [1.0]}}
+    assert observe(seen, mapped) == {"observation/state": [1.0], "prompt": "go", "all": seen}
+    with pytest.raises(BadInputError, match=r"no 'eye\.left'; there are robot"):
+        observe(seen, [Mapped("x", "eye.left")])
+    for wrong in ("x: 3\n", "{}\n", "x: {path: y}\n"):
+        path.write_text(wrong)
+        with pytest.raises(BadInputError, match="for example"):
+            read_mapped(path)
+
+
+def test_without_a_map_an_observation_keeps_its_keys():
+    assert observe({"eye": 1}) == {"eye": 1}
+    assert observe([1.0]) == {"observation/state": [1.0]}
+
+
+def test_a_round_trip_keeps_the_ratio_of_the_profile():
+    link = link_at("lte", 100.0)
+    assert (link.uplink.delay_ms, link.downlink.delay_ms) == (60.0, 40.0)
+    assert (link.uplink.jitter_ms, link.uplink.loss) == (8, 0.002)
+    none, even = link_at("lte", 0.0), link_at("ideal", 80.0)
+    assert (none.uplink.delay_ms, none.uplink.jitter_ms) == (0.0, 0.0)
+    assert (even.uplink.delay_ms, even.downlink.delay_ms) == (40.0, 40.0)
+    with pytest.raises(BadInputError, match="change over time"):
+        link_at("handover", 80.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("0.02", 0.02),
+        ("0.05,0.02", (0.05, 0.02)),
+        ("measured", ("measured", "")),
+        ("a.csv", ("file", "a.csv")),
+    ],
+)
+def test_a_time_for_an_answer_is_read(text, found):
+    assert read_compute(text) == found
+
+
+@pytest.mark.parametrize("text", ["-1", "1,2,3", "nan", "inf"])
+def test_a_wrong_time_for_an_answer_is_refused(text):
+    with pytest.raises(BadInputError, match="--compute"):
+        read_compute(text)
+
+
+@pytest.mark.parametrize("content", ["", "x\n", "1\nx\n", "-1\n", "nan\n", "\xff"])
+def test_a_wrong_file_of_times_is_refused(law, tmp_path, content):
+    path = tmp_path / "times.csv"
+    path.write_bytes(content.encode("latin-1"))
+    with pytest.raises(BadInputError, match="--compute"):
+        check_setup(EvalSetup("CartPole-v1", law(), compute=("file", str(path))))
+
+
+@pytest.mark.parametrize("policy", ["no_such.py", "ws://", "http://h:1", "law"])
+def test_a_policy_that_is_none_is_refused(policy):
+    with pytest.raises(BadInputError, match="--policy"):
+        check_setup(EvalSetup("CartPole-v1", policy))
+
+
+def test_arguments_of_an_environment_are_yaml():
+    assert read_env_args(["b=[1, 2]", "a=x"]) == (("a", "x"), ("b", [1, 2]))
+    for wrong in ("a", "=1", "a b=1"):
+        with pytest.raises(BadInputError, match="--env-arg"):
+            read_env_args([wrong])
+
+
+def run(*words):
+    return main(["eval", "--env", "CartPole-v1", "--jobs", "1", *map(str, words)])
+
+
+def test_an_evaluation_has_a_table_a_page_and_rows_and_continues(law, tmp_path, capsys):
+    words = ["--policy", law(), "--rtt", "0,200", "--success-at", 500, "--out", tmp_path / "e"]
+    assert run(*words, "--seeds", 2) == 0
+    rows = (tmp_path / "e" / "rows.jsonl").read_text().splitlines()
+    assert run(*words, "--seeds", 3, "-o", "json") == 0
+    more = (tmp_path / "e" / "rows.jsonl").read_text().splitlines()
+    assert (len(rows), len(more), more[:4]) == (4, 6, rows)
+    document = json.loads(capsys.readouterr().out.partition("\n{")[2].join("{}")[:-1])
+    near, far = document["outcomes"]
+    assert (near["successes"], near["episodes"], far["successes"]) == (3, 3, 0)
+    assert near["success_interval"] == [pytest.approx(0.292, abs=0.001), 1.0]
+    page = (tmp_path / "e" / "report.html").read_text()
+    assert "<svg" in page
+    assert "3/3" in page
+    assert "http://www.w3.org" not in page.replace("http://www.w3.org/", "")
+
+
+def test_rows_of_other_code_are_refused(law, tmp_path, capsys):
+    words = ["--policy", law(), "--seeds", 1, "--out", tmp_path / "e"]
+    assert run(*words) == 0
+    path = tmp_path / "e" / "rows.jsonl"
+    row = json.loads(path.read_text())
+    path.write_text(json.dumps({**row, "code": "0" * 16}) + "\n")
+    assert run(*words) == 2
+    assert "000" in capsys.readouterr().err
+
+
+def after(count, last):
+    """Serve `LAW`'s first action `count` times, then `last`."""
+    from cloudrc.policy.codec import pack
+
+    left = iter(range(count))
+    return lambda connection, frame: (
+        pack({"actions": [[0]]}) if next(left, None) is not None else last
+    )
+
+
+@pytest.mark.parametrize(
+    ("last", "text"),
+    [
+        ("ValueError: no", "ValueError: no"),
+        (b"\x91\x01", "cannot be read"),
+        (results.json.dumps({}).encode(), "cannot be read"),
+    ],
+)
+def test_a_server_that_fails_keeps_the_rows_and_is_one_line(tmp_path, capsys, last, text):
+    with stock_like(after(60, last)) as url:
+        assert run("--policy", url, "--seeds", 50, "--out", tmp_path / "e") == 5
+    error = capsys.readouterr().err.splitlines()
+    assert text in error[-1]
+    assert "rows are kept" in error[-2]
+    assert len((tmp_path / "e" / "rows.jsonl").read_text().splitlines()) > 2
+
+
+@pytest.mark.parametrize(
+    ("answer", "text"),
+    [
+        ("[[float('nan')]]", "not finite"),
+        ("[[1, 2]]", r"shape \(1, 2\)"),
+        ("[1]", "shape"),
+        ("[[1]] * count", "after 1"),
+    ],
+)
+def test_wrong_actions_of_a_file_are_one_line(law, answer, text):
+    source = "count = 0\ndef infer(o):\n    global count\n    count += 1\n"
+    path = law(f"{source}    return {{'actions': {answer}}}\n")
+    with pytest.raises(CloudrcError, match=text) as raised:
+        play(Episode(None, "newest", 1), EvalSetup("CartPole-v1", path), {})
+    assert raised.value.exit_code == 5
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--env", "NoSuch-v0"], "--env NoSuch-v0"),
+        (["--env", "no_such_module:X-v0"], "no_such_module"),
+        (["--env-arg", "nothing=1"], "nothing"),
+        (["--executor", "no-such"], "no_such"),
+        (["--executor", "newest,"], "--executor"),
+        (["--rtt", "0,x"], "--rtt"),
+        (["--rtt", "-1"], "--rtt"),
+        (["--link", "no-such"], "no-such"),
+        (["--seeds", "0"], "--seeds"),
+        (["--map", "no-such.yaml"], "no-such.yaml"),
+    ],
+)
+def test_wrong_flags_are_one_line_and_leave_no_folder(law, tmp_path, capsys, words, text):
+    assert run("--policy", law(), "--out", tmp_path / "e", *words) == 2
+    assert text in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "e").exists()
+
+
+def test_the_policy_of_the_documentation_stands_where_the_table_says(law, tmp_path):
+    text = (Path(__file__).parents[2] / "docs" / "eval.md").read_text()
+    path = law(text.partition("```python\n")[2].partition("```")[0])
+    setup = EvalSetup("CartPole-v1", path, link="lte", success_at=500)
+    names = ("newest", "time-indexed", "broker")
+    verdicts = [play(Episode(100.0, name, 1), setup, {})["verdict"] for name in names]
+    assert verdicts == ["failure", "success", "failure"]
