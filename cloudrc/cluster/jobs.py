@@ -342,10 +342,7 @@ def _why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
     """
     found = [pod_failure(pod) for pod in pods if pod.status.phase == "Pending"]
     if not pods:  # the cluster may refuse them, for example for a quota
-        selector = f"involvedObject.uid={job.metadata.uid}"
-        events = release.request("list", "events", field_selector=selector)
-        refusals = (event.message for event in events if event.reason == "FailedCreate")
-        found = [explain_refusal(message, job.spec.template.spec) for message in refusals]
+        found = _refusals(release, job)
     name = job.metadata.name
     for why in found:
         if why and not why.startswith(UNSCHEDULED):
@@ -354,3 +351,11 @@ def _why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
                 f"{release.kubectl} delete job {name}"
             )
     return next((f"waiting: {why}" for why in found if why), "")
+
+
+def _refusals(release: Release, job: Any) -> list[str]:
+    """Return why the cluster has refused to make pods of a Job."""
+    selector = f"involvedObject.uid={job.metadata.uid}"
+    events = release.request("list", "events", field_selector=selector)
+    messages = (event.message for event in events if event.reason == "FailedCreate")
+    return [explain_refusal(message, job.spec.template.spec) for message in messages]

@@ -93,16 +93,23 @@ def model_path(kind: str, name: str, folder: Path) -> str:
         check_name(kind, name, folder)
         return name
     path = Path(os.path.realpath(folder / os.path.expanduser(name)))
-    if kind == "robot" and os.path.isdir(path):
-        if not os.path.isfile(path / ROBOT_FILE):
-            raise BadInputError(f"{path}: has no {ROBOT_FILE}, so it is no robot")
+    if kind == "robot" and _is_robot_folder(path):
         return str(path)
-    if kind == "robot" and path.name == ROBOT_FILE and os.path.isfile(path):
-        raise BadInputError(f"{path}: give its folder: {path.parent}")
     if path.suffix != ".xml" or not os.path.isfile(path):
         what = "folder or .xml file" if kind == "robot" else ".xml file"
         raise _no_file(f"no such {what}", kind, path)
     return str(path)
+
+
+def _is_robot_folder(path: Path) -> bool:
+    """Return whether `path` is a folder; raise a BadInputError if that folder is no robot."""
+    if os.path.isdir(path):
+        if not os.path.isfile(path / ROBOT_FILE):
+            raise BadInputError(f"{path}: has no {ROBOT_FILE}, so it is no robot")
+        return True
+    if path.name == ROBOT_FILE and os.path.isfile(path):
+        raise BadInputError(f"{path}: give its folder: {path.parent}")
+    return False
 
 
 def is_path(name: str) -> bool:

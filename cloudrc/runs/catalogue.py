@@ -63,20 +63,28 @@ def as_text(found: Mapping[str, Mapping[str, str]], paint: Paint = plain) -> str
 def settings() -> Iterator[str]:
     """Yield the beginning of each setting: KEY=NAME if the key takes names, else KEY=."""
     from cloudrc.config import problems
-    from cloudrc.config.overrides import KINDS as PLUGIN_KINDS
-    from cloudrc.config.overrides import parameter_names
     from cloudrc.config.schema import Experiment
 
     named = _named_keys()
     keys = {".".join(path) for path, _ in problems.leaves(Experiment) if "0" not in path}
-    for key, kind in PLUGIN_KINDS.items():
-        for name in named[f"cloud.{key}"]:
-            keys |= {f"cloud.{key}.{parameter}" for parameter in parameter_names(kind, name)}
+    keys |= _keys_in_cloud(named)
     of_robots, named["world.tuning"] = _of_robots()
     keys |= of_robots
     keys |= {key.replace("uplink", "both") for key in keys if key.startswith("link.uplink.")}
     yield from (f"{key}=" for key in sorted(keys - set(named)) if not key.endswith(".name"))
     yield from sorted(f"{key}={name}" for key, names in named.items() for name in names)
+
+
+def _keys_in_cloud(named: Mapping[str, Sequence[str]]) -> set[str]:
+    """Return the keys of the parameters of all plug-ins of cloud."""
+    from cloudrc.config.overrides import KINDS as PLUGIN_KINDS
+    from cloudrc.config.overrides import parameter_names
+
+    keys = set[str]()
+    for key, kind in PLUGIN_KINDS.items():
+        for name in named[f"cloud.{key}"]:
+            keys |= {f"cloud.{key}.{parameter}" for parameter in parameter_names(kind, name)}
+    return keys
 
 
 def _named_keys() -> dict[str, Sequence[str]]:
