@@ -10,7 +10,8 @@ places:
 
 Plug-ins are code of the user, which may raise anything and may call `sys.exit()`. `check_failure`
 decides what is a failure of a plug-in; all parts of cloudrc that call plug-ins use it. `apart`
-keeps the working folder and the standard streams of the command.
+keeps the working folder and the standard streams of the command. `find` returns a `Found`, through
+which alone a caller reaches what the file of a plug-in defines.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any, TextIO, cast
 
 from cloudrc.errors import (
@@ -64,6 +65,75 @@ METHODS = {
 """Kind of plug-in -> the method that every plug-in of this kind defines."""
 
 
+class Found:
+    """The file of a plug-in, or the object of an entry point: the guarded way to what it defines.
+
+    A file may define anything, also a `__getattr__` that fails, so no caller reads it directly.
+    """
+
+    def __init__(self, target: Any) -> None:
+        """Guard `target`, a module or the object of an entry point."""
+        self._target = target
+
+    @property
+    def doc(self) -> str:
+        """The first line of the docstring."""
+        return (inspect.getdoc(self._target) or "").partition("\n")[0]
+
+    @property
+    def builder(self) -> Any:
+        """What builds the plug-in: `build`, or the object of an entry point itself."""
+        build = self.get("build")
+        is_module = isinstance(self._target, ModuleType)
+        return self._target if build is None and not is_module else build
+
+    def get(self, name: str) -> Any:
+        """Return what is called `name`, to look at it or to call it in a guard; None if missing.
+
+        Raises:
+            BadInputError: If it cannot be read.
+        """
+        with self._refusing(name, None, "cannot be read"):
+            return getattr(self._target, name, None)
+
+    @contextmanager
+    def calling(self, name: str) -> Iterator[Callable[..., Any]]:
+        """Give the function `name` to the block, which calls it and reads what it returns.
+
+        A failure in the block is the user's: it becomes a BadInputError with file and line.
+        """
+        function = self.get(name)
+        with self._refusing(f"{name}()", function, "failed"):
+            if function is None:
+                raise ValueError("there is no such function; write one")
+            yield function
+
+    @contextmanager
+    def _refusing(self, name: str, function: Any, verb: str) -> Iterator[None]:
+        try:
+            with apart():
+                yield
+        except BaseException as error:
+            what = f"{self._place(error, function)}: {name} {verb}"
+            check_failure(error, what)
+            raise BadInputError(f"{what}: {_explain(error)}") from error
+
+    def _place(self, error: BaseException, function: Any) -> str:
+        """Return file and line: where a plug-in's own code failed, else where `function` begins."""
+        frames = [*traceback.walk_tb(error.__traceback__)]
+        file = getattr(self._target, "__file__", None) or type(self._target).__name__
+        own = [(f.f_code.co_filename, line) for f, line in frames if _is_own(f.f_globals, file)]
+        code = getattr(function, "__code__", None)
+        if not own and isinstance(code, CodeType):
+            own = [(code.co_filename, code.co_firstlineno)]
+        return f"{own[-1][0]}:{own[-1][1]}" if own else str(file)
+
+
+def _is_own(variables: dict[str, Any], file: str) -> bool:
+    """Return whether a module's global `variables` are those of a plug-in's file or one beside."""
+    return str(variables.get("__name__")).startswith(PREFIX) or variables.get("__file__") == file
+
+
 def names(kind: str) -> list[str]:
     """List the names of all plug-ins of a kind, sorted, without importing them."""
     return sorted({*_shipped(kind), *_installed(kind)})
@@ -92,10 +162,9 @@ def _packages(entry: EntryPoint) -> Iterator[str]:
 def describe(kind: str, name: str) -> str:
     """Return the first line of a plug-in's docstring, or why the plug-in cannot be loaded."""
     try:
-        target = find(kind, name)
+        return find(kind, name).doc
     except CloudrcError as error:
         return f"(not usable: {error})"
-    return (inspect.getdoc(target) or "").partition("\n")[0]
 
 
 def signature(kind: str, name: str) -> inspect.Signature:
@@ -124,8 +193,8 @@ def load(kind: str, name: str, /, **parameters: Any) -> Any:
     return plugin
 
 
-def find(kind: str, name: str, *, look: bool = True) -> Any:
-    """Import a plug-in by name or path; return its module, or the object of an entry point.
+def find(kind: str, name: str, *, look: bool = True) -> Found:
+    """Import a plug-in by name or path.
 
     With `look`, the caller only looks at what the file defines; it neither builds nor measures.
     """
@@ -134,13 +203,13 @@ def find(kind: str, name: str, *, look: bool = True) -> Any:
     with refuse_failure(f"{_one(kind)} {name!r} cannot be imported"):
         if is_path(name):
             if (module := _module_of(Path(name))) is not None:
-                return importlib.import_module(module)
-            return load_file(Path(name), look=look)
+                return Found(importlib.import_module(module))
+            return Found(load_file(Path(name), look=look))
         if name in _shipped(kind):
-            return importlib.import_module(f"{PACKAGES[kind]}.{name}")
+            return Found(importlib.import_module(f"{PACKAGES[kind]}.{name}"))
         # Last, because the search of all installed packages takes milliseconds.
         if (entry := _installed(kind).get(name)) is not None:
-            return entry.load()
+            return Found(entry.load())
     raise BadInputError(unknown_name_text(_one(kind), name, names(kind)))
 
 
@@ -278,8 +347,7 @@ def builder(kind: str, name: str, *, look: bool = True) -> Callable[..., Any]:
 
     Raise a BadInputError if there is none.
     """
-    target = find(kind, name, look=look)
-    build = getattr(target, "build", None if isinstance(target, ModuleType) else target)
+    build = find(kind, name, look=look).builder
     if not callable(build):
         raise BadInputError(
             f"{_one(kind)} {name!r} has no function build(); write one that returns the plug-in"

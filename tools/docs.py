@@ -223,7 +223,7 @@ def _plug_ins() -> str:
 
 def _parameters(kind: str, name: str) -> list[tuple[str, ...]]:
     """Return a row for each parameter of a plug-in; the first cell is empty."""
-    texts = _arguments(plugins.find(kind, name).build)
+    texts = _arguments(plugins.builder(kind, name))
     rows: list[tuple[str, ...]] = [
         ("", f"`{parameter}`", f"`{flow(default)}`", texts[parameter])
         for parameter, default in default_parameters(kind, name).items()

@@ -9,6 +9,7 @@ from collections.abc import Generator, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 
+from cloudrc import metrics
 from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.mission import TERMINATION_LOG
 from cloudrc.cli.output import (
@@ -24,7 +25,7 @@ from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import PICTURES, refuse_other_file, write_atomically
 from cloudrc.metrics.verdict import EXIT_CODES
 from cloudrc.runs import seeds, store, sweep
-from cloudrc.runs.experiment import load, refuse_seed
+from cloudrc.runs.experiment import check_mode, load, refuse_seed
 from cloudrc.runs.flight import Row
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.grid import Grid, SweepPoint, read_grid, unpack
@@ -191,6 +192,8 @@ def fly_seeds(options: argparse.Namespace) -> int:
     """
     refuse_seed(options.set)
     experiment = load(options.experiment, options.set)
+    check_mode(experiment, "virtual")
+    metrics.check(experiment.report.metrics)
     warn(experiment)
     name = experiment.name
     folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds", "latest-sweep")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
-from typing import Any
 
 import numpy as np
 
@@ -35,7 +34,7 @@ def known_hull(name: str) -> Hull | None:
 def _read_hull(name: str, robot: RobotFiles) -> Hull:
     if robot.hull_points is not None:
         file = plugins.find("hull", robot.hull_points, look=False)
-        return Hull(*(_spheres(getattr(file, part)(), robot.hull_points) for part in Hull._fields))
+        return Hull(*(_spheres(file, part) for part in Hull._fields))
     if robot.hull is not None:
         return ball(robot.hull)
     if find_spec("mujoco") is None:
@@ -48,8 +47,16 @@ def _read_hull(name: str, robot: RobotFiles) -> Hull:
     return ball(reach_of(robot.model))
 
 
-def _spheres(rows: Any, path: str) -> Spheres:
-    numbers = np.asarray(rows, dtype=np.float64)
-    if numbers.ndim != 2 or numbers.shape[1] != 4 or not np.isfinite(numbers).all():
-        raise BadInputError(f"{path}: few and dense must return rows of x, y, z, radius [m]")
-    return Spheres(numbers[:, :3], numbers[:, 3])
+def _spheres(file: plugins.Found, part: str) -> Spheres:
+    """Return the spheres of one function of a file."""
+    with file.calling(part) as function:
+        numbers = np.asarray(function(), dtype=np.float64)
+        if numbers.ndim != 2 or numbers.shape[1] != 4:
+            raise ValueError(
+                f"it returned shape {numbers.shape}, not rows of x, y, z, radius [m]: shape (n, 4)"
+            )
+        if not len(numbers):
+            raise ValueError("it returned no row; give at least one: x, y, z, radius [m]")
+        if not np.isfinite(numbers).all() or (numbers[:, 3] < 0.0).any():
+            raise ValueError("it returned a number that is not finite, or a radius below 0")
+        return Spheres(numbers[:, :3], numbers[:, 3])

@@ -247,8 +247,10 @@ def _check_fit(mission: MissionConfig, scene: Scene, robot: str) -> list[ConfigP
     def check() -> list[ConfigProblem]:
         try:
             size = hull_of(robot).dense
-        except BadInputError:  # of its model; `check_robot` says what is wrong with it
-            size = NO_SIZE.dense
+        except BadInputError:
+            if known_robot(robot).hull_points is not None:
+                raise
+            size = NO_SIZE.dense  # `check_robot` says what is wrong with its model
         if above := check_scene(scene, size, touch=mission.touched, planar=planar):
             return above
         wrong = check_mission(mission, scene, size, planar=planar)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -60,12 +59,12 @@ def find(choice: str, *, look: bool = False) -> Metric:
     if is_path and name in known:
         raise BadInputError(f"metric {choice!r}: {name} is a metric already; rename the file")
     found = plugins.find("metrics", choice, look=look)
-    unit, measure = getattr(found, "UNIT", None), getattr(found, "measure", None)
+    unit, measure = found.get("UNIT"), found.get("measure")
     if not isinstance(unit, str) or not callable(measure):
         raise BadInputError(
             f"metric {choice!r} needs a text UNIT and a function measure(flight); write both"
         )
-    return Metric(name, unit, (inspect.getdoc(found) or "").partition("\n")[0], measure)
+    return Metric(name, unit, found.doc, measure)
 
 
 def name_of(choice: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from cloudrc.errors import BadInputError, CloudrcError
@@ -32,20 +33,19 @@ class LoadedPolicy:
         if not is_path(name):
             raise BadInputError(f"policy '{name}': name a Python file, such as ./{name}.py")
         policy = find("policies", name, look=False)
-        build = getattr(policy, "build", None)
-        if build is not None and not hasattr(policy, "infer"):
-            with refuse_failure(f"policy '{name}' cannot be built"):
-                policy = build()
-        self._infer = getattr(policy, "infer", None)
-        if not callable(self._infer):
+        build, infer = policy.get("build"), policy.get("infer")
+        with refuse_failure(f"policy '{name}' cannot be built"):
+            is_built = build is not None and infer is None
+            read = partial(_attribute, build()) if is_built else policy.get
+            infer, reset, metadata = read("infer"), read("reset"), read("metadata")
+            self.metadata: dict[str, Any] = dict(metadata) if isinstance(metadata, Mapping) else {}
+        self._infer = infer
+        if not callable(infer):
             raise BadInputError(
                 f"policy '{name}' has no function infer(observation); write one that returns "
                 '{"actions": array of shape (H, A)}'
             )
-        reset = getattr(policy, "reset", None)
         self._reset: Callable[[], Any] | None = reset if callable(reset) else None
-        metadata = getattr(policy, "metadata", None)
-        self.metadata: dict[str, Any] = dict(metadata) if isinstance(metadata, Mapping) else {}
 
     @property
     def has_state(self) -> bool:
@@ -70,3 +70,7 @@ class LoadedPolicy:
             stack = stack_of(error)
             last = stack.rpartition("\n")[2]
             raise PolicyFailedError(f"{what}: {last} ({locate(error)})", stack) from error
+
+
+def _attribute(policy: Any, name: str) -> Any:
+    return getattr(policy, name, None)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from math import isfinite
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from cloudrc import plugins
 from cloudrc.config.document import KeyPath
+from cloudrc.config.load import ResolvedGuard
 from cloudrc.config.overrides import BRAKING, build_plugin, check_plugin, default_parameters
 from cloudrc.config.problems import ConfigProblem, ProblemsError
 from cloudrc.config.robot import GENERAL, RobotFiles, find_robot, parameters
@@ -18,7 +19,7 @@ from cloudrc.config.scene import steered_in
 from cloudrc.config.schema import PlugIn, World
 from cloudrc.config.shipped import ROBOT_FILE, file_of
 from cloudrc.errors import BadInputError
-from cloudrc.messages import Vector
+from cloudrc.messages import ZERO, Vector
 from cloudrc.robots.onboard._airframe import thrust_to_weight
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.onboard import Accelerator, Actuators, Direct, Onboard
@@ -28,9 +29,6 @@ from cloudrc.world.robot import STEP, Robot
 from cloudrc.world.scene import compile_model, compile_true
 from cloudrc.world.simulator import Simulator, find_site
 from cloudrc.world.watched import WatchedActuators, WatchedOnboard
-
-if TYPE_CHECKING:
-    from cloudrc.config.load import ResolvedGuard
 
 KIND = "onboard"
 """Kind of plug-in."""
@@ -42,7 +40,7 @@ class Parts(NamedTuple):
     """The parts of a robot in its scene, before they are connected."""
 
     model: Any  # compiled `MjModel` of the true robot
-    plugin: Any  # plug-in of the onboard controller
+    plugin: plugins.Found  # file of the onboard controller
     onboard: Onboard
     actuators: Actuators
     probe: str | None  # site with which the robot touches; None: any part of it touches
@@ -51,7 +49,8 @@ class Parts(NamedTuple):
 
 def check_robot(world: World) -> None:
     """Raise a BadInputError if the robot does not compile, or if it cannot move as `world` says."""
-    _make_parts(world)
+    build_robot(world, ResolvedGuard.model_validate({}))
+    advise(world, ZERO)
 
 
 def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -> Robot:
@@ -66,7 +65,8 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     faster = _accelerator(world, plugin)
     if faster is not None and faster.make is not None:
         simulator = Simulator(model, actuators, wind, probe, sensors)
-        return faster.make(simulator, onboard, guard)  # type: ignore[no-any-return]
+        with plugin.calling("accelerator"):
+            return faster.make(simulator, onboard, guard)  # type: ignore[no-any-return]
     if not isinstance(actuators, Direct):
         actuators = WatchedActuators(actuators, model.nu)
     simulator = Simulator(model, actuators, wind, probe, sensors)
@@ -98,15 +98,25 @@ def onboard_values(world: World) -> dict[str, Any]:
     return default_parameters(KIND, choice.name) | parameters(robot, world)
 
 
-def advise(world: World, gains: Vector) -> Iterator[str]:
-    """Yield the warnings of the onboard controller about a world that differs from its model.
+def advise(world: World, gains: Vector) -> tuple[str, ...]:
+    """Return the warnings of the onboard controller about a world that differs from its model.
 
     Its plug-in may have a function `advise(world, values, gains)`; `values` are its parameters.
     `gains` are the cloud's velocities per distance from the setpoint [1/s], 0 if unknown.
     """
-    plugin = plugins.find(KIND, _choose(world)[1].name)
-    if hasattr(plugin, "advise"):
-        yield from plugin.advise(world, onboard_values(world), gains)
+    return _advise(plugins.find(KIND, _choose(world)[1].name), world, gains)
+
+
+def _advise(plugin: plugins.Found, world: World, gains: Vector) -> tuple[str, ...]:
+    if plugin.get("advise") is None:
+        return ()
+    values = onboard_values(world)
+    with plugin.calling("advise") as function:
+        advice = function(world, values, gains)
+        texts = () if isinstance(advice, str) else tuple(advice)
+        if isinstance(advice, str) or not all(isinstance(text, str) for text in texts):
+            raise ValueError(f"it returned {plugins.shorten(advice)}, not texts; yield each text")
+        return texts
 
 
 def accelerator(world: World) -> Accelerator | None:
@@ -122,10 +132,14 @@ def describe_steps(world: World) -> str:
     return faster.text
 
 
-def _accelerator(world: World, plugin: Any) -> Accelerator | None:
-    if not world.is_nominal or not hasattr(plugin, "accelerator"):
+def _accelerator(world: World, plugin: plugins.Found) -> Accelerator | None:
+    if not world.is_nominal or plugin.get("accelerator") is None:
         return None
-    return plugin.accelerator()  # type: ignore[no-any-return]
+    with plugin.calling("accelerator") as function:
+        faster = function()
+        if not isinstance(faster, Accelerator | None):
+            raise ValueError(f"it returned {plugins.shorten(faster)}, no Accelerator")
+        return faster
 
 
 def _choose(world: World) -> tuple[RobotFiles, PlugIn]:
@@ -231,14 +245,14 @@ def _check_lift(world: World, where: str, model: Any) -> None:
     raise ProblemsError([ConfigProblem(("world", key), where, reason)])
 
 
-def _build_actuators(plugin: Any, model: Any, given: dict[str, Any]) -> Actuators:
+def _build_actuators(plugin: plugins.Found, model: Any, given: dict[str, Any]) -> Actuators:
     """Make the actuators; they get those parameters of the controller that they name, too."""
-    if not hasattr(plugin, "actuators"):
+    if plugin.get("actuators") is None:
         return Direct(model.nu)
-    known = inspect.signature(plugin.actuators).parameters
-    own = {name: value for name, value in given.items() if name in known}
-    with plugins.refuse_failure("actuators() of the onboard controller failed"):
-        actuators = plugin.actuators(model, STEP, **own)
+    with plugin.calling("actuators") as function:
+        known = inspect.signature(function).parameters
+        own = {name: value for name, value in given.items() if name in known}
+        actuators = function(model, STEP, **own)
         actuators.reset()
         return actuators  # type: ignore[no-any-return]
 
@@ -258,11 +272,12 @@ def _check_onboard(onboard: Onboard, size: int | None) -> None:
         onboard.reset()
 
 
-def _refuse_wind(world: World, plugin: Any) -> None:
+def _refuse_wind(world: World, plugin: plugins.Found) -> None:
     """Raise the error about a wind that would not move the robot."""
     text = f"{world.robot} has actuators without drag, so wind would not move it; "
-    if hasattr(plugin, "actuators"):
-        known = inspect.signature(plugin.actuators).parameters
+    if plugin.get("actuators") is not None:
+        with plugin.calling("actuators") as function:
+            known = inspect.signature(function).parameters
         keys = [f"world.onboard.{name}" for name in list(known)[2:]]
         text += f"set {' and '.join(keys)} above 0, or "
     raise ProblemsError([ConfigProblem(("world", "wind"), "", f"{text}leave the wind out")])

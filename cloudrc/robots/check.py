@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cloudrc.config.hull import hull_of
 from cloudrc.config.load import ResolvedGuard
 from cloudrc.config.problems import ProblemsError
 from cloudrc.config.robot import RobotFiles, find_robot
@@ -21,7 +22,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry.shapes import Surface
 from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Vector
-from cloudrc.robots.build import build_robot, check_robot, controller, onboard_values
+from cloudrc.robots.build import advise, build_robot, check_robot, controller, onboard_values
 from cloudrc.robots.onboard._airframe import thrust_to_weight
 from cloudrc.text import table
 from cloudrc.world.guard.limits import REACTION
@@ -73,7 +74,10 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
     """
     world = World.model_validate({"robot": name, "scene": SCENE})
     robot = find_robot(name)
+    if robot.hull_points is not None:
+        hull_of(name)
     try:
+        advise(world, ZERO)
         body = build_robot(world, ResolvedGuard.model_validate({}))
     except ProblemsError as error:  # no experiment has chosen the robot
         raise BadInputError("; ".join(problem.reason for problem in error.problems)) from error

@@ -1,0 +1,127 @@
+"""Each function of a user's file is called in one guard: its failure is one error with its line."""
+
+import re
+
+import pytest
+
+from cloudrc.config.load import load_experiment
+from cloudrc.errors import BadInputError
+from cloudrc.robots.build import accelerator, advise, check_robot
+from cloudrc.robots.check import check
+from tests.robots.conftest import CONTROLLER
+
+SPHERES = """
+def few():
+    return [[0.0, 0.0, 0.0, 0.3]]
+
+def dense():
+    return few()
+"""
+ONBOARD = "from cloudrc.robots.pelican.onboard import actuators, build\n"
+FUNCTIONS = {
+    "few": "hull.py",
+    "dense": "hull.py",
+    "accelerator": "own.py",
+    "advise": "own.py",
+    "actuators": "own.py",
+    "__getattr__": "own.py",
+}
+"""Function of a robot's files that cloudrc calls -> its file; `build` has tests of its own."""
+MAKE = "from cloudrc.world.onboard import Accelerator as A; return A"
+FAILURES = {
+    "raise SystemExit(0)": r"SystemExit: 0 \(sys\.exit\(\) was called\)",
+    "raise OSError('cc: no such compiler')": "OSError: cc: no such compiler",
+    "return {}['gain']": "KeyError: 'gain'",
+    "return 1 / 0": "ZeroDivisionError: division by zero",
+}
+
+
+@pytest.fixture
+def failing(own_robot):
+    """Return a function that writes a robot of which one function has another body."""
+
+    def write(function, body, arguments="*given, **named"):
+        mine = own_robot("onboard: ./own.py\nhull_points: ./hull.py")
+        sources = {"hull.py": SPHERES, "own.py": ONBOARD}
+        sources[FUNCTIONS[function]] += f"\ndef {function}({arguments}):\n    {body}\n"
+        for name, source in sources.items():
+            (mine / name).write_text(source)
+        return mine
+
+    return write
+
+
+def refusals(mine):
+    """Return the errors with which a flight and the check of the robot refuse it."""
+    texts = []
+
+    def fly():
+        check_robot(load_experiment("hover", [f"world.robot={mine}", "world.scene=empty"]).world)
+
+    for look in (fly, lambda: check(str(mine))):
+        with pytest.raises(BadInputError) as caught:
+            look()
+        assert caught.value.exit_code == 2
+        texts.append(str(caught.value))
+    return texts
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+@pytest.mark.parametrize("body", FAILURES)
+def test_a_failure_of_any_function_is_one_error_with_file_and_line(failing, function, body):
+    mine = failing(function, body)
+    file = mine / FUNCTIONS[function]
+    line = file.read_text().splitlines().index(f"    {body}") + 1
+    for text in refusals(mine):
+        assert re.search(rf"{re.escape(str(file))}:{line}: .*{FAILURES[body]}$", text)
+
+
+@pytest.mark.parametrize("function", [each for each in FUNCTIONS if each != "__getattr__"])
+def test_a_function_with_the_wrong_arguments_is_named_by_its_line(failing, function):
+    mine = failing(function, "return None", "*, missing")
+    file = mine / FUNCTIONS[function]
+    line = file.read_text().splitlines().index(f"def {function}(*, missing):") + 1
+    for text in refusals(mine):
+        assert f"{file}:{line}: {function}() failed: TypeError: " in text
+
+
+@pytest.mark.parametrize(
+    ("function", "body", "reason"),
+    [
+        ("few", "return [[0, 0, 0, 1], [0, 0]]", "inhomogeneous"),
+        ("few", "return [0, 0, 0, 0.3]", "it returned shape (4,)"),
+        ("few", "return [[0, 0, 0]]", "it returned shape (1, 3)"),
+        ("few", "import numpy; return numpy.zeros((0, 4))", "it returned no row"),
+        ("dense", "return [[0, 0, 0, float('nan')]]", "not finite"),
+        ("dense", "return [[0, 0, 0, -1]]", "a radius below 0"),
+        ("dense", "return None", "it returned shape ()"),
+        ("accelerator", "return 'C'", "it returned str 'C', no Accelerator"),
+        ("accelerator", f"{MAKE}(3, '')", "'int' object is not callable"),
+        ("accelerator", f"{MAKE}(lambda *given: given[9], '')", "IndexError"),
+        ("advise", "return 'careful'", "it returned str 'careful', not texts"),
+        ("advise", "yield 1", "not texts"),
+        ("advise", "return None", "TypeError"),
+    ],
+)
+def test_what_a_function_returns_is_checked_before_the_flight(failing, function, body, reason):
+    mine = failing(function, body)
+    for text in refusals(mine):
+        assert f"{mine / FUNCTIONS[function]}:" in text
+        assert reason in text
+
+
+def test_a_file_of_spheres_without_a_function_is_refused(own_robot):
+    mine = own_robot(f"onboard: {CONTROLLER}\nhull_points: ./hull.py")
+    (mine / "hull.py").write_text("def few():\n    return [[0, 0, 0, 0.3]]\n")
+    for text in refusals(mine):
+        assert text.endswith("hull.py: dense() failed: there is no such function; write one")
+
+
+def test_a_robot_whose_functions_hold_the_contract_is_accepted(failing, capsys):
+    mine = failing("advise", "print('looks'); yield 'careful'")
+    world = load_experiment("hover", [f"world.robot={mine}"]).world
+    assert advise(world, (1.0, 1.0, 1.0)) == ("careful",)
+    assert accelerator(world) is None
+    check_robot(world)
+    printed = capsys.readouterr()
+    assert (printed.out, "looks" in printed.err) == ("", True)
