@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 ROUNDING = 1e-9
 """Two numbers are equal if they differ by less than this share of the larger one [1]."""
+NOISE = 1e-12
+"""Two numbers are equal if they differ by less than this [any SI unit]: a number that is 0 but for
+rounding has no size of its own."""
 DECIMALS = 2, 15
 """Smallest and largest number of decimals of `format_beside`."""
 
@@ -21,14 +24,14 @@ def differences(a: ArrayLike, b: ArrayLike) -> NDArray[Any]:
     """Return b - a, any unit and shape; 0 where a and b are equal up to rounding."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     found = b - a
-    tied = np.abs(found) < ROUNDING * np.maximum(np.abs(a), np.abs(b))
+    tied = np.abs(found) < np.maximum(NOISE, ROUNDING * np.maximum(np.abs(a), np.abs(b)))
     return np.where(tied, 0.0, found)
 
 
 def exceeds(value: float, limit: float) -> bool:
     """Return whether `value` is above `limit`, both in any unit, by more than rounding."""
     above = value - limit  # in plain floats: teleop asks for each telemetry
-    return above > 0.0 and above >= ROUNDING * max(abs(value), abs(limit))
+    return above >= max(NOISE, ROUNDING * max(abs(value), abs(limit)))
 
 
 def format_beside(value: float, limit: float) -> str:

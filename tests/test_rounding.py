@@ -15,7 +15,11 @@ from cloudrc.rounding import differences, exceeds, format_beside
         (1e6, 1e6 + 1e-4, 0.0),
         (-5.0, -5.0 - 1e-9, 0.0),
         (1.0, 1.5, 0.5),
-        (0.0, 1e-300, 1e-300),  # a share of the larger number, not a fixed size
+        (0.0, 7e-14, 0.0),  # 0 has no size of which it could be a share
+        (-7e-14, 0.0, 0.0),
+        (3e-13, -3e-13, 0.0),
+        (0.0, 1e-300, 0.0),
+        (0.0, 2e-12, 2e-12),
         (0.0, 0.0, 0.0),
         (1e-12, -1e-12, -2e-12),
     ],

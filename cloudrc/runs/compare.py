@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.metrics import SHIPPED
 from cloudrc.plugins import unknown_name_text
 from cloudrc.renamed import new_key
 from cloudrc.rounding import differences
@@ -115,17 +116,24 @@ def compare(
     flight of a pair lacks a metric, the pair is left out for this metric. `units`: metric -> unit.
 
     Raises:
-        BadInputError: If all pairs are left out, or if no pair has a metric of `names`.
+        BadInputError: If all pairs are left out, or if no flight can have a metric of `names`.
     """
     flown = _valid(pairs)
-    known = sorted({n for _, a, b in flown for n in a["numbers"].keys() & b["numbers"].keys()})
-    check_names(names, known)
+    known = {n for _, a, b in flown for n in a["numbers"].keys() | b["numbers"].keys()}
+    if not {*names} <= {*units, *SHIPPED}:
+        check_names(names, known)
     chosen = names or [name for name in NUMBERS if name in known]
+    lacking = {name: _lacking(flown, name) for name in chosen}
     return {
         "pairs": len(flown),
         "left_out": len(pairs) - len(flown),
         "success": _success(flown),
-        "numbers": {name: _number(flown, name, units[name]) for name in chosen},
+        "numbers": {
+            name: _number(flown, name, units[name])
+            for name in chosen
+            if lacking[name]["left_out"] < len(flown)
+        },
+        "lacking": {name: each for name, each in lacking.items() if each["left_out"]},
         "method": METHOD,
         "flights": [
             {**label, "a": _flight(a, chosen), "b": _flight(b, chosen)} for label, a, b in pairs
@@ -148,6 +156,13 @@ def check_names(names: Iterable[str], known: Collection[str]) -> None:
     for name in names:
         if name not in known:
             raise BadInputError(f"--number: {unknown_name_text('number', name, sorted(known))}")
+
+
+def _lacking(pairs: Sequence[Pair], name: str) -> dict[str, int]:
+    """Count the flights of A and of B without a metric, and the pairs left out for this reason."""
+    lacks = [(name not in a["numbers"], name not in b["numbers"]) for _, a, b in pairs]
+    a, b = (sum(side) for side in zip(*lacks, strict=True))
+    return {"a": a, "b": b, "left_out": sum(map(any, lacks))}
 
 
 def _number(pairs: Sequence[Pair], name: str, unit: str) -> dict[str, Any]:

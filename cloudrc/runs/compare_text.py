@@ -31,6 +31,7 @@ def as_text(document: Mapping[str, Any]) -> str:
         f"of {document['of']}; pairs: {document['pairs']}"
         + (f"; {left_out} left out with {LEFT_OUT}" if left_out else ""),
         *("", table([TITLES, *body], right=(1, 2, 3)), ""),
+        *map(lacking_text, document["lacking"].items()),
         f"success: {', '.join(rates)}, p = {success['p_mcnemar']:.2g}",
         document["method"],
         *([FAILED_NOTE] if any(_failed(entry) for entry in document["numbers"].values()) else []),
@@ -50,6 +51,14 @@ def _row(name: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
         *(f"{entry['p_wilcoxon']:.2g}", f"{entry['p_sign']:.2g}"),
         *("yes" if entry["decided"] else f"no: {_needed(entry)}", unit),
     )
+
+
+def lacking_text(entry: tuple[str, Mapping[str, int]]) -> str:
+    """Say which flights lack a number: `entry` is its name and an entry of `lacking`."""
+    name, counts = entry
+    who = " and ".join(side.upper() for side in "ab" if counts[side])
+    pairs = "1 pair" if counts["left_out"] == 1 else f"{counts['left_out']} pairs"
+    return f"{who} {'have' if 'and' in who else 'has'} no {name}: {pairs} left out"
 
 
 def _failed(entry: Mapping[str, Any]) -> str:
@@ -81,7 +90,7 @@ def _answer(document: Mapping[str, Any]) -> str:
             f" {less.upper()} in {success[less]}, p = {success['p_mcnemar']:.2g}.\n"
         )
     if not document["numbers"]:
-        return f"{text}No pair has one of the default numbers; name one with --number."
+        return f"{text}No pair has one of these numbers; name another with --number."
     name, entry = next(iter(document["numbers"].items()))
     p, count = f"p = {entry['p_wilcoxon']:.2g}", entry["count"]
     if not entry["decided"]:

@@ -4,6 +4,7 @@ import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.runs.compare import Pair, compare
+from cloudrc.runs.compare_text import as_text
 from tests.runs.conftest import flown
 
 UNITS = {"iae_mean": "m", "rtt_mean": "s"}
@@ -56,6 +57,35 @@ def test_numbers_of_a_plugin_that_failed_do_not_count(code):
     assert (found["pairs"], found["left_out"]) == (1, 1)
     with pytest.raises(BadInputError, match="plug-in failed: a reason"):
         compare(pairs((ok, failed)), UNITS)
+
+
+def test_a_number_that_a_side_lacks_is_counted_and_the_others_are_compared():
+    """In the flights of B, which have plans, this number is never known."""
+    a, b = flown(rtt_mean=1.0, iae_mean=1.0), flown(iae_mean=2.0)
+    found = compare(pairs((a, b), (a, b)), UNITS, ["rtt_mean", "iae_mean"])
+    assert list(found["numbers"]) == ["iae_mean"]
+    assert found["lacking"] == {"rtt_mean": {"a": 0, "b": 2, "left_out": 2}}
+    text = as_text({"a": "x=1", "b": "x=2", "of": "steps", **found})
+    assert "B has no rtt_mean: 2 pairs left out" in text
+    found = compare(pairs((a, b), (b, a), (a, a)), UNITS, ["rtt_mean"])
+    assert found["numbers"]["rtt_mean"]["count"] == 1
+    assert found["lacking"] == {"rtt_mean": {"a": 1, "b": 1, "left_out": 2}}
+    found = compare(pairs((b, b)), UNITS, ["rtt_mean", "min_clearance"])
+    assert (found["numbers"], list(found["lacking"])) == ({}, ["rtt_mean", "min_clearance"])
+    text = as_text({"a": "x=1", "b": "x=2", "of": "steps", **found})
+    assert "A and B have no rtt_mean: 1 pair left out" in text
+
+
+def test_a_default_number_that_one_side_lacks_is_told():
+    a, b = flown(prediction_error_rms=1.0, iae_mean=1.0), flown(iae_mean=2.0)
+    units = {**UNITS, "prediction_error_rms": "m"}
+    assert list(compare(pairs((a, b)), units)["lacking"]) == ["prediction_error_rms"]
+
+
+def test_numbers_that_are_0_but_for_rounding_are_equal():
+    both = [(flown(iae_mean=0.0), flown(iae_mean=7e-14)) for _ in range(8)]
+    found = compare(pairs(*both), UNITS)["numbers"]["iae_mean"]
+    assert (found["difference"], found["decided"]) == (0.0, False)
 
 
 def test_numbers_that_differ_by_rounding_are_equal():
