@@ -56,6 +56,10 @@ PACKAGES = {
 cloudrc's metrics are functions, models of motion are files of robots, policies those of users."""
 SHOWN_MAX = 60
 """Largest length of a wrong value's representation in a message [characters]."""
+LARGEST = 1e30
+"""Largest size of a number that a plug-in returns, and largest length of several [any unit].
+Metrics square numbers, and the page of the report stores some with single precision: a much larger
+number overflows there."""
 STACK_MAX = 4000
 """Largest length of a failure's stack in the recording [characters]."""
 METHODS = {

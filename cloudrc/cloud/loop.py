@@ -17,9 +17,8 @@ It needs no clock synchronisation.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from copy import deepcopy
-from itertools import chain
 from math import nan
 from typing import Any
 
@@ -27,7 +26,7 @@ from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.plan_log import PlanLog
 from cloudrc.cloud.predictors import Predictor
-from cloudrc.cloud.results import check_estimate, check_output, is_fit, refuse, to_vector
+from cloudrc.cloud.results import check_estimate, check_output, refuse, to_vector
 from cloudrc.errors import ControllerLostError, describe_error
 from cloudrc.messages import (
     NEVER_NS,
@@ -322,25 +321,16 @@ class ControlLoop:
             controller, later, most = deepcopy(self._controller), path_of(setpoint), PLANNED_MAX
             for k in range(1, self._planned + 1):
                 plug_in = "predictor"
-                state = model.step(velocity, PLAN_STEP)
-                if type(state) is not Odometry:
-                    state = check_estimate(state)
-                position = to_vector(state.position, "position")
+                state = check_estimate(model.step(velocity, PLAN_STEP))
                 goal = later(now_ns + k * PLAN_STEP_NS)
                 plug_in = "controller"
                 output = controller.update(state, goal, PLAN_STEP)
                 velocity = x, y, z = to_vector(output.velocity, "planned velocity")
                 if not (abs(x) <= most and abs(y) <= most and abs(z) <= most):
-                    if not is_fit(*velocity):
-                        plug_in = "predictor"
-                        check_estimate(state)  # a wrong state is the model's failure
-                        plug_in = "controller"
-                        refuse("planned velocity", *velocity)
+                    refuse("planned velocity", *velocity)
                     break
                 plan.append(as_planned(velocity))
-                positions.append(position)
-            plug_in = "predictor"
-            _refuse_positions(positions)
+                positions.append(state.position)
         except BaseException as error:
             self._note(plug_in, error, "cloud sends this command without a plan")
             return [], []
@@ -377,10 +367,3 @@ class ControlLoop:
             what = f"the {kind} failed ({describe_error(error)}{where})"
             text = f"{what}; {instead or INSTEAD[kind]}; fix cloud.{kind} or choose another"
             self.faults.append(Fault(self._now_ns, code, text, stack_of(error)))
-
-
-def _refuse_positions(positions: Sequence[Vector]) -> None:
-    """Raise an InvalidResultError if a planned position [m] is not finite or too large."""
-    if not is_fit(*chain.from_iterable(positions)):
-        for position in positions:
-            refuse("planned position", *position)

@@ -13,16 +13,13 @@ from typing import Any, NoReturn
 
 from cloudrc.cloud.controllers import ControlOutput
 from cloudrc.messages import Odometry, Quaternion, Vector
-from cloudrc.plugins import InvalidResultError, shorten, to_number
+from cloudrc.plugins import LARGEST, InvalidResultError, shorten, to_number
 
 SQUARE_TOLERANCE = 0.01
 """Largest deviation from 1 of an orientation's squared length [1]. A smaller one, such as that of a
 first-order integration, is scaled away. ROS's tf2 accepts the same deviation."""
 SQUARE_ROUNDING = 1e-9
 """Deviation from 1 of an orientation's squared length that comes from rounding [1]."""
-LARGEST = 1e30
-"""Largest length of the numbers of a result [any unit]. Metrics square numbers, and the page of the
-report stores some with single precision: a much larger number overflows there."""
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 

@@ -116,10 +116,11 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Numb
             if value is None:
                 continue
             number = plugins.to_number(value, "value")
-            if isfinite(number):
+            if abs(number) <= plugins.LARGEST:  # False for NaN
                 numbers[name] = Number(number, metric.unit, metric.meaning)
             else:
-                notes.append(f"{METRIC_NOTE}{name} gave {number}: left out")
+                beyond = f", beyond {plugins.LARGEST:g}" if isfinite(number) else ""
+                notes.append(f"{METRIC_NOTE}{name} gave {number}{beyond}: left out")
         except BaseException as error:
             plugins.check_failure(error, f"{METRIC_NOTE}{name}")
             notes.append(f"{METRIC_NOTE}{name} failed: {describe_error(error)}")

@@ -123,6 +123,9 @@ class Following(Controller):
 
 
 NOWHERE = Odometry(0, (nan, 0.0, 0.0), UPRIGHT, ZERO, ZERO)
+BOOLEAN = Odometry(0, ZERO, UPRIGHT, (True, 0.0, 0.0), ZERO)
+TWICE = Odometry(0, ZERO, (2.0, 0.0, 0.0, 0.0), ZERO, ZERO)
+NO_LENGTH = Odometry(0, ZERO, (0.0, 0.0, 0.0, 0.0), ZERO, ZERO)
 
 
 class Impatient(Integrating):
@@ -138,7 +141,10 @@ class Impatient(Integrating):
         (Modelled(), Impatient(), "controller", "in update"),
         (Modelled(), Breaking(nan), "controller", "its planned velocity is (1, nan, 0)"),
         (Modelled(), Breaking("1"), "controller", "its planned velocity is str '1'"),
-        (Lost(NOWHERE), Integrating(), "predictor", "its planned position is (nan, 0, 0)"),
+        (Lost(NOWHERE), Integrating(), "predictor", "its position is (nan, 0, 0)"),
+        (Lost(BOOLEAN), Integrating(), "predictor", "its velocity is bool True"),
+        (Lost(TWICE), Integrating(), "predictor", "has the length 2, not 1"),
+        (Lost(NO_LENGTH), Integrating(), "predictor", "has the length 0, not 1"),
         (Lost(None), Following(), "predictor", "its result is NoneType None, not 5 values"),
         (Lost(NOWHERE), Following(), "predictor", "its position is (nan, 0, 0)"),
     ],

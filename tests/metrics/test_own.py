@@ -30,6 +30,7 @@ FAILING = '"""A metric."""\nUNIT = "1"\ndef measure(flight):\n    '
 BODIES = {
     "overshoot": OVERSHOOT,
     "raises": f"{FAILING}raise RuntimeError('no such\\ncolumn')",
+    "huge": f"{FAILING}return -1e31",
     "infinite": f"{FAILING}return float('inf')",
     "exits": f"{FAILING}raise SystemExit(0)",
 }
@@ -56,7 +57,7 @@ def report_of(run):
 
 
 def test_a_later_report_measures_a_file_only_if_named(folder):
-    run, names = folder / "run", ("exits", "infinite", "overshoot", "raises")
+    run, names = folder / "run", ("exits", "huge", "infinite", "overshoot", "raises")
     asked = f"report.metrics=[{', '.join(f'mine/{name}.py' for name in names)}]"
     assert main(["run", *SHORT, "--set", asked, "--out", "run"]) == 0
     first = report_of(run)
@@ -64,6 +65,7 @@ def test_a_later_report_measures_a_file_only_if_named(folder):
     assert (overshoot["value"] >= 0.0, overshoot["unit"]) == (True, "m")
     assert first["notes"] == [
         "metric exits failed: SystemExit: 0 (sys.exit() was called)",
+        "metric huge gave -1e+31, beyond 1e+30: left out",
         "metric infinite gave inf: left out",
         "metric raises failed: RuntimeError: no such column",
     ]
