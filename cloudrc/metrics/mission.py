@@ -189,7 +189,9 @@ def _steady_error(flight: Flight, axis: int) -> float | None:
         return None
     begin_ns = flight.end_ns - RESTING_NS
     settling_ns = begin_ns - SETTLING_NS
-    still = control["setpoint"][control["stamp_ns"] >= settling_ns]
+    # In the period in which the mission ends, the setpoint is the place where the robot stays.
+    during = (control["stamp_ns"] >= settling_ns) & (control["waypoint"] >= 0)
+    still = control["setpoint"][during]
     touched = (force["force"][force["stamp_ns"] >= settling_ns] > 0).any()
     too_short = settling_ns < flight.start_ns
     if too_short or touched or not len(still) or (still != still[-1]).any():

@@ -24,6 +24,7 @@ from cloudrc.records import (
     TelemetrySent,
 )
 from tests.metrics.conftest import (
+    END,
     ONE_PIPE,
     OPEN_AIR,
     PELICAN,
@@ -149,6 +150,19 @@ def resting():
     log = flown(lambda t: (0.97, 0.0, 1.001))
     log.change(Control, lambda n, c: c._replace(setpoint=(1.0, 0.0, 1.0)))
     log.change(MissionEvent, lambda n, e: None if e.event == "done" else e)
+    return log.flight()
+
+
+def resting_until_done():
+    """The mission ends in a control period, which already has the setpoint of the stay after it."""
+    log = flown(lambda t: (0.97, 0.0, 1.001))
+
+    def stay(n, control):
+        over = {"setpoint": (0.9, 0.0, 1.0), "waypoint": -1} if control.stamp_ns >= END else {}
+        return control._replace(setpoint=(1.0, 0.0, 1.0))._replace(**over)
+
+    log.change(Control, stay)
+    log.change(MissionEvent, lambda n, e: e._replace(stamp_ns=END) if e.event == "done" else e)
     return log.flight()
 
 
@@ -281,6 +295,11 @@ NUMBERS = {
         "steady_error_y": approx(0.0),
         "steady_error_z": approx(0.001),
         "duration": approx(15.0),  # without an end it lasts as its recording
+    },
+    resting_until_done: {
+        "steady_error_x": approx(0.03),
+        "steady_error_y": approx(0.0),
+        "steady_error_z": approx(0.001),
     },
     slow_machine: {
         "world_slip": approx(0.5),
