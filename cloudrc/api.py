@@ -14,7 +14,9 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from operator import index
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -89,7 +91,8 @@ class SweepTable:
     """The flights of a sweep, one per row, in the order of the grid.
 
     `table[column]` is a numpy array: an axis, `seed`, `verdict`, `failures` or a metric. A metric
-    that a flight does not have is nan.
+    that a flight does not have is nan. An axis of numbers is float64, and None in it is nan; an
+    axis of numbers and other values is text.
     """
 
     columns: dict[str, NDArray[Any]]  # name -> values, shape (n,)
@@ -241,6 +244,7 @@ def sweep(
     """
     from cloudrc.runs.grid import read_grid
 
+    jobs = _count(jobs, "jobs")
     with TemporaryDirectory(prefix="cloudrc-sweep-") as temporary:
         path = Path(temporary, "sweep.yaml")
         if isinstance(grid, Mapping):
@@ -268,8 +272,9 @@ def _fly_sweep(grid: Grid, out: Path | None, temporary: Path, jobs: int) -> Swee
         raise _as_exception(stopped)
     columns = store.columns_of([rows[key] for key in grid.flights], grid)
     units = store.read_summary(folder)["units"]
+    numbers = {name for name in grid.axes if {*map(type, columns[name])} <= store.NUMBERS}
     arrays = {
-        name: np.array(values, dtype=float if None in values else None)
+        name: np.array(values, dtype=float if name in numbers or None in values else None)
         for name, values in columns.items()
     }
     return SweepTable(arrays, {name: units[name] for name in arrays if name in units}, out)
@@ -301,6 +306,7 @@ def compare(
     """
     from cloudrc.runs import compare as pairs
 
+    seeds, jobs = _count(seeds, "seeds"), _count(jobs, "jobs")
     first, second = (pairs.split_settings(x) if isinstance(x, str) else _texts(x) for x in (a, b))
     sides, units = pairs.load_sides(of, _texts(settings or {}), first, second, numbers)
     for text in advice_on(*sides):
@@ -310,7 +316,7 @@ def compare(
         raise _as_exception(stopped)
     document = pairs.compare(flown, units, numbers)
     if not document["numbers"]:
-        raise BadInputError("no pair has one of the default numbers; name one with numbers=[...]")
+        raise BadInputError("no pair has one of the numbers; name another with numbers=[...]")
     name, entry = next(iter(document["numbers"].items()))
     return Comparison(name, entry["p_wilcoxon"], entry["difference"], document)
 
@@ -342,6 +348,7 @@ def margin(
     """
     from cloudrc.runs.trials import QUESTIONS, Asked, Trials, describe, questions
 
+    seeds = _count(seeds, "seeds")
     trials = Trials(Asked(key, of, _texts(settings or {}), seeds, largest, resolution))
     asked = questions(trials)
     found = {name: trials.search(name) if name in asked else None for name in QUESTIONS}
@@ -413,6 +420,14 @@ def verify(
 def _as_exception(stopped: CloudrcError) -> BaseException:
     """Return the exception for work that ended early."""
     return KeyboardInterrupt() if isinstance(stopped, InterruptedRunError) else stopped
+
+
+def _count(value: Any, name: str) -> int:
+    """Return the argument `name` as a number of seeds or processes; raise a BadInputError."""
+    with suppress(TypeError):
+        if not isinstance(value, bool) and (count := index(value)) >= 1:
+            return count
+    raise BadInputError(f"{name}={value!r}: give a whole number, 1 or more")
 
 
 def _texts(settings: Mapping[str, Any]) -> list[str]:

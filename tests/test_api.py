@@ -125,6 +125,42 @@ def test_a_wrong_sweep_is_refused_and_writes_nothing(grid, text, tmp_path, monke
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("wrong", [[1, 2, 3], 2.5, 2.0, 0, -1, "3", None, True])
+def test_a_wrong_number_of_seeds_or_processes_is_named(wrong):
+    sides = "cloud.predictor=none", "cloud.predictor=last_sample"
+    for call, name in (
+        (lambda: cloudrc.compare(*sides, seeds=wrong), "seeds"),
+        (lambda: cloudrc.compare(*sides, jobs=wrong), "jobs"),
+        (lambda: cloudrc.margin("link.both.delay_ms", seeds=wrong), "seeds"),
+        (lambda: cloudrc.sweep(GRID, jobs=wrong), "jobs"),
+    ):
+        with pytest.raises(BadInputError, match=rf"^{name}=.*: give a whole number, 1 or more$"):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("axis", "kind", "values"),
+    [
+        ([0, 12.5, 20], np.float64, [0.0, 12.5, 20.0]),
+        ([np.float32(12.5), np.int64(3)], np.float64, [12.5, 3.0]),
+        ([0, 20], np.float64, [0.0, 20.0]),
+    ],
+)
+def test_an_axis_of_numbers_is_float64(axis, kind, values):
+    table = cloudrc.sweep(
+        {"experiment": "steps", "set": SHORT, "grid": {"link.both.delay_ms": axis}}
+    )
+    column = table["link.both.delay_ms"]
+    assert (column.dtype, column.tolist()) == (kind, values)
+
+
+def test_none_in_an_axis_of_numbers_is_nan_and_texts_stay_texts():
+    grid = {"criteria.settle_m": [None, 0.5], "cloud.predictor": ["last_sample"]}
+    table = cloudrc.sweep({"experiment": "steps", "set": SHORT, "grid": grid})
+    assert np.array_equal(table["criteria.settle_m"], [np.nan, 0.5], equal_nan=True)
+    assert table["cloud.predictor"].tolist() == ["last_sample"] * 2
+
+
 def test_a_comparison_has_a_p_value_and_all_of_the_commands_document():
     found = cloudrc.compare(
         "cloud.predictor=last_sample", {"cloud.predictor": "kalman"}, settings=SHORT, seeds=6

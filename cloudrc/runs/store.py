@@ -32,6 +32,8 @@ from cloudrc.version import __version__
 
 FILE, SUMMARY = "sweep.yaml", "sweep.json"
 TABLE, PARQUET = "table.csv", "table.parquet"
+NUMBERS = {int, float, type(None)}
+"""Types of the values of an axis of numbers; None is the value null."""
 LINE_MAX = 1 << 20
 """Largest length of a row [bytes]."""
 SUMMARY_MAX = 1 << 26
@@ -203,7 +205,7 @@ def as_csv(columns: Mapping[str, Sequence[Any]], unit_of: Mapping[str, str]) -> 
 
 
 def columns_of(rows: list[Row], grid: Grid) -> dict[str, list[Any]]:
-    """Return the columns of a sweep's tables; an axis with values of several types becomes text."""
+    """Return the columns of a sweep's tables; an axis of numbers and other values becomes text."""
 
     def column(name: str) -> list[Any]:
         return [row.get(name, "") for row in rows]
@@ -223,8 +225,9 @@ def columns_of(rows: list[Row], grid: Grid) -> dict[str, list[Any]]:
 
 
 def _axis_column(values: list[Any]) -> list[Any]:
-    """Return the column of an axis; values of several types, or lists, become text."""
-    plain = len({*map(type, values)}) == 1 and isinstance(values[0], str | int | float)
+    """Return the column of an axis: texts, truth values, or numbers and None; else all as text."""
+    types = {*map(type, values)}
+    plain = types <= NUMBERS or types in ({str}, {bool})
     return values if plain else [*map(as_text, values)]
 
 
