@@ -12,6 +12,7 @@ from PIL import Image
 
 from cloudrc.cli import console
 from cloudrc.config.load import load_experiment
+from cloudrc.console import in_pod
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import KEYS, PANEL_WIDTH, Page, _with_gaps
 from cloudrc.console.steering import Steering
@@ -282,7 +283,7 @@ def test_in_a_pod_a_slider_requests_a_change_and_returns(monkeypatch, capsys, tm
     assert capsys.readouterr().out == "link set uplink.delay_ms=120\n"
     assert "requested; only 'cloudrc console --cluster' carries it out" in link.note
     assert link.read()["uplink"] == {"delay_ms": 120.0}
-    monkeypatch.setattr(console, "OWN_S", 0.0)
+    monkeypatch.setattr(in_pod, "OWN_S", 0.0)
     assert link.read()["uplink"] == {"delay_ms": 40}
 
 
