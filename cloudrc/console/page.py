@@ -210,20 +210,10 @@ class Page:
         if feed.status is None:
             return "**waiting for the robot**"
         silence, age = feed.silence(now), feed.command_age(now)
-        mission = state.get("mission")
-        doing = "none"
-        is_free = not mission or mission["by_hand"] or mission["state"] == "held"
-        if is_free and self._steering.velocity(now) != ZERO:
-            doing = "driving"
-        elif is_drive(mission):
-            doing = "drive, waits for keys"
-        elif mission:
-            reached = f"{len(mission['reached'])} of {mission['waypoints']} waypoints"
-            doing = f"{mission['name'] or mission['id']}, {mission['state']}, {reached}"
         lines = [
             f"**{feed.status.guard.name}**: {feed.status.cause.words}",
             f"Last command: {'none' if age == inf else f'{age:.2f} s ago'}",
-            f"Mission: {doing}",
+            f"Mission: {self._describe_mission(now)}",
         ]
         if shown := describe_sensors((state.get("seen") or {}).get("sensors", ())):
             lines.append(f"Sensors: {shown}")
@@ -235,6 +225,18 @@ class Page:
         elif seen := state.get("seen"):
             lines.append(seen["next_step"])
         return "  \n".join(lines).replace("cloudrc mission ", "")  # buttons have the verbs' names
+
+    def _describe_mission(self, now: float) -> str:
+        mission = self._steering.state.get("mission")
+        is_free = not mission or mission["by_hand"] or mission["state"] == "held"
+        if is_free and self._steering.velocity(now) != ZERO:
+            return "driving"
+        if is_drive(mission):
+            return "drive, waits for keys"
+        if not mission:
+            return "none"
+        reached = f"{len(mission['reached'])} of {mission['waypoints']} waypoints"
+        return f"{mission['name'] or mission['id']}, {mission['state']}, {reached}"
 
     def _follow_link(self, now: float) -> None:
         """Show the link's present state on the sliders, unless somebody is moving a slider."""

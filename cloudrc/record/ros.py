@@ -85,14 +85,23 @@ def converter(ros_type: str, text: str) -> Callable[[bytes], bytes] | None:
         found = get_types_from_msg(text, ros_type)
     except Exception:  # rosbags' parser may raise anything on a foreign text
         return None
-    known = STORE.fielddefs
-    others = {name for name in found if name not in known or known[name][1] != found[name][1]}
+    others = _other_types(found)
     if not others:
         return _as_they_are
-    fields = [field for field in found[ros_type][1] if field in known[ros_type][1]]
-    if others != {ros_type} or ros_type not in _OWN or fields != known[ros_type][1]:
-        return None
-    return _without_other_fields(ros_type, found)
+    is_longer = others == {ros_type} and _has_all_fields(ros_type, found)
+    return _without_other_fields(ros_type, found) if is_longer and ros_type in _OWN else None
+
+
+def _other_types(found: Any) -> set[str]:
+    """Return the names of the types in `found` that have another layout here."""
+    known = {name: fields for name, (_, fields) in STORE.fielddefs.items()}
+    return {name for name, (_, fields) in found.items() if known.get(name) != fields}
+
+
+def _has_all_fields(ros_type: str, found: Any) -> bool:
+    """Return whether the type in `found` has all fields of the type here, in their order."""
+    known = STORE.fielddefs[ros_type][1]
+    return [field for field in found[ros_type][1] if field in known] == known
 
 
 def _as_they_are(data: bytes) -> bytes:

@@ -21,6 +21,7 @@ from cloudrc.messages import (
     Command,
     Datagram,
     GuardState,
+    Odometry,
     OperatorRequest,
     Request,
     Start,
@@ -192,13 +193,33 @@ class WorldEndpoint(TunnelEnd):
 
     def _sample(self, now_ns: int) -> None:
         """Record the true state and new guard changes and contacts; send telemetry if it is due."""
-        simulator, guard, records = self.robot.simulator, self.robot.guard, self._records
+        truth, shown = self._record_state(now_ns)
+        self._record_events(now_ns)
+        if now_ns >= self._odometry_ns:
+            self._odometry_ns += self._odometry_period_ns
+            if epoch := self._session.epoch:
+                self._send_telemetry(now_ns, epoch, truth, shown)
+        if now_ns >= self._count_ns:
+            self._record_counts(now_ns)
+        self._sample_ns += self._sample_period_ns
+
+    def _record_state(self, now_ns: int) -> tuple[Odometry, tuple[float, ...]]:
+        """Record true state, contact force and sensors; return the state and the sensors' values.
+
+        The values are those of the robot's own sensors, each in its unit.
+        """
+        simulator, records = self.robot.simulator, self._records
         truth, shown = simulator.truth(now_ns), simulator.read_sensors()
-        records.append(_new(GroundTruth, (now_ns, truth, guard.reference)))
+        records.append(_new(GroundTruth, (now_ns, truth, self.robot.guard.reference)))
         if (force := simulator.take_contact_force()) is not None:
             records.append(_new(ContactForce, (now_ns, *force)))
         for (name, unit, _), value in zip(simulator.sensors, shown, strict=True):
             records.append(_new(SensorRead, (now_ns, name, unit, value)))
+        return truth, shown
+
+    def _record_events(self, now_ns: int) -> None:
+        """Record a failure of the onboard controller, changes of the guard's state and contacts."""
+        simulator, guard, records = self.robot.simulator, self.robot.guard, self._records
         if (failure := self.robot.failure) is not None:
             text = f"{failure}; the guard stopped the robot; fix the file"
             self._tell("onboard_failed", text, failure.stamp_ns, failure.trace)
@@ -209,32 +230,31 @@ class WorldEndpoint(TunnelEnd):
             for touch in simulator.take_contacts():
                 records.append(touch._replace(stamp_ns=now_ns))
                 self._note_touch(touch)
-        is_due = now_ns >= self._odometry_ns
-        if is_due:
-            self._odometry_ns += self._odometry_period_ns
-        if is_due and (epoch := self._session.epoch):
-            known = (
-                now_ns,
-                self._sensors.measure(truth),
-                shown,
-                self._echo_stamp_ns,
-                now_ns - self._applied_ns if self._applied_ns >= 0 else 0,
-                self._slip_ns,
-                self._number,
-                guard.state,
-                self._obstacles,
-                self._touch_speed,
-                self._mission_id,
-                self._reached,
-                guard.cause,
-            )
-            telemetry = _new(Telemetry, known)
-            counter = self._session.next_counter(TELEMETRY)
-            self._send_message(TELEMETRY, telemetry)
-            records.append(_new(TelemetrySent, (now_ns, epoch, counter, telemetry)))
-        if now_ns >= self._count_ns:
-            self._record_counts(now_ns)
-        self._sample_ns += self._sample_period_ns
+
+    def _send_telemetry(
+        self, now_ns: int, epoch: int, truth: Odometry, shown: tuple[float, ...]
+    ) -> None:
+        """Send telemetry with the measured `truth` and the sensors' values `shown`; record it."""
+        guard = self.robot.guard
+        known = (
+            now_ns,
+            self._sensors.measure(truth),
+            shown,
+            self._echo_stamp_ns,
+            now_ns - self._applied_ns if self._applied_ns >= 0 else 0,
+            self._slip_ns,
+            self._number,
+            guard.state,
+            self._obstacles,
+            self._touch_speed,
+            self._mission_id,
+            self._reached,
+            guard.cause,
+        )
+        telemetry = _new(Telemetry, known)
+        counter = self._session.next_counter(TELEMETRY)
+        self._send_message(TELEMETRY, telemetry)
+        self._records.append(_new(TelemetrySent, (now_ns, epoch, counter, telemetry)))
 
     def _record_counts(self, now_ns: int) -> None:
         """Record the counters of world and guard; report a slow simulation once per session."""
