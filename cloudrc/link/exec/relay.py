@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import os
 import select
+import time
 from array import array
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
-from time import monotonic_ns
 
 from cloudrc.link.exec.namespace import MTU
 from cloudrc.link.library import KIND
@@ -86,11 +86,11 @@ class TunRelay:
         packets = self._packets
         if packets:
             due_ns = packets[0][0]
-            timeout = min(timeout, max(0.0, (due_ns - SPIN_NS - monotonic_ns()) * 1e-9))
+            timeout = min(timeout, max(0.0, (due_ns - SPIN_NS - time.monotonic_ns()) * 1e-9))
         readable, _, _ = select.select(self._sources, (), (), timeout)
-        if packets and packets[0][0] - monotonic_ns() <= SPIN_NS:
+        if packets and packets[0][0] - time.monotonic_ns() <= SPIN_NS:
             due_ns = packets[0][0]
-            while monotonic_ns() < due_ns:
+            while time.monotonic_ns() < due_ns:
                 pass
             self._release()
         for source in readable:
@@ -106,7 +106,7 @@ class TunRelay:
                 data = read(source, MTU)
             except OSError:  # no packet waits
                 return
-            now_ns, number, size = monotonic_ns(), way.received, len(data)
+            now_ns, number, size = time.monotonic_ns(), way.received, len(data)
             way.received += 1
             # The model counts the bytes of UDP payload, and adds the headers itself.
             arrivals = send(1, KIND, number, size - HEADER_BYTES, now_ns)
@@ -134,7 +134,7 @@ class TunRelay:
         """Write up to `BATCH` packets that are due."""
         packets, write = self._packets, os.write
         for _ in range(BATCH):
-            now_ns = monotonic_ns()
+            now_ns = time.monotonic_ns()
             if not packets or packets[0][0] > now_ns:
                 return
             due_ns, _, way, number, data = heappop(packets)

@@ -2,6 +2,7 @@
 
 import os
 import socket
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ def clock(monkeypatch):
         time["now"] += 1_000
         return time["now"]
 
-    monkeypatch.setattr(module, "monotonic_ns", read)
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic_ns=read))
     return time
 
 
