@@ -111,7 +111,7 @@ mutants: $(VENV)/dev ## mutate guard, tunnel and store, list the mutants that te
 # kind, helm and kubectl.
 NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults.json \
 	search-adversarial.json $(ROBOTS:%=search-%.json) search-random.json \
-	link.json mujoco-oldest.json mujoco-newest.json) \
+	link.json mujoco-oldest.json mujoco-newest.json gym-sb3.json) \
 	mutants night-tun night-netem e2e-full $(EVIDENCE)/index.md
 
 nightly: export CLOUDRC_EVIDENCE = $(CURDIR)/$(EVIDENCE)
@@ -147,6 +147,12 @@ $(EVIDENCE)/mujoco-%.json:
 	rm -rf build/mujoco-$* && $(PYTHON) -m venv build/mujoco-$*
 	build/mujoco-$*/bin/pip install --quiet '.[world,record,report]' '$(MUJOCO)'
 	build/mujoco-$*/bin/cloudrc run paper --mode virtual --out build/mujoco-$*/run -o json > $@
+
+# A policy of stable-baselines3 learns through a link.
+$(EVIDENCE)/gym-sb3.json:
+	rm -rf build/sb3 && $(PYTHON) -m venv build/sb3
+	build/sb3/bin/pip install --quiet '.[gym]' stable-baselines3
+	build/sb3/bin/python -m tools.train > $@
 
 $(EVIDENCE)/index.md:
 	$(bin)/python -m tools.evidence $(EVIDENCE)
