@@ -79,7 +79,8 @@ def _waypoints_reached(flight: Flight) -> float | None:
 
 def _final_error(flight: Flight) -> float | None:
     """Measure how far the robot was from the last setpoint of a file at the mission's end [m]."""
-    if flight.mission.setpoints is None or flight.ending is None:
+    driven = "driving" in flight.during("/mission")["event"]  # the file has what was driven
+    if flight.mission.setpoints is None or flight.ending is None or driven:
         return None
     end_ns, event, _ = flight.ending
     control = flight.control

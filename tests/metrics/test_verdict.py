@@ -140,6 +140,15 @@ def test_a_robot_far_from_the_last_setpoint_of_a_file_fails(last, settle, found,
         assert f"{last - 10.0:.2f} m from the last one" in verdict.failures[0].text
 
 
+def test_a_drive_by_hand_may_end_anywhere():
+    """Its mission names the file of its setpoints, for a repetition."""
+    log = good()
+    log.cloud.append(MissionEvent(at(1), "driving", -1, "driven by hand"))
+    log.change(Control, lambda n, c: c._replace(setpoint=(14.0, 0.0, 1.0), waypoint=0))
+    flight = log.flight(mission=MissionConfig(setpoints="drive.csv"), touch="board")
+    assert (codes(judged(flight)), SHIPPED["final_error"].measure(flight)) == ([], None)
+
+
 def test_setpoints_that_were_not_flown_to_their_end_fail_for_that_reason_alone():
     log = ended("timed_out")
     log.change(Control, lambda n, c: c._replace(setpoint=(14.0, 0.0, 1.0), waypoint=0))
