@@ -12,9 +12,9 @@ SILENT = 3.0
 
 
 @contextmanager
-def telling_if_slow(text: str) -> Iterator[None]:
-    """Log `text` if the block takes longer than `SILENT`, while it runs."""
-    timer = threading.Timer(SILENT, logging.getLogger("cloudrc").warning, ("%s", text))
+def telling_if_slow(text: str, silent: float = SILENT) -> Iterator[None]:
+    """Log `text` if the block takes longer than `silent` [s], while it runs."""
+    timer = threading.Timer(silent, logging.getLogger("cloudrc").warning, ("%s", text))
     timer.daemon = True
     timer.start()
     try:

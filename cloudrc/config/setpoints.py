@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -10,7 +10,14 @@ import numpy as np
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import Fence
-from cloudrc.link.traces import read_lines, read_rows
+from cloudrc.link.traces import (
+    Row,
+    is_rising,
+    read_columns,
+    read_lines,
+    read_rows,
+    telling_rows,
+)
 from cloudrc.messages import Vector
 
 COLUMNS = ["time_s", "x_m", "y_m", "z_m"]
@@ -28,12 +35,41 @@ def read_setpoints(path: Path, fence: Fence) -> tuple[TimedPosition, ...]:
     Raise a BadInputError if the file is not usable, or if it leads out of the box in which the
     guard lets the robot fly inside `fence`. A robot that stays on the ground needs no column z_m.
     """
-    name, found = f"setpoints {path}", list[TimedPosition]()
-    fits = COLUMNS if fence.ground is None else COLUMNS[:3]
-    columns, rows = read_rows(read_lines(path, name, f"give a CSV file: {','.join(fits)}"), name)
+    name, fits = f"setpoints {path}", COLUMNS if fence.ground is None else COLUMNS[:3]
+    lines = read_lines(path, name, f"give a CSV file: {','.join(fits)}")
+    columns, rows = read_rows(lines, name)
     if columns not in (COLUMNS, fits):
         given = ",".join(columns)[:80] or "missing"
         raise BadInputError(f"{name}, line 1: the columns are {given}; give {','.join(fits)}")
+    with telling_rows(path, lines):
+        table = read_columns(lines, name)
+        found = None if table is None else _take_all(table, fence)
+        found = found or _take_each(rows, columns, fence)  # names the wrong row
+    if len(found) < 2:
+        raise BadInputError(f"{name}: has {len(found)} rows; give at least two")
+    return tuple((time - found[0][0], position) for time, position in found)
+
+
+def _take_all(table: Mapping[str, Sequence[float]], fence: Fence) -> list[TimedPosition] | None:
+    """Return all setpoints of a table of finite numbers; None if a row does not fit."""
+    times = table[COLUMNS[0]]
+    low, high = fence.inner_low, fence.inner_high
+    heights = table.get(COLUMNS[3], (low[2],) * len(times))
+    if fence.ground is not None and max(abs(z - fence.ground) for z in heights) > ROUNDING:
+        return None
+    places = (table[COLUMNS[1]], table[COLUMNS[2]], heights)
+    inside = all(
+        least - ROUNDING <= min(each) and max(each) <= most + ROUNDING
+        for least, each, most in zip(low, places, high, strict=True)
+    )
+    if not inside or not is_rising(times):
+        return None
+    return list(zip(times, zip(*places, strict=True), strict=True))
+
+
+def _take_each(rows: Iterable[Row], columns: Sequence[str], fence: Fence) -> list[TimedPosition]:
+    """Return the setpoint of each row; raise a BadInputError about the first that does not fit."""
+    found = list[TimedPosition]()
     for row in rows:
         time, *place = map(row.number, columns)
         if found and time <= found[-1][0]:
@@ -41,9 +77,7 @@ def read_setpoints(path: Path, fence: Fence) -> tuple[TimedPosition, ...]:
                 f"{row.where}: time_s {time:g} does not rise; sort the rows by time"
             )
         found.append((time, _position(place, fence, row.where)))
-    if len(found) < 2:
-        raise BadInputError(f"{name}: has {len(found)} rows; give at least two")
-    return tuple((time - found[0][0], position) for time, position in found)
+    return found
 
 
 def _position(place: Sequence[float], fence: Fence, where: str) -> Vector:

@@ -8,7 +8,7 @@ not.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
@@ -207,7 +207,7 @@ class Timeline:
         end_ns = inf if self.period_ns is None else self.period_ns
         ordered = [instant for instant in sorted(instants) if round(instant * 1e9) < end_ns]
         self.pass_ns = [round(instant * 1e9) for instant in ordered]
-        self.pieces = [_conditions(profile, instant) for instant in ordered]
+        self.pieces = list(_pieces(profile, ordered))
 
     def at(self, elapsed_ns: int) -> Conditions:
         """Return the conditions at the time `elapsed_ns` [ns] after the link came up."""
@@ -240,7 +240,24 @@ def settled(profile: DirectionProfile) -> DirectionProfile:
     return replace(profile, **constant)
 
 
+def _pieces(profile: DirectionProfile, instants: Sequence[float]) -> Iterator[Conditions]:
+    """Yield the conditions from each of the rising `instants` [s]; a trace may have millions."""
+    always = None if profile.changes or profile.blackouts else _conditions(profile, 0.0)
+    trace, row = profile.rows, 0
+    for instant in instants:
+        now = always or _conditions(profile, instant)
+        if trace is None:
+            yield now
+            continue
+        while row + 1 < len(trace.times) and trace.times[row + 1] <= instant:
+            row += 1
+        delay_ns = round(trace.delays[row] * 1e9)
+        loss = now.loss if trace.losses is None else trace.losses[row]
+        yield Conditions(delay_ns, now.jitter, loss, now.rate, now.blackout)
+
+
 def _conditions(profile: DirectionProfile, instant: float) -> Conditions:
+    """Return the conditions at an instant [s] without the trace."""
     delay, jitter, loss = profile.delay_ms * 1e-3, profile.jitter_ms, profile.loss
     rate = profile.rate_kbit
     for change in profile.changes:
@@ -250,10 +267,6 @@ def _conditions(profile: DirectionProfile, instant: float) -> Conditions:
         jitter = jitter if change.jitter_ms is None else change.jitter_ms
         loss = loss if change.loss is None else change.loss
         rate = rate if change.rate_kbit is None else change.rate_kbit
-    if (trace := profile.rows) is not None:
-        row = max(bisect_right(trace.times, instant) - 1, 0)
-        delay = trace.delays[row]
-        loss = loss if trace.losses is None else trace.losses[row]
     blackout = any(b.start_s <= instant < b.start_s + b.duration_s for b in profile.blackouts)
     rate = None if rate is None else rate * 1e3
     return Conditions(round(delay * 1e9), jitter * 1e-3, loss, rate, blackout)

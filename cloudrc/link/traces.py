@@ -9,14 +9,18 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import fields
-from math import fsum, inf, sqrt
+from functools import lru_cache
+from itertools import islice
+from math import fsum, inf, isfinite, sqrt
+from operator import lt
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from cloudrc.errors import BadInputError
-from cloudrc.files import read
+from cloudrc.files import read, version
 from cloudrc.link.profile import (
     Blackout,
     Change,
@@ -25,6 +29,7 @@ from cloudrc.link.profile import (
     GilbertElliott,
     Trace,
 )
+from cloudrc.patience import telling_if_slow
 from cloudrc.rounding import differences
 
 SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a second
@@ -32,20 +37,34 @@ START_MAX = 600.0  # if the first row is later, times count from the first row [
 LATEST = 1e11  # largest plausible time since 1970 [s]; a larger time has another unit
 HEAD = re.compile(rb"time_s,delay_[mu]s(,loss)?\n")
 """First line of the files that `write_trace` writes."""
+SILENT = 1.0  # time after which a command says that it reads a large file [s]
 _GZIP = b"\x1f\x8b"  # first bytes of a compressed file (RFC 1952)
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
 _ROWS_TO_JUDGE = 10  # with fewer rows, delays of 0 are accepted, as a user may have typed them
 
 
 def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
-    """Read a trace from a CSV file of at most `size_max` bytes.
+    """Read a trace from a CSV file of at most `size_max` bytes; an unchanged file is read once.
 
     Raises:
         BadInputError: If the file cannot be read or is no trace; the text names file, line, value
             and remedy.
     """
+    return _read_trace(path, size_max, version(path))
+
+
+@lru_cache(maxsize=4)  # of both directions: a large trace takes seconds
+def _read_trace(path: Path, size_max: int, state: object) -> Trace:
+    """Read a trace; `state` changes with the file."""
     remedy = "give a CSV file with the columns time_s,delay_ms"
-    return parse_trace(read_lines(path, f"trace {path}", remedy, size_max), str(path))
+    lines = read_lines(path, f"trace {path}", remedy, size_max)
+    with telling_rows(path, lines):
+        return parse_trace(lines, str(path))
+
+
+def telling_rows(path: Path, lines: Sequence[str]) -> AbstractContextManager[None]:
+    """Say while the block reads the lines of a file how many they are, if that takes long."""
+    return telling_if_slow(f"reads {path}: {len(lines) - 1:,} rows", SILENT)
 
 
 def link_profile(direction: DirectionKeys, file_max: int = SIZE_MAX) -> DirectionProfile:
@@ -125,6 +144,7 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
     If the first row's time is above `START_MAX` [s], subtract this time from all times.
     """
     place = f"trace {name}"
+    lines = list(lines)
     columns, rows = read_rows(lines, place)
     delay = next((column for column in columns if column in _SCALES), "delay_ms")
     if sorted(columns) not in (sorted(["time_s", delay]), sorted(["time_s", delay, "loss"])):
@@ -132,16 +152,31 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
             f"{place}, line 1: the columns are {','.join(columns)[:200] or 'missing'}; the header "
             "is time_s,delay_ms or time_s,delay_us, and may end in ,loss"
         )
-    found = _rising(rows, ["time_s", delay, "loss"][: len(columns)])
-    if not found:
-        raise BadInputError(f"{place}: no rows; give at least one, for example: 0,45")
-    times, delays, *losses = zip(*found, strict=True)
+    wanted = ["time_s", delay, "loss"][: len(columns)]
+    table = read_columns(lines, place)
+    if table is None or not _is_trace(table):
+        found = _rising(rows, wanted)  # names the wrong row
+        if not found:
+            raise BadInputError(f"{place}: no rows; give at least one, for example: 0,45")
+        table = dict(zip(wanted, zip(*found, strict=True), strict=True))
+    times, delays, *losses = (table[column] for column in wanted)
     _check_delays(delays, delay, place, may_be_lost=not losses)
     if times[0] > LATEST:
         raise BadInputError(f"{place}: time_s begins at {times[0]:.15g}, which is not in seconds")
     start = times[0] if times[0] > START_MAX else 0.0
     scaled = tuple(one * _SCALES[delay] for one in delays)
     return Trace(tuple(time - start for time in times), scaled, losses[0] if losses else None)
+
+
+def _is_trace(table: Mapping[str, Sequence[float]]) -> bool:
+    """Return whether columns of finite numbers have the values of a trace."""
+    least = min(map(min, table.values()))
+    return is_rising(table["time_s"]) and least >= 0.0 and max(table.get("loss", (0.0,))) <= 1.0
+
+
+def is_rising(times: Sequence[float]) -> bool:
+    """Return whether each time comes after the one before it."""
+    return all(map(lt, times, islice(times, 1, None)))
 
 
 def _rising(rows: Iterable[Row], columns: Sequence[str]) -> list[list[float]]:
@@ -213,10 +248,10 @@ def read_rows(lines: Iterable[str], name: str) -> tuple[list[str], Iterator[Row]
     Returns:
         Names of the columns in lower case ("RTT (ms)" becomes rtt_ms), and the rows.
     """
-    data = ((n, one) for n, one in enumerate(lines, 1) if one.strip() and one[:1] != "#")
+    data = ((n, one) for n, one in enumerate(lines, 1) if _has_data(one))
     kept = ((n, line) for n, line in data if not line.startswith("sep="))
     _, header = next(kept, (1, ""))
-    separator = next((mark for mark in ";\t" if mark in header), ",")
+    separator = _separator(header)
     columns = [_column(cell) for cell in _cells(header, separator, f"{name}, line 1")]
     if len(columns) == 1 and _parse(header) is not None:
         raise BadInputError(
@@ -238,6 +273,38 @@ def read_rows(lines: Iterable[str], name: str) -> tuple[list[str], Iterator[Row]
             yield Row(where, named, "." if separator == "," else ",")
 
     return columns, rows()
+
+
+def read_columns(lines: Iterable[str], name: str) -> dict[str, tuple[float, ...]] | None:
+    """Read the numbers of a CSV file as `read_rows` does, but fast: column -> its values.
+
+    Return None if there is no row, or one that is not finite numbers alone, in as many cells as the
+    header has. Then only `read_rows` can say which row is wrong, or read it in another form.
+    """
+    kept = [line for line in lines if _has_data(line) and not line.startswith("sep=")]
+    if len(kept) < 2:
+        return None
+    header, *data = kept
+    separator = _separator(header)
+    if separator != ",":
+        data = [line.replace(",", ".") for line in data]
+    rows = [line.split(separator) for line in data]
+    columns = [_column(cell) for cell in _cells(header, separator, f"{name}, line 1")]
+    try:
+        values = [tuple(map(float, cells)) for cells in zip(*rows, strict=True)]
+    except ValueError:
+        return None
+    if len(values) != len(columns) or not all(all(map(isfinite, each)) for each in values):
+        return None
+    return dict(zip(columns, values, strict=True))
+
+
+def _has_data(line: str) -> bool:
+    return bool(line.strip()) and line[:1] != "#"
+
+
+def _separator(header: str) -> str:
+    return next((mark for mark in ";\t" if mark in header), ",")
 
 
 def _cells(line: str, separator: str, where: str) -> list[str]:

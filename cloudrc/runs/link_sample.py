@@ -66,9 +66,10 @@ def sample_profile(
 def _profile(name: str) -> tuple[Profile, bool]:
     """Load the profile `name`, or make one from a trace; return whether `name` is a trace."""
     path = Path(name).absolute()
-    lines = read_lines(path, name, "give a profile or a trace") if path.is_file() else []
-    if not (name.endswith(".csv") or re.match(r"(\s|#.*\n)*(time_s|\d)", "\n".join(lines[:9]))):
-        return load_profile(name), False
+    if not name.endswith(".csv"):
+        lines = read_lines(path, name, "give a profile or a trace") if path.is_file() else []
+        if not re.match(r"(\s|#.*\n)*(time_s|\d)", "\n".join(lines[:9])):
+            return load_profile(name), False
     times = read_trace(path).times
     about = f"a trace of {len(times)} rows in {times[-1] - times[0]:.4g} s"
     return Profile.model_validate({"description": about, "uplink": {"trace": str(path)}}), True

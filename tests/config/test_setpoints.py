@@ -2,7 +2,9 @@
 
 import pytest
 
+from cloudrc.config import setpoints
 from cloudrc.config.setpoints import read_setpoints, write_setpoints
+from cloudrc.errors import BadInputError
 from tests.fences import FENCE
 
 HERE, THERE = (0.0, 0.0, 1.0), (0.5, 0.0, 1.2)
@@ -15,3 +17,23 @@ def test_setpoints_that_follow_closely_can_be_read_again(gap, tmp_path):
     track = read_setpoints(path, FENCE)
     assert track[0] == (0.0, HERE)
     assert track[-1] == (pytest.approx(70.8107 + gap, abs=1e-6), THERE)
+
+
+HEAD = "time_s,x_m,y_m,z_m"
+
+
+def test_good_setpoints_are_read_without_an_object_for_each_row(tmp_path, monkeypatch):
+    path = tmp_path / "drive.csv"
+    path.write_text(f"{HEAD}\n5,0,0,1\n\n6.5,0.5,0,1.2\n")
+    monkeypatch.setattr(setpoints, "_take_each", None)
+    assert read_setpoints(path, FENCE) == ((0.0, HERE), (1.5, THERE))
+
+
+@pytest.mark.parametrize(
+    "row", ["1,0,0,1", "0.5,0,0,1", "3,900,0,1", "3,0,0", "3,nan,0,1", "3,a,0,1"]
+)
+def test_the_wrong_row_of_setpoints_is_named_by_its_line(tmp_path, row):
+    path = tmp_path / "drive.csv"
+    path.write_text(f"{HEAD}\n0,0,0,1\n1,0,0,1\n{row}\n4,0,0,1\n")
+    with pytest.raises(BadInputError, match=r"drive\.csv, line 4: "):
+        read_setpoints(path, FENCE)

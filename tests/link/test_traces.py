@@ -3,7 +3,8 @@
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.profile import Trace
+from cloudrc.link import traces
+from cloudrc.link.profile import Conditions, DirectionProfile, Timeline, Trace
 from cloudrc.link.traces import parse_trace, read_table, read_trace, write_trace
 
 HEAD = "time_s,delay_ms"
@@ -82,3 +83,76 @@ def test_a_table_is_the_arrived_delays_with_mean_0_deviation_1(tmp_path):
     path.write_text(f"{HEAD},loss\n0,45,0\n1,45,0\n2,50,1\n")
     with pytest.raises(BadInputError, match="at least two different delays"):
         read_table(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{HEAD}\n0,45\n1, 46.5 \n2,47\n",
+        "# measured\ndelay_us;time_s\n45000,5;0\n46000;0,25\n\n",
+        f"sep=,\n{HEAD},loss\n0,45,0\n1,0,1\n",
+    ],
+)
+def test_a_good_file_is_read_without_an_object_for_each_row(monkeypatch, text):
+    slow = traces.read_columns
+    with monkeypatch.context() as patch:
+        patch.setattr(traces, "read_columns", lambda *given: None)
+        expected = parse_trace(text.splitlines(), "x")
+    assert slow(text.splitlines(), "x") is not None
+    monkeypatch.setattr(traces, "Row", None)
+    assert parse_trace(text.splitlines(), "x") == expected
+
+
+@pytest.mark.parametrize(
+    "row", ["9,45,1", "9", "8,45", "9,x", '9,"46"', "9,nan", "9,inf", "-1,45", "9,-1", ""]
+)
+def test_the_fast_reader_takes_no_row_that_the_other_one_refuses(monkeypatch, row):
+    lines = [HEAD, *(f"{n},45" for n in range(9)), row, "10,45"]
+
+    def result():
+        try:
+            return parse_trace(lines, "x")
+        except BadInputError as error:
+            return str(error)
+
+    fast = result()
+    monkeypatch.setattr(traces, "read_columns", lambda *given: None)
+    assert fast == result()
+
+
+def test_an_unchanged_file_is_read_once_and_a_changed_one_anew(tmp_path, monkeypatch):
+    path, reads = tmp_path / "trace.csv", []
+    path.write_text(f"{HEAD}\n0,45\n")
+    real = traces.read
+    monkeypatch.setattr(traces, "read", lambda *given: reads.append(given) or real(*given))
+    assert read_trace(path) is read_trace(path)
+    assert len(reads) == 1
+    path.write_text(f"{HEAD}\n0,45\n1,50\n")
+    assert read_trace(path).times == (0.0, 1.0)
+
+
+def test_a_file_that_takes_long_is_named_with_its_rows(tmp_path, monkeypatch, caplog):
+    path = tmp_path / "trace.csv"
+    path.write_text(f"{HEAD}\n" + "".join(f"{n},45\n" for n in range(1200)))
+    real = traces.parse_trace
+    monkeypatch.setattr(traces, "SILENT", 0.0)
+
+    def parse(lines, name):
+        while not caplog.records:
+            pass  # until the command has spoken
+        return real(lines, name)
+
+    monkeypatch.setattr(traces, "parse_trace", parse)
+    read_trace(path)
+    assert caplog.messages == [f"reads {path}: 1,200 rows"]
+
+
+def test_each_row_of_a_trace_is_a_piece_of_the_time_line():
+    trace = Trace((0.5, 1.0, 2.0), (0.01, 0.02, 0.03), (0.0, 0.5, 1.0))
+    line = Timeline(DirectionProfile(rows=trace, jitter_ms=2.0, rate_kbit=8.0))
+    assert line.pass_ns == [0, 500_000_000, 1_000_000_000, 2_000_000_000]
+    delays, losses = (10_000_000, 10_000_000, 20_000_000, 30_000_000), (0.0, 0.0, 0.5, 1.0)
+    rest = (8000.0, False)
+    assert line.pieces == [
+        Conditions(delay, 0.002, loss, *rest) for delay, loss in zip(delays, losses, strict=True)
+    ]
