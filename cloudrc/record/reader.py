@@ -140,7 +140,7 @@ class _Found:
             for record in StreamReader(stream, skip_magic=True, emit_chunks=True).records:
                 self._store(record, contents)
         # If bytes were lost or inserted, the positions hold up to the first damage only.
-        self.holes = [FilePart(at, size, contents.get(at, "")) for at, size, _ in self.holes]
+        self.holes = [FilePart(at, size, contents.get(at, was)) for at, size, was in self.holes]
 
     def _store(self, record: mcap.McapRecord, contents: dict[int, str]) -> None:
         if isinstance(record, mcap.ChunkIndex):
@@ -310,10 +310,14 @@ class File:
     def _search(self, position: int) -> _Found | None:
         """Find the intact parts of a file from `position` on; None if that finds nothing new."""
         self._stream.seek(0)
-        data, found = self._stream.read(), _Found()
+        data, found, listed = self._stream.read(), _Found(), dict[int, list[tuple[int, int]]]()
         while position < len(data) and not found.ended:
             record, end = self._parse_at(data, position)
-            if record is not None:
+            if isinstance(record, mcap.Chunk):
+                listed = self._list_messages(record)
+            if isinstance(record, mcap.MessageIndex) and not _is_index_of(record, listed):
+                found.holes.append(FilePart(position, end - position, "an index of messages"))
+            elif record is not None:
                 found.take(record, data[position:end], position)
             else:
                 if not self._is_intact(data, end):  # the length is damaged, too
@@ -327,6 +331,14 @@ class File:
             found.size += len(MCAP0_MAGIC)
             found.read_index(data)
         return found if found.parts and (found.holes or found.data_ended) else None
+
+    def _list_messages(self, chunk: mcap.Chunk) -> dict[int, list[tuple[int, int]]]:
+        """Return channel -> time and position in the intact `chunk`, for each of its messages."""
+        listed: dict[int, list[tuple[int, int]]] = {}
+        for at, record in self._unpack(chunk):
+            if isinstance(record, mcap.Message):
+                listed.setdefault(record.channel_id, []).append((record.log_time, at))
+        return listed
 
     def _next_intact(self, data: bytes, start: int) -> int:
         """Return where the next intact record begins, from `start` on; the end if there is none."""
@@ -363,7 +375,7 @@ class File:
     def _store_chunk(self, chunk: mcap.Chunk, part: FilePart) -> None:
         """Store the records of a chunk; leave out a damaged chunk."""
         try:
-            for record in self._unpack(chunk):
+            for _, record in self._unpack(chunk):
                 self._store(record)
         except _StopError:
             raise
@@ -445,7 +457,8 @@ class File:
         if self._room < 0:
             raise _StopError(f"unpacks to more than {UNPACKED_MAX} times its size")
 
-    def _unpack(self, chunk: mcap.Chunk) -> Iterator[mcap.McapRecord]:
+    def _unpack(self, chunk: mcap.Chunk) -> Iterator[tuple[int, mcap.McapRecord]]:
+        """Yield position in the unpacked chunk and content of each record."""
         size = chunk.uncompressed_size
         if size > self._room:  # a bomb, or a damaged number
             self._unreadable = f"it unpacks to more than {UNPACKED_MAX} times its size"
@@ -467,9 +480,14 @@ class File:
         records = StreamReader(stream, skip_magic=True, emit_chunks=True).records
         try:
             while stream.tell() < size:  # one at a time: a chunk may hold millions
-                yield next(records)
+                yield stream.tell(), next(records)
         except EndOfFile as error:
             raise ValueError("a record is not as long as it states") from error
+
+
+def _is_index_of(index: mcap.MessageIndex, listed: dict[int, list[tuple[int, int]]]) -> bool:
+    """Return whether an index has the messages of a chunk; `listed` as `_list_messages` does."""
+    return sorted(index.records) == sorted(listed.get(index.channel_id, []))
 
 
 def _parse(data: bytes) -> mcap.McapRecord:

@@ -382,6 +382,24 @@ def test_a_file_with_all_that_its_index_counts_is_complete(path, call, data):
     assert copy.attachments == Recording.read(path).attachments
 
 
+INDEXES = [span for span in spans(WHOLE) if span[0] == Opcode.MESSAGE_INDEX]
+
+
+@pytest.mark.parametrize("number", [0, 3, -1])
+@pytest.mark.parametrize("inside", [0, 1, 9, 11, 15, 22, 23, 30])
+def test_a_damaged_index_of_messages_loses_nothing_and_has_a_place(path, call, number, inside):
+    """`inside` is the damaged byte: of opcode, length, channel, number of entries, or an entry."""
+    _, start, _ = INDEXES[number]
+    path.write_bytes(flipped(start + inside, 3))
+    new = path.with_name("x.recovered.mcap")
+    told = call("recover", path, code=0).out
+    assert "kept 100.0%" in told
+    assert f"damaged at byte {start}" in told
+    copy = Recording.read(new)
+    assert (copy.messages, copy.note) == (MESSAGES, "")
+    assert copy.attachments == Recording.read(path).attachments
+
+
 @pytest.mark.parametrize("rest", [WHOLE, WHOLE[:SECOND], WHOLE[1000:-1000]])
 def test_a_second_recording_behind_the_first_is_not_passed_over(path, rest):
     path.write_bytes(WHOLE + rest)
