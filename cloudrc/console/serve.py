@@ -17,7 +17,7 @@ from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import Page
 from cloudrc.console.steering import LinkControl, Steering
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.geometry.obstacles import obstacles
+from cloudrc.geometry.obstacles import has_surface, obstacles
 from cloudrc.teleop.client import Api
 
 SWITCH_PERIOD = 5e-4
@@ -63,7 +63,7 @@ def serve(
         ready(page)
         experiment = read_experiment(str(flight.config))
         known = obstacles(scene_of(experiment.world), touch=experiment.mission.touched)
-        feed = FlightFeed(known, known_hull(experiment.world.robot))
+        feed = FlightFeed(tuple(filter(has_surface, known)), known_hull(experiment.world.robot))
         steering = Steering(flight.api, flight.link)
         steering.watch()
         steering.start()

@@ -60,7 +60,7 @@ _SHAPES: dict[Any, Shape] = {
     _GEOM.mjGEOM_PLANE: "plane",
     _GEOM.mjGEOM_MESH: "hull",
 }
-"""Type of a geom -> shape of its solid; all other types become the box around the geom."""
+"""Type of a geom -> shape of its solid; all other types become an outline."""
 ROBOT_BITS = 1
 """Value of contype and conaffinity of the robot's geoms."""
 
@@ -177,14 +177,14 @@ def _ground(model: Any, data: Any, spawn: Array) -> float:
 
 
 def _solid(model: Any, data: Any, geom: int, name: str) -> Solid:
-    shape = _SHAPES.get(kind := _GEOM(model.geom_type[geom]), "box")
+    shape = _SHAPES.get(_GEOM(model.geom_type[geom]), "outline")
     centre, axes = data.geom_xpos[geom].copy(), data.geom_xmat[geom].reshape(3, 3).copy()
     size, radius, faces = model.geom_size[geom].copy(), float(model.geom_rbound[geom]), None
     if shape == "plane":
         radius = inf
     elif shape == "hull":
         faces = _faces(model, model.geom_dataid[geom])
-    elif kind not in _SHAPES:
+    elif shape == "outline":
         middle, size = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:].copy()
         centre, radius = centre + axes @ middle, float(np.linalg.norm(size))
     return Solid(name, shape, centre, axes, size, radius, faces)

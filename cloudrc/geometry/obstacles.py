@@ -37,6 +37,11 @@ def obstacles(scene: Scene, *, touch: str | None) -> tuple[Obstacle, ...]:
     return tuple(each for each in found if is_obstacle(each.name, touch=touch))
 
 
+def has_surface(obstacle: Obstacle) -> bool:
+    """Return whether the surface of an obstacle is known, and not only the box around it."""
+    return isinstance(obstacle, Tube) or obstacle.shape != "outline"
+
+
 def surface(obstacle: Obstacle) -> str:
     """Return how messages name what the robot would touch."""
     if isinstance(obstacle, Tube):

@@ -9,14 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array: TypeAlias = NDArray[np.float64]
-Shape: TypeAlias = Literal["box", "sphere", "capsule", "cylinder", "ellipsoid", "plane", "hull"]
+Shape: TypeAlias = Literal[
+    "box", "sphere", "capsule", "cylinder", "ellipsoid", "plane", "hull", "outline"
+]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Solid:
     """A convex body, or the space below a plane.
 
-    `size` is half the edges of a box; the radius of a sphere; the radius, and half the length of
+    `size` is half the edges of a box, or of an outline, the box around a shape that is not convex,
+    such as a height field; the radius of a sphere; the radius, and half the length of
     the axis of a capsule (without its ends) or cylinder; the half-axes of an ellipsoid. The axis of
     a capsule or cylinder and the normal of a plane are along z.
     """
@@ -94,4 +97,5 @@ _DISTANCES = {
     "ellipsoid": _to_ellipsoid,
     "plane": _to_plane,
     "hull": _to_hull,
+    "outline": _to_box,
 }

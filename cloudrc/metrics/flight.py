@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from cloudrc.config.schema import Criteria, MissionConfig
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import Hull, clearance, least_clearance, tube_index
-from cloudrc.geometry.obstacles import Obstacle, obstacles
+from cloudrc.geometry.obstacles import Obstacle, has_surface, obstacles
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording, Table
@@ -152,9 +152,13 @@ class Flight:
 
     @cached_property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """All bodies that the robot must not touch; if the scene cannot be read, its tubes."""
+        """All bodies that the robot must not touch, and from which clearances are known.
+
+        If the scene cannot be read, these are its tubes.
+        """
         try:
-            return obstacles(self.scene, touch=self.mission.touched)
+            found = obstacles(self.scene, touch=self.mission.touched)
+            return tuple(each for each in found if has_surface(each))
         except BadInputError:
             return self.scene.tubes
 

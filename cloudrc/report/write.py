@@ -15,7 +15,7 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import read, write_atomically
-from cloudrc.geometry.obstacles import known, obstacles
+from cloudrc.geometry.obstacles import has_surface, known, obstacles
 from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
@@ -89,11 +89,13 @@ def _unknown_clearance(flight: Flight) -> list[str]:
     if flight.hull is None:
         return [f"{UNKNOWN} anything: the size of the robot is not known here."]
     try:
-        obstacles(flight.scene, touch=flight.mission.touched)
+        found = obstacles(flight.scene, touch=flight.mission.touched)
     except BadInputError as error:
         return [f"{UNKNOWN} all bodies but declared tubes: {error}."]
     if not known(flight.scene):
         return [f"{UNKNOWN} all bodies but declared tubes: MuJoCo is not installed."]
+    if unknown := sorted({each.name for each in found if not has_surface(each)}):
+        return [f"{UNKNOWN} {', '.join(unknown)}: of a height field, only the box around it is."]
     return []
 
 

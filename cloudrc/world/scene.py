@@ -29,6 +29,8 @@ NEEDED = {
 }
 """Flag of MuJoCo that a scene must not disable -> its bit: without contacts, for example, robots
 fly through walls."""
+MARGIN_MAX = 0.001
+"""Largest distance at which a contact may push [m]: below the accuracy of a clearance."""
 FUSES_WRONG = tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 11)
 """Whether MuJoCo computes a wrong inertia when it fuses static bodies, as it does up to 3.10."""
 
@@ -41,7 +43,7 @@ def compile_model(robot: Path, scene: Path) -> Any:
     bodies are fused, so that a step takes half the time. Fused bodies lose their names; therefore
     each geom of the scene gets the name BODY/NUMBER. Raise a BadInputError if a file is
     missing or does not compile, if the robot has no free base or no actuator, or if the scene has
-    another time step.
+    another time step or contacts that push at a distance.
     """
     model = _compile(robot, scene)
     _check_parts(model, robot, scene)
@@ -188,6 +190,23 @@ def _check_parts(model: Any, robot_path: Path, scene_path: Path) -> None:
         raise BadInputError(
             f"{scene_path}: option timestep is {model.opt.timestep}, not {TIMESTEP}"
         )
+    _check_margins(model, robot_path, scene_path)
+
+
+def _check_margins(model: Any, robot_path: Path, scene_path: Path) -> None:
+    """Refuse contacts that push at a distance: every clearance would be too large."""
+    text = f"so that contacts push more than {MARGIN_MAX * 1e3:g} mm away from it; remove margin"
+    reach = model.geom_margin - model.geom_gap
+    touchable = (model.geom_contype | model.geom_conaffinity) > 0
+    for geom in np.flatnonzero((reach > MARGIN_MAX) & touchable)[:1]:
+        body = bodies_of_geoms(model)[geom]
+        where = f"{scene_path}: body {body}" if body else f"{robot_path}: the robot"
+        raise BadInputError(f"{where} has a geom with margin {model.geom_margin[geom]:g}, {text}")
+    if (model.pair_margin - model.pair_gap > MARGIN_MAX).any():
+        raise BadInputError(f"{robot_path} in {scene_path}: a pair has a margin, {text}")
+    is_overriding = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE
+    if is_overriding and model.opt.o_margin > MARGIN_MAX:
+        raise BadInputError(f"{scene_path}: option o_margin is {model.opt.o_margin:g}, {text}")
 
 
 def rotation(quaternion: Any) -> Any:

@@ -74,7 +74,7 @@ def test_only_what_the_robot_can_touch_is_a_solid(tmp_path):
     assert bodies.names == ("floor", "ghost", "other", "half", "hills")
     assert [(solid.name, solid.shape) for solid in bodies.solids] == [
         ("half", "sphere"),
-        ("hills", "box"),
+        ("hills", "outline"),
     ]
 
 

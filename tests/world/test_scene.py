@@ -108,6 +108,16 @@ def test_each_geom_has_the_name_of_its_body_and_the_robot_none(tmp_path):
         ("scene", "<option ", '<option><flag contact="disable"/></option><option ',
                   "option flag contact is disabled"),
         ("scene", '<body name="floor">', "<body>", "needs a body named floor"),
+        ("scene", '<body name="floor">', '<body name="a"><geom size=".1" margin=".3"/></body>'
+                   '<body name="floor">', "body a has a geom with margin 0.3, so"),
+        ("scene", '<body name="floor">', '<body name="a"><geom size=".1" margin=".3" gap=".1"/>'
+                   '</body><body name="floor">', "body a has a geom with margin 0.3, so"),
+        ("scene", "<option ", '<default><geom margin=".02"/></default><option ',
+                  "has a geom with margin 0.02, so"),
+        ("scene", "<option ", '<option o_margin=".3"><flag override="enable"/></option><option ',
+                  "option o_margin is 0.3, so"),
+        ("robot", 'size=".05 .05 .10"', 'size=".05 .05 .10" margin=".3"',
+                  "the robot has a geom with margin 0.3, so"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_flown_is_refused_by_name(tmp_path, monkeypatch, kind, old, new, message):
@@ -119,6 +129,18 @@ def test_what_cannot_be_flown_is_refused_by_name(tmp_path, monkeypatch, kind, ol
         check_robot(World(**(SHIPPED | {kind: str(path)})))
     assert "\n" not in str(error.value)
     assert list(tmp_path.iterdir()) == [path], "MuJoCo wrote a log"
+
+
+def test_margins_that_make_no_contact_push_are_flown(tmp_path):
+    path, good = tmp_path / "mine.xml", FILES["scene"].read_text()
+    for geom in (
+        'margin=".001"',
+        'margin=".3" gap=".3"',
+        'margin=".3" contype="0" conaffinity="0"',
+    ):
+        body = f'<body name="a" pos="9 9 9"><geom size=".1" {geom}/></body>'
+        path.write_text(good.replace("</worldbody>", f"{body}</worldbody>"))
+        check_robot(World(**(SHIPPED | {"scene": str(path)})))
 
 
 @pytest.mark.parametrize(
