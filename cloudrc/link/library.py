@@ -179,10 +179,14 @@ class OneWay:
         Returns:
             The delays [s], shape (count,); NaN for a lost packet.
         """
+        for name, number in {"count": count, "first": first}.items():
+            if not isinstance(number, int | np.integer) or number < 0:
+                raise BadInputError(f"{name} {number!r}: give a whole number of packets, 0 or more")
+        period_ns = _to_ns(period)
         conditions = self._link.only
         if conditions and _is_independent(self.profile, conditions):
             return self._independent(conditions, episode, first, count)
-        period_ns, fresh = round(period * 1e9), self._new()
+        fresh = self._new()
         delays = np.full(count, np.nan)
         for n in range(first, first + count):
             now_ns = n * period_ns
@@ -203,7 +207,7 @@ class OneWay:
         link = LinkDirection(
             self.profile, self._seed, self._uplink, stream=f"{self._stream} expected"
         )
-        period_ns = round(period * 1e9)
+        period_ns = _to_ns(period)
         return numbers(sample(link, KIND, range(0, _PACKETS * period_ns, period_ns), size))
 
     def _new(self) -> LinkDirection:
@@ -259,6 +263,13 @@ class OneWay:
             if chance and isinstance(chance, float):
                 delays[draw(purpose) < chance] = np.nan
         return delays
+
+
+def _to_ns(period: float) -> int:
+    """Return the time between two packets [ns], given in seconds."""
+    if not 1e-9 <= period <= 1e9:
+        raise BadInputError(f"period {period!r}: give the time between two packets in seconds")
+    return round(period * 1e9)
 
 
 def _is_independent(profile: DirectionProfile, conditions: Conditions) -> bool:

@@ -185,6 +185,25 @@ def test_a_seed_that_is_none_is_refused(seed):
         cloudrc.link.open("ideal", seed)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((-1, 0.01), "count -1: give a whole number"),
+        ((3.0, 0.01), "count 3.0"),
+        ((3, 0.0), "period 0.0: give the time"),
+        ((3, float("nan")), "period nan"),
+        ((3, -0.01), "period -0.01"),
+    ],
+)
+@pytest.mark.parametrize("name", ["paper-p1", "lte"])
+def test_a_table_that_cannot_be_made_is_refused(name, arguments, words):
+    up, _ = cloudrc.link.open(name, 1)
+    with pytest.raises(BadInputError, match=re.escape(words)):
+        up.table(*arguments)
+    with pytest.raises(BadInputError, match="first -1"):
+        up.table(3, 0.01, first=-1)
+
+
 def test_the_examples_of_the_page_run(tmp_path, capsys):
     page = (Path(__file__).parents[2] / "docs" / "library.md").read_text()
     program = tmp_path / "page.py"
