@@ -9,7 +9,7 @@ import numpy as np
 
 from cloudrc import assembly
 from cloudrc.config.hull import hull_of
-from cloudrc.config.load import load_experiment
+from cloudrc.config.load import read_experiment
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import MissionConfig
@@ -202,7 +202,7 @@ def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
     expects="the whole mission is refused before the flight",
 )
 def _impossible(outcome: Outcome, seed: int) -> None:
-    experiment, first = load_experiment("paper"), (0.5, 0.0, 0.8)
+    experiment, first = read_experiment("paper"), (0.5, 0.0, 0.8)
     scene, robot = scene_of(experiment.world), hull_of(experiment.world.robot).dense
     points: dict[str, Vector] = {
         "1 m behind a wall of the fence": (fence_of(scene).high[0] + 1.0, 0.0, 1.0),
