@@ -223,4 +223,7 @@ add_metrics(
      "only.", _real_time_factor),
     ("missed_periods", "1", "Number of periods without a command because cloud was late; "
      "real time only.", _missed_periods),
+    ("controller_gaps", "1", "Number of times that the program of cloud.controller remote was "
+     "silent for 0.2 s, so that the robot stood still.",
+     lambda flight: flight.last_total("controller_gaps")),
 )  # fmt: skip

@@ -70,8 +70,9 @@ def test_the_program_of_the_documentation_flies(tmp_path):
     assert main(words) == 0
 
 
-def test_a_program_and_its_children_end_with_the_block(tmp_path):
-    with companion("sh -c 'sleep 600 & echo $!; wait'", tmp_path):
+@pytest.mark.process
+def test_a_program_and_its_children_end_with_the_block_even_if_they_ignore_sigterm(tmp_path):
+    with companion("sh -c 'trap \"\" TERM; sleep 600 & echo $!; wait'", tmp_path):
         while len(lines := (tmp_path / "with.log").read_text().splitlines()) < 2:
             pass
         child = int(lines[1])

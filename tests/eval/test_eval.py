@@ -125,6 +125,16 @@ def test_the_time_for_an_answer_is_charged(law, compute, tmp_path, monkeypatch):
     assert late["numbers"]["action_age"] > 0.03
 
 
+def test_each_answer_takes_the_next_time_of_the_file(law, tmp_path):
+    rows = []
+    for times in ("0.04\n", "0\n0.08\n"):
+        path = tmp_path / "times.csv"
+        path.write_text(times)
+        setup = EvalSetup("CartPole-v1", law(), compute=("file", str(path)))
+        rows.append(play(Episode(0.0, "newest", 1), setup, {}))
+    assert rows[0]["records_sha256"] != rows[1]["records_sha256"]
+
+
 def test_a_measured_time_leaves_no_hash(law):
     setup = EvalSetup("CartPole-v1", law(), compute=("measured", ""))
     row = play(Episode(0.0, "newest", 1), setup, {})

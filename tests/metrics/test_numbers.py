@@ -186,6 +186,7 @@ def faults_and_drops():
     log.cloud += [Counted(at(n), "cloud", "predictor_failed", (7, 14, 2)[n]) for n in range(3)]
     log.world += [Counted(at(n), "world", "recorder_dropped", n) for n in (1, 2)]
     log.cloud += [Counted(at(n), "cloud", "recorder_dropped", 10 * n) for n in (1, 2)]
+    log.cloud.append(Counted(at(2), "cloud", "controller_gaps", 3))
     return log.flight()
 
 
@@ -234,7 +235,7 @@ NUMBERS = {
         # No board contact, no pipe, no rest, no real time, no relay.
         **dict.fromkeys(("contact_time", "touch_speed", "steady_contact_force", "contact_impulse")),
         **dict.fromkeys(("peak_contact_force", "min_clearance", "min_clearance_flight")),
-        **dict.fromkeys(("steady_error_x", "recorder_dropped")),
+        **dict.fromkeys(("steady_error_x", "recorder_dropped", "controller_gaps")),
         **dict.fromkeys(REAL_TIME | OF_RELAYS | TRAFFIC),
     },
     contact: {
@@ -308,7 +309,7 @@ NUMBERS = {
         "cloud_lateness_p99": approx(0.0495),
         "missed_periods": 14.0,
     },
-    faults_and_drops: {"fault_count": 15.0, "recorder_dropped": 22.0},
+    faults_and_drops: {"fault_count": 15.0, "recorder_dropped": 22.0, "controller_gaps": 3.0},
     lambda: plus(*OF_A_RELAY): {
         "release_error_p99_uplink": approx(40e-6),
         "released_early_uplink": 0.0,
@@ -332,7 +333,7 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight():
     numbers, notes = measure_all(flight_of(paper()[1]))
     assert (notes, list(numbers)) == ([], sorted(numbers))
     resting = {f"steady_error_{axis}" for axis in "xyz"}
-    others = {"recorder_dropped", "final_error"}
+    others = {"recorder_dropped", "final_error", "controller_gaps"}
     assert set(SHIPPED) - set(numbers) == REAL_TIME | OF_RELAYS | resting | others
     for name, number in numbers.items():
         assert set(number.unit) <= set("smNB12^/ "), name
