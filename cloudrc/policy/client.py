@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from types import TracebackType
-from typing import Any
+from typing import Any, NoReturn
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
+from websockets.frames import CloseCode
 from websockets.sync.client import ClientConnection, connect
 
 from cloudrc.errors import BadInputError, CloudrcError, describe_error, to_one_line
@@ -86,6 +87,7 @@ class PolicyClient:
         """Send an observation and return the answer; raise a PolicyServerError without one."""
         if self._connection is None:
             raise SilentServerError(f"{self.url}: the connection is closed; connect again")
+        self._refuse_early_answer()
         try:
             self._connection.send(pack(observation))
         except ConnectionClosed:
@@ -95,6 +97,22 @@ class PolicyClient:
         answer = self._receive("answer")
         self._limit = self._answer_limit
         return answer
+
+    def _refuse_early_answer(self) -> None:
+        """Raise a PolicyServerError if the server has sent more than one answer per observation.
+
+        Its answers would be taken for those of later observations.
+        """
+        assert self._connection is not None
+        try:
+            frame = self._connection.recv(timeout=0)
+        except (TimeoutError, ConnectionClosed):
+            return
+        if isinstance(frame, bytes):
+            self.close()
+            text = f"{self.url}: the server sent an answer that belongs to no observation"
+            raise PolicyServerError(f"{text}; send one answer for each")
+        self._refuse_text(frame)
 
     def close(self) -> None:
         """Close the connection."""
@@ -142,14 +160,17 @@ class PolicyClient:
             self.close()
             raise SilentServerError(f"{self.url}: {_explain_end(error, what)}") from None
         if isinstance(frame, str):
-            self.close()
-            last = to_one_line(frame.strip()[-2000:].rpartition("\n")[2]) or "an empty text"
-            raise PolicyServerError(f"{self.url}: the server sent an error: {last}")
+            self._refuse_text(frame)
         try:
             return unpack(frame)
         except WireError as error:
             self.close()
             raise PolicyServerError(f"{self.url}: the {what} cannot be read: {error}") from None
+
+    def _refuse_text(self, text: str) -> NoReturn:
+        self.close()
+        last = to_one_line(text.strip()[-2000:].rpartition("\n")[2]) or "an empty text"
+        raise PolicyServerError(f"{self.url}: the server sent an error: {last}")
 
     def _silent(self, text: str) -> SilentServerError:
         return SilentServerError(f"{self.url}: {text} within {self._limit:g} s")
@@ -162,6 +183,8 @@ def _explain_status(code: int) -> str:
 
 
 def _explain_end(error: ConnectionClosed, what: str) -> str:
+    if error.sent is not None and error.sent.code == CloseCode.MESSAGE_TOO_BIG:
+        return f"its {what} is larger than {MESSAGE_MAX >> 20} MiB"
     if error.rcvd is None:
         return f"the server ended before its {what}"
     reason = to_one_line(error.rcvd.reason)

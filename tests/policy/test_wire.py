@@ -217,6 +217,25 @@ def test_a_server_that_closes_is_named_with_its_reason():
             client.infer(STATE)
 
 
+def test_two_answers_to_one_observation_are_refused():
+    """The second would be taken for the answer to the next observation."""
+
+    def twice(connection, frame):
+        connection.send(actions(1.0))
+        return actions(2.0)
+
+    with stock_like(twice) as url, PolicyClient(url) as client:
+        with pytest.raises(PolicyServerError, match="belongs to no observation"):
+            [client.infer(STATE) for _ in range(100)]  # the second answer may arrive later
+
+
+def test_an_answer_beyond_the_limit_is_named(monkeypatch):
+    monkeypatch.setattr("cloudrc.policy.client.MESSAGE_MAX", 1 << 20)
+    with stock_like(lambda link, frame: actions(1.0, (50_000, 4))) as url:
+        with PolicyClient(url) as client, pytest.raises(PolicyServerError, match="larger than 1 M"):
+            client.infer(STATE)
+
+
 def test_nobody_listening_and_other_servers_are_one_line():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         free = taken.getsockname()[1]
