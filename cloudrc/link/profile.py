@@ -10,6 +10,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import inf
 from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
@@ -198,16 +199,7 @@ class Timeline:
     """
 
     def __init__(self, profile: DirectionProfile) -> None:
-        instants = {0.0, *(change.at_s for change in profile.changes)}
-        instants.update(profile.rows.times if profile.rows else ())
-        for blackout in profile.blackouts:
-            instants.update((blackout.start_s, blackout.start_s + blackout.duration_s))
-        period = profile.rows.period if profile.rows and profile.loop else None
-        self.period_ns = None if period is None else round(period * 1e9)
-        end_ns = inf if self.period_ns is None else self.period_ns
-        ordered = [instant for instant in sorted(instants) if round(instant * 1e9) < end_ns]
-        self.pass_ns = [round(instant * 1e9) for instant in ordered]
-        self.pieces = list(_pieces(profile, ordered))
+        self.pass_ns, self.pieces, self.period_ns = _lay_out(profile)
 
     def at(self, elapsed_ns: int) -> Conditions:
         """Return the conditions at the time `elapsed_ns` [ns] after the link came up."""
@@ -238,6 +230,21 @@ def settled(profile: DirectionProfile) -> DirectionProfile:
         "blackouts": (),
     }
     return replace(profile, **constant)
+
+
+@lru_cache(maxsize=2)  # both directions of a link; of a trace with millions of rows it takes long
+def _lay_out(profile: DirectionProfile) -> tuple[list[int], list[Conditions], int | None]:
+    """Return what `Timeline` has: `pass_ns`, `pieces` and `period_ns`; nobody changes the lists."""
+    instants = {0.0, *(change.at_s for change in profile.changes)}
+    instants.update(profile.rows.times if profile.rows else ())
+    for blackout in profile.blackouts:
+        instants.update((blackout.start_s, blackout.start_s + blackout.duration_s))
+    period = profile.rows.period if profile.rows and profile.loop else None
+    period_ns = None if period is None else round(period * 1e9)
+    end_ns = inf if period_ns is None else period_ns
+    ordered = [instant for instant in sorted(instants) if round(instant * 1e9) < end_ns]
+    pass_ns = [round(instant * 1e9) for instant in ordered]
+    return pass_ns, list(_pieces(profile, ordered)), period_ns
 
 
 def _pieces(profile: DirectionProfile, instants: Sequence[float]) -> Iterator[Conditions]:

@@ -156,3 +156,13 @@ def test_each_row_of_a_trace_is_a_piece_of_the_time_line():
     assert line.pieces == [
         Conditions(delay, 0.002, loss, *rest) for delay, loss in zip(delays, losses, strict=True)
     ]
+
+
+def test_equal_profiles_share_their_time_line():
+    def line(*delays, **keys):
+        trace = Trace(tuple(map(float, range(len(delays)))), delays)
+        return Timeline(DirectionProfile(rows=trace, **keys))
+
+    assert line(0.1, 0.2).pieces is line(0.1, 0.2).pieces
+    assert line(0.1, 0.2).pieces != line(0.1, 0.3).pieces
+    assert line(0.1, 0.2, loop=True).period_ns != line(0.1, 0.2).period_ns
