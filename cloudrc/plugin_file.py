@@ -13,6 +13,7 @@ import builtins
 import importlib
 import os
 import sys
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator, Mapping, Sequence
 from hashlib import sha256
 from importlib.abc import MetaPathFinder
@@ -123,7 +124,10 @@ class _Loader(SourceFileLoader):
     def get_code(self, fullname: str) -> CodeType:
         """Compile the source; a cached file may be that of an earlier source."""
         path = self.get_filename(fullname)
-        return self.source_to_code(self.get_data(path), path)
+        source = self.get_data(path)
+        if source.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
+            raise ValueError(f"{path} is saved as UTF-16; save it as UTF-8")
+        return self.source_to_code(source, path)
 
     def exec_module(self, module: ModuleType) -> None:
         """Execute a module."""

@@ -203,7 +203,8 @@ def find(kind: str, name: str, *, look: bool = True) -> Found:
     With `look`, the caller only looks at what the file defines; it neither builds nor measures.
     """
     if is_path(name) and not Path(name).is_file():
-        raise BadInputError(f"{_one(kind)} {name!r}: there is no such file")
+        near = _suggest_file(Path(name))
+        raise BadInputError(f"{_one(kind)} {name!r}: there is no such file{near}")
     with refuse_failure(f"{_one(kind)} {name!r} cannot be imported"):
         if is_path(name):
             if (module := _module_of(Path(name))) is not None:
@@ -332,6 +333,22 @@ def shorten(value: Any) -> str:
 def is_path(name: str) -> bool:
     """Check whether the name of a plug-in is the path of a file."""
     return name.endswith(".py") or "/" in name or "\\" in name
+
+
+def _suggest_file(path: Path) -> str:
+    """Return a suggestion of a file beside a missing one, to append to an error text; or "".
+
+    It has the same name in other letters, or with another suffix, such as `.py.txt`.
+    """
+
+    def plain(name: str) -> str:
+        return name.casefold().partition(".")[0].replace("-", "_").replace(" ", "_")
+
+    with suppress(OSError):
+        files = sorted(each.name for each in path.parent.iterdir() if each.is_file())
+        near = [name for name in files if plain(name) == plain(path.name)]
+        return f"; did you mean {near[0]}?" if near else ""
+    return ""
 
 
 def unknown_name_text(what: str, name: str, available: list[str]) -> str:

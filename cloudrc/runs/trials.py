@@ -83,6 +83,8 @@ class Trials:
         self.present = self._number(1.0 if first is None else first)
         given = STEPS_MAX * self.present * self.size if asked.max is None else asked.max
         if not 0 < self.size <= given < math.inf:
+            if asked.max is None:
+                raise BadInputError(f"--resolution {self.size:g} must be a finite number above 0")
             raise BadInputError(
                 f"--resolution {self.size:g} must be above 0, --max {given:g} not below it"
             )

@@ -148,7 +148,7 @@ def test_the_end_of_the_limits_is_no_failure_of_the_loop(fly_with, call):
         ("link.both.loss --max 50", "--max 50: link.both.loss must be a number >= 0 and <= 1 (1 %"),
         ("guard.command_age_max_ms --max 2e4", "--max 20000: guard.command_age_max_ms must be a"),
         *(
-            (f"{KEY} --resolution {text}", f"--resolution {text} must")
+            (f"{KEY} --resolution {text}", f"--resolution {text} must be a finite number above 0")
             for text in ("-1", "0", "nan")
         ),
         *((f"{KEY} --max {text}", f"--max {text} not") for text in ("nan", "0")),
