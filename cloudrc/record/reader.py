@@ -193,6 +193,7 @@ class File:
         self.position = 0  # end of the last intact record in the file [bytes]
         self.data_ended = False  # whether all messages were read; only the index follows
         self.ended = False  # whether the whole file was read
+        self._is_proven = False  # whether a checksum proves all that is before the index
         self.fault = ""  # why reading stopped or what is wrong, in words; "" if nothing is wrong
         self.cut = False  # whether the file breaks off at the fault, as after a kill
         self.gaps = list[FilePart]()  # what was left out
@@ -209,6 +210,10 @@ class File:
         head = self._stream.peek(16)[:16]
         begins = head.startswith(MCAP0_MAGIC)
         may_be_damaged = not begins or self._try(self._read_records)
+        index_is_wrong = self.fault.startswith("damaged") or not self._is_counted()
+        if self._is_proven and not self.gaps and index_is_wrong:
+            self.content.remarks += ("had a damaged index: all its messages were read",)
+            self.fault, self.statistics = "", None
         if self.gaps and self.data_ended:  # thus the checksum of all data is wrong, too
             self.fault = ""
         found = None
@@ -255,7 +260,9 @@ class File:
                 self._store(record)
             if isinstance(record, mcap.Statistics):
                 self.statistics = record
-            self.data_ended |= isinstance(record, mcap.DataEnd)
+            if isinstance(record, mcap.DataEnd):
+                self.data_ended = True
+                self._is_proven = bool(record.data_section_crc)  # a wrong one is an error
             self.position = end
         self.position = self._stream.tell()
         self.ended = self.data_ended = True
@@ -302,15 +309,21 @@ class File:
         return (
             counts is not None
             and kinds[mcap.Header] > 0
-            and self.read == Counter(counts.channel_message_counts)
+            and self._is_counted()
             and kinds[mcap.Attachment] >= counts.attachment_count
             and kinds[mcap.Metadata] >= counts.metadata_count
         )
 
+    def _is_counted(self) -> bool:
+        """Return whether as many messages were read as the index counts, if it does."""
+        counts = self.statistics
+        return counts is None or self.read == Counter(counts.channel_message_counts)
+
     def _search(self, position: int) -> _Found | None:
         """Find the intact parts of a file from `position` on; None if that finds nothing new."""
         self._stream.seek(0)
-        data, found, listed = self._stream.read(), _Found(), dict[int, list[tuple[int, int]]]()
+        data, found = self._stream.read(), _Found()
+        listed: dict[int, list[tuple[int, int]]] | None = None  # messages of the chunk before
         while position < len(data) and not found.ended:
             record, end = self._parse_at(data, position)
             if isinstance(record, mcap.Chunk):
@@ -325,6 +338,7 @@ class File:
                 if end == len(data):
                     break  # the rest is lost
                 found.holes.append(FilePart(position, end - position, ""))
+                listed = None  # it may have been a chunk
             position = end
         found.size = position
         if found.ended:
@@ -485,9 +499,9 @@ class File:
             raise ValueError("a record is not as long as it states") from error
 
 
-def _is_index_of(index: mcap.MessageIndex, listed: dict[int, list[tuple[int, int]]]) -> bool:
-    """Return whether an index has the messages of a chunk; `listed` as `_list_messages` does."""
-    return sorted(index.records) == sorted(listed.get(index.channel_id, []))
+def _is_index_of(index: mcap.MessageIndex, listed: dict[int, list[tuple[int, int]]] | None) -> bool:
+    """Return whether an index may be that of a chunk, which has the messages `listed`, if known."""
+    return listed is None or sorted(index.records) == sorted(listed.get(index.channel_id, []))
 
 
 def _parse(data: bytes) -> mcap.McapRecord:

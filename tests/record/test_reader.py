@@ -400,6 +400,24 @@ def test_a_damaged_index_of_messages_loses_nothing_and_has_a_place(path, call, n
     assert copy.attachments == Recording.read(path).attachments
 
 
+def test_behind_a_damaged_chunk_its_indexes_are_no_damage(path):
+    path.write_bytes(flipped(sum(CHUNKS[1]) // 2))
+    note = Recording.read(path).note
+    assert note.count("byte ") == 1, note
+    assert f"byte {CHUNKS[1][0]} " in note
+
+
+@pytest.mark.parametrize("opcode", [Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.SUMMARY_OFFSET])
+@pytest.mark.parametrize("inside", [1, 12, 20, 60])
+def test_a_damaged_index_of_the_file_loses_nothing(path, call, opcode, inside):
+    """The checksum of all data proves that every message was read."""
+    start = next(start for kind, start, _ in spans(WHOLE) if kind == opcode)
+    path.write_bytes(flipped(start + inside, 1))
+    assert "kept 100.0%" in call("recover", path, code=0).out
+    copy = Recording.read(path.with_name("x.recovered.mcap"))
+    assert (copy.messages, copy.note) == (MESSAGES, "")
+
+
 @pytest.mark.parametrize("rest", [WHOLE, WHOLE[:SECOND], WHOLE[1000:-1000]])
 def test_a_second_recording_behind_the_first_is_not_passed_over(path, rest):
     path.write_bytes(WHOLE + rest)
