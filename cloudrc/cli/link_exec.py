@@ -12,10 +12,10 @@ from cloudrc.runs.interrupts import interrupt_on_signals
 
 EPILOG = """\
 examples:
-  cloudrc link exec --link lte --seed 1 --server "python serve_policy.py" \\
+  cloudrc link exec --link lte --server "python serve_policy.py" \\
       --client "python robot.py --host {server}"
   cloudrc link exec --link wifi --set uplink.loss=0.02 -o out \\
-      --server "python3 -m http.server 8000" --client "curl -O http://{server}:8000/a"
+      --server "python -m http.server 80" --client "curl http://{server}/"
   cloudrc link set downlink.delay_ms=120      (meanwhile, in another terminal)
 
 Each program has a network of its own, and every IP packet between them passes

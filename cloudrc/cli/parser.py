@@ -41,6 +41,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "robot": "check a robot: facts, a flight, and what must change",
         "doctor": "check whether this machine can fly; say what to fix",
         "link": "show, record, verify or change the emulated network",
+        "relay": "carry TCP connections over the emulated network",
         "key": "make or replace the key that world and cloud share",
         "completion": "print a completion script for your shell",
     },

@@ -32,24 +32,23 @@ MEANINGS = {
 
 def make_exec_report(settings: ExecSettings, outcome: ExecOutcome, link: ExecLink) -> Report:
     """Judge both directions; return the content of link.json."""
+    assert link.relay is not None
     judged = {
-        name: judge_packets(one.way.log, one.period)
-        for name, one in link.directions.items()
-        if one.way
+        name: judge_packets(way.log, link.period(name)) for name, way in link.relay.ways.items()
     }
     late = link.counts().get("release_error_p99_ns", 0) * 1e-9
     findings = {}
     for name, rows in judged.items():
         facts = _facts(link, name, late)
         findings[name] = Findings([row for _, row in rows], facts, _packets(link, name))
-    report = make_report(link.cause, findings)
+    report = make_report(link.live.cause, findings)
     for name, rows in judged.items():
         asked = {row.name: value for value, row in rows}
         for row in report["directions"][name]["rows"]:
             row["applied"] = row.pop("asked")
             if (value := asked[row["name"]]) == value:
                 row["asked"] = value
-    states = {name: asdict(one.state) for name, one in link.directions.items() if one.state}
+    states = {name: asdict(state) for name, state in link.live.states.items()}
     return {
         "schemaVersion": 1,
         **report,
@@ -65,23 +64,21 @@ def make_exec_report(settings: ExecSettings, outcome: ExecOutcome, link: ExecLin
 
 
 def _packets(link: ExecLink, name: str) -> str:
-    one = link.directions[name]
-    assert one.way is not None
-    count = one.way.received - one.period.first
-    since = ", since the last change" if one.period.first else ""
-    return f"{count} packets{since}"
+    assert link.relay is not None
+    first = link.period(name).first
+    since = ", since the last change" if first else ""
+    return f"{link.relay.ways[name].received - first} packets{since}"
 
 
 def _facts(link: ExecLink, name: str, late: float) -> ShaperFacts:
-    one = link.directions[name]
-    assert one.way is not None
+    assert link.relay is not None
+    way, unread = link.relay.ways[name], link.unread[name]
     signs = (
         (late > LATE, f"1 % of packets left later than {in_unit(late, 's')}"),
-        (one.way.waited > WAITED * one.way.received, f"{one.way.waited} packets waited to be read"),
-        (one.unread > 0, f"{one.unread} packets not read in time"),
+        (way.waited > WAITED * way.received, f"{way.waited} packets waited to be read"),
+        (unread > 0, f"{unread} packets not read in time"),
     )
-    starved = ", ".join(text for holds, text in signs if holds)
-    return ShaperFacts(shaper="relay", starved=starved)
+    return ShaperFacts(shaper="relay", starved=", ".join(text for holds, text in signs if holds))
 
 
 def as_text(report: Report) -> str:
@@ -114,12 +111,11 @@ def write_report(folder: Path, report: Report, link: ExecLink) -> None:
     path = folder / "link.json"
     with naming(path):
         path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    for name, one in link.directions.items():
-        assert one.way is not None
-        assert one.state is not None
+    assert link.relay is not None
+    for name, way in link.relay.ways.items():
         path = folder / f"{name}.csv"
         with naming(path), path.open("w", encoding="utf-8") as file:
-            if one.way.received > LOGGED_MAX:
-                file.write(f"# the first {LOGGED_MAX} of {one.way.received} packets\n")
-            origin_ns = one.way.log.sent[0] if len(one.way.log) else 0
-            file.writelines(f"{line}\n" for line in recording(one.way.log, origin_ns))
+            if way.received > LOGGED_MAX:
+                file.write(f"# the first {LOGGED_MAX} of {way.received} packets\n")
+            origin_ns = way.log.sent[0] if len(way.log) else 0
+            file.writelines(f"{line}\n" for line in recording(way.log, origin_ns))

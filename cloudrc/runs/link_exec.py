@@ -29,6 +29,7 @@ from cloudrc.link.exec.namespace import ADDRESSES
 from cloudrc.records import Counted
 from cloudrc.runs.exec_link import FLOWS, ExecLink
 from cloudrc.runs.folder import new_folder
+from cloudrc.runs.live_link import LiveLink
 
 if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
@@ -76,8 +77,8 @@ def run_programs(settings: ExecSettings, tell: Tell) -> tuple[ExecOutcome, ExecL
     for note in edit.notes:
         tell(f"note: {note}")
     with contextlib.ExitStack() as stack:
-        folder, url = _folder(settings.output, stack)
-        link = ExecLink(edit, settings.seed, folder, url)
+        folder, url = link_folder(settings.output, stack)
+        link = ExecLink(LiveLink(edit, folder, url, "cloudrc link exec"), settings.seed)
         stack.callback(link.close)
         run = _Run(link, tell)
         run.open_ends(stack)
@@ -91,7 +92,7 @@ def run_programs(settings: ExecSettings, tell: Tell) -> tuple[ExecOutcome, ExecL
     return outcome, link
 
 
-def _folder(output: Path | None, stack: contextlib.ExitStack) -> tuple[Path, str]:
+def link_folder(output: Path | None, stack: contextlib.ExitStack) -> tuple[Path, str]:
     """Return a folder for the link's state, and the URL beside whose path its sockets are."""
     base = tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder())
     sockets = Path(stack.enter_context(base))
@@ -154,7 +155,7 @@ class _Run:
         from cloudrc.drivers.exporter import Exporter
 
         exporter = self._exporter = Exporter("link")
-        exporter.link.tell = self._link.status_page
+        exporter.link.tell = self._link.live.status_page
         exporter.serve(("127.0.0.1", port))
         stack.callback(exporter.close)
 
@@ -214,7 +215,7 @@ class _Run:
     def _count(self, states: Mapping[str, ProgramState]) -> None:
         """Note the packets that the devices dropped; update the metrics once a second."""
         for name, (sender, _) in FLOWS.items():
-            self._link.directions[name].unread = states[sender].dropped
+            self._link.unread[name] = states[sender].dropped
         now = time.monotonic()
         if self._exporter and now - self._counted_at >= COUNT_PERIOD:
             self._counted_at = now
@@ -236,7 +237,7 @@ def _describe(link: ExecLink, end: ProgramEnd) -> str:
         addresses.ipv4 + (f" and {addresses.ipv6}" if end.has_ipv6 else "")
         for addresses in (ADDRESSES["client"], ADDRESSES["server"])
     )
-    return f"link: {link.cause}, seed {link.seed}, {way}; client {client}, server {server}"
+    return f"link: {link.live.cause}, seed {link.seed}, {way}; client {client}, server {server}"
 
 
 def _only_loopback(state: ProgramState) -> str:

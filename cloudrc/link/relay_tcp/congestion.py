@@ -1,0 +1,175 @@
+"""How many segments of a stream may be on their way, as Linux decides it with CUBIC or with BBR.
+
+Source: RFC 6928 (10 segments), RFC 9438 (CUBIC), Linux, net/ipv4/tcp_cubic.c (HyStart's trains),
+net/ipv4/tcp_bbr.c. Deviation: BBR starts and paces, but does not probe round trip and rate later.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from math import inf
+from typing import Protocol
+
+FIRST_WINDOW = 10.0  # segments
+SHRINK, GROWTH = 0.7, 0.4  # CUBIC's factor after a loss, and constant of growth [segments/s^3]
+TRAIN_NS, TRAIN_WINDOW = 2_000_000, 16
+"""HyStart: largest gap between acknowledgements of one train [ns], smallest window [segments]."""
+START_GAIN, STEADY_GAIN, ROUNDS = 2.885, 2.0, 10
+"""BBR: gain while it looks for the rate of the link and later; rounds that it remembers."""
+PLATEAU, PLATEAUS = 1.25, 3
+"""BBR: the start ends after this number of rounds whose rate has not grown by this factor."""
+
+
+class Congestion(Protocol):
+    """The window of one stream.
+
+    Attributes:
+        window: Largest number of segments on their way.
+    """
+
+    window: float
+
+    def acknowledged(self, sent: SentSegment, now_ns: int, most: int) -> None:
+        """Note an acknowledged segment; `most` segments were on their way since a pause."""
+
+    def lost(self, now_ns: int) -> None:
+        """Note the first loss of a window."""
+
+    def timed_out(self, now_ns: int) -> None:
+        """Note that no answer has come."""
+
+    def rested(self, pauses: float) -> None:
+        """Note a pause of `pauses` time-outs [1]."""
+
+    def spacing_ns(self) -> float:
+        """Return the shortest time between two segments [ns]."""
+
+
+class SentSegment:
+    """What a stream knows about a segment that is acknowledged."""
+
+    __slots__ = ("delivered", "limited", "new_round", "rate_of", "recovers", "sent_ns")
+
+    def __init__(self, sent_ns: int, delivered: int, *, limited: bool) -> None:
+        """Note the time, the segments acknowledged so far, and whether the program limits."""
+        self.sent_ns, self.delivered, self.limited = sent_ns, delivered, limited
+        self.new_round = self.recovers = False
+        self.rate_of = 0  # segments acknowledged between its sending and its acknowledgement
+
+
+class Cubic:
+    """CUBIC, with its early end of slow start."""
+
+    def __init__(self) -> None:
+        self.window, self._threshold = FIRST_WINDOW, inf
+        self._peak, self._shrunk_ns = 0.0, 0
+        self._least_ns = self._round_ns = self._train_ns = 0
+
+    def acknowledged(self, sent: SentSegment, now_ns: int, most: int) -> None:
+        """Grow the window, if it has limited the stream."""
+        trip_ns = now_ns - sent.sent_ns
+        self._least_ns = min(self._least_ns or trip_ns, trip_ns)
+        if sent.recovers:
+            return
+        if self.window < self._threshold:
+            if self.window < 2 * most:
+                self.window += 1.0
+            self._end_start(sent, now_ns)
+        elif most >= self.window - 1.0:
+            since = (now_ns - self._shrunk_ns + self._least_ns) * 1e-9
+            middle = (max(self._peak - self._threshold, 0.0) / GROWTH) ** (1 / 3)
+            wanted = GROWTH * (since - middle) ** 3 + self._peak
+            reno = self._threshold + 0.53 * since / max(self._least_ns * 1e-9, 1e-3)
+            wanted = min(max(wanted, reno), 1.5 * self.window)
+            self.window += max(0.0, wanted - self.window) / self.window
+
+    def _end_start(self, sent: SentSegment, now_ns: int) -> None:
+        """End slow start if one round's train of acknowledgements is as long as half a round."""
+        if sent.new_round:
+            self._round_ns = self._train_ns = now_ns
+        if now_ns - self._train_ns <= TRAIN_NS:
+            self._train_ns = now_ns
+            is_long = now_ns - self._round_ns > self._least_ns // 2
+            if is_long and self.window >= TRAIN_WINDOW:
+                self._threshold = self._peak = self.window
+                self._shrunk_ns = now_ns
+
+    def lost(self, now_ns: int) -> None:
+        """Shrink the window."""
+        self._peak, self._shrunk_ns = self.window, now_ns
+        self._threshold = self.window = max(2.0, SHRINK * self.window)
+
+    def timed_out(self, now_ns: int) -> None:
+        """Begin again with one segment."""
+        self.lost(now_ns)
+        self.window = 1.0
+
+    def rested(self, pauses: float) -> None:
+        """Shrink the window after `pauses` time-outs [1]: it may not fit the link any more."""
+        while pauses > 1.0 and self.window > FIRST_WINDOW:
+            self._threshold = max(self._threshold, 0.75 * self.window)
+            self.window = max(FIRST_WINDOW, 0.5 * self.window)
+            pauses -= 1.0
+
+    def spacing_ns(self) -> float:
+        """Return 0: CUBIC sends as acknowledgements arrive."""
+        return 0.0
+
+
+class Bbr:
+    """BBR: it measures the rate at which segments arrive, and paces by it; losses do not count."""
+
+    def __init__(self) -> None:
+        self.window = FIRST_WINDOW
+        self._rates = deque([0.0], maxlen=ROUNDS)  # fastest of each round [segments/ns]
+        self._least_ns, self._full, self._plateaus = 0, 0.0, 0
+
+    def acknowledged(self, sent: SentSegment, now_ns: int, most: int) -> None:
+        """Measure the rate, and set the window to what the link then holds."""
+        trip_ns = max(1, now_ns - sent.sent_ns)
+        self._least_ns = min(self._least_ns or trip_ns, trip_ns)
+        rate = sent.rate_of / trip_ns
+        fastest = max(self._rates)
+        if sent.new_round:
+            self._look_for_plateau(sent)
+            self._rates.append(0.0)
+        if rate > fastest or not sent.limited:
+            self._rates[-1] = max(self._rates[-1], rate)
+        elif not max(self._rates):
+            self._rates[-1] = fastest
+        gain = START_GAIN if self._plateaus < PLATEAUS else STEADY_GAIN
+        target = max(4.0, gain * max(self._rates) * self._least_ns)
+        if self._plateaus < PLATEAUS:
+            self.window += 1.0 if self.window < target else 0.0
+        else:
+            self.window = min(self.window + 1.0, target)
+
+    def _look_for_plateau(self, sent: SentSegment) -> None:
+        if sent.limited:
+            return
+        fastest = max(self._rates)
+        if fastest >= PLATEAU * self._full:
+            self._full, self._plateaus = fastest, 0
+        else:
+            self._plateaus += 1
+
+    def lost(self, now_ns: int) -> None:
+        """Change nothing."""
+
+    def timed_out(self, now_ns: int) -> None:
+        """Change nothing."""
+
+    def rested(self, pauses: float) -> None:
+        """Change nothing after `pauses` time-outs [1]."""
+
+    def spacing_ns(self) -> float:
+        """Return the time between two segments at the measured rate [ns]; 0 at first."""
+        rate = max(self._rates)
+        if not rate:
+            return 0.0
+        return 1.0 / (rate * (START_GAIN if self._plateaus < PLATEAUS else 1.0))
+
+
+def of_machine(name: str) -> type[Cubic] | type[Bbr]:
+    """Return the kind that is nearest to the kernel's congestion control `name`."""
+    return Bbr if name.startswith("bbr") else Cubic

@@ -1,0 +1,146 @@
+"""A link that a command runs and `cloudrc link set` changes: its profiles, states and sockets."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+from cloudrc.config.document import write_yaml
+from cloudrc.config.load import DIRECTIONS, Edit, load_profile
+from cloudrc.drivers.link_control import ControlServer
+from cloudrc.drivers.local import LINK_FOLDER, link_socket
+from cloudrc.files import write_atomically
+from cloudrc.link.follow import PROFILE, Loaded, Profiles
+from cloudrc.link.profile import DirectionProfile, summary
+from cloudrc.link.state import STATE_FILE, LinkState, to_text
+from cloudrc.link.traces import link_profile
+
+Apply = Callable[[str, Loaded, int], None]
+"""Function that lets a direction follow a profile, at a time on the monotonic clock [ns]."""
+Check = Callable[[DirectionProfile, str], None]
+"""Function that raises a BadInputError if a direction cannot have a profile."""
+
+
+class LiveLink:
+    """Both directions of a link, whose profile can change.
+
+    Attributes:
+        states: Direction -> its present state; empty before `serve`.
+        profiles: Direction -> its present profile.
+        origins_ns: Direction -> start of its time line, monotonic clock [ns].
+    """
+
+    def __init__(
+        self,
+        edit: Edit,
+        folder: Path,
+        url: str,
+        reason: str,
+        check: Check = lambda profile, name: None,
+    ) -> None:
+        """Prepare a link with the profile `edit.values`; raise a BadInputError if `check` does.
+
+        `folder` gets the state of the link, for `cloudrc link set`, which changes it through the
+        sockets beside `url`. `reason` names the command that runs the link.
+        """
+        self.cause, self._reason, self._check = edit.cause, reason, check
+        self._folder, self._url = folder / LINK_FOLDER, url
+        for way in DIRECTIONS:
+            (self._folder / way).mkdir(parents=True)
+        file = self._folder / PROFILE
+        file.write_text(write_yaml(edit.values), encoding="utf-8")
+        self._files = {
+            way: Profiles(file, partial(self._load, way), lambda _: None) for way in DIRECTIONS
+        }
+        self._loaded = {way: profiles.first() for way, profiles in self._files.items()}
+        self.profiles = {way: loaded.direction for way, loaded in self._loaded.items()}
+        self.states: dict[str, LinkState] = {}
+        self.origins_ns: dict[str, int] = {}
+        self._servers: list[ControlServer] = []
+        self._changed: Callable[[LinkState], None] = lambda state: None
+
+    def serve(
+        self,
+        queue: Callable[[Callable[[], None]], None],
+        apply: Apply,
+        changed: Callable[[LinkState], None],
+    ) -> None:
+        """Begin the time line, and take changes from now on.
+
+        `queue` gets a function for the thread that carries the packets, which then calls `apply`.
+        `changed` gets each new state.
+        """
+        now_ns, self._changed = time.monotonic_ns(), changed
+        for way in DIRECTIONS:
+            self.origins_ns[way] = now_ns
+            self._publish(way, now_ns)
+            take = partial(self._take, way, queue, apply)
+            state = partial(self.states.get, way)
+            self._servers.append(ControlServer(link_socket(self._url, way), take, state))
+
+    def close(self) -> None:
+        """Take no more changes, and remove the states."""
+        for server in self._servers:
+            server.shutdown()
+            server.server_close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def status_page(self) -> str:
+        """Return the states of both directions as JSON. Any thread may call this method."""
+        return json.dumps({way: asdict(state) for way, state in self.states.items()}) + "\n"
+
+    def _load(self, way: str, path: Path) -> Loaded:
+        """Read one direction of a profile's file."""
+        profile = load_profile(path)
+        values = profile.model_dump(mode="json", exclude_defaults=True)
+        direction = link_profile(getattr(profile, way))
+        self._check(direction, way)
+        return Loaded(direction, values)
+
+    def _take(
+        self,
+        way: str,
+        queue: Callable[[Callable[[], None]], None],
+        apply: Apply,
+        document: bytes,
+    ) -> str:
+        """Take a change from `cloudrc link set`; return its number."""
+        loaded = self._files[way].take(document, self._folder)
+
+        def change() -> None:
+            now_ns = time.monotonic_ns()
+            if loaded.change.restart:
+                self.origins_ns[way] = now_ns
+            self._loaded[way], self.profiles[way] = loaded, loaded.direction
+            apply(way, loaded, now_ns)
+            self._publish(way, now_ns)
+
+        queue(change)
+        return loaded.change.number
+
+    def _publish(self, way: str, now_ns: int) -> None:
+        before, loaded = self.states.get(way), self._loaded[way]
+        state = self.states[way] = LinkState(
+            shaper="relay",
+            reason=self._reason,
+            mode="relay",
+            direction=way,
+            profile=loaded.values,
+            since=datetime.now(UTC).isoformat(timespec="seconds"),
+            since_ns=now_ns,
+            changes=before.changes + 1 if before else 0,
+            change=loaded.change.number,
+            cause=loaded.change.cause if before else "",
+            asked=summary(loaded.direction),
+            origin_ns=self.origins_ns[way],
+        )
+        with suppress(OSError):  # the link works even if the disk is full
+            write_atomically(self._folder / way / STATE_FILE, to_text(state).encode())
+        self._changed(state)

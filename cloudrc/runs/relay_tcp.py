@@ -1,0 +1,127 @@
+"""Carry TCP connections to a server over the emulated link, until a signal."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import quantiles
+from typing import Any
+
+from cloudrc.config.document import Document
+from cloudrc.config.load import DIRECTIONS, edit_profile
+from cloudrc.drivers.realtime import Address, show_address
+from cloudrc.errors import BadInputError
+from cloudrc.link.follow import Loaded
+from cloudrc.link.relay import settle, tighten_slack
+from cloudrc.link.relay_tcp.congestion import of_machine
+from cloudrc.link.relay_tcp.medium import Medium, refuse_unsupported
+from cloudrc.link.relay_tcp.relay import StreamRelay
+from cloudrc.link.state import LinkState
+from cloudrc.runs.link_exec import link_folder
+from cloudrc.runs.live_link import LiveLink
+
+STEP = 0.05  # longest time until the relay reacts to a change or a signal [s]
+CONTROL = Path("/proc/sys/net/ipv4/tcp_congestion_control")
+WAITING = 512  # connections that the kernel keeps until the relay accepts them
+
+
+@dataclass(frozen=True)
+class RelaySettings:
+    """What to relay; a field is the flag of this name."""
+
+    listen: Address
+    to: Address
+    link: str  # name or file of a profile
+    settings: Sequence[str]  # changes of the profile: KEY=VALUE
+    seed: int
+
+
+def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str, Any]:
+    """Relay connections until KeyboardInterrupt; return counts, and the times of turns [s].
+
+    Raises:
+        BadInputError: If the profile or an address cannot be used.
+    """
+    edit = edit_profile(Document({}), settings.link, settings.settings)
+    for note in edit.notes:
+        tell(f"note: {note}")
+    with contextlib.ExitStack() as stack:
+        folder, url = link_folder(None, stack)
+        live = LiveLink(edit, folder, url, "cloudrc relay tcp", refuse_unsupported)
+        stack.callback(live.close)
+        family, to = _find(settings.to)
+        listening = stack.enter_context(_listen(settings.listen))
+        now_ns = time.monotonic_ns()
+        up, down = (
+            Medium(live.profiles[way], settings.seed, way == "uplink", now_ns) for way in DIRECTIONS
+        )
+        relay = StreamRelay(listening, to, family, (up, down), of_machine(_control()))
+        stack.callback(relay.close)
+
+        def follow(way: str, loaded: Loaded, at_ns: int) -> None:
+            origin_ns = at_ns if loaded.change.restart else None
+            (up if way == "uplink" else down).replace_profile(loaded.direction, origin_ns)
+
+        def changed(state: LinkState) -> None:
+            if state.changes:
+                tell(f"the {state.direction} has changed: {state.cause}")
+
+        live.serve(relay.changes.append, follow, changed)
+        settle()
+        tighten_slack()
+        where = show_address(listening.getsockname()[:2])
+        with contextlib.suppress(KeyboardInterrupt):
+            tell(f"{where} leads to {show_address(settings.to)}; link: {live.cause}")
+            while True:
+                relay.step(STEP)
+        return _summary(relay)
+
+
+def _control() -> str:
+    """Return the congestion control of this machine's TCP; "" if it is not known."""
+    try:
+        return CONTROL.read_text(encoding="ascii").strip()
+    except OSError:  # not Linux
+        return ""
+
+
+def _listen(where: Address) -> socket.socket:
+    family = socket.AF_INET6 if ":" in where[0] else socket.AF_INET
+    try:
+        return socket.create_server(where, family=family, backlog=WAITING)
+    except OSError as error:
+        raise BadInputError(
+            f"--listen {show_address(where)}: {os.strerror(error.errno or 0)};"
+            " name an address of this machine and a port that is free"
+        ) from None
+
+
+def _find(to: Address) -> tuple[int, tuple[str, int]]:
+    """Look up the server's address; return its family, host and port."""
+    try:
+        found = socket.getaddrinfo(*to, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as error:
+        raise BadInputError(f"--to {show_address(to)}: {error}; name a host and a port") from None
+    family, _, _, _, address = found[0]
+    return int(family), (str(address[0]), int(address[1]))
+
+
+def _summary(relay: StreamRelay) -> dict[str, Any]:
+    turns = sorted(turn * 1e-9 for turn in relay.turns)
+    found: dict[str, Any] = {
+        "schemaVersion": 1,
+        "connections": relay.connected,
+        "refused": relay.refused,
+        "uplink_bytes": relay.up_bytes,
+        "downlink_bytes": relay.down_bytes,
+        "turns": {"count": len(turns)},
+    }
+    if turns:
+        cuts = quantiles(turns, n=100, method="inclusive") if len(turns) > 1 else turns * 99
+        found["turns"] |= {"median": cuts[49], "p95": cuts[94], "max": turns[-1]}
+    return found
