@@ -117,12 +117,13 @@ class Cubic:
 
 
 class Bbr:
-    """BBR: it measures the rate at which segments arrive, and paces by it; losses do not count."""
+    """BBR: it measures the rate at which segments arrive, and paces by it, whatever is lost."""
 
     def __init__(self) -> None:
         self.window = FIRST_WINDOW
         self._rates = deque([0.0], maxlen=ROUNDS)  # fastest of each round [segments/ns]
         self._least_ns, self._full, self._plateaus = 0, 0.0, 0
+        self._held_ns = 0  # until then, the window does not grow
 
     def acknowledged(self, sent: SentSegment, now_ns: int, most: int) -> None:
         """Measure the rate, and set the window to what the link then holds."""
@@ -140,7 +141,8 @@ class Bbr:
         gain = START_GAIN if self._plateaus < PLATEAUS else STEADY_GAIN
         target = max(4.0, gain * max(self._rates) * self._least_ns)
         if self._plateaus < PLATEAUS:
-            self.window += 1.0 if self.window < target else 0.0
+            grows = self.window < target and now_ns >= self._held_ns
+            self.window += 1.0 if grows else 0.0
         else:
             self.window = min(self.window + 1.0, target)
 
@@ -154,7 +156,8 @@ class Bbr:
             self._plateaus += 1
 
     def lost(self, now_ns: int) -> None:
-        """Change nothing."""
+        """Let the window not grow for one round trip."""
+        self._held_ns = now_ns + self._least_ns
 
     def timed_out(self, now_ns: int) -> None:
         """Change nothing."""

@@ -1,8 +1,8 @@
 """Compute when the segments of TCP connections cross one direction of the link.
 
-The loss of a segment depends on its place in the bytes of its connection, and the jitter on the
-time, in slots of 10 ms. So the way in which programs and the kernel cut the bytes changes neither.
-All connections share one bottleneck.
+The loss of a segment depends on its place in the bytes of its connection (`stream.py` counts the
+places), and the jitter on the time, in slots of 10 ms. So the way in which programs and the kernel
+cut the bytes changes neither. All connections share one bottleneck.
 """
 
 from __future__ import annotations

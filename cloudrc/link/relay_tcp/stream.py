@@ -63,6 +63,8 @@ class LinkStream:
         self._flight = deque[Segment]()  # in the order of sending, without holes found
         self._order = deque[Segment]()  # not delivered yet, in the order of the bytes
         self._holes = dict[int, Segment]()  # segments that later ones have overtaken
+        # Number of the draw for the last segment; number and offset where the present burst began.
+        self._place, self._first_place, self._first_offset = -1, 0, 0
         self._crossing = self._bytes = 0  # segments and bytes on their way
         self._arrival_ns = self._answer_ns = 0
         self._congestion, self._delivered, self._next_ns = congestion, 0, 0.0
@@ -109,7 +111,8 @@ class LinkStream:
                 data = b""
             else:
                 return
-            segment = Segment(data, self._count, max(self._offset, 0) // SEGMENT)
+            self._place = self._first_place + (self._offset - self._first_offset) // SEGMENT
+            segment = Segment(data, self._count, self._place)
             self._offset = self._offset + len(data) if data else -1
             self._count += 1
             self._bytes += len(data)
@@ -135,6 +138,7 @@ class LinkStream:
     def _restart(self, now_ns: int) -> None:
         """Shrink the window after a pause, as it may not fit the link any more."""
         self._most = 0
+        self._first_place, self._first_offset = self._place + 1, self._offset
         if self._sent_ns:
             self._congestion.rested((now_ns - self._sent_ns) / self._retry_ns())
 

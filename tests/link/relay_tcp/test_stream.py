@@ -2,6 +2,7 @@
 
 import hashlib
 import random
+from itertools import pairwise
 
 import pytest
 
@@ -144,6 +145,19 @@ def test_losses_do_not_depend_on_how_the_bytes_are_cut():
         found.append([medium.cross(1, place, 1, 100, 90_000 * MS) is None for place in range(138)])
     assert found[0] == found[1]
     assert 0 < sum(found[0]) < 20
+
+
+def test_messages_one_after_the_other_have_losses_of_their_own():
+    """Seven of them fit into one segment, but they are seven packets."""
+    far, took, now_ns = Far(profile_of(0.010, loss=0.2)), [], 0
+    for _ in range(200):
+        took.append(far.send(bytes(200), now_ns))
+        now_ns = far.times[-1] + 20 * MS
+        far.agenda.run(now_ns)
+    lost = [time > 11 for time in took]
+    runs = sum(one != other for one, other in pairwise(lost))
+    assert 20 <= sum(lost) <= 60
+    assert runs > 1.2 * sum(lost)  # independent: 1.6; seven at a time: .3
 
 
 def test_losses_shrink_the_window_of_cubic_and_not_that_of_bbr():
