@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +25,8 @@ EPILOG = """\
 examples:
   cloudrc eval --env CartPole-v1 --policy ./law.py --rtt 0,80 --success-at 500
   cloudrc eval --env Pendulum-v1 --policy ws://gpu:8000 --link lte --seeds 50
-  cloudrc eval --env Meta-World/MT1 --env-arg env_name=reach-v3 \\
-      --policy ./expert.py --link lte --rtt 0,80 --executor newest,time-indexed
+  cloudrc eval --env metaworld:Meta-World/MT1 --env-arg env_name=reach-v3 \\
+      --env-arg seed={seed} --policy ./expert.py --link lte --rtt 0,80
 
 law.py has a function infer(observation), as for 'cloudrc policy serve'. The
 environment and its packages are yours. Each condition has the same seeds. With
@@ -77,11 +78,14 @@ def execute(options: argparse.Namespace) -> int:
     needed = ["gym", "report", *(["policy"] if "://" in options.policy else [])]
     require("an evaluation", needed)
     from cloudrc.eval import results
-    from cloudrc.eval.episode import check_environment
+    from cloudrc.eval.episode import check_environment, follows_seed
     from cloudrc.eval.page import write_page
 
     setup, episodes = _read(options)
     check_environment(setup, episodes)
+    if not follows_seed(setup):
+        setup = replace(setup, follows_seed=False)
+        print_line(f"cloudrc: warning: --env {setup.env}: {results.SEEDLESS}", sys.stderr)
     folder = options.out
     if folder is None or not results.is_begun(folder):
         folder = new_folder(folder, f"eval-{Path(setup.env).name}", "latest-eval")

@@ -17,7 +17,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
-from cloudrc.eval.setup import FILE, MEASURED, Episode, EvalSetup, link_at, read_times
+from cloudrc.eval.setup import FILE, MEASURED, SEED, Episode, EvalSetup, link_at, read_times
 from cloudrc.gym import Networked
 from cloudrc.plugins import locate
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
@@ -76,7 +76,7 @@ class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 def play(episode: Episode, setup: EvalSetup, identity: Mapping[str, Any]) -> dict[str, Any]:
     """Play an episode; return its row. Raise a CloudrcError if policy or environment fail."""
-    with make_env(setup) as env, asking(setup) as ask:
+    with make_env(setup, episode.seed) as env, asking(setup) as ask:
         found = _play(episode, setup, env, ask)
     up, down = found.loop["uplink"], found.loop["downlink"]
     numbers = {
@@ -106,11 +106,11 @@ def play(episode: Episode, setup: EvalSetup, identity: Mapping[str, Any]) -> dic
 
 
 @contextmanager
-def make_env(setup: EvalSetup) -> Iterator[gymnasium.Env[Any, Any]]:
-    """Make the environment; raise a BadInputError if that fails."""
-    words = dict(setup.env_args)
+def make_env(setup: EvalSetup, seed: int) -> Iterator[gymnasium.Env[Any, Any]]:
+    """Make the environment of an episode; raise a BadInputError if it fails, also in the block."""
+    words = {key: seed if value == SEED else value for key, value in setup.env_args}
     try:
-        env = gymnasium.make(setup.env, **words)
+        env = gymnasium.make(setup.env, disable_env_checker=True, **words)
     except CloudrcError:
         raise
     except Exception as error:
@@ -279,9 +279,20 @@ def check_environment(setup: EvalSetup, episodes: list[Episode]) -> None:
 
     The call comes before a folder is made. A server is not asked.
     """
-    with make_env(setup) as env:
+    with make_env(setup, 1) as env:
         width_of(env.action_space)
         for executor in dict.fromkeys(each.executor for each in episodes):
             Networked(env, dt=setup.dt, chunk=1, executor=executor)
     if not setup.is_remote:
         _load(setup.policy)
+
+
+def follows_seed(setup: EvalSetup) -> bool:
+    """Return whether two environments begin equally with the same seed."""
+    digests = list[str]()
+    for _ in range(2):
+        with make_env(setup, 1) as env:
+            witness = _Witness(env)
+            witness.reset(seed=1)
+            digests.append(witness.digest.hexdigest())
+    return digests[0] == digests[1]

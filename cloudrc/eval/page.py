@@ -8,7 +8,7 @@ from math import nan
 from pathlib import Path
 from string import Template
 
-from cloudrc.eval.results import EvalOutcome, cells, describe_success
+from cloudrc.eval.results import SEEDLESS, EvalOutcome, cells, describe_success
 from cloudrc.eval.setup import MEASURED, EvalSetup
 from cloudrc.files import write_atomically
 from cloudrc.report.figures.bands import Panel, Point, draw
@@ -24,7 +24,7 @@ CAPTION = (
     "means. All conditions have the same seeds, so that they meet the same environments and "
     "networks."
 )
-NOT_REPEATABLE = (
+MEASURED_TIME = (
     "Not repeatable: the time for an answer was measured on this machine, so that the rows have no "
     "hash."
 )
@@ -60,7 +60,7 @@ def write_page(folder: Path, setup: EvalSetup, outcomes: Sequence[EvalOutcome]) 
     page = TEMPLATE.substitute(
         title=escape(f"{setup.env}: {Path(setup.policy).name} over {setup.link}"),
         facts=escape(_facts(setup, outcomes)),
-        warning="" if setup.is_repeatable else f'<p class="warning">{NOT_REPEATABLE}</p>',
+        warning="".join(f'<p class="warning">{escape(each)}</p>' for each in _warnings(setup)),
         figure=svg[svg.index("<svg") :],
         caption=CAPTION,
         table="".join(f"<tr>{line}</tr>" for line in lines),
@@ -69,6 +69,11 @@ def write_page(folder: Path, setup: EvalSetup, outcomes: Sequence[EvalOutcome]) 
     )
     write_atomically(folder / PAGE, page.encode())
     return folder / PAGE
+
+
+def _warnings(setup: EvalSetup) -> list[str]:
+    found = [(setup.is_measured, MEASURED_TIME), (not setup.follows_seed, SEEDLESS)]
+    return [text for applies, text in found if applies]
 
 
 def _facts(setup: EvalSetup, outcomes: Sequence[EvalOutcome]) -> str:

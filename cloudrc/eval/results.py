@@ -21,6 +21,11 @@ from cloudrc.text import format_number, table
 
 FILE = "eval.json"
 """File in the folder of an evaluation: what it plays, and the summary of its rows."""
+SEEDLESS = (
+    "the environment begins differently with the same seed, so that the conditions are not paired; "
+    "if it takes a seed, add --env-arg 'seed={seed}'"
+)
+"""Warning about an environment that does not follow the seed of its reset."""
 AVERAGED = {
     "stale_share": "steps without a new action",
     "observation_age": "age of the observation",

@@ -23,6 +23,8 @@ from cloudrc.policy.observation import Mapped
 Compute: TypeAlias = float | tuple[float, float] | tuple[str, str]
 """Time for an answer [s]: constant; or mean and deviation; or (FILE, name) or (MEASURED, "")."""
 FILE, MEASURED = "file", "measured"
+SEED = "{seed}"
+"""Value of an environment's argument that stands for the seed of the episode."""
 COMPUTE_MAX = 3600.0
 """Largest time for an answer [s]."""
 
@@ -40,6 +42,7 @@ class EvalSetup:
     success_at: float | None = None  # smallest return of a success [1]; None: what the info says
     dt: float | None = None  # time of a step [s]; None: that of the environment
     max_steps: int = 10_000  # longest episode
+    follows_seed: bool = True  # whether equal seeds give equal episodes
 
     @property
     def is_remote(self) -> bool:
@@ -48,8 +51,13 @@ class EvalSetup:
 
     @property
     def is_repeatable(self) -> bool:
-        """Whether no clock of this machine counts."""
-        return self.compute[:1] != (MEASURED,) if isinstance(self.compute, tuple) else True
+        """Whether the environment follows its seed, and no clock of this machine counts."""
+        return self.follows_seed and not self.is_measured
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the time for an answer is measured."""
+        return isinstance(self.compute, tuple) and self.compute[0] == MEASURED
 
     def identity(self) -> dict[str, Any]:
         """Return all that the result of an episode depends on, but its condition and seed."""
@@ -176,7 +184,7 @@ def read_env_args(texts: list[str]) -> tuple[tuple[str, Any], ...]:
         key, equals, value = text.partition("=")
         if not (equals and key.isidentifier()):
             raise BadInputError(f"--env-arg {text}: give KEY=VALUE, such as env_name=reach-v3")
-        found[key] = parse_value(value, f"--env-arg {key}")
+        found[key] = value if value == SEED else parse_value(value, f"--env-arg {key}")
     return tuple(sorted(found.items()))
 
 

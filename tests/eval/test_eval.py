@@ -185,6 +185,32 @@ def test_a_success_is_what_the_info_says_in_any_step(law, key, verdict):
     assert play(Episode(None, "newest", 1), setup, {})["verdict"] == verdict
 
 
+class Random(Task):
+    """Begins at random, unless it gets a seed."""
+
+    def __init__(self, seed=None):
+        super().__init__()
+        start = seed if seed is not None else np.random.SeedSequence().entropy % 200
+        self.start = np.full(2, start % 200, np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        return {"eye": self.start}, super().reset()[1]
+
+
+gymnasium.register("Random-v0", Random)
+
+
+def test_an_environment_that_does_not_follow_its_seed_is_told_and_may_get_it(law, tmp_path, capsys):
+    words = ["eval", "--env", "Random-v0", "--policy", law(STILL), "--seeds", "1", "--jobs", "1"]
+    for name, more, warned in (("a", [], True), ("b", ["--env-arg", "seed={seed}"], False)):
+        assert main([*words, *more, "--out", str(tmp_path / name)]) == 0
+        assert ("not paired" in capsys.readouterr().err) is warned
+        page = (tmp_path / name / "report.html").read_text()
+        assert ("not paired" in page) is warned
+        document = json.loads((tmp_path / name / "eval.json").read_text())
+        assert document["repeatable"] is not warned
+
+
 def test_an_episode_without_an_end_is_cut(law):
     setup = EvalSetup("Pendulum-v1", law(SHAKY), max_steps=7)
     assert play(Episode(None, "newest", 1), setup, {})["numbers"]["steps"] == 7
