@@ -67,6 +67,12 @@ METHODS = {
     **{"onboard": "update", "motion": "__call__", "executors": "action"},
 }
 """Kind of plug-in -> the method that every plug-in of this kind defines."""
+INHERITED = {
+    "estimators": ("update", "add_applied"),
+    "predictors": ("observe", "commanded", "applied", "reset"),
+    "controllers": ("reset",),
+}
+"""Kind of plug-in -> further methods that cloud calls; the base class of the kind has them."""
 
 
 class Found:
@@ -188,12 +194,17 @@ def signature(kind: str, name: str) -> inspect.Signature:
 
 def load(kind: str, name: str, /, **parameters: Any) -> Any:
     """Find a plug-in and build it; raise a BadInputError if it is missing or its `build` fails."""
-    build, method = builder(kind, name, look=False), METHODS[kind]
+    build, inherited = builder(kind, name, look=False), INHERITED.get(kind, ())
     with refuse_failure(f"{_one(kind)} {name!r} cannot be built"):
         plugin = build(**parameters)
-        if not callable(getattr(plugin, method, None)):
-            built = type(plugin).__name__
-            raise ValueError(f"build() returned {built}, which has no method {method}()")
+        for method in (METHODS[kind], *inherited):
+            if not callable(getattr(plugin, method, None)):
+                base = f"{PACKAGES[kind]}.{_one(kind).capitalize()}"
+                advice = f"; derive its class from {base}" if method in inherited else ""
+                built = type(plugin).__name__
+                raise ValueError(
+                    f"build() returned {built}, which has no method {method}(){advice}"
+                )
     return plugin
 
 

@@ -80,7 +80,8 @@ def test_parameters_are_checked_against_build(share, setting, reason):
          "cannot be built: CancelledError"),
         ("def build():\n    return build()", "cannot be built: RecursionError: "),
         ("def build(): ...", "build() returned NoneType, which has no method predict()"),
-        ("class A:\n    def reset(self): 1 / 0\n    predict = reset\ndef build(): return A()",
+        ("from cloudrc.cloud.predictors.last_sample import LastSample\n"
+         "class build(LastSample):\n    def reset(self): 1 / 0\n",
          "its reset() failed: ZeroDivisionError"),
         ("def build(share=object()): ...", "has a default that YAML cannot contain: "),
         ("class A: ...\ndef build(a: A = None): ...", "must be an object of a class, which YAML"),
@@ -98,6 +99,25 @@ def test_a_broken_plug_in_is_one_line(share, text, reason):
 class ExitingTextError(Exception):
     def __str__(self):
         raise SystemExit(0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "lacking"),
+    [
+        *(("predictor", name) for name in ("predict", "observe", "commanded", "applied", "reset")),
+        *(("estimator", name) for name in ("horizon", "update", "add_applied")),
+        *(("controller", name) for name in ("update", "reset")),
+    ],
+)
+def test_a_plug_in_that_lacks_a_method_is_refused_before_the_flight(share, kind, lacking):
+    methods = {plugins.METHODS[f"{kind}s"], *plugins.INHERITED[f"{kind}s"]} - {lacking}
+    lines = [f"    def {name}(self, *given): ..." for name in sorted(methods)]
+    share.write_text("\n".join(["class Own:", *lines, "build = Own"]))
+    found = refused("paper", f"cloud.{kind}={share}")
+    assert (
+        f"{share}' cannot be built: build() returned Own, which has no method {lacking}()" in found
+    )
+    assert "\n" not in found.strip()
 
 
 @pytest.mark.parametrize(
