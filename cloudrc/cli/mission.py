@@ -256,7 +256,9 @@ def _order(options: argparse.Namespace, api: Api) -> int:
         if options.verb == "resume" and mission["by_hand"]:
             _say(api, f"the drive ends, and the robot holds; mission {mission['id']} is then done")
             return 0
-        action = f"flying to waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
+        action = "following the setpoints of a file"
+        if mission["waypoints"]:
+            action = f"flying to waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
         action = _stay(api) if options.verb == "hold" else action
     _say(api, f"{action}; {describe_mission(mission)}")
     return 0

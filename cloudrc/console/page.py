@@ -235,8 +235,10 @@ class Page:
             return "drive, waits for keys"
         if not mission:
             return "none"
-        reached = f"{len(mission['reached'])} of {mission['waypoints']} waypoints"
-        return f"{mission['name'] or mission['id']}, {mission['state']}, {reached}"
+        progress = "setpoints of a file"
+        if mission["waypoints"]:
+            progress = f"{len(mission['reached'])} of {mission['waypoints']} waypoints"
+        return f"{mission['name'] or mission['id']}, {mission['state']}, {progress}"
 
     def _follow_link(self, now: float) -> None:
         """Show the link's present state on the sliders, unless somebody is moving a slider."""

@@ -13,7 +13,7 @@ def missions_table(missions: Sequence[Mapping[str, Any]]) -> str:
     """Return a table with a row per mission."""
     rows = [("ID", "NAME", "STATE", "WAYPOINTS", "VERDICT")]
     for each in missions:
-        done = f"{len(each['reached'])}/{each['waypoints']}"
+        done = f"{len(each['reached'])}/{each['waypoints']}" if each["waypoints"] else "-"
         verdict = describe_verdict(each["verdict"]) if each["verdict"] else ""
         rows.append((each["id"], each["name"], each["state"], done, verdict))
     return table(rows)

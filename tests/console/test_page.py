@@ -243,6 +243,18 @@ def test_the_state_tells_a_drive_and_names_buttons(filled):
     assert "Mission: driving" in page._status.content
 
 
+@pytest.mark.parametrize(
+    ("waypoints", "shown"), [(7, "0 of 7 waypoints"), (0, "setpoints of a file")]
+)
+def test_the_state_tells_what_the_mission_follows(filled, waypoints, shown):
+    page, feed, steering = filled("hover")
+    mission = {"id": "m1", "name": "tour", "by_hand": False, "state": "flying", "reached": []}
+    steering.state = {"mission": mission | {"waypoints": waypoints}, "seen": {"next_step": ""}}
+    feed.take(status(0.1), 1.0)
+    page.update(1.0)
+    assert f"Mission: tour, flying, {shown}" in page._status.content
+
+
 def test_controls_of_a_browser_that_left_do_not_end_the_console(filled):
     page, _, steering = filled("hover")
     slider = page._server.gui.add_slider("Up", 0.0, 500.0, 1.0, 0.0)
