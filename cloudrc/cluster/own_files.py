@@ -15,7 +15,8 @@ from pathlib import Path
 from cloudrc.cluster.client import NotFoundError, Release, run
 from cloudrc.cluster.jobs import owner_of
 from cloudrc.cluster.pods import find_deployment
-from cloudrc.config.robot import files_of
+from cloudrc.config.hull import hull_of
+from cloudrc.config.robot import files_of, find_robot
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import ROBOT_FILE, is_path
 from cloudrc.errors import BadInputError
@@ -49,6 +50,7 @@ def find_own_files(world: World) -> dict[str, dict[str, Path]]:
         found["robot"] = {path.name: path for path in folder.iterdir() if path.is_file()}
         needed = {file for path in files_of(world.robot) for file in model_files(path)}
         _check("world.robot", folder, needed, found["robot"])
+        _check_size(world.robot)
     if world.scene.endswith(".xml"):
         scene = Path(world.scene)
         needed = {*model_files(scene)} - {scene}
@@ -71,6 +73,15 @@ def _check(key: str, folder: Path, needed: set[Path], files: Mapping[str, Path])
         text = f"has {total} bytes, but a ConfigMap takes {SIZE_MAX} (1 MiB)"
         largest = f"the largest is {sizes[max(sizes)]} with {max(sizes)}; move what is not needed"
         raise BadInputError(f"{key}: {folder}: {text}; {largest}, {REMEDY}")
+
+
+def _check_size(name: str) -> None:
+    """Refuse a robot without a size, because the cloud pod has no MuJoCo to measure the model."""
+    robot = find_robot(name)
+    if robot.hull is None and robot.hull_points is None:
+        radius = float(hull_of(name).few.radii[0])
+        text = f"in a cluster a robot needs its size; add the line hull_m: {radius + 0.0005:.3f}"
+        raise BadInputError(f"world.robot: {Path(name) / ROBOT_FILE}: {text}")
 
 
 def send_own_files(release: Release, found: Mapping[str, Mapping[str, Path]]) -> dict[str, str]:

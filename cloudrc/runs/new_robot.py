@@ -15,7 +15,7 @@ description: My robot
 model: robot.xml          # MJCF; the base has a free joint
 onboard: multirotor       # or diff_drive, or ./onboard.py with a function build(model)
 # planar: true            # for a robot that stays on the ground
-# hull_m: 0.4             # radius of the ball about the base that holds the robot [m]
+hull_m: 0.34              # ball about the base that holds the robot: at least size_m of the check
 # sensors: {height: {unit: m, sensor: range}}            # own values, from sensors of the model
 guard: {acceleration_max_mps2: 4, braking_mps2: 3}     # 'cloudrc robot check' measures the braking
 # response:               # for predictors; 'cloudrc identify RUN' fits it to a flight

@@ -61,7 +61,7 @@ def test_a_shipped_robot_needs_no_change(robot, capsys, tmp_path, monkeypatch):
     ("file", "old", "new", "shown"),
     [
         ("robot.yaml", "braking_mps2: 3", "braking_mps2: 9", "guard.braking_mps2 is 9, but"),
-        ("robot.yaml", "# hull_m: 0.4", "hull_m: 0.1", "hull_m is 0.1, but the geoms reach"),
+        ("robot.yaml", "hull_m: 0.34", "hull_m: 0.1", "hull_m is 0.1, but the geoms reach"),
         ("robot.yaml", "onboard: multirotor", "onboard: ./own.py", "own.py:10 in update"),
         ("robot.yaml", "onboard: multirotor", "onboard: ./turns.py", "the robot turns over"),
     ],

@@ -10,6 +10,7 @@ from cloudrc.cluster.own_files import SIZE_MAX, find_own_files, send_own_files
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import FOLDERS
 from cloudrc.errors import BadInputError
+from cloudrc.runs.new_robot import write_robot
 
 MESHES = """<mujoco><compiler meshdir="meshes"/><asset><mesh name="arm" file="arm.stl"/></asset>
 <worldbody/></mujoco>"""
@@ -110,6 +111,22 @@ def test_a_name_that_is_no_key_of_a_configmap_is_refused(robot, name):
 
 def test_a_model_without_robot_yaml_is_refused_with_what_to_write(robot):
     assert "robot.yaml" in refused(robot / "robot.xml")
+
+
+def test_a_robot_without_a_size_is_refused_with_the_line_to_add(robot):
+    file = robot / "robot.yaml"
+    text = file.read_text()
+    (size,) = (line for line in text.splitlines() if line.startswith("hull_m"))
+    file.write_text(text.replace(size, ""))
+    said = refused(robot)
+    assert str(file) in said
+    file.write_text(text.replace(size, said.rpartition("add the line ")[2]))
+    assert "robot" in find(robot)
+
+
+def test_a_new_robot_can_be_sent(tmp_path):
+    write_robot(tmp_path / "new")
+    assert "robot.xml" in find(tmp_path / "new")["robot"]
 
 
 def test_a_scene_is_sent_under_a_fixed_name_with_the_files_that_it_names(tmp_path):
