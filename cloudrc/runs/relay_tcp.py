@@ -102,12 +102,13 @@ def _listen(where: Address) -> socket.socket:
 
 
 def _find(to: Address) -> tuple[int, tuple[str, int]]:
-    """Look up the server's address; return its family, host and port."""
+    """Look up the server's address, IPv4 if it has one; return its family, host and port."""
     try:
         found = socket.getaddrinfo(*to, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:
         raise BadInputError(f"--to {show_address(to)}: {error}; name a host and a port") from None
-    family, _, _, _, address = found[0]
+    # A server rarely listens at ::1 alone, but localhost often names it first.
+    family, _, _, _, address = min(found, key=lambda one: one[0] != socket.AF_INET)
     return int(family), (str(address[0]), int(address[1]))
 
 
