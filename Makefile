@@ -34,11 +34,12 @@ BUILD_ARGS := $(BASE:%=--build-arg BASE=%) --build-arg VERSION=$(VERSION) \
 # Independent of the processor: the lock has the hashes of all wheels for Linux.
 COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python-platform linux \
 	--generate-hashes --no-emit-index-url --custom-compile-command 'make lock'
+ROS_PACKAGES := rclpy rmw-fastrtps-cpp nav-msgs geometry-msgs rosgraph-msgs
 # MuJoCo's viewers, a tenth of the image: a pod draws nothing.
 DRAWING := glfw pyopengl mujoco-studio
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link pictures results docs dist images kind-load lock clean
+.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link pictures results docs dist images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -71,6 +72,26 @@ test-tun: $(VENV)/dev ## run the tests of two programs in namespaces; needs root
 
 smoke-tun: $(VENV)/dev ## of these the few that every push runs
 	$(bin)/pytest -m 'tun and smoke' tests/link/exec
+
+ros2-test: build/ros-jazzy/done build/ros-kilted/done ## fly with nodes of ROS 2 Jazzy and Kilted, from wheels; x86-64 Linux only
+	build/ros-jazzy/bin/python -m pytest -m 'ros2 and not full' tests/bridges
+	build/ros-kilted/bin/python -m pytest -m 'ros2 and not full' tests/bridges
+
+ros2-smoke: build/ros-jazzy/done build/ros-kilted/done ## of these one flight each, which every push runs
+	build/ros-jazzy/bin/python -m pytest -m 'ros2 and smoke' tests/bridges
+	build/ros-kilted/bin/python -m pytest -m 'ros2 and smoke' tests/bridges
+
+# A real ROS 2 in an environment of its own, which also has the packages of $(VENV).
+build/ros-%/done: tests/bridges/ros-%.txt | $(VENV)/dev
+	@test "$$(uname -sm)" = "Linux x86_64" || { echo "no wheels of ROS 2 for this machine: source a \
+	ROS 2, and run pytest -m ros2 tests/bridges" >&2; exit 3; }
+	rm -rf build/ros-$*
+	$(bin)/python -m venv build/ros-$*
+	build/ros-$*/bin/python -m pip install --disable-pip-version-check --quiet --no-deps \
+		--require-hashes --requirement $<
+	echo "import site; site.addsitedir('$$($(bin)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')')" \
+		> "$$(build/ros-$*/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/dev.pth"
+	@touch $@
 
 # Without root or sch_netem, pytest ends with 3; make turns every failure into 2.
 test-netem: $(VENV)/dev ## run the tests of netem in the kernel; needs root and sch_netem
@@ -112,7 +133,7 @@ mutants: $(VENV)/dev ## mutate guard, tunnel and store, list the mutants that te
 NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults.json \
 	search-adversarial.json $(ROBOTS:%=search-%.json) search-random.json \
 	link.json mujoco-oldest.json mujoco-newest.json gym-sb3.json) \
-	mutants night-tun night-netem e2e-full $(EVIDENCE)/index.md
+	mutants night-tun night-ros2 night-netem e2e-full $(EVIDENCE)/index.md
 
 nightly: export CLOUDRC_EVIDENCE = $(CURDIR)/$(EVIDENCE)
 nightly: $(VENV)/dev ## run every test, search and bench; writes build/evidence (needs what e2e needs)
@@ -120,7 +141,7 @@ nightly: $(VENV)/dev ## run every test, search and bench; writes build/evidence 
 	$(MAKE) --jobs=1 --keep-going $(NIGHT)
 
 $(EVIDENCE)/tests.xml:
-	$(bin)/pytest -n auto -m 'not process and not e2e and not netem and not tun' --junitxml=$@
+	$(bin)/pytest -n auto -m 'not process and not e2e and not netem and not tun and not ros2' --junitxml=$@
 
 $(EVIDENCE)/process.xml:
 	REQUIRE_ALL=1 $(bin)/pytest -m process --junitxml=$@
@@ -157,9 +178,13 @@ $(EVIDENCE)/gym-sb3.json:
 $(EVIDENCE)/index.md:
 	$(bin)/python -m tools.evidence $(EVIDENCE)
 
-.PHONY: night-tun night-netem
+.PHONY: night-tun night-ros2 night-netem
 night-tun:
 	$(bin)/pytest -m tun tests/link/exec
+
+night-ros2: build/ros-jazzy/done build/ros-kilted/done
+	build/ros-jazzy/bin/python -m pytest -m ros2 tests/bridges
+	build/ros-kilted/bin/python -m pytest -m ros2 tests/bridges
 
 night-netem:
 	@if unshare --net tc qdisc add dev lo root netem delay 1ms; then $(MAKE) test-netem-full; \
@@ -248,6 +273,9 @@ lock: $(VENV)/bin/python ## update the locked requirements of images and tests
 	printf 'hatchling\ntccbox\n' | $(COMPILE) - --output-file images/build-requirements.txt
 	$(COMPILE) pyproject.toml --extra dev --no-emit-package cloudrc \
 		--output-file tests/requirements.txt
+	for ros in jazzy kilted; do printf "ros-$$ros-%s\n" $(ROS_PACKAGES) | $(COMPILE) - \
+		--no-emit-package numpy --no-emit-package pyyaml --output-file tests/bridges/ros-$$ros.txt \
+		|| exit 1; done
 
 clean: ## remove the environment and generated folders
 	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

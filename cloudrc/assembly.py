@@ -15,6 +15,7 @@ import numpy as np
 
 from cloudrc.cloud.controllers import Controller
 from cloudrc.cloud.controllers.remote import ControllerChannel, OutsideController
+from cloudrc.cloud.controllers.ros2 import RosController
 from cloudrc.cloud.endpoint import CloudEndpoint, ComputeTime
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
@@ -113,15 +114,17 @@ def fly(
     experiment: ResolvedExperiment,
     see: Sink,
     make_loop: Callable[..., ControlLoop] = ControlLoop,
+    gone: Callable[[], bool] = lambda: False,
 ) -> None:
     """Fly in virtual time until the mission is over.
 
     Every 100 ms of virtual time, call `see` with the new records of world and of cloud, both on
     world's clock. `make_loop` is that of `build_cloud`.
 
-    Raise a ControllerLostError if a program outside controls the robot and is lost.
+    `gone` returns whether a program that controls the robot from outside has ended. Raise a
+    ControllerLostError if such a program is lost.
     """
-    with _lock_step(experiment) as channel:
+    with _lock_step(experiment, gone) as channel:
         _, _, teleop, run = assemble(experiment, make_loop, channel)
         lost = list[ControllerLostError]()
 
@@ -136,14 +139,20 @@ def fly(
         raise lost[0]
 
 
-def _lock_step(experiment: ResolvedExperiment) -> AbstractContextManager[ControllerChannel | None]:
+def _lock_step(
+    experiment: ResolvedExperiment, gone: Callable[[], bool]
+) -> AbstractContextManager[ControllerChannel | None]:
     """Connect to the program outside that controls the robot; without one, yield None."""
     controller = build_controller(experiment)
     if not isinstance(controller, OutsideController):
         return nullcontext()
+    if isinstance(controller, RosController):
+        from cloudrc.bridges.ros2.lock_step import RosLockStep
+
+        return RosLockStep(controller.place, controller.start_limit, gone)
     from cloudrc.drivers.remote import LockStep
 
-    return LockStep(controller.url, controller.start_limit)
+    return LockStep(controller.place, controller.start_limit)
 
 
 def lost_controller(records: Iterable[Record]) -> Iterator[ControllerLostError]:
@@ -231,7 +240,7 @@ def build_cloud(
         plan=cloud.plan_s,
     )
     if remote is not None and channel is not None:
-        remote.connect(channel, loop.period_ns * 1e-9, loop.counts)
+        remote.connect(channel, loop.period_ns * 1e-9, loop.counts, lambda: loop.newest)
     cpu_clock = cpu_clock if cloud.compute_measured else None
     compute = None
     if cloud.compute_ms or cpu_clock:

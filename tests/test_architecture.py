@@ -62,6 +62,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         *("endpoint", "tunnel", "link", "exposition", "files", "policy", "policy.address"),
         *("record", "teleop"),
     },
+    "bridges": {"drivers", "policy", "record"},
     "record": {"endpoint", "files"},
     "metrics": {"metrics.definitions", "record", "config", "geometry", "plugins"},
     "metrics.definitions": set(),  # live metrics import it in every process, with no heavy library
@@ -73,7 +74,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cluster": {"config", "geometry", "link", "record", "report", "teleop"},
     "statistics": set(),
     "runs": {
-        *("assembly", "cloud", "cluster", "config", "drivers", "files", "geometry", "link"),
+        *("assembly", "bridges", "cloud", "cluster", "config", "drivers", "files", "geometry"),
+        "link",
         *("metrics", "plugin_file", "plugins", "record", "report", "robots", "statistics"),
         *("teleop", "tunnel", "warnings", "world"),
     },
@@ -100,6 +102,8 @@ ALWAYS = {
     "version",
 }
 
+ROS = ("rclpy", "geometry_msgs", "nav_msgs", "rosgraph_msgs")
+# Packages of a sourced ROS 2, which no package registry is asked for.
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it. Ruff checks
 # clocks, sockets, threads, signals, chance, and calls such as `eval` and `print` (pyproject.toml).
 RESERVED: dict[str, tuple[str, ...]] = {
@@ -136,6 +140,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("secrets", "uuid"), ("console/", "drivers/", "cluster/", "cli/")),
     "websockets": ("console/handed", "policy/"),
     "msgpack": ("policy/codec",),
+    **dict.fromkeys(ROS, ("bridges/ros2/",)),
     **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),
 }
 # Imported package -> its name in pyproject.toml.
@@ -264,7 +269,8 @@ def test_live_metrics_load_neither_recordings_nor_heavy_libraries():
 def foreign(trees):
     """Return the imported external packages by their names in pyproject.toml."""
     found = {name.partition(".")[0] for tree in trees for name in imports(tree)}
-    return {ASKED_AS.get(name, name) for name in found - sys.stdlib_module_names - {"cloudrc"}}
+    found -= sys.stdlib_module_names | {"cloudrc", *ROS}
+    return {ASKED_AS.get(name, name) for name in found}
 
 
 def test_imported_and_declared_packages_are_the_same():

@@ -157,6 +157,11 @@ class ControlLoop:
         return NEVER_NS if self._basis is None else self._basis.stamp_ns
 
     @property
+    def newest(self) -> tuple[int, Odometry | None]:
+        """Time of the newest telemetry or command [ns], cloud's clock, and the newest odometry."""
+        return self._now_ns, self._basis
+
+    @property
     def ready(self) -> bool:
         """Whether telemetry has arrived in this session."""
         return self._basis is not None

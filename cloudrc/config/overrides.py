@@ -36,7 +36,8 @@ from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.renamed import new_key
 
-REMOTE = "remote"
+REMOTE, ROS2 = "remote", "ros2"
+OUTSIDE = (REMOTE, ROS2)
 """Name of the controller that asks a program outside."""
 KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "controllers"}
 """Key under `cloud` -> kind of plug-in."""
@@ -312,8 +313,8 @@ def _complete(
     if document.get("cloud", "plan_s"):
         if kind == "predictors":
             _check_model(plugin, name)
-        if kind == "controllers" and name == REMOTE:
-            raise BadInputError(f"'{REMOTE}' cannot plan ahead; set cloud.plan_s to 0")
+        if kind == "controllers" and name in OUTSIDE:
+            raise BadInputError(f"'{name}' cannot plan ahead; set cloud.plan_s to 0")
     return values
 
 

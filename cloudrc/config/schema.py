@@ -58,6 +58,9 @@ Place = Annotated[
 """A point; a robot that stays on the ground needs no third number."""
 ServerUrl = Annotated[str, AfterValidator(check_url)]
 """Address of a policy's server, such as ws://127.0.0.1:8000."""
+_ROS_NAME = "[A-Za-z_][A-Za-z0-9_]*"
+RosNamespace = Annotated[str, Field(pattern=f"^(/?{_ROS_NAME}(/{_ROS_NAME})*)?$")]
+"""Namespace of ROS 2, such as drone1."""
 NotNegatives = tuple[NotNegative, NotNegative, NotNegative]
 _Constant = Annotated[float, Field(gt=0, le=30)]
 _DeadTime = Annotated[float, Field(ge=0, le=5)]

@@ -9,7 +9,7 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -28,8 +28,10 @@ LOOK_PERIOD = 0.1
 
 
 @contextmanager
-def companion(command: str, folder: Path, url: str = "") -> Iterator[None]:
+def companion(command: str, folder: Path, url: str = "") -> Iterator[Callable[[], bool]]:
     """Run `command` during the block; its output goes to `LOG_FILE` in `folder`.
+
+    The yielded function returns whether the program has ended.
 
     With `url`, the address of a policy's server, first wait until somebody listens there. At the
     end of the block, the program and all its children are ended.
@@ -44,7 +46,7 @@ def companion(command: str, folder: Path, url: str = "") -> Iterator[None]:
     try:
         if url:
             _wait_for(url, program, log)
-        yield
+        yield lambda: program.poll() is not None
     except ControllerLostError as error:
         if (code := program.poll()) is None:
             raise

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc import assembly
 from cloudrc.cloud.controllers.remote import OutsideController
+from cloudrc.cloud.controllers.ros2 import RosController
 from cloudrc.config.load import ResolvedExperiment, load_experiment, read_experiment
 from cloudrc.config.robot import known_robot
 from cloudrc.drivers.keyfile import KeyFile
@@ -28,6 +29,7 @@ from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.messages import GuardState, plan_length
 from cloudrc.plugins import apart
 from cloudrc.processes.ports import listening, open_exporter, warn
+from cloudrc.records import Fault
 from cloudrc.runs.requirements import require
 from cloudrc.source import code_hash
 from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES, Kind
@@ -112,10 +114,18 @@ def run_remote(config: Path, folder: Path, stop: StopSignal, *, watched: bool) -
     feed = Feed.on_stdout(watched=watched)
     controller = assembly.build_controller(load_experiment(str(config)))
     if not isinstance(controller, OutsideController):
-        raise BadInputError(f"{config}: cloud.controller is not remote")
+        raise BadInputError(f"{config}: cloud.controller is neither remote nor ros2")
     other, own = sockets_of(folder)
     with closing(UnixDatagrams(own, other, DATAGRAM_MAX)) as peer:
-        driver = RemoteDriver(peer, controller.url, controller.start_limit)
+        if isinstance(controller, RosController):
+            from cloudrc.bridges.ros2.driver import RosDriver
+
+            def tell(text: str) -> None:
+                feed.tell([Fault(time.monotonic_ns(), "controller_unstamped", text)])
+
+            RosDriver(peer, controller.place, tell).run(feed.alive_while(stop))
+            return
+        driver = RemoteDriver(peer, controller.place, controller.start_limit)
         driver.run(feed.alive_while(stop))
 
 

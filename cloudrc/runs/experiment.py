@@ -7,7 +7,7 @@ from contextlib import suppress
 
 from cloudrc import metrics
 from cloudrc.config.load import ResolvedExperiment, load_experiment
-from cloudrc.config.overrides import REMOTE, parse_settings
+from cloudrc.config.overrides import OUTSIDE, ROS2, parse_settings
 from cloudrc.config.reuse import reuse
 from cloudrc.config.schema import Parameters, World
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
@@ -47,12 +47,17 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
             "cloud.clock_offset_s and cloud.clock_drift_ppm act in virtual time only, elsewhere "
             "the machine's clock counts; use --mode virtual, or leave them out"
         )
-    if experiment.cloud.controller.name == REMOTE:
+    if (controller := experiment.cloud.controller.name) in OUTSIDE:
         if mode == "cluster":
             raise BadInputError(
-                f"cloud.controller {REMOTE} flies on this machine only; use --mode virtual or local"
+                f"cloud.controller {controller} flies on this machine only; use --mode virtual "
+                "or local"
             )
         require("a remote controller", ("policy",))
+        if controller == ROS2:
+            from cloudrc.bridges.ros2 import require_ros
+
+            require_ros()
     if mode != "cluster":
         check_world(experiment.world)
 

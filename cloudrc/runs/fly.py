@@ -9,7 +9,6 @@ import contextlib
 import heapq
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from math import inf
 from operator import attrgetter
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any, TypeAlias
 
 from cloudrc import assembly
 from cloudrc.config.load import ResolvedExperiment, dump
-from cloudrc.config.overrides import REMOTE
+from cloudrc.config.overrides import OUTSIDE, REMOTE
 from cloudrc.drivers.companion import companion
 from cloudrc.drivers.local import LINK_FOLDER, LocalRun
 from cloudrc.errors import CloudrcError, ControllerLostError, InterruptedRunError, machine_error
@@ -61,13 +60,17 @@ def fly(
 
     `beside` is a command: a program that runs during the flight, such as a remote controller.
     """
-    record = _record_virtual if mode == "virtual" else partial(_record_local, session=session)
     own = experiment.report.metrics
     try:
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
         files = hash_files(experiment)  # now: the user may edit them during the flight
-        with _beside(beside, experiment, folder), record(experiment, folder, see) as flown:
-            recording, resolved, run = flown
+        with contextlib.ExitStack() as stack:
+            gone = stack.enter_context(_beside(beside, experiment, folder))
+            if mode == "virtual":
+                flown = _record_virtual(experiment, folder, see, gone)
+            else:
+                flown = _record_local(experiment, folder, see, session=session)
+            recording, resolved, run = stack.enter_context(flown)
             run = replace(run, files=files)
             return write_report(folder, recording, resolved, run, own=own, page=page)
     except OSError as error:
@@ -77,10 +80,13 @@ def fly(
 
 def _beside(
     command: str, experiment: ResolvedExperiment, folder: Path
-) -> contextlib.AbstractContextManager[None]:
-    """Run `command` during the flight; wait until it listens if it is the remote controller."""
+) -> contextlib.AbstractContextManager[Callable[[], bool]]:
+    """Run `command` during the flight; wait until it listens if it is the remote controller.
+
+    The context is a function that returns whether the program has ended.
+    """
     if not command:
-        return contextlib.nullcontext()
+        return contextlib.nullcontext(lambda: False)
     controller = experiment.cloud.controller
     url = str((controller.model_extra or {})["url"]) if controller.name == REMOTE else ""
     return companion(command, folder, url)
@@ -104,12 +110,12 @@ def _interruptible(see: See) -> See:
 
 @contextlib.contextmanager
 def _record_virtual(
-    experiment: ResolvedExperiment, folder: Path, see: See
+    experiment: ResolvedExperiment, folder: Path, see: See, gone: Callable[[], bool]
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
     """Fly in virtual time, and yield the recording, the experiment and facts about the run.
 
-    The caller writes the report in the `with` block. After the block, this function attaches a copy
-    of the report to mission.mcap.
+    `gone` is that of `assembly.fly`. The caller writes the report in the `with` block. After the
+    block, this function attaches a copy of the report to mission.mcap.
     """
     from cloudrc.robots.build import describe_steps
     from cloudrc.world.shapes import flown_files
@@ -130,7 +136,7 @@ def _record_virtual(
             see(from_world)
 
         try:
-            assembly.fly(experiment, sink)
+            assembly.fly(experiment, sink, gone=gone)
         except KeyboardInterrupt:
             interrupted = True
         except ControllerLostError as error:
@@ -168,7 +174,7 @@ def _record_local(
         folder,
         _interruptible(see),
         session=session,
-        remote=experiment.cloud.controller.name == REMOTE,
+        remote=experiment.cloud.controller.name in OUTSIDE,
         lost=_raise_if_lost,
     )
     broken, interrupted = None, True

@@ -14,6 +14,7 @@ from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.config.load import load_experiment
+from cloudrc.config.overrides import OUTSIDE
 from cloudrc.config.robot import facts
 from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
@@ -41,8 +42,10 @@ every_plugin = pytest.mark.parametrize(
 )
 every_estimator = pytest.mark.parametrize("module", discover(estimators), ids=short)
 every_predictor = pytest.mark.parametrize("module", discover(predictors), ids=short)
-OWN = [module for module in discover(controllers) if module.__name__.rpartition(".")[2] != "remote"]
-"""Controllers that compute commands themselves; `remote` asks a program."""
+OWN = [
+    module for module in discover(controllers) if module.__name__.rpartition(".")[2] not in OUTSIDE
+]
+"""Controllers that compute commands themselves; the others ask a program."""
 every_controller = pytest.mark.parametrize("module", OWN, ids=short)
 fewer = settings(max_examples=20, deadline=None)
 

@@ -9,7 +9,7 @@ Source: docs/remote.md, "The messages".
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeAlias
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
@@ -20,6 +20,8 @@ from cloudrc.messages import ZERO, Odometry, Setpoint
 Answer: TypeAlias = tuple[float, Sequence[Sequence[float]]]
 """Age of the answered observation [s], and the rows vx, vy, vz [m/s], world frame, yaw rate [rad/s]
 for its period and the following ones."""
+Surroundings: TypeAlias = Callable[[], tuple[int, Odometry | None]]
+"""Function that returns cloud's time [ns], and the newest odometry as it has arrived."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
 ROUNDING = 1e-6
 """Part of a period by which an answer may be younger than a whole period, and count as one [1]."""
@@ -40,20 +42,34 @@ class ControllerChannel(Protocol):
 
 
 class OutsideController(Controller):
-    """Asks a program for each command; stands still while it has no valid answer."""
+    """Asks a program for each command; stands still while it has no valid answer.
 
-    def __init__(self, url: str, start_limit: float) -> None:
-        self.url, self.start_limit = url, start_limit
+    Attributes:
+        place: Where the program is: an address, or a namespace of ROS.
+        start_limit: Time limit for the first answer of an episode [s].
+        surroundings: Function that returns cloud's time [ns] and the newest odometry.
+    """
+
+    def __init__(self, place: str, start_limit: float) -> None:
+        self.place, self.start_limit = place, start_limit
+        self.surroundings: Surroundings = lambda: (0, None)
         self._channel: ControllerChannel | None = None
         self._period = 0.0
         self._counts: Counter[str] = Counter()
         self._lost = self._flies = False
 
-    def connect(self, channel: ControllerChannel, period: float, counts: Counter[str]) -> None:
+    def connect(
+        self,
+        channel: ControllerChannel,
+        period: float,
+        counts: Counter[str],
+        surroundings: Surroundings = lambda: (0, None),
+    ) -> None:
         """Use `channel` for the flight.
 
         `period` is the time between two commands [s]. Gaps between answers are counted in `counts`.
         """
+        self.surroundings = surroundings
         self._channel, self._period, self._counts = channel, period, counts
         counts["controller_gaps"] += 0  # so that a recording tells that there was none
 
@@ -72,7 +88,7 @@ class OutsideController(Controller):
         if self._lost or self._channel is None:
             return STAND_STILL
         try:
-            answer = self._channel.exchange(_observe(estimate, setpoint, dt))
+            answer = self._channel.exchange(self.observe(estimate, setpoint, dt))
         except ControllerLostError:
             self._lost = True
             raise
@@ -86,19 +102,19 @@ class OutsideController(Controller):
         x, y, z, yaw_rate = rows[min(int(age / self._period + ROUNDING), len(rows) - 1)]
         return ControlOutput((x, y, z), yaw_rate)
 
-
-def _observe(estimate: Odometry, setpoint: Setpoint, dt: float) -> dict[str, Any]:
-    return {
-        "stamp_ns": estimate.stamp_ns,
-        "position": estimate.position,
-        "orientation_wxyz": estimate.orientation_wxyz,
-        "velocity": estimate.velocity,
-        "angular_velocity": estimate.angular_velocity_body,
-        "setpoint/position": setpoint.position,
-        "setpoint/velocity": setpoint.velocity,
-        "setpoint/yaw": setpoint.yaw,
-        "period_s": dt,
-    }
+    def observe(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> dict[str, Any]:
+        """Return what the program gets to know; `dt` is the period [s]."""
+        return {
+            "stamp_ns": estimate.stamp_ns,
+            "position": estimate.position,
+            "orientation_wxyz": estimate.orientation_wxyz,
+            "velocity": estimate.velocity,
+            "angular_velocity": estimate.angular_velocity_body,
+            "setpoint/position": setpoint.position,
+            "setpoint/velocity": setpoint.velocity,
+            "setpoint/yaw": setpoint.yaw,
+            "period_s": dt,
+        }
 
 
 def build(

@@ -1,0 +1,1 @@
+"""Bridges connect cloudrc with the networks of other systems."""

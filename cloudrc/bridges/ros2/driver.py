@@ -1,0 +1,89 @@
+"""Real time: a process beside cloud that exchanges messages with nodes of ROS 2.
+
+Cloud never waits for ROS: it exchanges datagrams with this process. The newest answer wins.
+"""
+
+from __future__ import annotations
+
+import select
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from cloudrc.bridges.ros2.node import WAKE, RosAnswer, RosNode
+from cloudrc.drivers.remote import SILENCE
+from cloudrc.drivers.teleop import UnixDatagrams
+from cloudrc.errors import ControllerLostError
+from cloudrc.policy.codec import pack, unpack
+
+LOOK_PERIOD = 0.5
+"""Time between two looks at the nodes [s], and the silence after which cloud is told about it."""
+STRANGE_MAX = 20
+"""Number of answers in a row with a stamp that no estimate had, with which the flight ends."""
+
+
+class RosDriver:
+    """Publishes cloud's observations, and sends the answers of a user's node to cloud."""
+
+    def __init__(self, peer: UnixDatagrams, namespace: str, tell: Callable[[str], None]) -> None:
+        """Exchange datagrams with cloud by `peer`; `tell` gets words for the user."""
+        self._peer, self._tell = peer, tell
+        self._node = RosNode(namespace, virtual=False)
+        self._episode, self._sent_ns = 0, 0  # of the newest observation
+        self._strange = 0
+        self._ended = False
+
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Serve cloud until `stop()` is true."""
+        listener = threading.Thread(target=self._listen, daemon=True)
+        listener.start()
+        while not stop():
+            if select.select([self._peer], [], [], WAKE)[0]:
+                arrived = self._peer.receive_data()
+                if arrived:
+                    self._publish(unpack(arrived[-1]))  # only the newest observation counts
+        self._ended = True
+        listener.join()
+        self._node.close()
+
+    def _publish(self, message: dict[str, Any]) -> None:
+        self._episode, self._sent_ns = message["episode"], message["sent_ns"]
+        self._node.publish(message["observation"], (self._episode, self._sent_ns))
+
+    def _listen(self) -> None:
+        heard = looked = time.monotonic()
+        while not self._ended:
+            try:
+                answer = self._node.take(WAKE)
+                now = time.monotonic()
+                if answer is not None:
+                    heard = now
+                    self._send(self._answer(answer))
+                if now - looked > LOOK_PERIOD:
+                    looked = now
+                    self._look(silent=now - heard > LOOK_PERIOD)
+            except ControllerLostError as error:
+                self._send({"invalid": str(error)})
+
+    def _look(self, *, silent: bool) -> None:
+        if word := self._node.check():
+            self._tell(word)
+        if silent:
+            self._send({"trouble": self._node.silence(SILENCE)})
+
+    def _answer(self, answer: RosAnswer) -> dict[str, Any]:
+        """Return what cloud is told about an answer."""
+        known: tuple[int, ...] = (self._episode, self._sent_ns)
+        if answer.stamp_ns is not None:
+            known = self._node.asked.get(answer.stamp_ns, ())
+        if known:
+            self._strange = 0
+            return {"episode": known[0], "sent_ns": known[1], "rows": [answer.row]}
+        self._strange += 1
+        text = "answers with a stamp that no estimate has: copy its header.stamp"
+        error = self._node.invalid(text)
+        return {"trouble" if self._strange < STRANGE_MAX else "invalid": str(error)}
+
+    def _send(self, message: dict[str, Any]) -> None:
+        self._peer.send_data(pack({"episode": self._episode, "sent_ns": 0, **message}))

@@ -1,0 +1,66 @@
+"""A node of ROS 2 that is right, or wrong in one way: python -m tests.bridges.node KIND."""
+
+import sys
+import time
+
+import rclpy
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+KIND = sys.argv[1]
+AFTER = 30
+"""Number of answers before a node becomes wrong."""
+LOSSY = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+rclpy.init()
+node = rclpy.create_node(KIND, namespace=sys.argv[2] if len(sys.argv) > 2 else None)
+kind = Twist if KIND == "unstamped" else PoseStamped if KIND == "type" else TwistStamped
+commands = node.create_publisher(kind, "cloudrc/cmd_vel", LOSSY if KIND == "lossy" else 1)
+count = 0
+setpoint = None
+
+
+def hear(message):
+    global setpoint
+    setpoint = message
+
+
+def answer(estimate):
+    global count
+    count += 1
+    if setpoint is None or (KIND == "silent" and count > AFTER):
+        return
+    if KIND == "slow" and count > AFTER:
+        time.sleep(10)
+    command = kind()
+    if KIND in ("unstamped", "type"):
+        twist = command if KIND == "unstamped" else None
+    else:
+        command.header.stamp = estimate.header.stamp
+        twist = command.twist
+    if twist is not None:
+        wanted, now = setpoint.pose.position, estimate.pose.pose.position
+        twist.linear.x = 0.8 * (wanted.x - now.x)
+        twist.linear.y = 0.8 * (wanted.y - now.y)
+        twist.linear.z = 1.5 * (wanted.z - now.z)
+    if count > AFTER:
+        if KIND == "nan":
+            twist.linear.y = float("nan")
+        elif KIND == "frame":
+            command.header.frame_id = "base_link"
+        elif KIND == "stamp":
+            command.header.stamp.nanosec += 5
+        elif KIND == "now":
+            command.header.stamp = node.get_clock().now().to_msg()
+        elif KIND == "twice":
+            commands.publish(command)
+            time.sleep(0.05)
+        elif KIND == "dies":
+            sys.exit(7)
+    commands.publish(command)
+
+
+node.create_subscription(PoseStamped, "cloudrc/setpoint", hear, 1)
+node.create_subscription(Odometry, "cloudrc/estimate", answer, 1)
+rclpy.spin(node)

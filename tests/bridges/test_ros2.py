@@ -1,0 +1,149 @@
+"""A node of ROS 2 controls the robot: `make ros2-test` runs these tests in a real ROS 2."""
+
+import json
+import os
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cloudrc import assembly
+from cloudrc.cli.main import main
+from cloudrc.config.load import load_experiment
+from cloudrc.drivers.companion import companion
+from cloudrc.record.columns import Recording, RecordStore
+
+pytestmark = [
+    pytest.mark.ros2,
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # of ROS's own packages
+    pytest.mark.skipif(find_spec("rclpy") is None, reason="needs a sourced ROS 2: make ros2-test"),
+]
+ROOT = Path(__file__).parents[2]
+SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 0.5}]", "mission.touch=null")
+
+
+def ros2(kind, namespace=""):
+    """Return the command of a node of the tests."""
+    return f"{sys.executable} -m tests.bridges.node {kind} {namespace}"
+
+
+def example(namespace=""):
+    """Return the command of the example's controller."""
+    more = f" --ros-args -r __ns:=/{namespace}" if namespace else ""
+    return f"env PYTHONPATH={ROOT}/examples/ros2 {sys.executable} -m cloudrc_nodes.controller{more}"
+
+
+@pytest.fixture(autouse=True)
+def own_domain(monkeypatch):
+    """Keep the tests apart from other nodes of this machine."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.chdir(ROOT)
+
+
+def flown(settings, command, folder):
+    """Fly in virtual time; return the recording."""
+    store = RecordStore()
+    experiment = load_experiment("paper", settings)
+    with companion(command, folder) as gone:
+        assembly.fly(experiment, store.add, gone=gone)
+    return Recording(records=store)
+
+
+def built_in(settings):
+    store = RecordStore()
+    assembly.fly(load_experiment("paper", settings), store.add)
+    return Recording(records=store)
+
+
+def true_path(recording):
+    truth = recording["/ground_truth"]
+    return np.column_stack((truth["stamp_ns"], truth["position"], truth["velocity"]))
+
+
+@pytest.mark.smoke
+def test_the_papers_controller_as_a_node_flies_the_path_of_the_built_in_one_bit_by_bit(tmp_path):
+    recording = flown(["cloud.controller=ros2"], example(), tmp_path)
+    path = true_path(recording)
+    assert np.array_equal(path, true_path(built_in([])))
+    assert len(path) > 1000
+
+
+def run(tmp_path, kind, *words, mode="virtual"):
+    """Fly with a node of the tests; return the exit code and the report."""
+    words = ["run", "hover", "--mode", mode, "--out", str(tmp_path / "run"), *words]
+    words += [word for setting in SHORT for word in ("--set", setting)]
+    command = ros2(kind) if " " not in kind else kind
+    code = main([*words, "--set", "cloud.controller=ros2", "--with", command])
+    return code, json.loads((tmp_path / "run" / "report.json").read_text())
+
+
+WRONG = [
+    ("nan", "controller_invalid", "node /nan sends a velocity that is not finite"),
+    ("frame", "controller_invalid", "the frame 'base_link'; cloudrc needs 'world'"),
+    ("stamp", "controller_invalid", "copy its header.stamp"),
+    ("twice", "controller_invalid", "node /twice answers an estimate twice"),
+    ("dies", "controller_silent", "node /dies is gone"),
+    ("silent", "controller_silent", "node /silent: no answer on /cloudrc/cmd_vel within 2 s"),
+    ("type", "controller_invalid", "publishes geometry_msgs/msg/PoseStamped"),
+    ("unstamped", "controller_invalid", "geometry_msgs/msg/Twist, which has no stamp"),
+    ("lossy", "controller_invalid", "BEST_EFFORT, VOLATILE, which cannot match cloudrc's RELIABLE"),
+]
+
+
+@pytest.mark.parametrize(("kind", "code", "text"), WRONG, ids=[kind for kind, _, _ in WRONG])
+def test_a_wrong_node_ends_the_flight_with_one_line(tmp_path, capsys, kind, code, text):
+    exit_code, report = run(tmp_path, kind)
+    assert (exit_code, report["failures"][0]["code"]) == (5, code)
+    assert text in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_program_that_ends_at_once_is_not_waited_for(tmp_path, capsys):
+    code, _ = run(tmp_path, f"{sys.executable} -m no_such_node")
+    assert code == 5
+    assert "No module named no_such_node" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_two_nodes_cannot_command(tmp_path, capsys):
+    with companion(ros2("first"), tmp_path):
+        code, _ = run(tmp_path, "second")
+    assert code == 5
+    assert "nodes /first and /second" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_robot_has_a_namespace(tmp_path):
+    settings = [*SHORT, "cloud.controller={name: ros2, namespace: drone1}"]
+    assert np.array_equal(
+        true_path(flown(settings, example("drone1"), tmp_path)), true_path(built_in(SHORT))
+    )
+
+
+def test_a_node_flies_in_real_time(tmp_path):
+    _, report = run(tmp_path, example(), mode="local")
+    assert report["numbers"]["waypoints_reached"]["value"] == 1
+
+
+def test_a_node_whose_commands_have_no_stamp_flies_in_real_time_with_a_word(tmp_path, capsys):
+    _, report = run(tmp_path, "unstamped", mode="local")
+    assert report["numbers"]["waypoints_reached"]["value"] == 1
+    assert "geometry_msgs/msg/Twist on /cloudrc/cmd_vel, which has no stamp" in str(
+        capsys.readouterr()
+    )
+
+
+@pytest.mark.parametrize("kind", ["dies", "slow"])
+def test_a_node_that_is_gone_in_real_time_ends_the_flight_after_5_s(tmp_path, capsys, kind):
+    code, report = run(tmp_path, kind, mode="local")
+    assert (code, report["failures"][0]["code"]) == (5, "controller_silent")
+    assert f"node /{kind}" in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.full
+def test_a_hundred_flights_have_one_path(tmp_path):
+    paths = {
+        true_path(flown(["cloud.controller=ros2"], example(), tmp_path)).tobytes()
+        for _ in range(100)
+    }
+    assert len(paths) == 1

@@ -1,0 +1,85 @@
+"""What ROS 2 needs, and its messages, without a ROS."""
+
+import importlib.util
+import sys
+from math import pi
+
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from cloudrc.bridges.ros2 import require_ros
+from cloudrc.cli.main import main
+from cloudrc.config.load import load_experiment
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.record.live import decode_stamped_twist, encode_clock, encode_odometry, encode_pose
+from cloudrc.runs.experiment import check_mode
+
+STORE = get_typestore(Stores.ROS2_KILTED)
+"""The messages of another distribution than the one that cloudrc encodes with."""
+
+
+def test_without_ros_a_flight_is_refused_before_a_folder_is_made(tmp_path, monkeypatch, capsys):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda name: None if name == "rclpy" else find(name)
+    )
+    words = ["run", "paper", "--set", "cloud.controller=ros2", "--out", str(tmp_path / "run")]
+    assert main([*words, "--mode", "virtual"]) == 3
+    (error,) = capsys.readouterr().err.splitlines()
+    assert "source /opt/ros" in error
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_ros_for_another_python_is_named(tmp_path, monkeypatch):
+    (tmp_path / "rclpy").mkdir()
+    (tmp_path / "rclpy" / "__init__.py").write_text("raise ImportError('no _rclpy_pybind11')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("ROS_DISTRO", "jazzy")
+    for name in ("rclpy", "cloudrc.bridges.ros2.node"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    with pytest.raises(MissingPrerequisiteError, match=r"jazzy .* no _rclpy_pybind11"):
+        require_ros()
+
+
+@pytest.mark.parametrize("namespace", ["9", "a b", "/", "a//b", "~", "a-b"])
+def test_a_namespace_that_ros_refuses_is_bad_input(namespace):
+    with pytest.raises(BadInputError, match="namespace"):
+        load_experiment("paper", [f"cloud.controller={{name: ros2, namespace: '{namespace}'}}"])
+
+
+def test_a_node_neither_plans_nor_flies_in_a_cluster():
+    with pytest.raises(BadInputError, match="'ros2' cannot plan"):
+        load_experiment("fast", ["cloud.controller=ros2", "cloud.plan_s=0.5"])
+    with pytest.raises(BadInputError, match="virtual or local"):
+        check_mode(load_experiment("paper", ["cloud.controller=ros2"]), "cluster")
+
+
+def test_ros_reads_an_odometry_with_the_twist_in_its_child_frame():
+    turned = (2**-0.5, 0.0, 0.0, 2**-0.5)  # by 90 degrees to the left
+    data = encode_odometry(3_000_000_005, (1.0, 2.0, 3.0), turned, (1.0, 0.0, 0.5), (0.1, 0.2, 0.3))
+    message = STORE.deserialize_cdr(data, "nav_msgs/msg/Odometry")
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (3, 5)
+    assert (message.header.frame_id, message.child_frame_id) == ("world", "base_link")
+    assert message.pose.pose.position.y == 2.0
+    linear = message.twist.twist.linear
+    assert (linear.x, linear.y, linear.z) == pytest.approx((0.0, -1.0, 0.5))
+    assert message.twist.twist.angular.z == 0.3
+
+
+def test_ros_reads_setpoint_and_clock():
+    pose = STORE.deserialize_cdr(encode_pose(7, (1, 2, 3), pi), "geometry_msgs/msg/PoseStamped")
+    assert (pose.header.stamp.nanosec, pose.header.frame_id) == (7, "world")
+    assert (pose.pose.position.z, pose.pose.orientation.z) == (3.0, 1.0)
+    clock = STORE.deserialize_cdr(encode_clock(2_000_000_001), "rosgraph_msgs/msg/Clock")
+    assert (clock.clock.sec, clock.clock.nanosec) == (2, 1)
+
+
+def test_a_command_of_ros_is_read():
+    types = STORE.types
+    time = types["builtin_interfaces/msg/Time"](1, 9)
+    vector = types["geometry_msgs/msg/Vector3"]
+    twist = types["geometry_msgs/msg/Twist"](vector(1.0, 2.0, 3.0), vector(0.0, 0.0, 0.25))
+    header = types["std_msgs/msg/Header"](time, "base_link")
+    message = types["geometry_msgs/msg/TwistStamped"](header, twist)
+    data = bytes(STORE.serialize_cdr(message, "geometry_msgs/msg/TwistStamped"))
+    assert decode_stamped_twist(data) == (1_000_000_009, "base_link", (1.0, 2.0, 3.0), 0.25)
