@@ -46,6 +46,7 @@ def compile_model(robot: Path, scene: Path) -> Any:
     another time step or contacts that push at a distance.
     """
     model = _compile(robot, scene)
+    _check_names(robot)
     _check_parts(model, robot, scene)
     if FUSES_WRONG:
         apart = _compile(robot, scene, fuse=False)
@@ -111,6 +112,18 @@ def _compile(
             return spec.compile()
     except (ValueError, KeyError) as error:
         raise compile_error(f"{robot_path} in {scene_path}", error) from None
+
+
+def _check_names(robot_path: Path) -> None:
+    """Refuse a robot with an element that names another, which the robot's file does not have.
+
+    Attached to a scene, such an element, for example the actuator of a rotor, would vanish without
+    a word.
+    """
+    try:
+        mujoco.MjSpec.from_file(str(robot_path)).compile()
+    except ValueError as error:
+        raise compile_error(str(robot_path), error) from None
 
 
 def is_of_robot(model: Any) -> Any:

@@ -102,6 +102,12 @@ def test_each_geom_has_the_name_of_its_body_and_the_robot_none(tmp_path):
     [
         ("robot", 'size=".05 .05 .10"', 'size=".05 nan .10"', "does not compile"),
         ("robot", '<freejoint name="base"/>', "", "freejoint"),
+        ("robot", "</worldbody>", '</worldbody><actuator><general site="gone"/></actuator>',
+                  "does not compile: .*'gone'"),
+        ("robot", "</worldbody>", '</worldbody><sensor><gyro site="gone"/></sensor>',
+                  "does not compile: .*'gone'"),
+        ("robot", "</worldbody>", '</worldbody><contact><exclude body1="gone" body2="base"/>'
+                  "</contact>", "does not compile: .*'gone'"),
         ("scene", 'name="spawn"', 'name="start"', "needs a frame named spawn"),
         ("scene", '<body name="floor">', '<body><freejoint/><geom size="1"/></body>'
                    '<body name="floor">', "body without a name has a joint"),
