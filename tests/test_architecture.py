@@ -133,7 +133,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     # A compiler makes the machine code of the usual step.
     "subprocess": (
         *("drivers/", "cli/", "cluster/", "robots/pelican/native/library"),
-        *("exercise/scoring", "link/exec/holder", "runs/doctor", "runs/link_under_test"),
+        *("exercise/scoring", "link/exec/holder", "runs/doctor", "runs/links/under_test"),
     ),
     "multiprocessing": ("drivers/", "runs/workers"),
     "concurrent": ("cli/", "runs/workers", "cluster/", "teleop/", "policy/serve"),

@@ -94,7 +94,7 @@ def _local(options: argparse.Namespace) -> ConsoleTarget:
     from cloudrc.console.serve import ConsoleTarget
     from cloudrc.console.steering import LinkControl
     from cloudrc.drivers.local import LINK_FOLDER, under_way
-    from cloudrc.runs.link_change import read_states, set_here
+    from cloudrc.runs.links.change import read_states, set_here
 
     found = find_local_run(options, flag="")
     if found is None:

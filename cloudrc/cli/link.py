@@ -146,7 +146,7 @@ def show(options: argparse.Namespace) -> int:
         raise BadInputError(f"-o {output}: not a picture; end its name in .png, .svg or .pdf")
     refuse_other_file(output, PICTURES[output.suffix[1:]])
     from cloudrc.report.figures.link import render_link
-    from cloudrc.runs.link_sample import SampleSettings, sample_profile, statistics_table
+    from cloudrc.runs.links.sample import SampleSettings, sample_profile, statistics_table
 
     settings = settings_from(options, SampleSettings)
     about, ways = sample_profile(

@@ -57,8 +57,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Run both programs, print the verdict on the link, and return the client's exit code."""
     interrupt_on_signals()
-    from cloudrc.runs.exec_report import as_text, make_exec_report, write_report
-    from cloudrc.runs.link_exec import ExecSettings, run_programs
+    from cloudrc.runs.links.programs import ExecSettings, run_programs
+    from cloudrc.runs.links.programs_report import as_text, make_exec_report, write_report
 
     def tell(text: str) -> None:
         print_line(f"cloudrc: {text}", sys.stderr)

@@ -45,7 +45,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Read the delays from SOURCE, write a trace per direction, and print a summary of each."""
     from cloudrc.link.traces import HEAD
-    from cloudrc.runs.link_trace import LogSettings, read_packets, write_trace_file
+    from cloudrc.runs.links.trace import LogSettings, read_packets, write_trace_file
 
     source, output = options.source, options.output
     settings = LogSettings(options.direction, options.halve_rtt, options.trust_units)

@@ -51,7 +51,7 @@ def execute(options: argparse.Namespace) -> int:
     """Change the link as the flags say, and print the new state of the link."""
     began, number = monotonic(), secrets.token_hex(4)
     from cloudrc.drivers.local import LINK_FOLDER
-    from cloudrc.runs.link_change import set_here, states_table
+    from cloudrc.runs.links.change import set_here, states_table
 
     if (found := find_local_run(options, links=True)) is not None:
         run = found.folder

@@ -48,7 +48,7 @@ def execute(options: argparse.Namespace) -> int:
     """Relay connections until a signal; print counts and turns, and return 0."""
     interrupt_on_signals()
     from cloudrc.processes.ports import warn_if_exposed
-    from cloudrc.runs.relay_tcp import RelaySettings, relay_tcp
+    from cloudrc.runs.links.streams import RelaySettings, relay_tcp
 
     warn_if_exposed(options.listen)
     settings = settings_from(options, RelaySettings)

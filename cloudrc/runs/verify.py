@@ -37,7 +37,7 @@ from cloudrc.link.verify.causes import (
 )
 from cloudrc.link.verify.judge import Flow, Judgement, Measurement, look_twice, verdict_of
 from cloudrc.link.verify.probe import PROBE, plan_probes
-from cloudrc.runs.link_under_test import LOOPBACK, WAYS, Way, inside, measure, run_link
+from cloudrc.runs.links.under_test import LOOPBACK, WAYS, Way, inside, measure, run_link
 from cloudrc.text import Paint, escape, plain, table
 from cloudrc.tunnel.codec import SIZES, TELEMETRY_SIZES, Kind
 

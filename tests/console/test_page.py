@@ -19,7 +19,7 @@ from cloudrc.console.steering import Steering
 from cloudrc.drivers.local import LINK_FOLDER
 from cloudrc.geometry.scene import load_scene
 from cloudrc.runs import requirements
-from cloudrc.runs.link_change import read_states
+from cloudrc.runs.links.change import read_states
 from tests.conftest import wait_until
 from tests.console.conftest import (
     LIMIT,

@@ -6,7 +6,7 @@ import numpy as np
 
 from cloudrc.link.logs import trace_of
 from cloudrc.link.traces import write_trace
-from cloudrc.runs.link_trace import one_way
+from cloudrc.runs.links.trace import one_way
 from tests.flights.conftest import fly
 
 

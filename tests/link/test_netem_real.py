@@ -20,7 +20,7 @@ from cloudrc.link.model import LinkDirection, numbers, sample
 from cloudrc.link.netem import STRETCH, Netem, table
 from cloudrc.link.profile import Trace
 from cloudrc.link.traces import link_profile
-from cloudrc.runs.link_under_test import DEVICE, HOSTS, _namespaces, inside
+from cloudrc.runs.links.under_test import DEVICE, HOSTS, _namespaces, inside
 from cloudrc.tunnel.codec import Kind
 from tests.link.profiles import blackout, changed, in_bursts, profile_of
 

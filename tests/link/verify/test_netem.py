@@ -7,8 +7,8 @@ from contextlib import contextmanager
 import pytest
 
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
-from cloudrc.runs import link_under_test
-from cloudrc.runs.link_under_test import DEVICE, HOSTS, run_link
+from cloudrc.runs.links import under_test
+from cloudrc.runs.links.under_test import DEVICE, HOSTS, run_link
 from cloudrc.runs.verify import as_text, find_experiment, make_plans, make_report, probe_link
 
 pytestmark = pytest.mark.netem
@@ -46,7 +46,7 @@ def running():
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch):
-    monkeypatch.setattr(link_under_test, "START_LIMIT", 300.0)  # emulated processors are slow
+    monkeypatch.setattr(under_test, "START_LIMIT", 300.0)  # emulated processors are slow
 
 
 @pytest.mark.smoke

@@ -9,8 +9,9 @@ import pytest
 from cloudrc.errors import CloudrcError
 from cloudrc.link.verify.causes import find_causes
 from cloudrc.link.verify.judge import verdict_of
-from cloudrc.runs import link_under_test, verify
-from cloudrc.runs.link_under_test import run_link
+from cloudrc.runs import verify
+from cloudrc.runs.links import under_test
+from cloudrc.runs.links.under_test import run_link
 from cloudrc.runs.verify import find_experiment, make_plans, probe_link
 
 # Far above what a machine adds that does other things, too.
@@ -62,7 +63,7 @@ def test_an_early_end_has_the_exit_code_of_the_process(code, words, exit_code, s
         (way.folder / "log").write_text(f"before\n{words}\n" if words else "")
         return subprocess.Popen(["sh", "-c", f"exit {code}" if name == "uplink" else "sleep 9"])
 
-    monkeypatch.setattr(link_under_test, "_start", start)
+    monkeypatch.setattr(under_test, "_start", start)
     with pytest.raises(CloudrcError) as ended, run_link(find_experiment("paper-p1", []), "relay"):
         pass
     assert ended.value.exit_code == exit_code

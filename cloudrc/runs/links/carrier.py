@@ -15,7 +15,7 @@ from cloudrc.link.follow import Loaded
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.relay import ask_for_fifo, settle, tighten_slack
 from cloudrc.link.state import LinkState
-from cloudrc.runs.live_link import LiveLink
+from cloudrc.runs.links.live import LiveLink
 
 STEP = 0.05  # longest time until the relay reacts to a change [s]
 DRAIN_LIMIT = 1.0  # for the packets in flight at the end [s]

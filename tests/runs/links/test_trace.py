@@ -7,7 +7,7 @@ import pytest
 
 from cloudrc.metrics import SHIPPED
 from cloudrc.records import Arrival
-from cloudrc.runs.link_trace import one_way
+from cloudrc.runs.links.trace import one_way
 from tests.metrics.conftest import DONE, END, PERIOD, SECOND, START, UPLINK, flown
 
 TRANSIT = round(UPLINK * SECOND)

@@ -27,9 +27,9 @@ from cloudrc.errors import (
 from cloudrc.link.exec.listening import is_loopback
 from cloudrc.link.exec.namespace import ADDRESSES
 from cloudrc.records import Counted
-from cloudrc.runs.exec_link import FLOWS, ExecLink
 from cloudrc.runs.folder import new_folder
-from cloudrc.runs.live_link import LiveLink
+from cloudrc.runs.links.carrier import FLOWS, ExecLink
+from cloudrc.runs.links.live import LiveLink
 
 if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter

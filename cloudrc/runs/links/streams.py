@@ -22,8 +22,8 @@ from cloudrc.link.relay_tcp.congestion import of_machine
 from cloudrc.link.relay_tcp.medium import Medium, refuse_unsupported
 from cloudrc.link.relay_tcp.relay import StreamRelay
 from cloudrc.link.state import LinkState
-from cloudrc.runs.link_exec import link_folder
-from cloudrc.runs.live_link import LiveLink
+from cloudrc.runs.links.live import LiveLink
+from cloudrc.runs.links.programs import link_folder
 
 STEP = 0.05  # longest time until the relay reacts to a change or a signal [s]
 CONTROL = Path("/proc/sys/net/ipv4/tcp_congestion_control")

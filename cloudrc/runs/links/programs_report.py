@@ -18,8 +18,8 @@ from cloudrc.runs.verify import Report, make_report
 from cloudrc.text import table
 
 if TYPE_CHECKING:
-    from cloudrc.runs.exec_link import ExecLink
-    from cloudrc.runs.link_exec import ExecOutcome, ExecSettings
+    from cloudrc.runs.links.carrier import ExecLink
+    from cloudrc.runs.links.programs import ExecOutcome, ExecSettings
 
 WAITED = 0.01
 """Share of packets that were read behind a full batch, above which the relay lacks CPU time."""

@@ -1,0 +1,1 @@
+"""Links on their own: between programs and streams, under test, drawn, recorded, and changed."""
