@@ -124,7 +124,12 @@ def fly(
     `gone` returns whether a program that controls the robot from outside has ended. Raise a
     ControllerLostError if such a program is lost.
     """
-    with _lock_step(experiment, gone) as channel:
+    try:
+        way = _lock_step(experiment, gone)
+    except ControllerLostError as error:
+        see([], [Fault(0, error.code, str(error))])
+        raise
+    with way as channel:
         _, _, teleop, run = assemble(experiment, make_loop, channel)
         lost = list[ControllerLostError]()
 

@@ -147,3 +147,9 @@ def test_a_hundred_flights_have_one_path(tmp_path):
         for _ in range(100)
     }
     assert len(paths) == 1
+
+
+def test_a_node_that_comes_back_in_real_time_goes_on(tmp_path):
+    again = f"sh -c '{ros2('dies')}; {ros2('again')}'"
+    _, report = run(tmp_path, again, mode="local")
+    assert report["numbers"]["waypoints_reached"]["value"] == 1

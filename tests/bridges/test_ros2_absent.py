@@ -41,6 +41,13 @@ def test_a_ros_for_another_python_is_named(tmp_path, monkeypatch):
         require_ros()
 
 
+@pytest.mark.parametrize("domain", ["233", "-1", "x", "1.5"])
+def test_a_domain_that_does_not_exist_is_bad_input(monkeypatch, domain):
+    monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+    with pytest.raises(BadInputError, match="ROS_DOMAIN_ID"):
+        require_ros()
+
+
 @pytest.mark.parametrize("namespace", ["9", "a b", "/", "a//b", "~", "a-b"])
 def test_a_namespace_that_ros_refuses_is_bad_input(namespace):
     with pytest.raises(BadInputError, match="namespace"):

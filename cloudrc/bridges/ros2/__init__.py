@@ -9,11 +9,17 @@ import importlib.util
 import os
 import sys
 
-from cloudrc.errors import MissingPrerequisiteError, to_one_line
+from cloudrc.errors import BadInputError, MissingPrerequisiteError, to_one_line
+
+DOMAIN_MAX = 232
+"""Largest number of a domain of ROS 2: larger ones would need ports that do not exist."""
 
 
 def require_ros() -> None:
     """Raise a MissingPrerequisiteError unless this process can be a node of ROS 2."""
+    domain = os.environ.get("ROS_DOMAIN_ID", "") or "0"
+    if not domain.isdecimal() or int(domain) > DOMAIN_MAX:
+        raise BadInputError(f"ROS_DOMAIN_ID={domain}: give a number from 0 to {DOMAIN_MAX}")
     python = f"Python {sys.version_info.major}.{sys.version_info.minor}"
     if importlib.util.find_spec("rclpy") is None:
         raise MissingPrerequisiteError(

@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 import rclpy
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.duration import Infinite
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from cloudrc.drivers.remote import INVALID
@@ -28,10 +27,9 @@ from cloudrc.record.live import (
     encode_pose,
 )
 
-# With a deadline as ROS tells it of other nodes: the comparison with theirs needs it.
-RELIABLE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, deadline=Infinite)
+RELIABLE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of what cloudrc publishes, which all subscriptions match, and of answers in lock step."""
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT, deadline=Infinite)
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """QoS of /clock, and of answers in real time: no message waits for an older one."""
 STAMPED, UNSTAMPED = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
 """Types of commands; cloudrc takes the second one in real time only."""
@@ -156,6 +154,8 @@ class RosNode:
         return None if taken is None else taken[0]
 
     def _read(self, data: bytes) -> RosAnswer:
+        if not self._known:
+            self.who()
         stamp_ns: int | None = None
         frame = WORLD
         if self._kind is TwistStamped:
@@ -181,8 +181,9 @@ class RosNode:
         return self._known or "a node"
 
     def _publishers(self) -> list[Any]:
-        infos: list[Any] = self._node.get_publishers_info_by_topic(self._names["cmd_vel"])
-        return infos
+        """Return the endpoints that command; one without a name has just left, or just come."""
+        infos = self._node.get_publishers_info_by_topic(self._names["cmd_vel"])
+        return [info for info in infos if "UNKNOWN" not in info.node_name]
 
     @property
     def is_met(self) -> bool:
@@ -219,8 +220,7 @@ class RosNode:
         """Yield sentences about the endpoints of others whose QoS cannot match `own`."""
         for info in infos:
             theirs, publishes = info.qos_profile, info.endpoint_type.name == "PUBLISHER"
-            pair = (theirs, own) if publishes else (own, theirs)
-            if qos_check_compatible(*pair)[0] == QoSCompatibility.ERROR:
+            if not (_matches(theirs, own) if publishes else _matches(own, theirs)):
                 verb, topic = ("publishes", "cmd_vel") if publishes else ("subscribes", "estimate")
                 yield (
                     f"node {_name(info)} {verb} {self._names[topic]} with QoS {_words(theirs)}, "
@@ -250,6 +250,17 @@ def _ignore(data: bytes) -> None:
 
 def _name(info: Any) -> str:
     return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+
+
+def _matches(offered: Any, wanted: Any) -> bool:
+    """Return whether a subscription with the QoS `wanted` gets what is `offered`.
+
+    rclpy's own check also compares deadlines, which it does not know of cloudrc's side.
+    """
+    reliable, kept = ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL
+    is_reliable = offered.reliability == reliable or wanted.reliability != reliable
+    is_kept = offered.durability == kept or wanted.durability != kept
+    return bool(is_reliable and is_kept)
 
 
 def _words(qos: Any) -> str:
