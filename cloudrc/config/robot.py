@@ -16,7 +16,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from cloudrc.config import shipped
 from cloudrc.config.document import read_document
-from cloudrc.config.problems import validate
+from cloudrc.config.problems import ConfigProblem, raise_problems, validate
 from cloudrc.config.reuse import reuse
 from cloudrc.config.schema import (
     Acceleration,
@@ -182,7 +182,9 @@ def find_robot(name: str) -> RobotFiles:
     folder = Path(name) if shipped.is_path(name) else shipped.FOLDERS["robot"] / name
     file = folder / shipped.ROBOT_FILE
     label = str(file) if shipped.is_path(name) else f"{name}/{shipped.ROBOT_FILE}"
-    robot = validate(read_document(file, label), RobotFile, label)
+    document = read_document(file, label)
+    robot = validate(document, RobotFile, label)
+    raise_problems(document, _missing_files(robot, folder), label)
     onboard = _absolute(robot.onboard, folder)
     stop = robot.guard.stop or ("brake" if robot.planar else "land")
     usual = OF_GENERAL if onboard.name == GENERAL else DEFAULT_LIMITS
@@ -201,6 +203,16 @@ def find_robot(name: str) -> RobotFiles:
         probe=robot.probe,
         sensors=robot.sensors,
     )
+
+
+def _missing_files(robot: RobotFile, folder: Path) -> list[ConfigProblem]:
+    """List the Python files that `robot.yaml` in `folder` names, and that do not exist."""
+    named = {"motion": robot.motion, "hull_points": robot.hull_points}
+    return [
+        ConfigProblem((key,), name, "there is no such file")
+        for key, name in named.items()
+        if name is not None and not (folder / name).is_file()
+    ]
 
 
 def parameters(robot: RobotFiles, world: World) -> dict[str, Any]:

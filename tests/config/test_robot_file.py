@@ -76,6 +76,8 @@ SEVENTEEN = f"sensors: {{{', '.join(f'a{n}: {{unit: m, sensor: a}}' for n in ran
         ("sensors: {a: {unit: '', sensor: a}}", "sensors.a.unit: must be text of 1 to 16"),
         ("sensors: {My range: {unit: m, sensor: a}}", "sensors.My range: a name has small letters"),
         (SEVENTEEN, "sensors: must have at most 16 entries"),
+        ("motion: ./gone.py", "motion: ./gone.py: there is no such file"),
+        ("hull_points: ./gone.py", "hull_points: ./gone.py: there is no such file"),
         ("hull: 0.3", "hull: unknown key; did you mean hull_m [m]?"),
     ],
 )
