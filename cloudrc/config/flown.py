@@ -77,8 +77,8 @@ def _solid(tree: dict[str, Any]) -> Solid:
         raise ValueError(f"unknown shape {shape!r}")
     faces = None
     if shape == "hull":
-        normals, offsets = tree["faces"]
-        faces = _array(normals, -1, 3), _array(offsets, len(normals))
+        normals, offsets, edges = tree["faces"]
+        faces = _array(normals, -1, 3), _array(offsets, len(normals)), _array(edges, -1, 2, 3)
     return Solid(
         name=str(tree["name"]),
         shape=shape,

@@ -190,13 +190,26 @@ def _solid(model: Any, data: Any, geom: int, name: str) -> Solid:
     return Solid(name, shape, centre, axes, size, radius, faces)
 
 
-def _faces(model: Any, mesh: int) -> tuple[Array, Array]:
-    """Return normals (m, 3) and offsets (m,) [m] of the faces of a mesh's convex hull."""
+def _faces(model: Any, mesh: int) -> tuple[Array, Array, Array]:
+    """Return the faces of a mesh's convex hull: normals (m, 3), offsets (m,) [m]; its edges.
+
+    An edge is its two ends [m]: shape (k, 2, 3).
+    """
     first, number = model.mesh_polyadr[mesh], model.mesh_polynum[mesh]
+    starts = model.mesh_polyvertadr[first : first + number]
+    numbers = model.mesh_polyvertnum[first : first + number]
     normals = model.mesh_polynormal[first : first + number].copy()
-    corners = model.mesh_polyvert[model.mesh_polyvertadr[first : first + number]]
-    places = model.mesh_vert[model.mesh_vertadr[mesh] + corners]
-    return normals, np.einsum("ij,ij->i", normals, places)
+    vertices = model.mesh_vert[model.mesh_vertadr[mesh] :].astype(np.float64)
+    pairs = set[tuple[int, int]]()
+    for start, corner_count in zip(starts.tolist(), numbers.tolist(), strict=True):
+        corners = model.mesh_polyvert[start : start + corner_count].tolist()
+        pairs.update(map(_ordered, corners, corners[1:] + corners[:1]))
+    offsets = np.einsum("ij,ij->i", normals, vertices[model.mesh_polyvert[starts]])
+    return normals, offsets, vertices[np.array(sorted(pairs))]
+
+
+def _ordered(a: int, b: int) -> tuple[int, int]:
+    return min(a, b), max(a, b)
 
 
 def reach_of(robot: Path) -> float:

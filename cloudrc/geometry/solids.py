@@ -13,6 +13,18 @@ Shape: TypeAlias = Literal[
     "box", "sphere", "capsule", "cylinder", "ellipsoid", "plane", "hull", "outline"
 ]
 
+_TINY = 1e-12
+"""Smallest distance of a point from the planes of an ellipsoid's axes [half-axes]."""
+_NEWTON_MAX = 100
+"""Largest number of steps to find the nearest point of an ellipsoid; most points need 5."""
+_CONVERGED = 1e-12
+"""Relative size of the last of these steps."""
+_CELLS_MAX = 1 << 16
+"""Largest number of pairs of points and faces, or edges, at a time: it bounds the memory."""
+_ON_HULL = 1e-5
+"""A point is on a hull if it is so little above the planes of its faces [m]: MuJoCo's corners are
+float32."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Solid:
@@ -30,13 +42,13 @@ class Solid:
     axes: Array  # columns: unit vectors along its x, y and z [1], world frame, shape (3, 3)
     size: Array  # [m], shape (3,); without meaning for planes and hulls
     radius: float  # of a ball around `centre` that contains the solid [m]
-    faces: tuple[Array, Array] | None = None  # of a hull: normals (m, 3), offsets (m,) [m]
+    # Of a hull: normals (m, 3) and offsets (m,) [m] of its faces, ends of its edges (k, 2, 3) [m].
+    faces: tuple[Array, Array, Array] | None = None
 
     def distance(self, points: Array) -> Array:
         """Compute the distance of points from the surface [m], shape (...); negative inside.
 
-        `points` are in [m], world frame, shape (..., 3). Near the edges of a hull, and near an
-        ellipsoid, the true distance is larger.
+        `points` are in [m], world frame, shape (..., 3).
         """
         local = (points - self.centre) @ self.axes
         return _DISTANCES[self.shape](self, local)
@@ -70,9 +82,30 @@ def _to_cylinder(solid: Solid, local: Array) -> Array:
 
 
 def _to_ellipsoid(solid: Solid, local: Array) -> Array:
-    scaled = np.linalg.norm(local / solid.size, axis=-1)
-    distance: Array = (scaled - 1.0) * solid.size.min()
-    return distance
+    """Compute the distance with Newton's method.
+
+    With the half-axes e and the smallest of them, c, the nearest point of the surface to y is
+    x = r y / (w + r - 1), r = (e / c)^2, for the one w > 0 that puts x on the surface. The sum
+    below is convex and falls with w, so w grows towards its value without passing it.
+    Source: D. Eberly, "Distance from a Point to an Ellipse, an Ellipsoid, or a Hyperellipsoid",
+    Geometric Tools, 2013.
+    """
+    ratios = (solid.size / solid.size.min()) ** 2
+    # On the plane of two axes the nearest point may be beside it: there w would be 0.
+    scaled = np.maximum(np.abs(local) / solid.size, _TINY)
+    numerators, shifts = ratios * scaled, ratios - 1.0
+    w = (numerators - shifts).max(axis=-1, keepdims=True)
+    for _ in range(_NEWTON_MAX):
+        squares = (numerators / (w + shifts)) ** 2
+        slope = (squares / (w + shifts)).sum(axis=-1, keepdims=True)
+        step = (squares.sum(axis=-1, keepdims=True) - 1.0) / (2.0 * slope)
+        w = w + step
+        if (step <= _CONVERGED * w).all():
+            break
+    nearest = numerators / (w + shifts) * solid.size
+    distance: Array = np.linalg.norm(scaled * solid.size - nearest, axis=-1)
+    inside = np.linalg.norm(scaled, axis=-1) < 1.0
+    return np.where(inside, -distance, distance)
 
 
 def _to_plane(solid: Solid, local: Array) -> Array:
@@ -81,9 +114,39 @@ def _to_plane(solid: Solid, local: Array) -> Array:
 
 
 def _to_hull(solid: Solid, local: Array) -> Array:
+    """Compute the distance from the nearest face, or from the nearest edge.
+
+    The largest distance from the planes of the faces is exact inside, and outside where the point
+    of this plane below is on the hull. Elsewhere an edge, or its end, is nearest.
+    """
     assert solid.faces is not None
-    normals, offsets = solid.faces
-    distance: Array = (local @ normals.T - offsets).max(axis=-1)
+    normals, offsets, edges = solid.faces
+    points = local.reshape(-1, 3)
+    distance = np.empty(len(points))
+    rows = max(_CELLS_MAX // max(len(normals), len(edges)), 1)
+    for start in range(0, len(points), rows):
+        some = points[start : start + rows]
+        heights = some @ normals.T - offsets
+        highest = heights.argmax(axis=1)
+        found = heights.max(axis=1)
+        below = some - found[:, None] * normals[highest]
+        beside = (found > 0.0) & ((below @ normals.T - offsets).max(axis=1) > _ON_HULL)
+        found[beside] = _to_edges(edges, some[beside])
+        distance[start : start + rows] = found
+    return distance.reshape(local.shape[:-1])
+
+
+def _to_edges(edges: Array, points: Array) -> Array:
+    """Compute the distance of points (n, 3) from the nearest of the edges (k, 2, 3) [m]."""
+    begins, along = edges[:, 0], edges[:, 1] - edges[:, 0]
+    lengths = np.linalg.norm(along, axis=1)
+    units = along / lengths[:, None]
+    shares = points @ units.T - np.einsum("ij,ij->i", begins, units)
+    from_begin = (points**2).sum(axis=1)[:, None] - 2.0 * points @ begins.T
+    from_begin += (begins**2).sum(axis=1)
+    nearest = np.clip(shares, 0.0, lengths)
+    squares = from_begin - nearest * (2.0 * shares - nearest)
+    distance: Array = np.sqrt(np.maximum(squares.min(axis=1), 0.0))
     return distance
 
 
