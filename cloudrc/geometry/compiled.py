@@ -96,8 +96,14 @@ def read_scene(path: Path) -> Any:
         ValueError: If MuJoCo cannot read the file.
     """
     spec = mujoco.MjSpec.from_file(str(path))
-    if spec.frame("spawn") is None:
+    spawn = spec.frame("spawn")
+    if spawn is None:
         raise BadInputError(f"{path}: needs a frame named spawn in its worldbody")
+    if spawn.parent.name != WORLD or spawn.frame is not None:
+        raise BadInputError(
+            f"{path}: the frame spawn is inside of a body or another frame; put it directly into "
+            "the worldbody"
+        )
     if spec.body(FLOOR) is None:
         raise BadInputError(
             f"{path}: needs a body named floor that has the ground; all other bodies are obstacles"
