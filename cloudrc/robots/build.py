@@ -162,7 +162,7 @@ def _make_parts(world: World) -> Parts:
     if not robot.planar:
         _check_lift(world, where, true)
     actuators = _build_actuators(plugin, nominal, parameters(robot, world))
-    _check_onboard(onboard, nominal.nu if isinstance(actuators, Direct) else None)
+    _check_onboard(choice.name, onboard, nominal.nu if isinstance(actuators, Direct) else None)
     if world.wind.blows and isinstance(actuators, Direct):
         _refuse_wind(world, plugin)
     try:
@@ -257,10 +257,13 @@ def _build_actuators(plugin: plugins.Found, model: Any, given: dict[str, Any]) -
         return actuators  # type: ignore[no-any-return]
 
 
-def _check_onboard(onboard: Onboard, size: int | None) -> None:
-    """Refuse a controller that lacks a part; `size` is the number of commands, None if unknown."""
+def _check_onboard(name: str, onboard: Onboard, size: int | None) -> None:
+    """Refuse the controller `name` if it lacks a part.
+
+    `size` is the number of commands, None if unknown.
+    """
     wanted = "finite numbers" if size is None else f"{size} finite numbers, one per actuator"
-    with plugins.refuse_failure("the onboard controller does not hold the contract"):
+    with plugins.refuse_failure(f"the onboard controller {name!r} does not hold the contract"):
         for method in ("reset", "update", "brake"):
             if not callable(getattr(onboard, method, None)):
                 raise ValueError(f"{type(onboard).__name__} has no method {method}()")

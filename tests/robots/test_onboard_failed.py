@@ -136,6 +136,7 @@ def test_a_controller_without_its_parts_is_refused_before_the_flight(fly, old, n
     with pytest.raises(BadInputError) as error:
         fly(FAILS.replace("{what}", "pass").replace(old, new))
     assert shown in str(error.value)
+    assert "/own.py'" in str(error.value)
     assert "\n" not in str(error.value)
 
 
