@@ -51,11 +51,12 @@ class RosLockStep:
         self._node.close()
 
     def _meet(self) -> None:
-        deadline = time.monotonic() + self._start_limit
+        began = time.monotonic()
         while not self._node.is_met:
             self._node.check()
-            if time.monotonic() > deadline or self._gone():
-                raise self._silent()
+            waited = time.monotonic() - began
+            if waited > self._start_limit or self._gone():
+                raise self._silent(waited)
             time.sleep(MET_PERIOD)
         time.sleep(SETTLE)
         self._node.check()
@@ -77,7 +78,7 @@ class RosLockStep:
                 self._check_other(answer.stamp_ns, stamp_ns)
             elif now - began > self._limit:
                 self._node.check()
-                raise self._silent()
+                raise self._silent(self._limit)
             elif self._answered_ns is None and now - again > REPEAT:
                 again, self._repeated_ns = now, stamp_ns
                 self._node.publish_again(observation, stamp_ns)
@@ -96,5 +97,5 @@ class RosLockStep:
             f"{stamp_ns * 1e-9:.9f}: copy its header.stamp"
         )
 
-    def _silent(self) -> ControllerLostError:
-        return ControllerLostError(SILENT, self._node.silence(self._limit))
+    def _silent(self, waited: float) -> ControllerLostError:
+        return ControllerLostError(SILENT, self._node.silence(waited))

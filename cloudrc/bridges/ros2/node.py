@@ -236,7 +236,8 @@ class RosNode:
             return clash
         if not heard:
             who = f"; {self._known} is gone" if self._known else ""
-            return f"no node subscribes to {estimate} in {domain} for {limit:g} s{who}"
+            waited = f" for {limit:.0f} s" if limit >= 1 else ""
+            return f"no node subscribes to {estimate} in {domain}{waited}{who}"
         topic = self._names["cmd_vel"]
         if not self._publishers():
             names = " and ".join(sorted({_name(info) for info in heard}))
