@@ -185,19 +185,19 @@ def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
         file.write(data)
 
 
-def refuse_other_file(
-    path: Path, own: re.Pattern[bytes], source: Path | None = None, flag: str = "-o"
-) -> None:
-    """Raise a BadInputError if writing to `path` would replace what cloudrc has not written.
+def refuse_file(path: Path, flag: str = "-o") -> None:
+    """Raise a BadInputError if writing to `path` would replace a file that is not empty.
 
-    A file may be replaced if it begins as files of this kind do (`own`) and is not its `source`,
-    or if it is empty. Writing to a device or
-    a pipe replaces nothing. `flag` names another file, for the error.
+    Writing to a device or a pipe replaces nothing. `flag` names another file, for the error.
     """
-    if not path.is_file():
-        return
-    with path.open("rb") as file:
-        start = file.read(256)
-    is_source = source is not None and path.samefile(source)
-    if is_source or (start and own.match(start) is None):
+    if path.is_file() and path.stat().st_size:
         raise BadInputError(f"{path}: already there; name another file with {flag}")
+
+
+def refuse_other_file(path: Path, own: re.Pattern[bytes], flag: str = "-o") -> None:
+    """Do as `refuse_file` for a file that does not begin as files of this kind do (`own`)."""
+    if path.is_file():
+        with path.open("rb") as file:
+            start = file.read(256)
+        if own.match(start) is None:
+            refuse_file(path, flag)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from shlex import quote
 
 from cloudrc.cli.output import format_document, print_or_drop, print_result
 from cloudrc.cli.parser import add_verbs
@@ -44,8 +45,8 @@ def execute(options: argparse.Namespace) -> int:
     folder: Path = options.folder
     if options.verb == "new":
         names = write_files(folder)
-        text = f"fill in {', '.join(names)} in {folder}, then: cloudrc class check {folder}"
-        print_or_drop(text)
+        command = f"cloudrc class check {quote(str(folder))}"
+        print_or_drop(f"fill in {', '.join(names)} in {folder}, then: {command}")
         return 0
     for_gradescope = options.output == "gradescope"
     check_folder(folder, may_be_empty=for_gradescope)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from cloudrc.files import refuse_other_file
+from cloudrc.files import refuse_file
 
 EPILOG = """\
 sources:
@@ -44,7 +44,6 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Read the delays from SOURCE, write a trace per direction, and print a summary of each."""
-    from cloudrc.link.traces import HEAD
     from cloudrc.runs.links.trace import LogSettings, read_packets, write_trace_file
 
     source, output = options.source, options.output
@@ -54,7 +53,7 @@ def execute(options: argparse.Namespace) -> int:
         way: output.with_stem(f"{output.stem}-{way}") if len(found) > 1 else output for way in found
     }
     for path in paths.values():
-        refuse_other_file(path, HEAD, source)
+        refuse_file(path)
     for way, packets in found.items():
         print("\n".join(write_trace_file(packets, paths[way], way)))
     return 0

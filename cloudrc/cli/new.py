@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from shlex import quote
 
 from cloudrc.cli.output import print_or_drop
 from cloudrc.cli.parser import add_verbs
@@ -28,10 +29,11 @@ def execute(options: argparse.Namespace) -> int:
     folder = options.folder
     names = write_robot(folder)
     path = folder if folder.is_absolute() or folder.parts[:1] == ("..",) else f"./{folder}"
+    typed = quote(str(path))
     print_or_drop(
         f"change {', '.join(names)} in {folder}, then:\n"
-        f"  cloudrc robot check {path}\n"
-        f"  cloudrc run steps --mode virtual --set world.robot={path}\n"
-        f"  pytest {path}"
+        f"  cloudrc robot check {typed}\n"
+        f"  cloudrc run steps --mode virtual --set world.robot={typed}\n"
+        f"  pytest {typed}"
     )
     return 0

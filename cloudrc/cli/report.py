@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from cloudrc.cli.output import output_argument, paint, print_line, print_result
@@ -75,8 +76,9 @@ def summary(report: Mapping[str, Any], folder: Path) -> str:
     """Summarize a report as text, and say where the replay and the page are."""
     from cloudrc.report.summary import summarize
 
-    how = f"pip install 'cloudrc[console]', then cloudrc replay {folder}"
-    replay = f"replay in 3-D: {how if missing('console') else f'cloudrc replay {folder}'}"
+    command = f"cloudrc replay {quote(str(folder))}"
+    how = f"pip install 'cloudrc[console]', then {command}"
+    replay = f"replay in 3-D: {how if missing('console') else command}"
     page = str(folder / "report.html")
     return "\n".join(["", summarize(report, paint), "", escape(replay), escape(page)])
 

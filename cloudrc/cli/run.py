@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, TextIO
 
 from cloudrc.cli.cluster_flags import (
@@ -159,7 +160,7 @@ def _place_of_recording(folder: Path) -> Iterator[None]:
         if folder.exists():
             text = f"the recording is in {folder}"
             if isinstance(error, KeyboardInterrupt):
-                text += f"; 'cloudrc report {folder}' writes its report"
+                text += f"; to write its report: cloudrc report {quote(str(folder))}"
             print_line(text, sys.stderr)
         raise error
 

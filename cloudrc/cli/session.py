@@ -141,7 +141,7 @@ def _down(options: argparse.Namespace) -> int:
         print_line(short(run / "report.html"))
     elif last := last_mission(run):
         text = f"ended; mission {last.id} flew, but has no report"
-        raise CloudrcError(f"{name}: {text}; to write it: cloudrc report {name}")
+        raise CloudrcError(f"{name}: {text}; to write it: cloudrc report {quote(str(name))}")
     else:
         print_line(f"{name}: ended; no mission flew")
     return 0

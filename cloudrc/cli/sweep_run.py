@@ -8,6 +8,7 @@ import sys
 from collections.abc import Generator, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
+from shlex import quote
 
 from cloudrc import metrics
 from cloudrc.cli.cluster_flags import release_from_flags
@@ -64,7 +65,7 @@ def _run_locked(
         rows, stopped = sweep.keep(flown, folder, grid, shard, work.before, view.see)
     if stopped:
         flags = " --on kubernetes, and its other flags" if options.on else ""
-        again = f"cloudrc sweep run {options.file} --out {folder}{flags}"
+        again = f"cloudrc sweep run {quote(str(options.file))} --out {quote(str(folder))}{flags}"
         print_line(f"cloudrc: {stopped}; to continue: {again}", sys.stderr)
     name = store.TABLE if len(rows) == len(grid.flights) else store.SUMMARY
     text = f"\n{sweep.count_verdicts(rows.values())}\n\n{escape(str(folder / name))}"

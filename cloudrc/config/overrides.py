@@ -82,10 +82,16 @@ def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
 
 
 def _refuse_second(path: KeyPath, found: Settings) -> None:
-    """Raise a BadInputError if the value of a setting above `path` sets the key `path`, too."""
+    """Raise a BadInputError if the value of a setting above `path` sets the key `path`, too.
+
+    Below a number there is no key, so one of both would be lost. Below a name are its parameters.
+    """
     for depth in range(1, len(path)):
         above = found.get(path[:depth])
-        if above and reduce(child, path[depth:], above.value) is not None:
+        if above is None:
+            continue
+        is_number = isinstance(above.value, int | float)
+        if is_number or reduce(child, path[depth:], above.value) is not None:
             both = f"{'.'.join(path)}: is set twice, also by {'.'.join(path[:depth])}"
             raise BadInputError(f"{found[path].source.label} {both}; keep one of them")
 

@@ -35,8 +35,6 @@ from cloudrc.rounding import differences
 SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a second
 START_MAX = 600.0  # if the first row is later, times count from the first row [s]
 LATEST = 1e11  # largest plausible time since 1970 [s]; a larger time has another unit
-HEAD = re.compile(rb"time_s,delay_[mu]s(,loss)?\n")
-"""First line of the files that `write_trace` writes."""
 SILENT = 1.0  # time after which a command says that it reads a large file [s]
 _GZIP = b"\x1f\x8b"  # first bytes of a compressed file (RFC 1952)
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,7 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
         text = f"{merged}: {lack}; no report is written"
         if lack == recording.lacking and "damaged" in lack:
             damaged = merged if before else folder / f"{lack.partition(':')[0]}.mcap"
-            text += f"; to copy what is readable: cloudrc recover {damaged}"
+            text += f"; to copy what is readable: cloudrc recover {quote(str(damaged))}"
         raise BadInputError(text)
     run = _read_facts(recording)
     if before is None:

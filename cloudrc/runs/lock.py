@@ -11,6 +11,7 @@ import fcntl
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from shlex import quote
 
 from cloudrc.errors import BadInputError
 
@@ -36,7 +37,8 @@ def lock_folder(folder: Path, shard: int | None = None, count: int = 1) -> Itera
             try:
                 fcntl.flock(file, how)
             except BlockingIOError:
-                text = f"{who} into it now; wait for its end, or see: cloudrc sweep status {folder}"
+                see = f"cloudrc sweep status {quote(str(folder))}"
+                text = f"{who} into it now; wait for its end, or see: {see}"
                 raise BadInputError(f"--out {folder}: {text}") from None
             except OSError as error:
                 text = f"{folder}: its file system has no locks ({error.strerror}); do not start "

@@ -165,7 +165,7 @@ def test_results_before_the_signal_are_kept():
 
 
 def test_a_flight_ends_after_a_signal_that_a_plugin_caught(tmp_path, monkeypatch):
-    def fly(experiment, see):
+    def fly(experiment, see, gone):
         with suppress(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGTERM)
         see([], [])
@@ -174,7 +174,7 @@ def test_a_flight_ends_after_a_signal_that_a_plugin_caught(tmp_path, monkeypatch
     interrupt_on_signals()
     monkeypatch.setattr("cloudrc.assembly.fly", fly)
     experiment = load_experiment("hover")
-    with flights._record_virtual(experiment, tmp_path, lambda records: None) as (_, _, facts):
+    with flights._record_virtual(experiment, tmp_path, lambda records: None, bool) as (_, _, facts):
         assert facts.interrupted
 
 
@@ -188,7 +188,7 @@ def test_a_signal_that_a_library_turned_into_an_error_of_the_report_interrupts(m
 
     monkeypatch.setattr(run, "_local_flight", lambda *words: fly)
     error = call("run hover --mode virtual --out r", code=130).err
-    assert error == "the recording is in r; 'cloudrc report r' writes its report\n"
+    assert error == "the recording is in r; to write its report: cloudrc report r\n"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])

@@ -40,21 +40,24 @@ def test_a_recording_of_the_world_alone_gives_no_trace(folder, refused):
     assert f"world.mcap: {said}" in refused("link record world.mcap -o t.csv")
 
 
-def test_a_trace_replaces_an_earlier_trace_but_neither_its_source_nor_another_file(
-    folder, call, refused
-):
+def test_a_trace_replaces_no_file(folder, call, refused):
     log = "time_s,delay_ms\n0,45\n1,46\n"
     (folder / "log.csv").write_text(log)
     (folder / "same.csv").symlink_to("log.csv")
-    (folder / "others.csv").write_text("robot,delay\n1,2\n")
-    for name in ("log.csv", "same.csv", "others.csv"):
+    (folder / "mine.csv").write_text("time_s,delay_ms,loss\n0,20,0\n")
+    for name in ("log.csv", "same.csv", "mine.csv"):
         said = refused(f"link record log.csv -o {name}")
         assert f"{name}: already there; name another file with -o" in said
     assert (folder / "log.csv").read_text() == log
     (folder / "t.csv").touch()  # as mktemp does
-    for _ in range(2):
-        call("link record log.csv -o t.csv")
+    call("link record log.csv -o t.csv")
     assert read_trace(folder / "t.csv").delays == (0.045, 0.046)
+
+
+def test_a_command_to_copy_has_quotes_around_a_path_with_blanks(folder, call):
+    (folder / "log.csv").write_text("time_s,delay_ms\n0,45\n1,46\n")
+    assert "link.uplink.trace='my trace.csv'" in call("link record log.csv -o", "my trace.csv").out
+    assert "cloudrc robot check './my robot'" in call("new robot", "my robot").out
 
 
 def test_both_traces_of_a_run_are_refused_before_one_is_written(run, folder, refused):

@@ -77,7 +77,7 @@ def test_a_run_and_its_report_can_be_repeated(folder, call):
     ("fails", "error", "code", "said"),
     [
         ("runs.fly.write_report", KeyboardInterrupt, 130,
-         "'cloudrc report here' writes its report"),
+         "to write its report: cloudrc report here"),
         ("report.write.write_json", OSError(28, "No space left on device", "here/report.json"), 3,
          "disk_full: here/report.json: free some space"),
     ],

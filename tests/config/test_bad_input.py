@@ -129,6 +129,10 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
             "link={'uplink':{'delay_ms':4}} link.both.delay_ms=3",
             "link.uplink.delay_ms: is set twice, also by link; keep one of them",
         ),
+        (
+            "link.uplink.loss=0.1 link.uplink.loss.bad_start=0.1",
+            "is set twice, also by link.uplink.loss;",
+        ),
         ("link.both={'delay_ms':4} link.uplink.delay_ms=3", "is set twice, also by link.uplink;"),
         (
             "mission.waypoints=[{'dwell_s':1}] mission.waypoints.0.dwell_s=2",

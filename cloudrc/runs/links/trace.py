@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from math import inf, isnan, nan
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 from cloudrc.errors import BadInputError
@@ -153,7 +154,7 @@ def write_trace_file(packets: Packets, path: Path, direction: Direction) -> list
         f"{path}: {count} packets in {seconds:.1f} s, {what} {mean:.4g} ± "
         f"{deviation:.3g} ms (mean, standard deviation), {found.loss:.3g} lost"
         + "".join(f"; {note}" for note in packets.notes),
-        f"  replay:   --set link.profile=ideal --set link.{direction}.trace={path}",
+        f"  replay:   --set link.profile=ideal --set link.{direction}.trace={quote(str(path))}",
     ]
     if deviation:
         drawn = f"{{delay_ms: {mean:.4g}, jitter_ms: {deviation:.3g}, "
