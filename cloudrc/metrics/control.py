@@ -6,9 +6,8 @@ from collections import deque
 
 import numpy as np
 
-from cloudrc.messages import GuardState
+from cloudrc.messages import NEVER_NS, GuardState
 from cloudrc.metrics.definitions import (
-    Echoes,
     PredictionJudge,
     age,
     delay_error,
@@ -27,13 +26,51 @@ from cloudrc.metrics.flight import (
     rms,
     select,
 )
+from cloudrc.record.columns import Table
 
 
 def round_trips(flight: Flight) -> Columns:
-    """Select the control periods in which cloud measured a new round trip."""
-    control, echoes = flight.control, Echoes()
-    measured = zip(control["rtt"].tolist(), control["loop_delay"].tolist(), strict=True)
-    return select(control, np.array([echoes.take(*each) for each in measured], dtype=bool))
+    """Measure the round trip of each applied command whose echo arrived, in order of arrival.
+
+    The first telemetry that names the command and that cloud used measures it. So each command
+    counts once, even if several echoes arrive in one control period; `Echoes` sees the last one.
+
+    Returns:
+        `stamp_ns` of the arrival [ns]; `loop_delay`, from the command to this arrival [s]; `rtt`,
+        the same without the hold time in world [s].
+    """
+    applied, sent = flight.recording["/command_applied"], flight.recording["/telemetry"]
+    estimates, arrivals = flight.recording["/delay_estimate"], flight.during("/uplink_delay")
+    made = dict(zip(_numbers(estimates), estimates["stamp_ns"].tolist(), strict=True))
+    # The stamp in an echo may be on another clock than the recording: the time of application,
+    # world's clock, tells the command.
+    commands = dict(zip(applied["stamp_ns"].tolist(), _numbers(applied), strict=True))
+    echoed = sent["echo_stamp_ns"] != NEVER_NS
+    applied_ns, holds_ns = sent["stamp_ns"] - sent["echo_hold_ns"], sent["echo_hold_ns"]
+    rows = zip(applied_ns[echoed].tolist(), holds_ns[echoed].tolist(), strict=True)
+    telemetry = dict(zip(_numbers(sent, echoed), rows, strict=True))
+    known, found = set[tuple[int, int]](), list[tuple[int, int, int]]()
+    used = arrivals["used"]
+    for number, stamp_ns in zip(
+        _numbers(arrivals, used), arrivals["stamp_ns"][used].tolist(), strict=True
+    ):
+        at_ns, hold_ns = telemetry.get(number, (NEVER_NS, 0))
+        command = commands.get(at_ns)
+        if command in made and command not in known:
+            known.add(command)
+            found.append((stamp_ns, stamp_ns - made[command], hold_ns))
+    stamps_ns, loops_ns, held_ns = np.array(found, np.int64).reshape(-1, 3).T
+    return {
+        "stamp_ns": stamps_ns,
+        "loop_delay": loops_ns * 1e-9,
+        "rtt": (loops_ns - held_ns) * 1e-9,
+    }
+
+
+def _numbers(table: Table | Columns, rows: Array | slice = slice(None)) -> list[tuple[int, int]]:
+    """Return epoch and counter, which identify a datagram, of the `rows` of a table."""
+    epochs, counters = table["epoch"][rows].tolist(), table["counter"][rows].tolist()
+    return list(zip(epochs, counters, strict=True))
 
 
 def _age_of_information(flight: Flight) -> float | None:

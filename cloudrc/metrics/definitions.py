@@ -2,8 +2,9 @@
 
 Each quantity is computed step by step. Live metrics and console do so while the records arrive, the
 report does so afterwards, with the same functions. So the same records give the same value, except
-for two quantities of which the report knows more: it waits longer for a missing datagram before it
-counts the datagram as lost (`WINDOW_MAX`), and it knows the true positions (`PredictionJudge`).
+for three quantities of which the report knows more: it waits longer for a missing datagram before
+it counts the datagram as lost (`WINDOW_MAX`), it knows the true positions (`PredictionJudge`), and
+it sees each echo of a command (`cloudrc.metrics.control.round_trips`), not one per control period.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ def delay_error(horizon: Any, basis_stamp_ns: Any, applied_ns: Any) -> Any:
 class Echoes:
     """Finds the control periods in which cloud measured a new round trip.
 
-    All other periods repeat the last measured values, for seconds on end if the link is silent.
+    All other periods repeat the last measured values, for seconds on end if the link is silent. If
+    several echoes arrive in one period, the period has the values of the last one.
     """
 
     def __init__(self) -> None:

@@ -108,7 +108,8 @@ def flown(path=straight):
 
 def _step(log, counter, stamp, path):
     odometry = Odometry(stamp, path((stamp - START) / SECOND), UPRIGHT, (1.0, 0.0, 0.0), ZERO)
-    telemetry = Telemetry(stamp, odometry, (), 0, 0, 0, 1, GuardState.TRACK)
+    # The command of two periods before was applied one period before.
+    telemetry = Telemetry(stamp, odometry, (), stamp - 2 * PERIOD, PERIOD, 0, 1, GuardState.TRACK)
     arrival, applied = stamp + round(UPLINK * SECOND), stamp + round(DOWNLINK * SECOND)
     basis = stamp - round(UPLINK * SECOND)
     x, y, z = path((applied - START) / SECOND)

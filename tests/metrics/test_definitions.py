@@ -17,7 +17,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
 from cloudrc.metrics import SHIPPED
-from cloudrc.metrics.control import estimate_errors
+from cloudrc.metrics.control import estimate_errors, round_trips
 from cloudrc.metrics.definitions import (
     GAP_MAX_NS,
     LONG_AGO_NS,
@@ -167,18 +167,39 @@ def average(live, name):
     return histogram.total / histogram.cumulative()[-1]
 
 
-def test_round_trip_and_age_of_a_flight_are_equal_live_and_in_the_report():
-    flight, _, cloud = lossy()
+def seen_in(flight, cloud):
+    """Show the control periods of the flight to live metrics."""
     live = LiveMetrics("cloud")
     for record in cloud:
         if not isinstance(record, Control) or flight.start_ns <= record.stamp_ns <= flight.end_ns:
             live.see([record])
-    for name, metric in (
-        ("rtt_mean", "cloudrc_rtt_seconds"),
-        ("loop_delay_mean", "cloudrc_loop_delay_seconds"),
-        ("age_of_information_mean", "cloudrc_age_of_information_seconds"),
-    ):
-        assert average(live, metric) == pytest.approx(measured(flight, name), rel=1e-9), name
+    return live
+
+
+def test_round_trips_over_an_even_link_are_equal_live_and_in_the_report():
+    settings = ("link.both.delay_ms=33", "link.both.jitter_ms=0")
+    flight, cloud = fly("hover", *settings).flight, records(load_experiment("hover", settings))[1]
+    assert measured(flight, "rtt_mean") == pytest.approx(0.066, abs=1e-3)
+    live = seen_in(flight, cloud)
+    for name in ("rtt", "loop_delay"):
+        true = measured(flight, f"{name}_mean")
+        assert average(live, f"cloudrc_{name}_seconds") == pytest.approx(true, abs=1e-5)
+
+
+def test_each_command_has_one_round_trip_even_if_telemetry_arrives_at_once():
+    flight = lossy()[0]
+    found = round_trips(flight)
+    made = np.round(found["stamp_ns"] - found["loop_delay"] * 1e9)
+    assert len(np.unique(made)) == len(made)
+    periods = np.unique(flight.control["stamp_ns"].searchsorted(found["stamp_ns"]))
+    assert len(periods) < len(made)
+
+
+def test_age_and_tracking_error_of_a_flight_are_equal_live_and_in_the_report():
+    flight, _, cloud = lossy()
+    live = seen_in(flight, cloud)
+    age = measured(flight, "age_of_information_mean")
+    assert average(live, "cloudrc_age_of_information_seconds") == pytest.approx(age, rel=1e-9)
     newest = flight.control["setpoint"][-1] - flight.control["measured"][-1]
     tracking = live.read()["cloudrc_tracking_error_meters"]
     assert [tracking[axis,] for axis in "xyz"] == list(newest)

@@ -76,10 +76,30 @@ def plus(*records, scene=OPEN_AIR, waypoints=1):
     return log.flight(scene, waypoints=waypoints)
 
 
-def echo_twice(n, control):
-    """Give the flight's 251 periods two echoes; the first one fills half of the periods."""
-    rtt = 0.1 if control.stamp_ns <= at(5) else 0.3
-    return control._replace(rtt=rtt, loop_delay=rtt)
+def echoes_at_once():
+    """Each second telemetry waits in a queue: it arrives 39 ms late, just before the next one."""
+    log = flown()
+    wait = 39_000_000
+    log.change(
+        Arrival,
+        lambda n, a: a._replace(stamp_ns=a.stamp_ns + wait) if a.uplink and a.counter % 2 else a,
+    )
+    return log.flight()
+
+
+def echoes_repeated():
+    """Each command is echoed twice, the second time with 40 ms more in world."""
+    log = flown()
+
+    def repeat(n, sent):
+        told = sent.telemetry
+        again = told._replace(
+            echo_stamp_ns=told.echo_stamp_ns - PERIOD, echo_hold_ns=told.echo_hold_ns + PERIOD
+        )
+        return sent._replace(telemetry=again) if sent.counter % 2 else sent
+
+    log.change(TelemetrySent, repeat)
+    return log.flight()
 
 
 def lost_late_and_duplicated():
@@ -221,7 +241,7 @@ NUMBERS = {
         "tracking_rms_estimated": approx(hypot(0.3 - 0.09 - 0.003, 0.4 - 0.004)),
         "rtt_mean": approx(0.09),
         "rtt_p95": approx(0.09),
-        "loop_delay_mean": approx(0.095),
+        "loop_delay_mean": approx(0.13),  # with the 40 ms in world
         "uplink_delay_mean": approx(0.05),
         "downlink_delay_mean": approx(0.04),
         "age_of_information_mean": approx(0.05),
@@ -254,11 +274,12 @@ NUMBERS = {
         "obstacle_contacts": 0.0,
     },
     lambda: plus(*REACHED, waypoints=2): {"waypoints_reached": 2.0, "duration": 10.0},
-    lambda: changed(Control, echo_twice): {
-        "rtt_mean": approx(0.2),
-        "rtt_p95": approx(0.29),
-        "loop_delay_mean": approx(0.2),
+    echoes_at_once: {
+        "rtt_mean": approx(0.1095, abs=1e-4),
+        "rtt_p95": approx(0.129),
+        "loop_delay_mean": approx(0.1495, abs=1e-4),
     },
+    echoes_repeated: {"rtt_mean": approx(0.09), "loop_delay_mean": approx(0.13)},
     # A duplicate does not hide a loss; late datagrams count in the delay.
     lost_late_and_duplicated: {
         "loss_uplink": approx(0.5, abs=6e-3),
