@@ -29,7 +29,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import CodeType, FrameType, ModuleType
 from typing import Any, TextIO, cast
 
 from cloudrc.errors import (
@@ -130,18 +130,26 @@ class Found:
 
     def _place(self, error: BaseException, function: Any) -> str:
         """Return file and line: where a plug-in's own code failed, else where `function` begins."""
-        frames = [*traceback.walk_tb(error.__traceback__)]
         file = getattr(self._target, "__file__", None) or type(self._target).__name__
-        own = [(f.f_code.co_filename, line) for f, line in frames if _is_own(f.f_globals, file)]
+        own = [(frame.f_code.co_filename, line) for frame, line in _own_frames(error, file)]
         code = getattr(function, "__code__", None)
         if not own and isinstance(code, CodeType):
             own = [(code.co_filename, code.co_firstlineno)]
         return f"{own[-1][0]}:{own[-1][1]}" if own else str(file)
 
 
-def _is_own(variables: dict[str, Any], file: str) -> bool:
-    """Return whether a module's global `variables` are those of a plug-in's file or one beside."""
-    return str(variables.get("__name__")).startswith(PREFIX) or variables.get("__file__") == file
+def _own_frames(error: BaseException, file: str = "") -> list[tuple[FrameType, int]]:
+    """Return frame and line of each call in a plug-in's files that `error` left, innermost last.
+
+    They are the files of users, those beside them, and `file`. A frame without a file, such as in
+    a method that a dataclass generates, has no line that a user could look at.
+    """
+
+    def is_own(frame: FrameType) -> bool:
+        name, own = (str(frame.f_globals.get(key)) for key in ("__name__", "__file__"))
+        return (name.startswith(PREFIX) or own == file) and frame.f_code.co_filename[:1] != "<"
+
+    return [each for each in traceback.walk_tb(error.__traceback__) if is_own(each[0])]
 
 
 def names(kind: str) -> list[str]:
@@ -282,7 +290,19 @@ def refuse_failure(what: str) -> Iterator[None]:
             yield
     except BaseException as error:
         check_failure(error, what)
-        raise BadInputError(f"{what}: {_explain(error)}") from error
+        raise BadInputError(f"{what}: {place_of(error)}{_explain(error)}") from error
+
+
+def place_of(error: BaseException) -> str:
+    """Return file and line where a user's own code failed, to put before the error's text.
+
+    Return "" if the user's code did not fail, or if Python's text names the place already.
+    """
+    own = _own_frames(error)
+    if not own or isinstance(error, SyntaxError):
+        return ""
+    frame, line = own[-1]
+    return f"{Path(frame.f_code.co_filename).name}:{line}: "
 
 
 def locate(error: BaseException) -> str:
@@ -291,8 +311,7 @@ def locate(error: BaseException) -> str:
     Prefer the last line of a plug-in's own file to that of a library that it calls.
     """
     frames = [*traceback.walk_tb(error.__traceback__)]
-    own = [each for each in frames if str(each[0].f_globals.get("__name__")).startswith(PREFIX)]
-    frame, line = (own or frames)[-1]
+    frame, line = (_own_frames(error) or frames)[-1]
     return f"{Path(frame.f_code.co_filename).name}:{line} in {frame.f_code.co_name}"
 
 

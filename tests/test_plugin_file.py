@@ -120,10 +120,14 @@ def test_a_dataclass_of_a_helper_knows_its_module(write):
 @pytest.mark.parametrize(
     ("helper", "said"),
     [
-        ("1 / 0", "ZeroDivisionError: division by zero"),
-        ("import sys; sys.exit(0)", "SystemExit: 0"),
-        ("def x(:", "SyntaxError: "),
-        ("from mine import build", "ImportError: "),
+        ("1 / 0", "helper.py:1: ZeroDivisionError: division by zero"),
+        ("import sys; sys.exit(0)", "helper.py:1: SystemExit: 0"),
+        ("def x(:", r"SyntaxError: .*helper.py, line 1"),
+        (
+            "\n\ngains = {}\ndef get():\n    return gains['tau']\nget()",
+            "helper.py:5: KeyError: 'tau'",
+        ),
+        ("from mine import build", "helper.py:1: ImportError: "),
     ],
 )
 def test_a_broken_helper_is_one_error_of_the_plug_in(write, helper, said):

@@ -123,5 +123,6 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Numb
                 notes.append(f"{METRIC_NOTE}{name} gave {number}{beyond}: left out")
         except BaseException as error:
             plugins.check_failure(error, f"{METRIC_NOTE}{name}")
-            notes.append(f"{METRIC_NOTE}{name} failed: {describe_error(error)}")
+            why = f"{plugins.place_of(error)}{describe_error(error)}"
+            notes.append(f"{METRIC_NOTE}{name} failed: {why}")
     return numbers, notes

@@ -512,8 +512,8 @@ def broken_metrics(folder):
 def test_each_metric_that_fails_is_told_once_and_to_programs(broken_metrics, call):
     flags = "--seeds", "2", *SHORT, f"--set=report.metrics={json.dumps(broken_metrics)}"
     first, second = call("run steps --out a", *flags).out.splitlines()[1:3]
-    assert "success: metric met_a failed: SystemExit: 0" in first
-    assert "; metric met_b failed: ZeroDivisionError" in first
+    assert "success: metric met_a failed: met_a.py:4: SystemExit: 0" in first
+    assert "; metric met_b failed: met_b.py:4: ZeroDivisionError" in first
     assert second == "    2/2  seed 2  success"
     said = call("run steps --out b -o json", *flags)
     assert all("met_a failed" in run["text"] for run in json.loads(said.out)["runs"])
@@ -522,7 +522,10 @@ def test_each_metric_that_fails_is_told_once_and_to_programs(broken_metrics, cal
 
 def test_a_sweep_tells_a_metric_that_fails_once(broken_metrics, write_sweep, call):
     file = write_sweep(ONE, seeds=2, set={"report.metrics": broken_metrics})
-    assert call("sweep run --out grid", file).out.count("metric met_a failed: SystemExit") == 1
+    assert (
+        call("sweep run --out grid", file).out.count("metric met_a failed: met_a.py:4: SystemExit")
+        == 1
+    )
 
 
 @pytest.mark.process

@@ -64,10 +64,10 @@ def test_a_later_report_measures_a_file_only_if_named(folder):
     overshoot = first["numbers"]["overshoot"]
     assert (overshoot["value"] >= 0.0, overshoot["unit"]) == (True, "m")
     assert first["notes"] == [
-        "metric exits failed: SystemExit: 0 (sys.exit() was called)",
+        "metric exits failed: exits.py:4: SystemExit: 0 (sys.exit() was called)",
         "metric huge gave -1e+31, beyond 1e+30: left out",
         "metric infinite gave inf: left out",
-        "metric raises failed: RuntimeError: no such column",
+        "metric raises failed: raises.py:4: RuntimeError: no such column",
     ]
     assert "flies past the setpoint along x" in (run / "report.html").read_text()
     assert str(folder / "mine" / "overshoot.py") in (run / "config.yaml").read_text()
@@ -86,8 +86,8 @@ def test_a_later_report_measures_a_file_only_if_named(folder):
     [
         (["no.py"], "", "there is no such file"),
         (["bad.py"], "def measure(flight): ...", "needs a text UNIT"),
-        (["bad.py"], "import nowhere", "cannot be imported: ModuleNotFoundError"),
-        (["bad.py"], "import sys; sys.exit(0)", "cannot be imported: SystemExit: 0"),
+        (["bad.py"], "import nowhere", "cannot be imported: bad.py:1: ModuleNotFoundError"),
+        (["bad.py"], "import sys; sys.exit(0)", "cannot be imported: bad.py:1: SystemExit: 0"),
         (["duration.py"], OVERSHOOT, "duration is a metric already; rename the file"),
         (["bad.py", "mine/../bad.py"], OVERSHOOT, "2 metrics are named bad"),
         (["overshoot"], "", "no metric named 'overshoot'; available: age_at_"),
@@ -130,7 +130,9 @@ def test_a_metric_that_changes_its_arrays_changes_no_other_number(folder):
     numbers, notes = measure_all(flight, ["./a_changing.py", "./a_writing.py"])
     assert numbers.pop("a_changing").value > 1000.0
     assert numbers == wanted
-    assert notes == ["metric a_writing failed: ValueError: assignment destination is read-only"]
+    assert notes == [
+        "metric a_writing failed: a_writing.py:4: ValueError: assignment destination is read-only"
+    ]
     assert flight.truth["position"].max() < 100.0  # also for verdict and figures
 
 
@@ -140,4 +142,4 @@ def test_a_metric_that_changes_its_arrays_changes_no_other_number(folder):
 def test_a_row_tells_that_a_metric_failed(name, why):
     row = fly_point(load_experiment("steps", [*KEYS, f"report.metrics=[mine/{name}.py]"]))
     assert (row["verdict"], name in row["numbers"]) == ("success", False)
-    assert row["text"].startswith(f"metric {name} failed: {why}")
+    assert row["text"].startswith(f"metric {name} failed: {name}.py:4: {why}")

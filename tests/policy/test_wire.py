@@ -140,7 +140,10 @@ def test_a_wrong_frame_of_a_client_is_answered_with_an_error(policy, frame):
         ("x = 1", "no function infer"),
         ("infer = 1", "no function infer"),
         ("def build():\n    return 1", "no function infer"),
-        ("def build():\n    raise ValueError('no weights')", "cannot be built: no weights"),
+        (
+            "def build():\n    raise ValueError('no weights')",
+            "cannot be built: expert.py:2: no weights",
+        ),
         ("import no_such_module", "no_such_module"),
         ("raise SystemExit", "SystemExit"),
         ("(", "SyntaxError"),
