@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
+from cloudrc.rounding import format_beside
 
 Array: TypeAlias = NDArray[np.float64]
 INPUT, OUTPUT = "/reference", "/ground_truth"
@@ -58,9 +59,10 @@ def series(recording: Recording, name: str) -> tuple[Array, Array]:
     start_ns, end_ns = guard["stamp_ns"][longest] + int(TAKE_OFF * 1e9), ends_ns[longest]
     end_ns = end_ns if tracks[longest] else start_ns
     if end_ns - start_ns < DURATION_MIN * 1e9:
+        flown = format_beside(max(0, end_ns - start_ns) * 1e-9, DURATION_MIN)
         raise BadInputError(
-            f"{name}: {max(0, end_ns - start_ns) * 1e-9:.1f} s of flight under commands after the "
-            f"take-off, and the fit needs {DURATION_MIN:g} s; record a longer flight"
+            f"{name}: {flown} s of flight under commands after the take-off, and the fit needs "
+            f"{DURATION_MIN:g} s; record a longer flight"
         )
     at_ns = np.arange(start_ns, end_ns, int(DT * 1e9))
     held = source["stamp_ns"].searchsorted(at_ns, "right") - 1
