@@ -22,6 +22,10 @@ class BadInputError(CloudrcError):
     exit_code = 2
 
 
+class PlacedError(ValueError):
+    """A user's file cannot be used; the text begins with the file, and its line if there is one."""
+
+
 class NothingFlownError(BadInputError):
     """No mission was flown in a session, so there is nothing to report."""
 

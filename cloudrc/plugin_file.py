@@ -19,10 +19,13 @@ from hashlib import sha256
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from io import BytesIO
 from pathlib import Path
+from tokenize import detect_encoding
 from types import CodeType, ModuleType
 from typing import Any, TypeAlias
 
+from cloudrc.errors import PlacedError
 from cloudrc.patience import telling_if_slow
 
 PREFIX = "cloudrc_plugin_"
@@ -125,8 +128,7 @@ class _Loader(SourceFileLoader):
         """Compile the source; a cached file may be that of an earlier source."""
         path = self.get_filename(fullname)
         source = self.get_data(path)
-        if source.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
-            raise ValueError(f"{path} is saved as UTF-16; save it as UTF-8")
+        _check_encoding(source, Path(path).name)
         return self.source_to_code(source, path)
 
     def exec_module(self, module: ModuleType) -> None:
@@ -135,6 +137,29 @@ class _Loader(SourceFileLoader):
         own = {**vars(builtins), "__import__": package.__dict__["import_beside"]}
         module.__dict__["__builtins__"] = own
         super().exec_module(module)
+
+
+def _check_encoding(source: bytes, name: str) -> None:
+    """Raise a PlacedError if the source in the file `name` is not in the encoding that it has.
+
+    Python refuses such a source, too, but names a wrong line.
+    """
+    if source.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
+        raise PlacedError(f"{name}: is saved as UTF-16; save it as UTF-8")
+    try:
+        encoding, _ = detect_encoding(BytesIO(source).readline)
+    except SyntaxError:  # an unknown encoding, or a byte that is not UTF-8 in the first two lines
+        encoding = "utf-8"
+    if not encoding.startswith("utf-8"):
+        return
+    try:
+        source.decode()
+    except UnicodeDecodeError as error:
+        line = len((source[: error.start] + b"x").splitlines())
+        raise PlacedError(
+            f"{name}:{line}: is not saved as UTF-8 (byte 0x{source[error.start]:02x}); "
+            "save it as UTF-8"
+        ) from None
 
 
 class _Finder(MetaPathFinder):

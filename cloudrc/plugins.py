@@ -37,6 +37,7 @@ from cloudrc.errors import (
     CloudrcError,
     ControllerLostError,
     OutOfMemoryError,
+    PlacedError,
     describe_error,
     to_one_line,
 )
@@ -299,7 +300,7 @@ def place_of(error: BaseException) -> str:
     Return "" if the user's code did not fail, or if Python's text names the place already.
     """
     own = _own_frames(error)
-    if not own or isinstance(error, SyntaxError):
+    if not own or isinstance(error, SyntaxError | PlacedError):
         return ""
     frame, line = own[-1]
     return f"{Path(frame.f_code.co_filename).name}:{line}: "

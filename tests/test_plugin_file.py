@@ -144,6 +144,32 @@ def test_a_file_in_another_encoding_says_how_to_save_it(tmp_path):
             find("predictors", str(path))
 
 
+@pytest.mark.parametrize(
+    ("source", "line"),
+    [
+        ("x = 1\n\ny = 'fähig'\n", 3),
+        ("x = 1\r\n\r\n# fähig\r\nx = (", 3),
+        ("# fähig\nx = 1\n", 1),
+        ('"""Text.\n\nfähig\n"""\n', 3),
+    ],
+)
+def test_a_file_saved_as_latin_1_names_its_line_and_how_to_save_it(write, source, line):
+    folder = write(mine="import helper", helper="")
+    said = rf"helper.py:{line}: is not saved as UTF-8 \(byte 0xe4\); save it as UTF-8$"
+    (folder / "helper.py").write_bytes(source.encode("latin-1"))
+    with pytest.raises(BadInputError, match=f"mine.py' cannot be imported: {said}"):
+        find("predictors", str(folder / "mine.py"))
+
+
+def test_a_file_that_declares_its_encoding_may_have_it(write):
+    text = "# -*- coding: latin-1 -*-\nvalue = 'fähig'\n"
+    folder = write(mine="from helper import value", helper="")
+    (folder / "helper.py").write_bytes(text.encode("latin-1"))
+    assert load_file(folder / "mine.py").value == "fähig"
+    (folder / "helper.py").write_text(text.replace("latin-1", "utf-8"), "utf-8-sig")
+    assert load_file(folder / "mine.py").value == "fähig"
+
+
 @pytest.mark.parametrize("near", ["Mine.py", "mine.py.txt", "mine.ipynb"])
 def test_a_missing_file_names_the_one_that_may_be_meant(tmp_path, near):
     (tmp_path / near).write_text("value = 1")

@@ -22,7 +22,7 @@ from typing import Any, BinaryIO, TypeAlias
 
 from cloudrc import plugins
 from cloudrc.cloud.estimators import DelaySample
-from cloudrc.errors import CloudrcError, describe_error
+from cloudrc.errors import CloudrcError, PlacedError, describe_error
 from cloudrc.messages import Command, Odometry, Setpoint
 
 FILES = {
@@ -84,6 +84,8 @@ class HandIn:
         """Describe an error; begin with FILE:LINE, the place in the student's files that failed."""
         while isinstance(error, CloudrcError) and error.__cause__ is not None:
             error = error.__cause__
+        if isinstance(error, PlacedError):
+            return str(error)
         trace = traceback.extract_tb(error.__traceback__)
         places = [(each.filename, each.lineno) for each in trace]
         if isinstance(error, SyntaxError):
