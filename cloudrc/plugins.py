@@ -203,18 +203,48 @@ def signature(kind: str, name: str) -> inspect.Signature:
 
 def load(kind: str, name: str, /, **parameters: Any) -> Any:
     """Find a plug-in and build it; raise a BadInputError if it is missing or its `build` fails."""
-    build, inherited = builder(kind, name, look=False), INHERITED.get(kind, ())
+    build = builder(kind, name, look=False)
     with refuse_failure(f"{_one(kind)} {name!r} cannot be built"):
         plugin = build(**parameters)
-        for method in (METHODS[kind], *inherited):
-            if not callable(getattr(plugin, method, None)):
-                base = f"{PACKAGES[kind]}.{_one(kind).capitalize()}"
-                advice = f"; derive its class from {base}" if method in inherited else ""
-                built = type(plugin).__name__
-                raise ValueError(
-                    f"build() returned {built}, which has no method {method}(){advice}"
-                )
+        _check_methods(kind, plugin)
     return plugin
+
+
+def _check_methods(kind: str, plugin: Any) -> None:
+    """Raise a ValueError if an object that `build` returned lacks a method of its kind."""
+    name = _one(kind).capitalize()
+    base = getattr(importlib.import_module(PACKAGES[kind] or "cloudrc"), name, None)
+    for method in (METHODS[kind], *INHERITED.get(kind, ())):
+        found = getattr(plugin, method, None)
+        if callable(found) and not _is_described(found, getattr(base, METHODS[kind], None)):
+            continue
+        near = _suggest_method(type(plugin), base, method)
+        if not near and method in INHERITED.get(kind, ()):
+            near = f"; derive its class from {PACKAGES[kind]}.{name}"
+        raise _no_method(type(plugin), f"no method {method}(){near}")
+
+
+def _is_described(found: Any, method: Any) -> bool:
+    """Return whether `found` is a `method` that the base class of a kind describes only.
+
+    The base class raises a NotImplementedError there.
+    """
+    return method is not None and getattr(found, "__func__", found) is method
+
+
+def _suggest_method(own: type, base: Any, method: str) -> str:
+    """Return a suggestion of the method that a user may have misspelt as `method`; or ""."""
+    added = [name for name in dir(own) if not hasattr(base, name) and name != method]
+    near = difflib.get_close_matches(method, added, n=1)
+    return f"; it has {near[0]}()" if near else ""
+
+
+def _no_method(own: type, lacking: str) -> ValueError:
+    """Return the error about the class of what `build` returned; it names the file of a user."""
+    file = getattr(sys.modules.get(own.__module__), "__file__", None)
+    if own.__module__.startswith(PREFIX) and file:
+        return PlacedError(f"{Path(file).name}: {own.__name__} has {lacking}")
+    return ValueError(f"build() returned {own.__name__}, which has {lacking}")
 
 
 def find(kind: str, name: str, *, look: bool = True) -> Found:

@@ -23,6 +23,8 @@ class Share(Predictor):
     def __init__(self, share: float, axes: tuple[bool, bool, bool]) -> None:
         self.share, self.axes = share, axes
 
+    def predict(self, odometry, horizon): ...
+
 
 def build(share: float = 0.5, axes: tuple[bool, bool, bool] = (True, True, False)) -> Share:
     if share > 1:
@@ -55,7 +57,7 @@ def test_a_plug_in_is_loaded_by_path(share):
         ("shar=1", "cloud.predictor.shar: unknown key; did you mean share?"),
         ("axes=[true]", "cloud.predictor.axes.1: is missing"),
         ("share=.inf", "cloud.predictor.share: inf: must be finite"),
-        ("share=2", "cannot be built: share.py:15: share: must be at most 1"),
+        ("share=2", "cannot be built: share.py:17: share: must be at most 1"),
     ],
 )
 def test_parameters_are_checked_against_build(share, setting, reason):
@@ -119,10 +121,41 @@ def test_a_plug_in_that_lacks_a_method_is_refused_before_the_flight(share, kind,
     lines = [f"    def {name}(self, *given): ..." for name in sorted(methods)]
     share.write_text("\n".join(["class Own:", *lines, "build = Own"]))
     found = refused("paper", f"cloud.{kind}={share}")
-    assert (
-        f"{share}' cannot be built: build() returned Own, which has no method {lacking}()" in found
-    )
+    assert f"{share}' cannot be built: share.py: Own has no method {lacking}()" in found
     assert "\n" not in found.strip()
+
+
+MISSPELT = [
+    ("predictor", "predict", "predicts"),
+    ("predictor", "predict", "Predict"),
+    ("estimator", "horizon", "horison"),
+    ("controller", "update", "_update"),
+]
+
+
+@pytest.mark.parametrize(("kind", "method", "typed"), MISSPELT)
+def test_a_misspelt_method_of_a_subclass_is_refused_before_the_flight(share, kind, method, typed):
+    base = kind.capitalize()
+    share.write_text(
+        f"from cloudrc.cloud.{kind}s import {base}\n"
+        f"class P({base}):\n    def {typed}(self, *given): ...\nbuild = P\n"
+    )
+    found = refused("paper", f"cloud.{kind}={share}")
+    assert f"share.py: P has no method {method}(); it has {typed}()" in found
+    share.write_text(f"from cloudrc.cloud.{kind}s import {base} as build")
+    found = refused("paper", f"cloud.{kind}={share}")
+    assert f"build() returned {base}, which has no method {method}()" in found
+
+
+def test_a_method_may_come_from_the_object_or_from_a_class_above(share):
+    head = "from cloudrc.cloud.predictors import Predictor\n"
+    for text in (
+        "class A(Predictor):\n    def predict(self, *given): ...\nclass build(A): ...",
+        "class build(Predictor):\n    def __init__(self): self.predict = lambda *given: None",
+        "class build(Predictor):\n    @staticmethod\n    def predict(*given): ...",
+    ):
+        share.write_text(head + text)
+        assert plugins.load("predictors", str(share)).predict(None, 0.0) is None
 
 
 @pytest.mark.parametrize(

@@ -59,6 +59,13 @@ def test_a_stub_scores_nothing_and_the_solution_all(part, folder, points):
         ("predictor", "p + v *", "p - v *", ["position", "steps"], "predictor.py:7: gives [0.95"),
         ("predictor", "v * horizon", "v * 1e999", ALL["predictor"][::3], "gives [inf"),
         ("predictor", "horizon):", "horizon)", ALL["predictor"], "predictor.py:7: SyntaxError: "),
+        (
+            "predictor",
+            "def predict(",
+            "def predicts(",
+            ALL["predictor"],
+            "predictor.py: StudentPredictor has no method predict(); it has predicts()",
+        ),
         ("controller", "(error - self", "(self.last - self", ["D"], "controller.py:17: gives [0."),
         ("controller", "np.subtract(", "-np.subtract(", ["P", "steps"], "controller.py:17: gives"),
         ("controller", "np.clip(u, -limit, limit)", "u", ["limit"], "gives [0.8, 0.8, 0.75], not"),
