@@ -236,7 +236,7 @@ def resolve_plugins(document: Document, *, build: bool) -> list[ConfigProblem]:
         except ValidationError as error:
             found += problems.from_pydantic(error, parameter_model(kind, name), path)
         except BadInputError as error:
-            found.append(ConfigProblem(path, "", str(error)))
+            found.append(ConfigProblem(path, "", str(error), error))
         else:
             # Not by `set_value`: the parameters keep their sources.
             document.tree["cloud"][key] = {"name": name, **parameters}

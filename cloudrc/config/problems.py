@@ -189,6 +189,7 @@ class ConfigProblem(NamedTuple):
     path: KeyPath  # keys that lead to the value
     value: str  # the value as short text; "" if there is no value
     reason: str  # why the value is invalid, and how to fix it
+    cause: BaseException | None = None  # the error that --debug shows, with the user's lines
 
     def __str__(self) -> str:
         return ": ".join(part for part in (".".join(self.path), self.value, self.reason) if part)
@@ -231,7 +232,7 @@ def raise_problems(document: Document, problems: Iterable[ConfigProblem], name: 
     if len(every) > 1:
         lines.insert(0, f"{name} has {len(every)} problems:")
     if every:
-        raise BadInputError("\n  ".join(lines))
+        raise BadInputError("\n  ".join(lines)) from every[0].cause
 
 
 def validate(

@@ -1,6 +1,7 @@
 """Plug-ins are found by name, entry point or path; an error lists the known names."""
 
 import sys
+import traceback
 from importlib.metadata import EntryPoint
 
 import pytest
@@ -101,6 +102,15 @@ def test_a_broken_plug_in_is_one_line(share, text, reason):
     assert "\n" not in found.strip()
     if "cannot be imported" in reason:
         assert plugins.describe("predictors", str(share)).startswith("(not usable")
+
+
+def test_the_traceback_of_a_broken_plug_in_has_the_lines_of_the_user(share):
+    share.write_text("def build():\n    return {}['tau']\n")
+    with pytest.raises(BadInputError) as caught:
+        load_experiment("paper", [f"cloud.predictor={share}"])
+    shown = "".join(traceback.format_exception(caught.value))
+    assert f'"{share}", line 2, in build' in shown
+    assert "return {}['tau']" in shown
 
 
 class ExitingTextError(Exception):
