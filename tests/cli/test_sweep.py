@@ -455,7 +455,7 @@ def test_lost_rows_are_flown_again_as_long_as_rows_arrive(make, code, count, sai
 
 
 def test_files_that_no_pod_has_are_refused(write_sweep, tmp_path, call):
-    source = "from cloudrc.cloud.predictors import Predictor as build\n"
+    source = "from cloudrc.cloud.predictors.last_sample import build\n"
     (tmp_path / "mine.py").write_text(source)
     path = write_sweep({"cloud.predictor": ["./mine.py"]})
     error = call("sweep run --out grid --on kubernetes", path, code=2).err

@@ -189,7 +189,7 @@ def test_paths_start_at_the_file_that_names_them(tmp_path, monkeypatch):
         "links/traced.yaml": "uplink: {trace: trace.csv}\n"
         "downlink: {distribution: table, table: trace.csv, delay_ms: 30, jitter_ms: 10}\n",
         "there.yaml": "waypoints: [{position_m: [0.5, 0, 0.7]}]\n",
-        "still.py": "from cloudrc.cloud.predictors import Predictor as build\n",
+        "still.py": "from cloudrc.cloud.predictors.last_sample import build\n",
         "mine.xml": (Path(shipped.FOLDERS["scene"]) / "pipes.xml").read_text(),
         "mine.yaml": "world: {robot: ./mine.xml, scene: mine.xml}\nmission: ./there.yaml\n"
         "link: {profile: links/traced.yaml}\ncloud: {predictor: still.py}\n"

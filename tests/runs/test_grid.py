@@ -72,9 +72,9 @@ def test_a_key_depends_on_what_a_model_includes(write_sweep, tmp_path, key):
 
 @pytest.mark.parametrize("named", ["in the source", "in a parameter"])
 def test_a_key_depends_on_the_data_of_a_plug_in(write_sweep, tmp_path, named):
-    base = "from pathlib import Path\nfrom cloudrc.cloud.predictors import Predictor\n"
+    base = "from pathlib import Path\nfrom cloudrc.cloud.predictors.last_sample import LastSample\n"
     file = '"gains.json"' if named == "in the source" else "None"
-    build = f"def build(file: Path | None = {file}):\n    return Predictor()\n"
+    build = f"def build(file: Path | None = {file}):\n    return LastSample()\n"
     (tmp_path / "mine.py").write_text(base + build)
     settings = {} if named == "in the source" else {"cloud.predictor.file": "gains.json"}
     path = write_sweep({"cloud.predictor": ["./mine.py"]}, set={**SHORT, **settings})
@@ -96,7 +96,7 @@ def test_points_with_one_seed_meet_the_same_draws(write_sweep):
 
 
 def test_relative_paths_start_at_the_file(write_sweep, tmp_path, monkeypatch):
-    source = "from cloudrc.cloud.predictors import Predictor as build\n"
+    source = "from cloudrc.cloud.predictors.last_sample import build\n"
     (tmp_path / "mine.py").write_text(source)
     (tmp_path / "own.yaml").write_text("{world: {scene: empty}, mission: steps}\n")
     monkeypatch.chdir("/")

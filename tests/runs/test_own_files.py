@@ -11,7 +11,7 @@ from cloudrc.config.shipped import file_of
 from cloudrc.runs.fly import fly
 from cloudrc.runs.own_files import describe_changes, hash_files
 
-PREDICTOR = "from cloudrc.cloud.predictors import Predictor as build\n"
+PREDICTOR = "from cloudrc.cloud.predictors.last_sample import build\n"
 
 
 @pytest.fixture(scope="module")

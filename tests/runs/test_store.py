@@ -169,7 +169,7 @@ def test_the_comments_of_a_user_stay_in_the_file_of_the_sweep(write_sweep, tmp_p
 @pytest.mark.parametrize("changed", ["mine.py", "helper.py"])
 def test_a_changed_plugin_is_not_mixed_with_rows_of_the_old_one(write_sweep, tmp_path, changed):
     (tmp_path / "mine.py").write_text("from helper import build\n")
-    (tmp_path / "helper.py").write_text("from cloudrc.cloud.predictors import Predictor as build\n")
+    (tmp_path / "helper.py").write_text("from cloudrc.cloud.predictors.last_sample import build\n")
     path = write_sweep({"cloud.predictor": ["./mine.py"]})
     (flight,) = read_grid(path).flights.values()
     write(tmp_path, [flight.row(flown())])

@@ -35,7 +35,7 @@ def trace(tmp_path):
     return tmp_path / "trace"
 
 
-BUILD = "from cloudrc.cloud.predictors import Predictor as build\n"
+BUILD = "from cloudrc.cloud.predictors.last_sample import build\n"
 
 
 @pytest.fixture
