@@ -69,7 +69,8 @@ def test_a_wrong_setting_is_refused_before_the_flight(settings):
 def test_every_function_can_be_called_after_every_module_is_imported():
     """A subpackage with the name of a function would take its place."""
     for module in pkgutil.walk_packages(cloudrc.__path__, "cloudrc."):
-        if not module.name.endswith("__main__"):
+        # The bridge to ROS 2 needs a ROS.
+        if not module.name.endswith("__main__") and ".bridges." not in module.name:
             importlib.import_module(module.name)
     names = [name for name in cloudrc.__all__ if not name.startswith("_")]
     assert all(callable(getattr(cloudrc, name)) for name in names)

@@ -8,11 +8,11 @@ from __future__ import annotations
 import select
 import selectors
 import socket
+import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from time import monotonic_ns
 
 from cloudrc.link.relay_tcp.agenda import Agenda
 from cloudrc.link.relay_tcp.congestion import Congestion
@@ -57,7 +57,7 @@ class RelayedConnection:
             for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
                 # Larger ones would hide from a sender that the receiver has stopped.
                 side.socket.setsockopt(socket.SOL_SOCKET, option, BUFFER)
-        self.began_ns = monotonic_ns()
+        self.began_ns = time.monotonic_ns()
         self.server.socket.connect_ex(relay.to)
         relay.watch(self, self.server, selectors.EVENT_WRITE)
 
@@ -217,18 +217,18 @@ class StreamRelay:
         """Wait at most `timeout` [s] until something is to be done, and do it."""
         while self.changes:
             self.changes.popleft()()
-        wait = max(0.0, min(timeout, (self.agenda.next_ns - monotonic_ns()) * 1e-9))
+        wait = max(0.0, min(timeout, (self.agenda.next_ns - time.monotonic_ns()) * 1e-9))
         if wait and hasattr(self._selector, "fileno"):  # its own wait counts milliseconds
             select.select([self._selector.fileno()], (), (), wait)
             wait = 0.0
         ready = self._selector.select(wait)
-        self.agenda.run(monotonic_ns())
+        self.agenda.run(time.monotonic_ns())
         for key, mask in ready:
             if key.data is None:
                 self._accept()
             else:
                 connection, side = key.data
-                now_ns = monotonic_ns()
+                now_ns = time.monotonic_ns()
                 self.agenda.run(now_ns)
                 connection.handle(side, mask, now_ns)
 
