@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable
 from contextlib import suppress
 from html import escape
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,6 +54,7 @@ def assess(
         notes.append(f"The recording is incomplete: {recording.note}.")
     notes += [f"The recording {remark}." for remark in recording.remarks]
     notes += [f"{text[0].upper()}{text[1:]}." for text in recording["/fault"]["text"] if text]
+    notes += _default_robot(experiment)
     notes += _clamped_horizon(flight, experiment)
     notes += _unknown_clearance(flight)
     if flight.ending is not None:
@@ -81,6 +82,17 @@ def _clamped_horizon(flight: Flight, experiment: ResolvedExperiment) -> list[str
         f"In {clamped} of {periods} periods, the estimator's horizon was not in the range 0 to "
         f"{experiment.cloud.horizon_max_s:g} s (cloud.horizon_max_s), and cloud limited it; a "
         "horizon is in seconds."
+    ]
+
+
+def _default_robot(experiment: ResolvedExperiment) -> list[str]:
+    """Return a note if the robot is a model alone, without a robot.yaml."""
+    robot = PurePath(experiment.world.robot)
+    if robot.suffix != ".xml":
+        return []
+    return [
+        f"The robot is the model {robot.name} alone, without a robot.yaml: its onboard controller "
+        "and its guard have default values."
     ]
 
 

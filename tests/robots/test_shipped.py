@@ -20,7 +20,9 @@ def test_a_model_alone_flies(tmp_path):
     """A user has an MJCF file of a multirotor, and no line of YAML."""
     model = tmp_path / "mine.xml"
     model.write_text(find_robot("x2").model.read_text().replace('mass="1.22"', 'mass="1.6"'))
-    assert cloudrc.fly("steps", STEPS | {"world.robot": str(model)}).verdict == "success"
+    flight = cloudrc.fly("steps", STEPS | {"world.robot": str(model)})
+    assert flight.verdict == "success"
+    assert any("mine.xml alone, without a robot.yaml" in note for note in flight.notes)
 
 
 def test_equal_flights_have_equal_records():

@@ -62,6 +62,8 @@ def read_airframe(model: Any, *, steers_yaw: bool = True) -> Airframe:
         )
     for number, name in enumerate(names):
         _check_actuator(model, number, name)
+    if steers_yaw:
+        _check_spins(model, names)
     low, high = np.array([_limits(model, number) for number in range(model.nu)]).T
     for name, least, most in zip(names, low, high, strict=True):
         if not least < most:
@@ -222,6 +224,17 @@ def _limits(model: Any, number: int) -> tuple[float, float]:
         if limited:
             low, high = max(low, min(limits)), min(high, max(limits))
     return float(low), float(high)
+
+
+def _check_spins(model: Any, names: list[str]) -> None:
+    """Refuse a rotor without a torque about its thrust if others have one: a forgotten number."""
+    spins = np.einsum("ij,ij->i", model.actuator_gear[:, :3], model.actuator_gear[:, 3:])
+    missing = [name for name, spin in zip(names, spins, strict=True) if not spin]
+    if missing and spins.any():
+        raise BadInputError(
+            f"actuator {missing[0]} has no spin direction, as others have: the last number of gear "
+            "is the torque about the thrust, positive or negative"
+        )
 
 
 def _check_directions(frame: Airframe) -> None:

@@ -72,6 +72,7 @@ REFUSED = {
     "one direction": (with_spins(1, 1, 1, 1), r"torque about z \(yaw\).*spin direction"),
     "both directions, on two sides": (with_spins(1, -1, -1, 1), r"\(yaw\).*neighbouring rotors"),
     "no torque": (with_spins(0, 0, 0, 0), r"torque about z \(yaw\).*spin direction"),
+    "one rotor without": (with_spins(1, 0, 1, -1), "actuator r1 has no spin direction"),
     "one of four": (
         with_spins(1, -1, 1, 1),
         "from actuator r0, which has no room.*spin directions",
