@@ -34,7 +34,7 @@ from cloudrc.geometry.placement import (
 from cloudrc.geometry.scene import FLOOR, Scene, Tube
 from cloudrc.messages import Vector
 
-_YAW = "the onboard controller holds yaw at 0, as the published one does; leave it out"
+_YAW = "missions keep the yaw at 0, as the paper does; leave it out"
 _REPORTED = 20
 """Largest number of problems of one kind in an error message."""
 TOUCHING = 1e-3

@@ -239,7 +239,7 @@ class Waypoint(Section):
     """Position of the base [m], world frame; two numbers for a robot that stays on the ground. The
     guard must allow the point and the straight line to it, and both must be clear of obstacles"""
     yaw_deg: Finite = 0.0
-    """Heading [deg]; only 0 is accepted, because the onboard controller holds the yaw at 0"""
+    """Heading [deg]; only 0 is accepted: missions keep the yaw at 0, as the paper does"""
     tolerance_m: Positive = 0.10
     """Distance [m] within which the point counts as reached"""
     dwell_s: Dwell = 0.5
