@@ -100,18 +100,27 @@ def _compile(
         spec = read_scene(scene_path)
         # An empty prefix would make MuJoCo write MUJOCO_LOG.TXT into the working directory, and
         # MuJoCo 3.3 crashes if a variable keeps the robot.
-        spec.attach(mujoco.MjSpec.from_file(str(robot_path)), prefix=ROBOT_PREFIX, frame="spawn")
+        robot = mujoco.MjSpec.from_file(str(robot_path))
+        _take_options(robot, spec)
+        spec.attach(robot, prefix=ROBOT_PREFIX, frame="spawn")
         for number, geom in enumerate(spec.worldbody.geoms):
             geom.name = f"{WORLD}/{number}"  # also geoms in the worldbody of the robot's file
         spec.compiler.fusestatic = fuse
         if inertia is not None:
             _set_inertia(_base(spec), *inertia)
         with warnings.catch_warnings():
-            # Options in the robot's file, which the scene's replace.
+            # Sizes in the robot's file, which the scene's replace.
             warnings.filterwarnings("ignore", "Attach conflict")
             return spec.compile()
     except (ValueError, KeyError) as error:
         raise compile_error(f"{robot_path} in {scene_path}", error) from None
+
+
+def _take_options(robot: Any, scene: Any) -> None:
+    """Give a robot's file the options of the scene, which count: MuJoCo warns of others."""
+    for name in (name for name in dir(scene.option) if not name.startswith("_")):
+        setattr(robot.option, name, getattr(scene.option, name))
+    robot.memory = scene.memory
 
 
 def _check_names(robot_path: Path) -> None:

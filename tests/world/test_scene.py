@@ -144,6 +144,25 @@ def test_what_cannot_be_flown_is_refused_by_name(tmp_path, monkeypatch, kind, ol
     assert list(tmp_path.iterdir()) == [path], "MuJoCo wrote a log"
 
 
+def test_options_of_a_robots_file_do_not_count_and_make_no_noise(tmp_path):
+    """Published models come with options of their own."""
+    options = '<option timestep="0.01" density="1.2"/><size memory="10M"/>'
+    text = find_robot("x2").model.read_text()
+    path = tmp_path / "robot.xml"
+    path.write_text(re.sub(r"(<mujoco[^>]*>)", rf"\1{options}", text, count=1))
+    # A process of its own: MuJoCo writes to its standard error by itself.
+    code = """
+import sys
+from pathlib import Path
+from cloudrc.world.scene import compile_model
+model = compile_model(Path(sys.argv[1]), Path(sys.argv[2]))
+print(model.opt.timestep, model.opt.density)
+"""
+    command = [sys.executable, "-c", code, str(path), str(file_of("empty"))]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("0.002 0.0\n", "")
+
+
 def test_margins_that_make_no_contact_push_are_flown(tmp_path):
     path, good = tmp_path / "mine.xml", FILES["scene"].read_text()
     for geom in (
