@@ -178,8 +178,12 @@ class RelayedConnection:
         self.relay.connections.discard(self)
 
     def close(self) -> None:
-        """Reset both sides at once."""
-        self._end(0)
+        """Reset both sides at once; the relay does not watch them any more."""
+        self.dead = True
+        for side in (self.client, self.server):
+            with suppress(OSError):  # closed already
+                side.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+            side.socket.close()
 
 
 class StreamRelay:
@@ -264,7 +268,8 @@ class StreamRelay:
 
     def close(self) -> None:
         """Reset all connections, and accept no more."""
-        for connection in list(self.connections):
-            connection.close()
+        # A signal may have ended the loop in the middle of a change of what it watches.
         self._selector.close()
+        for connection in self.connections:
+            connection.close()
         self._listening.close()

@@ -15,7 +15,11 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc import link
 from cloudrc.drivers.realtime import free_ports
+from cloudrc.link.relay_tcp.congestion import of_machine
+from cloudrc.link.relay_tcp.medium import Medium
+from cloudrc.link.relay_tcp.relay import StreamRelay
 
 pytestmark = pytest.mark.process
 
@@ -206,7 +210,8 @@ def test_a_stopped_reader_stops_the_sender_and_memory_stays_small(relayed, flags
         stop.set()
 
 
-def test_link_set_acts_on_an_open_connection(relayed):
+def test_link_set_acts_on_an_open_connection(relayed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # without runs/latest, which may have ended
     with server(echo) as port:
         relay = relayed(port, *SHORT)
         with relay.connect() as client:
@@ -251,3 +256,19 @@ def test_nothing_is_left_behind(relayed):
         relay.process.terminate()
         out, _ = relay.process.communicate(timeout=20)
     assert json.loads(out)["connections"] >= 0
+
+
+def test_a_signal_in_the_middle_of_a_change_does_not_spoil_the_end():
+    profile = link.read_profile("ideal")
+    ways = (Medium(profile.uplink, 1, True, 0), Medium(profile.downlink, 1, False, 0))
+    with socket.create_server(("127.0.0.1", 0)) as far, socket.create_server(("", 0)) as here:
+        to = far.getsockname()
+        relay = StreamRelay(here, to, socket.AF_INET, ways, of_machine("cubic"))
+        with socket.create_connection(("127.0.0.1", here.getsockname()[1])) as client:
+            relay.step(1.0)
+            (connection,) = relay.connections
+            # As if KeyboardInterrupt came between the selector's call and the note of it.
+            relay._selector.unregister(connection.server.socket)
+            relay.close()
+            with pytest.raises(ConnectionResetError):
+                client.recv(1)
