@@ -100,7 +100,7 @@ def build(model):
         ('mass="1.22"', 'mass="3.3"', "hover needs 104 % of the thrust"),
         ('diaginertia=".022 .018 .038"', 'diaginertia="22 18 38"', "robot.xml"),
         ("<freejoint", "<!-- <freejoint", "robot.xml"),
-        (' gear="0 0 1 0 0 .02"', ' gear="0 0 1"', "spin directions"),
+        (' gear="0 0 1 0 0 .02"', ' gear="0 0 1"', "has no spin direction"),
     ],
 )
 def test_a_model_that_cannot_fly_is_refused_in_one_line(mine, capsys, old, new, shown):
