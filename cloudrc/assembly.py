@@ -6,7 +6,7 @@ World and cloud do not import each other. Drivers use them only through `cloudrc
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext
 from math import degrees, dist, inf, radians
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -154,10 +154,10 @@ def _lock_step(
     if isinstance(controller, RosController):
         from cloudrc.bridges.ros2.lock_step import RosLockStep
 
-        return RosLockStep(controller.place, controller.start_limit, gone)
+        return closing(RosLockStep(controller.place, controller.start_limit, gone))
     from cloudrc.drivers.remote import LockStep
 
-    return LockStep(controller.place, controller.start_limit)
+    return closing(LockStep(controller.place, controller.start_limit))
 
 
 def lost_controller(records: Iterable[Record]) -> Iterator[ControllerLostError]:

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from types import TracebackType
 from typing import Any
 
 from cloudrc.drivers.teleop import UnixDatagrams
@@ -61,15 +60,8 @@ class LockStep:
         self._used = False
         self._client = self._connect()
 
-    def __enter__(self) -> LockStep:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Leave the program."""
         self._client.close()
 
     def begin(self) -> None:

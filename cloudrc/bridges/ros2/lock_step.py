@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Any
 
 from cloudrc.bridges.ros2.node import WAKE, RosNode
@@ -39,15 +38,8 @@ class RosLockStep:
             self._node.close()
             raise
 
-    def __enter__(self) -> RosLockStep:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Leave the program."""
         self._node.close()
 
     def _meet(self) -> None:
