@@ -1,8 +1,10 @@
 """Metrics of the response to steps of the setpoint: overshoot, settling, errors, and stability.
 
 A step begins when the setpoint changes and ends when it changes again, or when the mission ends.
-Setpoints that last less than 0.5 s belong to a moving reference and are no steps. All errors are
-distances between the setpoint and the true position.
+Setpoints that last less than 0.5 s belong to a moving reference and are no steps. Where a moving
+reference stops, the robot is moving and still behind it: this end has no overshoot or settling time
+that describes the loop. Only the verdict judges it. All errors are distances between the setpoint
+and the true position.
 """
 
 from __future__ import annotations
@@ -18,6 +20,9 @@ from cloudrc.rounding import differences
 
 SHORTEST_NS = 500_000_000
 """Shortest duration of a step, and its last part, in which the robot must have settled [ns]."""
+JUMP_MAX = 3
+"""Largest number of changes of the setpoint in `SHORTEST_NS` that are one step: a file of setpoints
+moves in a straight line between two rows, also between two rows of a step."""
 LENGTH_MIN = 0.05
 """Shortest length of a step [m]; the values of a shorter step would be noise."""
 BAND = 0.05
@@ -44,21 +49,34 @@ class Step(NamedTuple):
     unstable: bool  # whether the error oscillates without decay
 
 
-@lru_cache(maxsize=1)  # ten metrics and the verdict ask for the same flight
 def steps(flight: Flight) -> tuple[Step, ...]:
     """Measure the response to each step of a flight, in order."""
-    control = flight.control
-    if flight.end_ns is None or not len(control["stamp_ns"]):
-        return ()
-    changed = (np.diff(control["setpoint"], axis=0) != 0).any(axis=1)
-    begins = [0, *(np.flatnonzero(changed) + 1)]
-    ends_ns = [*control["stamp_ns"][begins[1:]], flight.end_ns]
-    found = (
-        _measure(flight, row, int(end_ns))
-        for row, end_ns in zip(begins, ends_ns, strict=True)
-        if end_ns - control["stamp_ns"][row] >= SHORTEST_NS
-    )
-    return tuple(step for step in found if step is not None)
+    return tuple(step for step, is_step in _measured(flight) if is_step)
+
+
+def responses(flight: Flight) -> tuple[Step, ...]:
+    """Measure the response to each step and to each end of a moving reference, in order."""
+    return tuple(step for step, _ in _measured(flight))
+
+
+@lru_cache(maxsize=1)  # ten metrics and the verdict ask for the same flight
+def _measured(flight: Flight) -> list[tuple[Step, bool]]:
+    """Measure all responses of a flight, in order, and say which ones are those to steps."""
+    stamps, setpoints = flight.control["stamp_ns"], flight.control["setpoint"]
+    if flight.end_ns is None or not len(stamps):
+        return []
+    changed = (np.diff(setpoints, axis=0) != 0).any(axis=1)
+    begins = np.append(0, np.flatnonzero(changed) + 1)
+    begins_ns = stamps[begins]
+    ends_ns = np.append(begins_ns[1:], flight.end_ns)
+    before = begins_ns.searchsorted(begins_ns - SHORTEST_NS)
+    is_step = np.arange(len(begins)) - before < JUMP_MAX
+    found = []
+    for number in np.flatnonzero(ends_ns - begins_ns >= SHORTEST_NS):
+        response = _measure(flight, int(begins[number]), int(ends_ns[number]))
+        if response is not None:
+            found.append((response, bool(is_step[number])))
+    return found
 
 
 def _measure(flight: Flight, row: int, end_ns: int) -> Step | None:
@@ -160,7 +178,7 @@ add_metrics(
     ("control_effort_mean", "m^2/s", "Integral of the squared commanded velocity over time, mean "
      "of the steps.", partial(_mean_of, name="effort")),
     ("unstable_steps", "1", "Number of steps in which the error oscillates without decay.",
-     lambda flight: flight.count(sum(step.unstable for step in steps(flight)))),
+     lambda flight: flight.count(sum(step.unstable for step in responses(flight)))),
 )  # fmt: skip
 add_metrics(
     "Estimation and tracking",

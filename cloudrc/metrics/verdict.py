@@ -29,7 +29,7 @@ from cloudrc.messages import Cause, GuardState, Vector
 from cloudrc.metrics import Flight, Number
 from cloudrc.metrics.definitions import real_time_factor
 from cloudrc.metrics.mission import first_touch, missed_end, obstacle_contacts, reported
-from cloudrc.metrics.response import steps
+from cloudrc.metrics.response import responses
 from cloudrc.record.columns import Recording
 from cloudrc.records import CONTROLLER_LOST, REAL_TIME_FACTOR_MIN
 from cloudrc.rounding import exceeds, format_beside
@@ -302,7 +302,7 @@ def plugin_failures(recording: Recording) -> Iterator[FlightFailure]:
 
 def _responses(flight: Flight, settle: float) -> Iterator[FlightFailure]:
     """Yield a failure if a step did not settle to `settle` [m]; another for an unstable loop."""
-    found, unit = steps(flight), "step" if flight.mission.steps else "waypoint"
+    found, unit = responses(flight), "step" if flight.mission.steps else "waypoint"
     far = [step for step in found if exceeds(step.last_error, settle)]
     if far and flight.mission.steps:
         first = far[0]

@@ -6,7 +6,7 @@ import pytest
 
 from cloudrc.config.schema import MissionConfig, Steps
 from cloudrc.metrics import SHIPPED
-from cloudrc.metrics.response import steps
+from cloudrc.metrics.response import responses, steps
 from cloudrc.metrics.verdict import flight_evidence, judge
 from cloudrc.records import Control
 from tests.metrics.conftest import SECOND, START, flown
@@ -72,6 +72,36 @@ def test_a_changed_setpoint_begins_a_step_a_moving_one_does_not():
     assert two[1].settling_time is None, "it never went there"
     assert two[1].last_error == pytest.approx(1.0, abs=0.01)
     assert steps(flight(second_order(0.5), lambda t: (0.1 * t, 0.0, 1.0))) == ()
+
+
+def test_the_end_of_a_moving_setpoint_is_judged_but_is_no_step():
+    """The robot swings about the place where the setpoint stops, 0.1 m ahead of the robot."""
+
+    def stopping(t):
+        return min(t, 3.0), 0.0, 1.0
+
+    def path(t):
+        return (
+            t - 0.1 if t < 3.0 else 3.0 - 0.1 * exp(0.5 * (t - 3.0)) * cos(3 * (t - 3.0)),
+            0.0,
+            1.0,
+        )
+
+    ended = flight(path, stopping)
+    assert steps(ended) == ()
+    assert [round(each.length, 2) for each in responses(ended)] == [0.1]
+    assert SHIPPED["overshoot_max"].measure(ended) is None
+    assert SHIPPED["unsettled_steps"].measure(ended) == 0.0
+    assert SHIPPED["unstable_steps"].measure(ended) == 1.0
+    assert "unstable" in judged(ended)
+
+
+def test_a_step_over_two_rows_of_a_file_is_a_step():
+    def ramp(t):
+        return min(max(t - 2.0, 0.0) / 0.06, 1.0), 0.0, 1.0
+
+    (step,) = steps(flight(lambda t: second_order(0.5)(t - 2.0), ramp))
+    assert step.start == pytest.approx(2.08)
 
 
 def test_random_steps_must_settle_and_null_switches_it_off():
