@@ -7,7 +7,7 @@ folders in `cloudrc/robots/`.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -59,6 +59,8 @@ DEFAULT_LIMITS = RobotLimits()
 """Limits of a robot that flies."""
 GENERAL = "multirotor"
 """Onboard controller of a model without `robot.yaml` that is not like the Pelican."""
+ON_GROUND = {GENERAL: False, "diff_drive": True}
+"""Shipped onboard controller -> whether its robots stay on the ground."""
 OF_GENERAL = RobotLimits(acceleration_max_mps2=4.0)
 """Limits of a robot with this onboard controller, if its robot.yaml does not say them. At a tilt of
 35 degrees a multirotor has 6.9 m/s^2. With more than 4 m/s^2 on one axis, it would not brake
@@ -184,8 +186,9 @@ def find_robot(name: str) -> RobotFiles:
     label = str(file) if shipped.is_path(name) else f"{name}/{shipped.ROBOT_FILE}"
     document = read_document(file, label)
     robot = validate(document, RobotFile, label)
-    raise_problems(document, _missing_files(robot, folder), label)
     onboard = _absolute(robot.onboard, folder)
+    found = [*_missing_files(robot, folder), *_misplaced(robot.planar, onboard.name)]
+    raise_problems(document, found, label)
     stop = robot.guard.stop or ("brake" if robot.planar else "land")
     usual = OF_GENERAL if onboard.name == GENERAL else DEFAULT_LIMITS
     given = robot.guard.model_dump(exclude_unset=True)
@@ -193,9 +196,9 @@ def find_robot(name: str) -> RobotFiles:
     tunings = {key: tuning.model_extra or {} for key, tuning in robot.tunings.items()}
     model = folder / robot.model
     motion = robot.motion and str((folder / robot.motion).resolve())
-    found = RobotFiles(model, onboard, robot.planar, limits, robot.hull_m)
+    files = RobotFiles(model, onboard, robot.planar, limits, robot.hull_m)
     return replace(
-        found,
+        files,
         hull_points=robot.hull_points and str((folder / robot.hull_points).resolve()),
         tunings=tunings,
         response=robot.response,
@@ -213,6 +216,17 @@ def _missing_files(robot: RobotFile, folder: Path) -> list[ConfigProblem]:
         for key, name in named.items()
         if name is not None and not (folder / name).is_file()
     ]
+
+
+def _misplaced(planar: bool, onboard: str) -> Iterator[ConfigProblem]:
+    """Yield the problem of a robot that flies on the ground, or that drives in the air."""
+    if planar is ON_GROUND.get(onboard, planar):
+        return
+    if planar:
+        reason = f"the onboard controller {onboard} flies; delete planar, or choose diff_drive"
+    else:
+        reason = f"the onboard controller {onboard} drives on the ground; set planar: true"
+    yield ConfigProblem(("planar",), str(planar).lower(), reason)
 
 
 def parameters(robot: RobotFiles, world: World) -> dict[str, Any]:

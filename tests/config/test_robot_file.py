@@ -10,8 +10,8 @@ from cloudrc.errors import BadInputError
 def read(tmp_path):
     """Return a function that reads a robot.yaml with these keys."""
 
-    def find(*keys):
-        lines = "\n".join(["onboard: multirotor", *keys])
+    def find(*keys, onboard="multirotor"):
+        lines = "\n".join([f"onboard: {onboard}", *keys])
         (tmp_path / "robot.yaml").write_text(lines)
         return find_robot(str(tmp_path))
 
@@ -19,16 +19,16 @@ def read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("keys", "stop"),
+    ("onboard", "keys", "stop"),
     [
-        ([], "land"),
-        (["planar: true"], "brake"),
-        (["guard: {stop: brake}"], "brake"),
-        (["planar: true", "guard: {stop: brake}"], "brake"),
+        ("multirotor", [], "land"),
+        ("diff_drive", ["planar: true"], "brake"),
+        ("multirotor", ["guard: {stop: brake}"], "brake"),
+        ("diff_drive", ["planar: true", "guard: {stop: brake}"], "brake"),
     ],
 )
-def test_a_robot_lands_unless_it_is_planar_or_says_that_it_brakes(read, keys, stop):
-    assert read(*keys).guard.stop == stop
+def test_a_robot_lands_unless_it_is_planar_or_says_that_it_brakes(read, onboard, keys, stop):
+    assert read(*keys, onboard=onboard).guard.stop == stop
 
 
 def test_limits_and_hull_are_read_and_have_defaults(read):
@@ -91,3 +91,37 @@ def test_a_wrong_value_is_one_line_with_file_line_and_key(read, tmp_path, keys, 
 def test_a_planar_robot_does_not_land(read):
     with pytest.raises(BadInputError, match=r"guard\.stop is land, but a planar robot does not"):
         read("planar: true", "guard: {stop: land}")
+
+
+@pytest.mark.parametrize(
+    ("onboard", "key", "message"),
+    [
+        (
+            "multirotor",
+            "planar: true",
+            "robot.yaml:2: planar: true: the onboard controller multirotor flies",
+        ),
+        ("{name: multirotor}", "planar: true", "delete planar, or choose diff_drive"),
+        (
+            "diff_drive",
+            "planar: false",
+            "robot.yaml:2: planar: false: the onboard controller diff_drive",
+        ),
+        ("diff_drive", "", "drives on the ground; set planar: true"),
+    ],
+)
+def test_a_shipped_controller_that_does_not_fit_planar_is_refused_in_one_line(
+    read, onboard, key, message
+):
+    with pytest.raises(BadInputError) as error:
+        read(key, onboard=onboard)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_controller_of_the_users_may_fly_or_drive(read, tmp_path):
+    (tmp_path / "own.py").touch()
+    assert [read(f"planar: {flag}", onboard="./own.py").planar for flag in ("true", "false")] == [
+        True,
+        False,
+    ]

@@ -25,7 +25,7 @@ def drive(own_robot):
     """Return a function that drives the rover with velocities (x, y, z, yaw rate), 2 s each."""
 
     def go(*wanted, model=TEXT, onboard="diff_drive", time=2.0):
-        folder = own_robot(f"onboard: {onboard}", model)
+        folder = own_robot(f"onboard: {onboard}\nplanar: true", model)
         robot = build_robot(World(robot=str(folder), scene="empty"), ResolvedGuard())
         simulator, controller = robot.simulator, robot.onboard
         for *velocity, yaw_rate in wanted:
@@ -136,7 +136,7 @@ def test_a_model_without_such_wheels_is_refused_in_one_line(own_robot, changes, 
     for old, new in changes.items():
         assert old in model
         model = model.replace(old, new)
-    folder = own_robot("onboard: diff_drive", model)
+    folder = own_robot("onboard: diff_drive\nplanar: true", model)
     with pytest.raises(BadInputError) as error:
         check_robot(World(robot=str(folder), scene="empty"))
     assert message in str(error.value)
@@ -145,7 +145,7 @@ def test_a_model_without_such_wheels_is_refused_in_one_line(own_robot, changes, 
 
 
 def test_a_robot_that_flies_is_refused(own_robot):
-    folder = own_robot("onboard: diff_drive")
+    folder = own_robot("onboard: diff_drive\nplanar: true")
     with pytest.raises(BadInputError, match="'rotor_front' must turn the hinge of a wheel"):
         check_robot(World(robot=str(folder), scene="empty"))
 
@@ -154,7 +154,7 @@ def test_a_robot_that_flies_is_refused(own_robot):
     "onboard", ["{name: diff_drive, turn_gain: 0}", "{name: diff_drive, r: 1}"]
 )
 def test_wrong_parameters_are_refused(own_robot, onboard):
-    folder = own_robot(f"onboard: {onboard}", TEXT)
+    folder = own_robot(f"onboard: {onboard}\nplanar: true", TEXT)
     with pytest.raises(BadInputError, match=r"turn_gain|unknown key"):
         check_robot(World(robot=str(folder), scene="empty"))
 
