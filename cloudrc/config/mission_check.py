@@ -18,7 +18,7 @@ import numpy as np
 
 from cloudrc.config.ground import check_heights
 from cloudrc.config.problems import ConfigProblem
-from cloudrc.config.schema import MissionConfig, Steps
+from cloudrc.config.schema import GROUND, MissionConfig, Steps
 from cloudrc.config.setpoints import read_setpoints
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import Array, Spheres
@@ -35,6 +35,7 @@ from cloudrc.geometry.scene import FLOOR, Scene, Tube
 from cloudrc.messages import Vector
 
 _YAW = "missions keep the yaw at 0, as the paper does; leave it out"
+FLIES = "a robot that flies needs a height: give three numbers, x, y and z"
 _REPORTED = 20
 """Largest number of problems of one kind in an error message."""
 TOUCHING = 1e-3
@@ -194,13 +195,15 @@ def _check_waypoints(
         path = ("waypoints", str(index), "yaw_deg")
         yield ConfigProblem(path, f"{mission.waypoints[index].yaw_deg:g}", _YAW)
     for index in wrong[:_REPORTED]:
+        position = mission.waypoints[index].position_m
         if outside[index]:
-            reason = f"beyond the fence, or too near to it; {_allowed(fence, planar=planar)}"
+            needs_height = position[2] == GROUND and not planar
+            what = FLIES if needs_height else "beyond the fence, or too near to it"
+            reason = f"{what}; {_allowed(fence, planar=planar)}"
         else:
             reason = (
                 f"the robot would be within {CLEARANCE_MIN:g} m of {surface(known[hit[index]])}"
             )
-        position = mission.waypoints[index].position_m
         before = mission.waypoints[index - 1].position_m if index else start
         legal = None if index - 1 in wrong else before
         near = None

@@ -91,9 +91,13 @@ def test_steps_in_the_plane_are_driven():
     assert cloudrc.fly("steps", settings).verdict == "success"
 
 
-def test_a_robot_that_flies_needs_three_numbers():
-    with pytest.raises(BadInputError, match=r"\[1, 0, 0\]: beyond the fence"):
-        load_experiment("steps", with_points((1, 0))[1:])
+@pytest.mark.parametrize("robot", ["pelican", "x2"])
+def test_a_robot_that_flies_is_told_that_its_waypoints_need_a_height(robot):
+    where = [f"world.robot={robot}", "world.scene=pillars"]
+    with pytest.raises(BadInputError, match=r"\[1, 0, 0\]: a robot that flies needs a height"):
+        load_experiment("steps", [*with_points((1, 0))[2:], *where])
+    with pytest.raises(RefusedError, match="a robot that flies needs a height"):
+        read_goto(b'{"position_m": [1, 0]}', SCENE, hull_of(robot).dense)
 
 
 def test_the_rover_drives_through_the_pillars_without_a_vertical_command():
