@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.config.document import write_yaml
 from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 from cloudrc.metrics import Flight
@@ -245,17 +244,14 @@ def sweep(
     from cloudrc.runs.grid import read_grid
 
     jobs = _count(jobs, "jobs")
+    if isinstance(grid, Mapping):
+        read = read_grid(json.loads(json.dumps(dict(grid), default=_plain)))
+    else:
+        read = read_grid(Path(grid))
+    for text in advice_on(*read.points):
+        warnings.warn(text, stacklevel=2)
     with TemporaryDirectory(prefix="cloudrc-sweep-") as temporary:
-        path = Path(temporary, "sweep.yaml")
-        if isinstance(grid, Mapping):
-            content = json.loads(json.dumps(dict(grid), default=_plain))
-            path.write_text(write_yaml({"folder": str(Path.cwd()), **content}), encoding="utf-8")
-        else:
-            path = Path(grid)
-        read = read_grid(path)
-        for text in advice_on(*read.points):
-            warnings.warn(text, stacklevel=2)
-        return _fly_sweep(read, None if out is None else Path(out), Path(temporary, "rows"), jobs)
+        return _fly_sweep(read, None if out is None else Path(out), Path(temporary), jobs)
 
 
 def _fly_sweep(grid: Grid, out: Path | None, temporary: Path, jobs: int) -> SweepTable:

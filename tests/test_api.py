@@ -126,6 +126,25 @@ def test_a_wrong_sweep_is_refused_and_writes_nothing(grid, text, tmp_path, monke
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("content", "place"),
+    [
+        ({"grid": {"link.profle": ["lte"]}}, "sweep: grid: link.profle: unknown key"),
+        ({"grid": {"a": {"x": {"cloud.predictor": "z"}}}}, "sweep: grid: cloud.predictor: "),
+        ({"grid": {"link.both.delay_ms": 10}}, "sweep: grid.link.both.delay_ms: must be a list"),
+        ({"grid": {"guard.hold_max_s": [5, 5.0]}}, "sweep: {'guard.hold_max_s': 5.0} is the same"),
+        ({"set": {"world.robot": "rovr"}}, "sweep: set: world.robot: no robot named 'rovr'"),
+        ({"set": {"seed": 3}}, "sweep: set: seed: "),
+        ({"seeds": 0}, "sweep: seeds: 0: "),
+        ({"grd": {}}, "sweep: grd: unknown key; did you mean grid?"),
+    ],
+)
+def test_an_error_of_a_sweep_in_python_names_its_key(content, place):
+    with pytest.raises(BadInputError) as error:
+        cloudrc.sweep({"experiment": "steps", **content})
+    assert str(error.value).startswith(place)
+
+
 @pytest.mark.parametrize("wrong", [[1, 2, 3], 2.5, 2.0, 0, -1, "3", None, True])
 def test_a_wrong_number_of_seeds_or_processes_is_named(wrong):
     sides = "cloud.predictor=none", "cloud.predictor=last_sample"

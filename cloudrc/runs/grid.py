@@ -20,7 +20,7 @@ from pydantic import Field
 
 from cloudrc import files, metrics, source
 from cloudrc.config import problems, shipped
-from cloudrc.config.document import Document, Source, read_document
+from cloudrc.config.document import Document, Source, parse_yaml, read_document, write_yaml
 from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files
 from cloudrc.config.overrides import Settings, collect_settings
 from cloudrc.config.problems import ConfigProblem, ProblemsError, validate
@@ -105,18 +105,21 @@ class _UncheckedGrid(NamedTuple):
 
 
 def read_grid(
-    path: Path, *, flights_max: int | None = None, see: See = lambda done, points, seeds: None
+    given: Path | Mapping[str, Any],
+    *,
+    flights_max: int | None = None,
+    see: See = lambda done, points, seeds: None,
 ) -> Grid:
-    """Read the file of a sweep, and check all of its points.
+    """Read a sweep, the path of its file or its content, and check all of its points.
 
     Call `see` with the number of points that are checked, that of all points, and that of seeds:
     once before the first point, and after each.
 
     Raises:
-        BadInputError: If the file or one of its points has problems, with file and line of each; or
-            if the sweep has more than `flights_max` flights.
+        BadInputError: If the sweep or one of its points has problems, with file and line of each,
+            or with the key of the content; or if it has more than `flights_max` flights.
     """
-    grid = _read_unchecked(path)
+    grid = _read_unchecked(given)
     count, seeds = prod(len(choices) for choices in grid.axes.values()), len(grid.seeds)
     if flights_max is not None and count * seeds > flights_max:
         text = f"{count:,} points x {seeds:,} seeds: {count * seeds:,} flights are more than "
@@ -155,11 +158,16 @@ def read_flight(path: Path, point: Mapping[str, Any], seed: int) -> SweepPoint |
     return SweepPoint(_key(_everything(resolved), seed), dict(point), seed, resolved)
 
 
-def _read_unchecked(path: Path) -> _UncheckedGrid:
-    """Read the file of a sweep, and check all but its points; raise a BadInputError."""
-    name, document = str(path), read_document(path, str(path))
+def _read_unchecked(given: Path | Mapping[str, Any]) -> _UncheckedGrid:
+    """Read a sweep, and check all but its points; raise a BadInputError."""
+    if isinstance(given, Path):
+        name, start, document = str(given), given.resolve().parent, read_document(given, str(given))
+    else:
+        name, start = "sweep", Path.cwd()
+        tree, _ = parse_yaml(write_yaml(dict(given)), name)
+        document = Document(tree, {(): Source(name, start)})
     file = validate(document, SweepFile, name)
-    folder = Path(file.folder or path.resolve().parent)
+    folder = Path(file.folder or start)
     found, seeds = list[ConfigProblem](), _seeds(file.seeds)
     if not seeds:
         text = f"must be a number of seeds, 1 to {SEEDS_MAX}, or a list of different seeds"
@@ -206,7 +214,10 @@ def _entries(
     """
 
     def entry(key: str, value: Any, *path: str) -> _Entry:
-        return key, value, document.source(path)._replace(folder=folder)
+        source = document.source(path)
+        if path not in document.sources:  # no file, so no line
+            source = source._replace(label=f"{source.label}: {path[0]}")
+        return key, value, source._replace(folder=folder)
 
     def choices_of(axis: str, given: Any, *above: str) -> list[tuple[Any, list[_Entry]]]:
         if isinstance(given, list):
