@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from cloudrc import plugins
 from cloudrc.errors import BadInputError
@@ -109,6 +110,16 @@ def test_an_executor_of_ones_own_is_found_by_its_path(tmp_path):
     (tmp_path / "empty.py").write_text("")
     with pytest.raises(BadInputError, match=r"has no function build\(\)"):
         flown(tmp_path / "empty.py", "ideal")
+
+
+@pytest.mark.parametrize("name", plugins.names("executors"))
+def test_every_executor_takes_actions_of_several_values(name):
+    space = spaces.Box(-1.0, 1.0, (2, 3))
+    env = Networked(Counter(space), both_ways(20, 20), chunk=8, executor=name, start="answer")
+    env.reset()
+    for _ in range(10):
+        env.step(np.full((8, 2, 3), 0.5, np.float32))
+    assert all((action == 0.5).all() for action in env.unwrapped.executed)
 
 
 @pytest.mark.parametrize("name", plugins.names("executors"))

@@ -13,6 +13,7 @@ import pytest
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import connect
 
+from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.policy.client import PolicyClient, PolicyServerError, SilentServerError
 from cloudrc.policy.load import LoadedPolicy
@@ -300,22 +301,78 @@ print("passed")
 """
 
 
+@pytest.fixture
+def stock(tmp_path):
+    """Install packages of openpi into an environment of their own; return its Python.
+
+    They pin an old numpy, and forget to ask for typing_extensions. Needs a package index.
+    """
+    environment = tmp_path / "openpi"
+
+    def install(*packages):
+        subprocess.run([sys.executable, "-m", "venv", environment], check=True)
+        words = [environment / "bin/pip", "install", "--quiet", *packages, "typing_extensions"]
+        subprocess.run(words, check=True)
+        return environment / "bin/python"
+
+    yield install
+    shutil.rmtree(environment)
+
+
 @pytest.mark.full
-def test_the_stock_client_of_openpi_talks_to_our_server(policy, tmp_path):
-    """In an environment of its own, because it pins an old numpy; needs a package index."""
+def test_the_stock_client_of_openpi_talks_to_our_server(policy, stock):
     source = """
 metadata = {"robot": "arm"}
 def infer(observation):
     return {"actions": observation["state"][None, :], "image": observation["image"]}
 """
-    environment = tmp_path / "openpi"
-    subprocess.run([sys.executable, "-m", "venv", environment], check=True)
-    # It forgets to ask for typing_extensions.
-    wanted = ["openpi-client==0.1.2", "typing_extensions"]
-    subprocess.run([environment / "bin/pip", "install", "--quiet", *wanted], check=True)
+    python = stock("openpi-client==0.1.2")
     with serving(policy(source), key="secret") as url:
-        port = url.rpartition(":")[2]
-        words = [environment / "bin/python", "-c", STOCK, port]
+        words = [python, "-c", STOCK, url.rpartition(":")[2]]
         done = subprocess.run(words, capture_output=True, text=True)
-    shutil.rmtree(environment)
     assert done.stdout == "passed\n", done.stderr
+
+
+STOCK_SERVER = """
+import sys
+import numpy as np
+from openpi_client.base_policy import BasePolicy
+from openpi_server import WebsocketPolicyServer
+
+class Policy(BasePolicy):
+    def infer(self, obs):
+        assert obs["image"].dtype == np.uint8 and obs["image"].shape == (224, 224, 3)
+        return {"actions": np.tile(obs["state"], (2, 1)), "prompt": obs["prompt"]}
+
+    def reset(self):
+        pass
+
+WebsocketPolicyServer(Policy(), "127.0.0.1", int(sys.argv[1]), {"robot": "arm"}).serve_forever()
+"""
+
+
+@pytest.mark.full
+def test_our_client_asks_the_stock_server_of_openpi(stock):
+    """The package's server is the file of openpi's repository, byte by byte."""
+    (port,) = free_ports(1)
+    words = [stock("openpi-server==0.1.0", "openpi-client==0.1.2"), "-c", STOCK_SERVER, str(port)]
+    server = subprocess.Popen(words, stderr=subprocess.DEVNULL)
+    observation = {
+        "image": np.full((224, 224, 3), 7, np.uint8),
+        "state": np.arange(3, dtype="f4"),
+        "prompt": "go",
+    }
+    try:
+        with PolicyClient(f"ws://127.0.0.1:{port}", patience=30) as client:
+            assert client.metadata == {"robot": "arm"}
+            for _ in range(2):
+                answer = client.infer(observation)
+                assert answer["actions"].tolist() == [[0, 1, 2]] * 2
+                assert answer["prompt"] == "go"
+            with pytest.raises(PolicyServerError, match="KeyError"):
+                client.infer({})
+        with PolicyClient(f"ws://127.0.0.1:{port}") as client:  # the server goes on
+            assert client.infer(observation)["prompt"] == "go"
+    finally:
+        server.terminate()
+        server.wait()

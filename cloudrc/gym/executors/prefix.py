@@ -30,8 +30,12 @@ class Prefix(TimeIndexed):
 
     def prefix(self, basis: int) -> list[Any]:
         """Return the actions for the ticks in which no answer can have arrived."""
-        found = [self._sent.get(basis + place) for place in range(self._late)]
-        return found[: found.index(None)] if None in found else found
+        found = list[Any]()
+        for tick in range(basis, basis + self._late):
+            if tick not in self._sent:
+                break
+            found.append(self._sent[tick])
+        return found
 
 
 def build() -> Prefix:
