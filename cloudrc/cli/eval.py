@@ -60,11 +60,17 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--dt", type=number(1e-6, 3600, "seconds"), metavar="S", help=about)
     about = "longest episode in steps (default: 10000)"
     add("--max-steps", type=read_count, default=10_000, metavar="N", help=about)
+    about = "size of an observation on the wire (default: that of its arrays)"
+    add("--observation-bytes", type=_bytes, metavar="N", help=about)
     about = "parallel processes for a policy in a file (default: one per core)"
     add("--jobs", type=read_count, default=COUNT_MAX, metavar="N", help=about)
     about = "folder (default: a new one in runs/); if it has rows, play the others"
     add("--out", type=Path, metavar="DIR", help=about)
     output_argument(parser)
+
+
+def _bytes(text: str) -> int:
+    return round(number(0, 1_000_000_000, "bytes")(text))
 
 
 def _round_trips(text: str) -> tuple[float, ...]:
@@ -136,6 +142,7 @@ def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
         options.success_at,
         options.dt,
         options.max_steps,
+        options.observation_bytes,
     )
     check_setup(setup)
     for rtt in options.rtt:

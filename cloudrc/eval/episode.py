@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.eval.setup import FILE, MEASURED, SEED, Episode, EvalSetup, link_at, read_times
 from cloudrc.gym import Networked
+from cloudrc.gym.values import size_of
 from cloudrc.plugins import locate
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
@@ -120,7 +121,7 @@ def make_env(setup: EvalSetup, seed: int) -> Iterator[gymnasium.Env[Any, Any]]:
     except CloudrcError:
         raise
     except Exception as error:
-        text = f"--env {setup.env}: the environment failed: {describe_error(error)}"
+        text = f"--env {setup.env}: the episode failed: {describe_error(error)}"
         raise BadInputError(f"{text} ({locate(error)})") from error
     finally:
         env.close()
@@ -156,10 +157,12 @@ class _Policy:
         self._width = width_of(space)
         self._count: int | None = None
         self.duration = 0.0  # of the last answer [s]
+        self.size = 0  # of the last observation on the wire [bytes]
 
     def __call__(self, observation: Any, prefix: list[Any]) -> NDArray[Any]:
         """Return the chunk of actions for an observation."""
         asked = observe(observation, self._setup.mapped)
+        self.size = size_of(asked)
         if prefix:
             asked["prefix"] = np.array(prefix).reshape(len(prefix), -1)
         start = time.perf_counter()
@@ -199,7 +202,7 @@ def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask:
     witness, policy = _Witness(env), _Policy(ask, setup, env.action_space)
     observation, _ = witness.reset(seed=episode.seed)
     chunk = policy(observation, [])  # the first answer, whose size the link has to know
-    world = _connect(witness, episode, setup, len(chunk), policy.duration)
+    world = _connect(witness, episode, setup, len(chunk), policy)
     witness.digest = sha256()
     observation, info = world.reset(seed=episode.seed)
     times, fresh = _times(setup), True
@@ -233,17 +236,18 @@ def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask:
 
 
 def _connect(
-    env: gymnasium.Env[Any, Any], episode: Episode, setup: EvalSetup, count: int, duration: float
+    env: gymnasium.Env[Any, Any], episode: Episode, setup: EvalSetup, count: int, policy: _Policy
 ) -> Networked:
     """Put the link between environment and policy, whose chunks have `count` actions.
 
-    `duration` is that of its first answer [s].
+    The policy has given its first answer.
     """
     compute: Any = setup.compute
+    sent = setup.observation_bytes
     if isinstance(compute, tuple) and compute[0] == FILE:
         compute = fmean(read_times(str(compute[1])))
     elif isinstance(compute, tuple) and compute[0] == MEASURED:
-        compute = duration
+        compute = policy.duration
     return Networked(
         env,
         link_at(setup.link, episode.rtt_ms),
@@ -252,6 +256,7 @@ def _connect(
         compute=compute,
         chunk=count,
         executor=episode.executor,
+        observation_bytes=policy.size if sent is None else sent,
         start="answer",  # a robot does nothing before its policy has answered
     )
 

@@ -42,6 +42,7 @@ class EvalSetup:
     success_at: float | None = None  # smallest return of a success [1]; None: what the info says
     dt: float | None = None  # time of a step [s]; None: that of the environment
     max_steps: int = 10_000  # longest episode
+    observation_bytes: int | None = None  # of an observation on the wire; None: that of its arrays
     follows_seed: bool = True  # whether equal seeds give equal episodes
 
     @property

@@ -185,6 +185,37 @@ def test_a_success_is_what_the_info_says_in_any_step(law, key, verdict):
     assert play(Episode(None, "newest", 1), setup, {})["verdict"] == verdict
 
 
+class Seeing(Task):
+    """Has an image of 1 MB, 0.8 s on the 10 Mbit/s of the profile lte."""
+
+    observation_space = gymnasium.spaces.Dict(
+        {
+            "eye": gymnasium.spaces.Box(0, 255, (1000, 1000), np.uint8),
+            "arm": gymnasium.spaces.Box(-1, 1, (4,)),
+        }
+    )
+
+    def reset(self, *, seed=None, options=None):
+        super().reset()
+        return {"eye": np.zeros((1000, 1000), np.uint8), "arm": np.zeros(4, np.float32)}, {}
+
+    def step(self, action):
+        return self.reset()[0], *super().step(action)[1:]
+
+
+gymnasium.register("Seeing-v0", Seeing)
+
+
+def test_the_size_on_the_wire_is_that_of_the_policys_observation_or_the_given_one(law):
+    def delay(**more):
+        setup = EvalSetup("Seeing-v0", law(STILL), link="lte", max_steps=3, **more)
+        return play(Episode(None, "newest", 1), setup, {})["numbers"]["delay_measured_uplink"]
+
+    assert delay() > 0.8
+    assert delay(mapped=(Mapped("state", "arm"),)) < 0.2
+    assert delay(observation_bytes=1_000) < 0.2
+
+
 class Random(Task):
     """Begins at random, unless it gets a seed."""
 
@@ -218,7 +249,7 @@ def test_an_episode_without_an_end_is_cut(law):
 
 def test_a_failing_environment_is_one_line(law):
     setup = EvalSetup("Task-v0", law(STILL), (("fails", True),))
-    with pytest.raises(BadInputError, match="environment failed: RuntimeError: the simulator"):
+    with pytest.raises(BadInputError, match="episode failed: RuntimeError: the simulator"):
         play(Episode(None, "newest", 1), setup, {})
 
 
