@@ -18,8 +18,8 @@ from gymnasium import spaces
 from cloudrc.assembly import assemble, build_links, flight_limit
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.loop import ControlLoop
-from cloudrc.cloud.planar import Planar
 from cloudrc.config.load import load_experiment
+from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Link
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.errors import BadInputError
@@ -37,6 +37,8 @@ NEVER_NS = 1 << 62
 """Time of the cloud's next period while it waits for the policy [ns]."""
 SEED_MAX = 2**31
 """Random seeds of episodes are below this number."""
+SPACE, PLANE = ("vx", "vy", "vz"), ("vx", "vy")
+"""Velocities in an action for a robot that flies, and for one that stays on the ground."""
 OWN = {
     "link.profile": "ideal",
     "cloud.clock_drift_ppm": 0,
@@ -91,8 +93,7 @@ class _Flight:
         self.policy, self.store = _Policy(), RecordStore()
 
         def make_loop(estimator: Any, predictor: Any, controller: Any, **keys: Any) -> ControlLoop:
-            own = Planar(self.policy) if isinstance(controller, Planar) else self.policy
-            return ControlLoop(estimator, predictor, own, **keys)
+            return ControlLoop(estimator, predictor, self.policy, **keys)
 
         world, self.cloud, self.teleop, _ = assemble(experiment, make_loop)
         self._waiting = _Waiting(self.cloud)
@@ -117,10 +118,11 @@ class _Flight:
 class RobotEnv(gymnasium.Env[Any, Any]):
     """A robot of the testbed with its guard and a mission; a step is one command, 10 ms.
 
-    An action is the velocity in x, y and z [m/s], world frame, and the yaw rate [rad/s]. An
-    observation is the newest odometry and the setpoint: position [m], orientation as a quaternion
-    wxyz, velocity [m/s], angular velocity in the body frame [rad/s], position of the setpoint [m]
-    and its yaw [rad]. The reward of a step is minus the distance from the setpoint [m].
+    An action is the velocity in x, y and z [m/s], world frame, and the yaw rate [rad/s]; a robot on
+    the ground has no z. An observation is the newest odometry and the setpoint: position [m],
+    orientation as a quaternion wxyz, velocity [m/s], angular velocity in the body frame [rad/s],
+    position of the setpoint [m] and its yaw [rad]. The reward of a step is minus the distance from
+    the setpoint [m].
 
     An episode ends with its mission. Then `info` has the `verdict` of the flight, its `failures`,
     `is_success` and the `numbers` of the report. `reset(seed=...)` is the seed of the experiment.
@@ -156,7 +158,9 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         )
         self._experiment = loaded.model_copy(update={"link": Link(profile="ideal")})
         guard = self._experiment.guard
-        most = np.array([guard.speed_max_mps] * 3 + [guard.yaw_rate_max_radps])
+        axes = PLANE if is_planar(self._experiment.world.robot) else SPACE
+        self._parts = (*axes, "yaw rate")
+        most = np.array([guard.speed_max_mps] * len(axes) + [guard.yaw_rate_max_radps])
         self.action_space = spaces.Box(-most, most, dtype=np.float64)
         self.observation_space = spaces.Box(-np.inf, np.inf, (17,), dtype=np.float64)
         self.dt = 1.0 / self._experiment.cloud.command_rate_hz
@@ -186,10 +190,12 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         if flight is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         values = np.asarray(action, dtype=np.float64)
-        if values.shape != (4,) or not np.isfinite(values).all():
-            raise BadInputError(f"action {action!r}: give 4 finite numbers: vx, vy, vz, yaw rate")
-        x, y, z, yaw_rate = values.tolist()
-        flight.policy.output = ControlOutput((x, y, z), yaw_rate)
+        count = len(self._parts)
+        if values.shape != (count,) or not np.isfinite(values).all():
+            parts = ", ".join(self._parts)
+            raise BadInputError(f"action {action!r}: give {count} finite numbers: {parts}")
+        x, y, *climb, yaw_rate = values.tolist()
+        flight.policy.output = ControlOutput((x, y, climb[0] if climb else 0.0), yaw_rate)
         flight.step()
         observation, distance = self._observe(flight)
         ended = flight.teleop.over

@@ -61,14 +61,21 @@ def test_the_served_pid_flies_the_path_of_the_built_in_one_bit_by_bit(policy):
     assert len(served) > 100
 
 
+ON_GROUND = ["mission.waypoints=[{position_m: [0.5, 0], dwell_s: 0.5}]", "criteria.time_limit_s=20"]
+
+
 def test_a_remote_controller_drives_a_robot_on_the_ground(policy):
-    """Its vertical velocity does not count there."""
+    with serving(policy(PID)) as url:
+        served = true_path(experiment(url, name="pillars", short=ON_GROUND))
+    assert np.array_equal(served, true_path(load_experiment("pillars", ON_GROUND)))
+
+
+def test_a_remote_controller_that_leads_off_the_ground_ends_the_flight(policy):
     source = PID.replace("[[*output.velocity,", "[[*output.velocity[:2], 3.0,")
-    way = ["mission.waypoints=[{position_m: [0.5, 0], dwell_s: 0.5}]", "criteria.time_limit_s=20"]
-    with serving(policy(source)) as url:
-        served = true_path(experiment(url, name="pillars", short=way))
-    own = true_path(load_experiment("pillars", way))
-    assert np.array_equal(served, own)
+    with serving(policy(source)) as url, pytest.raises(ControllerLostError) as raised:
+        true_path(experiment(url, name="pillars", short=ON_GROUND))
+    assert raised.value.code == "controller_invalid"
+    assert f"{url}: its velocity in z is 3 m/s, but the robot rover stays" in str(raised.value)
 
 
 def lost(answer, tmp_path, metadata=b"\x80", settings=()):

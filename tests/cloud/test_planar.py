@@ -1,0 +1,63 @@
+"""A controller steers a robot on the ground in the plane; a vertical velocity is refused."""
+
+import pytest
+
+from cloudrc.cloud.controllers import Controller, ControlOutput
+from cloudrc.cloud.controllers.pid import build
+from cloudrc.cloud.controllers.remote import OutsideController
+from cloudrc.cloud.planar import Planar
+from cloudrc.errors import ControllerLostError
+from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
+from cloudrc.plugins import InvalidResultError
+
+SEEN = Odometry(0, (0.0, 0.0, 0.0993), UPRIGHT, (0.2, 0.0, 0.004), ZERO)
+GOAL = Setpoint((1.0, 2.0, 0.1), velocity=(0.5, 0.0, 1e-5))
+
+
+class Climbing(Controller):
+    """Commands a vertical velocity."""
+
+    def __init__(self, z):
+        self.z = z
+
+    def update(self, estimate, setpoint, dt):
+        return ControlOutput((0.5, 0.0, self.z), 0.0)
+
+
+class Outside(OutsideController):
+    """Stands for a program outside that commands a vertical velocity."""
+
+    def update(self, estimate, setpoint, dt):
+        return ControlOutput((0.5, 0.0, 0.3), 0.0)
+
+
+def steer(controller):
+    return Planar(controller, "/mine/climb.py", "the robot rover").update(SEEN, GOAL, 0.01)
+
+
+def test_the_pid_plans_in_the_plane_and_its_limits_count_there():
+    gains = {"gain_p": (1.0, 1.0, 9.0), "gain_i": (0.1,) * 3, "gain_d": (0.1,) * 3}
+    output = steer(build(**gains))
+    assert output.velocity == pytest.approx((1.53, 2.0, 0.0))
+    assert output.proportional == (1.0, 2.0, 0.0)
+    assert steer(build(**gains, speed_max=1.0)).velocity[2] == 0.0
+
+
+@pytest.mark.parametrize("z", [0.3, -0.3, 1e-6])
+def test_a_vertical_velocity_is_refused_with_file_value_and_robot(z):
+    said = f"^/mine/climb.py: its velocity in z is {z:g} m/s, but the robot rover stays on the"
+    with pytest.raises(InvalidResultError, match=said):
+        steer(Climbing(z))
+
+
+@pytest.mark.parametrize("z", [0.0, -0.0, 1e-12])
+def test_a_rounding_error_is_no_vertical_velocity(z):
+    assert steer(Climbing(z)).velocity == (0.5, 0.0, 0.0)
+
+
+def test_a_program_outside_ends_the_flight_once():
+    planar = Planar(Outside("ws://here:1", 60.0), "remote", "the robot rover")
+    with pytest.raises(ControllerLostError, match="ws://here:1: its velocity in z") as raised:
+        planar.update(SEEN, GOAL, 0.01)
+    assert raised.value.code == "controller_invalid"
+    assert planar.update(SEEN, GOAL, 0.01).velocity == ZERO
