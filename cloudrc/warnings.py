@@ -41,6 +41,7 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
                 f" mission.waypoints.{number - 1}.tolerance_m in metres"
             )
             break  # the others are alike
+    yield from _size(experiment)
     yield from _balance(experiment)
     carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
     if carrot is not None and carrot.speed_mps > cap:
@@ -175,6 +176,15 @@ def _fast_track(experiment: ResolvedExperiment) -> Iterator[str]:
             f"the guard caps the speed at {cap:.3g} m/s: the robot falls behind, and the mission "
             "fails if the robot is not at the last row in time"
         )
+
+
+def _size(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Yield a warning if a user's robot is larger than it says; without MuJoCo there is none."""
+    from cloudrc.config.hull import too_small
+
+    if "/" in experiment.world.robot:
+        with suppress(MissingPrerequisiteError):
+            yield from filter(None, [too_small(experiment.world.robot)])
 
 
 def _balance(experiment: ResolvedExperiment) -> Iterator[str]:

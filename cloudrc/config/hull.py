@@ -9,8 +9,12 @@ import numpy as np
 from cloudrc import plugins
 from cloudrc.config.reuse import reuse
 from cloudrc.config.robot import RobotFiles, known_robot
+from cloudrc.config.shipped import ROBOT_FILE
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry.clearance import Hull, Spheres, ball
+
+TOLERANCE = 1e-3
+"""Length by which geoms may reach out of the hull [m]: hull_m is rounded."""
 
 
 def hull_of(name: str) -> Hull:
@@ -29,6 +33,25 @@ def known_hull(name: str) -> Hull | None:
         return hull_of(name)
     except (BadInputError, MissingPrerequisiteError):
         return None
+
+
+def too_small(name: str) -> str:
+    """Say that the hull_m of a robot, given as for `find_robot`, does not hold its geoms.
+
+    Return "" if it does, or if the robot gives none.
+
+    Raises:
+        MissingPrerequisiteError: If MuJoCo is missing.
+    """
+    robot = known_robot(name)
+    if robot.hull is None or robot.hull_points is not None:
+        return ""
+    from cloudrc.geometry.compiled import reach_of
+
+    if robot.hull >= (reach := reach_of(robot.model)) - TOLERANCE:
+        return ""
+    text = f"hull_m is {robot.hull:g}, but the geoms reach {reach:.3f} m from the base"
+    return f"{name}/{ROBOT_FILE}: {text}"
 
 
 def _read_hull(name: str, robot: RobotFiles) -> Hull:

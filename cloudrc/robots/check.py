@@ -12,13 +12,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cloudrc.config.hull import hull_of
+from cloudrc.config.hull import hull_of, too_small
 from cloudrc.config.load import ResolvedGuard
 from cloudrc.config.problems import ProblemsError
 from cloudrc.config.robot import RobotFiles, find_robot
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of
 from cloudrc.errors import BadInputError
+from cloudrc.geometry.compiled import reach_of
 from cloudrc.geometry.shapes import Surface
 from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Vector
@@ -28,7 +29,7 @@ from cloudrc.text import table
 from cloudrc.world.guard.limits import REACTION
 from cloudrc.world.robot import STEP, Robot
 from cloudrc.world.scene import ROBOT_PREFIX, compile_model
-from cloudrc.world.shapes import read_shapes, shapes_of
+from cloudrc.world.shapes import read_shapes
 from cloudrc.world.watched import OnboardFailedError
 
 SCENE = "empty"
@@ -83,7 +84,7 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
         raise BadInputError("; ".join(problem.reason for problem in error.problems)) from error
     model = compile_model(robot.model, file_of(SCENE))
     facts = _read_facts(world, robot, model)
-    changes = [*_judge_hull(robot, facts["size_m"]), *_judge_tunings(robot, world)]
+    changes = [*filter(None, [too_small(name)]), *_judge_tunings(robot, world)]
     try:
         motion = _move(body, robot)
     except OnboardFailedError as error:
@@ -108,7 +109,7 @@ def _read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
     """Return the facts that need no motion."""
     base = model.jnt_bodyid[0]
     ratio = thrust_to_weight(model) if not robot.planar else None
-    size = _size(model)
+    size = reach_of(robot.model)
     return {
         "model": str(robot.model),
         "mass_kg": float(model.body_subtreemass[base]),
@@ -125,17 +126,6 @@ def _read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
         "has_response": robot.response is not None,
         "sensors": {name: each.unit for name, each in robot.sensors.items()},
     }
-
-
-def _size(model: Any) -> float:
-    """Return the radius of a ball about the base that holds the robot's geoms [m], upright."""
-    return 0.5 * shapes_of(model, planar=False).size
-
-
-def _judge_hull(robot: RobotFiles, size: float) -> list[str]:
-    if robot.hull is None or robot.hull >= size - 1e-3:
-        return []
-    return [f"robot.yaml: hull_m is {robot.hull:g}, but the geoms reach {size:.3f} m from the base"]
 
 
 def _judge_tunings(robot: RobotFiles, world: World) -> Iterator[str]:

@@ -7,6 +7,8 @@ import sys
 import pytest
 
 from cloudrc.cli.main import main
+from cloudrc.config.load import load_experiment
+from cloudrc.warnings import advise
 
 
 @pytest.fixture
@@ -31,6 +33,14 @@ def test_a_new_robot_is_complete_and_its_test_flies_it(mine):
     ]
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(mine)]
     assert subprocess.run(command, cwd=mine, check=False).returncode == 0
+
+
+def test_a_run_and_the_check_say_that_a_robot_is_larger_than_its_hull(mine, capsys):
+    replace(mine / "robot.yaml", "hull_m: 0.34", "hull_m: 0.1")
+    assert main(["robot", "check", str(mine), "-o", "json"]) == 2
+    (told,) = json.loads(capsys.readouterr().out)["changes"]
+    assert told == f"{mine}/robot.yaml: hull_m is 0.1, but the geoms reach 0.333 m from the base"
+    assert told in advise(load_experiment("hover", [f"world.robot={mine}"]))
 
 
 def test_a_folder_with_files_stays_as_it_is(mine, capsys):
