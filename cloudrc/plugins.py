@@ -189,13 +189,11 @@ def describe(kind: str, name: str) -> str:
 def signature(kind: str, name: str) -> inspect.Signature:
     """Return the parameters of a plug-in's `build`; their annotations are types, not strings."""
     build = builder(kind, name)
-    with refuse_failure(
-        f"{_one(kind)} {name!r} has a build() with annotations that cannot be read"
-    ):
+    with refuse_failure(f"{one(kind)} {name!r} has a build() with annotations that cannot be read"):
         found = inspect.signature(build, eval_str=True)
     if "name" in found.parameters:
         raise BadInputError(
-            f"{_one(kind)} {name!r}: no parameter of build() may be called name, because the key "
+            f"{one(kind)} {name!r}: no parameter of build() may be called name, because the key "
             "name is the plug-in itself; call it something else"
         )
     return found
@@ -204,7 +202,7 @@ def signature(kind: str, name: str) -> inspect.Signature:
 def load(kind: str, name: str, /, **parameters: Any) -> Any:
     """Find a plug-in and build it; raise a BadInputError if it is missing or its `build` fails."""
     build = builder(kind, name, look=False)
-    with refuse_failure(f"{_one(kind)} {name!r} cannot be built"):
+    with refuse_failure(f"{one(kind)} {name!r} cannot be built"):
         plugin = build(**parameters)
         _check_methods(kind, plugin)
     return plugin
@@ -212,7 +210,7 @@ def load(kind: str, name: str, /, **parameters: Any) -> Any:
 
 def _check_methods(kind: str, plugin: Any) -> None:
     """Raise a ValueError if an object that `build` returned lacks a method of its kind."""
-    name = _one(kind).capitalize()
+    name = one(kind).capitalize()
     base = getattr(importlib.import_module(PACKAGES[kind] or "cloudrc"), name, None)
     for method in (METHODS[kind], *INHERITED.get(kind, ())):
         found = getattr(plugin, method, None)
@@ -254,8 +252,8 @@ def find(kind: str, name: str, *, look: bool = True) -> Found:
     """
     if is_path(name) and not Path(name).is_file():
         near = _suggest_file(Path(name))
-        raise BadInputError(f"{_one(kind)} {name!r}: there is no such file{near}")
-    with refuse_failure(f"{_one(kind)} {name!r} cannot be imported"):
+        raise BadInputError(f"{one(kind)} {name!r}: there is no such file{near}")
+    with refuse_failure(f"{one(kind)} {name!r} cannot be imported"):
         if is_path(name):
             if (module := _module_of(Path(name))) is not None:
                 return Found(importlib.import_module(module))
@@ -265,7 +263,7 @@ def find(kind: str, name: str, *, look: bool = True) -> Found:
         # Last, because the search of all installed packages takes milliseconds.
         if (entry := _installed(kind).get(name)) is not None:
             return Found(entry.load())
-    raise BadInputError(unknown_name_text(_one(kind), name, names(kind)))
+    raise BadInputError(unknown_name_text(one(kind), name, names(kind)))
 
 
 def check_failure(error: BaseException, what: str) -> None:
@@ -432,7 +430,7 @@ def builder(kind: str, name: str, *, look: bool = True) -> Callable[..., Any]:
     build = find(kind, name, look=look).builder
     if not callable(build):
         raise BadInputError(
-            f"{_one(kind)} {name!r} has no function build(); write one that returns the plug-in"
+            f"{one(kind)} {name!r} has no function build(); write one that returns the plug-in"
         )
     return build  # type: ignore[no-any-return]
 
@@ -464,7 +462,8 @@ def _entries(kind: str, path: tuple[str, ...]) -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=f"cloudrc.{kind}")}
 
 
-def _one(kind: str) -> str:
+def one(kind: str) -> str:
+    """Return the word for one plug-in of a kind, such as "predictor"."""
     return "policy" if kind == "policies" else kind.removesuffix("s")
 
 

@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from cloudrc import plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, KeyPath, Source, child, parse_value
-from cloudrc.config.problems import ConfigProblem
+from cloudrc.config.problems import ConfigProblem, ProblemsError
 from cloudrc.config.reuse import reuse
 from cloudrc.config.robot import RobotFacts, facts, find_robot, known_robot, parameters
 from cloudrc.config.schema import Experiment, PlugIn, Steps, World
@@ -221,7 +221,7 @@ def resolve_plugins(document: Document, *, build: bool) -> list[ConfigProblem]:
     """
     found: list[ConfigProblem] = []
     robot = _robot_of(document) if build else None
-    for key, kind in KINDS.items():
+    for key in KINDS:
         path = ("cloud", key)
         choice = document.get(*path)
         given = {"name": choice} if isinstance(choice, str) else choice
@@ -233,8 +233,8 @@ def resolve_plugins(document: Document, *, build: bool) -> list[ConfigProblem]:
         try:
             if build:
                 parameters = _complete_once(document, path, name, parameters, robot)
-        except ValidationError as error:
-            found += problems.from_pydantic(error, parameter_model(kind, name), path)
+        except ProblemsError as error:
+            found += [each._replace(path=path + each.path) for each in error.problems]
         except BadInputError as error:
             found.append(ConfigProblem(path, "", str(error), error))
         else:
@@ -292,8 +292,8 @@ def _complete(
 ) -> dict[str, Any]:
     """Check the parameters `given` to a plug-in, and add defaults; build the plug-in as a test.
 
-    `path` is the key of the plug-in, such as ("cloud", "predictor"). Raise a ValidationError or a
-    BadInputError about a wrong parameter or a plug-in that fails.
+    `path` is the key of the plug-in, such as ("cloud", "predictor"). Raise a BadInputError about a
+    wrong parameter or a plug-in that fails.
     """
     kind = KINDS[path[-1]]
     model = _parameters_of(kind, name)
@@ -306,11 +306,10 @@ def _complete(
         if field.annotation == Path | None and isinstance(document.get(*place), str):
             file = document.source(place).absolute(parameters[parameter])
             parameters[parameter] = str(file)
-    checked = model.model_validate_json(json.dumps(parameters))
+    checked = _check(kind, name, parameters)
     with plugins.refuse_failure(f"{path[-1]} {name!r} has a default that YAML cannot contain"):
         values: dict[str, Any] = checked.model_dump(mode="json")
-    # Check the defaults as `build_plugin` will do.
-    checked = model.model_validate_json(json.dumps(values))
+    checked = _check(kind, name, values)  # as `build_plugin` will do
     more = {"robot": robot} if _takes_robot(kind, name) else {}
     plugin = plugins.load(kind, name, **dict(checked), **more)
     if kind != "estimators":
@@ -347,11 +346,7 @@ def build_plugin(kind: str, choice: PlugIn, /, **given: Any) -> Any:
     its `build` that are no parameters of the user. Raise a BadInputError that names the wrong
     parameters.
     """
-    try:
-        checked = _check(kind, choice.name, choice.model_extra or {})
-    except ValidationError as error:
-        found = problems.from_pydantic(error, parameter_model(kind, choice.name))
-        raise BadInputError("; ".join(map(str, found))) from None
+    checked = _check(kind, choice.name, choice.model_extra or {})
     return plugins.load(kind, choice.name, **given, **dict(checked))
 
 
@@ -365,8 +360,8 @@ def check_plugin(kind: str, choice: PlugIn) -> list[ConfigProblem]:
     """List the problems of the parameters of a plug-in."""
     try:
         _check(kind, choice.name, choice.model_extra or {})
-    except ValidationError as error:
-        return problems.from_pydantic(error, parameter_model(kind, choice.name))
+    except ProblemsError as error:
+        return [*error.problems]
     return []
 
 
@@ -404,9 +399,20 @@ def _model_of(kind: str, name: str, build: Callable[..., Any]) -> type[BaseModel
         extra="allow" if is_open else "forbid", strict=True, arbitrary_types_allowed=True,
         allow_inf_nan=False, protected_namespaces=(),
     )  # fmt: skip
-    model: type[BaseModel] = create_model("parameters", __config__=config, **fields)
+    with plugins.refuse_failure(f"{plugins.one(kind)} {name!r} has a type that cannot be read"):
+        model: type[BaseModel] = create_model("parameters", __config__=config, **fields)
     return model
 
 
 def _check(kind: str, name: str, parameters: dict[str, Any]) -> BaseModel:
-    return parameter_model(kind, name).model_validate_json(json.dumps(parameters))
+    """Convert the parameters of a plug-in to the types that its `build` declares.
+
+    Raise a ProblemsError about wrong parameters, a BadInputError if a validator of the user fails.
+    """
+    model, text = _parameters_of(kind, name), json.dumps(parameters)
+    with plugins.refuse_failure(f"{plugins.one(kind)} {name!r}: a check of a parameter failed"):
+        try:
+            return model.model_validate_json(text)
+        except ValidationError as error:
+            found = problems.from_pydantic(error, model)
+    raise ProblemsError(found)

@@ -66,6 +66,15 @@ def test_parameters_are_checked_against_build(share, setting, reason):
     assert reason in found
 
 
+CHECKED = """from pydantic import AfterValidator
+from typing import Annotated
+def check(value):
+    {what}
+def build(share: Annotated[float, AfterValidator(check)] = 1.0): ...
+"""
+"""A plug-in whose parameter has a check by the user."""
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
@@ -93,6 +102,11 @@ def test_parameters_are_checked_against_build(share, setting, reason):
          "its reset() failed: share.py:3: ZeroDivisionError"),
         ("def build(share=object()): ...", "has a default that YAML cannot contain: "),
         ("class A: ...\ndef build(a: A = None): ...", "must be an object of a class, which YAML"),
+        (CHECKED.format(what="return {}['tau']"), "parameter failed: share.py:4: KeyError: 'tau'"),
+        (CHECKED.format(what="raise SystemExit(0)"), "parameter failed: share.py:4: SystemExit"),
+        (CHECKED.format(what="raise ValueError('is even')"), "cloud.predictor.share: is even"),
+        ("class A:\n    def __get_pydantic_core_schema__(*a): exit()\ndef build(a: A = 1): ...",
+         "has a type that cannot be read: share.py:2: SystemExit"),
     ],
 )  # fmt: skip
 def test_a_broken_plug_in_is_one_line(share, text, reason):
