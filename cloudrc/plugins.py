@@ -92,6 +92,11 @@ class Found:
         return (inspect.getdoc(self._target) or "").partition("\n")[0]
 
     @property
+    def is_shipped(self) -> bool:
+        """Whether it is a module of cloudrc, and not code of a user."""
+        return isinstance(self._target, ModuleType) and self._target.__name__.startswith("cloudrc.")
+
+    @property
     def builder(self) -> Any:
         """What builds the plug-in: `build`, or the object of an entry point itself."""
         build = self.get("build")

@@ -21,6 +21,7 @@ from cloudrc.config.shipped import ROBOT_FILE, file_of
 from cloudrc.errors import BadInputError
 from cloudrc.messages import ZERO, Vector
 from cloudrc.robots.onboard._airframe import thrust_to_weight
+from cloudrc.world.accelerated import AcceleratedRobot
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.onboard import Accelerator, Actuators, Direct, Onboard
 from cloudrc.world.own_sensors import OwnSensor, find_sensors
@@ -63,14 +64,18 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     robot = find_robot(world.robot)
     guard = Guard(limits, steered_in(world), robot.guard)
     faster = _accelerator(world, plugin)
-    if faster is not None and faster.make is not None:
+    make = None if faster is None else faster.make
+    if make is not None and plugin.is_shipped:
         simulator = Simulator(model, actuators, wind, probe, sensors)
-        with plugin.calling("accelerator"):
-            return faster.make(simulator, onboard, guard)  # type: ignore[no-any-return]
-    if not isinstance(actuators, Direct):
-        actuators = WatchedActuators(actuators, model.nu)
-    simulator = Simulator(model, actuators, wind, probe, sensors)
-    return Robot(simulator, WatchedOnboard(onboard), guard)
+        return make(simulator, onboard, guard)  # type: ignore[no-any-return]
+    with plugin.calling("build"):
+        if not isinstance(actuators, Direct):
+            actuators = WatchedActuators(actuators, model.nu)
+        simulator = Simulator(model, actuators, wind, probe, sensors)
+        if make is None:
+            return Robot(simulator, WatchedOnboard(onboard), guard)
+    with plugin.calling("accelerator"):
+        return AcceleratedRobot(simulator, onboard, guard, make)
 
 
 def controller(robot: RobotFiles, model: Any) -> PlugIn:
@@ -253,6 +258,8 @@ def _build_actuators(plugin: plugins.Found, model: Any, given: dict[str, Any]) -
         known = inspect.signature(function).parameters
         own = {name: value for name, value in given.items() if name in known}
         actuators = function(model, STEP, **own)
+        if not callable(getattr(actuators, "step", None)):
+            raise ValueError(f"{type(actuators).__name__} has no method step()")
         actuators.reset()
         return actuators  # type: ignore[no-any-return]
 

@@ -56,7 +56,7 @@ class WatchedOnboard:
         try:
             reset()
         except BaseException as error:
-            raise _failure(WHAT, reset, error) from error
+            raise failure_of(WHAT, reset, error) from error
 
     def update(self, readings: Readings, velocity: Vector, yaw_rate: float) -> Commands:
         """Return the commands that make the robot follow a velocity [m/s] and yaw rate [rad/s]."""
@@ -65,7 +65,7 @@ class WatchedOnboard:
             if type(commands) is tuple and len(commands) == self._size and isfinite(sum(commands)):
                 return commands  # `_numbers` takes a microsecond
         except BaseException as error:
-            raise _failure(WHAT, self._update, error) from error
+            raise failure_of(WHAT, self._update, error) from error
         return _numbers(commands, self._size, WHAT, self._update)
 
     def brake(self, readings: Readings, velocity: Vector) -> Commands:
@@ -75,7 +75,7 @@ class WatchedOnboard:
             if type(commands) is tuple and len(commands) == self._size and isfinite(sum(commands)):
                 return commands
         except BaseException as error:
-            raise _failure(WHAT, self._brake, error) from error
+            raise failure_of(WHAT, self._brake, error) from error
         return _numbers(commands, self._size, WHAT, self._brake)
 
 
@@ -97,11 +97,17 @@ class WatchedActuators:
     @property
     def speeds(self) -> Commands:
         """What the actuators do at present."""
-        return self._actuators.speeds
+        try:
+            return self._actuators.speeds
+        except BaseException as error:
+            raise failure_of(PHYSICS, self._step, error) from error
 
     @speeds.setter
     def speeds(self, speeds: Commands) -> None:
-        self._actuators.speeds = speeds
+        try:
+            self._actuators.speeds = speeds
+        except BaseException as error:
+            raise failure_of(PHYSICS, self._step, error) from error
 
     def reset(self) -> None:
         """Stand still."""
@@ -110,7 +116,7 @@ class WatchedActuators:
             self._actuators.reset()
         except BaseException as error:
             self._has_failed = True
-            raise _failure(PHYSICS, self._actuators.reset, error) from error
+            raise failure_of(PHYSICS, self._actuators.reset, error) from error
 
     def step(self, commands: Commands, readings: Readings) -> Inputs:
         """Advance by one physics step towards `commands`; return the input to MuJoCo."""
@@ -122,7 +128,7 @@ class WatchedActuators:
                 return inputs
         except BaseException as error:
             self._has_failed = True
-            raise _failure(PHYSICS, self._step, error) from error
+            raise failure_of(PHYSICS, self._step, error) from error
         try:
             return _numbers(inputs, self._size, PHYSICS, self._step)
         except OnboardFailedError:
@@ -140,11 +146,11 @@ def _numbers(values: Any, size: int, what: str, call: Callable[..., Any]) -> tup
     if wrong:
         name = getattr(call, "__name__", "it")
         text = f"{name}() returned {shorten(values)}, not {size} finite numbers"
-        raise OnboardFailedError(f"{what} failed ({text}, {_place(call)})")
+        raise OnboardFailedError(f"{what} failed ({text}, {where(call)})")
     return numbers
 
 
-def _failure(what: str, call: Callable[..., Any], error: BaseException) -> OnboardFailedError:
+def failure_of(what: str, call: Callable[..., Any], error: BaseException) -> OnboardFailedError:
     """Return what to raise for an exception that `call` raised.
 
     Raises:
@@ -152,11 +158,11 @@ def _failure(what: str, call: Callable[..., Any], error: BaseException) -> Onboa
     """
     check_failure(error, what)
     is_inside = error.__traceback__ is not None and error.__traceback__.tb_next is not None
-    place = locate(error) if is_inside else _place(call)  # a call with wrong arguments
+    place = locate(error) if is_inside else where(call)  # a call with wrong arguments
     return OnboardFailedError(f"{what} failed ({describe_error(error)}, {place})", stack_of(error))
 
 
-def _place(call: Callable[..., Any]) -> str:
+def where(call: Callable[..., Any]) -> str:
     """Return file and line of a function of the user."""
     code = getattr(call, "__code__", None)
     if not isinstance(code, CodeType):

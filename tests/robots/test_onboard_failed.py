@@ -6,6 +6,8 @@ import cloudrc
 from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState
+from cloudrc.world.onboard import Direct
+from cloudrc.world.watched import OnboardFailedError, WatchedActuators
 
 HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
 FAILS = """
@@ -50,6 +52,27 @@ class Push:
 
 def actuators(model, dt):
     return Push()
+"""
+
+FASTER = """
+from cloudrc.robots.onboard.multirotor import build
+from cloudrc.world.onboard import Accelerator
+from cloudrc.world.robot import Robot
+
+
+class Faster(Robot):
+    runs = 0
+
+    def run(self, tick_ns, until_ns):
+        self.runs += 1
+        data, ended_ns = self.simulator.data, super().run(tick_ns, until_ns)
+        if self.runs == 300:
+            {what}
+        return ended_ns
+
+
+def accelerator():
+    return Accelerator(Faster, "mine")
 """
 
 
@@ -107,6 +130,47 @@ def test_physics_of_actuators_that_fails_in_flight_is_onboard_failed_too(fly, wh
     assert "own.py:" in flight.failures[0].text
 
 
+def test_speeds_of_actuators_are_read_as_their_steps_are():
+    class Push(Direct):
+        speeds = property(lambda self: self.gone, lambda self, value: None)
+
+    watched = WatchedActuators(Push(1), 1)
+    watched.speeds = (1.0,)
+    with pytest.raises(OnboardFailedError, match="no attribute 'gone'"):
+        watched.speeds  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("what", "shown"),
+    [
+        ("1 / 0", "ZeroDivisionError: division by zero, own.py:14 in run"),
+        ("raise SystemExit(0)", "sys.exit() was called"),
+        ("return None", "run() returned NoneType None, not the time of the next step, own.py:"),
+        ("return ended_ns - 10_000_000", "not the time of the next step"),
+        ("data.qvel[0] = float('nan')", "its values are not finite, own.py:"),
+        ("self.simulator.step((float('nan'),) * 4)", "its values are not finite"),
+    ],
+)
+def test_an_accelerator_that_fails_in_flight_ends_it_with_onboard_failed(
+    fly, what, shown, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a file about values that are not finite
+    flight = fly(FASTER.replace("{what}", what))
+    assert [each.code for each in flight.failures].count("onboard_failed") == 1
+    text = next(each.text for each in flight.failures if each.code == "onboard_failed")
+    assert shown in text
+    assert "\n" not in text
+    assert flight["/guard"]["state"][-1] == GuardState.ESTOP
+
+
+def test_an_accelerator_that_holds_the_contract_flies_as_without_it(fly):
+    faster = FASTER.replace("{what}", "pass")
+    plain = faster.replace("def accelerator", "def _unused")
+    assert fly(faster)["/ground_truth"]["position"].tolist() == (
+        fly(plain)["/ground_truth"]["position"].tolist()
+    )
+
+
 def test_both_may_fail_in_the_same_step(fly):
     both = FAILS.replace("{what}", "return ()") + ACTUATORS.replace("{what}", "commands[0] / 0")
     assert fly(both).failures[0].code == "onboard_failed"
@@ -143,6 +207,27 @@ def test_a_controller_without_its_parts_is_refused_before_the_flight(fly, old, n
 def test_actuators_that_cannot_be_made_are_refused_before_the_flight(fly):
     with pytest.raises(BadInputError, match=r"\.py:\d+: actuators\(\) failed: ZeroDivisionError"):
         fly(FAILS.replace("{what}", "pass") + "\ndef actuators(model, dt):\n    return 1 / 0\n")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "shown"),
+    [
+        ("def step", "def move", "actuators() failed: Push has no method step()"),
+        ("self.steps = 0\n", "self.steps = 0\n        1 / Push.made; Push.made = 0\n", "own.py:"),
+    ],
+)
+def test_actuators_that_cannot_work_are_refused_before_the_flight(fly, old, new, shown):
+    source = FAILS.replace("{what}", "pass") + ACTUATORS.replace("{what}", "pass")
+    source = source.replace("class Push:", "class Push:\n    made = 1\n")
+    with pytest.raises(BadInputError) as error:
+        fly(source.replace(old, new))
+    assert shown in str(error.value)
+
+
+@pytest.mark.parametrize("make", ["3", "lambda *given: 3", "lambda *given: given[9]"])
+def test_an_accelerator_that_makes_no_robot_is_refused_before_the_flight(fly, make):
+    with pytest.raises(BadInputError, match=r"own\.py:\d+: accelerator\(\) failed: "):
+        fly(FASTER.replace("{what}", "pass").replace("(Faster", f"({make}"))
 
 
 def test_build_and_actuators_are_of_one_import_of_the_file(fly):
