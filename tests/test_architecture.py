@@ -102,7 +102,7 @@ ALWAYS = {
     "version",
 }
 
-ROS = ("rclpy", "geometry_msgs", "nav_msgs", "rosgraph_msgs")
+ROS = ("rclpy", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs")
 # Packages of a sourced ROS 2, which no package registry is asked for.
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it. Ruff checks
 # clocks, sockets, threads, signals, chance, and calls such as `eval` and `print` (pyproject.toml).

@@ -157,9 +157,13 @@ class ControlLoop:
         return NEVER_NS if self._basis is None else self._basis.stamp_ns
 
     @property
-    def newest(self) -> tuple[int, Odometry | None]:
-        """Time of the newest telemetry or command [ns], cloud's clock, and the newest odometry."""
-        return self._now_ns, self._basis
+    def newest(self) -> tuple[int, Odometry | None, float, float]:
+        """What a controller outside may know besides prediction and setpoint.
+
+        Time of the newest telemetry or command [ns], cloud's clock, the newest odometry, the newest
+        loop delay [s], NaN before the first, and the horizon [s].
+        """
+        return self._now_ns, self._basis, self._loop_delay, self._horizon
 
     @property
     def ready(self) -> bool:

@@ -47,6 +47,12 @@ def encode_pose(stamp_ns: int, position: Sequence[float], yaw: float) -> bytes:
     return _pack("geometry_msgs/msg/PoseStamped", header(stamp_ns), pose)
 
 
+def encode_span(stamp_ns: int, duration: float) -> bytes:
+    """Encode a sensor_msgs/TimeReference as CDR: `duration` [s] from time_ref to its stamp."""
+    begin = header(stamp_ns - round(duration * 1e9)).stamp
+    return _pack("sensor_msgs/msg/TimeReference", header(stamp_ns, ""), begin, "")
+
+
 def encode_clock(now_ns: int) -> bytes:
     """Encode a rosgraph_msgs/Clock as CDR: `now_ns` is the time [ns]."""
     return _pack("rosgraph_msgs/msg/Clock", header(now_ns).stamp)

@@ -2,6 +2,8 @@
 
 from setuptools import setup
 
+NODES = ("estimator", "predictor", "teleop", "controller")
+
 setup(
     name="cloudrc_nodes",
     version="0.1.0",
@@ -9,7 +11,8 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/cloudrc_nodes"]),
         ("share/cloudrc_nodes", ["package.xml"]),
+        ("share/cloudrc_nodes/launch", ["launch/paper.launch.py"]),
     ],
     install_requires=["setuptools"],
-    entry_points={"console_scripts": ["controller = cloudrc_nodes.controller:main"]},
+    entry_points={"console_scripts": [f"{name} = cloudrc_nodes.{name}:main" for name in NODES]},
 )

@@ -29,10 +29,11 @@ def ros2(kind, namespace=""):
     return f"{sys.executable} -m tests.bridges.node {kind} {namespace}"
 
 
-def example(namespace=""):
-    """Return the command of the example's controller."""
+def example(names="controller", namespace=""):
+    """Return the command of the example's nodes."""
     more = f" --ros-args -r __ns:=/{namespace}" if namespace else ""
-    return f"env PYTHONPATH={ROOT}/examples/ros2 {sys.executable} -m cloudrc_nodes.controller{more}"
+    path = f"PYTHONPATH={ROOT}/examples/ros2"
+    return f"env {path} {sys.executable} -m cloudrc_nodes {names}{more}"
 
 
 @pytest.fixture(autouse=True)
@@ -69,6 +70,26 @@ def test_the_papers_controller_as_a_node_flies_the_path_of_the_built_in_one_bit_
     path = true_path(recording)
     assert np.array_equal(path, true_path(built_in([])))
     assert len(path) > 1000
+
+
+def first_touch(path):
+    """Return the time at which the path is at the board [s]."""
+    return path[np.argmax(path[:, 1] > 8.1), 0] * 1e-9
+
+
+def test_estimator_predictor_teleoperation_and_controller_fly_as_nodes_and_repeat(tmp_path):
+    settings = ["cloud.controller=ros2", "cloud.predictor=last_sample"]
+    path, again = (true_path(flown(settings, example(""), tmp_path)) for _ in range(2))
+    assert np.array_equal(path, again)
+    assert first_touch(path) == pytest.approx(first_touch(true_path(built_in([]))), rel=0.03)
+
+
+@pytest.mark.parametrize("names", ["predictor", "estimator predictor", "teleop"])
+def test_each_application_may_stay_built_in(tmp_path, names):
+    settings = ["cloud.controller=ros2"]
+    settings += ["cloud.predictor=last_sample"] * ("predictor" in names)
+    path = true_path(flown(settings, example(f"{names} controller"), tmp_path))
+    assert first_touch(path) == pytest.approx(first_touch(true_path(built_in([]))), rel=0.03)
 
 
 def run(tmp_path, kind, *words, mode="virtual"):
@@ -116,7 +137,8 @@ def test_two_nodes_cannot_command(tmp_path, capsys):
 def test_a_robot_has_a_namespace(tmp_path):
     settings = [*SHORT, "cloud.controller={name: ros2, namespace: drone1}"]
     assert np.array_equal(
-        true_path(flown(settings, example("drone1"), tmp_path)), true_path(built_in(SHORT))
+        true_path(flown(settings, example(namespace="drone1"), tmp_path)),
+        true_path(built_in(SHORT)),
     )
 
 

@@ -11,7 +11,13 @@ from cloudrc.bridges.ros2 import require_ros
 from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
-from cloudrc.record.live import decode_stamped_twist, encode_clock, encode_odometry, encode_pose
+from cloudrc.record.live import (
+    decode_stamped_twist,
+    encode_clock,
+    encode_odometry,
+    encode_pose,
+    encode_span,
+)
 from cloudrc.runs.experiment import check_mode
 
 STORE = get_typestore(Stores.ROS2_KILTED)
@@ -79,6 +85,15 @@ def test_ros_reads_setpoint_and_clock():
     assert (pose.pose.position.z, pose.pose.orientation.z) == (3.0, 1.0)
     clock = STORE.deserialize_cdr(encode_clock(2_000_000_001), "rosgraph_msgs/msg/Clock")
     assert (clock.clock.sec, clock.clock.nanosec) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("stamp_ns", "begin"), [(1_500_000_000, (1, 250_000_000)), (0, (-1, 750_000_000))]
+)
+def test_ros_reads_a_delay_as_a_time_before_the_stamp(stamp_ns, begin):
+    message = STORE.deserialize_cdr(encode_span(stamp_ns, 0.25), "sensor_msgs/msg/TimeReference")
+    assert (message.time_ref.sec, message.time_ref.nanosec) == begin
+    assert message.header.stamp.nanosec == stamp_ns % 10**9
 
 
 def test_a_command_of_ros_is_read():

@@ -32,5 +32,5 @@ def require_ros() -> None:
         ros = os.environ.get("ROS_DISTRO", "this ROS 2")
         raise MissingPrerequisiteError(
             f"rclpy of {ros} cannot be used in {python}: {to_one_line(str(error))}; use cloudrc "
-            "in the Python of this ROS, with nav_msgs and geometry_msgs"
+            "in the Python of this ROS, with nav_msgs, geometry_msgs and sensor_msgs"
         ) from None

@@ -15,6 +15,7 @@ from nav_msgs.msg import Odometry
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import TimeReference
 
 from cloudrc.drivers.remote import INVALID
 from cloudrc.errors import ControllerLostError, MissingPrerequisiteError, to_one_line
@@ -25,6 +26,7 @@ from cloudrc.record.live import (
     encode_clock,
     encode_odometry,
     encode_pose,
+    encode_span,
 )
 
 RELIABLE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
@@ -33,6 +35,8 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """QoS of /clock, and of answers in real time: no message waits for an older one."""
 STAMPED, UNSTAMPED = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
 """Types of commands; cloudrc takes the second one in real time only."""
+SPANS = ("loop_delay", "horizon")
+"""Topics with the delays of a period, from `time_ref` to the stamp of the estimate."""
 ASKED_MAX = 1000
 """Number of observations whose answers cloudrc recognises by their stamp."""
 WAKE = 0.1
@@ -75,12 +79,15 @@ class RosNode:
         )
         self._names = {
             name: f"{self._node.get_namespace().rstrip('/')}/cloudrc/{name}"
-            for name in ("estimate", "odometry", "setpoint", "cmd_vel")
+            for name in ("estimate", "odometry", "setpoint", "cmd_vel", *SPANS)
         }
         publisher = self._node.create_publisher
         self._estimate = publisher(Odometry, self._names["estimate"], RELIABLE)
         self._odometry = publisher(Odometry, self._names["odometry"], RELIABLE)
         self._setpoint = publisher(PoseStamped, self._names["setpoint"], RELIABLE)
+        self._spans = {
+            name: publisher(TimeReference, self._names[name], RELIABLE) for name in SPANS
+        }
         self._clock = publisher(Clock, "/clock", NEWEST) if virtual else None
         self._waiting = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, self._context.handle)
         self._take_type(TwistStamped)
@@ -129,6 +136,9 @@ class RosNode:
         if is_new and self._odometry.get_subscription_count():
             self._measured_ns = measured[0]
             self._odometry.publish(encode_odometry(*measured))
+        for name, span in self._spans.items():
+            if span.get_subscription_count():
+                span.publish(encode_span(stamp_ns, seen[name]))
         self._setpoint.publish(
             encode_pose(stamp_ns, seen["setpoint/position"], seen["setpoint/yaw"])
         )

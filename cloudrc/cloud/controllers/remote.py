@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from math import nan
 from typing import Any, Protocol, TypeAlias
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
@@ -20,11 +21,17 @@ from cloudrc.messages import ZERO, Odometry, Setpoint
 Answer: TypeAlias = tuple[float, Sequence[Sequence[float]]]
 """Age of the answered observation [s], and the rows vx, vy, vz [m/s], world frame, yaw rate [rad/s]
 for its period and the following ones."""
-Surroundings: TypeAlias = Callable[[], tuple[int, Odometry | None]]
-"""Function that returns cloud's time [ns], and the newest odometry as it has arrived."""
+Surroundings: TypeAlias = Callable[[], tuple[int, Odometry | None, float, float]]
+"""Function that returns cloud's time [ns], the newest odometry as it has arrived, the newest loop
+delay [s], NaN before the first, and the horizon [s]."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
 ROUNDING = 1e-6
 """Part of a period by which an answer may be younger than a whole period, and count as one [1]."""
+
+
+def no_surroundings() -> tuple[int, Odometry | None, float, float]:
+    """Return that nothing is known."""
+    return 0, None, nan, 0.0
 
 
 class ControllerChannel(Protocol):
@@ -47,12 +54,12 @@ class OutsideController(Controller):
     Attributes:
         place: Where the program is: an address, or a namespace of ROS.
         start_limit: Time limit for the first answer of an episode [s].
-        surroundings: Function that returns cloud's time [ns] and the newest odometry.
+        surroundings: What there is to know besides estimate and setpoint.
     """
 
     def __init__(self, place: str, start_limit: float) -> None:
         self.place, self.start_limit = place, start_limit
-        self.surroundings: Surroundings = lambda: (0, None)
+        self.surroundings: Surroundings = no_surroundings
         self._channel: ControllerChannel | None = None
         self._period = 0.0
         self._counts: Counter[str] = Counter()
@@ -63,7 +70,7 @@ class OutsideController(Controller):
         channel: ControllerChannel,
         period: float,
         counts: Counter[str],
-        surroundings: Surroundings = lambda: (0, None),
+        surroundings: Surroundings = no_surroundings,
     ) -> None:
         """Use `channel` for the flight.
 

@@ -5,6 +5,7 @@ Source: docs/ros2.md, "The topics".
 
 from __future__ import annotations
 
+from math import isnan
 from typing import Any
 
 from cloudrc.cloud.controllers.remote import OutsideController
@@ -13,14 +14,19 @@ from cloudrc.messages import Odometry, Setpoint
 
 
 class RosController(OutsideController):
-    """Asks a node of ROS 2; it also gets the odometry as it has arrived, and cloud's time."""
+    """Asks a node of ROS 2; it also gets the odometry as it has arrived, delays and the time."""
 
     def observe(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> dict[str, Any]:
         """Return what the node gets to know; `dt` is the period [s]."""
-        now_ns, newest = self.surroundings()
-        # A message of odometry has the fields of `Odometry`, in their order.
-        measured = None if newest is None else tuple(newest)
-        return {**super().observe(estimate, setpoint, dt), "now_ns": now_ns, "measured": measured}
+        now_ns, newest, loop_delay, horizon = self.surroundings()
+        return {
+            **super().observe(estimate, setpoint, dt),
+            "now_ns": now_ns,
+            # A message of odometry has the fields of `Odometry`, in their order.
+            "measured": None if newest is None else tuple(newest),
+            "loop_delay": 0.0 if isnan(loop_delay) else loop_delay,
+            "horizon": horizon,
+        }
 
 
 def build(namespace: RosNamespace = "", start_limit_s: Positive = 60.0) -> RosController:
