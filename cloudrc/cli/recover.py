@@ -19,7 +19,7 @@ examples:
   cloudrc recover runs/latest/world.mcap
   cloudrc recover torn.mcap --to clean.mcap -o json
 
-exit codes: 0 complete, 1 some data is lost (printed), 2 nothing readable"""
+exit codes: 0 complete, 1 some data is lost (printed), 2 nothing readable, or still in flight"""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,8 +35,10 @@ def execute(options: argparse.Namespace) -> int:
     require("a recovery", ("record",))
     from cloudrc.record.recovery import recover
     from cloudrc.report.attached import attached_views
+    from cloudrc.runs.session import refuse_under_way
 
     source: Path = options.file
+    refuse_under_way(source.resolve().parent)
     target = options.to or source.parent / f"{source.stem}.recovered{source.suffix}"
     if os.path.lexists(target):
         raise BadInputError(f"{target}: already there; name another file with --to")

@@ -16,6 +16,7 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
 
+from cloudrc.drivers import local
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.recovery import recover
@@ -472,6 +473,16 @@ def test_a_recording_without_messages_is_not_recovered(path):
     with pytest.raises(BadInputError, match="holds no readable message: none is in it; nothing"):
         recover(write(path, []), new := path.with_name("new.mcap"))
     assert not new.exists()
+
+
+def test_a_recording_of_a_session_in_flight_is_not_recovered(path, monkeypatch, refused):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(path.parent))
+    path.write_bytes(WHOLE[: CHUNKS[0][1] + 100])
+    (path.parent / local.JOURNAL_FILE).touch()
+    with local.announced(path.parent, ""):
+        said = refused("recover", path)
+    assert f"{path.parent}: the session has not ended; end it: cloudrc down" in said
+    assert sorted(path.parent.glob("*.mcap")) == [path]
 
 
 def test_the_command_says_what_is_kept_and_lost(path, call, refused):
