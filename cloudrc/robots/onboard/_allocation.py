@@ -60,13 +60,15 @@ class Allocation:
         self._columns = list(zip(thrust.tolist(), *turns.T.tolist(), strict=True))
         self._limits = list(zip(frame.low.tolist(), frame.high.tolist(), strict=True))
         self._lifts = abs(thrust) > TINY * abs(thrust).max()
+        self._gravity = frame.gravity
 
     def allocate(self, thrust: float, roll: float, pitch: float, yaw: float) -> Commands:
         """Return the controls that make an acceleration and angular accelerations.
 
         `thrust` is the acceleration along z [m/s^2]; `roll`, `pitch` and `yaw` are the angular
         accelerations about x, y and z [rad/s^2]. If a control exceeds its range, the turn about x
-        and y is kept first, then the thrust, then the turn about z.
+        and y is kept first, then the thrust, then the turn about z. For a turn, the thrust changes
+        at most to that of hover: else large turns would lift the robot, whatever it wants.
         """
         commands = tuple(
             [
@@ -86,7 +88,8 @@ class Allocation:
         interval, and a shorter turn makes the intervals overlap.
         """
         turns = [turn_x * roll + turn_y * pitch for _, turn_x, turn_y, _ in self._columns]
-        shorter, intervals = 1.0, []
+        thrusts = min(thrust, self._gravity), max(thrust, self._gravity)
+        shorter, intervals = 1.0, [(*thrusts, 0.0)]
         for (lift, *_), turn, limits, lifts in zip(
             self._columns, turns, self._limits, self._lifts, strict=True
         ):

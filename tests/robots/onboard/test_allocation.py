@@ -55,9 +55,18 @@ def test_a_turn_that_is_too_fast_keeps_its_direction(parts):
     controls = allocation.allocate(GRAVITY, 9e3, -4e3, 1e3)
     made = accelerations(controls)
     assert made[2] / made[1] == pytest.approx(-4.0 / 9.0)
-    assert made[1] > 0.8 * allocation.turn_max
+    assert made[1] > 0.6 * allocation.turn_max
     assert (controls >= frame.low).all()
     assert (controls <= frame.high).all()
+
+
+def test_a_turn_lifts_no_robot_that_wants_to_sink(parts):
+    _, allocation, accelerations = parts
+    for thrust in (0.0, 0.3 * GRAVITY, GRAVITY):
+        made = accelerations(allocation.allocate(thrust, 9e3, -9e3, 0.0))
+        assert thrust - 1e-6 <= made[0] <= GRAVITY + 1e-6
+    made = accelerations(allocation.allocate(allocation.acceleration_max, 9e3, 9e3, 0.0))
+    assert made[0] >= GRAVITY - 1e-6
 
 
 def test_any_wish_leads_to_controls_within_their_ranges(parts):

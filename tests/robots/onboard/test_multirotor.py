@@ -5,6 +5,7 @@ from math import radians
 import numpy as np
 import pytest
 
+from cloudrc.config.robot import find_robot
 from cloudrc.robots.onboard import multirotor
 from tests.robots.onboard.conftest import (
     DT,
@@ -99,6 +100,14 @@ def test_saturation_does_not_turn_it_over(flight):
     assert flight.tilt < 40.0
     flight.fly(5.0)
     assert flight.speed < 0.02
+
+
+def test_a_short_climb_ends_at_rest():
+    flight = Flight(find_robot("x2").model.read_text().replace('"base">', '"base" pos="0 0 2">', 1))
+    flight.fly(0.5)
+    flight.fly(0.3, (2.0, -2.0, 3.0))
+    flight.fly(3.0)
+    assert flight.speed < 0.1
 
 
 def test_it_rights_itself_from_upside_down():
