@@ -31,7 +31,7 @@ LOOK_PERIOD = 0.1
 def companion(command: str, folder: Path, url: str = "") -> Iterator[Callable[[], bool]]:
     """Run `command` during the block; its output goes to `LOG_FILE` in `folder`.
 
-    The yielded function returns whether the program has ended.
+    The yielded function returns whether the program and all its children have ended.
 
     With `url`, the address of a policy's server, first wait until somebody listens there. At the
     end of the block, the program and all its children are ended.
@@ -46,7 +46,7 @@ def companion(command: str, folder: Path, url: str = "") -> Iterator[Callable[[]
     try:
         if url:
             _wait_for(url, program, log)
-        yield lambda: program.poll() is not None
+        yield lambda: _has_ended(program)
     except ControllerLostError as error:
         if (code := program.poll()) is None:
             raise
@@ -111,9 +111,21 @@ def _listens(url: str) -> bool:
 
 
 def _how(code: int, log: Path) -> str:
-    said = log.read_text(errors="replace").strip().splitlines()[-1]
+    _, *said = log.read_text(errors="replace").strip().splitlines()  # without the command
     how = f"signal {-code}" if code < 0 else f"exit code {code}"
-    return f"the program of --with has ended ({how}): {to_one_line(said)}; see {log}"
+    text = f": {to_one_line(said[-1])}" if said else " without a word"
+    return f"the program of --with has ended ({how}){text}; see {log}"
+
+
+def _has_ended(program: subprocess.Popen[bytes]) -> bool:
+    """Return whether nothing of the program's group runs: a program may leave its children."""
+    if program.poll() is None:
+        return False
+    try:
+        os.killpg(program.pid, 0)
+    except ProcessLookupError:
+        return True
+    return False
 
 
 def _end(program: subprocess.Popen[bytes]) -> None:

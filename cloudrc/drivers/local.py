@@ -220,6 +220,7 @@ class LocalRun:
         *,
         remote: bool = False,
         lost: Callable[[list[Record]], None] = lambda records: None,
+        gone: Callable[[], bool] = lambda: False,
     ) -> None:
         """Prepare a run in `folder`; start no process yet.
 
@@ -232,9 +233,10 @@ class LocalRun:
         `session` gets the API's address and a mapping: process -> HOST:PORT of its metrics.
 
         With `remote`, a sixth process asks a controller outside. `lost` gets the same records as
-        `see`, and raises a ControllerLostError if this controller is lost.
+        `see`, and raises a ControllerLostError if this controller is lost. `gone` returns whether
+        the user's program beside the flight has ended.
         """
-        self._remote, self._lost = remote, lost
+        self._remote, self._lost, self._gone = remote, lost, gone
         self._folder, self._see, self._session = folder, see, session
         self._metrics: dict[str, str] = {}
         self.announcement = contextlib.ExitStack()
@@ -308,7 +310,7 @@ class LocalRun:
         self._wait_until_ready()
         if session:
             session(url, self._metrics)
-        self._watch(limit)
+        self._watch(limit, sockets)
 
     def _start(self, name: str, *words: str, **options: object) -> None:
         options["config"] = self._folder / "config.yaml"
@@ -330,7 +332,7 @@ class LocalRun:
             self._see(self._listen())
             self._check_alive()
 
-    def _watch(self, limit: float) -> None:
+    def _watch(self, limit: float, sockets: Path) -> None:
         deadline, paused = Deadline(limit, PAUSE), 0.0
         teleop = next(child for child in self._children if child.name == "teleop")
         heard_from = time.monotonic()
@@ -338,6 +340,8 @@ class LocalRun:
             records = self._listen()
             self._see(records)
             self._lost(records)
+            if self._remote and self._gone():
+                _tell_ended(sockets)
             now = time.monotonic()  # before the deadline looks for a pause: `now` contains none
             if deadline.passed():
                 raise TimedOutError(f"the flight was ended after {limit:g} s, its limit")
@@ -392,6 +396,12 @@ class LocalRun:
             child.process.kill()
             child.process.communicate()
         self._selector.close()
+
+
+def _tell_ended(sockets: Path) -> None:
+    from cloudrc.drivers.remote import tell_ended  # needs an extra
+
+    tell_ended(sockets)
 
 
 def start_process(

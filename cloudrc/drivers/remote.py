@@ -12,7 +12,7 @@ import select
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -35,6 +35,8 @@ VIRTUAL_LIMIT = 2.0
 HOLD = 0.2
 """Time after the end of an answer's rows for which its last row is flown, in real time [s]."""
 HOLD_NS = round(HOLD * 1e9)
+ENDED_LIMIT = 0.5
+"""Time limit for the first answer if the program of `--with` has ended, in real time [s]."""
 SILENCE = 5.0
 """Time without a valid answer after which the flight ends, in real time [s]."""
 PAUSE_NS = 100_000_000
@@ -113,7 +115,7 @@ class RemoteLink:
         """
         self._peer, self._period_ns = peer, round(period * 1e9)
         self._start_limit = start_limit
-        self._episode, self._trouble = 0, ""
+        self._episode, self._trouble, self._has_ended = 0, "", False
         self._forget()
 
     def _forget(self) -> None:
@@ -146,7 +148,8 @@ class RemoteLink:
         return None
 
     def _take(self, message: dict[str, Any]) -> None:
-        if message["episode"] != self._episode:
+        self._has_ended |= "ended" in message
+        if message.get("episode") != self._episode:
             return
         if text := message.get("invalid"):
             raise ControllerLostError(INVALID, text)
@@ -157,7 +160,9 @@ class RemoteLink:
 
     def _check_silence(self, silence: float) -> None:
         """Raise a ControllerLostError if no answer was flown for `silence` [s], which is long."""
-        limit = self._start_limit if self._newest is None else SILENCE
+        limit = SILENCE
+        if self._newest is None:
+            limit = ENDED_LIMIT if self._has_ended else self._start_limit
         if silence > limit:
             why = f": {self._trouble}" if self._trouble else "; is the program too slow?"
             text = f"the remote controller gave no answer in time for {limit:g} s{why}"
@@ -226,6 +231,13 @@ class RemoteDriver:
             start_limit=self._start_limit,
             answer_limit=SILENCE,
         )
+
+
+def tell_ended(folder: Path) -> None:
+    """Tell cloud that the program of `--with` has ended; `folder` is as in `sockets_of`."""
+    cloud, _ = sockets_of(folder)
+    with closing(UnixDatagrams(folder / "supervisor.sock", cloud)) as peer:
+        peer.send_data(pack({"ended": True}))
 
 
 def sockets_of(folder: Path) -> tuple[Path, Path]:

@@ -69,7 +69,7 @@ def fly(
             if mode == "virtual":
                 flown = _record_virtual(experiment, folder, see, gone)
             else:
-                flown = _record_local(experiment, folder, see, session=session)
+                flown = _record_local(experiment, folder, see, gone, session=session)
             recording, resolved, run = stack.enter_context(flown)
             run = replace(run, files=files)
             return write_report(folder, recording, resolved, run, own=own, page=page)
@@ -161,22 +161,18 @@ def _record_local(
     experiment: ResolvedExperiment,
     folder: Path,
     see: See,
+    gone: Callable[[], bool],
     session: Session | None = None,
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
     """Fly in real time; yield the merged recording, the experiment and facts about the run.
 
-    With `session`, as in `fly`, yield those of the session's last mission.
+    With `session`, as in `fly`, yield those of its last mission. `gone` is that of `LocalRun`.
     """
     from cloudrc.robots.build import describe_steps
 
     prepare_link(folder / LINK_FOLDER, experiment)
-    local = LocalRun(
-        folder,
-        _interruptible(see),
-        session=session,
-        remote=experiment.cloud.controller.name in OUTSIDE,
-        lost=_raise_if_lost,
-    )
+    see, remote = _interruptible(see), experiment.cloud.controller.name in OUTSIDE
+    local = LocalRun(folder, see, session, remote=remote, lost=_raise_if_lost, gone=gone)
     broken, interrupted = None, True
     try:
         local.fly(inf if session else assembly.flight_limit(experiment))

@@ -121,9 +121,10 @@ def test_a_wrong_node_ends_the_flight_with_one_line(tmp_path, capsys, kind, code
     assert text in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_a_program_that_ends_at_once_is_not_waited_for(tmp_path, capsys):
-    code, _ = run(tmp_path, f"{sys.executable} -m no_such_node")
-    assert code == 5
+@pytest.mark.parametrize("mode", ["virtual", "local"])
+def test_a_program_that_ends_at_once_is_not_waited_for(tmp_path, capsys, mode):
+    code, report = run(tmp_path, f"{sys.executable} -m no_such_node", mode=mode)
+    assert (code, report["failures"][0]["code"]) == (5, "controller_silent")
     assert "No module named no_such_node" in capsys.readouterr().err.splitlines()[-1]
 
 

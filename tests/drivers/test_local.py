@@ -170,7 +170,7 @@ def test_a_pause_at_any_point_of_a_turn_ends_no_flight(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "_check_alive", stand_still)
     monkeypatch.setattr(local, "Deadline", partial(Deadline, clock=lambda: now))
     monkeypatch.setattr(local, "time", SimpleNamespace(monotonic=lambda: now))
-    run._watch(inf)
+    run._watch(inf, tmp_path)
     assert run.notes[0].startswith("the supervisor of this run stood still for 10.")
 
 

@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -79,6 +80,17 @@ def test_a_program_and_its_children_end_with_the_block_even_if_they_ignore_sigte
         os.kill(child, 0)
     stat = Path(f"/proc/{child}/stat")
     wait_until(lambda: not stat.exists() or stat.read_text().split()[2] == "Z", 5)
+
+
+@pytest.mark.process
+def test_a_program_has_ended_once_its_children_have(tmp_path):
+    with companion("sh -c 'exec sleep 0 & exec sleep 600'", tmp_path) as gone:
+        assert not gone()
+    with companion("true", tmp_path) as gone:
+        wait_until(gone, 5)
+    with companion("sh -c 'sleep 600 & exit 3'", tmp_path) as gone:
+        time.sleep(0.3)
+        assert not gone()
 
 
 @pytest.mark.parametrize(

@@ -265,6 +265,24 @@ def test_the_first_answer_may_take_until_the_start_limit(monkeypatch):
         flight.step(3)
 
 
+def test_a_program_that_has_ended_before_its_first_answer_is_not_waited_for(flight):
+    flight.peer.arrived.append({"ended": True})
+    flight.step(40)
+    with pytest.raises(ControllerLostError, match=r"for 0\.5 s") as raised:
+        flight.step(20)
+    assert raised.value.code == "controller_silent"
+
+
+def test_a_program_that_has_ended_later_may_be_followed_by_another_one_within_5_s(flight):
+    flight.step()
+    flight.answer(1.0)
+    flight.step()
+    flight.peer.arrived.append({"ended": True})
+    flight.step(500)
+    flight.answer(2.0)
+    assert flight.step() == [2.0]
+
+
 def test_a_wrong_answer_in_real_time_ends_the_flight_at_once(flight):
     flight.step()
     flight.answer(invalid="ws://h:1: 'actions' has values that are not finite")

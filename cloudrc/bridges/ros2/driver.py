@@ -12,7 +12,6 @@ from collections.abc import Callable
 from typing import Any
 
 from cloudrc.bridges.ros2.node import WAKE, RosAnswer, RosNode
-from cloudrc.drivers.remote import SILENCE
 from cloudrc.drivers.teleop import UnixDatagrams
 from cloudrc.errors import ControllerLostError
 from cloudrc.policy.codec import pack, unpack
@@ -70,7 +69,7 @@ class RosDriver:
         if word := self._node.check():
             self._tell(word)
         if silent:
-            self._send({"trouble": self._node.silence(SILENCE)})
+            self._send({"trouble": self._node.silence()})
 
     def _answer(self, answer: RosAnswer) -> dict[str, Any]:
         """Return what cloud is told about an answer."""

@@ -237,8 +237,8 @@ class RosNode:
                     f"which cannot match cloudrc's {_words(own)}"
                 )
 
-    def silence(self, limit: float) -> str:
-        """Say why there was no answer for `limit` [s]."""
+    def silence(self, limit: float = 0.0) -> str:
+        """Say why there was no answer, for `limit` [s] if it is given."""
         domain = f"ROS domain {self._context.get_domain_id()} (ROS_DOMAIN_ID)"
         estimate = self._names["estimate"]
         heard = self._node.get_subscriptions_info_by_topic(estimate)
@@ -252,7 +252,8 @@ class RosNode:
         if not self._publishers():
             names = " and ".join(sorted({_name(info) for info in heard}))
             return f"no node publishes {topic} in {domain}; {names} subscribes to {estimate}"
-        return f"{self.who()}: no answer on {topic} within {limit:g} s"
+        waited = f" within {limit:g} s" if limit else ""
+        return f"{self.who()}: no answer on {topic}{waited}"
 
 
 def _ignore(data: bytes) -> None:
