@@ -23,7 +23,7 @@ def waypoint(**more):
          "waypoints.1.position_m", 1, "beyond the fence"),
         (waypoint(position_m=[-0.4, 2.0, 0.8]), "waypoints.0.position_m", 0, "wall of pipe"),
         (waypoint(position_m=[0]), "waypoints.0.position_m.1", 0, "is missing"),
-        (waypoint(position_m=[0, 0]), "waypoints.0.position_m", 0, "beyond the fence"),
+        (waypoint(position_m=[0, 0]), "waypoints.0.position_m", 0, "needs a height"),
         (waypoint(position_m=[0, 0, "high"]), "waypoints.0.position_m.2", 0, "be a number [m]"),
         (waypoint(dwell=1), "waypoints.0.dwell", 0, "did you mean dwell_s"),
         (waypoint(tolerance_m=0), "waypoints.0.tolerance_m", 0, "> 0"),
