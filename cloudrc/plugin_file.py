@@ -4,6 +4,9 @@ Each plug-in becomes a package of its own, whose folder is that of the file: two
 have a module `helper` beside them, and `sys.path` stays as it is. The package's modules get their
 own import statement, which looks beside the plug-in first, as Python does for a script. So a module
 beside the plug-in may be named like one of Python, and only the plug-in sees it.
+
+The name of the package has the path of the file: a process that a plug-in starts, for example by a
+ProcessPoolExecutor, knows only this name, and imports the plug-in by it.
 """
 
 from __future__ import annotations
@@ -15,8 +18,7 @@ import os
 import sys
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator, Mapping, Sequence
-from hashlib import sha256
-from importlib.abc import MetaPathFinder
+from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from io import BytesIO
@@ -28,8 +30,10 @@ from typing import Any, TypeAlias
 from cloudrc.errors import PlacedError
 from cloudrc.patience import telling_if_slow
 
-PREFIX = "cloudrc_plugin_"
-"""Beginning of the names of plug-ins' packages."""
+PREFIX = f"{__name__}."
+"""Beginning of the names of plug-ins' packages; the path of the file in hexadecimal follows."""
+__path__: list[str] = []
+"""Tells Python that this module contains others: plug-ins' packages."""
 OWN = "cloudrc"
 """Name that always means this package: a plug-in may lie in the folder of its sources."""
 
@@ -65,17 +69,12 @@ def _state(path: Path) -> _State:
 
 def _execute(path: Path) -> ModuleType:
     file = path.resolve()
-    name = PREFIX + sha256(str(file).encode(errors="surrogateescape")).hexdigest()[:16]
+    name = PREFIX + os.fsencode(file).hex()
     for known in [each for each in sys.modules if f"{each}.".startswith(f"{name}.")]:
         del sys.modules[known]
     importlib.invalidate_caches()  # a file may be new
-    if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
-        sys.meta_path.insert(0, _Finder())  # before the finder of paths
-    package = module_from_spec(ModuleSpec(name, None, is_package=True))
-    package.__path__ = [str(file.parent)]
-    package.__dict__["import_beside"] = _ImportStatement(name, str(file.parent))
-    sys.modules[name] = package
-    inner = f"{name}.{file.stem.replace('.', '_')}"
+    importlib.import_module(name)
+    inner = _inner(name, file)
     spec = spec_from_file_location(inner, path, loader=_Loader(inner, str(path)))
     assert spec is not None
     assert spec.loader is not None
@@ -83,6 +82,11 @@ def _execute(path: Path) -> ModuleType:
     sys.modules[inner] = module  # dataclasses look up their module there
     spec.loader.exec_module(module)
     return module
+
+
+def _inner(package: str, file: Path) -> str:
+    """Return the name of the module of a plug-in's `file` in its package."""
+    return f"{package}.{file.stem.replace('.', '_')}"
 
 
 class _ImportStatement:
@@ -133,7 +137,7 @@ class _Loader(SourceFileLoader):
 
     def exec_module(self, module: ModuleType) -> None:
         """Execute a module."""
-        package = sys.modules[module.__name__.partition(".")[0]]
+        package = sys.modules[_package_of(module.__name__)]
         own = {**vars(builtins), "__import__": package.__dict__["import_beside"]}
         module.__dict__["__builtins__"] = own
         super().exec_module(module)
@@ -162,8 +166,17 @@ def _check_encoding(source: bytes, name: str) -> None:
         ) from None
 
 
+class _PackageLoader(Loader):
+    """Gives the package of a plug-in its import statement."""
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Set the import statement, which the modules of the package use."""
+        statement = _ImportStatement(module.__name__, str(module.__path__[0]))
+        module.__dict__["import_beside"] = statement
+
+
 class _Finder(MetaPathFinder):
-    """Finds the modules of plug-ins' packages, and no others."""
+    """Finds the packages of plug-ins and their modules, and no others."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -171,10 +184,26 @@ class _Finder(MetaPathFinder):
         """Find a module by its full name in the folders `path` of its package."""
         if path is None or not fullname.startswith(PREFIX):
             return None
-        spec = PathFinder.find_spec(fullname, path, target)
-        if spec is not None and isinstance(spec.loader, SourceFileLoader):
-            spec.loader = _Loader(fullname, spec.loader.path)
-        return spec
+        package = _package_of(fullname)
+        file = Path(os.fsdecode(bytes.fromhex(package.removeprefix(PREFIX))))
+        if fullname == package:
+            spec = ModuleSpec(package, _PackageLoader(), is_package=True)
+            spec.submodule_search_locations = [str(file.parent)]
+            return spec
+        if fullname == _inner(package, file):
+            return spec_from_file_location(fullname, file, loader=_Loader(fullname, str(file)))
+        found = PathFinder.find_spec(fullname, path, target)
+        if found is not None and isinstance(found.loader, SourceFileLoader):
+            found.loader = _Loader(fullname, found.loader.path)
+        return found
+
+
+def _package_of(module: str) -> str:
+    """Return the name of the plug-in's package that contains a module, or that is the module."""
+    return PREFIX + module.removeprefix(PREFIX).partition(".")[0]
+
+
+sys.meta_path.insert(0, _Finder())  # before the finder of paths
 
 
 def sources(path: Path) -> list[Path]:

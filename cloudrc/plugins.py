@@ -21,6 +21,7 @@ import importlib
 import inspect
 import os
 import pkgutil
+import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator
@@ -94,7 +95,9 @@ class Found:
     @property
     def is_shipped(self) -> bool:
         """Whether it is a module of cloudrc, and not code of a user."""
-        return isinstance(self._target, ModuleType) and self._target.__name__.startswith("cloudrc.")
+        name = str(getattr(self._target, "__name__", ""))
+        is_module = isinstance(self._target, ModuleType)
+        return is_module and name.startswith("cloudrc.") and not name.startswith(PREFIX)
 
     @property
     def builder(self) -> Any:
@@ -390,7 +393,7 @@ def shorten(value: Any) -> str:
     """Describe a value in a short text: its type and, as far as it has one, its representation."""
     shown = ""
     with suppress(Exception):  # a user's __repr__ may raise, and so does that of a huge integer
-        shown = to_one_line(repr(value))[:SHOWN_MAX]
+        shown = to_one_line(re.sub(rf"{PREFIX}\w+\.", "", repr(value)))[:SHOWN_MAX]
     return f"{type(value).__name__} {shown}".strip()
 
 

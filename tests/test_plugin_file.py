@@ -1,6 +1,7 @@
 """Modules beside a plug-in: its import statements find them, and nobody else does."""
 
 import logging
+import pickle
 import statistics
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ from textwrap import dedent
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.plugin_file import load_file, sources
+from cloudrc.plugin_file import PREFIX, load_file, sources
 from cloudrc.plugins import find
 
 
@@ -236,6 +237,19 @@ def test_a_plugin_or_a_module_beside_it_that_changes_after_a_look_is_executed_an
     load_file(folder / "plugin.py", look=True)
     write(helper="value = 12")
     assert load_file(folder / "plugin.py").value == 12
+
+
+@pytest.mark.parametrize("name", ["plugin", "my-plugin", "my.plugin"])
+def test_a_process_that_a_plugin_starts_can_import_it_by_its_name(write, name):
+    """A ProcessPoolExecutor sends functions by the names of their modules."""
+    folder = write(
+        plugin="from helper import value\ndef f(x): return x + value", helper="value = 2"
+    )
+    path = (folder / "plugin.py").rename(folder / f"{name}.py")
+    sent = pickle.dumps(load_file(path).f)
+    for known in [each for each in sys.modules if each.startswith(PREFIX)]:
+        del sys.modules[known]
+    assert pickle.loads(sent)(1) == 3  # noqa: S301
 
 
 def test_a_plugin_whose_import_takes_long_is_named(write, monkeypatch):

@@ -51,6 +51,7 @@ class HandIn:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._built: dict[str, Any] = {}
+        self._process = os.getpid()
 
     def answer(self, calls: Iterable[Call]) -> tuple[Any, str]:
         """Carry out calls in order; return the result of the last one, and the first error or "".
@@ -64,6 +65,8 @@ class HandIn:
                 result = self._carry_out(name, part, method, arguments)
             except BaseException as error:  # a student's file may raise anything
                 first = first or self._explain(error, part)
+            if os.getpid() != self._process:  # a file called os.fork(): one process answers
+                os._exit(0)
         return result, first
 
     def _carry_out(self, name: str, part: str, method: str, arguments: Any) -> Any:

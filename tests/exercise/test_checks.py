@@ -100,6 +100,20 @@ def test_whatever_a_file_does_the_other_parts_are_scored(tmp_path):
     assert {row["valid"] for row in rows} == {True}
 
 
+def test_a_process_that_a_file_forks_does_not_answer(monkeypatch):
+    """Else its answer was taken for that of the file which was called next."""
+
+    def leave(status):
+        raise SystemExit(status)
+
+    hand_in, calls = HandIn(SOLUTION), [("predictor 1", "build", {})]
+    assert hand_in.answer(calls) == (None, "")
+    monkeypatch.setattr(os, "_exit", leave)
+    monkeypatch.setattr(os, "getpid", lambda: -1)
+    with pytest.raises(SystemExit):
+        hand_in.answer(calls)
+
+
 @pytest.mark.process
 def test_a_wait_costs_no_processor_time_and_ends_with_a_score_that_is_not_valid(tmp_path):
     """A loaded computer gives a right hand-in too little processor time, which costs no points."""
