@@ -88,14 +88,42 @@ def load_scene(name: str, corners: Corners | None = None) -> Scene:
     is_shipped = not name.endswith(".xml")
     path = SCENES / f"{name}.xml" if is_shipped else Path(name)
     try:
-        scene = _read(ElementTree.parse(path).getroot(), path, is_shipped=is_shipped)
+        scene = _read(_parse(path), path, is_shipped=is_shipped)
     except OSError as error:
         raise BadInputError(f"scene {path.name}: cannot be read: {error.strerror}") from error
     except ElementTree.ParseError as error:
         raise BadInputError(f"scene {path.name}: not readable as XML: {error}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise BadInputError(f"scene {path.name}: {error}") from None
     return replace(scene, own_fence=Fence(*corners)) if corners else scene
+
+
+def _parse(path: Path) -> ElementTree.Element:
+    """Read an MJCF file; each `<include>` has become the content of its file, as in MuJoCo.
+
+    A file that is missing or included twice is left out: MuJoCo refuses it with its reason.
+    """
+    root, known = ElementTree.parse(path).getroot(), {path}
+
+    def expand(element: ElementTree.Element, folder: Path) -> None:
+        children = list[ElementTree.Element]()
+        for child in element:
+            if child.tag != "include":
+                expand(child, folder)
+                children.append(child)
+                continue
+            # Where MuJoCo looks depends on its version.
+            places = [each / child.get("file", "") for each in (folder, path.parent)]
+            file = next((each for each in places if each.is_file()), path)
+            if file not in known:
+                known.add(file)
+                content = ElementTree.parse(file).getroot()
+                expand(content, file.parent)
+                children += content
+        element[:] = children
+
+    expand(root, path.parent)
+    return root
 
 
 def _read(root: ElementTree.Element, path: Path, *, is_shipped: bool) -> Scene:

@@ -34,6 +34,26 @@ def test_a_scene_of_ones_own_is_read(tmp_path):
     assert scene.spawn == (1, 2, 3)
 
 
+def test_spawn_and_numbers_of_included_files_count(tmp_path):
+    (tmp_path / "parts").mkdir()
+    frame = '<mujocoinclude><frame name="spawn" pos="1 2 3"/></mujocoinclude>'
+    (tmp_path / "parts" / "spawn.xml").write_text(frame)
+    inner = '<mujocoinclude><include file="spawn.xml"/></mujocoinclude>'
+    (tmp_path / "parts" / "inner.xml").write_text(inner)
+    number = '<custom><numeric name="floor" data="-.1"/></custom>'
+    world = '<worldbody><include file="parts/inner.xml"/></worldbody>'
+    (tmp_path / "room.xml").write_text(f"<mujoco>{number}{world}</mujoco>")
+    (tmp_path / "mine.xml").write_text('<mujoco><include file="room.xml"/></mujoco>')
+    scene = load_scene(str(tmp_path / "mine.xml"))
+    assert (scene.spawn, scene.floor) == ((1, 2, 3), -0.1)
+
+
+def test_a_file_that_includes_itself_or_is_missing_is_left_to_mujoco(tmp_path):
+    text = '<mujoco><include file="mine.xml"/><include file="none.xml"/></mujoco>'
+    (tmp_path / "mine.xml").write_text(text)
+    assert load_scene(str(tmp_path / "mine.xml")).spawn == (0, 0, 0.1)
+
+
 @pytest.mark.parametrize(
     ("numbers", "reason"),
     [
