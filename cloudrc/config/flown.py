@@ -77,7 +77,8 @@ def _solid(tree: dict[str, Any]) -> Solid:
         raise ValueError(f"unknown shape {shape!r}")
     faces = None
     if shape == "hull":
-        normals, offsets, edges = tree["faces"]
+        normals, offsets, *rest = tree["faces"]
+        edges = rest[0] if rest else []  # old recordings have none
         faces = _array(normals, -1, 3), _array(offsets, len(normals)), _array(edges, -1, 2, 3)
     return Solid(
         name=str(tree["name"]),

@@ -43,6 +43,7 @@ class Solid:
     size: Array  # [m], shape (3,); without meaning for planes and hulls
     radius: float  # of a ball around `centre` that contains the solid [m]
     # Of a hull: normals (m, 3) and offsets (m,) [m] of its faces, ends of its edges (k, 2, 3) [m].
+    # A hull of an old recording has no edges: k = 0, and the distance beside an edge is too small.
     faces: tuple[Array, Array, Array] | None = None
 
     def distance(self, points: Array) -> Array:
@@ -131,7 +132,8 @@ def _to_hull(solid: Solid, local: Array) -> Array:
         found = heights.max(axis=1)
         below = some - found[:, None] * normals[highest]
         beside = (found > 0.0) & ((below @ normals.T - offsets).max(axis=1) > _ON_HULL)
-        found[beside] = _to_edges(edges, some[beside])
+        if len(edges):
+            found[beside] = _to_edges(edges, some[beside])
         distance[start : start + rows] = found
     return distance.reshape(local.shape[:-1])
 

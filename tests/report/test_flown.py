@@ -148,6 +148,20 @@ def test_robot_and_scene_are_kept_exactly(flown):
     assert read.steered == flown.steered
 
 
+def test_a_mesh_of_an_old_recording_has_no_edges_and_is_read(flown):
+    tree = json.loads(flown.to_bytes())
+    for solid in tree["scene"]["solids"]:
+        solid["faces"] = solid["faces"] and solid["faces"][:2]
+    places = np.random.default_rng(1).uniform(3, 7, (50, 3))
+    distances = []
+    for data in (json.dumps(tree).encode(), flown.to_bytes()):
+        solids = FlownWorld.from_bytes(data).scene.solids
+        distances += [each.distance(places) for each in solids if each.shape == "hull"]
+    old, exact = distances
+    assert (old <= exact).all()
+    assert old.max() > 1.0
+
+
 @pytest.mark.parametrize("data", [b"", b"[]", b"{}", b'{"scene": 1, "hull": null, "planar": 0}'])
 def test_a_damaged_file_is_refused(data):
     with pytest.raises(BadInputError, match="is not readable"):
