@@ -152,7 +152,7 @@ def _unmet_goals(evidence: Evidence) -> Iterator[FlightFailure]:
     ending, end = evidence.ending, evidence.end
     if ending.code != "done":
         yield FlightFailure(*ending, *end)
-    if ending.code == "not_started":
+    if ending.code in ("not_started", "onboard_failed"):  # then the goals say nothing more
         return
     if evidence.reached < evidence.waypoints:
         text = f"{evidence.reached} of {evidence.waypoints} waypoints reached"

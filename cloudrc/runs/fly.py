@@ -130,10 +130,10 @@ def _record_virtual(
             writer.attach(name, data)
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
-            writer.write(heapq.merge(from_world, from_cloud, key=attrgetter("stamp_ns")))
+            records = [*heapq.merge(from_world, from_cloud, key=attrgetter("stamp_ns"))]
+            writer.write(records)
             store.add(from_world, from_cloud)
-            see(from_cloud)
-            see(from_world)
+            see(records)
 
         try:
             assembly.fly(experiment, sink, gone=gone)

@@ -3,9 +3,13 @@
 import pytest
 
 import cloudrc
+from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState
+from cloudrc.records import Fault, MissionEvent
+from cloudrc.runs.fly import fly as fly_into_folder
+from cloudrc.runs.folder import run_folder
 from cloudrc.world.onboard import Direct
 from cloudrc.world.watched import OnboardFailedError, WatchedActuators
 
@@ -77,14 +81,24 @@ def accelerator():
 
 
 @pytest.fixture
-def fly(tmp_path):
-    """Return a function that flies an x2 with an onboard controller of one's own."""
+def own(tmp_path):
+    """Return a function that writes an x2 with an onboard controller of one's own."""
     model = find_robot("x2").model.read_text()
 
-    def with_source(source, mission=HOVER):
+    def write(source):
         (tmp_path / "robot.xml").write_text(model)
         (tmp_path / "robot.yaml").write_text("onboard: ./own.py")
         (tmp_path / "own.py").write_text(source)
+
+    return write
+
+
+@pytest.fixture
+def fly(own, tmp_path):
+    """Return a function that flies an x2 with an onboard controller of one's own."""
+
+    def with_source(source, mission=HOVER):
+        own(source)
         return cloudrc.fly("hover", mission | {"world.robot": str(tmp_path)})
 
     return with_source
@@ -111,7 +125,18 @@ def test_a_controller_that_fails_in_flight_ends_it_with_onboard_failed(fly, what
     assert "own.py:" in text
     assert "\n" not in text
     assert flight["/guard"]["state"][-1] == GuardState.ESTOP
-    assert [each.code for each in flight.failures].count("onboard_failed") == 1
+    assert [each.code for each in flight.failures] == ["onboard_failed"]
+
+
+def test_what_a_flight_tells_stands_in_the_order_of_time(own, tmp_path):
+    own(FAILS.replace("{what}", "raise KeyError"))
+    told = []
+    experiment = load_experiment("hover", [f"world.robot={tmp_path}", "world.scene=empty"])
+    folder = run_folder(experiment, "virtual", tmp_path / "run")
+    fly_into_folder(experiment, "virtual", folder, told.extend)
+    stamps = [each.stamp_ns for each in told if isinstance(each, Fault | MissionEvent)]
+    assert len(stamps) >= 3
+    assert stamps == sorted(stamps)
 
 
 def test_the_actuators_of_a_robot_that_failed_push_nothing(fly):
