@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, closing, nullcontext
-from math import degrees, dist, inf, radians
+from math import degrees, dist, inf, pi, radians
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,6 +51,8 @@ CLOUD_CLOCK = b"cloud".ljust(16)
 MEASURED = "Not repeatable: cloud.compute_measured uses the processor time of this machine."
 CRUISE_SPEED = 1.0
 """Expected speed between two waypoints, if the guard allows this speed [m/s]."""
+TURN_RATE = 1.0
+"""Expected yaw rate, if the guard allows it [rad/s]."""
 SETTLE_TIME = 4.0
 """Expected extra time at the beginning and end of the way to a waypoint [s]."""
 LEG_FACTOR = 3.0
@@ -280,6 +282,7 @@ def build_plan(experiment: ResolvedExperiment) -> Plan:
         experiment.seed,
         fence=steered_in(experiment.world),
         speed_max=experiment.guard.speed_max_mps,
+        turn_rate_max=experiment.guard.yaw_rate_max_radps,
     )
 
 
@@ -290,12 +293,13 @@ def mission_plan(
     *,
     fence: Fence,
     speed_max: float = inf,
+    turn_rate_max: float = inf,
 ) -> Plan:
     """Convert a valid mission to a plan for teleop.
 
     `time_limit` is the time limit of the mission [s]; None: as long as the mission may need. `seed`
     is the seed of random setpoints, `fence` that of the scene, `speed_max` the guard's speed limit
-    [m/s].
+    [m/s], `turn_rate_max` its limit of the yaw rate [rad/s].
     """
     track = read_setpoints(Path(mission.setpoints), fence) if mission.setpoints else ()
     if track:
@@ -308,7 +312,8 @@ def mission_plan(
         starts = (None, *mission.waypoints)
         ways = zip(starts, mission.waypoints, strict=False)  # no way starts at the last waypoint
         carrot = mission.carrot
-        legs = tuple(_leg(way, fence, speed_max, carrot) for way in ways)
+        limits = speed_max, turn_rate_max
+        legs = tuple(_leg(way, fence, limits, carrot) for way in ways)
         needed = sum(leg.time_limit for leg in legs)
     start = Start.SPAWN if mission.start == "spawn" else Start.HERE
     return Plan(legs, start, time_limit or max(LIMIT_MIN, needed), track=track)
@@ -327,7 +332,8 @@ def with_order(
     waypoints = tuple(
         schema.Waypoint(
             position_m=leg.position,
-            yaw_deg=round(degrees(leg.yaw), 9),
+            yaw_deg=None if leg.yaw is None else round(degrees(leg.yaw), 9),
+            yaw_tolerance_deg=None if leg.yaw is None else round(degrees(leg.yaw_tolerance), 9),
             tolerance_m=leg.tolerance,
             dwell_s=leg.dwell,
             time_limit_s=leg.time_limit,
@@ -351,10 +357,11 @@ def with_order(
 def _leg(
     ends: tuple[schema.Waypoint | None, schema.Waypoint],
     fence: Fence,
-    speed_max: float,
+    limits: tuple[float, float],
     carrot: schema.Carrot | None,
 ) -> Leg:
-    start, waypoint = ends
+    """Convert the waypoint at the end of a way; `limits` are those of `mission_plan`."""
+    (start, waypoint), (speed_max, turn_rate_max) = ends, limits
     limit = waypoint.time_limit_s
     speed, acceleration = 0.0, 1.0
     if carrot is not None:
@@ -366,9 +373,15 @@ def _leg(
         longest = fence.low, fence.high
         way = longest if start is None else (start.position_m, waypoint.position_m)
         expected = dist(*way) / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
+        if waypoint.yaw_deg is not None:
+            expected += pi / min(TURN_RATE, turn_rate_max)  # the longest turn
         limit = round(LEG_FACTOR * expected, 1)
-    yaw, tolerance, dwell = radians(waypoint.yaw_deg), waypoint.tolerance_m, waypoint.dwell_s
-    return Leg(waypoint.position_m, yaw, tolerance, dwell, limit, speed, acceleration)
+    yaw = None if waypoint.yaw_deg is None else radians(waypoint.yaw_deg)
+    tolerance, dwell = waypoint.tolerance_m, waypoint.dwell_s
+    yaw_tolerance = radians(waypoint.yaw_tolerance_deg or schema.YAW_TOLERANCE_DEG)
+    return Leg(
+        waypoint.position_m, yaw, tolerance, dwell, limit, speed, acceleration, yaw_tolerance
+    )
 
 
 def _step_legs(steps: schema.Steps, seed: int) -> tuple[Leg, ...]:

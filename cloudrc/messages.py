@@ -229,6 +229,7 @@ class Setpoint(NamedTuple):
     epoch: int = 0  # session for which teleop made the setpoint; 0 for none
     velocity: Vector = ZERO  # velocity of the target [m/s]
     motion: Motion | Drive | None = None  # how the target moves; None: it rests
+    turns: bool = False  # whether the robot has to turn to `yaw`; else it keeps its heading
 
 
 class Passed(NamedTuple):

@@ -54,7 +54,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cloud": {
         *("cloud.motion", "endpoint", "geometry.vectors", "tunnel", "config", "plugins", "teleop"),
     },
-    "teleop": {"config", "files", "geometry", "metrics"},
+    "teleop": {"config", "files", "geometry", "geometry.vectors", "metrics"},
     "policy": {"plugins", "policy.address"},
     "policy.address": set(),
     "exposition": {"metrics.definitions"},

@@ -32,8 +32,7 @@ examples:
 The page is served on this machine only; the printed address has its token. The
 first browser steers, the others read; every page has STOP. Keys: arrows fly
 along x and y, W and S up and down, while they are held; Space holds; Shift+X
-switches it off. No key turns the robot: the published onboard controller holds
-the yaw at 0."""
+switches it off. No key turns the robot: it keeps its heading."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -113,6 +113,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         verbs["goto"].add_argument(axis.lower(), type=metres, metavar=axis, help=about)
     about += "; none for a robot on the ground"
     verbs["goto"].add_argument("z", nargs="?", type=metres, metavar="Z", help=about)
+    about = "heading there [deg], for a robot that obeys a yaw"
+    degrees = number(-360, 360, "degrees")
+    verbs["goto"].add_argument("--yaw", type=degrees, metavar="DEG", help=about)
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -249,8 +252,12 @@ def _logs(options: argparse.Namespace, api: Api) -> int:
 def _order(options: argparse.Namespace, api: Api) -> int:
     if options.verb == "goto":
         point = [each for each in (options.x, options.y, options.z) if each is not None]
-        mission = api.post("/v1/goto", {"position_m": point})
         action = f"on the way to ({', '.join(f'{each:g}' for each in point)})"
+        order: dict[str, object] = {"position_m": point}
+        if options.yaw is not None:
+            order["yaw_deg"] = options.yaw
+            action += f", yaw {options.yaw:g} deg"
+        mission = api.post("/v1/goto", order)
     else:
         mission = api.post(f"/v1/{options.verb}")
         if options.verb == "resume" and mission["by_hand"]:

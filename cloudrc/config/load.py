@@ -27,6 +27,7 @@ from cloudrc import plugins, renamed
 from cloudrc.config import overrides, problems, shipped
 from cloudrc.config.document import Document, KeyPath, read_document, write_yaml
 from cloudrc.config.ground import put_on_ground
+from cloudrc.config.heading import without_held_yaws
 from cloudrc.config.hull import hull_of
 from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.overrides import Settings
@@ -237,12 +238,13 @@ def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> Res
     mission = put_on_ground(mission, scene) if robot.planar else mission
     found += _check_fit(mission, scene, experiment.world.robot)
     problems.raise_problems(document, found, name)
+    mission = without_held_yaws(mission, robot.heading)
     return experiment.model_copy(update={"mission": mission})
 
 
 def _check_fit(mission: MissionConfig, scene: Scene, robot: str) -> list[ConfigProblem]:
     """List the problems of a mission in a scene, with their paths in the experiment."""
-    planar = known_robot(robot).planar
+    planar, heading = known_robot(robot).planar, known_robot(robot).heading
 
     def check() -> list[ConfigProblem]:
         try:
@@ -253,7 +255,7 @@ def _check_fit(mission: MissionConfig, scene: Scene, robot: str) -> list[ConfigP
             size = NO_SIZE.dense  # `check_robot` says what is wrong with its model
         if above := check_scene(scene, size, touch=mission.touched, planar=planar):
             return above
-        wrong = check_mission(mission, scene, size, planar=planar)
+        wrong = check_mission(mission, scene, size, planar=planar, heading=heading)
         return [problem._replace(path=("mission", *problem.path)) for problem in wrong]
 
     return reuse(("mission", mission.model_dump_json(), repr(scene), robot), check)

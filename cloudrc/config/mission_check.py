@@ -11,12 +11,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
+from itertools import islice
+from math import radians
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from cloudrc.config.ground import check_heights
+from cloudrc.config.heading import Heading, check_yaws
 from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.schema import GROUND, MissionConfig, Steps
 from cloudrc.config.setpoints import read_setpoints
@@ -34,7 +37,6 @@ from cloudrc.geometry.placement import (
 from cloudrc.geometry.scene import FLOOR, Scene, Tube
 from cloudrc.messages import Vector
 
-_YAW = "missions keep the yaw at 0, as the paper does; leave it out"
 FLIES = "a robot that flies needs a height: give three numbers, x, y and z"
 _REPORTED = 20
 """Largest number of problems of one kind in an error message."""
@@ -117,12 +119,17 @@ def _check_touch(mission: MissionConfig, scene: Scene) -> ConfigProblem | None:
 
 
 def check_mission(
-    mission: MissionConfig, scene: Scene, robot: Spheres, *, planar: bool = False
+    mission: MissionConfig,
+    scene: Scene,
+    robot: Spheres,
+    *,
+    planar: bool = False,
+    heading: Heading = "free",
 ) -> list[ConfigProblem]:
     """List the problems of a mission in a scene, each with its path inside the mission.
 
     The `robot` is given as dense spheres. A `planar` robot stays on the ground, at the height of
-    the spawn.
+    the spawn. `heading` says whether the robot obeys a yaw.
     """
     if problem := _check_parts(mission) or _check_touch(mission, scene):
         return [problem]
@@ -132,6 +139,8 @@ def check_mission(
     if mission.setpoints is not None:
         steered = replace(fence, ground=scene.spawn[2]) if planar else fence
         return _check_setpoints(Path(mission.setpoints), steered)
+    if problems := list(islice(check_yaws(mission, heading), _REPORTED)):
+        return problems
     place = _Place(obstacles(scene, touch=mission.touched), robot, fence, planar)
     if mission.steps is not None:
         reason = _check_steps(mission.steps, place)
@@ -185,15 +194,12 @@ def _check_waypoints(
 ) -> Iterator[ConfigProblem]:
     known, robot, fence, planar = place
     positions = np.array([waypoint.position_m for waypoint in mission.waypoints])
-    yaws = np.radians([waypoint.yaw_deg for waypoint in mission.waypoints])
+    yaws = _yaws(mission)
     # A waypoint may be outside by half its tolerance; the other half is for control errors.
     slack = np.array([0.5 * waypoint.tolerance_m for waypoint in mission.waypoints])
     outside = outside_fence(fence, positions, slack, planar=planar)
-    hit = find_overlapped(known, robot, positions, yaws)
+    hit = find_overlapped(known, robot, positions, yaws[1:])
     wrong = np.flatnonzero(outside | (hit >= 0))
-    for index in np.flatnonzero(yaws)[:_REPORTED]:
-        path = ("waypoints", str(index), "yaw_deg")
-        yield ConfigProblem(path, f"{mission.waypoints[index].yaw_deg:g}", _YAW)
     for index in wrong[:_REPORTED]:
         position = mission.waypoints[index].position_m
         if outside[index]:
@@ -208,18 +214,31 @@ def _check_waypoints(
         legal = None if index - 1 in wrong else before
         near = None
         if not planar:
-            near = find_nearest_legal(fence, known, robot, position, float(yaws[index]), legal)
+            near = find_nearest_legal(fence, known, robot, position, float(yaws[index + 1]), legal)
         if near is not None:
             reason += f"; nearest legal point found: {_point(np.array(near))}"
         yield _at_point(index, positions[index], reason)
     if not len(wrong):
-        yield from _check_ways(np.vstack([start or positions[0], positions]), place)
+        yield from _check_ways(np.vstack([start or positions[0], positions]), yaws, place)
 
 
-def _check_ways(positions: Array, place: _Place) -> Iterator[ConfigProblem]:
-    """Report straight ways between successive `positions` [m], shape (n, 3), to an obstacle."""
-    known = place.known
-    through = find_crossed(known, place.robot, positions[:-1], positions[1:])
+def _yaws(mission: MissionConfig) -> Array:
+    """Return the robot's yaw at the start, 0, and at each of n waypoints [rad], shape (n + 1,)."""
+    yaws = [0.0]
+    for waypoint in mission.waypoints:
+        yaws.append(yaws[-1] if waypoint.yaw_deg is None else radians(waypoint.yaw_deg))
+    return np.array(yaws)
+
+
+def _check_ways(positions: Array, yaws: Array, place: _Place) -> Iterator[ConfigProblem]:
+    """Report straight ways between successive `positions` [m], shape (n, 3), to an obstacle.
+
+    The robot turns on its way: it must be clear with the yaw of either end [rad], shape (n,).
+    """
+    known, ends = place.known, (positions[:-1], positions[1:])
+    through = find_crossed(known, place.robot, *ends, yaws[:-1])
+    if (yaws[:-1] != yaws[1:]).any():
+        through = np.maximum(through, find_crossed(known, place.robot, *ends, yaws[1:]))
     for index in np.flatnonzero(through >= 0)[:_REPORTED]:
         obstacle = known[through[index]]
         around = "around it or through the tube" if isinstance(obstacle, Tube) else "around it"

@@ -16,6 +16,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from cloudrc.config import shipped
 from cloudrc.config.document import read_document
+from cloudrc.config.heading import Heading
 from cloudrc.config.problems import ConfigProblem, raise_problems, validate
 from cloudrc.config.reuse import reuse
 from cloudrc.config.schema import (
@@ -129,6 +130,10 @@ class RobotFile(Section):
     """Whether the robot stays on the ground. Then the guard limits x and y alone, HOLD and LAND
     brake the robot to rest, waypoints have the height of the spawn, and cloud commands no vertical
     velocity"""
+    heading: Heading | None = None
+    """What decides about the robot's heading; free: the commanded yaw rate, so that waypoints may
+    have a yaw_deg; fixed: nothing, the onboard controller holds the yaw at 0; velocity: the robot
+    turns towards its velocity. null: velocity for a planar robot, else free"""
     guard: RobotLimits = DEFAULT_LIMITS
     """What the guard may expect of the robot"""
     hull_m: Hull | None = None
@@ -172,6 +177,7 @@ class RobotFiles:
     motion: str | None = None  # path of a Python file with a better model
     probe: str | None = None  # site with which the robot touches; None: any part of it touches
     sensors: Mapping[str, SensorConfig] = field(default_factory=dict)  # the robot's own
+    heading: Heading = "free"  # what decides about its heading
 
 
 def find_robot(name: str) -> RobotFiles:
@@ -205,6 +211,7 @@ def find_robot(name: str) -> RobotFiles:
         motion=motion,
         probe=robot.probe,
         sensors=robot.sensors,
+        heading=robot.heading or ("velocity" if robot.planar else "free"),
     )
 
 

@@ -232,14 +232,23 @@ NameOr = Annotated[
 """The name of a file or plug-in, or its contents."""
 
 
+YAW_TOLERANCE_DEG = 5.0
+"""Default of yaw_tolerance_deg of a waypoint [deg]."""
+YawTolerance = Annotated[float, Field(gt=0, le=180)]
+
+
 class Waypoint(Section):
     """A point to fly to."""
 
     position_m: Place
     """Position of the base [m], world frame; two numbers for a robot that stays on the ground. The
     guard must allow the point and the straight line to it, and both must be clear of obstacles"""
-    yaw_deg: Finite = 0.0
-    """Heading [deg]; only 0 is accepted: missions keep the yaw at 0, as the paper does"""
+    yaw_deg: Finite | None = None
+    """Heading of the robot at the point [deg], counter-clockwise from the x axis. The robot turns
+    the shorter way around, while it flies there. Only for a robot that obeys a yaw, see heading in
+    robot.yaml. null: the robot keeps its heading"""
+    yaw_tolerance_deg: YawTolerance | None = None
+    """Difference from yaw_deg [deg] within which the point counts as reached. null: 5"""
     tolerance_m: Positive = 0.10
     """Distance [m] within which the point counts as reached"""
     dwell_s: Dwell = 0.5
@@ -320,6 +329,11 @@ class MissionConfig(Section):
     def touched(self) -> str | None:
         """Name of the body that the robot has to touch; None without one."""
         return self.touch.body if self.touch else None
+
+    @property
+    def turns(self) -> bool:
+        """Whether a waypoint has a yaw."""
+        return any(waypoint.yaw_deg is not None for waypoint in self.waypoints)
 
     @property
     def contents(self) -> str:

@@ -65,17 +65,23 @@ def find_overlapped(
 
 
 def find_crossed(
-    obstacles: Sequence[Obstacle], robot: Spheres, starts: Array, ends: Array
+    obstacles: Sequence[Obstacle],
+    robot: Spheres,
+    starts: Array,
+    ends: Array,
+    yaws: Array | float = 0.0,
 ) -> NDArray[np.int64]:
     """Find the first obstacle along each of n straight ways to which the robot comes too near.
 
-    Too near is a distance below `CLEARANCE_MIN`. The robot is level with yaw 0. A way may begin
+    Too near is a distance below `CLEARANCE_MIN`. The robot is level. A way may begin
     nearer to an obstacle than `CLEARANCE_MIN` if it leads away from this obstacle.
 
     `starts` and `ends` are positions of the base [m], world frame, inside or near the fence, shape
-    (n, 3). Return the index of the obstacle for each way, -1 if there is none, shape (n,).
+    (n, 3); `yaws` are the headings on the ways [rad], shape (n,) or (). Return the index of the
+    obstacle for each way, -1 if there is none, shape (n,).
     """
     result = np.full(len(starts), -1, dtype=np.int64)
+    facing = np.broadcast_to(yaws, len(starts))
     length = np.linalg.norm(ends - starts, axis=1)
     flown = np.zeros(len(starts))
     least = np.full(len(starts), np.inf)
@@ -83,7 +89,7 @@ def find_crossed(
     while len(flying):
         share = flown[flying] / np.maximum(length[flying], 1e-12)
         at = starts[flying] + share[:, None] * (ends - starts)[flying]
-        distances = _distances(obstacles, robot, at, np.zeros(len(at)))
+        distances = _distances(obstacles, robot, at, facing[flying])
         nearest = distances.min(axis=1)
         if np.isinf(least).any():  # a way may begin near a wall
             least = np.minimum(CLEARANCE_MIN, nearest - STEP_MIN)
@@ -130,7 +136,8 @@ def find_nearest_legal(
     candidates = candidates[np.linalg.norm(candidates - start, axis=1).argsort(kind="stable")]
     for part in np.array_split(candidates, max(1, len(candidates) // _AT_ONCE)):
         if before is not None:
-            part = part[find_crossed(obstacles, robot, np.tile(before, (len(part), 1)), part) < 0]
+            starts = np.tile(before, (len(part), 1))
+            part = part[find_crossed(obstacles, robot, starts, part, yaw) < 0]
         if len(part):
             x, y, z = part[0].tolist()
             return x, y, z

@@ -123,6 +123,16 @@ class Flight:
         return float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
 
     @cached_property
+    def yaw_noise(self) -> float:
+        """Root mean square of the error of the measured yaws [rad]; 0 if unknown."""
+        measured, truth = self.during("/odometry"), self.recording["/ground_truth"]
+        rows = np.searchsorted(truth["stamp_ns"], measured["stamp_ns"])
+        known = rows < len(truth["stamp_ns"])
+        true = yaw_of(truth["orientation_wxyz"][rows[known]])
+        errors = turn_between(yaw_of(measured["orientation_wxyz"][known]), true)
+        return float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
+
+    @cached_property
     def truth(self) -> Columns:
         """True states of the robot during the flight."""
         return self.during("/ground_truth")
@@ -206,6 +216,22 @@ class Flight:
         else:
             rows = (stamps >= self.start_ns) & (stamps <= self.end_ns)
         return select(columns, rows)
+
+
+def yaw_of(orientations_wxyz: Array) -> Array:
+    """Return the yaws of n orientations [rad], shape (n,).
+
+    `orientations_wxyz` are unit quaternions [1], body to world, shape (n, 4).
+    """
+    w, x, y, z = orientations_wxyz.T
+    yaws: Array = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return yaws
+
+
+def turn_between(start: Array, end: Array | float) -> Array:
+    """Return the shortest turns from the yaws `start` to `end`, in [rad], from -pi to pi."""
+    turns: Array = np.remainder(end - start + np.pi, 2.0 * np.pi) - np.pi
+    return turns
 
 
 class _Columns(Columns):

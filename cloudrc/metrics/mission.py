@@ -4,13 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from math import radians
 
 import numpy as np
 
-from cloudrc.config.schema import Waypoint
+from cloudrc.config.schema import YAW_TOLERANCE_DEG, Waypoint
 from cloudrc.geometry.scene import is_obstacle
 from cloudrc.metrics.definitions import Holds
-from cloudrc.metrics.flight import Array, Flight, Measure, add_metrics, finite, mean, select
+from cloudrc.metrics.flight import (
+    Array,
+    Flight,
+    Measure,
+    add_metrics,
+    finite,
+    mean,
+    select,
+    turn_between,
+    yaw_of,
+)
 from cloudrc.rounding import differences, exceeds
 
 IMPACT_NS = 100_000_000
@@ -77,6 +88,18 @@ def _waypoints_reached(flight: Flight) -> float | None:
     return flight.count(sum(_was_at(flight, points[i], stamps[i]) for i in known))
 
 
+def _yaw_error(flight: Flight) -> float | None:
+    """Find the largest error of the true yaw when a waypoint with a yaw was reached [rad]."""
+    truth, points, errors = flight.truth, flight.mission.waypoints, list[float]()
+    for index, stamp_ns in reported(flight).items():
+        yaw = points[index].yaw_deg if index < len(points) else None
+        row = np.searchsorted(truth["stamp_ns"], stamp_ns, side="right") - 1
+        if yaw is not None and row >= 0:
+            now = yaw_of(truth["orientation_wxyz"][[row]])
+            errors.append(abs(float(turn_between(now, radians(yaw))[0])))
+    return max(errors, default=None)
+
+
 def _final_error(flight: Flight) -> float | None:
     """Measure how far the robot was from the last setpoint of a file at the mission's end [m]."""
     driven = "driving" in flight.during("/mission")["event"]  # the file has what was driven
@@ -107,14 +130,20 @@ def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
     """Return whether the robot stayed near a waypoint for its dwell time before `until_ns`.
 
     The true position counts, give or take `NOISE` times the noise of the measured positions, which
-    are all that the operator sees. If the mission has a `carrot` (a moving setpoint), a stay of any
-    length is enough, because the setpoint waits at the waypoint for the dwell time.
+    are all that the operator sees, and likewise the true yaw if the waypoint has one. If the
+    mission has a `carrot` (a moving setpoint), a stay of any length is enough, because the setpoint
+    waits at the waypoint for the dwell time.
     """
     truth, dwell = flight.truth, 0.0 if flight.mission.carrot else waypoint.dwell_s
     rows = truth["stamp_ns"] <= until_ns
     distance = np.linalg.norm(truth["position"][rows] - waypoint.position_m, axis=1)
     tolerance = waypoint.tolerance_m + NOISE * flight.position_noise
-    near = np.append(differences(tolerance, distance) <= 0.0, [False])
+    there = differences(tolerance, distance) <= 0.0
+    if waypoint.yaw_deg is not None:
+        allowed = radians(waypoint.yaw_tolerance_deg or YAW_TOLERANCE_DEG)
+        turns = turn_between(yaw_of(truth["orientation_wxyz"][rows]), radians(waypoint.yaw_deg))
+        there &= differences(allowed + NOISE * flight.yaw_noise, np.abs(turns)) <= 0.0
+    near = np.append(there, [False])
     edges = np.flatnonzero(np.diff(near, prepend=[False]))
     stamps = np.append(truth["stamp_ns"][rows], until_ns)
     stays_ns = stamps[edges[1::2] - 1] - stamps[edges[::2]]
@@ -220,8 +249,11 @@ def _recorder_dropped(flight: Flight) -> float | None:
 add_metrics(
     "Mission",
     ("waypoints_reached", "1", "Number of waypoints at which the true position stayed within the "
-     "tolerance, plus 3 times the position noise, for the dwell time. The last row of a "
+     "tolerance, plus 3 times the position noise, for the dwell time, and likewise the "
+     "true yaw if the waypoint has a yaw_deg. The last row of a "
      "file of setpoints counts as one.", _waypoints_reached),
+    ("yaw_error", "rad", "Largest difference between the yaw_deg of a waypoint and the true yaw "
+     "when the waypoint was reached.", _yaw_error),
     ("final_error", "m", "Distance from the last setpoint of a file to the true position when the "
      "mission ended.", _final_error),
     ("obstacle_contacts", "1", "Number of contacts with obstacles. These are all bodies but the "

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from cloudrc import assembly
 from cloudrc.config.hull import hull_of
 from cloudrc.config.load import ResolvedExperiment, read_experiment
-from cloudrc.config.robot import is_planar, known_robot
+from cloudrc.config.robot import known_robot
 from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.drivers.link_news import LinkNews
 from cloudrc.drivers.process import Feed, GracefulStop, StopSignal
@@ -102,15 +102,20 @@ def serve_api(settings: TeleopSettings, experiment: ResolvedExperiment, scene: S
     if not isinstance(settings.api, Path):
         warn_if_exposed(settings.api)
     bridge = Bridge()
-    planar = is_planar(experiment.world.robot)
-    grounded = f"the robot {Path(experiment.world.robot).name}" if planar else ""
+    found = known_robot(experiment.world.robot)
+    grounded = f"the robot {Path(experiment.world.robot).name}" if found.planar else ""
     speed_max, robot = experiment.guard.speed_max_mps, hull_of(experiment.world.robot).dense
-    plan = partial(assembly.mission_plan, fence=steered_in(experiment.world), speed_max=speed_max)
-    order = partial(read_order, scene=scene, robot=robot, planar=planar, plan=plan)
-    tokens = Tokens(settings.tokens, log_line) if settings.tokens else None
-    goto = partial(
-        read_goto, scene=scene, robot=robot, touch=experiment.mission.touch, planar=planar
+    plan = partial(
+        assembly.mission_plan,
+        fence=steered_in(experiment.world),
+        speed_max=speed_max,
+        turn_rate_max=experiment.guard.yaw_rate_max_radps,
     )
+    tokens = Tokens(settings.tokens, log_line) if settings.tokens else None
+    planar, heading = found.planar, found.heading
+    order = partial(read_order, scene=scene, robot=robot, planar=planar, heading=heading, plan=plan)
+    touch = experiment.mission.touch
+    goto = partial(read_goto, scene=scene, robot=robot, planar=planar, heading=heading, touch=touch)
     app = create_app(bridge, order, goto, partial(read_drive, grounded=grounded), log_line)
     server = ApiServer(Gate(app, tokens, Audit(settings.audit, log_line)), bridge, settings.api)
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)

@@ -48,10 +48,16 @@ class Parts(NamedTuple):
     sensors: tuple[OwnSensor, ...]
 
 
-def check_robot(world: World) -> None:
-    """Raise a BadInputError if the robot does not compile, or if it cannot move as `world` says."""
+def check_robot(world: World, *, turns: bool = False) -> None:
+    """Raise a BadInputError if the robot does not compile, or if it cannot move as `world` says.
+
+    With `turns`, it also has to obey a yaw.
+    """
     build_robot(world, ResolvedGuard.model_validate({}))
     advise(world, ZERO)
+    if turns and not getattr(_make_parts(world).onboard, "obeys_yaw", True):
+        reason = f"the onboard controller of {world.robot} does not obey a yaw; leave yaw_deg out"
+        raise ProblemsError([ConfigProblem(("mission", "waypoints"), "", reason)])
 
 
 def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -> Robot:

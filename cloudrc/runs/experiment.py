@@ -59,11 +59,13 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
 
             require_ros()
     if mode != "cluster":
-        check_world(experiment.world)
+        check_world(experiment.world, turns=experiment.mission.turns)
 
 
-def check_world(world: World) -> None:
+def check_world(world: World, *, turns: bool = False) -> None:
     """Raise a BadInputError if the robot cannot move in its scene as `world` says.
+
+    With `turns`, it also has to obey a yaw.
 
     The shipped robots can in the shipped scenes, if nothing is changed. Without MuJoCo, such as on
     a machine that only starts flights in a cluster, world checks it.
@@ -75,7 +77,7 @@ def check_world(world: World) -> None:
         from cloudrc.robots.build import check_robot
 
         facts = world.model_dump_json(exclude={"sensors", "odometry_rate_hz"})
-        reuse(("world", facts), lambda: check_robot(world))
+        reuse(("world", facts, turns), lambda: check_robot(world, turns=turns))
 
 
 def advice_on(*experiments: ResolvedExperiment) -> list[str]:

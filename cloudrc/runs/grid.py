@@ -250,7 +250,7 @@ def _resolve(experiment: str, entries: Iterable[_Entry]) -> ResolvedExperiment:
         raise BadInputError(f"{source.label}: seed: give the seeds with the key 'seeds'")
     resolved = load_experiment(experiment, settings)
     try:
-        check_world(resolved.world)
+        check_world(resolved.world, turns=resolved.mission.turns)
     except ProblemsError as error:
         lines = [f"{_label(settings, problem)}{problem}" for problem in error.problems]
         raise BadInputError("; ".join(lines)) from error

@@ -127,7 +127,7 @@ class Trials:
         settings = [*asked.settings, f"{asked.key}={self.value(number):.12g}"]
         try:
             experiment = load(asked.experiment, settings)
-            check_world(experiment.world)
+            check_world(experiment.world, turns=experiment.mission.turns)
         except BadInputError as error:
             return None, str(error)
         given = [text.partition("=")[0].strip() for text in settings]

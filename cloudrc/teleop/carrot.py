@@ -72,8 +72,8 @@ def _moved(setpoint: Setpoint, distance: float, ramp: float, total: float, now_n
     x, y, z = (bx - ax) / distance, (by - ay) / distance, (bz - az) / distance
     position = (ax + way * x, ay + way * y, az + way * z)
     velocity = (speed * x, speed * y, speed * z)
-    moved = (position, setpoint.yaw, setpoint.waypoint, setpoint.epoch, velocity, motion)
-    return _new(Setpoint, moved)
+    _, yaw, waypoint, epoch, _, _, turns = setpoint
+    return _new(Setpoint, (position, yaw, waypoint, epoch, velocity, motion, turns))
 
 
 def _profile(setpoint: Setpoint) -> tuple[float, float, float]:
@@ -91,7 +91,7 @@ def steer(setpoint: Setpoint, velocity: Vector, now_ns: int, fence: Fence) -> Se
     It begins where `setpoint` is at `now_ns`. It stays in the box in which the guard lets the robot
     fly inside `fence`, and slows down before a wall.
     """
-    start, yaw, _, _, before, _ = setpoint_at(setpoint, now_ns)
+    start, yaw, _, _, before, _, _ = setpoint_at(setpoint, now_ns)
     low, high = fence.inner_low, fence.inner_high
     x, y, z = (
         max(-_speed_within(at - below), min(asked, _speed_within(above - at)))

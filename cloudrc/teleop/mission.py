@@ -21,11 +21,12 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
-from math import dist
+from math import degrees, dist
 from typing import TYPE_CHECKING
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import Fence
+from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import (
     MISSION_OVER,
     NEVER_NS,
@@ -40,7 +41,6 @@ from cloudrc.messages import (
     Vector,
 )
 from cloudrc.records import MissionEvent
-from cloudrc.rounding import exceeds
 from cloudrc.teleop.carrot import ACCELERATION, HEARTBEAT_NS, arrival_ns, steer
 from cloudrc.teleop.requests import REPEAT_NS, RequestSender
 from cloudrc.teleop.wire import (
@@ -107,7 +107,7 @@ class LegWatch:
                 self._flown_ns += min(now_ns - before_ns, GAP_MAX_NS)
             if now_ns - before_ns > UNSEEN_MAX_NS:
                 self._near_since_ns = NEVER_NS  # the robot's path in the gap is unknown
-        if exceeds(dist(seen.position, leg.position), leg.tolerance):
+        if not (leg.is_at(seen.position) and leg.is_facing(seen.orientation_wxyz)):
             self._near_since_ns = NEVER_NS
             return False
         if self._near_since_ns < 0:
@@ -203,7 +203,7 @@ class Teleop:
         self._check("goto", HELD)
         x, y, z = leg.position
         self._report("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
-        self._select(Setpoint(leg.position, leg.yaw, NO_WAYPOINT))
+        self._select(self._setpoint_of(leg, NO_WAYPOINT))
 
     def hold(self, now_ns: int) -> None:
         """Hold the robot at its position; raise BadInputError unless a mission flies."""
@@ -367,11 +367,19 @@ class Teleop:
                 )
             return "timed_out", f"mission not done within {limit:g} s (time_limit_s): {self.where}"
         if self._watch.flown >= leg_limit and self.state == FLYING:
-            return (
-                "leg_timed_out",
-                f"{self._leg_name} not reached in {leg_limit:g} s (its time_limit_s)",
-            )
+            text = f"{self._leg_name} not reached in {leg_limit:g} s (its time_limit_s)"
+            return "leg_timed_out", text + self._describe_turn(self._plan.legs[self.leg])
         return None
+
+    def _describe_turn(self, leg: Leg) -> str:
+        """Say by how much the yaw of a robot at a waypoint is wrong; "" if it is not."""
+        seen = self.seen
+        if seen is None or leg.yaw is None or not leg.is_at(seen.position):
+            return ""
+        if leg.is_facing(seen.orientation_wxyz):
+            return ""
+        left = degrees(abs(turn_to(leg.yaw, seen.orientation_wxyz)))
+        return f": the robot is there, but its yaw is {left:.0f} deg away"
 
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
         """Keep the robot at its position: the mission in telemetry may come from another teleop.
@@ -465,7 +473,7 @@ class Teleop:
         if not leg.speed:
             return rested
         leaves_ns = self._leaves_ns(self.leg)
-        near = not exceeds(dist(seen.position, leg.position), leg.tolerance)
+        near = leg.is_at(seen.position) and leg.is_facing(seen.orientation_wxyz)
         return near and leaves_ns is not None and now_ns >= leaves_ns
 
     def _leaves_ns(self, leg: int) -> int | None:
@@ -559,14 +567,20 @@ class Teleop:
         if to.speed and self.seen is not None:
             motion = Motion(start or self.seen.position, begin_ns, to.speed, to.acceleration)
         if not self._stays:
-            self._select(Setpoint(to.position, to.yaw, leg, motion=motion))
+            self._select(self._setpoint_of(to, leg)._replace(motion=motion))
 
     def _select_here(self) -> None:
         if self.seen is not None:
             x, y, z = self.seen.position
-            yaw = 0.0 if self._setpoint is None else self._setpoint.yaw
             z = max(z, self._fence.inner_low[2])  # lower, the robot would scrape along the ground
-            self._select(Setpoint((x, y, z), yaw, NO_WAYPOINT))
+            self._select(self._setpoint_of(Leg((x, y, z)), NO_WAYPOINT))
+
+    def _setpoint_of(self, leg: Leg, waypoint: int) -> Setpoint:
+        """Return the setpoint at a leg; without a yaw, it keeps the yaw of the setpoint before."""
+        if leg.yaw is not None:
+            return Setpoint(leg.position, leg.yaw, waypoint, turns=True)
+        yaw = 0.0 if self._setpoint is None else self._setpoint.yaw
+        return Setpoint(leg.position, yaw, waypoint)
 
     def _select(self, setpoint: Setpoint) -> None:
         epoch = 0 if self.seen is None else self.seen.epoch

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cloudrc.config.ground import on_ground, put_on_ground
+from cloudrc.config.heading import Heading, without_held_yaws
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import ConfigProblem, from_pydantic
 from cloudrc.config.schema import (
@@ -68,7 +69,9 @@ class GoToRequest(Section):
     """Order to fly to a point."""
 
     position_m: Place = Field(description="Base position [m], world frame")
-    yaw_deg: Finite = Field(0.0, description="Heading [deg]")
+    yaw_deg: Finite | None = Field(
+        None, description="Heading there [deg], for a robot that obeys a yaw; null: any"
+    )
 
 
 class DriveRequest(Section):
@@ -89,7 +92,7 @@ EXAMPLES: dict[type[Section], dict[str, Any]] = {
             {"position_m": [0.5, 3.6, 0.7]},
         ],
     },
-    GoToRequest: {"position_m": [0.5, 0.0, 1.2], "yaw_deg": 0.0},
+    GoToRequest: {"position_m": [0.5, 0.0, 1.2]},
     DriveRequest: {"velocity_mps": [0.5, 0.0, 0.0]},
 }
 
@@ -253,12 +256,14 @@ def read_order(
     robot: Spheres,
     *,
     planar: bool = False,
+    heading: Heading = "free",
     plan: Callable[[MissionConfig, float | None], Plan],
 ) -> Order:
     """Read, check and plan the mission in the body of a request.
 
-    A `planar` robot stays on the ground. `plan` makes a plan from a mission and a time
-    limit [s], which may be None. Raise a RefusedError that lists all problems.
+    A `planar` robot stays on the ground. `heading` says whether the robot obeys a yaw. `plan` makes
+    a plan from a mission and a time limit [s], which may be None. Raise a RefusedError that lists
+    all problems.
     """
     request = _parse(body, MissionRequest)
     if not request.waypoints:  # only an experiment may have steps instead
@@ -270,30 +275,37 @@ def read_order(
         touch=request.touch,
     )
     mission = put_on_ground(mission, scene) if planar else mission
-    if problems := check_mission(mission, scene, robot, planar=planar):
+    if problems := check_mission(mission, scene, robot, planar=planar, heading=heading):
         raise RefusedError(problems)
-    planned = plan(mission, request.time_limit_s)
+    planned = plan(without_held_yaws(mission, heading), request.time_limit_s)
     lease = request.lease_s or 0.0
     return Order(planned, request.name, request.key, request.touch, request.queue, lease)
 
 
 def read_goto(
-    body: bytes, scene: Scene, robot: Spheres, *, touch: Touch | None = None, planar: bool = False
+    body: bytes,
+    scene: Scene,
+    robot: Spheres,
+    *,
+    touch: Touch | None = None,
+    planar: bool = False,
+    heading: Heading = "free",
 ) -> Leg:
     """Read and check a point in a request's body; raise a RefusedError that lists all problems.
 
     The experiment's mission has to `touch` a body, so that a point there is none of the problems.
-    A `planar` robot stays on the ground.
+    A `planar` robot stays on the ground. `heading` says whether the robot obeys a yaw.
     """
     request = _parse(body, GoToRequest)
     position = on_ground(request.position_m, scene) if planar else request.position_m
     waypoint = Waypoint(position_m=position, yaw_deg=request.yaw_deg)
     # What is an obstacle depends on the mission under way; the service checks the way there.
     mission = MissionConfig(start="here", waypoints=(waypoint,), touch=touch)
-    problems = check_mission(mission, scene, robot, planar=planar)
+    problems = check_mission(mission, scene, robot, planar=planar, heading=heading)
     if problems:
         raise RefusedError([ConfigProblem(p.path[2:], p.value, p.reason) for p in problems])
-    return Leg(position, radians(request.yaw_deg))
+    (waypoint,) = without_held_yaws(mission, heading).waypoints
+    return Leg(position, None if waypoint.yaw_deg is None else radians(waypoint.yaw_deg))
 
 
 def read_drive(body: bytes, *, grounded: str = "") -> Vector:

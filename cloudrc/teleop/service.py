@@ -457,7 +457,7 @@ class MissionService:
             return
         here, there = np.array([seen.position]), np.array([leg.position])
         known = obstacles(scene, touch=touch)
-        through = int(find_crossed(known, self._hull.dense, here, there)[0])
+        through = int(find_crossed(known, self._hull.dense, here, there, leg.yaw or 0.0)[0])
         if through >= 0:
             raise ConflictError(
                 f"the straight way from where the robot is, {_place(seen.position)}, to "

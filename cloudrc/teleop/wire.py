@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from math import isinf, nan
+from math import dist, isinf, nan, radians
 from typing import Any, NamedTuple, TypeAlias
 
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_json
 
+from cloudrc.config.schema import YAW_TOLERANCE_DEG
+from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import (
     NEVER_NS,
     UPRIGHT,
@@ -27,24 +29,40 @@ from cloudrc.messages import (
     Vector,
 )
 from cloudrc.records import FAILURES, Control, MissionEvent
+from cloudrc.rounding import exceeds
 
 
 @dataclass(frozen=True, slots=True)
 class Leg:
     """A waypoint, and the conditions under which it counts as reached.
 
-    If `speed` is 0, the robot has to stay within `tolerance` for the time `dwell`. If `speed` is
-    above 0, the setpoint has to rest at the waypoint for the time `dwell`; then the robot has to be
-    within `tolerance`. With an infinite `tolerance`, only the time counts.
+    If `speed` is 0, the robot has to stay there for the time `dwell`. If `speed` is above 0, the
+    setpoint has to rest at the waypoint for the time `dwell`; then the robot has to be there. It is
+    there within `tolerance`, and within `yaw_tolerance` if the leg has a `yaw`. With an infinite
+    `tolerance`, only the time counts.
     """
 
     position: Vector  # [m], world frame, shape (3,)
-    yaw: float = 0.0  # heading to hold [rad]
+    yaw: float | None = None  # heading at the waypoint [rad]; None: any
     tolerance: float = 0.10  # largest distance from the waypoint that counts as reached [m]
     dwell: float = 0.5  # time to stay within the tolerance without interruption [s]
     time_limit: float = 60.0  # for reaching the waypoint, without holds [s]
     speed: float = 0.0  # of the setpoint on its way to the waypoint [m/s]; 0: the setpoint jumps
     acceleration: float = 1.0  # of the setpoint [m/s^2]
+    yaw_tolerance: float = radians(YAW_TOLERANCE_DEG)  # largest error of `yaw` when reached [rad]
+
+    def is_at(self, position: Vector) -> bool:
+        """Return whether a position [m] is within the tolerance."""
+        return not exceeds(dist(position, self.position), self.tolerance)
+
+    def is_facing(self, orientation_wxyz: Quaternion) -> bool:
+        """Return whether a robot has the leg's heading, if it has one.
+
+        `orientation_wxyz` is a unit quaternion [1], body to world.
+        """
+        if self.yaw is None:
+            return True
+        return not exceeds(abs(turn_to(self.yaw, orientation_wxyz)), self.yaw_tolerance)
 
 
 @dataclass(frozen=True, slots=True)

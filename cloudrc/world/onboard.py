@@ -28,6 +28,8 @@ class Onboard(Protocol):
     Attributes:
         stopped: Commands while the guard has stopped the robot. World tells by identity whether the
             robot is stopped, so `update` and `brake` must not return this object.
+
+    A controller that ignores the yaw rate says so with an attribute `obeys_yaw`, which is False.
     """
 
     stopped: Commands

@@ -74,6 +74,17 @@ def test_limits_shorten_the_vector_or_clamp_each_axis(limit, velocity):
     assert output.proportional == (3.0, 0.0, -4.0)
 
 
+def test_without_a_gain_the_yaw_turns_only_to_a_waypoint_with_a_yaw():
+    heading = Odometry(0, ZERO, UPRIGHT, ZERO, ZERO)
+    wanted = Setpoint(ZERO, yaw=0.5)
+    rates = [
+        pid.build(**gain).update(heading, wanted._replace(turns=turns), DT).yaw_rate
+        for gain in ({}, {"gain_yaw": 2.0}, {"gain_yaw": 0.0})
+        for turns in (False, True)
+    ]
+    assert rates == pytest.approx([0.0, 0.4, 1.0, 1.0, 0.0, 0.0])
+
+
 def test_yaw_turns_the_short_way_round():
     # Heading 170 deg, wanted -170 deg: 20 deg to the left, not 340 to the right.
     heading = Odometry(0, ZERO, (0.08715574274765817, 0.0, 0.0, 0.9961946980917455), ZERO, ZERO)

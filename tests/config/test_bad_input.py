@@ -142,7 +142,10 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("seed=[", "--set seed"),
         ("seed=[1],[2]", "--set seed: [1],[2]: text after the value"),
         ("mission.waypoints.9.dwell_s=1", "entries 0 to 6; use one of these, or 7 to append"),
-        ("mission.waypoints.2.yaw_deg=90", "keep the yaw at 0"),
+        (
+            "mission.waypoints.2.yaw_deg=90",
+            "yaw_deg: 90: the onboard controller of this robot holds",
+        ),
         ("cloud.plan_s=0.4", "cloud.predictor: 'constant_velocity' has no model of the robot"),
         ("mission.waypoints.2.speed_mps=1", "waypoints.2.speed_mps: 1: is the speed of a carrot;"),
         ("mission=steps mission.carrot.speed_mps=1", "mission.carrot: impossible with steps"),

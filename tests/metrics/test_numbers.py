@@ -1,7 +1,7 @@
 """Every shipped metric: numbers computed by hand, and its contract on any recording."""
 
 from dataclasses import replace
-from math import hypot, isfinite, nan
+from math import cos, hypot, isfinite, nan, radians, sin
 
 import pytest
 
@@ -17,6 +17,7 @@ from cloudrc.records import (
     Control,
     Counted,
     Fault,
+    GroundTruth,
     GuardChange,
     Lateness,
     MissionEvent,
@@ -354,7 +355,7 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight():
     numbers, notes = measure_all(flight_of(paper()[1]))
     assert (notes, list(numbers)) == ([], sorted(numbers))
     resting = {f"steady_error_{axis}" for axis in "xyz"}
-    others = {"recorder_dropped", "final_error", "controller_gaps"}
+    others = {"recorder_dropped", "final_error", "controller_gaps", "yaw_error"}
     assert set(SHIPPED) - set(numbers) == REAL_TIME | OF_RELAYS | resting | others
     for name, number in numbers.items():
         assert set(number.unit) <= set("smNB12^/ "), name
@@ -365,6 +366,23 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight():
 
 def test_an_empty_recording_has_no_numbers():
     assert measure_all(flight_of(Recording.from_records([]))) == ({}, [])
+
+
+@pytest.mark.parametrize(("degree", "reached"), [(90, 1.0), (86, 1.0), (84, 0.0), (-90, 0.0)])
+def test_a_waypoint_with_a_yaw_needs_the_true_yaw_too(degree, reached):
+    half = radians(degree) / 2
+
+    def turn(record):
+        facing = (cos(half), 0.0, 0.0, sin(half))
+        return record._replace(odometry=record.odometry._replace(orientation_wxyz=facing))
+
+    log = flown()
+    log.change(GroundTruth, lambda n, record: turn(record))
+    log.change(TelemetrySent, lambda n, sent: sent._replace(telemetry=turn(sent.telemetry)))
+    point = Waypoint(position_m=(10.0, 0.0, 1.0), tolerance_m=10.0, dwell_s=0.0, yaw_deg=90.0)
+    flight = log.flight(mission=MissionConfig(waypoints=(point,)))
+    assert SHIPPED["waypoints_reached"].measure(flight) == reached
+    assert SHIPPED["yaw_error"].measure(flight) == pytest.approx(abs(radians(90 - degree)))
 
 
 NOTHING = Recording.from_records([])

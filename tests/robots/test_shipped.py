@@ -1,5 +1,6 @@
 """Each shipped multirotor flies the same missions over the same links."""
 
+import numpy as np
 import pytest
 
 import cloudrc
@@ -28,3 +29,17 @@ def test_a_model_alone_flies(tmp_path):
 def test_equal_flights_have_equal_records():
     flights = [cloudrc.fly("steps", STEPS | {"world.robot": "nano"}) for _ in range(2)]
     assert flights[0].records_sha256 == flights[1].records_sha256
+
+
+@pytest.mark.parametrize("carrot", [None, {"speed_mps": 1.0}])
+def test_a_drone_turns_the_short_way_to_the_yaws_of_its_waypoints(carrot):
+    places = ((0.0, 170), (0.5, -170), (0.0, None))
+    points = [{"position_m": [x, 0, 1], "yaw_deg": yaw} for x, yaw in places]
+    mission = {"waypoints": points, "carrot": carrot}
+    flight = cloudrc.fly("steps", {"world.robot": "x2", "mission": mission})
+    assert (flight.verdict, flight.numbers["waypoints_reached"]) == ("success", 3)
+    assert flight.numbers["yaw_error"] < 0.09
+    w, x, y, z = flight["/ground_truth"]["orientation_wxyz"].T
+    yaws = np.degrees(np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))))
+    assert yaws[-1] == pytest.approx(190, abs=6)
+    assert yaws.max() < 200

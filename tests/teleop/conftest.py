@@ -18,7 +18,7 @@ from cloudrc import assembly
 from cloudrc.cloud.operator import EmergencyStopRepeater
 from cloudrc.config.hull import hull_of
 from cloudrc.geometry.scene import load_scene
-from cloudrc.messages import Cause, GuardState, OperatorRequest, Request, Setpoint, Start
+from cloudrc.messages import UPRIGHT, Cause, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
 from cloudrc.teleop.api import STARTING, ApiServer, Bridge, create_app
@@ -40,7 +40,7 @@ ID = 7
 UNITS = {"battery": "V", "range": "m"}
 THREE = Plan((Leg(A, dwell=0.0), Leg(B, dwell=0.0), Leg(C, dwell=0.0)), Start.HERE)
 FROM_SPAWN = Plan(THREE.legs)
-PLAN = Plan((Leg(A, yaw=0.3), Leg(B, tolerance=0.2, dwell=0.0), Leg(C)))
+PLAN = Plan((Leg(A, yaw=0.3, yaw_tolerance=1.0), Leg(B, tolerance=0.2, dwell=0.0), Leg(C)))
 
 
 class Flight:
@@ -53,7 +53,7 @@ class Flight:
         self.onboard = (0, 0)  # mission's number and waypoints reached, as world keeps them
         self.guard, self.cause = GuardState.GROUND, Cause.SPAWN
         self.obstacle_contacts, self.touch_speed, self.slip_ns = 0, float("nan"), 0
-        self.sensors = ()
+        self.sensors, self.orientation = (), UPRIGHT
         self.uplink = self.downlink = True
         self.first_shown_ns = {}  # number of a request -> when telemetry first showed it
         self.said, self.said_at = [], []
@@ -80,7 +80,7 @@ class Flight:
             *(self.epoch, self.position, self.guard, self.mission, self.world),
             *(self.obstacle_contacts, self.touch_speed, self.slip_ns),
             mission_id=self.onboard[0], reached=self.onboard[1], cause=self.cause,
-            sensors=self.sensors,
+            sensors=self.sensors, orientation_wxyz=self.orientation,
         )  # fmt: skip
 
     def see(self):
@@ -286,7 +286,7 @@ def play(flight, script):
         elif action in ("create", "queue", "here"):
             flight.create(THREE if action == "here" else FROM_SPAWN, queue=action == "queue")
         elif action == "goto":
-            flight.teleop.go_to(Leg(AWAY, 0.5), flight.now_ns)
+            flight.teleop.go_to(Leg(AWAY), flight.now_ns)
         elif action.startswith("cancel"):
             newest = next(reversed(flight.teleop.book.missions))
             flight.teleop.cancel(action.removeprefix("cancel") or newest, flight.now_ns)

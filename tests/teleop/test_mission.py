@@ -108,7 +108,7 @@ def test_a_robot_seen_to_hold_gets_the_first_waypoint_at_once():
     assert (flight.state, flight.guard) == ("DONE", HOLD)
     before = len(flight.setpoints)
     flight.operate("start", PLAN)
-    assert flight.setpoints[before:] == [Setpoint(A, 0.3, 0)]
+    assert flight.setpoints[before:] == [Setpoint(A, 0.3, 0, turns=True)]
     flight.operate("cancel")
     before = len(flight.setpoints)
     flight.operate("start", PLAN)

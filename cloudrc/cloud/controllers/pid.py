@@ -5,13 +5,17 @@ Source: the paper, eqs. (4) and (5); gains: docs/reference/plant.md, "Cloud cont
 
 from __future__ import annotations
 
-from math import atan2, hypot, inf, remainder, tau
+from math import hypot, inf
 from operator import add
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.config.schema import NotNegative, NotNegatives
+from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
 
+GAIN_YAW = 0.8
+"""Gain of the yaw if a waypoint asks for one [1/s]: that of x and y, so that delays have the same
+effect on both."""
 UNLIMITED: Vector = (inf, inf, inf)
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
@@ -36,13 +40,14 @@ class Pid(Controller):
         gain_p: Vector,
         gain_i: Vector,
         gain_d: Vector,
-        gain_yaw: float,
+        gain_yaw: float | None,
         integral_limit: Vector,
         velocity_max: Vector,
         speed_max: float,
     ) -> None:
         self._gain_p, self._gain_d = gain_p, gain_d
-        self._gain_yaw, self._integral_limit = gain_yaw, integral_limit
+        self._gain_yaw = GAIN_YAW if gain_yaw is None else gain_yaw
+        self._always_turns, self._integral_limit = bool(gain_yaw), integral_limit
         self._velocity_max, self._speed_max = velocity_max, speed_max
         self._gain_i = ZERO if gain_i == ZERO else gain_i
         self._proportional_only = gain_i == ZERO and gain_d == ZERO
@@ -81,10 +86,8 @@ class Pid(Controller):
         if self._gain_i is not ZERO:
             self._integrate((ex, ey, ez), wanted, velocity, dt)
         yaw_rate = 0.0
-        if self._gain_yaw:
-            w, x, y, z = estimate.orientation_wxyz
-            measured = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-            yaw_rate = self._gain_yaw * remainder(setpoint.yaw - measured, tau)
+        if self._always_turns or setpoint.turns:
+            yaw_rate = self._gain_yaw * turn_to(setpoint.yaw, estimate.orientation_wxyz)
         return _new(ControlOutput, (velocity, yaw_rate, proportional, integral, derivative))
 
     def _limit(self, wanted: Vector) -> Vector:
@@ -115,7 +118,7 @@ def build(
     gain_p: NotNegatives = (0.8, 0.8, 1.5),
     gain_i: NotNegatives = ZERO,
     gain_d: NotNegatives = ZERO,
-    gain_yaw: NotNegative = 0.0,
+    gain_yaw: NotNegative | None = None,
     integral_limit: NotNegatives | None = None,
     velocity_max: NotNegatives | None = None,
     speed_max: NotNegative | None = None,
@@ -128,7 +131,8 @@ def build(
         gain_p: Proportional gain per axis [1/s], shape (3,).
         gain_i: Integral gain per axis [1/s^2], shape (3,).
         gain_d: Derivative gain per axis [1], shape (3,).
-        gain_yaw: Gain of the yaw [1/s]; the published low-level controller ignores the yaw rate.
+        gain_yaw: Gain of the yaw [1/s], always; None: 0.8 if a waypoint asks for a yaw, else 0. The
+            published low-level controller ignores the yaw rate.
         integral_limit: Largest integral term per axis [m/s], shape (3,); None: no limit.
         velocity_max: Largest velocity per axis [m/s], shape (3,); None: no limit.
         speed_max: Largest speed [m/s]; the limit keeps the direction. None: no limit. With an

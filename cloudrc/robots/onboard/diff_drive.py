@@ -47,9 +47,13 @@ class Wheel(NamedTuple):
 class DiffDrive:
     """Makes a robot with driven wheels follow a horizontal velocity.
 
+    It does not obey a yaw, because the robot needs its heading to drive.
+
     Attributes:
         stopped: Commands of wheels at rest.
     """
+
+    obeys_yaw = False
 
     def __init__(self, wheels: Sequence[Wheel], turn_gain: float, turn_rate_max: float) -> None:
         """Begin with the front in the lead.

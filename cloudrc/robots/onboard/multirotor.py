@@ -71,6 +71,7 @@ class Multirotor:
     Attributes:
         gains: Bandwidths and limits.
         stopped: Controls while the guard has stopped the robot.
+        obeys_yaw: Whether it follows a yaw rate.
     """
 
     stopped: Commands
@@ -79,6 +80,7 @@ class Multirotor:
         """Set up the loops; `dt` is the time between two updates [s]."""
         self.gains = gains
         self.stopped = allocation.stopped
+        self.obeys_yaw = gains.yaw > 0.0
         self._allocate = allocation.allocate
         self._dt = dt
         self._gravity = gravity = frame.gravity

@@ -74,6 +74,7 @@ class LowLevel:
     """
 
     stopped: Commands = STOPPED
+    obeys_yaw = False
 
     def __init__(
         self,

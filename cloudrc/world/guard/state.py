@@ -96,7 +96,7 @@ class Guard:
         fence: Box that the robot's base may not leave.
         armed: Whether a mission is active: from the operator's start to its end, LAND or ESTOP.
         reference: Velocity reference of the last step [m/s], world frame, shape (3,).
-        yaw_rate: Limited yaw rate [rad/s]; unused, as the low-level controller keeps a yaw of 0.
+        yaw_rate: Limited yaw rate [rad/s]; not every onboard controller obeys it.
         command_age_max_ns: Largest accepted age of the odometry from which cloud computed a command
             [ns].
         acceleration_max: Largest rate of change of the velocity reference [m/s^2].

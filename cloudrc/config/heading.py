@@ -1,0 +1,44 @@
+"""The yaw of waypoints: not every robot obeys one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal, TypeAlias
+
+from cloudrc.config.problems import ConfigProblem
+from cloudrc.config.schema import MissionConfig
+
+Heading: TypeAlias = Literal["free", "fixed", "velocity"]
+"""What decides about a robot's heading: the commanded yaw rate, nothing, or its velocity."""
+WHY: dict[Heading, str] = {
+    "fixed": "the onboard controller of this robot holds the yaw at 0",
+    "velocity": "the heading of this robot follows its velocity",
+}
+"""Heading of a robot that does not obey a yaw -> why not."""
+
+
+def check_yaws(mission: MissionConfig, heading: Heading) -> Iterator[ConfigProblem]:
+    """Yield each yaw that the robot would not obey, and each tolerance without a yaw."""
+    for index, waypoint in enumerate(mission.waypoints):
+        path, yaw = ("waypoints", str(index)), waypoint.yaw_deg
+        if yaw is None:
+            if waypoint.yaw_tolerance_deg is not None:
+                shown = f"{waypoint.yaw_tolerance_deg:g}"
+                reason = "is the tolerance of yaw_deg; give the waypoint a yaw_deg, or delete it"
+                yield ConfigProblem((*path, "yaw_tolerance_deg"), shown, reason)
+        elif heading in WHY and not _is_held(yaw, heading):
+            reason = f"{WHY[heading]}; leave it out, or choose another robot, such as x2"
+            yield ConfigProblem((*path, "yaw_deg"), f"{yaw:g}", reason)
+
+
+def without_held_yaws(mission: MissionConfig, heading: Heading) -> MissionConfig:
+    """Return a mission without the yaws of 0 that a robot with a fixed heading holds anyway."""
+    if heading != "fixed":
+        return mission
+    kept = {"yaw_deg": None, "yaw_tolerance_deg": None}
+    waypoints = tuple(waypoint.model_copy(update=kept) for waypoint in mission.waypoints)
+    return mission.model_copy(update={"waypoints": waypoints})
+
+
+def _is_held(yaw: float, heading: Heading) -> bool:
+    return heading == "fixed" and yaw == 0.0

@@ -1,0 +1,110 @@
+"""A waypoint may have a yaw only if the robot obeys one; robot.yaml says whether it does."""
+
+import json
+from functools import partial
+from math import radians
+from pathlib import Path
+
+import pytest
+
+from cloudrc.assembly import build_plan, mission_plan
+from cloudrc.config.hull import hull_of
+from cloudrc.config.load import dump, load_experiment
+from cloudrc.config.robot import find_robot
+from cloudrc.errors import BadInputError
+from cloudrc.geometry.scene import load_scene
+from cloudrc.runs.experiment import check_mode
+from cloudrc.teleop.models import RefusedError, read_goto, read_order
+from tests.fences import FENCE
+
+SCENE = load_scene("empty")
+
+
+def flown(robot, point=(0, 0, 1), **keys):
+    waypoint = json.dumps({"position_m": list(point), **keys})
+    where = [f"world.robot={robot}", "world.scene=empty"]
+    return load_experiment("steps", [*where, f"mission={{waypoints: [{waypoint}]}}"])
+
+
+@pytest.mark.parametrize(
+    ("robot", "point", "keys", "message"),
+    [
+        ("pelican", (0, 0, 1), {"yaw_deg": 90}, "90: the onboard controller of this robot holds"),
+        ("rover", (1, 0), {"yaw_deg": 90}, "90: the heading of this robot follows its velocity"),
+        ("rover", (1, 0), {"yaw_deg": 0}, "0: the heading of this robot follows its velocity"),
+        ("x2", (0, 0, 1), {"yaw_tolerance_deg": 3}, "3: is the tolerance of yaw_deg; give"),
+        ("x2", (0, 0, 1), {"yaw_deg": 9, "yaw_tolerance_deg": 0}, "must be a number > 0"),
+        ("x2", (0, 0, 1), {"yaw_deg": "north"}, "must be a number or null"),
+    ],
+)
+def test_a_yaw_that_the_robot_does_not_obey_is_refused_in_one_line(robot, point, keys, message):
+    with pytest.raises(BadInputError) as error:
+        flown(robot, point, **keys)
+    assert message in str(error.value)
+    assert "mission.waypoints.0.yaw" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("robot", ["x2", "nano"])
+def test_a_yaw_of_a_robot_that_obeys_reaches_the_plan(robot):
+    (leg,) = build_plan(flown(robot, yaw_deg=-170, yaw_tolerance_deg=2)).legs
+    assert (leg.yaw, leg.yaw_tolerance) == (radians(-170), radians(2))
+    (other,) = build_plan(flown(robot, yaw_deg=0)).legs
+    assert (other.yaw, other.yaw_tolerance) == (0.0, radians(5))
+    assert build_plan(flown(robot)).legs[0].yaw is None
+
+
+def test_the_time_limit_of_a_waypoint_includes_the_turn():
+    limits = [build_plan(flown("x2", **keys)).legs[0].time_limit for keys in ({}, {"yaw_deg": 9})]
+    assert limits[1] - limits[0] == pytest.approx(3 * 3.14159, abs=0.11)
+
+
+def test_a_yaw_of_0_is_what_the_pelican_holds_anyway(tmp_path):
+    experiment = flown("pelican", yaw_deg=0.0)
+    assert experiment == flown("pelican")
+    (tmp_path / "again.yaml").write_text(dump(experiment))
+    assert load_experiment(tmp_path / "again.yaml").mission == experiment.mission
+
+
+@pytest.mark.parametrize(
+    ("text", "heading"),
+    [
+        ("onboard: multirotor", "free"),
+        ("onboard: diff_drive\nplanar: true", "velocity"),
+        ("onboard: ./own.py\nplanar: true\nheading: free", "free"),
+        ("onboard: ./own.py\nheading: fixed", "fixed"),
+    ],
+)
+def test_robot_yaml_says_what_decides_about_the_heading(tmp_path, text, heading):
+    (tmp_path / "robot.yaml").write_text(text)
+    assert find_robot(str(tmp_path)).heading == heading
+
+
+def test_a_wrong_heading_is_refused(tmp_path):
+    (tmp_path / "robot.yaml").write_text("onboard: multirotor\nheading: north")
+    with pytest.raises(BadInputError, match=r"robot.yaml:2: heading: 'north': must be"):
+        find_robot(str(tmp_path))
+
+
+def test_a_flight_with_a_controller_that_leaves_the_yaw_alone_is_refused(tmp_path):
+    (tmp_path / "pelican_like.xml").write_text(Path(find_robot("pelican").model).read_text())
+    for robot, more in (("x2", {"yaw_bandwidth_radps": 0}), (tmp_path / "pelican_like.xml", {})):
+        waypoint = "{position_m: [0, 0, 1], yaw_deg: 90}"
+        settings = [f"world.robot={robot}", "world.scene=empty", f"world.onboard={more}"]
+        experiment = load_experiment("steps", [*settings, f"mission={{waypoints: [{waypoint}]}}"])
+        with pytest.raises(BadInputError, match="does not obey a yaw; leave yaw_deg out"):
+            check_mode(experiment, "virtual")
+
+
+def test_teleop_takes_and_refuses_yaws_as_a_mission_does():
+    plan, size = partial(mission_plan, fence=FENCE), hull_of("x2").dense
+    order = json.dumps({"waypoints": [{"position_m": [0, 0, 1], "yaw_deg": 90}]}).encode()
+    goto = b'{"position_m": [0, 0, 1], "yaw_deg": 90}'
+    assert read_order(order, SCENE, size, plan=plan).plan.legs[0].yaw == radians(90)
+    assert read_goto(goto, SCENE, size).yaw == radians(90)
+    assert read_goto(b'{"position_m": [0, 0, 1]}', SCENE, size).yaw is None
+    with pytest.raises(RefusedError, match=r"^yaw_deg: 90: the onboard controller"):
+        read_goto(goto, SCENE, size, heading="fixed")
+    with pytest.raises(RefusedError, match=r"waypoints.0.yaw_deg: 90: the heading"):
+        read_order(order, SCENE, size, heading="velocity", plan=plan)
+    assert read_goto(goto.replace(b"90", b"0"), SCENE, size, heading="fixed").yaw is None

@@ -1,0 +1,78 @@
+"""A waypoint with a yaw is reached when the robot is there and faces the yaw; else any yaw does."""
+
+from math import cos, pi, radians, sin
+
+import pytest
+
+from cloudrc.messages import NEVER_NS, Setpoint, Start
+from cloudrc.teleop.carrot import setpoint_at, steer
+from cloudrc.teleop.wire import Leg, Plan, decode, encode
+from tests.fences import FENCE
+from tests.teleop.conftest import A, B, flying
+
+
+def facing(degree):
+    return (cos(radians(degree) / 2), 0.0, 0.0, sin(radians(degree) / 2))
+
+
+@pytest.mark.parametrize(
+    ("yaw", "seen", "reached"),
+    [
+        (90, 0, False),
+        (90, 84, False),
+        (90, 86, True),
+        (180, -176, True),
+        (-180, 176, True),
+        (179, -179, True),
+        (-90, 270, True),
+        (720, 1, True),
+        (0, 180, False),
+    ],
+)
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+def test_a_waypoint_with_a_yaw_is_reached_within_5_degrees(yaw, seen, reached, speed):
+    flight = flying(Plan((Leg(A, radians(yaw), speed=speed), Leg(B)), Start.HERE))
+    flight.orientation = facing(seen)
+    flight.step(position=A, seconds=4.0)
+    assert (flight.teleop.leg == 1) is reached
+
+
+def test_turning_away_at_the_waypoint_restarts_the_dwell_time():
+    flight = flying(Plan((Leg(A, 0.0), Leg(B)), Start.HERE))
+    flight.step(position=A, seconds=0.45)
+    flight.orientation = facing(20)
+    flight.step()
+    flight.orientation = facing(0)
+    flight.step(seconds=0.45)
+    assert flight.teleop.leg == 0
+    flight.step(seconds=0.06)
+    assert flight.teleop.leg == 1
+
+
+def test_the_setpoint_turns_only_at_a_waypoint_with_a_yaw_and_keeps_the_last_one():
+    plan = Plan((Leg(A, 0.5, dwell=0.0, yaw_tolerance=pi), Leg(B, dwell=0.0)), Start.HERE)
+    flight = flying(plan)
+    flight.step(position=A)
+    assert [(s.yaw, s.turns) for s in flight.setpoints[-2:]] == [(0.5, True), (0.5, False)]
+    before = len(flight.setpoints)
+    flight.operate("hold")
+    flight.operate("go_to", Leg(A, -1.0))
+    flight.operate("go_to", Leg(B))
+    turned = [(s.yaw, s.turns) for s in flight.setpoints[before:]]
+    assert turned == [(0.5, False), (-1.0, True), (-1.0, False)]
+
+
+def test_a_carrot_keeps_the_yaw_and_a_drive_by_hand_asks_for_none():
+    flight = flying(Plan((Leg(A, 0.5, speed=1.0),), Start.HERE))
+    moving = flight.setpoints[-1]
+    assert decode(encode(moving)) == moving
+    midway = setpoint_at(moving, moving.motion.begin_ns + 500_000_000)
+    assert (midway.yaw, midway.turns) == (0.5, True)
+    assert not steer(Setpoint(A, 0.5, turns=True), (0.5, 0.0, 0.0), NEVER_NS + 1, FENCE).turns
+
+
+def test_a_time_limit_says_that_only_the_yaw_is_missing():
+    flight = flying(Plan((Leg(A, radians(90), time_limit=2.0),), Start.HERE))
+    flight.step(position=A, seconds=2.5)
+    assert flight.events[-1].event == "leg_timed_out"
+    assert "the robot is there, but its yaw is 90 deg away" in flight.events[-1].text
