@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from math import isfinite, nan
 from pathlib import Path
 from typing import Any, TypeAlias, TypedDict
@@ -143,9 +144,17 @@ def answer_space(
 ) -> tuple[gymnasium.Space[Any], Callable[[Any], tuple[Any, ...]]]:
     """Return the space of an answer, and a function that copies an answer into its actions."""
     if chunk is None:
-        return space, lambda action: (copied(action),)
+        return space, _one
     batched = batch_space(space, chunk)
-    return batched, lambda answer: tuple(iterate(batched, copied(answer)))
+    return batched, partial(_each, batched)
+
+
+def _one(action: Any) -> tuple[Any, ...]:
+    return (copied(action),)
+
+
+def _each(space: gymnasium.Space[Any], answer: Any) -> tuple[Any, ...]:
+    return tuple(iterate(space, copied(answer)))
 
 
 def describe_answer(chunk: int | None) -> str:

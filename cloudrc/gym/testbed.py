@@ -203,6 +203,15 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         info = self._judge(flight) if ended or late else {}
         return observation, -distance, ended, late, info
 
+    def __getstate__(self) -> object:
+        """Return the state for a copy; refuse it in flight, whose tunnel has keys in C objects."""
+        if self.flight is not None:
+            raise BadInputError(
+                "a flight of the testbed cannot be copied; reset another environment with the same "
+                "seed and give it the same actions: it flies the same path"
+            )
+        return super().__getstate__()
+
     def _observe(self, flight: _Flight) -> tuple[Any, float]:
         """Return the observation, and the distance from the setpoint [m]."""
         telemetry, setpoint = flight.cloud.telemetry, flight.policy.setpoint

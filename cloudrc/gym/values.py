@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from copy import deepcopy
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -64,34 +65,47 @@ def checker(space: spaces.Space[Any], what: str) -> Callable[[Any], None]:
     It does not look at values: the environment decides about them. `what` says in words what an
     action is.
     """
-    fits = _form_of(space)
+    return partial(_check, _form_of(space), space, what)
 
-    def check(action: Any) -> None:
-        if fits(action):
-            return
-        shape = getattr(action, "shape", None)
-        given = type(action).__name__ + (f" of shape {shape}" if shape is not None else "")
-        raise BadInputError(f"the action is {given}; give {what}, in {space}")
 
-    return check
+# Functions of this module and no closures: an environment that has them can be pickled.
+def _check(fits: Callable[[Any], bool], space: spaces.Space[Any], what: str, action: Any) -> None:
+    if fits(action):
+        return
+    shape = getattr(action, "shape", None)
+    given = type(action).__name__ + (f" of shape {shape}" if shape is not None else "")
+    raise BadInputError(f"the action is {given}; give {what}, in {space}")
 
 
 def _form_of(space: spaces.Space[Any]) -> Callable[[Any], bool]:
     """Return a function that tells whether an action has the form of a space."""
     if isinstance(space, spaces.Box | spaces.MultiDiscrete | spaces.MultiBinary):
-        return lambda action: (
-            action.shape == space.shape
-            if type(action) is np.ndarray
-            else isinstance(action, list | tuple | np.number) and _shape(action) == space.shape
-        )
+        return partial(_is_array, space.shape)
     if isinstance(space, spaces.Discrete):
-        return lambda action: (
-            isinstance(action, int | np.integer)
-            or (isinstance(action, np.ndarray) and action.shape == ())
-        )
+        return _is_integer
     if isinstance(space, spaces.Dict):
-        return lambda action: isinstance(action, Mapping) and action.keys() == space.spaces.keys()
-    return lambda action: action is not None
+        return partial(_has_keys, frozenset(space.spaces))
+    return _is_given
+
+
+def _is_array(shape: tuple[int, ...], action: Any) -> bool:
+    if type(action) is np.ndarray:
+        return bool(action.shape == shape)
+    return isinstance(action, list | tuple | np.number) and _shape(action) == shape
+
+
+def _is_integer(action: Any) -> bool:
+    if isinstance(action, np.ndarray):
+        return bool(action.shape == ())
+    return isinstance(action, int | np.integer)
+
+
+def _has_keys(keys: Set[str], action: Any) -> bool:
+    return isinstance(action, Mapping) and action.keys() == keys
+
+
+def _is_given(action: Any) -> bool:
+    return action is not None
 
 
 def _shape(action: Any) -> tuple[int, ...] | None:

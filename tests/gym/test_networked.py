@@ -1,6 +1,8 @@
 """A link between any environment and its policy: ticks, delays, repeatability, bad input."""
 
+import copy
 import hashlib
+import pickle
 import subprocess
 import sys
 from itertools import pairwise
@@ -315,6 +317,35 @@ def test_an_action_of_another_form_is_refused_in_one_line(space, chunk, action, 
         env.step(action)
     assert "\n" not in str(caught.value)
     assert env.unwrapped.executed == []
+
+
+@pytest.mark.parametrize("make_copy", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])  # noqa: S301
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compute": (0.02, 0.01)},
+        {"chunk": 8, "executor": "prefix", "start": "answer"},
+        {"chunk": 4, "executor": "broker"},
+    ],
+)
+def test_a_copy_within_an_episode_continues_bit_by_bit(make_copy, options):
+    """As a policy that plans needs it, with packets in flight."""
+    env = Networked(gymnasium.make("Pendulum-v1", max_episode_steps=60), "lossy", 3, **options)
+    env.action_space.seed(1)
+
+    def fly(world, answers):
+        told = []
+        for answer in answers:
+            told.append(world.step(answer))
+            if told[-1][3]:
+                told.append(world.reset())
+        return repr(told)
+
+    env.reset(seed=2)
+    before, after = ([env.action_space.sample() for _ in range(n)] for n in (20, 100))
+    fly(env, before)
+    other = make_copy(env)
+    assert fly(other, after) == fly(env, after)
 
 
 def test_a_step_before_the_first_reset_is_refused():

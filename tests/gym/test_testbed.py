@@ -1,5 +1,7 @@
 """The testbed's robots as environments fly the true path of its flights, bit by bit."""
 
+import copy
+
 import gymnasium
 import numpy as np
 import pytest
@@ -84,6 +86,13 @@ def test_a_seed_selects_the_steps_and_a_flight_can_be_repeated():
 
     assert fly(1) == fly(1) != fly(2)
     assert env.reset(seed=1)[0].tolist() != env.reset()[0].tolist()
+
+
+def test_a_flight_is_not_copied_and_another_environment_flies_the_same():
+    env = copy.deepcopy(gymnasium.make("cloudrc/Steps-v0"))
+    env.reset(seed=1)
+    with pytest.raises(BadInputError, match="cannot be copied; reset another environment"):
+        copy.deepcopy(Networked(env))
 
 
 def test_what_a_robot_cannot_fly_is_refused():
