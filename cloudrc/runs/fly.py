@@ -49,6 +49,7 @@ def fly(
     page: bool = True,
     session: Session | None = None,
     beside: str = "",
+    landed: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
     """Fly in mode "virtual" or "local"; write all files into `folder`, and return the report.
 
@@ -59,6 +60,7 @@ def fly(
     processes are ready, `session` gets the API's address and process -> HOST:PORT of its metrics.
 
     `beside` is a command: a program that runs during the flight, such as a remote controller.
+    `landed` is called once the flight is over, before the report is written.
     """
     own = experiment.report.metrics
     try:
@@ -67,9 +69,9 @@ def fly(
         with contextlib.ExitStack() as stack:
             gone = stack.enter_context(_beside(beside, experiment, folder))
             if mode == "virtual":
-                flown = _record_virtual(experiment, folder, see, gone)
+                flown = _record_virtual(experiment, folder, see, gone, landed)
             else:
-                flown = _record_local(experiment, folder, see, gone, session=session)
+                flown = _record_local(experiment, folder, see, gone, landed, session=session)
             recording, resolved, run = stack.enter_context(flown)
             run = replace(run, files=files)
             return write_report(folder, recording, resolved, run, own=own, page=page)
@@ -110,12 +112,16 @@ def _interruptible(see: See) -> See:
 
 @contextlib.contextmanager
 def _record_virtual(
-    experiment: ResolvedExperiment, folder: Path, see: See, gone: Callable[[], bool]
+    experiment: ResolvedExperiment,
+    folder: Path,
+    see: See,
+    gone: Callable[[], bool],
+    landed: Callable[[], None],
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
     """Fly in virtual time, and yield the recording, the experiment and facts about the run.
 
-    `gone` is that of `assembly.fly`. The caller writes the report in the `with` block. After the
-    block, this function attaches a copy of the report to mission.mcap.
+    `gone` is that of `assembly.fly`, `landed` that of `fly`. The caller writes the report in the
+    `with` block. After the block, this function attaches a copy of the report to mission.mcap.
     """
     from cloudrc.robots.build import describe_steps
     from cloudrc.world.shapes import flown_files
@@ -141,6 +147,7 @@ def _record_virtual(
             interrupted = True
         except ControllerLostError as error:
             lost = error
+        landed()
         try:
             steps = describe_steps(experiment.world)
             notes = (*assembly.virtual_notes(experiment), *([str(lost)] if lost else ()))
@@ -162,11 +169,13 @@ def _record_local(
     folder: Path,
     see: See,
     gone: Callable[[], bool],
+    landed: Callable[[], None],
     session: Session | None = None,
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
     """Fly in real time; yield the merged recording, the experiment and facts about the run.
 
-    With `session`, as in `fly`, yield those of its last mission. `gone` is that of `LocalRun`.
+    With `session`, as in `fly`, yield those of its last mission. `gone` is that of `LocalRun`,
+    `landed` that of `fly`.
     """
     from cloudrc.robots.build import describe_steps
 
@@ -181,6 +190,7 @@ def _record_local(
         pass
     except CloudrcError as error:
         broken = error
+    landed()
     try:
         if session:
             mission, experiment, interrupted = read_last_mission(folder)

@@ -73,6 +73,15 @@ def test_a_run_and_its_report_can_be_repeated(folder, call):
 
 
 @pytest.mark.usefixtures("no_page")
+@pytest.mark.parametrize("form", ["table", "json"])
+def test_a_report_that_takes_long_is_told_in_a_pipe(form, monkeypatch, call):
+    monkeypatch.setattr("cloudrc.cli.progress.FIRST_WAIT", 0.0)
+    shown = call(*FLY, "--out", "here", "-o", form)
+    assert "writes the report\n" in shown.err
+    assert "writes the report" not in shown.out
+
+
+@pytest.mark.usefixtures("no_page")
 @pytest.mark.parametrize(
     ("fails", "error", "code", "said"),
     [
