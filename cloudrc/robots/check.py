@@ -1,13 +1,13 @@
 """Check a robot: read its facts from the compiled model, and move it in virtual time.
 
 The robot moves without a network, a cloud and a guard: it stands or hovers, follows a step of the
-velocity, and brakes.
+velocity, brakes, and turns if its heading is free.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from math import dist, hypot
+from math import atan2, dist, hypot, remainder, tau
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,7 +43,9 @@ SPEED = 2.0
 DRIFT_MAX = 0.2
 """Largest distance from its place of a robot that hovers or stands [m]."""
 SHORT = 0.2
-"""Largest part of the step that may be missing at its end [1]."""
+"""Largest part of the step or of the turn that may be missing at its end [1]."""
+TURN, TURNING = 0.5, 3.0
+"""Yaw rate [rad/s] and duration [s] of the turn of a robot that obeys a yaw."""
 REST = 0.1
 """Largest speed at the end of braking [m/s]."""
 BRAKING_MAX = 10.0
@@ -62,6 +64,7 @@ class CheckFlight(NamedTuple):
     reached: float  # part of this speed at the end of the step [1]
     braking: float  # least deceleration that explains the braking distance [m/s^2]
     rest: float  # speed at the end of braking [m/s]
+    turned: float | None  # part of the turn that it did [1]; None: its heading is not free
 
 
 def check(name: str) -> tuple[dict[str, Any], list[str]]:
@@ -94,6 +97,7 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
         "step_mps": motion.speed,
         "step_reached": motion.reached,
         "braking_measured_mps2": motion.braking,
+        **({} if motion.turned is None else {"turn_reached": motion.turned}),
     }
     if body.simulator.data.warning.number[DIVERGED : DIVERGED + 3].any():
         return facts, [*changes, "the simulation diverged: check masses and inertias of the model"]
@@ -118,6 +122,7 @@ def _read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
         ],
         **({} if ratio is None else {"thrust_to_weight": ratio, "hover_thrust": 1.0 / ratio}),
         "planar": robot.planar,
+        "heading": robot.heading,
         "onboard": controller(robot, model).name,
         "parameters": onboard_values(world),
         "guard": robot.guard.model_dump(),
@@ -140,7 +145,7 @@ def _judge_tunings(robot: RobotFiles, world: World) -> Iterator[str]:
 
 
 def _move(body: Robot, robot: RobotFiles) -> CheckFlight:
-    """Let the robot hover or stand, follow a step along x, and brake."""
+    """Let the robot hover or stand, follow a step along x, brake, and turn."""
     climb = (0.0, 0.0, 0.0 if robot.planar else CLIMB)
     body.simulator.reset()
     body.onboard.reset()
@@ -155,13 +160,31 @@ def _move(body: Robot, robot: RobotFiles) -> CheckFlight:
     _follow(body, robot, None, ZERO, STOP)
     way = hypot(*np.subtract(body.simulator.readings.position, start)[:2]) - REACTION * before
     braking = min(before * before / (2.0 * max(way, 1e-9)), BRAKING_MAX)
-    return CheckFlight(drift, speed, before / speed, braking, _speed(body))
+    rest = _speed(body)
+    return CheckFlight(drift, speed, before / speed, braking, rest, _turn(body, robot))
+
+
+def _turn(body: Robot, robot: RobotFiles) -> float | None:
+    """Let the robot turn, and return the part of the turn that it did [1].
+
+    None: its heading is not free, or an .xml file alone leaves open what flies it.
+    """
+    if robot.heading != "free" or robot.onboard is None:
+        return None
+    start = _yaw(body)
+    _follow(body, robot, ZERO, ZERO, TURNING, TURN)
+    return remainder(_yaw(body) - start, tau) / (TURN * TURNING)
 
 
 def _follow(
-    body: Robot, robot: RobotFiles, reference: Vector | None, wanted: Vector, duration: float
+    body: Robot,
+    robot: RobotFiles,
+    reference: Vector | None,
+    wanted: Vector,
+    duration: float,
+    yaw_rate: float = 0.0,
 ) -> Vector:
-    """Follow `wanted` [m/s] for a time [s], and return the last reference [m/s].
+    """Follow `wanted` [m/s] and `yaw_rate` [rad/s] for a time [s]; return the last reference [m/s].
 
     The reference starts at `reference` and changes as fast as the guard allows; None: brake.
     """
@@ -173,7 +196,7 @@ def _follow(
             commands = onboard.brake(readings, wanted)
         else:
             reference = step_towards(reference, wanted, change)
-            commands = onboard.update(readings, reference, 0.0)
+            commands = onboard.update(readings, reference, yaw_rate)
         simulator.step(commands)
         if simulator.readings.axes[8] < UPRIGHT_MIN:
             raise OnboardFailedError("the robot turns over: check the onboard controller's gains")
@@ -183,6 +206,11 @@ def _follow(
 def _speed(body: Robot) -> float:
     x, y, _ = body.simulator.readings.velocity
     return hypot(x, y)
+
+
+def _yaw(body: Robot) -> float:
+    axes = body.simulator.readings.axes
+    return atan2(axes[1], axes[0])
 
 
 def _judge(robot: RobotFiles, motion: CheckFlight) -> list[str]:
@@ -196,6 +224,12 @@ def _judge(robot: RobotFiles, motion: CheckFlight) -> list[str]:
             f"in {FAST:g} s: check the onboard controller, or set guard.speed_max_mps"
         )
         return found
+    if motion.turned is not None and motion.turned < 1.0 - SHORT:
+        share = round(motion.turned, 2) + 0.0  # no -0 %
+        found.append(
+            f"robot.yaml: heading is free, but the robot follows {share:.0%} of a yaw rate "
+            f"of {TURN:g} rad/s: let the onboard controller follow it, or set heading: fixed"
+        )
     if motion.rest > REST:
         found.append(f"the robot still moves at {motion.rest:.2f} m/s, {STOP:g} s after it brakes")
     if motion.braking < robot.guard.braking_mps2:

@@ -72,6 +72,12 @@ def test_a_shipped_robot_needs_no_change(robot, capsys, tmp_path, monkeypatch):
     [
         ("robot.yaml", "braking_mps2: 3", "braking_mps2: 9", "guard.braking_mps2 is 9, but"),
         ("robot.yaml", "hull_m: 0.34", "hull_m: 0.1", "hull_m is 0.1, but the geoms reach"),
+        (
+            "robot.yaml",
+            "onboard: multirotor",
+            "onboard: {name: multirotor, yaw_bandwidth_radps: 0}",
+            "heading is free, but the robot follows 0% of a yaw rate",
+        ),
         ("robot.yaml", "onboard: multirotor", "onboard: ./own.py", "own.py:10 in update"),
         ("robot.yaml", "onboard: multirotor", "onboard: ./turns.py", "the robot turns over"),
     ],
