@@ -23,6 +23,7 @@ import os
 import pkgutil
 import re
 import sys
+import sysconfig
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -64,6 +65,11 @@ Metrics square numbers, and the page of the report stores some with single preci
 number overflows there."""
 STACK_MAX = 4000
 """Largest length of a failure's stack in the recording [characters]."""
+INSTALLED = (
+    *(sysconfig.get_path(name) + os.sep for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+    os.path.dirname(__file__) + os.sep,
+)
+"""Folders of Python, of installed packages, and of cloudrc: files elsewhere are those of users."""
 METHODS = {
     **{"estimators": "horizon", "predictors": "predict", "controllers": "update"},
     **{"onboard": "update", "motion": "__call__", "executors": "action"},
@@ -148,15 +154,18 @@ class Found:
 
 
 def _own_frames(error: BaseException, file: str = "") -> list[tuple[FrameType, int]]:
-    """Return frame and line of each call in a plug-in's files that `error` left, innermost last.
+    """Return frame and line of each call in a user's files that `error` left, innermost last.
 
-    They are the files of users, those beside them, and `file`. A frame without a file, such as in
-    a method that a dataclass generates, has no line that a user could look at.
+    They are the files of plug-ins, those beside them, `file`, and all others that are not
+    installed, such as the module of an environment. A frame without a file, such as in a method
+    that a dataclass generates, has no line that a user could look at.
     """
 
     def is_own(frame: FrameType) -> bool:
         name, own = (str(frame.f_globals.get(key)) for key in ("__name__", "__file__"))
-        return (name.startswith(PREFIX) or own == file) and frame.f_code.co_filename[:1] != "<"
+        if frame.f_code.co_filename[:1] == "<":
+            return False
+        return name.startswith(PREFIX) or own == file or not own.startswith(INSTALLED)
 
     return [each for each in traceback.walk_tb(error.__traceback__) if is_own(each[0])]
 
@@ -317,14 +326,17 @@ def apart() -> Iterator[None]:
 
 
 @contextmanager
-def refuse_failure(what: str) -> Iterator[None]:
+def refuse_failure(what: str, *, keep: type[CloudrcError] | tuple[()] = ()) -> Iterator[None]:
     """Convert the failure of a plug-in to a BadInputError; `what` says which one failed to do what.
 
-    Use it before a flight and between flights; in flight, cloud goes on.
+    Use it before a flight and between flights; in flight, cloud goes on. Errors of the kind `keep`,
+    which the block's other code raises, stay as they are.
     """
     try:
         with apart():
             yield
+    except keep:
+        raise
     except BaseException as error:
         check_failure(error, what)
         raise BadInputError(f"{what}: {place_of(error)}{_explain(error)}") from error

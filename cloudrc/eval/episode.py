@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import cache
 from hashlib import sha256
 from math import isfinite
@@ -16,11 +16,11 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from cloudrc.errors import BadInputError, CloudrcError, describe_error
+from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.eval.setup import FILE, MEASURED, SEED, Episode, EvalSetup, link_at, read_times
 from cloudrc.gym import Networked
 from cloudrc.gym.values import size_of
-from cloudrc.plugins import locate
+from cloudrc.plugins import refuse_failure
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
 from cloudrc.policy.observation import observe
@@ -110,21 +110,11 @@ def play(episode: Episode, setup: EvalSetup, identity: Mapping[str, Any]) -> dic
 def make_env(setup: EvalSetup, seed: int) -> Iterator[gymnasium.Env[Any, Any]]:
     """Make the environment of an episode; raise a BadInputError if it fails, also in the block."""
     words = {key: seed if value == SEED else value for key, value in setup.env_args}
-    try:
+    what = f"--env {setup.env}"
+    with refuse_failure(what, keep=CloudrcError):
         env = gymnasium.make(setup.env, disable_env_checker=True, **words)
-    except CloudrcError:
-        raise
-    except Exception as error:
-        raise BadInputError(f"--env {setup.env}: {describe_error(error)}") from error
-    try:
+    with refuse_failure(f"{what}: the episode failed", keep=CloudrcError), closing(env):
         yield env
-    except CloudrcError:
-        raise
-    except Exception as error:
-        text = f"--env {setup.env}: the episode failed: {describe_error(error)}"
-        raise BadInputError(f"{text} ({locate(error)})") from error
-    finally:
-        env.close()
 
 
 @contextmanager

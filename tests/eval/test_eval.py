@@ -1,6 +1,7 @@
 """Evaluations: episodes over a link, their rows, tables and pages."""
 
 import json
+import sys
 from hashlib import sha256
 from pathlib import Path
 
@@ -249,8 +250,65 @@ def test_an_episode_without_an_end_is_cut(law):
 
 def test_a_failing_environment_is_one_line(law):
     setup = EvalSetup("Task-v0", law(STILL), (("fails", True),))
-    with pytest.raises(BadInputError, match="episode failed: RuntimeError: the simulator"):
+    with pytest.raises(BadInputError, match=r"episode failed: test_eval\.py:.*: the simulator"):
         play(Episode(None, "newest", 1), setup, {})
+
+
+ENDING = """
+import argparse
+import sys
+
+import gymnasium
+
+def end(place):
+    if place == PLACE:
+        END
+
+end("import")
+
+class Ending(gymnasium.Env):
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+    observation_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self):
+        end("init")
+
+    def reset(self, *, seed=None, options=None):
+        end("reset")
+        return 0, {}
+
+    def step(self, action):
+        end("step")
+        return 0, 1.0, True, False, {}
+
+    def close(self):
+        end("close")
+
+gymnasium.register("Ending-v0", Ending)
+"""
+
+
+@pytest.mark.parametrize(
+    ("place", "end"),
+    [
+        ("import", "argparse.ArgumentParser().parse_args(['x'])"),
+        *((place, "sys.exit(0)") for place in ("import", "init", "reset", "step", "close")),
+    ],
+)
+def test_an_environment_that_ends_itself_is_one_line_with_its_file(
+    law, tmp_path, monkeypatch, capsys, place, end
+):
+    source = ENDING.replace("PLACE", repr(place)).replace("END", end)
+    (tmp_path / "ending.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "ending", raising=False)
+    monkeypatch.delitem(gymnasium.registry, "Ending-v0", raising=False)
+    words = ["--policy", law(STILL), "--dt", "0.1", "--seeds", "1", "--out", str(tmp_path / "out")]
+    assert main(["eval", "--env", "ending:Ending-v0", *words]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "--env ending:Ending-v0" in error
+    assert "ending.py:9: " in error
+    assert "sys.exit() was called" in error
 
 
 def test_spaces_without_numbers_are_refused_and_integers_are_rounded():
