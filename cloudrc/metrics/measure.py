@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
+from typing import NamedTuple
 
 from cloudrc import plugins
 from cloudrc.errors import BadInputError, describe_error
@@ -97,14 +98,23 @@ def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
     ]
 
 
-def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Number], list[str]]:
+class Measured(NamedTuple):
+    """The numbers of a flight."""
+
+    numbers: dict[str, Number]  # known numbers by name, sorted
+    notes: list[str]  # one for each metric that failed
+    traceback: str  # of the first one that raised, "" if none did
+
+
+def measure_all(flight: Flight, own: Iterable[str] = ()) -> Measured:
     """Compute the metrics of cloudrc, of installed packages and of the user.
 
-    `own` lists the user's metrics by name or file path. Return the known numbers by name, sorted,
-    and a note for each metric that failed. A failure of a user's metric affects only this metric.
+    `own` lists the user's metrics by name or file path. A failure of a user's metric affects only
+    this metric.
     """
     numbers: dict[str, Number] = {}
     notes: list[str] = []
+    traceback = ""
     for choice in sorted({*SHIPPED, *plugins.names("metrics"), *own}, key=name_of):
         name = name_of(choice)
         try:
@@ -125,4 +135,5 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Numb
             plugins.check_failure(error, f"{METRIC_NOTE}{name}")
             why = f"{plugins.place_of(error)}{describe_error(error)}"
             notes.append(f"{METRIC_NOTE}{name} failed: {why}")
-    return numbers, notes
+            traceback = traceback or plugins.stack_of(error)
+    return Measured(numbers, notes, traceback)

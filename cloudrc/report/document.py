@@ -60,11 +60,7 @@ class Assessment:
     operator: FlightVerdict | None  # what telemetry told the operator at the end, if it differs
     notes: tuple[str, ...]  # sentences for the reader of the report
     records_sha256: str | None  # hash of the recording; None if the recording is incomplete
-
-    @property
-    def traceback(self) -> str | None:
-        """The traceback of a plug-in's first failure, if one failed."""
-        return next(filter(None, self.flight.recording["/fault"]["traceback"]), None)
+    traceback: str | None  # of the first failure of a plug-in or a metric, if one failed
 
     @property
     def code(self) -> str | None:

@@ -45,7 +45,7 @@ def assess(
     the experiment names are not executed, because somebody else may have written them.
     """
     flight = flight_of(recording, experiment)
-    numbers, metric_notes = measure_all(flight, own)
+    numbers, metric_notes, traceback = measure_all(flight, own)
     real_time, stopped = run.mode != "virtual", run.interrupted or bool(recording.note)
     evidence = flight_evidence(flight, numbers, real_time=real_time, interrupted=stopped)
     verdict, operator = judge(evidence), None
@@ -67,7 +67,9 @@ def assess(
             )
     kept = tuple(dict.fromkeys([*notes, *metric_notes]))
     digest = None if recording.note else recording.sha256
-    return Assessment(run, experiment, flight, numbers, verdict, operator, kept, digest)
+    # A plug-in in flight comes before a metric.
+    first = next(filter(None, [*recording["/fault"]["traceback"], traceback]), None)
+    return Assessment(run, experiment, flight, numbers, verdict, operator, kept, digest, first)
 
 
 def _clamped_horizon(flight: Flight, experiment: ResolvedExperiment) -> list[str]:

@@ -140,6 +140,17 @@ def test_a_failing_plug_in_fails_the_run_and_debug_shows_where(how, more, folder
     assert 'raise KeyError("oops")' in call(*line, "--debug", code=1).err
 
 
+@pytest.mark.usefixtures("no_page")
+@pytest.mark.parametrize("how", ["--mode virtual", "--seeds 1"])
+def test_debug_shows_the_lines_of_a_metric_that_fails(how, folder, call):
+    (folder / "bad.py").write_text("UNIT = 'm'\ndef measure(flight):\n    return {}['gain']\n")
+    line = [f"run steps {how} --set report.metrics=[./bad.py]", *SHORT]
+    assert "return {}" not in call(*line).err
+    shown = call(*line, "--debug")
+    assert "return {}['gain']" in shown.err
+    assert "KeyError: 'gain'" in shown.err
+
+
 @pytest.mark.parametrize(
     ("out", "said"),
     [

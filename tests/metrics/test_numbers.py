@@ -352,7 +352,7 @@ def flight_of(recording):
 
 
 def test_the_paper_flight_has_all_numbers_of_virtual_flight():
-    numbers, notes = measure_all(flight_of(paper()[1]))
+    numbers, notes, _ = measure_all(flight_of(paper()[1]))
     assert (notes, list(numbers)) == ([], sorted(numbers))
     resting = {f"steady_error_{axis}" for axis in "xyz"}
     others = {"recorder_dropped", "final_error", "controller_gaps", "yaw_error"}
@@ -365,7 +365,7 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight():
 
 
 def test_an_empty_recording_has_no_numbers():
-    assert measure_all(flight_of(Recording.from_records([]))) == ({}, [])
+    assert measure_all(flight_of(Recording.from_records([]))) == ({}, [], "")
 
 
 @pytest.mark.parametrize(("degree", "reached"), [(90, 1.0), (86, 1.0), (84, 0.0), (-90, 0.0)])
