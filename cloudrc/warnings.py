@@ -41,7 +41,7 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
                 f" mission.waypoints.{number - 1}.tolerance_m in metres"
             )
             break  # the others are alike
-    yield from _size(experiment)
+    yield from _robot(experiment)
     yield from _balance(experiment)
     carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
     if carrot is not None and carrot.speed_mps > cap:
@@ -178,13 +178,13 @@ def _fast_track(experiment: ResolvedExperiment) -> Iterator[str]:
         )
 
 
-def _size(experiment: ResolvedExperiment) -> Iterator[str]:
-    """Yield a warning if a user's robot is larger than it says; without MuJoCo there is none."""
-    from cloudrc.config.hull import too_small
+def _robot(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Yield what in a user's model of a robot cannot be right; nothing without MuJoCo."""
+    from cloudrc.config.hull import doubts
 
     if "/" in experiment.world.robot:
         with suppress(MissingPrerequisiteError):
-            yield from filter(None, [too_small(experiment.world.robot)])
+            yield from doubts(experiment.world.robot)
 
 
 def _balance(experiment: ResolvedExperiment) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from importlib.util import find_spec
 
 import numpy as np
@@ -35,23 +36,22 @@ def known_hull(name: str) -> Hull | None:
         return None
 
 
-def too_small(name: str) -> str:
-    """Say that the hull_m of a robot, given as for `find_robot`, does not hold its geoms.
-
-    Return "" if it does, or if the robot gives none.
+def doubts(name: str) -> Iterator[str]:
+    """Say what in the model of a robot, given as for `find_robot`, cannot be right.
 
     Raises:
+        BadInputError: If the model does not compile.
         MissingPrerequisiteError: If MuJoCo is missing.
     """
-    robot = known_robot(name)
-    if robot.hull is None or robot.hull_points is not None:
-        return ""
-    from cloudrc.geometry.compiled import reach_of
+    from cloudrc.geometry.compiled import odd_inertias, reach_of
 
-    if robot.hull >= (reach := reach_of(robot.model)) - TOLERANCE:
-        return ""
-    text = f"hull_m is {robot.hull:g}, but the geoms reach {reach:.3f} m from the base"
-    return f"{name}/{ROBOT_FILE}: {text}"
+    robot = known_robot(name)
+    yield from odd_inertias(robot.model)
+    if robot.hull is None or robot.hull_points is not None:
+        return
+    if robot.hull < (reach := reach_of(robot.model)) - TOLERANCE:
+        text = f"hull_m is {robot.hull:g}, but the geoms reach {reach:.3f} m from the base"
+        yield f"{name}/{ROBOT_FILE}: {text}"
 
 
 def _read_hull(name: str, robot: RobotFiles) -> Hull:

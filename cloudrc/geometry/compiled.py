@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Iterator
 from functools import lru_cache
 from itertools import count
 from math import inf
@@ -61,6 +62,10 @@ _SHAPES: dict[Any, Shape] = {
     _GEOM.mjGEOM_MESH: "hull",
 }
 """Type of a geom -> shape of its solid; all other types become an outline."""
+INERTIAS = 0.005, 10.0
+"""Smallest and largest plausible moment of inertia of a body, relative to its mass times the square
+of the distance of its farthest geom [1]. The small one is a ball of a ninth of this radius. The
+large one leaves room for a model that draws only a part of the body."""
 ROBOT_BITS = 1
 """Value of contype and conaffinity of the robot's geoms."""
 
@@ -218,8 +223,8 @@ def _ordered(a: int, b: int) -> tuple[int, int]:
     return min(a, b), max(a, b)
 
 
-def reach_of(robot: Path) -> float:
-    """Return the radius of the smallest ball about the base that holds a robot's geoms [m].
+def _compile_alone(robot: Path) -> tuple[Any, Any]:
+    """Return the `MjModel` of a robot, and its `MjData` with the robot at rest.
 
     Raise a BadInputError if the robot does not compile.
     """
@@ -229,6 +234,40 @@ def reach_of(robot: Path) -> float:
         raise compile_error(str(robot), error) from None
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    return model, data
+
+
+def odd_inertias(robot: Path) -> Iterator[str]:
+    """Say of each body of a robot that its inertia does not fit its mass and its geoms.
+
+    Raise a BadInputError if the robot does not compile.
+    """
+    model, data = _compile_alone(robot)
+    bodies = model.geom_bodyid
+    for body in np.flatnonzero(model.body_mass).tolist():
+        fixed = np.flatnonzero(model.body_weldid[bodies] == model.body_weldid[body]).tolist()
+        own = [geom for geom in fixed if bodies[geom] == body] or fixed
+        if not own:
+            continue
+        mass, found = float(model.body_mass[body]), float(model.body_inertia[body].max())
+        near, far = (
+            max(_reach(model, data, geom, data.xipos[body]) for geom in geoms)
+            for geoms in (own, fixed)
+        )
+        least, most = INERTIAS[0] * mass * near**2, INERTIAS[1] * mass * far**2
+        if not least <= found <= most:
+            yield (
+                f"{robot}: body {model.body(body).name or body}: an inertia of {found:.2g} kg m^2 "
+                f"does not fit {mass:.3g} kg and its geoms, which have {least:.2g} to {most:.2g}"
+            )
+
+
+def reach_of(robot: Path) -> float:
+    """Return the radius of the smallest ball about the base that holds a robot's geoms [m].
+
+    Raise a BadInputError if the robot does not compile.
+    """
+    model, data = _compile_alone(robot)
     if not model.njnt:  # no robot, as `world.scene` says
         return 0.0
     body = model.jnt_bodyid[0]

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cloudrc.config.hull import hull_of, too_small
+from cloudrc.config.hull import doubts, hull_of
 from cloudrc.config.load import ResolvedGuard
 from cloudrc.config.problems import ProblemsError
 from cloudrc.config.robot import RobotFiles, find_robot
@@ -87,7 +87,7 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
         raise BadInputError("; ".join(problem.reason for problem in error.problems)) from error
     model = compile_model(robot.model, file_of(SCENE))
     facts = _read_facts(world, robot, model)
-    changes = [*filter(None, [too_small(name)]), *_judge_tunings(robot, world)]
+    changes = [*doubts(name), *_judge_tunings(robot, world)]
     try:
         motion = _move(body, robot)
     except OnboardFailedError as error:
