@@ -13,7 +13,8 @@ MODEL_OF = "x2"
 DESCRIPTION = """\
 description: My robot
 model: robot.xml          # MJCF; the base has a free joint
-onboard: multirotor       # or diff_drive, or ./onboard.py with a function build(model)
+onboard: multirotor       # or diff_drive, or ./onboard.py with a function build(model), or the name
+                          # that a package gives in its entry point group cloudrc.onboard
 # planar: true            # for a robot that stays on the ground
 hull_m: 0.34              # ball about the base that holds the robot: at least size_m of the check
 # sensors: {height: {unit: m, sensor: range}}            # own values, from sensors of the model
