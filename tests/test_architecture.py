@@ -311,7 +311,6 @@ MAY_SAY = {
     "renamed.py": ({"board", "pipe", "tip"}, "it is the table of old names"),
     "config/schema.py": ({"pelican", "pipe"}, "shipped robot, scene and mission are defaults"),
     "cli/mission.py": ({"pipe"}, "a shipped mission is an example"),
-    "cli/session.py": ({"pipe"}, "a shipped mission is an example"),
     "gym/registration.py": ({"pipe"}, "an environment has the name of a shipped mission"),
 }
 OPERATING_SYSTEM = {"PIPE", "BrokenPipeError"}

@@ -11,7 +11,7 @@ import argparse
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from shlex import quote
 from threading import Thread
@@ -21,7 +21,8 @@ from cloudrc.cli.find_run import run_argument
 from cloudrc.cli.output import print_line
 from cloudrc.cli.processes import CliCommand
 from cloudrc.cli.run import experiment_arguments, fly_once
-from cloudrc.errors import CloudrcError, NothingFlownError
+from cloudrc.config.shipped import names
+from cloudrc.errors import BadInputError, CloudrcError, NothingFlownError
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.text import escape
@@ -75,15 +76,12 @@ def _up(options: argparse.Namespace) -> int:
         say(escape(f"  API      {api}"))
         say(f"  metrics  http://127.0.0.1:PORT/metrics ({ports})")
         is_seen = folder.resolve() in under_way()
-        planar = is_planar(read_experiment(folder / "config.yaml", flown=True).world.robot)
-        mission, point = ("pillars", "1 0") if planar else ("pipes", "0.5 0 1.2")
+        mission, point = propose(folder / "config.yaml")
         text = NEXT if is_seen else NEXT_UNSEEN
         say(text.format(api=quote(escape(api)), mission=mission, point=point))
         if options.console:
             stack.enter_context(_console(folder, say))
 
-    from cloudrc.config.load import read_experiment
-    from cloudrc.config.robot import is_planar
     from cloudrc.drivers.local import under_way
     from cloudrc.runs.under_way import short
 
@@ -94,6 +92,25 @@ def _up(options: argparse.Namespace) -> int:
     except NothingFlownError as nothing:
         print_line(str(nothing))
         return 0
+
+
+def propose(config: Path) -> tuple[str, str]:
+    """Return a shipped mission and a point that fit the scene and the robot of an experiment.
+
+    `config` is the experiment's file. If no mission fits, return a word for a user's file.
+    """
+    from cloudrc.config.load import load_experiment, read_experiment
+    from cloudrc.config.robot import is_planar
+    from cloudrc.config.scene import scene_of
+
+    world = read_experiment(config, flown=True).world
+    x, y, z = scene_of(world).spawn
+    point = f"{x + 1:g} {y:g}" if is_planar(world.robot) else f"{x + 0.5:g} {y:g} {z + 1.1:g}"
+    for mission in sorted(names("mission"), key=lambda name: name != world.scene):
+        with suppress(BadInputError):
+            load_experiment(config, [f"mission={mission}"], build=False)
+            return mission, point
+    return "MISSION.yaml", point
 
 
 @contextmanager

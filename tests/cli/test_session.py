@@ -18,6 +18,7 @@ from cloudrc import assembly
 from cloudrc.cli import session
 from cloudrc.config.load import dump, load_experiment, read_experiment
 from cloudrc.config.setpoints import write_setpoints
+from cloudrc.config.shipped import file_of
 from cloudrc.drivers import local
 from cloudrc.drivers.machine import usable_cores
 from cloudrc.messages import Start
@@ -130,6 +131,26 @@ def up(folder, *words):
     finally:
         process.kill()
         process.communicate()
+
+
+@pytest.mark.parametrize(
+    ("settings", "proposed"),
+    [
+        (["world.scene=pipes", "mission=pipes"], ("pipes", "0.5 0 1.2")),
+        (["world.robot=nano", "world.scene=empty"], ("hover", "0.5 0 1.2")),
+        (["world.robot=rover", "world.scene=pillars", "mission=pillars"], ("pillars", "1 0")),
+        (["world.scene=./room.xml", "mission=./high.yaml"], ("MISSION.yaml", "5.5 5 3")),
+    ],
+)
+def test_a_session_proposes_what_fits_its_robot_and_scene(folder, settings, proposed):
+    (folder / "high.yaml").write_text("waypoints: [{position_m: [5, 5, 3]}]")
+    room = file_of("empty").read_text()
+    frame = '<frame name="spawn" pos="5 5 1.9"/>'
+    room = re.sub('<frame name="spawn"[^>]*/>', frame, room)
+    room = re.sub('(name="fence" data=)"[^"]*"', r'\1"3 3 0 8 8 4"', room)
+    (folder / "room.xml").write_text(room)
+    (folder / "config.yaml").write_text(dump(load_experiment("hover", settings)))
+    assert session.propose(folder / "config.yaml") == proposed
 
 
 @pytest.mark.process
