@@ -184,7 +184,7 @@ class Stream:
 class Numbers:
     """Statistics of a stream; an unknown value is NaN.
 
-    Source: RFC 4737, section 3, for `overtaken`.
+    Source: RFC 4737, sections 3 and 4.1, for `overtaken`.
     """
 
     mean: float  # mean delay [s]
@@ -253,7 +253,7 @@ def numbers(stream: Stream) -> Numbers:
         correlation=float(np.corrcoef(*pairs)[0, 1]) if varies else float("nan"),
         loss=float(np.mean(stream.copies == 0)),
         runs=loss_runs(stream),
-        overtaken=float(np.mean(overtaken)) if len(overtaken) else float("nan"),
+        overtaken=float(np.sum(overtaken)) / len(arrival) if len(arrival) else float("nan"),
         duplicated=float(np.mean(stream.copies > 1)),
     )
 

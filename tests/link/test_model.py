@@ -282,6 +282,14 @@ def test_statistics_of_losses_copies_and_of_nothing():
     assert all(isnan(value) for value in (nothing.mean, nothing.p99, nothing.correlation))
 
 
+def test_the_share_of_overtaken_packets_is_that_of_all_that_arrived():
+    """Of four packets one is lost and the first is overtaken (RFC 4737)."""
+    stream = Stream(np.array([0.0, 1.0, 2.0, 3.0]), np.array([1.5, 0.1, np.nan, 0.1]), np.ones(4))
+    assert numbers(stream).overtaken == pytest.approx(1 / 3)
+    one = Stream(np.zeros(1), np.ones(1), np.ones(1))
+    assert numbers(one).overtaken == 0.0
+
+
 @pytest.mark.parametrize("delay_ms", [0.1, 45.0, 270.3])
 def test_a_constant_delay_has_no_deviation_and_no_correlation(delay_ms):
     profile = profile_of(delay_ms * 1e-3)
