@@ -29,10 +29,13 @@ def write_files(folder: Path) -> list[str]:
 
 
 def check_folder(folder: Path, *, may_be_empty: bool = False) -> None:
-    """Raise a BadInputError if a folder does not exist or has none of the files.
+    """Raise a BadInputError if a folder does not exist, is a file, or has none of the files.
 
     With `may_be_empty` it may have none, so that a hand-in without the files gets 0 points.
     """
+    if folder.is_file():
+        text = "is a file; if it is an archive, unpack it, and name the folder with the files"
+        raise BadInputError(f"{folder}: {text}")
     if not folder.is_dir():
         raise BadInputError(f"{folder}: no such folder; 'cloudrc class new' makes one")
     names = FILES.values()

@@ -132,7 +132,11 @@ def to_tuple(value: Any) -> Any:
 
 
 def serve(folder: Path, requests: BinaryIO, answers: BinaryIO) -> None:
-    """Answer the requests of the check until it closes its end."""
+    """Answer the requests of the check until it closes its end; work in the hand-in's folder.
+
+    So a file may open one beside it by its name, wherever the check was started.
+    """
+    os.chdir(folder)
     hand_in = HandIn(folder)
     for line in requests:
         number, calls = json.loads(line)

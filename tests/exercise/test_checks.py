@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from contextlib import closing, suppress
+from io import BytesIO
 from math import inf, nan
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from cloudrc import exercise
 from cloudrc.cli.main import main
 from cloudrc.exercise import checks, scoring
 from cloudrc.exercise import files as written
-from cloudrc.exercise.hand_in import FILES, HandIn
+from cloudrc.exercise.hand_in import FILES, HandIn, serve
 from cloudrc.exercise.remote import HandInError, Remote
 from tests.conftest import wait_until
 
@@ -112,6 +113,16 @@ def test_a_process_that_a_file_forks_does_not_answer(monkeypatch):
     monkeypatch.setattr(os, "getpid", lambda: -1)
     with pytest.raises(SystemExit):
         hand_in.answer(calls)
+
+
+def test_a_file_of_the_hand_in_is_found_by_its_name_from_everywhere(tmp_path, monkeypatch):
+    text = (SOLUTION / "predictor.py").read_text()
+    (tmp_path / "predictor.py").write_text(f"open('gains.json').close()\n{text}")
+    (tmp_path / "gains.json").touch()
+    monkeypatch.chdir("/")
+    answers = BytesIO()
+    serve(tmp_path, BytesIO(b'[1, [["predictor 1", "build", {}]]]\n'), answers)
+    assert json.loads(answers.getvalue()) == [1, None, ""]
 
 
 @pytest.mark.process
@@ -262,6 +273,10 @@ def test_files_are_not_overwritten_and_a_folder_must_exist(tmp_path, refused):
     refused("class check", tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     assert "has none of delay_estimator.py" in refused("class check", tmp_path / "empty")
+    (tmp_path / "student.zip").write_bytes(b"PK")
+    assert "is a file; if it is an archive, unpack it" in refused(
+        "class check", tmp_path / "student.zip"
+    )
 
 
 def test_new_files_on_a_full_disk_are_named_and_none_is_left(tmp_path, monkeypatch, refused):
