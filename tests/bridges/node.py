@@ -1,5 +1,7 @@
 """A node of ROS 2 that is right, or wrong in one way: python -m tests.bridges.node KIND."""
 
+import os
+import signal
 import sys
 import time
 
@@ -7,14 +9,15 @@ import rclpy
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.utilities import remove_ros_args
 
-KIND = sys.argv[1]
+KIND, *MORE = remove_ros_args(sys.argv)[1:]
 AFTER = 30
 """Number of answers before a node becomes wrong."""
 LOSSY = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 rclpy.init()
-node = rclpy.create_node(KIND, namespace=sys.argv[2] if len(sys.argv) > 2 else None)
+node = rclpy.create_node(KIND, namespace=MORE[0] if MORE else None)
 kind = Twist if KIND == "unstamped" else PoseStamped if KIND == "type" else TwistStamped
 commands = node.create_publisher(kind, "cloudrc/cmd_vel", LOSSY if KIND == "lossy" else 1)
 count = 0
@@ -33,6 +36,8 @@ def answer(estimate):
         return
     if KIND == "slow" and count > AFTER:
         time.sleep(10)
+    if KIND == "late":
+        time.sleep(0.1)
     command = kind()
     if KIND in ("unstamped", "type"):
         twist = command if KIND == "unstamped" else None
@@ -58,6 +63,10 @@ def answer(estimate):
             time.sleep(0.05)
         elif KIND == "dies":
             sys.exit(7)
+        elif KIND == "killed":
+            os.kill(os.getpid(), signal.SIGKILL)
+        elif KIND == "short":
+            command = bytes(20)
     commands.publish(command)
 
 

@@ -2,7 +2,9 @@
 
 import importlib.util
 import sys
+from importlib.machinery import ModuleSpec
 from math import pi
+from types import SimpleNamespace
 
 import pytest
 from rosbags.typesys import Stores, get_typestore
@@ -44,6 +46,17 @@ def test_a_ros_for_another_python_is_named(tmp_path, monkeypatch):
     for name in ("rclpy", "cloudrc.bridges.ros2.node"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     with pytest.raises(MissingPrerequisiteError, match=r"jazzy .* no _rclpy_pybind11"):
+        require_ros()
+
+
+def test_messages_of_another_ros_are_named(monkeypatch):
+    def load_messages():
+        raise ImportError("Could not import 'rosidl_typesupport_c' for package 'geometry_msgs'")
+
+    monkeypatch.setitem(sys.modules, "rclpy", SimpleNamespace(__spec__=ModuleSpec("rclpy", None)))
+    node = SimpleNamespace(load_messages=load_messages)
+    monkeypatch.setitem(sys.modules, "cloudrc.bridges.ros2.node", node)
+    with pytest.raises(MissingPrerequisiteError, match="for package 'geometry_msgs'"):
         require_ros()
 
 

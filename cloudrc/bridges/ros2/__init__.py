@@ -27,7 +27,11 @@ def require_ros() -> None:
             f"'source /opt/ros/DISTRIBUTION/setup.bash' of a ROS 2 for {python}, then cloudrc again"
         )
     try:
-        import cloudrc.bridges.ros2.node  # noqa: F401
+        import rclpy  # noqa: F401  first: its error says most
+
+        from cloudrc.bridges.ros2.node import load_messages
+
+        load_messages()
     except Exception as error:
         ros = os.environ.get("ROS_DISTRO", "this ROS 2")
         raise MissingPrerequisiteError(

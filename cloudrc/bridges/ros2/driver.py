@@ -21,6 +21,9 @@ LOOK_PERIOD = 0.5
 STRANGE_MAX = 20
 """Number of answers in a row with a stamp that no estimate had, with which the flight ends."""
 
+REPEATS_MAX = 10
+"""Number of answers within `LOOK_PERIOD` to an answered estimate, above which two nodes answer."""
+
 
 class RosDriver:
     """Publishes cloud's observations, and sends the answers of a user's node to cloud."""
@@ -30,7 +33,8 @@ class RosDriver:
         self._peer, self._tell = peer, tell
         self._node = RosNode(namespace, virtual=False)
         self._episode, self._sent_ns = 0, 0  # of the newest observation
-        self._strange = 0
+        self._strange = self._repeats = 0
+        self._answered_ns: int | None = None  # stamp of the newest answer
         self._ended = False
 
     def run(self, stop: Callable[[], bool]) -> None:
@@ -66,7 +70,8 @@ class RosDriver:
                 self._send({"invalid": str(error)})
 
     def _look(self, *, silent: bool) -> None:
-        if word := self._node.check():
+        crowded, self._repeats = self._repeats > REPEATS_MAX, 0
+        if word := self._node.check(crowded=crowded):
             self._tell(word)
         if silent:
             self._send({"trouble": self._node.silence()})
@@ -76,6 +81,8 @@ class RosDriver:
         known: tuple[int, ...] = (self._episode, self._sent_ns)
         if answer.stamp_ns is not None:
             known = self._node.asked.get(answer.stamp_ns, ())
+            self._repeats += answer.stamp_ns == self._answered_ns
+            self._answered_ns = answer.stamp_ns
         if known:
             self._strange = 0
             return {"episode": known[0], "sent_ns": known[1], "rows": [answer.row]}

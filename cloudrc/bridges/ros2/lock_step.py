@@ -81,6 +81,7 @@ class RosLockStep:
         """Refuse an answer to another estimate, unless cloudrc itself has repeated that one."""
         if answered_ns is not None and answered_ns == self._repeated_ns:
             return
+        self._node.check()  # a second node may have come
         if answered_ns == self._answered_ns:
             raise self._node.invalid("answers an estimate twice: publish one command for each")
         given = "-" if answered_ns is None else f"{answered_ns * 1e-9:.9f}"

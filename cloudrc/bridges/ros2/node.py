@@ -5,20 +5,27 @@ Messages cross as CDR bytes, which is faster than rclpy's Python objects.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from math import isfinite
 from typing import Any, NamedTuple
 
-import rclpy
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.type_support import check_for_type_support
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import TimeReference
 
+from cloudrc.bridges.ros2.own_node import (
+    LINGERS,
+    NEWEST,
+    RELIABLE,
+    OwnNode,
+    clash,
+    known,
+    name_of,
+)
 from cloudrc.drivers.remote import INVALID
-from cloudrc.errors import ControllerLostError, MissingPrerequisiteError, to_one_line
+from cloudrc.errors import ControllerLostError
 from cloudrc.record.live import (
     WORLD,
     decode_stamped_twist,
@@ -29,10 +36,6 @@ from cloudrc.record.live import (
     encode_span,
 )
 
-RELIABLE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS of what cloudrc publishes, which all subscriptions match, and of answers in lock step."""
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""QoS of /clock, and of answers in real time: no message waits for an older one."""
 STAMPED, UNSTAMPED = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
 """Types of commands; cloudrc takes the second one in real time only."""
 SPANS = ("loop_delay", "horizon")
@@ -43,6 +46,12 @@ WAKE = 0.1
 """Longest time for which the node waits before it lets signals act [s]."""
 
 
+def load_messages() -> None:
+    """Load the code of all messages; raise an exception if it is not for this ROS or Python."""
+    for kind in (Odometry, PoseStamped, TimeReference, TwistStamped, Twist, Clock):
+        check_for_type_support(kind)
+
+
 class RosAnswer(NamedTuple):
     """A velocity command of a user's node."""
 
@@ -50,8 +59,8 @@ class RosAnswer(NamedTuple):
     row: list[float]  # vx, vy, vz [m/s], world frame, yaw rate [rad/s]
 
 
-class RosNode:
-    """cloudrc's node in ROS 2, with a context of its own: others in this process may have theirs.
+class RosNode(OwnNode):
+    """The node that publishes what a controller needs, and takes its velocity commands.
 
     Attributes:
         asked: Stamp of a published estimate [ns] -> what `publish` was told about it.
@@ -62,26 +71,13 @@ class RosNode:
 
         In `virtual` time, publish /clock, and take answers with a stamp only.
         """
+        super().__init__("cloudrc", namespace)
         self._virtual = virtual
-        self._context = rclpy.Context()
-        try:
-            rclpy.init(args=[], context=self._context)
-        except Exception as error:  # a wrong ROS_DOMAIN_ID, a missing RMW_IMPLEMENTATION
-            text = to_one_line(str(error).partition(", at ")[0])
-            raise MissingPrerequisiteError(f"ROS 2 does not start here: {text}") from None
-        self._node = rclpy.create_node(
-            "cloudrc",
-            context=self._context,
-            namespace=namespace,
-            use_global_arguments=False,
-            enable_rosout=False,
-            start_parameter_services=False,
-        )
         self._names = {
-            name: f"{self._node.get_namespace().rstrip('/')}/cloudrc/{name}"
+            name: self.topic(name)
             for name in ("estimate", "odometry", "setpoint", "cmd_vel", *SPANS)
         }
-        publisher = self._node.create_publisher
+        publisher = self.node.create_publisher
         self._estimate = publisher(Odometry, self._names["estimate"], RELIABLE)
         self._odometry = publisher(Odometry, self._names["odometry"], RELIABLE)
         self._setpoint = publisher(PoseStamped, self._names["setpoint"], RELIABLE)
@@ -89,7 +85,7 @@ class RosNode:
             name: publisher(TimeReference, self._names[name], RELIABLE) for name in SPANS
         }
         self._clock = publisher(Clock, "/clock", NEWEST) if virtual else None
-        self._waiting = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, self._context.handle)
+        self._waiting = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, self.context.handle)
         self._take_type(TwistStamped)
         self.asked: dict[int, Any] = {}
         self._measured_ns = -1
@@ -97,18 +93,13 @@ class RosNode:
 
     def _take_type(self, kind: Any) -> None:
         self._kind = kind
-        self._commands = self._node.create_subscription(
+        self._commands = self.node.create_subscription(
             kind,
             self._names["cmd_vel"],
             _ignore,
             RELIABLE if self._virtual else NEWEST,
             raw=True,
         )
-
-    def close(self) -> None:
-        """Leave ROS."""
-        self._node.destroy_node()
-        rclpy.shutdown(context=self._context)
 
     def publish(self, seen: dict[str, Any], told: Any = None) -> int:
         """Publish an observation; return the stamp of its estimate [ns], which no other one has.
@@ -166,18 +157,25 @@ class RosNode:
     def _read(self, data: bytes) -> RosAnswer:
         if not self._known:
             self.who()
-        stamp_ns: int | None = None
-        frame = WORLD
-        if self._kind is TwistStamped:
-            stamp_ns, frame, velocity, yaw_rate = decode_stamped_twist(data)
-        else:
-            velocity, yaw_rate = decode_twist(data)
-        row = [*velocity, yaw_rate]
+        stamp_ns, frame, row = self._decode(data)
         if not all(map(isfinite, row)):
             raise self.invalid(f"sends a velocity that is not finite: {row}")
         if frame not in (WORLD, ""):
             raise self.invalid(f"sends a velocity in the frame '{frame}'; cloudrc needs '{WORLD}'")
         return RosAnswer(stamp_ns, row)
+
+    def _decode(self, data: bytes) -> tuple[int | None, str, list[float]]:
+        """Return the stamp [ns], the frame and the numbers of a command."""
+        try:
+            if self._kind is Twist:
+                velocity, yaw_rate = decode_twist(data)
+                return None, WORLD, [*velocity, yaw_rate]
+            stamp_ns, frame, velocity, yaw_rate = decode_stamped_twist(data)
+        except Exception:  # rosbags raises what it meets
+            kind = UNSTAMPED if self._kind is Twist else STAMPED
+            text = f"sends {len(data)} bytes that are no {kind} of this ROS"
+            raise self.invalid(text) from None
+        return stamp_ns, frame, [*velocity, yaw_rate]
 
     def invalid(self, text: str) -> ControllerLostError:
         """Return the error that the user's node is wrong as `text` says."""
@@ -185,95 +183,82 @@ class RosNode:
 
     def who(self) -> str:
         """Name the nodes that command, or have commanded."""
-        names = sorted({_name(info) for info in self._publishers()})
+        names = sorted({name_of(info) for info in self._publishers()})
         if names:
             self._known = f"node{'s' if len(names) > 1 else ''} {' and '.join(names)}"
         return self._known or "a node"
 
     def _publishers(self) -> list[Any]:
-        """Return the endpoints that command; one without a name has just left, or just come."""
-        infos = self._node.get_publishers_info_by_topic(self._names["cmd_vel"])
-        return [info for info in infos if "UNKNOWN" not in info.node_name]
+        """Return the endpoints that command."""
+        return known(self.node.get_publishers_info_by_topic(self._names["cmd_vel"]))
 
     @property
     def is_met(self) -> bool:
         """Whether a node commands, and one hears the estimate."""
         heard = self._estimate.get_subscription_count()
-        return bool(heard and self._node.count_publishers(self._names["cmd_vel"]))
+        return bool(heard and self.node.count_publishers(self._names["cmd_vel"]))
 
-    def check(self) -> str:
+    def check(self, *, crowded: bool = False) -> str:
         """Look for a node that cannot command; return a word if its commands have no stamp.
+
+        `crowded` is whether estimates get two answers, as from two nodes with one name.
 
         Raises:
             ControllerLostError: If its type or QoS is wrong, or if two nodes command.
         """
         topic, infos = self._names["cmd_vel"], self._publishers()
         self.who()
+        self._check_alone()
+        names = sorted(map(name_of, infos))
+        if len(set(names)) > 1 or (crowded and len(names) > 1):
+            text = f"nodes {' and '.join(names)} command both ({topic})"
+            raise ControllerLostError(INVALID, f"{text}: end all but one; {LINGERS}")
         word = ""
         for info in infos:
             if info.topic_type == UNSTAMPED and not self._virtual:
                 if self._kind is not Twist:
-                    self._node.destroy_subscription(self._commands)
+                    self.node.destroy_subscription(self._commands)
                     self._take_type(Twist)
-                    word = f"node {_name(info)} publishes {UNSTAMPED} on {topic}, which has no "
+                    word = f"node {name_of(info)} publishes {UNSTAMPED} on {topic}, which has no "
                     word += "stamp: cloudrc takes it as the answer to the newest estimate"
             elif info.topic_type != STAMPED:
                 why = ", which has no stamp" if info.topic_type == UNSTAMPED else ""
                 raise self.invalid(f"publishes {info.topic_type}{why}; cloudrc needs {STAMPED}")
-        for text in self._clashes(infos, self._commands.qos_profile):
-            raise ControllerLostError(INVALID, text)
-        if len({_name(info) for info in infos}) > 1:
-            raise self.invalid("command both: end all but one; a killed node stays for 20 s")
+        for info in infos:
+            if text := clash(info, self._commands.qos_profile, topic):
+                raise ControllerLostError(INVALID, text)
         return word
 
-    def _clashes(self, infos: list[Any], own: QoSProfile) -> Iterator[str]:
-        """Yield sentences about the endpoints of others whose QoS cannot match `own`."""
-        for info in infos:
-            theirs, publishes = info.qos_profile, info.endpoint_type.name == "PUBLISHER"
-            if not (_matches(theirs, own) if publishes else _matches(own, theirs)):
-                verb, topic = ("publishes", "cmd_vel") if publishes else ("subscribes", "estimate")
-                yield (
-                    f"node {_name(info)} {verb} {self._names[topic]} with QoS {_words(theirs)}, "
-                    f"which cannot match cloudrc's {_words(own)}"
-                )
+    def _check_alone(self) -> None:
+        """Raise a ControllerLostError if another node publishes the estimate."""
+        estimate = self._names["estimate"]
+        names = [name_of(info) for info in known(self.node.get_publishers_info_by_topic(estimate))]
+        if len(names) > 1:
+            names.remove(self.node.get_fully_qualified_name())
+            raise ControllerLostError(
+                INVALID,
+                f"node {names[0]} publishes {estimate} in {self.domain}, too: give each flight a "
+                f"domain or a namespace of its own; {LINGERS}",
+            )
 
     def silence(self, limit: float = 0.0) -> str:
         """Say why there was no answer, for `limit` [s] if it is given."""
-        domain = f"ROS domain {self._context.get_domain_id()} (ROS_DOMAIN_ID)"
         estimate = self._names["estimate"]
-        heard = self._node.get_subscriptions_info_by_topic(estimate)
-        if clash := next(self._clashes(heard, RELIABLE), ""):
-            return clash
+        heard = self.node.get_subscriptions_info_by_topic(estimate)
+        for info in heard:
+            if text := clash(info, RELIABLE, estimate):
+                return text
         if not heard:
             who = f"; {self._known} is gone" if self._known else ""
             waited = f" for {limit:.0f} s" if limit >= 1 else ""
-            return f"no node subscribes to {estimate} in {domain}{waited}{who}"
+            return f"no node subscribes to {estimate} in {self.domain}{waited}{who}"
         topic = self._names["cmd_vel"]
         if not self._publishers():
-            names = " and ".join(sorted({_name(info) for info in heard}))
-            return f"no node publishes {topic} in {domain}; {names} subscribes to {estimate}"
+            names = " and ".join(sorted({name_of(info) for info in heard}))
+            return f"no node publishes {topic} in {self.domain}; {names} subscribes to {estimate}"
         waited = f" within {limit:g} s" if limit else ""
         return f"{self.who()}: no answer on {topic}{waited}"
 
 
 def _ignore(data: bytes) -> None:
     """Do nothing: `take` takes the messages."""
-
-
-def _name(info: Any) -> str:
-    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-
-
-def _matches(offered: Any, wanted: Any) -> bool:
-    """Return whether a subscription with the QoS `wanted` gets what is `offered`.
-
-    rclpy's own check also compares deadlines, which it does not know of cloudrc's side.
-    """
-    reliable, kept = ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL
-    is_reliable = offered.reliability == reliable or wanted.reliability != reliable
-    is_kept = offered.durability == kept or wanted.durability != kept
-    return bool(is_reliable and is_kept)
-
-
-def _words(qos: Any) -> str:
-    return f"{qos.reliability.name}, {qos.durability.name}"
