@@ -11,7 +11,7 @@ import argparse
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from shlex import quote
 from threading import Thread
@@ -145,7 +145,6 @@ def _console(folder: Path, say: Say) -> Iterator[None]:
 
 def _down(options: argparse.Namespace) -> int:
     """End a session, and print the path of its report."""
-    from cloudrc.cli.progress import StepView
     from cloudrc.drivers.local import end_session
     from cloudrc.runs.session import last_mission
     from cloudrc.runs.under_way import find_session, short
@@ -153,8 +152,7 @@ def _down(options: argparse.Namespace) -> int:
     run, note = find_session(options.run)
     if note:
         print_line(f"cloudrc: {note}", sys.stderr)
-    with closing(StepView(sys.stderr, f"waits for the report of {short(run)}")):
-        end_session(run, DOWN_LIMIT)
+    end_session(run, DOWN_LIMIT)
     name = short(run)
     if (run / "report.json").exists():
         print_line(short(run / "report.html"))
