@@ -7,9 +7,9 @@ import sys
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from cloudrc.cli.output import output_argument, print_line, print_result
+from cloudrc.cli.output import output_argument, print_line, print_or_drop, print_result
 from cloudrc.cli.parser import COUNT_MAX, number, read_count
 from cloudrc.errors import BadInputError
 from cloudrc.runs.folder import new_folder
@@ -83,24 +83,26 @@ def execute(options: argparse.Namespace) -> int:
     interrupt_on_signals()
     needed = ["gym", "report", *(["policy"] if "://" in options.policy else [])]
     require("an evaluation", needed)
+    from cloudrc.cli.progress import CountView, StepView
     from cloudrc.eval import results
     from cloudrc.eval.episode import check_environment, follows_seed
     from cloudrc.eval.page import write_page
 
     setup, episodes = _read(options)
-    check_environment(setup, episodes)
-    if not follows_seed(setup):
+    with closing(StepView(sys.stderr, f"makes the environment {setup.env}")):
+        check_environment(setup, episodes)
+        seeded = follows_seed(setup)
+    if not seeded:
         setup = replace(setup, follows_seed=False)
         print_line(f"cloudrc: warning: --env {setup.env}: {results.SEEDLESS}", sys.stderr)
     folder = options.out
     if folder is None or not results.is_begun(folder):
         folder = new_folder(folder, f"eval-{Path(setup.env).name}", "latest-eval")
     stream = sys.stdout if options.output == "table" else sys.stderr
-    with lock_folder(folder), closing(_Progress(stream, len(episodes))) as progress:
+    print_or_drop(escape(f"{setup.env}: {len(episodes)} episodes"), stream)
+    with lock_folder(folder), closing(CountView(stream, len(episodes), "episodes")) as view:
         try:
-            rows, stopped = results.play_missing(
-                folder, setup, episodes, options.jobs, progress.see
-            )
+            rows, stopped = results.play_missing(folder, setup, episodes, options.jobs, view.count)
         except Exception:
             if results.is_begun(folder):
                 print_line(
@@ -156,23 +158,3 @@ def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
         for seed in range(1, options.seeds + 1)
     ]
     return setup, episodes
-
-
-class _Progress:
-    """One line that counts the episodes, on a terminal."""
-
-    def __init__(self, stream: Any, count: int) -> None:
-        self._stream, self._count, self._done = stream, count, 0
-
-    def see(self, row: dict[str, Any]) -> None:
-        """Count a row."""
-        self._done += 1
-        if self._stream.isatty():
-            print(
-                f"\r{self._done} of {self._count} episodes", end="", file=self._stream, flush=True
-            )
-
-    def close(self) -> None:
-        """End the line."""
-        if self._done and self._stream.isatty():
-            print(file=self._stream)

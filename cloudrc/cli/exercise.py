@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import closing
 from pathlib import Path
 from shlex import quote
 
@@ -52,15 +53,16 @@ def execute(options: argparse.Namespace) -> int:
     check_folder(folder, may_be_empty=for_gradescope)
     require("a check", ("world",))
     interrupt_on_signals()
-    print_or_drop(escape(f"scores {folder}"), sys.stderr)
+    from cloudrc.cli.progress import StepView
     from cloudrc.exercise import score
     from cloudrc.exercise.scoring import check
 
     rows = []
-    for row in check(folder.resolve()):
-        rows.append(row)
-        text = f"  {row['part']}, {row['test']}: {row['points']:g}/{row['max_points']}"
-        print_or_drop(text, sys.stderr)
+    with closing(StepView(sys.stderr, f"scores {folder}")) as view:
+        view.say(escape(f"scores {folder}"))
+        for row in check(folder.resolve()):
+            rows.append(row)
+            view.say(f"  {row['part']}, {row['test']}: {row['points']:g}/{row['max_points']}")
     result = score.sum_up(rows)
     if for_gradescope:  # without schemaVersion
         print_result("table", {}, format_document(score.for_gradescope(result), "json"))

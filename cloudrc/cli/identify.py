@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
+from contextlib import closing
 from pathlib import Path
 
 from cloudrc.cli.output import format_document, output_argument, print_result
@@ -31,12 +33,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Fit the model, write it to a file, and print it."""
     require("identify", ("record",))
+    from cloudrc.cli.progress import StepView
     from cloudrc.runs.identify import as_text, describe, identify
 
     out = options.out
     if os.path.lexists(out):
         raise BadInputError(f"{out}: already there; name another file with --out")
-    fits, seconds = identify(options.run)
+    with closing(StepView(sys.stderr, f"reads {options.run} and fits the model")):
+        fits, seconds = identify(options.run)
     document = describe(fits, seconds)
     write_atomically(out, f"{format_document(document, 'yaml')}\n".encode())
     print_result(options.output, document, f"{as_text(fits, seconds)}\n{escape(str(out))}")

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
+from contextlib import closing
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.compare import flight_arguments
-from cloudrc.cli.output import output_argument, print_or_drop, print_result
+from cloudrc.cli.output import output_argument, print_result
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.text import escape
@@ -46,9 +48,11 @@ def execute(options: argparse.Namespace) -> int:
     """Print both answers; return 0, or 1 if no value is stable (or, without that, none settles)."""
     interrupt_on_signals()
     require("margin", MODES["virtual"])
+    from cloudrc.cli.progress import StepView
     from cloudrc.runs.margin_text import as_text
     from cloudrc.runs.trials import QUESTIONS, Asked, Trials, describe, questions
 
+    stream = sys.stdout if options.output == "table" else sys.stderr
     trials = Trials(
         Asked(
             options.key,
@@ -61,27 +65,28 @@ def execute(options: argparse.Namespace) -> int:
     )
     asked = questions(trials)
     found: dict[str, ValueRange | None] = {}
-    for name in QUESTIONS:
-        found[name] = _search(options, trials, name) if name in asked else None
-    document = describe(trials, found)
+    with closing(StepView(stream, "flies")) as view:
+        for name in QUESTIONS:
+            found[name] = _search(options, trials, name, view.say) if name in asked else None
+        document = describe(trials, found)
     lines = as_text(document, found, trials).splitlines()
     print_result(options.output, document, "\n".join(["", *map(escape, lines)]))
     return 0 if document[f"{asked[0]}_up_to"] is not None else 1
 
 
-def _search(options: argparse.Namespace, trials: Trials, question: str) -> ValueRange:
-    """Search the answer to a question, and print each value that is tried."""
+def _search(
+    options: argparse.Namespace, trials: Trials, question: str, say: Callable[[str], None]
+) -> ValueRange:
+    """Search the answer to a question, and `say` each value that is tried."""
     from cloudrc.runs.margin_text import result
     from cloudrc.runs.stability import SCENE, SMALL
     from cloudrc.runs.trials import QUESTIONS
 
-    stream = sys.stdout if options.output == "table" else sys.stderr
     facts = {"small": SMALL, "scene": SCENE, "experiment": options.experiment}
     text = QUESTIONS[question].format(**facts)
-    print_or_drop(escape(f"{text}, seeds 1 to {options.seeds}"), stream)
+    say(escape(f"{text}, seeds 1 to {options.seeds}"))
 
     def see(number: int, trial: Trial) -> None:
-        line = f"  {trials.name(number):<26}{result(question, trial)}"
-        print_or_drop(escape(line), stream)
+        say(escape(f"  {trials.name(number):<26}{result(question, trial)}"))
 
     return trials.search(question, see)

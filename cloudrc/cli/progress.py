@@ -1,15 +1,17 @@
-"""Show the progress of a flight or of a sweep; on a terminal, in a status line."""
+"""Show what a long command does: on a terminal in a moving line, else in a line every 10 s."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from threading import Timer
+import sys
+from collections.abc import Callable, Iterable
+from threading import Event, Lock, Thread
 from time import monotonic
 from typing import TYPE_CHECKING, TextIO
 
 from rich.console import Console
 from rich.live import Live
+from rich.spinner import Spinner
 from rich.text import Text
 
 from cloudrc.cli.output import is_live, print_or_drop
@@ -30,39 +32,118 @@ if TYPE_CHECKING:
     from cloudrc.runs.flight import Row
 
 ENDINGS = ("done", "cancelled", "timed_out")
-FIRST_WAIT = 3.0
-"""Time from the first result to the first line of progress on a stream that is no terminal [s]."""
-FLIGHTS_PERIOD, CHECK_PERIOD = 30.0, 10.0
-"""Time between two further lines [s]: while flights are flown, and while points are checked."""
-REPORT_AFTER = 1.0
-"""Time without a record after the end of a mission, from which on the report is written [s]."""
-PLAN_WAIT = 1.0
-"""Time after which the check of a sweep, or a report, shows its progress [s]."""
+FIRST_WAIT, PERIOD = 3.0, 10.0
+"""Time to the first line on a stream that is no terminal, and from one line to the next [s]."""
+STEP_WAIT = 1.0
+"""Time after which a terminal shows the step of a command, or the check of a sweep [s]."""
 
 
-class FlightView:
-    """Prints the events of a flight to a stream and, on a terminal, updates a status line.
+class StatusLine:
+    """Shows one line about a work until it is closed: a terminal or a log is never silent.
+
+    On a terminal the line moves. On another stream it is printed `FIRST_WAIT` after the beginning,
+    and then whenever nothing was printed for `PERIOD`.
+    """
+
+    def __init__(
+        self,
+        stream: TextIO,
+        line: Callable[[], str | Text],
+        wait: float = 0.0,
+        *,
+        in_logs: bool = True,
+    ) -> None:
+        """Set the stream and the function that returns the line.
+
+        A terminal shows the line after `wait` [s]. Without `in_logs`, other streams
+        get it after `begin_log`.
+        """
+        self._stream, self._line, self._wait = stream, line, wait
+        self._began, self._quiet_since = monotonic(), monotonic() - PERIOD
+        self._closed, self._printing = Event(), Lock()
+        self._live: Live | None = None
+        self._thread: Thread | None = None
+        if is_live(stream):
+            self._spinner = Spinner("dots")
+            terminal = Console(file=stream)
+            self._live = Live(
+                console=terminal,
+                transient=True,
+                get_renderable=self._moving,
+                # What goes elsewhere must not appear on this terminal.
+                redirect_stdout=is_live(sys.stdout),
+                redirect_stderr=is_live(sys.stderr),
+            )
+            self._live.start(refresh=True)  # now: the work may begin with a long import
+        elif in_logs:
+            self.begin_log()
+
+    def begin_log(self) -> None:
+        """Print the line from now on, if the stream is no terminal."""
+        if not self._live and not self._thread:
+            self._thread = Thread(target=self._print, daemon=True)
+            self._thread.start()
+
+    @property
+    def elapsed(self) -> str:
+        """The time since the beginning, for people."""
+        return f"{monotonic() - self._began:.0f} s"
+
+    def _moving(self) -> Text:
+        line = Text(no_wrap=True, overflow="crop")
+        if monotonic() - self._began >= self._wait:
+            line.append(str(self._spinner.render(monotonic()))).append(" ").append(self._line())
+        return line
+
+    def _print(self) -> None:
+        wait = FIRST_WAIT
+        while not self._closed.wait(wait):
+            wait = PERIOD - (monotonic() - self._quiet_since)
+            if wait <= 0.0:
+                wait = PERIOD
+                self.say(str(self._line()))
+
+    def say(self, line: str) -> None:
+        """Print a line for good; on a terminal, above the moving one."""
+        self._quiet_since = monotonic()
+        if self._live:
+            self._live.console.print(Text(line))
+            return
+        with self._printing:
+            print_or_drop(line, self._stream)
+
+    def close(self) -> None:
+        """Erase the moving line."""
+        self._closed.set()
+        if self._thread:
+            self._thread.join()
+        if self._live:
+            self._live.stop()
+
+
+class FlightView(StatusLine):
+    """Prints the events of a flight to a stream, and shows its state.
 
     All times are those of the report: since the mission's start, on world's clock.
     """
 
-    def __init__(self, stream: TextIO, waypoints: int, unit: str = "waypoint") -> None:
+    def __init__(
+        self, stream: TextIO, waypoints: int, unit: str = "waypoint", *, events: bool = True
+    ) -> None:
         """Set the stream and the number of waypoints (0: unknown); show a status line at once.
 
-        `unit` is what the mission counts; "": nothing.
+        `unit` is what the mission counts; "": nothing. Without `events`, print no events.
         """
-        self._stream, self._waypoints, self._unit = stream, waypoints, unit
+        self._waypoints, self._unit, self._events = waypoints, unit, events
         self._first_ns = self._now_ns = self._start_ns = NEVER_NS
         self._mission = 0  # number of the mission in the newest telemetry
-        self._began = self._seen = monotonic()
+        self._moved_at = self._seen = monotonic()
         self._position: Vector = (math.nan, math.nan, math.nan)
         self._delay, self._waypoint = math.nan, -1
         self._guard, self._ended = GuardState.GROUND, False
-        self._status: Live | None = None
-        if is_live(stream):
-            terminal = Console(file=stream)
-            self._status = Live(console=terminal, transient=True, get_renderable=self.line)
-            self._status.start(refresh=True)  # now: the preparation takes a second
+        self._step = ""  # what the command does after the flight
+        # A session, which has no waypoints, may wait for its next mission for days.
+        super().__init__(stream, self.line, in_logs=bool(waypoints))
 
     def see(self, records: Iterable[Record]) -> None:
         """Show new records of world or cloud, in the order of time."""
@@ -84,7 +165,7 @@ class FlightView:
 
     def _see_telemetry(self, record: TelemetrySent) -> None:
         if self._first_ns == NEVER_NS:
-            self._first_ns, self._began = record.stamp_ns, monotonic()
+            self._first_ns, self._moved_at = record.stamp_ns, monotonic()
         if record.telemetry.mission_id != self._mission:
             self._mission, self._start_ns = record.telemetry.mission_id, record.stamp_ns
         self._now_ns, self._seen = record.stamp_ns, monotonic()
@@ -101,9 +182,9 @@ class FlightView:
 
     def line(self) -> Text:
         """Return the status line; it ends with the least important part, which may be cropped."""
-        if self._ended and monotonic() - self._seen > REPORT_AFTER:
-            return Text("the mission is over: writes the report")
-        elapsed, flown = self._seen - self._began, (self._now_ns - self._first_ns) * 1e-9
+        if self._step:
+            return Text(f"{self._step} ({self.elapsed})")
+        elapsed, flown = self._seen - self._moved_at, (self._now_ns - self._first_ns) * 1e-9
         since = self._now_ns - self._start_ns if self._start_ns != NEVER_NS else 0
         cells = (
             f"{since * 1e-9:6.1f} s",
@@ -130,64 +211,47 @@ class FlightView:
         return "" if math.isnan(x) else f"({x:5.2f}, {y:5.2f}, {z:4.2f}) m"
 
     def _event(self, text: str, stamp_ns: int) -> None:
+        if not self._events:
+            return
         since = (stamp_ns - self._start_ns) * 1e-9
         time = " " * 9 if self._start_ns == NEVER_NS else f"{since:7.2f} s"
         self.say(_joined((time, f"{escape(text):<44}", self._place())))
 
-    def say(self, line: str) -> None:
-        """Print a line above the status line."""
-        if self._status:
-            self._status.console.print(Text(line))
-        else:
-            print_or_drop(line, self._stream)
-
-    def close(self) -> None:
-        """Erase the status line."""
-        if self._status:
-            self._status.stop()
+    def tell(self, step: str) -> None:
+        """Show what the command does after the flight."""
+        self._step, self._began = step, monotonic()
+        self.begin_log()
 
 
 def _joined(cells: Iterable[str]) -> str:
     return "  ".join(cell for cell in cells if cell).rstrip()
 
 
-class CountView:
-    """Shows how much of a long work is done: on a terminal in a status line, else in some lines."""
+class CountView(StatusLine):
+    """Shows how much of a long work is done, and how long the rest takes."""
 
-    def __init__(self, stream: TextIO, total: int, unit: str, period: float) -> None:
-        """Set the amount of work `total` and its `unit`, such as "flights".
-
-        If the stream is no terminal, print a line `FIRST_WAIT` after the first result, and then
-        every `period` [s]. The rate counts from the first result: workers take seconds to start.
-        """
-        self._stream, self._total, self._unit, self._period = stream, total, unit, period
-        self._began, self._at_first, self._next = math.nan, 0, math.inf
-        self._status = Console(file=stream).status(f"0/{total}") if is_live(stream) else None
-        if self._status:
-            self._status.start()
+    def __init__(self, stream: TextIO, total: int, unit: str) -> None:
+        """Set the amount of work `total` and its `unit`, such as "flights"."""
+        self._total, self._unit, self._done, self._more = total, unit, 0, ""
+        self._first, self._at_first = math.nan, 0
+        super().__init__(stream, self.line)
 
     def count(self, done: int, more: str = "") -> None:
         """Show that `done` pieces of work are done; `more` ends the line."""
-        now = monotonic()
-        if math.isnan(self._began):
-            self._began, self._at_first, self._next = now, done, now + FIRST_WAIT
-        rate = (done - self._at_first) / max(now - self._began, 1e-3)
-        line = f"{done}/{self._total}"
-        if rate > 0.0:
-            left = (self._total - done) / rate
-            time = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
-            line += f"  {rate:.1f} {self._unit}/s, {time} left"
-        line += more
-        if self._status:
-            self._status.update(line)
-        elif now >= self._next:
-            self._next = now + self._period
-            print_or_drop(line, self._stream)
+        if math.isnan(self._first):
+            self._first, self._at_first = monotonic(), done
+        self._done, self._more = done, more
 
-    def close(self) -> None:
-        """Erase the status line on a terminal."""
-        if self._status:
-            self._status.stop()
+    def line(self) -> str:
+        """Return the line. The rate counts from the first result: workers take seconds to start."""
+        line = f"{self._done}/{self._total} {self._unit}"
+        more = self._done - self._at_first
+        if not more:
+            return f"{line}  {self.elapsed}{self._more}"
+        rate = more / max(monotonic() - self._first, 1e-3)
+        left = (self._total - self._done) / rate
+        time = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
+        return f"{line}  {rate:.1f}/s, {time} left{self._more}"
 
 
 class PlanView:
@@ -200,12 +264,12 @@ class PlanView:
 
     def see(self, done: int, points: int, seeds: int) -> None:
         """Show that `done` points of a sweep are checked."""
-        if monotonic() - self._began < PLAN_WAIT or done == points:
+        if monotonic() - self._began < STEP_WAIT or done == points:
             return
         if not self._view:
             text = f"checks {points:,} points x {seeds:,} seeds: {points * seeds:,} flights"
             print_or_drop(text, self._stream)
-            self._view.append(CountView(self._stream, points, "points", CHECK_PERIOD))
+            self._view.append(CountView(self._stream, points, "points"))
         self._view[0].count(done)
 
     def close(self) -> None:
@@ -214,82 +278,60 @@ class PlanView:
             view.close()
 
 
-class StepView:
-    """Shows the present step of a command: on a terminal in a status line, else in one line.
-
-    Nothing is shown before `PLAN_WAIT` on a terminal, or `FIRST_WAIT` on another stream.
-    """
+class StepView(StatusLine):
+    """Shows the present step of a command, if the command takes longer than a second."""
 
     def __init__(self, stream: TextIO, step: str) -> None:
         """Set the stream and the first step, such as "reads the recording"."""
-        self._stream, self._step = stream, step
-        self._status = Console(file=stream).status(Text(escape(step))) if is_live(stream) else None
-        self._timer = Timer(PLAN_WAIT if self._status else FIRST_WAIT, self._begin)
-        self._timer.daemon = True
-        self._timer.start()
+        self._step = step
+        super().__init__(stream, self.line, STEP_WAIT)
 
-    def _begin(self) -> None:
-        if self._status:
-            self._status.start()
-        else:
-            print_or_drop(escape(self._step), self._stream)
+    def line(self) -> str:
+        """Return the step, and how long the command has taken."""
+        return f"{escape(self._step)} ({self.elapsed})"
 
     def tell(self, step: str) -> None:
         """Set the next step."""
         self._step = step
-        if self._status:
-            self._status.update(Text(escape(step)))
-
-    def close(self) -> None:
-        """Erase the status line on a terminal."""
-        self._timer.cancel()
-        self._timer.join()
-        if self._status:
-            self._status.stop()
 
 
 class SweepView(CountView):
-    """Shows how many flights are done: on a terminal in a status line, else in a line per 30 s."""
+    """Shows how many flights are done."""
 
     def __init__(self, stream: TextIO, head: str, total: int) -> None:
         """Print the headline `head`; set `total`, the number of flights to fly."""
         print_or_drop(escape(head), stream)
-        super().__init__(stream, total, "flights", FLIGHTS_PERIOD)
-        self._done, self._failed, self._told = 0, 0, set[str]()
+        super().__init__(stream, total, "flights")
+        self._failed, self._told = 0, set[str]()
 
     def see(self, row: Row) -> None:
         """Count a finished flight; print its failure if it is the first of its verdict.
 
         Print why a metric has no value once per text.
         """
-        self._done += 1
         self._failed += row["verdict"] != "success"
         kind = row["verdict"] if row["failures"] else row["text"]
         if row["text"] and kind not in self._told:
             self._told.add(kind)
-            text = f"{row['key']}: {row['verdict']}: {row['text']}"
-            print_or_drop(escape(text), self._stream)
-        self.count(self._done, f", {self._failed} failed" if self._failed else "")
+            self.say(escape(f"{row['key']}: {row['verdict']}: {row['text']}"))
+        self.count(self._done + 1, f", {self._failed} failed" if self._failed else "")
 
 
-class SeedsView:
+class SeedsView(CountView):
     """Prints a line per flight with its seed, its verdict and why it failed."""
 
     def __init__(self, stream: TextIO, head: str, total: int) -> None:
         """Print the headline `head`; set `total`, the number of flights to fly."""
         print_or_drop(escape(head), stream)
-        self._stream, self._total = stream, total
-        self._done, self._told = 0, set[str]()
+        super().__init__(stream, total, "flights")
+        self._told = set[str]()
 
     def see(self, row: Row) -> None:
         """Print the line of a finished flight; say why a metric has no value once per text."""
-        self._done += 1
+        self.count(self._done + 1)
         count = f"{self._done}/{self._total}"
         line = f"{count:>7}  seed {row['seed']}  {row['verdict']}"
         if row["failures"] or row["text"] not in ("", *self._told):
             line += f": {row['text']}"
         self._told.add(row["text"])
-        print_or_drop(escape(line), self._stream)
-
-    def close(self) -> None:
-        """Do nothing: each line is final."""
+        self.say(escape(line))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 
@@ -33,6 +35,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Copy a damaged recording; print which share of the data was kept, and the known losses."""
     require("a recovery", ("record",))
+    from cloudrc.cli.progress import StepView
     from cloudrc.record.recovery import recover
     from cloudrc.report.attached import attached_views
     from cloudrc.runs.session import refuse_under_way
@@ -42,7 +45,8 @@ def execute(options: argparse.Namespace) -> int:
     target = options.to or source.parent / f"{source.stem}.recovered{source.suffix}"
     if os.path.lexists(target):
         raise BadInputError(f"{target}: already there; name another file with --to")
-    recovery = recover(source, target, attached_views)
+    with closing(StepView(sys.stderr, f"copies what is readable of {source}")):
+        recovery = recover(source, target, attached_views)
     text = "\n".join(map(escape, [*recovery.as_lines(), str(target)]))
     print_result(options.output, {"file": str(target), **asdict(recovery)}, text)
     return 0 if recovery.complete else LOSSY

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import closing
 from pathlib import Path
 
 from cloudrc.cli.output import open_page, print_line
@@ -26,9 +27,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Write the page, open it in the browser, and print its path."""
     require("a replay", ("world", "record", "console"))
+    from cloudrc.cli.progress import StepView
     from cloudrc.runs.replay import write_replay
 
-    out = write_replay(options.run, options.out)
+    with closing(StepView(sys.stderr, f"reads the recording of {options.run}")):
+        out = write_replay(options.run, options.out)
     if not options.no_open and not open_page(out.absolute().as_uri()):
         print_line("cloudrc: found no browser here; open the page yourself", sys.stderr)
     print_line(str(out))

@@ -173,22 +173,24 @@ def _local_flight(
     With `ready`, the function flies a session, in which teleop waits for missions. It calls `ready`
     when all processes are ready. `beside` is the command of a program that runs with the flight.
     """
-    from cloudrc.cli.progress import FlightView, StepView
+    from cloudrc.cli.progress import FlightView
     from cloudrc.runs.fly import fly
 
     def flight(folder: Path) -> dict[str, Any]:
         with contextlib.ExitStack() as stack:
-
-            def landed() -> None:
-                if not is_live(stream):  # there the view of the flight says so
-                    report = StepView(sys.stderr, "writes the report")
-                    stack.enter_context(contextlib.closing(report))
-
-            if stream is sys.stderr and not is_live(stream):
-                return fly(experiment, mode, folder, beside=beside, landed=landed)
             mission = experiment.mission
             counted = (0, "waypoint") if ready else (mission.count, mission.unit)
-            view = stack.enter_context(contextlib.closing(FlightView(stream, *counted)))
+            # Programs that read the document may also read what a log of stderr has.
+            events = stream is sys.stdout or is_live(stream)
+            view = FlightView(stream, *counted, events=events)
+            stack.enter_context(contextlib.closing(view))
+
+            def landed() -> None:
+                if is_interrupted():
+                    why = "the session ends" if ready else "interrupted"
+                    view.say(f"{why}: writes the report; Ctrl-C again leaves it out")
+                view.tell("writes the report")
+
             session = partial(ready, folder, view.say, stack) if ready else None
             return fly(
                 experiment, mode, folder, view.see, session=session, beside=beside, landed=landed

@@ -19,7 +19,7 @@ from cloudrc.cli.output import (
     print_result,
     warn,
 )
-from cloudrc.cli.progress import PlanView, SeedsView, SweepView
+from cloudrc.cli.progress import PlanView, SeedsView, StepView, SweepView
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.cluster.pods import refuse_local_files
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
@@ -98,7 +98,8 @@ def fly_again(options: argparse.Namespace) -> int:
     require("a report", MODES["virtual"])
     row, flight = sweep.find_flight(options.folder, options.key)
     key = flight.key
-    report = sweep.fly_into(options.folder / key, flight, page=True)
+    with closing(StepView(sys.stderr, f"flies {key} again")):
+        report = sweep.fly_into(options.folder / key, flight, page=True)
     print_traceback(options, report)
     print_or_drop(summary(report, options.folder / key))
     sweep.check_repeated(row, report)

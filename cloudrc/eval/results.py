@@ -63,9 +63,11 @@ def play_missing(
     setup: EvalSetup,
     episodes: Sequence[Episode],
     jobs: int,
-    see: Callable[[Row], None] = lambda row: None,
+    see: Callable[[int], None] = lambda done: None,
 ) -> tuple[list[Row], CloudrcError | None]:
     """Play the episodes without a row in `folder`; return the rows of all, and why it ended early.
+
+    `see` gets the number of episodes that have a row, at the beginning and after each one.
 
     Raises:
         BadInputError: If the folder has rows of other code, or the environment fails.
@@ -83,12 +85,16 @@ def play_missing(
     # A server may serve one episode at a time.
     jobs = 1 if setup.is_remote else jobs
     played = map_in_order(partial(play, setup=setup, identity=identity), missing, jobs)
+    left = len(missing)
+    see(len(episodes) - left)
     with append_rows(folder, None) as append:
 
         def take(row: Row) -> None:
+            nonlocal left
             append(row)
             rows[row["key"]] = row
-            see(row)
+            left -= 1
+            see(len(episodes) - left)
 
         stopped = take_each(played, take)
     keys = [each.key(identity) for each in episodes]

@@ -95,7 +95,7 @@ def verify(
         settings: Changes of the experiment: KEY=VALUE.
         shaper: "relay", or "netem", which needs root.
         seconds: Time to send probes [s]; None: as long as needed.
-        tell: Receives a line before each measurement.
+        tell: Receives each step, in words.
     """
     experiment = find_experiment(target, settings)
     plans, found = make_plans(experiment, check_seconds(seconds), shaper), dict[str, Findings]()
@@ -103,7 +103,7 @@ def verify(
     for look in ("sending probes", "measuring again what is off"):
         with run_link(experiment, shaper) as ways:
             tell(f"{look} for {longest:.0f} s")
-            now = probe_link(ways, plans)
+            now = probe_link(ways, plans, tell)
         rows = {way: look_twice(found.get(way, now[way]).rows, now[way].rows) for way in now}
         found = {way: now[way]._replace(rows=rows[way]) for way in now}
         if "off" not in {verdict_of(one.rows) for one in found.values()}:
@@ -141,9 +141,12 @@ def make_plans(
     return plans
 
 
-def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Measurement]) -> dict[str, Findings]:
+def probe_link(
+    ways: Mapping[str, Way], plans: Mapping[str, Measurement], tell: Tell = lambda text: None
+) -> dict[str, Findings]:
     """Send all probes over a running link, and judge it; return direction -> findings."""
     streams, found = measure(ways, plans), {}
+    tell("judges what has arrived")
     time.sleep(COUNTS_WAIT)
     for name, way in ways.items():
         page = json.loads((way.folder / STATE_FILE).read_text())

@@ -13,6 +13,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
+from unittest.mock import Mock
 
 import pytest
 from pydantic import Discriminator, Tag, create_model
@@ -174,8 +175,20 @@ def test_a_flight_ends_after_a_signal_that_a_plugin_caught(tmp_path, monkeypatch
     interrupt_on_signals()
     monkeypatch.setattr("cloudrc.assembly.fly", fly)
     experiment = load_experiment("hover")
-    with flights._record_virtual(experiment, tmp_path, lambda records: None, bool) as (_, _, facts):
+    with flights._record_virtual(experiment, tmp_path, lambda records: None, bool, bool) as (
+        _,
+        _,
+        facts,
+    ):
         assert facts.interrupted
+
+
+def test_an_interrupted_flight_says_at_once_that_the_report_takes_time(monkeypatch, call):
+    interrupt = Mock(side_effect=lambda *given, **more: os.kill(os.getpid(), signal.SIGINT))
+    monkeypatch.setattr("cloudrc.assembly.fly", interrupt)
+    monkeypatch.setattr("cloudrc.runs.fly.views", interrupt)
+    shown = call("run hover --mode virtual --out r", code=130)
+    assert "interrupted: writes the report; Ctrl-C again leaves it out" in shown.out
 
 
 def test_a_signal_that_a_library_turned_into_an_error_of_the_report_interrupts(monkeypatch, call):

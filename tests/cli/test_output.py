@@ -59,17 +59,25 @@ def test_yaml_has_the_content_of_json(line, call):
     assert document["schemaVersion"] == 1
 
 
-def test_a_file_gets_the_first_rate_soon_and_then_one_per_period(monkeypatch):
-    """The rate counts from the first result, not from the start of the workers."""
-    now, file = [-50.0], io.StringIO()
+def test_the_rate_counts_from_the_first_result_and_before_it_the_time_runs(monkeypatch):
+    """Workers take seconds to start."""
+    now = [0.0]
     monkeypatch.setattr(progress, "monotonic", lambda: now[0])
-    view = CountView(file, 200, "flights", 30.0)
-    for done in range(1, 101):
-        now[0] = float(done)
-        view.count(done)
-    lines = [line.split("  ") for line in file.getvalue().splitlines()]
-    assert [line[0] for line in lines] == ["4/200", "34/200", "64/200", "94/200"]
-    assert lines[0][1] == "1.0 flights/s, 3 min left"
+    with closing(CountView(io.StringIO(), 200, "flights")) as view:
+        now[0] = 50.0
+        assert view.line() == "0/200 flights  50 s"
+        for done in range(1, 41):
+            now[0] = 50.0 + done
+            view.count(done)
+        assert view.line() == "40/200 flights  1.0/s, 3 min left"
+
+
+def test_a_log_gets_a_line_soon_and_then_whenever_nothing_was_said(monkeypatch):
+    monkeypatch.setattr(progress, "FIRST_WAIT", 0.0)
+    monkeypatch.setattr(progress, "PERIOD", 0.05)
+    file = io.StringIO()
+    with closing(CountView(file, 9, "flights")):
+        wait_until(lambda: file.getvalue().count("0/9 flights") >= 2, 5.0)
 
 
 def test_events_are_plain_lines_or_wrapped_on_a_terminal():
@@ -101,19 +109,23 @@ def test_events_are_plain_lines_or_wrapped_on_a_terminal():
     assert terminal.getvalue().endswith("\x1b[2K"), "the status line is erased"
 
 
-def test_a_terminal_shows_what_happens_before_and_after_the_flight(monkeypatch):
-    """MuJoCo loads for a second, and the report takes several; a file gets no line about them."""
-    file, terminal = io.StringIO(), Terminal()
-    for stream in (file, terminal):
-        view = FlightView(stream, 7)
-        assert ("GROUND" in stream.getvalue()) is (stream is terminal)
-        view.see([MissionEvent(0, "done", 6, "mission done")])
-        assert "GROUND" in str(view.line())
-        with monkeypatch.context() as later:
-            later.setattr("cloudrc.cli.progress.REPORT_AFTER", -1.0)
-            assert str(view.line()) == "the mission is over: writes the report"
-        view.close()
-    assert file.getvalue().split() == ["mission", "done"]
+@pytest.mark.parametrize("kind", [io.StringIO, Terminal])
+def test_a_flight_shows_what_happens_before_it_and_after_it(kind, monkeypatch):
+    """MuJoCo loads for a second, and the report takes several."""
+    monkeypatch.setattr(progress, "FIRST_WAIT", 0.0)
+    stream = kind()
+    with closing(FlightView(stream, 7)) as view:
+        wait_until(lambda: "GROUND" in stream.getvalue(), 5.0)
+        view.tell("writes the report")
+        assert str(view.line()) == "writes the report (0 s)"
+
+
+def test_a_session_that_waits_writes_no_log_but_tells_of_its_report(monkeypatch):
+    monkeypatch.setattr(progress, "FIRST_WAIT", 0.0)
+    file = io.StringIO()
+    with closing(FlightView(file, 0)) as view:
+        view.tell("writes the report")
+        wait_until(lambda: file.getvalue() == "writes the report (0 s)\n", 5.0)
 
 
 @pytest.mark.parametrize("kind", [io.StringIO, Terminal])
@@ -121,13 +133,19 @@ def test_a_long_report_shows_its_step_and_a_short_one_nothing(kind, monkeypatch)
     stream = kind()
     with closing(StepView(stream, "reads [it]")) as view:
         view.tell("draws")
-    assert stream.getvalue() == ""
-    monkeypatch.setattr("cloudrc.cli.progress.PLAN_WAIT", 0.0)
-    monkeypatch.setattr("cloudrc.cli.progress.FIRST_WAIT", 0.0)
-    with closing(StepView(stream, "reads [it]")) as view:
+    assert "draws" not in stream.getvalue()
+    monkeypatch.setattr(progress, "STEP_WAIT", 0.0)
+    monkeypatch.setattr(progress, "FIRST_WAIT", 0.0)
+    with closing(StepView(stream, "reads [it]")):
         wait_until(lambda: "reads [it]" in stream.getvalue(), 5.0)
-        view.tell("draws")
-    assert stream.isatty() or stream.getvalue() == "reads [it]\n"
+
+
+def test_a_moving_line_on_stderr_leaves_stdout_alone(monkeypatch):
+    document = io.StringIO()
+    monkeypatch.setattr("sys.stdout", document)
+    with closing(StepView(Terminal(), "reads")):
+        print("{}")
+    assert document.getvalue() == "{}\n"
 
 
 PRINTS = """\

@@ -73,12 +73,13 @@ def test_a_run_and_its_report_can_be_repeated(folder, call):
 
 
 @pytest.mark.usefixtures("no_page")
-@pytest.mark.parametrize("form", ["table", "json"])
-def test_a_report_that_takes_long_is_told_in_a_pipe(form, monkeypatch, call):
+@pytest.mark.parametrize(("form", "stream"), [("table", "out"), ("json", "err")])
+def test_a_flight_and_a_report_that_take_long_are_told_in_a_pipe(form, stream, monkeypatch, call):
     monkeypatch.setattr("cloudrc.cli.progress.FIRST_WAIT", 0.0)
-    shown = call(*FLY, "--out", "here", "-o", form)
-    assert "writes the report\n" in shown.err
-    assert "writes the report" not in shown.out
+    monkeypatch.setattr("cloudrc.cli.progress.PERIOD", 0.01)
+    shown = getattr(call(*FLY, "--out", "here", "-o", form), stream)
+    assert " s  TRACK " in shown
+    assert "writes the report (" in shown
 
 
 @pytest.mark.usefixtures("no_page")

@@ -113,7 +113,7 @@ def test_a_sweep_that_is_too_large_is_refused_before_it_is_checked(write_sweep, 
 
 def test_a_check_of_more_than_a_second_says_how_far_it_is(write_sweep, call, monkeypatch):
     """Without a terminal it prints one line, not one for each point."""
-    monkeypatch.setattr("cloudrc.cli.progress.PLAN_WAIT", 0.0)
+    monkeypatch.setattr("cloudrc.cli.progress.STEP_WAIT", 0.0)
     lines = call("sweep run --out grid --shard 5/5", write_sweep()).out.splitlines()
     assert lines[:2] == [
         "checks 4 points x 1 seeds: 4 flights",
