@@ -65,7 +65,7 @@ class Log:
     unmeasured: set[float] = field(default_factory=set)
     """Times of sending [s] of packets that arrived with an unknown delay, NaN in `entries`."""
     elsewhere: list[float] = field(default_factory=list)
-    """Times [s] at which a packet is missing because the other direction has lost it."""
+    """Times [s] at which a packet is missing: the other direction or the recording has lost it."""
 
     def packets(self) -> Packets:
         """Check the packets, sort them by time of sending, and add a note on each correction.

@@ -23,6 +23,7 @@ from cloudrc.geometry.obstacles import Obstacle, has_surface, obstacles
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording, Table
+from cloudrc.record.holes import Hole
 from cloudrc.records import UNDER_WAY
 from cloudrc.renamed import new_column
 
@@ -50,10 +51,22 @@ class Flight:
 
     @cached_property
     def start_ns(self) -> int | None:
-        """Start of the flight [ns], world's clock; None if the robot never flew."""
+        """Start of the flight [ns], world's clock; None if the robot never flew.
+
+        If the recording has lost the start, this is the first telemetry of a robot in flight.
+        """
         guard = self.recording["/guard"]
         tracking = guard["stamp_ns"][guard["state"] == GuardState.TRACK]
+        if self.is_start_lost:
+            telemetry = self.recording["/telemetry"]
+            tracking = telemetry["stamp_ns"][telemetry["guard"] == GuardState.TRACK]
         return int(tracking[0]) if len(tracking) else None
+
+    @property
+    def is_start_lost(self) -> bool:
+        """Whether the recording has lost messages, among them the start of the flight."""
+        is_known = (self.recording["/guard"]["state"] == GuardState.TRACK).any()
+        return bool(self.recording.holes) and not is_known
 
     @cached_property
     def mission_ns(self) -> int | None:
@@ -75,6 +88,14 @@ class Flight:
             return self.ending[0] if self.ending else None
         stamps = self.recording["/ground_truth"]["stamp_ns"]
         return int(stamps[-1]) if len(stamps) else self.start_ns
+
+    @cached_property
+    def holes(self) -> tuple[Hole, ...]:
+        """Times of the flight in which messages are lost."""
+        if self.start_ns is None or self.end_ns is None:
+            return self.recording.holes
+        begin_ns = 0 if self.is_start_lost else self.start_ns
+        return tuple(h for h in self.recording.holes if h.meets(begin_ns, self.end_ns))
 
     @property
     def duration(self) -> float:
@@ -103,7 +124,7 @@ class Flight:
         """Interpolate the base's true position at `stamp_ns` [ns], world's clock, shape (n,).
 
         Returns:
-            Positions [m], shape (n, 3); NaN before and after the recording.
+            Positions [m], shape (n, 3); NaN before and after the recording, and in its holes.
         """
         truth = self.recording["/ground_truth"]
         stamps, positions = truth["stamp_ns"], truth["position"]
@@ -112,7 +133,10 @@ class Flight:
         # Differences to the first stamp are exact in float64; the stamps themselves may not be.
         at, known = (stamp_ns - stamps[0]).astype(float), (stamps - stamps[0]).astype(float)
         axes = [np.interp(at, known, positions[:, i], np.nan, np.nan) for i in range(3)]
-        return np.stack(axes, axis=1)
+        found = np.stack(axes, axis=1)
+        for hole in self.recording.holes:
+            found[(stamp_ns > hole.begin_ns) & (stamp_ns < hole.end_ns)] = np.nan
+        return found
 
     @cached_property
     def position_noise(self) -> float:
@@ -327,7 +351,7 @@ def _speed_max(flight: Flight) -> float | None:
 add_metrics(
     "Mission",
     ("duration", "s", "Time from the start of the mission to its end.",
-     lambda flight: flight.count(flight.duration)),
+     lambda flight: None if flight.is_start_lost else flight.count(flight.duration)),
     ("start_delay", "s", "Time from the start of the mission until the robot followed its first "
      "command.", lambda flight: flight.start_ns and float(flight.seconds(flight.start_ns))),
     ("distance_flown", "m", "Length of the path that the robot's base flew.", _distance),

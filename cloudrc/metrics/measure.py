@@ -14,6 +14,7 @@ from cloudrc.errors import BadInputError, describe_error
 from cloudrc.metrics import control, link, mission, response
 from cloudrc.metrics.flight import SHIPPED, Flight, Metric
 from cloudrc.patience import telling_if_slow
+from cloudrc.record.holes import goes_on
 from cloudrc.renamed import new_name
 
 # The imported modules add the metrics of cloudrc to SHIPPED.
@@ -21,6 +22,20 @@ __all__ = ["SHIPPED", "Flight", "Metric", "control", "link", "mission", "respons
 
 METRIC_NOTE = "metric "
 """Beginning of a note about a metric."""
+
+
+IN_SPITE_OF_HOLES = {
+    *("duration", "waypoints_reached", "obstacle_contacts", "rtt_mean", "rtt_p95"),
+    *("uplink_delay_mean", "downlink_delay_mean", "late_uplink", "late_downlink"),
+    *("age_of_information_mean", "prediction_error_rms", "estimate_error_rms"),
+    *("delay_estimate_error_rms", "tracking_rms_measured", "tracking_rms_estimated"),
+    *("tracking_error_p95", "overshoot_mean", "rise_time_mean", "settling_time_mean"),
+    *("iae_mean", "ise_mean", "control_effort_mean", "world_lateness_p99", "cloud_lateness_p99"),
+    *("world_slip", "real_time_factor"),
+}
+"""Metrics of a flight with lost messages: means over the rows or steps that are left, and what the
+rest of the recording proves. All other metrics would be wrong: they compute over time, count, or
+look for an extreme."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,12 +125,12 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> Measured:
     """Compute the metrics of cloudrc, of installed packages and of the user.
 
     `own` lists the user's metrics by name or file path. A failure of a user's metric affects only
-    this metric.
+    this metric. If messages of the flight are lost, compute only `IN_SPITE_OF_HOLES`.
     """
     numbers: dict[str, Number] = {}
-    notes: list[str] = []
+    choices, notes = _choose(flight, {*SHIPPED, *plugins.names("metrics"), *own})
     traceback = ""
-    for choice in sorted({*SHIPPED, *plugins.names("metrics"), *own}, key=name_of):
+    for choice in sorted(choices, key=name_of):
         name = name_of(choice)
         try:
             metric = find(choice)
@@ -137,3 +152,16 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> Measured:
             notes.append(f"{METRIC_NOTE}{name} failed: {why}")
             traceback = traceback or plugins.stack_of(error)
     return Measured(numbers, notes, traceback)
+
+
+def _choose(flight: Flight, choices: set[str]) -> tuple[set[str], list[str]]:
+    """Leave out the metrics that lost messages would make wrong; also return notes about them."""
+    if not flight.holes:
+        return choices, []
+    ends = flight.ending is not None or not goes_on(flight.holes)
+    left = choices & IN_SPITE_OF_HOLES if ends else set[str]()
+    others = sorted(name_of(choice) for choice in choices - left if choice not in SHIPPED)
+    notes = [f"{METRIC_NOTE}{name} is not measured: messages are lost in flight" for name in others]
+    about = "Ages, losses, counts, distances and extremes"
+    about = about if ends else "The end of the flight is lost, too: all numbers"
+    return left, [f"{about} are left out, because messages are lost in flight.", *notes]

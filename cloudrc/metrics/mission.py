@@ -78,7 +78,16 @@ def reported(flight: Flight) -> dict[int, int]:
 
 
 def _waypoints_reached(flight: Flight) -> float | None:
-    """Count the waypoints that teleop reported as reached and the true position confirms."""
+    """Count the waypoints that teleop reported as reached and the true position confirms.
+
+    None if messages are lost and the others do not prove all waypoints.
+    """
+    count = _count_reached(flight)
+    wanted = 1 if flight.mission.setpoints else flight.waypoints
+    return None if flight.holes and (count or 0.0) < wanted else count
+
+
+def _count_reached(flight: Flight) -> float | None:
     stamps, points = reported(flight), flight.mission.waypoints
     if flight.mission.steps:  # they end after their time, anywhere
         return flight.count(len(stamps))
@@ -103,7 +112,7 @@ def _yaw_error(flight: Flight) -> float | None:
 def _final_error(flight: Flight) -> float | None:
     """Measure how far the robot was from the last setpoint of a file at the mission's end [m]."""
     driven = "driving" in flight.during("/mission")["event"]  # the file has what was driven
-    if flight.mission.setpoints is None or flight.ending is None or driven:
+    if flight.mission.setpoints is None or flight.ending is None or driven or flight.holes:
         return None
     end_ns, event, _ = flight.ending
     control = flight.control
@@ -208,6 +217,25 @@ def obstacle_contacts(flight: Flight) -> dict[str, Array]:
     return select(contact, np.array(rows, dtype=bool))
 
 
+def lost_contacts(flight: Flight) -> tuple[int, int]:
+    """Count the contacts with obstacles that telemetry counts, but that are not in the recording.
+
+    Also return the stamp of the first telemetry that counts one [ns]. Only a recording that has
+    lost messages has such contacts.
+    """
+    if not flight.recording.note:
+        return 0, 0
+    telemetry, known_ns = flight.during("/telemetry"), obstacle_contacts(flight)["stamp_ns"]
+    lost = telemetry["obstacle_contacts"] - known_ns.searchsorted(telemetry["stamp_ns"], "right")
+    first = int(np.argmax(lost > 0)) if len(lost) else 0
+    return (int(lost.max()), int(telemetry["stamp_ns"][first])) if (lost > 0).any() else (0, 0)
+
+
+def _obstacle_contacts(flight: Flight) -> float | None:
+    known = len(obstacle_contacts(flight)["stamp_ns"])
+    return flight.count(known + lost_contacts(flight)[0])
+
+
 def _steady_error(flight: Flight, axis: int) -> float | None:
     """Average the distance from setpoint to true position [m] along x, y or z (`axis` 0, 1 or 2).
 
@@ -257,8 +285,7 @@ add_metrics(
     ("final_error", "m", "Distance from the last setpoint of a file to the true position when the "
      "mission ended.", _final_error),
     ("obstacle_contacts", "1", "Number of contacts with obstacles. These are all bodies but the "
-     "floor and the body that the mission has to touch.",
-     lambda flight: flight.count(len(obstacle_contacts(flight)["stamp_ns"]))),
+     "floor and the body that the mission has to touch.", _obstacle_contacts),
     ("contact_time", "s", "Time from the start of the mission to the first touch of what it has "
      "to touch.", _of_touch(lambda flight, touch: float(flight.seconds(touch["stamp_ns"])))),
     ("touch_speed", "m/s", "Speed of the probe (without one: of the base) just before this touch.",

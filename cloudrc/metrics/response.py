@@ -1,6 +1,7 @@
 """Metrics of the response to steps of the setpoint: overshoot, settling, errors, and stability.
 
 A step begins when the setpoint changes and ends when it changes again, or when the mission ends.
+Steps of which messages are lost are left out.
 Setpoints that last less than 0.5 s belong to a moving reference and are no steps. Where a moving
 reference stops, the robot is moving and still behind it: this end has no overshoot or settling time
 that describes the loop. Only the verdict judges it. All errors are distances between the setpoint
@@ -72,7 +73,11 @@ def _measured(flight: Flight) -> list[tuple[Step, bool]]:
     before = begins_ns.searchsorted(begins_ns - SHORTEST_NS)
     is_step = np.arange(len(begins)) - before < JUMP_MAX
     found = []
+    before_ns = stamps[np.maximum(begins - 1, 0)]  # the step may have begun since then
     for number in np.flatnonzero(ends_ns - begins_ns >= SHORTEST_NS):
+        span = int(before_ns[number]), int(ends_ns[number])
+        if any(hole.meets(*span) for hole in flight.holes):
+            continue
         response = _measure(flight, int(begins[number]), int(ends_ns[number]))
         if response is not None:
             found.append((response, bool(is_step[number])))

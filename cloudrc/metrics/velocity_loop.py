@@ -25,6 +25,8 @@ INPUT, OUTPUT = "/reference", "/ground_truth"
 """Topics with the commanded and the measured velocity."""
 DT = 0.01
 """Time between two samples of the fit [s]."""
+UNKNOWN = -1
+"""In place of the guard's state in a hole of the recording."""
 START = 100
 """Number of first samples that the fit leaves out, because the earlier input is unknown."""
 TAKE_OFF = 2.0
@@ -46,29 +48,46 @@ class Fit(NamedTuple):
 def series(recording: Recording, name: str) -> tuple[Array, Array]:
     """Return the commanded and the measured velocity [m/s], one sample per `DT`, shape (n, 3) each.
 
-    The samples are from the longest phase with the guard in TRACK, without its take-off. `name` is
-    the recording's name in error messages.
+    The samples are from the longest phase with the guard in TRACK, without its take-off. A phase
+    ends where messages are lost. `name` is the recording's name in error messages.
     """
     for topic in (INPUT, OUTPUT, "/guard"):
         if not len(recording[topic]):
             raise BadInputError(f"{name}: has no {topic}; name the recording of a whole flight")
-    source, sink, guard = recording[INPUT], recording[OUTPUT], recording["/guard"]
-    ends_ns = np.append(guard["stamp_ns"][1:], sink["stamp_ns"][-1])
-    tracks = np.where(guard["state"] == GuardState.TRACK, ends_ns - guard["stamp_ns"], 0)
+    source, sink = recording[INPUT], recording[OUTPUT]
+    begins_ns, states = _states(recording)
+    ends_ns = np.append(begins_ns[1:], sink["stamp_ns"][-1])
+    tracks = np.where(states == GuardState.TRACK, ends_ns - begins_ns, 0)
     longest = int(tracks.argmax())
-    start_ns, end_ns = guard["stamp_ns"][longest] + int(TAKE_OFF * 1e9), ends_ns[longest]
+    start_ns, end_ns = begins_ns[longest] + int(TAKE_OFF * 1e9), ends_ns[longest]
     end_ns = end_ns if tracks[longest] else start_ns
     if end_ns - start_ns < DURATION_MIN * 1e9:
         flown = format_beside(max(0, end_ns - start_ns) * 1e-9, DURATION_MIN)
+        where = " without lost messages" if recording.holes else ""
         raise BadInputError(
-            f"{name}: {flown} s of flight under commands after the take-off, and the fit needs "
-            f"{DURATION_MIN:g} s; record a longer flight"
+            f"{name}: {flown} s of flight under commands after the take-off{where}, and the fit "
+            f"needs {DURATION_MIN:g} s; record a longer flight"
         )
     at_ns = np.arange(start_ns, end_ns, int(DT * 1e9))
     held = source["stamp_ns"].searchsorted(at_ns, "right") - 1
     given, columns = source["reference"][np.maximum(held, 0)], sink["velocity"].T
     measured = np.stack([np.interp(at_ns, sink["stamp_ns"], column) for column in columns], axis=1)
     return given, measured
+
+
+def _states(recording: Recording) -> tuple[Array, Array]:
+    """Return the stamps of the guard's changes [ns], shape (n,), and its states since then.
+
+    A hole of the recording begins with no state, and ends with the state in the next telemetry.
+    """
+    guard, telemetry = recording["/guard"], recording["/telemetry"]
+    found = list(zip(guard["stamp_ns"].tolist(), guard["state"].tolist(), strict=True))
+    for hole in recording.holes:
+        found.append((hole.begin_ns, UNKNOWN))
+        later = telemetry["guard"][telemetry["stamp_ns"] >= hole.end_ns]
+        found += [(hole.end_ns, int(state)) for state in later[:1]]
+    stamps_ns, states = np.array(sorted(found)).T
+    return stamps_ns, states
 
 
 def identify(given: Array, measured: Array, name: str) -> Fit:

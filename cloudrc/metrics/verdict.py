@@ -3,7 +3,8 @@
 The first matching outcome of this list is the verdict:
 
 - `interrupted`: the run was stopped or the mission was cancelled before its end.
-- `invalid`: the run had to keep real time but did not, so its numbers mean nothing.
+- `invalid`: the run had to keep real time but did not, so its numbers mean nothing. Or no failure
+  is known, but the recording is incomplete.
 - `failure`: at least one criterion of success is not met. Each such criterion is listed with time
   and place.
 - `success`: all waypoints, or the last setpoint of a file, were reached within the time limit, what
@@ -28,9 +29,16 @@ from cloudrc.errors import DISK_FULL, DiskFullError
 from cloudrc.messages import Cause, GuardState, Vector
 from cloudrc.metrics import Flight, Number
 from cloudrc.metrics.definitions import real_time_factor
-from cloudrc.metrics.mission import first_touch, missed_end, obstacle_contacts, reported
+from cloudrc.metrics.mission import (
+    first_touch,
+    lost_contacts,
+    missed_end,
+    obstacle_contacts,
+    reported,
+)
 from cloudrc.metrics.response import responses
 from cloudrc.record.columns import Recording
+from cloudrc.record.holes import describe
 from cloudrc.records import CONTROLLER_LOST, REAL_TIME_FACTOR_MIN
 from cloudrc.rounding import exceeds, format_beside
 
@@ -48,6 +56,10 @@ NOT_STARTED = (
     " start; look at the link: its loss, its damage (corrupt), and its delays beside"
     " guard.command_age_max_ms"
 )
+PROVEN_BY_ALL = {
+    *("not_recorded", "not_started", "mission_not_ended", "waypoint_not_reached", "not_touched"),
+}
+"""Codes of failures that only a recording without holes proves: something never happened in it."""
 ADVICE = "close other programs or give the run more cores"
 
 Outcome = Literal["success", "failure", "invalid", "interrupted"]
@@ -117,6 +129,7 @@ class Evidence:
     touch: tuple[float, Moment] | None = None  # speed of the first touch of `wanted` [m/s]
     violations: tuple[FlightFailure, ...] = ()  # other events that must not happen
     slow: str = ""  # why the run failed to keep real time; "" if it did not fail
+    lost: str = ""  # what the recording has lost, in words; "" if it is complete
 
 
 def judge(evidence: Evidence) -> FlightVerdict:
@@ -127,10 +140,17 @@ def judge(evidence: Evidence) -> FlightVerdict:
             "interrupted", (FlightFailure(*evidence.ending, *evidence.end), *violations)
         )
     codes = {failure.code for failure in violations}
-    failures = [*violations, *(f for f in _unmet_goals(evidence) if f.code not in codes)]
+    unmet = [f for f in _unmet_goals(evidence) if f.code not in codes]
+    proven = [f for f in unmet if not evidence.lost or f.code not in PROVEN_BY_ALL]
+    failures = [*violations, *proven]
     failures.sort(key=lambda failure: inf if failure.time is None else failure.time)
     if evidence.slow:
         return FlightVerdict("invalid", (FlightFailure("not_real_time", evidence.slow), *failures))
+    if evidence.lost and not failures:
+        known = "it is not known whether the mission succeeded"
+        known = known if unmet else "success as far as the recording goes"
+        failure = FlightFailure("recording_incomplete", f"{known}: {evidence.lost}")
+        return FlightVerdict("invalid", (failure,))
     return FlightVerdict("failure" if failures else "success", tuple(failures))
 
 
@@ -184,7 +204,7 @@ def flight_evidence(
     """Collect the evidence for the verdict from the records and from the metrics of a flight.
 
     `real_time` is True if the run had to keep real time: in all modes except virtual. `interrupted`
-    is True if the run was stopped, or if its recording is incomplete.
+    is True if the run was stopped, or if its recording is cut short.
     """
     criteria, end_ns = flight.criteria, flight.end_ns
     reached, touch = numbers.get("waypoints_reached"), None
@@ -201,7 +221,14 @@ def flight_evidence(
         touch=touch,
         violations=tuple(_violations(flight)),
         slow=_not_real_time(numbers) if real_time else "",
+        lost=_lost(flight),
     )
+
+
+def _lost(flight: Flight) -> str:
+    """Describe what the recording of a flight has lost; "" if nothing."""
+    recording = flight.recording
+    return describe(recording.holes, flight.seconds) or recording.note
 
 
 def _violations(flight: Flight) -> Iterator[FlightFailure]:
@@ -230,6 +257,8 @@ def _ending(flight: Flight, interrupted: bool) -> Ending:
         return Ending("disk_full", text)
     if interrupted:
         return Ending("interrupted", "the run ended before the mission")
+    if flight.recording.holes:
+        return Ending("not_recorded", "the recording has lost the end of the mission")
     if flight.end_ns is None:
         return Ending("not_started", NOT_STARTED)
     return Ending("mission_not_ended", "the mission did not end")
@@ -249,6 +278,10 @@ def _obstacles(flight: Flight, until_ns: float = inf) -> Iterator[FlightFailure]
         stamps = stamps[stamps <= until_ns]
         if len(stamps):
             yield _obstacle_touched(body, len(stamps), _moment(flight, int(stamps[0])))
+    lost, seen_ns = lost_contacts(flight)
+    if lost and seen_ns <= until_ns:
+        name = "an obstacle, as telemetry counts; the recording has lost the contact"
+        yield _obstacle_touched(name, lost, Moment(float(flight.seconds(seen_ns))))
 
 
 def _interventions(flight: Flight) -> Iterator[FlightFailure]:
@@ -286,7 +319,7 @@ def _restarts(flight: Flight) -> Iterator[FlightFailure]:
 
 def plugin_failures(recording: Recording) -> Iterator[FlightFailure]:
     """Yield a failure for each plug-in that failed in too many control periods."""
-    periods, faults = len(recording["/delay_estimate"]), recording["/fault"]
+    periods, faults = _count_periods(recording), recording["/fault"]
     count = recording["/count"]
     for kind in ("estimator", "predictor", "controller"):
         totals = count["total"][count["name"] == f"{kind}_failed"]
@@ -298,6 +331,15 @@ def plugin_failures(recording: Recording) -> Iterator[FlightFailure]:
             limit = f"{PLUGIN_FAILURES_MAX:.0%}"
             text = f"cloud.{kind} failed in {shown}% of its periods, above {limit}{why}"
             yield FlightFailure("plugin_failed", text)
+
+
+def _count_periods(recording: Recording) -> int:
+    """Count cloud's control periods; each has a datagram, whose number tells of lost rows."""
+    rows = recording["/delay_estimate"]
+    if not recording.holes:
+        return len(rows)
+    sessions = [rows["counter"][rows["epoch"] == epoch] for epoch in np.unique(rows["epoch"])]
+    return sum(int(numbers.max() - numbers.min()) + 1 for numbers in sessions)
 
 
 def _responses(flight: Flight, settle: float) -> Iterator[FlightFailure]:

@@ -154,8 +154,9 @@ class Recording(Content):
         return total.hexdigest()
 
     def keep(self, first_ns: int, last_ns: int) -> None:
-        """Remove the messages with a log time [ns] before `first_ns` or after `last_ns`."""
+        """Remove what has a log time [ns] before `first_ns` or after `last_ns`."""
         self.messages = [each for each in self.messages if first_ns <= each[1] <= last_ns]
+        self.holes = tuple(hole for hole in self.holes if hole.meets(first_ns, last_ns))
         self._tables.clear()
 
     def __getitem__(self, topic: str) -> Table:

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
+from shlex import quote
 from typing import TypeAlias
+
+from cloudrc.errors import BadInputError
+from cloudrc.record.holes import Hole
 
 Message: TypeAlias = tuple[str, int, bytes]
 """Topic, log time [ns] and CDR bytes of a message."""
@@ -21,7 +26,18 @@ class Content:
     torn: str = ""  # that a killed process has not written the end of the file, in words
     lacking: str = ""  # what was damaged or changed in the file, in words
     told: str = ""  # what the writer of the file missed, in words
+    holes: tuple[Hole, ...] = ()  # times in which messages are lost
     remarks: tuple[str, ...] = ()  # what was ignored or sorted; "The recording" precedes each
+
+    def refuse_damaged(self, path: Path) -> None:
+        """Raise a BadInputError if the file was damaged or changed; `path` is the file."""
+        if self.lacking:
+            raise BadInputError(f"{path}: {self.lacking}{self.remedy(path)}")
+
+    def remedy(self, path: Path) -> str:
+        """Return the end of an error about the damaged file `path`: what to do; "" for others."""
+        how = f"; to copy what is readable: cloudrc recover {quote(str(path))}"
+        return how if "damaged" in self.lacking else ""
 
     @property
     def note(self) -> str:

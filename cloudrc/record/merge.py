@@ -16,7 +16,7 @@ Telemetry contains this lag.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording, Table
+from cloudrc.record.holes import END_NS, SOMEWHERE, Hole
 from cloudrc.record.ros import shifted
 from cloudrc.record.topics import TOPICS
 from cloudrc.records import UNDER_WAY
@@ -131,28 +132,43 @@ def merge(world: Path, cloud: Path) -> Recording:
     )
     mission.torn, mission.lacking = "; ".join(torn), "; ".join(lacking)
     mission.told = "; ".join([*told, *map(str, failures)])
+    mission.holes += (SOMEWHERE,) * bool(failures)
     return mission
 
 
 def _join(world: Recording, cloud: Recording) -> Recording:
-    logged_ns = np.array([message[1] for message in cloud.messages], dtype=np.int64)
-    clock_id = world.metadata.get("clock_id")
-    if clock_id and clock_id == cloud.metadata.get("clock_id"):
-        offset, moved_ns = SAME_CLOCK, world_time_ns(world["/telemetry"], logged_ns)
-    else:
+    offset, clock_id = SAME_CLOCK, world.metadata.get("clock_id")
+    if not clock_id or clock_id != cloud.metadata.get("clock_id"):
         offset = clock_offset(world, cloud)
-        moved_ns = logged_ns + offset.offset_ns
-    moved = [
+
+    def moved(times_ns: list[int]) -> list[int]:
+        """Convert times [ns] from cloud's clock to world's clock."""
+        if offset is not SAME_CLOCK:
+            return [time_ns + offset.offset_ns for time_ns in times_ns]
+        there_ns = np.array(times_ns, dtype=np.int64)
+        here_ns: list[int] = world_time_ns(world["/telemetry"], there_ns).tolist()
+        return here_ns
+
+    logged_ns = [message[1] for message in cloud.messages]
+    messages = [
         (topic, to_ns, shifted(data, to_ns - from_ns))
-        for (topic, from_ns, data), to_ns in zip(cloud.messages, moved_ns.tolist(), strict=True)
+        for (topic, from_ns, data), to_ns in zip(cloud.messages, moved(logged_ns), strict=True)
     ]
-    in_order = heapq.merge(world.messages, moved, key=itemgetter(1))
+    in_order = heapq.merge(world.messages, messages, key=itemgetter(1))
     return Recording(
         messages=[(topic, max(ns, 0), data) for topic, ns, data in in_order],  # MCAP's least time
         metadata={**cloud.metadata, **world.metadata, **offset.metadata()},
         attachments={**cloud.attachments, **world.attachments},
         source=f"{world.source} or {cloud.source}",
+        holes=world.holes + tuple(_moved(hole, moved) for hole in cloud.holes),
     )
+
+
+def _moved(hole: Hole, moved: Callable[[list[int]], list[int]]) -> Hole:
+    """Convert a hole by `moved`; a side of it without a message stays so."""
+    begin_ns, end_ns = moved([*hole])
+    begin_ns = max(begin_ns, 0) if hole.begin_ns else 0
+    return Hole(begin_ns, end_ns if hole.end_ns < END_NS else END_NS)
 
 
 def cut_to_last_mission(mission: Recording) -> bool:
@@ -169,7 +185,10 @@ def cut_to_last_mission(mission: Recording) -> bool:
     mission.keep(first, ended + AFTER_NS if ended is not None else until)
     if ended is None or until <= ended:
         return False
+    if any(hole.begin_ns <= ended and hole.end_ns >= END_NS for hole in mission.holes):
+        return False  # of one end, the file is cut short before the mission's end
     mission.torn = ""
+    mission.holes = tuple(hole for hole in mission.holes if hole.begin_ns < ended)
     return True
 
 

@@ -33,6 +33,7 @@ from mcap.writer import MCAP0_MAGIC
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file
 from cloudrc.record.content import Content
+from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, between, of_metadata
 from cloudrc.record.ros import converter
 from cloudrc.record.topics import TOPICS, VIEWS
 from cloudrc.record.writer import CHANGED, CLOCK, COUNTS, MISSING
@@ -197,6 +198,8 @@ class File:
         self.fault = ""  # why reading stopped or what is wrong, in words; "" if nothing is wrong
         self.cut = False  # whether the file breaks off at the fault, as after a kill
         self.gaps = list[FilePart]()  # what was left out
+        # Position, first and last log time [ns] of each part with messages; of a damaged file only.
+        self.spans = list[tuple[int, int, int]]()
         self.read = Counter[int]()  # channel -> number of messages, also of other programs
         self.statistics: mcap.Statistics | None = None
         self.channels: dict[int, mcap.Channel] = {}
@@ -288,10 +291,13 @@ class File:
             self._stream.seek(part.start)
             record = _parse(self._stream.read(part.size))
             kinds[type(record)] += 1
+            before = len(self.content.messages)
             if isinstance(record, mcap.Chunk):
                 self._store_chunk(record, part)
             else:
                 self._store(record)
+            if times := [message[1] for message in self.content.messages[before:]]:
+                self.spans.append((part.start, min(times), max(times)))
         self.position, self.ended, self.data_ended = found.size, found.ended, found.data_ended
         if not self.data_ended:
             self.fault, self.cut = "cut short", True
@@ -545,6 +551,28 @@ def _note(file: File) -> None:
     content.torn = fault if file.cut else ""
     content.lacking = "; ".join([*damage, *changed])
     content.told = to_one_line(metadata.get(MISSING, ""))
+    content.holes = _holes(file)
+
+
+def _holes(file: File) -> tuple[Hole, ...]:
+    """Find the times in which messages are lost that cloudrc records."""
+    content, known = file.content, of_metadata(file.content.metadata)
+    found = set(known or ())
+    if not _has_all_rows(file):
+        found |= {between(file.spans, gap.start) for gap in file.gaps}
+        if not file.data_ended or (content.told and known is None):
+            found.add(Hole(content.messages[-1][1] if content.messages else 0, END_NS))
+        if content.note and not found:
+            found.add(SOMEWHERE)
+    return tuple(sorted(found))
+
+
+def _has_all_rows(file: File) -> bool:
+    """Return whether nothing is lost but views, as the counts in the file prove."""
+    read = Counter(topic for topic, _, _ in file.content.messages)
+    lost = (file.stated - read).keys() & {*TOPICS, UNKNOWN}
+    is_ours = bool(file.content.metadata.get(CLOCK))  # else the index may be another program's
+    return not lost and (file.has_counts or (is_ours and file.statistics is not None))
 
 
 def _describe(gaps: list[FilePart]) -> str:

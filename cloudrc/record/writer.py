@@ -26,6 +26,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 from cloudrc.files import atomic_file
 from cloudrc.record import WALL_OFFSET, wall_time
 from cloudrc.record.content import Content
+from cloudrc.record.holes import to_metadata
 from cloudrc.record.ros import definition, encode, type_hash
 from cloudrc.record.topics import TOPICS, VIEWS, topics_of
 from cloudrc.records import Record
@@ -231,7 +232,8 @@ def write(content: Content, target: Path, attachments: Mapping[str, bytes]) -> N
     metadata, messages = content.metadata, content.messages
     clock, machine = metadata.get(CLOCK, ""), metadata.get("clock_id", "")
     with atomic_file(target) as file, McapWriter(file, clock=clock, clock_id=machine) as writer:
-        writer.note({**metadata, **({MISSING: content.note} if content.note else {})})
+        missing = {MISSING: content.note} | to_metadata(content.holes) if content.note else {}
+        writer.note({**metadata, **missing})
         if messages and (began := wall_time(metadata, messages[0][1])):
             writer.note({STARTED: began.isoformat(timespec="milliseconds")})
         for name, data in {**content.attachments, **attachments}.items():

@@ -41,6 +41,7 @@ def read_flight(run: Path) -> tuple[Recording, ResolvedExperiment]:
     if run.is_dir():
         return read_run(run)[:2]
     recording = Recording.read(run)
+    recording.refuse_damaged(run)
     try:
         return recording, read_attached(recording)
     except BadInputError as error:

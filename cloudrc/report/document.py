@@ -23,6 +23,8 @@ RUN = "run"
 """Metadata key of mission.mcap: facts about the run, as JSON."""
 ENVIRONMENT_FILE, FILES = "environment.json", "files"
 """Name of the file about the machine of a flight, and its key for the hashes of files."""
+INCOMPLETE = "The recording is incomplete"
+"""Beginning of the note on what a recording has lost."""
 PACKAGES = (
     *("cloudrc", "mujoco", "numpy", "pydantic", "pyyaml", "cryptography", "mcap", "rosbags"),
     "matplotlib",

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -50,9 +49,9 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     whole = _is_of_whole_recording(folder / "report.json")
     for lack in _lacking(recording, config, whole=whole):
         text = f"{merged}: {lack}; no report is written"
-        if lack == recording.lacking and "damaged" in lack:
+        if lack == recording.lacking:
             damaged = merged if before else folder / f"{lack.partition(':')[0]}.mcap"
-            text += f"; to copy what is readable: cloudrc recover {quote(str(damaged))}"
+            text += recording.remedy(damaged)
         raise BadInputError(text)
     run = _read_facts(recording)
     if before is None:

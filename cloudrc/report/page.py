@@ -26,7 +26,7 @@ from cloudrc.version import __version__
 HEADLINES = {
     "success": ("The mission succeeded.", "#00694b"),
     "failure": ("The mission failed.", "#a33a00"),
-    "invalid": ("The run is invalid: it did not keep real time.", "#7a5200"),
+    "invalid": ("The run is invalid: it proves no success.", "#7a5200"),
     "interrupted": ("The run was interrupted.", "#7a5200"),
 }
 """Outcome of the verdict -> headline and colour of the page."""

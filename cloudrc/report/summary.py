@@ -6,9 +6,15 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from cloudrc.metrics import METRIC_NOTE, Number
+from cloudrc.report.document import INCOMPLETE
 from cloudrc.report.page import main_numbers
 from cloudrc.text import Paint, escape, plain, table
 
+NO_NUMBERS = {
+    True: "  no numbers: nothing was flown",
+    False: "  no numbers: the recording has lost the end of the flight",
+}
+"""Whether the recording is complete -> line in place of the numbers."""
 COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
 
 
@@ -18,14 +24,15 @@ def summarize(report: Mapping[str, Any], paint: Paint = plain) -> str:
         name: Number(entry["value"], entry["unit"], "") for name, entry in report["numbers"].items()
     }
     rows = [(f"  {label}", digits, unit) for label, digits, unit in main_numbers(numbers)]
-    shown = table(rows, right=[1]) if rows else "  no numbers: nothing was flown"
+    shown = table(rows, right=[1]) if rows else NO_NUMBERS[report.get("complete", True)]
     return "\n".join([*_verdict(report, paint), "", shown, *_warnings(report, paint)])
 
 
 def _verdict(report: Mapping[str, Any], paint: Paint) -> Iterable[str]:
     outcome, failures = report["verdict"], report["failures"]
     first = failures[0]["text"] if failures else f"{_goal(report)}, every criterion met"
-    yield f"{paint(outcome.upper(), COLOURS[outcome])}: {escape(first)}"
+    about = "" if report.get("complete", True) else " (recording incomplete)"
+    yield f"{paint(outcome.upper(), COLOURS[outcome])}{about}: {escape(first)}"
     for failure in failures[1:]:
         when = f" (at {failure['time']:.2f} s)" if "time" in failure else ""
         yield escape(f"  also: {failure['text']}{when}")
@@ -40,7 +47,7 @@ def _goal(report: Mapping[str, Any]) -> str:
 
 def _warnings(report: Mapping[str, Any], paint: Paint) -> Iterable[str]:
     for note in report.get("notes", ()):
-        if note.startswith(METRIC_NOTE):
+        if note.startswith((METRIC_NOTE, INCOMPLETE)):
             yield paint(f"  {escape(note)}", "yellow")
     faults = report["numbers"].get("fault_count", {"value": 0})["value"]
     if faults:

@@ -19,8 +19,10 @@ from cloudrc.geometry.obstacles import has_surface, known, obstacles
 from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
+from cloudrc.record.holes import goes_on
 from cloudrc.report.document import (
     ENVIRONMENT_FILE,
+    INCOMPLETE,
     Assessment,
     Run,
     environment_document,
@@ -46,12 +48,13 @@ def assess(
     """
     flight = flight_of(recording, experiment)
     numbers, metric_notes, traceback = measure_all(flight, own)
-    real_time, stopped = run.mode != "virtual", run.interrupted or bool(recording.note)
+    is_cut = bool(recording.note) and not goes_on(recording.holes)
+    real_time, stopped = run.mode != "virtual", run.interrupted or is_cut
     evidence = flight_evidence(flight, numbers, real_time=real_time, interrupted=stopped)
     verdict, operator = judge(evidence), None
     notes = list(run.notes)
     if recording.note:
-        notes.append(f"The recording is incomplete: {recording.note}.")
+        notes.append(f"{INCOMPLETE}: {recording.note}.")
     notes += [f"The recording {remark}." for remark in recording.remarks]
     notes += [f"{text[0].upper()}{text[1:]}." for text in recording["/fault"]["text"] if text]
     notes += _default_robot(experiment)

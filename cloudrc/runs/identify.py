@@ -31,6 +31,7 @@ def identify(run: Path) -> tuple[list[Fit], float]:
     if not path.exists():
         refuse_under_way(path.parent)
     recording = Recording.read(path)
+    recording.refuse_damaged(path)
     given, measured = velocity_loop.series(recording, str(path))
     axes = "xy" if _is_planar(recording, path.parent) else "xyz"
     fits = [

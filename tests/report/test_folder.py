@@ -11,11 +11,14 @@ import pytest
 
 from cloudrc.config.load import dump
 from cloudrc.errors import BadInputError
+from cloudrc.metrics.verdict import exit_code
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
+from cloudrc.record.recovery import recover
 from cloudrc.records import Counted
 from cloudrc.report.document import Run
 from cloudrc.report.folder import read_run
+from cloudrc.report.summary import summarize
 from cloudrc.report.write import write_report
 from tests.metrics.conftest import at, good, paper
 from tests.record.conftest import rewrite, write, write_mission
@@ -116,6 +119,19 @@ def test_a_torn_recording_still_gives_a_report(run):
     assert 0 < found["numbers"]["duration"]["value"] < 10
     assert "records_sha256" not in found
     assert write_report(run, *read_run(run), page=False) == found
+
+
+def test_a_report_of_a_recovered_recording_says_in_its_first_line_that_it_is_incomplete(run):
+    (run / "report.json").unlink()
+    mission = run / "mission.mcap"
+    damage(mission, run / "damaged.mcap")
+    recover(run / "damaged.mcap", run / "copy.mcap")
+    (run / "copy.mcap").replace(mission)
+    found = write_report(run, *read_run(run), page=False)
+    assert ((found["verdict"], found["complete"]), exit_code(found)) == (("invalid", False), 6)
+    first, *rest = summarize(found).splitlines()
+    assert first.startswith("INVALID (recording incomplete): ")
+    assert [line.strip() for line in rest if "The recording is incomplete: damaged" in line]
 
 
 def test_the_hash_is_of_the_recording_beside_the_report(run):

@@ -5,16 +5,19 @@ The content of the source tells its format.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from math import inf, isnan, nan
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from cloudrc.errors import BadInputError
 from cloudrc.files import naming
 from cloudrc.link.logs import (
+    GAP_MIN,
     Direction,
     Log,
     Packets,
@@ -31,6 +34,7 @@ from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
     from cloudrc.record.columns import Recording, Table
+    from cloudrc.record.holes import Hole
 
 DIRECTIONS: tuple[Direction, ...] = ("uplink", "downlink")
 
@@ -82,11 +86,19 @@ def _from_log(path: Path, settings: LogSettings) -> Packets:
 
 def _recording(path: Path) -> Recording:
     from cloudrc.record.columns import Recording
+    from cloudrc.record.holes import SOMEWHERE
 
     file = path / "mission.mcap" if path.is_dir() else path
     if not file.is_file():
         raise BadInputError(f"{path}: has no mission.mcap; name the folder of a run, or a file")
-    return Recording.read(file)
+    recording = Recording.read(file)
+    recording.refuse_damaged(file)
+    if SOMEWHERE in recording.holes:
+        raise BadInputError(
+            f"{file}: {recording.note}: nobody knows when, so what the link has lost is not known; "
+            "give the original file"
+        )
+    return recording
 
 
 def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
@@ -106,22 +118,49 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
         )
     delays = _delays(arrivals, log)
     rows = list(_columns(sent, "stamp_ns", "epoch", "counter"))
+    longest_ns = transit_ns(recording, direction)
+    known = _outside_holes(rows, recording.holes, longest_ns, log)
     # The link did not lose what the receiver refused before its session was open, and what may
     # still arrive after the end. All datagrams of these times are left out, also those that
     # arrived: if they alone remained, the trace would lose too few.
     latest_first = reversed(list(_columns(arrivals, "epoch", "counter")))
     first = {epoch: counter for epoch, counter in latest_first}  # the first arrival remains
     last_ns = {epoch: stamp_ns for stamp_ns, epoch, _ in rows}
-    longest_ns = transit_ns(recording, direction)
     log.entries = [
         ((stamp_ns - rows[0][0]) * 1e-9, delays.get((epoch, counter), nan))
-        for stamp_ns, epoch, counter in rows
+        for stamp_ns, epoch, counter in known
         if counter >= first.get(epoch, inf) and stamp_ns < last_ns[epoch] - longest_ns
     ]
-    unknown = len(rows) - len(log.entries)
+    unknown = len(known) - len(log.entries)
     last = f"in its last {longest_ns * 1e-6:.4g} ms"
     log.counts[f"left out, sent before the session was open or {last}"] += unknown
     return log.packets()
+
+
+def _outside_holes(
+    rows: list[tuple[float, ...]], holes: Iterable[Hole], longest_ns: int, log: Log
+) -> list[tuple[float, ...]]:
+    """Leave out the datagrams whose arrival may be lost in a hole of the recording.
+
+    `rows` begin with the stamp of sending [ns], and `longest_ns` is the longest time to the arrival
+    [ns]. `log` notes what is left out, and when nothing is known.
+    """
+    from cloudrc.record.holes import END_NS, describe
+
+    def seconds(stamp_ns: float) -> float:
+        return (stamp_ns - rows[0][0]) * 1e-9
+
+    lost = [row for row in rows if any(h.meets(row[0], row[0] + longest_ns) for h in holes)]
+    log.elsewhere = [seconds(row[0]) for row in lost]
+    for hole in holes:
+        if hole.end_ns < END_NS:
+            span = seconds(hole.begin_ns), seconds(hole.end_ns)
+            log.elsewhere += np.arange(*span, GAP_MIN / 2).tolist()
+    if lost:
+        why = f"their arrivals may be lost: {describe(holes, seconds)}"
+        log.counts[f"left out, because {why}"] += len(lost)
+    left_out = set(lost)
+    return [row for row in rows if row not in left_out]
 
 
 def _delays(arrivals: Table, log: Log) -> dict[tuple[float, float], float]:

@@ -1,0 +1,88 @@
+"""Know the holes of a recording: the times in which its messages are lost.
+
+The reader finds them in a damaged file, and the metadata of a copy keep them. What is computed over
+time, such as an age or a loss, is computed outside of the holes, or not at all.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+HOLES = "holes"
+"""Metadata key: start and end of each hole as JSON [ns]."""
+END_NS = 1 << 62
+"""End of a hole behind which there is no message [ns]."""
+
+
+class Hole(NamedTuple):
+    """A time in which messages of a recording are lost, by the recording's log times."""
+
+    begin_ns: int  # last message before the hole [ns]; 0: none
+    end_ns: int  # first message behind the hole [ns]; END_NS: none
+
+    def meets(self, first_ns: float, last_ns: float) -> bool:
+        """Return whether messages from `first_ns` to `last_ns` [ns] may be lost."""
+        return self.begin_ns < last_ns and first_ns < self.end_ns
+
+    def describe(self, seconds: Callable[[int], float]) -> str:
+        """Describe the hole in words; `seconds` converts a log time [ns] to a time [s]."""
+        begin, end = seconds(self.begin_ns), seconds(self.end_ns)
+        if self == SOMEWHERE:
+            return "messages lost, nobody knows when"
+        if self.end_ns >= END_NS:
+            return f"all lost from {begin:.2f} s on"
+        if not self.begin_ns:
+            return f"all lost up to {end:.2f} s"
+        return f"{end - begin:.2f} s lost at {begin:.2f} s"
+
+
+SOMEWHERE = Hole(0, END_NS)
+"""In place of the holes if nobody knows when the lost messages were."""
+SHOWN_MAX = 3
+"""Largest number of holes that a text describes."""
+
+
+def describe(holes: Iterable[Hole], seconds: Callable[[int], float]) -> str:
+    """Describe the first holes in words, and count the others; "" without a hole."""
+    texts = [hole.describe(seconds) for hole in sorted(set(holes))]
+    more = len(texts) - SHOWN_MAX
+    return ", ".join(texts[:SHOWN_MAX]) + f" and {more} more holes" * (more > 0)
+
+
+def goes_on(holes: Iterable[Hole]) -> bool:
+    """Return whether the recording goes on behind one of its holes."""
+    return any(hole.end_ns < END_NS or hole == SOMEWHERE for hole in holes)
+
+
+def between(spans: Iterable[tuple[int, int, int]], position: int) -> Hole:
+    """Return the hole that damage at a position of a file has left.
+
+    `spans`: position of each intact part, and the first and the last log time in it [ns].
+    """
+    spans = list(spans)
+    begin_ns = max((last for at, _, last in spans if at < position), default=0)
+    end_ns = min((first for at, first, _ in spans if at > position), default=END_NS)
+    return Hole(begin_ns, end_ns) if begin_ns <= end_ns else SOMEWHERE  # a file without order
+
+
+def to_metadata(holes: Iterable[Hole]) -> dict[str, str]:
+    """Return the holes as an entry of a file's metadata."""
+    return {HOLES: json.dumps(sorted(set(holes)))}
+
+
+def of_metadata(metadata: Mapping[str, str]) -> tuple[Hole, ...] | None:
+    """Return the holes that a file's metadata name; None if they say nothing about holes."""
+    if HOLES not in metadata:
+        return None
+    try:
+        return tuple(_hole(*pair) for pair in json.loads(metadata[HOLES]))
+    except (ValueError, TypeError, RecursionError):  # the file may come from somebody else
+        return (SOMEWHERE,)
+
+
+def _hole(begin_ns: Any, end_ns: Any) -> Hole:
+    if not (isinstance(begin_ns, int) and isinstance(end_ns, int) and begin_ns <= end_ns):
+        raise ValueError(f"no hole: {begin_ns} to {end_ns}")
+    return Hole(max(begin_ns, 0), min(end_ns, END_NS))

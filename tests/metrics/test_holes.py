@@ -1,0 +1,209 @@
+"""A flight of which messages are lost: no number and no verdict says more than what is left."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cloudrc.messages import GuardState
+from cloudrc.metrics import SHIPPED, measure_all
+from cloudrc.metrics.measure import IN_SPITE_OF_HOLES
+from cloudrc.metrics.response import steps
+from cloudrc.metrics.velocity_loop import series
+from cloudrc.metrics.verdict import exit_code, flight_evidence, judge
+from cloudrc.record.holes import END_NS, SOMEWHERE, Hole
+from cloudrc.records import Control, Counted, GroundTruth, GuardChange, TelemetrySent
+from cloudrc.runs.links.trace import one_way
+from tests.metrics.conftest import OPEN_AIR, SECOND, UPLINK, at, flown, good, touch
+
+
+def on_the_ground(_, sent):
+    """Let telemetry before the start say that the robot is on the ground."""
+    if sent.stamp_ns >= at(0):
+        return sent
+    return sent._replace(telemetry=sent.telemetry._replace(guard=GuardState.GROUND))
+
+
+def lossy(log, *spans, **options):
+    """Return the flight of a log without the records of the spans of time [s]."""
+    log.change(TelemetrySent, on_the_ground)
+    holes = [Hole(at(first), at(last)) for first, last in spans]
+    for records in (log.world, log.cloud):
+        records[:] = [each for each in records if not any(b < each.stamp_ns < e for b, e in holes)]
+    flight = log.flight(**options)
+    flight.recording.holes, flight.recording.told = tuple(holes), "damaged"
+    return flight
+
+
+def judged(flight):
+    return judge(
+        flight_evidence(flight, measure_all(flight)[0], real_time=False, interrupted=False)
+    )
+
+
+def counting(log, since):
+    """Let telemetry count a contact with an obstacle since a time [s]."""
+
+    def count(_, sent):
+        number = int(sent.stamp_ns >= at(since))
+        return sent._replace(telemetry=sent.telemetry._replace(obstacle_contacts=number))
+
+    log.change(TelemetrySent, count)
+    return log
+
+
+def test_a_contact_that_the_recording_has_lost_fails_the_mission_if_telemetry_counts_it():
+    log = counting(flown(), 3.0)
+    log.world.append(touch(3, "wall"))
+    flight = lossy(log, (2.9, 3.4))
+    (failure,) = judged(flight).failures
+    assert (failure.code, failure.place) == ("obstacle_touched", None)
+    assert failure.time == pytest.approx(3.4, abs=0.05)
+    assert measure_all(flight)[0]["obstacle_contacts"].value == 1
+
+
+def test_a_contact_that_is_recorded_counts_once():
+    log = counting(flown(), 3.0)
+    log.world.append(touch(3, "wall"))
+    flight = lossy(log, (5.0, 5.5))
+    assert [failure.text for failure in judged(flight).failures] == ["the robot touched wall"]
+    assert measure_all(flight)[0]["obstacle_contacts"].value == 1
+
+
+@pytest.mark.parametrize(
+    ("spans", "mission", "known"),
+    [
+        ([(5.0, 5.5)], {}, True),
+        ([(-0.5, 0.5)], {}, True),
+        ([(4.0, 4.5), (12.0, 12.5)], {}, True),
+        ([(9.5, 10.5)], {}, False),  # the end
+        ([(5.0, 5.5)], {"waypoints": 2}, False),
+        ([(7.5, 8.5)], {"touch": "board"}, False),
+    ],
+)
+def test_an_incomplete_recording_proves_neither_success_nor_a_goal_that_was_missed(
+    spans, mission, known
+):
+    verdict = judged(lossy(good() if mission.get("touch") else flown(), *spans, **mission))
+    assert (verdict.outcome, [each.code for each in verdict.failures]) == (
+        "invalid",
+        ["recording_incomplete"],
+    )
+    assert ("as far as the recording goes" in verdict.failures[0].text) == known
+    assert exit_code({"verdict": verdict.outcome, "failures": []}) == 6
+
+
+def test_a_note_alone_makes_a_recording_incomplete():
+    flight = flown().flight()
+    flight.recording.told = "two recordings are in one file"
+    assert judged(flight).failures[0].text.endswith("goes: two recordings are in one file")
+
+
+def test_what_is_recorded_still_fails_the_mission():
+    log = flown()
+    log.world.append(GuardChange(at(4), GuardState.LAND, "link lost"))
+    assert [each.code for each in judged(lossy(log, (5.0, 5.5))).failures] == ["guard_intervened"]
+
+
+def test_a_plug_in_may_fail_in_one_percent_of_the_periods_also_of_those_lost():
+    log = flown()
+    log.cloud.append(Counted(at(9), "cloud", "predictor_failed", 3))  # of 400
+    assert judged(lossy(log, (1.0, 8.0))).failures[0].code == "recording_incomplete"
+
+
+def test_numbers_in_spite_of_a_hole_are_those_of_the_whole_flight():
+    whole = measure_all(flown().flight())[0]
+    found, notes, _ = measure_all(lossy(flown(), (5.0, 5.5)))
+    assert found.keys() <= IN_SPITE_OF_HOLES <= SHIPPED.keys()
+    assert {"duration", "rtt_mean", "uplink_delay_mean", "waypoints_reached"} <= found.keys()
+    for name, number in found.items():
+        assert number.value == pytest.approx(whole[name].value, rel=1e-3), name
+    assert len(notes) == 1
+
+
+def test_a_hole_outside_of_the_flight_changes_no_number():
+    assert measure_all(lossy(flown(), (11.0, 12.0))) == measure_all(flown().flight())
+
+
+def test_without_the_end_of_the_flight_there_are_no_numbers():
+    assert measure_all(lossy(flown(), (9.5, 10.5)))[0] == {}
+
+
+def test_without_the_start_of_the_flight_its_duration_is_not_known():
+    found, *_ = measure_all(lossy(flown(), (-0.5, 0.5)))
+    assert "rtt_mean" in found
+    assert not {"duration", "age_at_actuator_peak"} & found.keys()
+
+
+def test_a_users_metric_is_not_measured_across_a_hole(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text('UNIT = "1"\ndef measure(flight):\n    return 1.0\n')
+    assert "mine" in measure_all(flown().flight(), [str(path)])[0]
+    found, notes, _ = measure_all(lossy(flown(), (5.0, 5.5)), [str(path)])
+    assert "mine" not in found
+    assert any(note.startswith("metric mine is not measured") for note in notes)
+
+
+def test_a_step_of_which_messages_are_lost_is_no_step():
+    log = flown()
+
+    def setpoint(_, control):  # changes every 2 s
+        moved = (control.stamp_ns - at(0)) // (2 * SECOND)
+        return control._replace(setpoint=(10.0 * (moved % 2), 5.0, 1.0))
+
+    log.change(Control, setpoint)
+    assert [round(each.start) for each in steps(log.flight())] == [0, 2, 4, 6, 8]
+    assert [round(each.start) for each in steps(lossy(log, (3.8, 4.3)))] == [0, 6, 8]
+
+
+def test_no_position_is_known_in_a_hole():
+    log = flown()
+    log.change(GroundTruth, lambda n, e: None if at(5) < e.stamp_ns < at(6) else e)
+    flight = lossy(log, (5.0, 6.0))
+    found = flight.true_position(np.array([at(4.5), at(5.5), at(6.5)]))
+    assert np.isnan(found).any(axis=1).tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("way", ["uplink", "downlink"])
+def test_a_trace_has_no_loss_and_no_pause_at_the_edges_of_a_hole(way):
+    whole = one_way(flown().flight().recording, Path("flight"), way)
+    found = one_way(lossy(flown(), (5.0, 5.5)).recording, Path("flight"), way)
+    assert not np.isnan(found.delays).any()
+    assert len(whole.delays) - 20 < len(found.delays) < len(whole.delays)
+    assert not any("nothing sent" in note for note in found.notes)
+    assert any("0.50 s lost at 6.00 s" in note for note in found.notes)  # since the first packet
+
+
+def test_losses_of_the_link_beside_a_hole_remain():
+    log = flown()
+    lost = {at(7), at(8)}
+    log.cloud[:] = [each for each in log.cloud if each.stamp_ns - round(UPLINK * 1e9) not in lost]
+    found = one_way(lossy(log, (5.0, 5.5)).recording, Path("flight"), "uplink")
+    assert np.isnan(found.delays).sum() == 2
+
+
+@pytest.mark.parametrize(
+    ("spans", "seconds"), [([], 38.0), ([(10.0, 10.5)], 27.5), ([(25.0, 25.5)], 23.0)]
+)
+def test_the_velocity_loop_is_fitted_to_the_longest_time_without_a_hole(spans, seconds):
+    log = flown()
+    last = max(each.stamp_ns for each in log.world)
+    log.world[:] = [
+        each._replace(stamp_ns=at(0) + (each.stamp_ns - at(0)) * 4) for each in log.world
+    ]
+    assert last < max(each.stamp_ns for each in log.world)
+    given, _ = series(lossy(log, *spans).recording, "flight")
+    assert len(given) * 0.01 == pytest.approx(seconds, abs=0.3)
+
+
+def test_a_recording_cut_short_is_measured_up_to_its_end():
+    log = flown()
+    for records in (log.world, log.cloud):
+        records[:] = [each for each in records if each.stamp_ns <= at(6)]
+    flight = log.flight()
+    flight.recording.holes, flight.recording.torn = (Hole(at(6), END_NS),), "cut short"
+    assert "age_at_actuator_peak" in measure_all(flight)[0]
+    flight = replace(flight, scene=OPEN_AIR)
+    flight.recording.holes = (SOMEWHERE,)
+    assert measure_all(flight)[0] == {}
