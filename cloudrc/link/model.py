@@ -137,24 +137,28 @@ class LinkDirection:
         arrival = now_ns
         if entry != OVERTAKES:
             if conditions.rate is not None:
-                if not self._queue(size, conditions.rate, now_ns):
+                departure = self._queue(size, conditions.rate, now_ns)
+                if departure is None:
                     return None
-                arrival = self._departures[-1]
-            arrival += max(0, conditions.delay_ns + entry)
+                arrival = departure
+            delay_ns = conditions.delay_ns + entry
+            if delay_ns > 0:
+                arrival += delay_ns
         if self._profile.keep_order:
             arrival = self._last_release_ns = max(arrival, self._last_release_ns)
         return arrival
 
-    def _queue(self, size: int, rate: float, now_ns: int) -> bool:
-        """Put a packet into the bottleneck's queue; return False if the queue is full."""
+    def _queue(self, size: int, rate: float, now_ns: int) -> int | None:
+        """Queue a packet at the bottleneck; return when it leaves [ns], or None if it is full."""
         departures = self._departures
         while departures and departures[0] <= now_ns:
             departures.popleft()
         if len(departures) >= self._profile.queue_packets:
-            return False
+            return None
         start = departures[-1] if departures else now_ns
-        departures.append(start + round((size + HEADER_BYTES) * 8e9 / rate))
-        return True
+        departure = start + round((size + HEADER_BYTES) * 8e9 / rate)
+        departures.append(departure)
+        return departure
 
     def _find_table(self, epoch: int, kind: int, block: int, conditions: Conditions) -> list[Fate]:
         jitter, loss = conditions.jitter, conditions.loss

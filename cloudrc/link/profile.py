@@ -205,7 +205,8 @@ class Timeline:
         """Return the conditions at the time `elapsed_ns` [ns] after the link came up."""
         if self.period_ns is not None and elapsed_ns > 0:
             elapsed_ns %= self.period_ns
-        return self.pieces[max(bisect_right(self.pass_ns, elapsed_ns) - 1, 0)]
+        place = bisect_right(self.pass_ns, elapsed_ns)
+        return self.pieces[place - 1 if place else 0]
 
     @property
     def last_ns(self) -> float:
