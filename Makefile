@@ -39,7 +39,7 @@ ROS_PACKAGES := rclpy rmw-fastrtps-cpp nav-msgs geometry-msgs sensor-msgs rosgra
 DRAWING := glfw pyopengl mujoco-studio
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link pictures results docs dist images kind-load lock clean
+.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link pictures results meta-world docs dist images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -133,7 +133,7 @@ mutants: $(VENV)/dev ## mutate guard, tunnel and store, list the mutants that te
 NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults.json \
 	search-adversarial.json $(ROBOTS:%=search-%.json) search-random.json \
 	link.json mujoco-oldest.json mujoco-newest.json gym-sb3.json) \
-	mutants night-tun night-ros2 night-netem e2e-full $(EVIDENCE)/index.md
+	mutants night-meta-world night-tun night-ros2 night-netem e2e-full $(EVIDENCE)/index.md
 
 nightly: export CLOUDRC_EVIDENCE = $(CURDIR)/$(EVIDENCE)
 nightly: $(VENV)/dev ## run every test, search and bench; writes build/evidence (needs what e2e needs)
@@ -178,7 +178,10 @@ $(EVIDENCE)/gym-sb3.json:
 $(EVIDENCE)/index.md:
 	$(bin)/python -m tools.evidence $(EVIDENCE)
 
-.PHONY: night-tun night-ros2 night-netem
+.PHONY: night-meta-world night-tun night-ros2 night-netem
+night-meta-world: build/meta-world/done
+	build/meta-world/bin/python -m tools.meta_world --seeds 2 > $(EVIDENCE)/meta-world.txt
+
 night-tun:
 	$(bin)/pytest -m tun tests/link/exec
 
@@ -238,6 +241,15 @@ pictures: $(VENV)/dev ## film the console for the README, draw two robots, and t
 
 results: $(VENV)/dev ## fly the README's results and write them into it: two minutes
 	$(bin)/python -m tools.results
+
+# Meta-World pins an old MuJoCo, and forgets two packages that it imports.
+meta-world: build/meta-world/done ## run Meta-World's experts over a network, for docs/eval.md: minutes
+	build/meta-world/bin/python -m tools.meta_world $(META_WORLD)
+
+build/meta-world/done: pyproject.toml
+	rm -rf build/meta-world && $(PYTHON) -m venv build/meta-world
+	build/meta-world/bin/pip install --quiet '.[gym,report]' metaworld==3.1.1 packaging imageio
+	@touch $@
 
 docs: $(VENV)/dev ## write the generated tables of docs/, and the chart's schema, table and copied files
 	$(bin)/python -m tools.docs
