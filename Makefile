@@ -77,9 +77,9 @@ ros2-test: build/ros-jazzy/done build/ros-kilted/done ## fly with nodes of ROS 2
 	build/ros-jazzy/bin/python -m pytest -m 'ros2 and not full' tests/bridges
 	build/ros-kilted/bin/python -m pytest -m 'ros2 and not full' tests/bridges
 
-ros2-smoke: build/ros-jazzy/done build/ros-kilted/done ## of these one flight each, which every push runs
+ros2-smoke: build/ros-jazzy/done build/ros-kilted/done ## of these one flight each, and one in real time, which every push runs
 	build/ros-jazzy/bin/python -m pytest -m 'ros2 and smoke' tests/bridges
-	build/ros-kilted/bin/python -m pytest -m 'ros2 and smoke' tests/bridges
+	build/ros-kilted/bin/python -m pytest -m 'ros2 and smoke and not alone' tests/bridges
 
 # A real ROS 2 in an environment of its own, which also has the packages of $(VENV).
 build/ros-%/done: tests/bridges/ros-%.txt | $(VENV)/dev

@@ -8,12 +8,13 @@ import time
 import rclpy
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
 
 KIND, *MORE = remove_ros_args(sys.argv)[1:]
 AFTER = 30
 """Number of answers before a node becomes wrong."""
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LOSSY = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 rclpy.init()
@@ -70,6 +71,6 @@ def answer(estimate):
     commands.publish(command)
 
 
-node.create_subscription(PoseStamped, "cloudrc/setpoint", hear, 1)
+node.create_subscription(PoseStamped, "cloudrc/setpoint", hear, LATCHED if KIND == "latched" else 1)
 node.create_subscription(Odometry, "cloudrc/estimate", answer, 1)
 rclpy.spin(node)

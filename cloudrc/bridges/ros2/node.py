@@ -227,6 +227,7 @@ class RosNode(OwnNode):
         for info in infos:
             if text := clash(info, self._commands.qos_profile, topic):
                 raise ControllerLostError(INVALID, text)
+        self._check_hears(set(names))
         return word
 
     def _check_alone(self) -> None:
@@ -240,6 +241,14 @@ class RosNode(OwnNode):
                 f"node {names[0]} publishes {estimate} in {self.domain}, too: give each flight a "
                 f"domain or a namespace of its own; {LINGERS}",
             )
+
+    def _check_hears(self, names: set[str]) -> None:
+        """Raise a ControllerLostError if the QoS of what the nodes `names` hear cannot match."""
+        for name in ("estimate", "setpoint"):
+            topic = self._names[name]
+            for info in known(self.node.get_subscriptions_info_by_topic(topic)):
+                if name_of(info) in names and (text := clash(info, RELIABLE, topic)):
+                    raise ControllerLostError(INVALID, text)
 
     def silence(self, limit: float = 0.0) -> str:
         """Say why there was no answer, for `limit` [s] if it is given."""
