@@ -87,11 +87,14 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.eval import results
     from cloudrc.eval.episode import check_environment, follows_seed
     from cloudrc.eval.page import write_page
+    from cloudrc.eval.setup import slow_answers
 
     setup, episodes = _read(options)
     with closing(StepView(sys.stderr, f"makes the environment {setup.env}")):
-        check_environment(setup, episodes)
+        dt = check_environment(setup, episodes)
         seeded = follows_seed(setup)
+    if slow := slow_answers(setup, dt):
+        print_line(f"cloudrc: warning: {slow}", sys.stderr)
     if not seeded:
         setup = replace(setup, follows_seed=False)
         print_line(f"cloudrc: warning: --env {setup.env}: {results.SEEDLESS}", sys.stderr)

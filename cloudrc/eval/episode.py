@@ -17,7 +17,16 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.eval.setup import FILE, MEASURED, SEED, Episode, EvalSetup, link_at, read_times
+from cloudrc.eval.setup import (
+    FILE,
+    MEASURED,
+    SEED,
+    Episode,
+    EvalSetup,
+    link_at,
+    mean_compute,
+    read_times,
+)
 from cloudrc.gym import Networked
 from cloudrc.gym.values import size_of
 from cloudrc.plugins import refuse_failure
@@ -235,7 +244,7 @@ def _connect(
     compute: Any = setup.compute
     sent = setup.observation_bytes
     if isinstance(compute, tuple) and compute[0] == FILE:
-        compute = fmean(read_times(str(compute[1])))
+        compute = mean_compute(compute)
     elif isinstance(compute, tuple) and compute[0] == MEASURED:
         compute = policy.duration
     return Networked(
@@ -269,17 +278,20 @@ def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
     return known
 
 
-def check_environment(setup: EvalSetup, episodes: list[Episode]) -> None:
-    """Raise a BadInputError if environment, policy file or executors cannot be used.
+def check_environment(setup: EvalSetup, episodes: list[Episode]) -> float:
+    """Return the time of a step [s].
+
+    Raise a BadInputError if environment, policy file or executors cannot be used.
 
     The call comes before a folder is made. A server is not asked.
     """
     with make_env(setup, 1) as env:
         width_of(env.action_space)
         for executor in dict.fromkeys(each.executor for each in episodes):
-            Networked(env, dt=setup.dt, chunk=1, executor=executor)
+            world = Networked(env, dt=setup.dt, chunk=1, executor=executor)
     if not setup.is_remote:
         _load(setup.policy)
+    return world.dt
 
 
 def follows_seed(setup: EvalSetup) -> bool:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from math import isfinite
 from pathlib import Path
+from statistics import fmean
 from typing import Any, TypeAlias
 
 from cloudrc.config.document import parse_value, read_document
@@ -27,6 +29,9 @@ SEED = "{seed}"
 """Value of an environment's argument that stands for the seed of the episode."""
 COMPUTE_MAX = 3600.0
 """Largest time for an answer [s]."""
+
+SLOW_STEPS = 100
+"""Number of steps of an environment after which an answer is slow enough for a warning."""
 
 
 @dataclass(frozen=True)
@@ -146,13 +151,36 @@ def read_compute(text: str) -> Compute:
     try:
         numbers = [float(each) for each in text.split(",")]
     except ValueError:
-        return FILE, text
-    if len(numbers) > 2 or not all(0.0 <= each <= COMPUTE_MAX for each in numbers):
+        if os.path.lexists(text):
+            return FILE, text
+        numbers = []
+    if len(numbers) not in (1, 2) or not all(0.0 <= each <= COMPUTE_MAX for each in numbers):
         raise BadInputError(
-            f"--compute {text}: give the time for an answer in seconds, its mean and standard "
-            "deviation (0.05,0.02), a file with one time per line, or 'measured'"
+            f"--compute {text}: give the time for an answer: a number of s such as 0.05, "
+            f"MEAN,DEVIATION in s, the path of a file that exists, or '{MEASURED}'"
         )
     return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+
+
+def mean_compute(compute: Compute) -> float:
+    """Return the mean time for an answer [s]; 0 if it is measured."""
+    if isinstance(compute, float):
+        return compute
+    kind, value = compute
+    if kind == FILE:
+        return fmean(read_times(str(value)))
+    return 0.0 if kind == MEASURED else float(kind)
+
+
+def slow_answers(setup: EvalSetup, dt: float) -> str:
+    """Return a warning if an answer takes very many steps of `dt` [s]; else ""."""
+    mean = mean_compute(setup.compute)
+    if mean <= SLOW_STEPS * dt:
+        return ""
+    return (
+        f"--compute: an answer takes {mean:g} s, as long as {mean / dt:,.0f} steps of the "
+        "environment; the unit is s"
+    )
 
 
 def read_times(path: str) -> tuple[float, ...]:

@@ -21,6 +21,7 @@ from cloudrc.eval.setup import (
     read_compute,
     read_env_args,
     read_mapped,
+    slow_answers,
 )
 from cloudrc.policy.observation import Mapped, observe
 from tests.policy.conftest import serving, stock_like
@@ -356,14 +357,27 @@ def test_a_round_trip_keeps_the_ratio_of_the_profile():
         ("a.csv", ("file", "a.csv")),
     ],
 )
-def test_a_time_for_an_answer_is_read(text, found):
+def test_a_time_for_an_answer_is_read(text, found, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("a.csv").touch()
     assert read_compute(text) == found
 
 
-@pytest.mark.parametrize("text", ["-1", "1,2,3", "nan", "inf"])
-def test_a_wrong_time_for_an_answer_is_refused(text):
-    with pytest.raises(BadInputError, match="--compute"):
+@pytest.mark.parametrize("text", ["-1", "1,2,3", "nan", "inf", "50ms", "0.05,x", "absent.csv", ""])
+def test_a_wrong_time_for_an_answer_is_refused_with_all_that_fits(text):
+    with pytest.raises(
+        BadInputError, match=r"--compute.* 0\.05, MEAN,DEVIATION .* file .*measured"
+    ):
         read_compute(text)
+
+
+@pytest.mark.parametrize(
+    ("compute", "warned"),
+    [(50.0, True), ((50.0, 1.0), True), (0.5, False), (("measured", ""), False)],
+)
+def test_an_answer_that_takes_very_many_steps_is_a_warning(compute, warned):
+    setup = EvalSetup("CartPole-v1", "law.py", compute=compute)
+    assert ("50 s, as long as 2,500 steps" in slow_answers(setup, 0.02)) is warned
 
 
 @pytest.mark.parametrize("content", ["", "x\n", "1\nx\n", "-1\n", "nan\n", "\xff"])
