@@ -79,12 +79,18 @@ class Trials:
             self.size = 10.0
         if asked.resolution is not None:
             self.size = asked.resolution
+        elif asked.max is not None and not isinstance(now, int):
+            while 0 < asked.max < self.size:  # the default fits the range
+                self.size /= 10.0
         # Without a value the key has no effect, as a large value has: begin there.
         self.present = self._number(1.0 if first is None else first)
         given = STEPS_MAX * self.present * self.size if asked.max is None else asked.max
         if not 0 < self.size <= given < math.inf:
             if asked.max is None:
                 raise BadInputError(f"--resolution {self.size:g} must be a finite number above 0")
+            if asked.resolution is None:
+                least = f"at least {self.size:g}" if 0 < given < 1 else "a finite number above 0"
+                raise BadInputError(f"--max {given:g} must be {least}")
             raise BadInputError(
                 f"--resolution {self.size:g} must be above 0, --max {given:g} not below it"
             )

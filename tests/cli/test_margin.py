@@ -60,6 +60,8 @@ def uplink(limit):
          f"settles from 120 ms up to 500 ms, the largest value tried; raise --max; "
          f"fails at 110 ms: {LATE}"),
         # The limits of the delay would lower the largest speed.
+        (f"{KEY} --max 0.5", lambda found: True, 0,
+         "settles up to 0.5 ms (RTT "),
         ("guard.speed_max_mps --max 7 --resolution 1", lambda found: True, 0,
          "settles up to 6, the largest value possible: --set: guard.speed_max_mps: must be at"),
         # Whole numbers are tried, one by one.
@@ -144,14 +146,18 @@ def test_the_end_of_the_limits_is_no_failure_of_the_loop(fly_with, call):
         ("world.odometry_rate_hz", "allows only 20, 25, 50, 100, 125, 250, 500; fly a sweep"),
         ("link.uplink.rate_kbit", "has no value now; name the largest one to try with --max"),
         ("cloud.command_rate_hz --resolution 0.3", "cloud.command_rate_hz: 99.9: must be"),
-        (f"{KEY} --max 5", "--resolution 10 must be above 0, --max 5 not below it"),
+        (f"{KEY} --max 5 --resolution 10", "--resolution 10 must be above 0, --max 5 not below it"),
+        ("link.uplink.queue_packets --max 0.5", "--max 0.5 must be at least 1"),
         ("link.both.loss --max 50", "--max 50: link.both.loss must be a number >= 0 and <= 1 (1 %"),
         ("guard.command_age_max_ms --max 2e4", "--max 20000: guard.command_age_max_ms must be a"),
         *(
             (f"{KEY} --resolution {text}", f"--resolution {text} must be a finite number above 0")
             for text in ("-1", "0", "nan")
         ),
-        *((f"{KEY} --max {text}", f"--max {text} not") for text in ("nan", "0")),
+        *(
+            (f"{KEY} --max {text}", f"--max {text} must be a finite number above 0")
+            for text in ("nan", "0")
+        ),
     ],
 )
 def test_a_search_that_cannot_begin_is_refused(arguments, text, refused):
