@@ -123,7 +123,9 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
     from cloudrc.runs.experiment import check_mode, load
     from cloudrc.runs.own_files import describe_changes
 
-    experiment = load(options.experiment, options.set, options.seed)
+    # The missions of a session come later, with what they touch.
+    before = ["mission.touch=null"] if ready else []
+    experiment = load(options.experiment, [*before, *options.set], options.seed)
     check_mode(experiment, mode)
     warn(experiment)
     if changes := describe_changes(options.experiment, experiment):
@@ -187,8 +189,10 @@ def _local_flight(
 
             def landed() -> None:
                 if is_interrupted():
-                    why = "the session ends" if ready else "interrupted"
-                    view.say(f"{why}: writes the report; Ctrl-C again leaves it out")
+                    text = "interrupted: writes the report; Ctrl-C again leaves it out"
+                    view.say(
+                        "the session ends; Ctrl-C again leaves its report out" if ready else text
+                    )
                 view.tell("writes the report")
 
             session = partial(ready, folder, view.say, stack) if ready else None

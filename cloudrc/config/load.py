@@ -236,10 +236,21 @@ def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> Res
     with _collect(found, ("world", "tuning")):
         parameters(robot, experiment.world)
     mission = put_on_ground(mission, scene) if robot.planar else mission
-    found += _check_fit(mission, scene, experiment.world.robot)
+    fit = _check_fit(mission, scene, experiment.world.robot)
+    found += [_blame_scene(document, each) for each in fit]
     problems.raise_problems(document, found, name)
     mission = without_held_yaws(mission, robot.heading)
     return experiment.model_copy(update={"mission": mission})
+
+
+def _blame_scene(document: Document, problem: ConfigProblem) -> ConfigProblem:
+    """Name the scene of a setting, if the mission that does not fit it is of no setting."""
+    scene = ("world", "scene")
+    if problem.path[0] != "mission" or not document.source(scene).is_setting:
+        return problem
+    if document.source(problem.path).is_setting:
+        return problem
+    return ConfigProblem(scene, str(document.get(*scene)), f"does not fit: {problem}")
 
 
 def _check_fit(mission: MissionConfig, scene: Scene, robot: str) -> list[ConfigProblem]:

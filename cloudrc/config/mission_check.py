@@ -104,9 +104,11 @@ def _check_touch(mission: MissionConfig, scene: Scene) -> ConfigProblem | None:
     if body is None:
         return None
     if mission.steps is not None:
-        return ConfigProblem(("touch",), "", "random steps lead to no body; set touch to null")
+        return ConfigProblem(
+            ("touch",), "", "random steps lead to no body; set mission.touch to null"
+        )
     if body == FLOOR:
-        reason = "the robot stands on it; name another body, or set touch to null"
+        reason = "the robot stands on it; name another body, or set mission.touch to null"
     elif names is None or body in names:
         return None
     else:
@@ -114,7 +116,7 @@ def _check_touch(mission: MissionConfig, scene: Scene) -> ConfigProblem | None:
         near = get_close_matches(body, others, 1)
         has = ", ".join(others[:_REPORTED]) or "none but floor"
         known = f"the nearest name is {near[0]}" if near else f"its bodies: {has}"
-        reason = f"the scene {scene.name} has no such body; {known}; or set touch to null"
+        reason = f"the scene {scene.name} has no such body; {known}; or set mission.touch to null"
     return ConfigProblem(("touch", "body"), body, reason)
 
 

@@ -31,7 +31,7 @@ from cloudrc.config.document import Document, KeyPath, Source, child, parse_valu
 from cloudrc.config.problems import ConfigProblem, ProblemsError
 from cloudrc.config.reuse import reuse
 from cloudrc.config.robot import RobotFacts, facts, find_robot, known_robot, parameters
-from cloudrc.config.schema import Experiment, PlugIn, Steps, World
+from cloudrc.config.schema import Cloud, Experiment, PlugIn, Steps, World
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.renamed import new_key
@@ -235,12 +235,28 @@ def resolve_plugins(document: Document, *, build: bool) -> list[ConfigProblem]:
                 parameters = _complete_once(document, path, name, parameters, robot)
         except ProblemsError as error:
             found += [each._replace(path=path + each.path) for each in error.problems]
+        except _NoModelError as error:
+            found.append(_no_model(document, path, error))
+            document.tree["cloud"][key] = {"name": name, **parameters}
         except BadInputError as error:
             found.append(ConfigProblem(path, "", str(error), error))
         else:
             # Not by `set_value`: the parameters keep their sources.
             document.tree["cloud"][key] = {"name": name, **parameters}
     return found
+
+
+class _NoModelError(BadInputError):
+    """A predictor has no model of the robot, which `cloud.plan_s` needs."""
+
+
+def _no_model(document: Document, path: KeyPath, error: _NoModelError) -> ConfigProblem:
+    """Return the problem of a predictor of a setting, else of `cloud.plan_s`, which needs more."""
+    if document.source(path).is_setting:
+        return ConfigProblem(path, "", str(error), error)
+    plan, default = ("cloud", "plan_s"), document.get(*path) == Cloud().predictor
+    what = "the default predictor" if default else "the predictor"
+    return ConfigProblem(plan, str(document.get(*plan)), f"{what} {error}", error)
 
 
 def _robot_of(document: Document) -> RobotFacts | None:
@@ -333,7 +349,7 @@ def _check_model(predictor: Any, name: str) -> None:
         predictor.predict(Odometry(0, ZERO, UPRIGHT, ZERO, ZERO), 0.0)
         model = predictor.model()
     if model is None:
-        raise BadInputError(
+        raise _NoModelError(
             f"'{name}' has no model of the robot, which cloud.plan_s above 0 needs; choose "
             "model_based, command_history or kalman, or set cloud.plan_s to 0"
         )

@@ -11,6 +11,7 @@ import urllib.request
 from contextlib import closing, contextmanager, suppress
 from math import inf
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -21,6 +22,7 @@ from cloudrc.config.setpoints import write_setpoints
 from cloudrc.config.shipped import file_of
 from cloudrc.drivers import local
 from cloudrc.drivers.machine import usable_cores
+from cloudrc.errors import BadInputError
 from cloudrc.messages import Start
 from cloudrc.record.columns import Recording
 from cloudrc.teleop.client import Api, ApiError
@@ -107,6 +109,14 @@ def test_a_console_is_shown_and_a_missing_one_is_explained(folder, monkeypatch):
     assert time.monotonic() - began < 10.0, "the console ends with the session"
     absent = "cloudrc: error: a console needs viser; run: pip install it"
     assert console(f"raise SystemExit({absent!r})") == [absent]
+
+
+def test_a_session_needs_no_body_that_a_shipped_mission_touches(folder, monkeypatch, call):
+    seen = Mock(side_effect=BadInputError("enough"))
+    monkeypatch.setattr("cloudrc.cli.run._local_flight", seen)
+    assert "enough" in call("up --set world.scene=empty", code=2).err
+    own = call("up --set world.scene=empty --set mission.touch.body=board", code=2).err
+    assert "--set: mission.touch.body: board: the scene empty has no such body" in own
 
 
 PYTHON = [sys.executable, "-c"]

@@ -146,7 +146,18 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
             "mission.waypoints.2.yaw_deg=90",
             "yaw_deg: 90: the onboard controller of this robot holds",
         ),
-        ("cloud.plan_s=0.4", "cloud.predictor: 'constant_velocity' has no model of the robot"),
+        (
+            "cloud.plan_s=0.4",
+            "--set: cloud.plan_s: 0.4: the default predictor 'constant_velocity' has no model of",
+        ),
+        (
+            "cloud.plan_s=0.4 cloud.predictor=last_sample",
+            "--set: cloud.predictor: 'last_sample' has no model of the robot",
+        ),
+        (
+            "world.scene=empty",
+            "--set: world.scene: empty: does not fit: mission.touch.body: board: the scene empty",
+        ),
         ("mission.waypoints.2.speed_mps=1", "waypoints.2.speed_mps: 1: is the speed of a carrot;"),
         ("mission=steps mission.carrot.speed_mps=1", "mission.carrot: impossible with steps"),
         ("world.robot=./no.xml", "no.xml; names of shipped robots: nano, pelican"),
