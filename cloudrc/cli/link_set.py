@@ -21,11 +21,12 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 where:
-  a run on this machine ('cloudrc up', 'cloudrc run', 'cloudrc link exec'):
-  found automatically, or named by --run
+  a run on this machine ('cloudrc up', 'cloudrc run', 'cloudrc link exec',
+  'cloudrc relay tcp'): found automatically, or named by --run
   a release in a cluster: if --context, -n or --release is given, or if there is
   no run on this machine; always with 'kubectl cloudrc link set'
-  If several runs fly, or ./runs/latest has ended, name the flight by a flag.
+  If several runs fly, or ./runs/latest has ended and another flight has begun,
+  name the run by a flag.
 
 examples:
   cloudrc link set downlink.delay_ms=120 uplink.loss=0.02

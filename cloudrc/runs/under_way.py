@@ -33,13 +33,13 @@ def find_run(
     """Find the run in flight that a user means: `run`, else the only one.
 
     If the user's newest run here, ./runs/latest, has ended, a command that changes a flight rejects
-    the only run in flight, which may belong to somebody else.
+    the only run in flight, which may belong to somebody else. A link without a flight is taken.
 
     Args:
         run: Folder of the run; None if the user names none.
         steers: Whether the command changes the flight.
         flag: Flag that names a run, for the texts of errors; "" for a positional argument.
-        links: Whether the command can also use a link between two programs.
+        links: Whether the command can also use a link of `link exec` or `relay tcp`.
 
     Returns:
         The run; None if no run is in flight.
@@ -56,7 +56,8 @@ def find_run(
         if url is None:
             raise BadInputError(f"{flag}{run}: no run flies there; name another folder")
         return RunInFlight(run, url)
-    note = ask_if_unclear(flights, steers=steers, flag=flag)
+    without_flight = bool(flights) and flights.keys().isdisjoint(under_way())
+    note = ask_if_unclear(flights, steers=steers and not without_flight, flag=flag)
     return next((RunInFlight(Path(short(run)), url, note) for run, url in flights.items()), None)
 
 

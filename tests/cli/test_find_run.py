@@ -72,6 +72,16 @@ def test_no_command_steers_another_flight_after_yours_has_ended(tmp_path, elsewh
         assert said(0, "mission estop") == using
 
 
+def test_a_link_without_a_flight_is_changed_after_yours_has_ended(tmp_path, elsewhere, said):
+    latest = elsewhere / "runs" / "latest"
+    latest.mkdir(parents=True)
+    (latest / "uplink.log").touch()
+    with local.announced(tmp_path / "a", "unix:/none.sock", local.LINK):
+        assert f"using the run in {tmp_path / 'a'}" in said(2, SET)  # it has no state to change
+        with flying(tmp_path / "b"):
+            assert "2 runs are flying here; choose one" in said(2, SET)
+
+
 def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
     with flying(elsewhere / "runs" / "latest") as served:
         api, far = Api(served.url), {"name": "far", "waypoints": [{"position_m": [0.5, -2.0, 1.0]}]}
