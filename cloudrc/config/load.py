@@ -576,7 +576,6 @@ CHANGEABLE_KEYS = ChangeConfig.model_fields.keys() - {"at_s"}
 """Keys of a direction that an entry of its list `changes` may set."""
 TIME_LINE_KEYS = ("changes", "trace", "blackouts")
 """Keys of a direction that make up its time line: how the link's conditions change over time."""
-_HERE = "link set"
 _EXAMPLE = "for example downlink.delay_ms=120, or --profile handover"
 
 
@@ -589,12 +588,14 @@ class Edit(NamedTuple):
     notes: list[str]  # sentences for the user about side effects
 
 
-def edit_profile(before: Document, profile: str | None, settings: Sequence[str]) -> Edit:
+def edit_profile(
+    before: Document, profile: str | None, settings: Sequence[str], command: str = "link set"
+) -> Edit:
     """Set values in the link profile `before`, or in the profile named `profile` if it is given.
 
     For each key in `settings`, remove the changes over time from the profile (for the delay also
-    the trace), so that the key keeps the user's value. Raise a BadInputError if the request is
-    empty or invalid.
+    the trace), so that the key keeps the user's value. Raise a BadInputError, which names the
+    `command`, if the request is empty or invalid.
     """
     if profile is None and not settings:
         raise BadInputError(f"nothing to set; name a value, {_EXAMPLE}")
@@ -609,7 +610,7 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
                 "guard keeps the limit that it started with, so the robot may hold"
             )
     changes: Settings = {}
-    for path, setting in overrides.parse_settings(settings, _HERE).items():
+    for path, setting in overrides.parse_settings(settings, command).items():
         way, *keys = path[1:] if path[0] == "link" else path
         if not keys or way not in DIRECTIONS:
             raise BadInputError(f"{'.'.join(path)}: set a key of uplink or downlink, {_EXAMPLE}")
@@ -617,7 +618,7 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
         restart |= keys[0] in TIME_LINE_KEYS
         notes += _drop_from_time_line(document, way, keys[0])
     overrides.apply_overrides(document, changes)
-    new_profile = check_profile(document, _HERE)
+    new_profile = check_profile(document, command)
     for way in DIRECTIONS:
         notes += describe_heavy_shares(getattr(new_profile, way), way)
     values = new_profile.model_dump(mode="json", exclude_defaults=True)

@@ -73,7 +73,7 @@ def run_programs(settings: ExecSettings, tell: Tell) -> tuple[ExecOutcome, ExecL
     Raises:
         CloudrcError: If the link or a program cannot start.
     """
-    edit = edit_profile(Document({}), settings.link, settings.settings)
+    edit = edit_profile(Document({}), settings.link, settings.settings, "link exec")
     for note in edit.notes:
         tell(f"note: {note}")
     with contextlib.ExitStack() as stack:

@@ -47,7 +47,7 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
     Raises:
         BadInputError: If the profile or an address cannot be used.
     """
-    edit = edit_profile(Document({}), settings.link, settings.settings)
+    edit = edit_profile(Document({}), settings.link, settings.settings, "relay tcp")
     for note in edit.notes:
         tell(f"note: {note}")
     with contextlib.ExitStack() as stack:
