@@ -1,49 +1,55 @@
 """Compare `cloudrc relay tcp` with `cloudrc link exec`: how long turns take, on the same link.
 
-    python -m tools.judge_relay [--turns 40] [--control cubic]
+    python -m tools.judge_relay [--only lte] [--rounds 6] [--control bbr]
 
 A turn sends a number of bytes, and gets eight back: on a new connection (cold) or on a used one
-(warm). The table has median and 95 % quantile [ms] of both. Needs what `link exec` needs.
+(warm). A round measures both at the same time, because other load on the machine changes; each
+round has a seed of its own. The table has median and 95 % quantile [ms] of both. Over `ideal` they
+are measured one after the other, and a connection without a link, too: `link exec` spends CPU time
+on each packet. Needs root, and what `link exec` needs.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import signal
+import os
 import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from statistics import quantiles
 
-SIZES = (200, 300_000, 1_400_000)  # bytes of a request
+from cloudrc.cli.main import main as run_command
+from cloudrc.drivers.realtime import free_ports
+from cloudrc.runs.links import streams
+
+TURNS = {200: 30, 300_000: 15, 1_400_000: 5}
+"""Bytes of a request -> turns of a round."""
 LINKS = {
     "ideal": "ideal",
     "lte": "lte",
-    "1 % loss": "uplink: {delay_ms: 40, loss: 0.01}\ndownlink: {delay_ms: 40, loss: 0.01}\n",
+    "loss": "uplink: {delay_ms: 40, loss: 0.01}\ndownlink: {delay_ms: 40, loss: 0.01}\n",
 }
 FLOOR = 1.0  # difference of median or quantile that counts as none [ms]
-MEDIAN, P95 = 0.10, 0.25  # accepted relative differences
-WARM_UP, WARM = 4, 10  # turns of a connection that are not measured, and that are
+SHARES = {"p50": 0.10, "p95": 0.25}  # accepted relative differences
+WARM_UP, WARM = 4, 5  # turns of a connection that are not measured, and that are
 PYTHON = sys.executable
 
-
-def connect(where: tuple[str, int], control: str) -> socket.socket:
-    """Connect with a congestion control; "" for that of the machine."""
-    one = socket.socket()
-    tune(one, control)
-    one.connect(where)
-    return one
+Times = dict[tuple[int, str], list[float]]
+"""Bytes and "cold" or "warm" -> times of turns [ms]."""
 
 
 def tune(one: socket.socket, control: str) -> None:
     """Set the options of a socket of both programs."""
     one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    if control:
-        one.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, control.encode())
+    one.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, control.encode())
 
 
 def serve(port: int, control: str) -> None:
@@ -64,113 +70,171 @@ def serve(port: int, control: str) -> None:
         threading.Thread(target=answer, args=(one,), daemon=True).start()
 
 
-def ask(where: tuple[str, int], turns: int, control: str) -> None:
-    """Print size, kind, median and 95 % quantile of the time of turns [ms]."""
-    for size in SIZES:
-        request = size.to_bytes(4, "big") + bytes(size)
+def ask(where: tuple[str, int], control: str) -> None:
+    """Print bytes, kind and time [ms] of the turns of a round."""
+    for size, turns in TURNS.items():
+        for _ in range(turns):
+            print(size, "cold", next(on_one_connection(where, size, control)))
+        for _ in range(max(1, turns // WARM)):
+            times = list(on_one_connection(where, size, control))
+            for taken in times[WARM_UP:]:
+                print(size, "warm", taken)
 
-        def turn(one: socket.socket, request: bytes = request) -> None:
+
+def on_one_connection(where: tuple[str, int], size: int, control: str) -> Iterator[float]:
+    """Connect, and yield how long turns take; the first one includes the connection."""
+    request = size.to_bytes(4, "big") + bytes(size)
+    began = time.perf_counter()
+    with socket.socket() as one:
+        tune(one, control)
+        one.connect(where)
+        for _ in range(WARM_UP + WARM):
             one.sendall(request)
             if len(one.recv(8, socket.MSG_WAITALL)) != 8:
                 raise ConnectionError("the server has closed the connection")
-
-        cold = []
-        for _ in range(turns):
+            yield (time.perf_counter() - began) * 1e3
             began = time.perf_counter()
-            with connect(where, control) as one:
-                turn(one)
-                cold.append((time.perf_counter() - began) * 1e3)
-        warm: list[float] = []
-        while len(warm) < turns:
-            with connect(where, control) as one:
-                for number in range(WARM_UP + WARM):
-                    began = time.perf_counter()
-                    turn(one)
-                    if number >= WARM_UP:
-                        warm.append((time.perf_counter() - began) * 1e3)
-        for kind, times in (("cold", cold), ("warm", warm)):
-            times.sort()
-            print(size, kind, times[len(times) // 2], times[int(0.95 * len(times))], flush=True)
 
 
-def words(*given: object) -> list[str]:
+def words(control: str, *given: object) -> list[str]:
     """Return the command line of this module with other arguments."""
-    return [PYTHON, "-m", "tools.judge_relay", *map(str, given)]
+    return [PYTHON, "-m", "tools.judge_relay", "--control", control, *map(str, given)]
 
 
-def through_exec(link: str, options: argparse.Namespace) -> str:
+def through_exec(link: str, seed: int, control: str) -> str:
     """Measure over `link exec`; return what `ask` prints."""
-    client = " ".join(words("--control", f"'{options.control}'", "--turns", options.turns))
-    command = [PYTHON, "-m", "cloudrc", "link", "exec", "--link", link]
-    command += ["--server", " ".join(words("--control", f"'{options.control}'", "--serve", 9000))]
-    command += ["--client", f"{client} --ask {{server}}:9000"]
+    command = [PYTHON, "-m", "cloudrc", "link", "exec", "--link", link, "--seed", str(seed)]
+    command += ["--server", " ".join(words(control, "--serve", 9000))]
+    command += ["--client", " ".join(words(control, "--ask", "{server}:9000"))]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return done.stdout.replace("[client] ", "")
 
 
-def through_relay(link: str, options: argparse.Namespace) -> str:
-    """Measure over `relay tcp`; return what `ask` prints."""
-    from cloudrc.drivers.realtime import free_ports
-
-    inside, outside = free_ports(2)
-    shared = ("--control", options.control)
-    server = subprocess.Popen(words(*shared, "--serve", inside))
-    command = [PYTHON, "-m", "cloudrc", "relay", "tcp", "--link", link]
-    command += ["--listen", f"127.0.0.1:{outside}", "--to", f"127.0.0.1:{inside}"]
-    relay = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+def through_relay(link: str, seed: int, control: str) -> str:
+    """Measure over `relay tcp`, or without it if `link` is ""; return what `ask` prints."""
+    port, entry = free_ports(2)
+    server = subprocess.Popen(words(control, "--serve", port))
+    relay = None
     try:
-        assert relay.stderr is not None
-        relay.stderr.readline()
-        asking = words(*shared, "--turns", options.turns, "--ask", f"127.0.0.1:{outside}")
+        wait_until_listening(port)
+        if link:
+            relay = subprocess.Popen(
+                words(control, "--relay", link, seed, entry, port), stderr=subprocess.PIPE
+            )
+            assert relay.stderr is not None
+            relay.stderr.readline()
+        asking = words(control, "--ask", f"127.0.0.1:{entry if link else port}")
         return subprocess.run(asking, capture_output=True, text=True, check=True).stdout
     finally:
-        relay.send_signal(signal.SIGINT)
-        relay.wait()
-        server.kill()
-        server.wait()
+        for process in filter(None, (relay, server)):
+            process.kill()
+            process.wait()
 
 
-def judge(options: argparse.Namespace) -> int:
+def wait_until_listening(port: int) -> None:
+    """Wait until a program of this machine listens."""
+    while True:
+        with contextlib.suppress(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", port)).close()
+            return
+        time.sleep(0.05)
+
+
+def relay(link: str, seed: str, entry: str, port: str, control: str) -> None:
+    """Run `cloudrc relay tcp` as on a machine whose kernel uses a congestion control."""
+    with tempfile.NamedTemporaryFile("w") as file:
+        file.write(control)
+        file.flush()
+        streams.CONTROL = Path(file.name)
+        sockets = ("--listen", f"127.0.0.1:{entry}", "--to", f"127.0.0.1:{port}")
+        run_command(["relay", "tcp", "--link", link, "--seed", seed, *sockets])
+
+
+def measure(way: str, link: str, seed: int, control: str, times: Times) -> None:
+    """Measure a round, and add it to `times`."""
+    if way == "exec":
+        text = through_exec(link, seed, control)
+    else:
+        text = through_relay(link if way == "relay" else "", seed, control)
+    for line in text.splitlines():
+        size, kind, taken = line.split()
+        times[int(size), kind].append(float(taken))
+
+
+def judge(names: Sequence[str], rounds: int, control: str) -> int:
     """Print the table; return 1 if a difference is too large."""
     off = 0
-    print(f"{'link':10}{'bytes':>9} {'':6}{'exec p50':>10}{'relay':>10}{'p95':>10}{'relay':>10}")
+    print(f"congestion control: {control}; {rounds} rounds\n")
+    print(f"{'link':6}{'bytes':>9} {'':5}{'turns':>6}", end="")
+    for share in SHARES:
+        print(f"{f'exec {share}':>10}{'relay':>9}{'ratio':>7}  {'':7}", end="")
+    print()
     with tempfile.TemporaryDirectory() as folder:
-        for name, link in LINKS.items():
-            if ":" in link:
-                path = Path(folder, "link.yaml")
-                path.write_text(link, encoding="utf-8")
-                link = str(path)
-            both = [through(link, options).split() for through in (through_exec, through_relay)]
-            for at in range(0, len(both[0]), 4):
-                size, kind, *truth = both[0][at : at + 4]
-                pairs = list(
-                    zip(map(float, truth), map(float, both[1][at + 2 : at + 4]), strict=True)
-                )
-                near = [
-                    abs(other - true) <= max(FLOOR, share * true)
-                    for (true, other), share in zip(pairs, (MEDIAN, P95), strict=True)
-                ]
-                off += near.count(False)
-                cells = "".join(f"{value:10.1f}" for pair in pairs for value in pair)
-                print(f"{name:10}{size:>9} {kind:6}{cells}  {'' if all(near) else 'differs'}")
+        for name in names:
+            path = Path(folder, "link.yaml")
+            path.write_text(LINKS[name], encoding="utf-8")
+            link = str(path) if ":" in LINKS[name] else LINKS[name]
+            ways = ("exec", "relay", "direct") if name == "ideal" else ("exec", "relay")
+            found: dict[str, Times] = {way: defaultdict(list) for way in ways}
+            with ThreadPoolExecutor(1 if name == "ideal" else len(ways)) as pool:
+                for seed in range(1, rounds + 1):
+                    doing = [
+                        pool.submit(measure, way, link, seed, control, found[way]) for way in ways
+                    ]
+                    for one in doing:
+                        one.result()
+            off += print_rows(name, found)
     return 1 if off else 0
+
+
+def print_rows(name: str, found: dict[str, Times]) -> int:
+    """Print the rows of a link; return how many differences are too large."""
+    off = 0
+    for (size, kind), true in found["exec"].items():
+        row = f"{name:6}{size:>9} {kind:5}{len(true):>6}"
+        for share, accepted in SHARES.items():
+            exact, near = (
+                at_share(times[size, kind], share) for times in (found["exec"], found["relay"])
+            )
+            good = abs(near - exact) <= max(FLOOR, accepted * exact)
+            off += not good
+            row += (
+                f"{exact:>10.1f}{near:>9.1f}{near / exact:>7.2f}  {'ok' if good else 'differs':7}"
+            )
+        if "direct" in found:
+            row += f"  without a link: {at_share(found['direct'][size, kind], 'p50'):.1f}"
+        print(row, flush=True)
+    return off
+
+
+def at_share(times: Sequence[float], share: str) -> float:
+    """Return the quantile "p50" or "p95" of times [ms]."""
+    return quantiles(times, n=100, method="inclusive")[int(share[1:]) - 1]
 
 
 def main() -> int:
     """Judge, or be one of the two programs."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--turns", type=int, default=40)
-    parser.add_argument("--control", default="", help="congestion control (default: the machine's)")
+    parser.add_argument("--only", choices=LINKS, help="judge one link")
+    parser.add_argument("--rounds", type=int, default=6, help="rounds of each (default: 6)")
+    parser.add_argument("--control", default="cubic", help="congestion control (default: cubic)")
     parser.add_argument("--serve", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--ask", help=argparse.SUPPRESS)
+    parser.add_argument("--relay", nargs=4, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.serve:
         serve(options.serve, options.control)
     if options.ask:
         host, _, port = options.ask.rpartition(":")
-        ask((host, int(port)), options.turns, options.control)
+        ask((host, int(port)), options.control)
         return 0
-    return judge(options)
+    if options.relay:
+        link, seed, entry, port = options.relay
+        relay(link, seed, entry, port, options.control)
+        return 0
+    # Other programs of this machine would delay the packets of `link exec`, each one a little.
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    return judge([options.only] if options.only else list(LINKS), options.rounds, options.control)
 
 
 if __name__ == "__main__":

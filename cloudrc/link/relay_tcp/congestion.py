@@ -12,8 +12,12 @@ from typing import Protocol
 
 FIRST_WINDOW = 10.0  # segments
 SHRINK, GROWTH = 0.7, 0.4  # CUBIC's factor after a loss, and constant of growth [segments/s^3]
+RENO = 0.53  # growth of the window that Reno would have [segments per round trip]
+SETTLED_NS = 1_000_000_000  # CUBIC trusts no round trip for this time after a loss [ns]
 TRAIN_NS, TRAIN_WINDOW = 2_000_000, 16
 """HyStart: largest gap between acknowledgements of one train [ns], smallest window [segments]."""
+SAMPLES, LONGER_NS = 8, (4_000_000, 16_000_000)
+"""HyStart: round trips that it measures in a round, and by how much they must be longer [ns]."""
 START_GAIN, STEADY_GAIN, ROUNDS = 2.885, 2.0, 10
 """BBR: gain while it looks for the rate of the link and later; rounds that it remembers."""
 PLATEAU, PLATEAUS = 1.25, 3
@@ -29,8 +33,11 @@ class Congestion(Protocol):
 
     window: float
 
-    def acknowledged(self, sent: SentSegment, now_ns: int, most: int) -> None:
-        """Note an acknowledged segment; `most` segments were on their way since a pause."""
+    def acknowledged(self, sent: SentSegment, count: int, now_ns: int, most: int) -> None:
+        """Note `count` acknowledged segments, the last of which is `sent`.
+
+        At most `most` segments were on their way in the last round trip.
+        """
 
     def lost(self, now_ns: int) -> None:
         """Note the first loss of a window."""
@@ -38,8 +45,8 @@ class Congestion(Protocol):
     def timed_out(self, now_ns: int) -> None:
         """Note that no answer has come."""
 
-    def rested(self, pauses: float) -> None:
-        """Note a pause of `pauses` time-outs [1]."""
+    def rested(self, pause_ns: int, retry_ns: int) -> None:
+        """Note a pause [ns]; without an answer, a segment is sent again after `retry_ns` [ns]."""
 
     def spacing_ns(self) -> float:
         """Return the shortest time between two segments [ns]."""
@@ -62,54 +69,80 @@ class Cubic:
 
     def __init__(self) -> None:
         self.window, self._threshold = FIRST_WINDOW, inf
-        self._peak, self._shrunk_ns = 0.0, 0
+        self._peak = 0.0  # window at the last loss
+        self._began_ns, self._middle, self._origin, self._reno = 0, 0.0, 0.0, 0.0
         self._least_ns = self._round_ns = self._train_ns = 0
+        self._round_least_ns = self._samples = 0  # of this round trip
 
-    def acknowledged(self, sent: SentSegment, now_ns: int, most: int) -> None:
+    def acknowledged(self, sent: SentSegment, count: int, now_ns: int, most: int) -> None:
         """Grow the window, if it has limited the stream."""
         trip_ns = now_ns - sent.sent_ns
-        self._least_ns = min(self._least_ns or trip_ns, trip_ns)
+        if not self._began_ns or now_ns - self._began_ns >= SETTLED_NS:
+            self._least_ns = min(self._least_ns or trip_ns, trip_ns)
         if sent.recovers:
             return
         if self.window < self._threshold:
+            self._end_start(sent, trip_ns, now_ns)
             if self.window < 2 * most:
-                self.window += 1.0
-            self._end_start(sent, now_ns)
+                self.window = min(self.window + count, max(self._threshold, self.window))
         elif most >= self.window - 1.0:
-            since = (now_ns - self._shrunk_ns + self._least_ns) * 1e-9
-            middle = (max(self._peak - self._threshold, 0.0) / GROWTH) ** (1 / 3)
-            wanted = GROWTH * (since - middle) ** 3 + self._peak
-            reno = self._threshold + 0.53 * since / max(self._least_ns * 1e-9, 1e-3)
-            wanted = min(max(wanted, reno), 1.5 * self.window)
-            self.window += max(0.0, wanted - self.window) / self.window
+            self._grow(count, now_ns)
 
-    def _end_start(self, sent: SentSegment, now_ns: int) -> None:
-        """End slow start if one round's train of acknowledgements is as long as half a round."""
+    def _grow(self, count: int, now_ns: int) -> None:
+        """Follow the cubic function of time, or the window that Reno would have if it is larger."""
+        if not self._began_ns:
+            self._began_ns, self._reno = now_ns, self.window
+            self._origin = max(self._peak, self.window)
+            self._middle = ((self._origin - self.window) / GROWTH) ** (1 / 3)
+        since = (now_ns - self._began_ns + self._least_ns) * 1e-9
+        wanted = GROWTH * (since - self._middle) ** 3 + self._origin
+        self._reno += RENO * count / self.window
+        wanted = max(wanted, self._reno)
+        step = max(0.01, wanted - self.window)  # in one round trip
+        if not self._peak:
+            step = max(step, 0.05 * self.window)
+        self.window += min(step / self.window, 0.5) * count
+
+    def _end_start(self, sent: SentSegment, trip_ns: int, now_ns: int) -> None:
+        """End slow start if round trips get longer, or the train of acknowledgements is long."""
         if sent.new_round:
             self._round_ns = self._train_ns = now_ns
+            self._round_least_ns, self._samples = trip_ns, 0
+        if self.window < TRAIN_WINDOW:
+            return
+        is_long = False
         if now_ns - self._train_ns <= TRAIN_NS:
             self._train_ns = now_ns
             is_long = now_ns - self._round_ns > self._least_ns // 2
-            if is_long and self.window >= TRAIN_WINDOW:
-                self._threshold = self._peak = self.window
-                self._shrunk_ns = now_ns
+        self._round_least_ns = min(self._round_least_ns, trip_ns)
+        self._samples += 1
+        more_ns = min(max(self._least_ns // 8, LONGER_NS[0]), LONGER_NS[1])
+        if self._samples > SAMPLES:
+            is_long |= self._round_least_ns > self._least_ns + more_ns
+        if is_long:
+            self._threshold = self.window
 
     def lost(self, now_ns: int) -> None:
         """Shrink the window."""
-        self._peak, self._shrunk_ns = self.window, now_ns
+        falls = self.window < self._peak  # another stream wants room, too
+        self._peak = self.window * ((1.0 + SHRINK) / 2 if falls else 1.0)
+        self._began_ns = 0
         self._threshold = self.window = max(2.0, SHRINK * self.window)
 
     def timed_out(self, now_ns: int) -> None:
         """Begin again with one segment."""
-        self.lost(now_ns)
+        if self.window > 1.0:
+            self.lost(now_ns)
         self.window = 1.0
 
-    def rested(self, pauses: float) -> None:
-        """Shrink the window after `pauses` time-outs [1]: it may not fit the link any more."""
-        while pauses > 1.0 and self.window > FIRST_WINDOW:
+    def rested(self, pause_ns: int, retry_ns: int) -> None:
+        """Grow as if there had been no pause; after time-outs, the window may not fit the link."""
+        if self._began_ns:
+            self._began_ns += pause_ns
+        while pause_ns > retry_ns and self.window > FIRST_WINDOW:
             self._threshold = max(self._threshold, 0.75 * self.window)
             self.window = max(FIRST_WINDOW, 0.5 * self.window)
-            pauses -= 1.0
+            pause_ns -= retry_ns
 
     def spacing_ns(self) -> float:
         """Return 0: CUBIC sends as acknowledgements arrive."""
@@ -125,7 +158,7 @@ class Bbr:
         self._least_ns, self._full, self._plateaus = 0, 0.0, 0
         self._held_ns = 0  # until then, the window does not grow
 
-    def acknowledged(self, sent: SentSegment, now_ns: int, most: int) -> None:
+    def acknowledged(self, sent: SentSegment, count: int, now_ns: int, most: int) -> None:
         """Measure the rate, and set the window to what the link then holds."""
         trip_ns = max(1, now_ns - sent.sent_ns)
         self._least_ns = min(self._least_ns or trip_ns, trip_ns)
@@ -142,9 +175,9 @@ class Bbr:
         target = max(4.0, gain * max(self._rates) * self._least_ns)
         if self._plateaus < PLATEAUS:
             grows = self.window < target and now_ns >= self._held_ns
-            self.window += 1.0 if grows else 0.0
+            self.window += count if grows else 0
         else:
-            self.window = min(self.window + 1.0, target)
+            self.window = min(self.window + count, target)
 
     def _look_for_plateau(self, sent: SentSegment) -> None:
         if sent.limited:
@@ -162,8 +195,8 @@ class Bbr:
     def timed_out(self, now_ns: int) -> None:
         """Change nothing."""
 
-    def rested(self, pauses: float) -> None:
-        """Change nothing after `pauses` time-outs [1]."""
+    def rested(self, pause_ns: int, retry_ns: int) -> None:
+        """Change nothing."""
 
     def spacing_ns(self) -> float:
         """Return the time between two segments at the measured rate [ns]; 0 at first."""

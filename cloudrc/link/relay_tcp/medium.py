@@ -2,7 +2,9 @@
 
 The loss of a segment depends on its place in the bytes of its connection (`stream.py` counts the
 places), and the jitter on the time, in slots of 10 ms. So the way in which programs and the kernel
-cut the bytes changes neither. All connections share one bottleneck.
+cut the bytes changes neither. If the profile keeps the order of packets, each packet has a jitter
+of its own, as in `cloudrc link exec`, because a late packet there holds up those behind it. All
+connections share one bottleneck.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ SEGMENT = 1448
 stamps [bytes]."""
 HEADERS = 52  # headers of IPv4 and of TCP with time stamps [bytes]
 SLOT_NS = 10_000_000  # time for which the jitter stays the same [ns]
-SLOTS = KIND + 1  # kind of the draws of the jitter; those of losses begin behind it
+JITTER = KIND + 1  # kind of the draws of the jitter; those of losses begin behind it
 _TABLES = 256  # number of blocks of draws that are kept in memory
 
 
@@ -40,6 +42,7 @@ class Medium:
         """Make the direction; its time line begins at `origin_ns` [ns]."""
         self._seed, self._uplink, self._origin_ns = seed, uplink, origin_ns
         self._departures = deque[int]()
+        self._packets = self._last_ns = 0  # number of packets, and arrival of the last one [ns]
         self.replace_profile(profile)
 
     def replace_profile(self, profile: DirectionProfile, origin_ns: int | None = None) -> None:
@@ -54,17 +57,17 @@ class Medium:
         now = self._at(now_ns)
         return not (now.delay_ns or now.jitter or now.loss or now.rate or now.blackout)
 
-    def delay_ns(self, now_ns: int) -> int:
-        """Return the delay of a small packet that is not lost [ns]."""
-        now = self._at(now_ns)
-        place = now_ns - self._origin_ns
-        offset = self._fate(1, SLOTS, place // SLOT_NS, now.jitter, 0.0)[0] if now.jitter else 0
-        return max(0, now.delay_ns + offset)
+    def arrival_ns(self, now_ns: int) -> int:
+        """Send a small packet that is never lost; return when it arrives [ns].
+
+        This and `cross` must be called in the order of time.
+        """
+        return self._pass(self._at(now_ns), 0, now_ns)
 
     def cross(
         self, connection: int, place: int, attempt: int, size: int, now_ns: int
     ) -> int | None:
-        """Send a segment with `size` bytes at `now_ns` [ns]; must be called in the order of time.
+        """Send a segment with `size` bytes at `now_ns` [ns].
 
         `place` counts segments by their bytes, `attempt` is 1 for the first transmission.
 
@@ -72,15 +75,25 @@ class Medium:
             When the segment arrives [ns]; None if it is lost.
         """
         now = self._at(now_ns)
-        fate = self._fate(connection, SLOTS + attempt, place, 0.0, now.loss)
+        fate = self._fate(connection, JITTER + attempt, place, 0.0, now.loss)
         if now.blackout or not fate:
             return None
         leaves_ns: int | None = now_ns
         if now.rate is not None:
             leaves_ns = self._queue(size + HEADERS, now.rate, now_ns)
-        if leaves_ns is None:
-            return None
-        return leaves_ns + fate[0] + self.delay_ns(leaves_ns)
+        return None if leaves_ns is None else self._pass(now, fate[0], leaves_ns)
+
+    def _pass(self, now: Conditions, extra_ns: int, leaves_ns: int) -> int:
+        """Return when a packet arrives that leaves the bottleneck at `leaves_ns` [ns]."""
+        number = (leaves_ns - self._origin_ns) // SLOT_NS
+        if self._profile.keep_order:
+            self._packets += 1
+            number = self._packets
+        offset = self._fate(1, JITTER, number, now.jitter, 0.0)[0] if now.jitter else 0
+        arrival_ns = leaves_ns + max(0, now.delay_ns + offset + extra_ns)
+        if self._profile.keep_order:
+            arrival_ns = self._last_ns = max(self._last_ns, arrival_ns)
+        return arrival_ns
 
     def _at(self, now_ns: int) -> Conditions:
         return self._timeline.at(now_ns - self._origin_ns)

@@ -24,6 +24,7 @@ BUFFER = 128 << 10  # of the kernel, for each socket and direction [bytes]
 ACCEPTED_MAX = 64  # connections that one turn of the loop accepts
 TURNS_KEPT = 100_000  # newest turns of which the times are kept
 FIRST_RETRY_NS = 1_000_000_000  # time until the first packet of a connection is sent again [ns]
+GREETINGS = 7  # times that the first packet of a connection is sent
 SYN = 0  # place of the draws of the first packets; the bytes of a connection have other epochs
 _RESET = b"\x01\0\0\0\0\0\0\0"  # struct linger: on, 0 s: close sends RST
 
@@ -57,9 +58,10 @@ class RelayedConnection:
             for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
                 # Larger ones would hide from a sender that the receiver has stopped.
                 side.socket.setsockopt(socket.SOL_SOCKET, option, BUFFER)
-        self.began_ns = time.monotonic_ns()
+        self.greeted = False  # whether the first packets of the connection have crossed the link
         self.server.socket.connect_ex(relay.to)
         relay.watch(self, self.server, selectors.EVENT_WRITE)
+        self._greet(1, time.monotonic_ns())
 
     def handle(self, side: Side, mask: int, now_ns: int) -> None:
         """Handle a socket that can be read or written."""
@@ -74,28 +76,59 @@ class RelayedConnection:
             self._read(side, now_ns)
         self.update()
 
-    def _connected(self, now_ns: int) -> None:
-        """Open the streams, or refuse the client, once the server has answered."""
-        up, down = self.relay.ways
-        trip_ns = self.relay.greeting_ns(self.number, now_ns)
-        error = self.server.socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-        if error:
-            self.relay.refused += 1
-            self.relay.watch(self, self.server, 0)
-            self.relay.agenda.at(self.began_ns + trip_ns, self._end)
+    def _greet(self, attempt: int, now_ns: int) -> None:
+        """Send the first packet of the connection, again and again until it is answered."""
+        if self.dead or self.greeted:
             return
+        if attempt > GREETINGS:
+            self._end(now_ns)
+            return
+        arrival_ns = self.relay.ways[0].cross(SYN, self.number, attempt, 0, now_ns)
+        if arrival_ns is not None:
+            self.relay.agenda.at(arrival_ns, self._welcome, attempt)
+        again_ns = now_ns + (FIRST_RETRY_NS << (attempt - 1))
+        self.relay.agenda.at(again_ns, self._greet, attempt + 1)
+
+    def _welcome(self, attempt: int, now_ns: int) -> None:
+        """Answer the first packet."""
+        arrival_ns = self.relay.ways[1].cross(SYN, self.number, attempt, 0, now_ns)
+        if arrival_ns is not None and not self.dead:
+            self.relay.agenda.at(arrival_ns, self._welcomed)
+
+    def _welcomed(self, now_ns: int) -> None:
+        if not self.greeted:
+            self.greeted = True
+            self._begin(now_ns)
+
+    def _connected(self, now_ns: int) -> None:
+        """Take what the client sends, or note that the server refuses it."""
         self.connecting = False
-        self.relay.connected += 1
-        for source, target, way, late_ns in (
-            (self.client, self.server, (up, down), 0),
-            (self.server, self.client, (down, up), up.delay_ns(now_ns)),
-        ):
-            start_ns = self.began_ns + trip_ns + late_ns
-            put = partial(self._put, target)
-            window = self.relay.congestion()
-            stream = LinkStream(self.relay.agenda, way, self.number, start_ns, put, window)
-            source.source = target.origin = stream
-        self.update()
+        self.relay.watch(self, self.server, 0)
+        if self.server.socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+            self.relay.refused += 1
+        else:
+            self.relay.connected += 1
+            up, down = self.relay.ways
+            self._join(self.client, self.server, (up, down))
+            self._join(self.server, self.client, (down, up))
+            self.update()
+        self._begin(now_ns)
+
+    def _join(self, source: Side, target: Side, way: Ways) -> None:
+        """Make the stream from one side to the other."""
+        put, window = partial(self._put, target), self.relay.congestion()
+        stream = LinkStream(self.relay.agenda, way, self.number, put, window)
+        source.source = target.origin = stream
+
+    def _begin(self, now_ns: int) -> None:
+        """Open the streams, or refuse the client, once the server and the link have answered."""
+        if self.dead or self.connecting or not self.greeted:
+            return
+        if self.client.source is None or self.server.source is None:
+            self._end(now_ns)
+            return
+        self.client.source.open(now_ns)
+        self.server.source.open(self.relay.ways[0].arrival_ns(now_ns))
 
     def update(self) -> None:
         """Watch the sockets for what the streams can take and give."""
@@ -162,7 +195,7 @@ class RelayedConnection:
         side.reads = False
         up, down = self.relay.ways
         way = up if side is self.client else down
-        self.relay.agenda.at(now_ns + way.delay_ns(now_ns), self._end)
+        self.relay.agenda.at(way.arrival_ns(now_ns), self._end)
 
     def _end(self, now_ns: int, *, reset: bool = True) -> None:
         """Close both sockets, by RST with `reset`."""
@@ -235,17 +268,6 @@ class StreamRelay:
                 now_ns = time.monotonic_ns()
                 self.agenda.run(now_ns)
                 connection.handle(side, mask, now_ns)
-
-    def greeting_ns(self, connection: int, now_ns: int) -> int:
-        """Return how long a connection takes to open: a round trip, and lost packets again [ns]."""
-        wait_ns, retry_ns, attempt = 0, FIRST_RETRY_NS, 1
-        up, down = self.ways
-        while attempt < 7:
-            there = up.cross(SYN, connection, attempt, 0, now_ns)
-            if there is not None and down.cross(SYN, connection, attempt, 0, now_ns) is not None:
-                break
-            wait_ns, retry_ns, attempt = wait_ns + retry_ns, 2 * retry_ns, attempt + 1
-        return wait_ns + up.delay_ns(now_ns) + down.delay_ns(now_ns)
 
     def watch(self, connection: RelayedConnection, side: Side, mask: int) -> None:
         """Wait for events of a socket; `mask` 0 for none."""

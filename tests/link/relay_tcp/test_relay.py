@@ -211,7 +211,10 @@ def test_a_stopped_reader_stops_the_sender_and_memory_stays_small(relayed, flags
 
 
 def test_link_set_acts_on_an_open_connection(relayed, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # without runs/latest, which may have ended
+    monkeypatch.chdir(tmp_path)
+    latest = tmp_path / "runs" / "latest"  # a flight that has ended
+    latest.mkdir(parents=True)
+    (latest / "uplink.log").touch()
     with server(echo) as port:
         relay = relayed(port, *SHORT)
         with relay.connect() as client:
@@ -233,6 +236,7 @@ def test_link_set_acts_on_an_open_connection(relayed, tmp_path, monkeypatch):
     ("flags", "said"),
     [
         ("--to 127.0.0.1:1 --set uplink.corrupt=0.1", "uplink.corrupt: TCP hands bytes on once"),
+        ("--to 127.0.0.1:1 --set uplink.loss=7", "error: relay tcp: uplink.loss: 7: must be"),
         ("--to no-such-host.invalid:1", "name a host and a port"),
         ("--to 127.0.0.1:1 --link nosuch", "no profile named"),
     ],

@@ -9,7 +9,7 @@ import pytest
 from cloudrc.errors import BadInputError
 from cloudrc.link.queue import NOTHING_NS
 from cloudrc.link.relay_tcp.agenda import Agenda
-from cloudrc.link.relay_tcp.congestion import Bbr, Cubic
+from cloudrc.link.relay_tcp.congestion import Bbr, Cubic, SentSegment
 from cloudrc.link.relay_tcp.medium import SEGMENT, Medium, refuse_unsupported
 from cloudrc.link.relay_tcp.stream import READ_AHEAD, WINDOW_BYTES, LinkStream
 from tests.link.profiles import blackout, changed, in_bursts, profile_of
@@ -26,7 +26,8 @@ class Far:
         self.takes = takes
         ways = Medium(up, seed, True, 0), Medium(down or up, seed, False, 0)
         self.up = ways[0]
-        self.stream = LinkStream(self.agenda, ways, 1, start_ns, self.deliver, kind())
+        self.stream = LinkStream(self.agenda, ways, 1, self.deliver, kind())
+        self.stream.open(start_ns)
 
     def deliver(self, data, now_ns):
         assert self.end_ns is None
@@ -163,6 +164,54 @@ def test_messages_one_after_the_other_have_losses_of_their_own():
     assert runs > 1.2 * sum(lost)  # independent: 1.6; seven at a time: .3
 
 
+def test_round_trips_that_get_longer_end_the_slow_start_of_cubic():
+    """A queue fills: with 8 round trips longer by an eighth, the window doubles no more."""
+    window, now_ns = Cubic(), 0
+    for trip_ms in (80, 80, 91, 91):
+        for number in range(int(window.window)):
+            now_ns += 3 * MS  # no train: its gaps are below 2 ms
+            sent = SentSegment(now_ns - trip_ms * MS, 0, limited=False)
+            sent.new_round = not number
+            window.acknowledged(sent, 1, now_ns, int(window.window))
+    assert 40 < window.window < 60
+
+
+def test_cubic_comes_back_to_the_window_of_the_last_loss():
+    window, now_ns = Cubic(), 0
+    window.window = 100.0
+    window.lost(now_ns)
+    assert window.window == 70
+    sizes = []
+    for _ in range(100):
+        now_ns += 80 * MS
+        for _ in range(int(window.window)):
+            sent = SentSegment(now_ns - 80 * MS, 0, limited=False)
+            window.acknowledged(sent, 1, now_ns, int(window.window))
+        sizes.append(window.window)
+    assert sizes[10] - 70 > 2 * (sizes[48] - sizes[38])  # steep, then flat around 100
+    assert sizes[48] == pytest.approx(100, abs=4)
+    assert sizes[99] > 120
+
+
+def test_after_a_time_out_the_window_opens_anew():
+    """A whole window is lost, and its probe: it is sent again 1, 2, 4, 8 segments at a time."""
+    far = Far(changed(PLAIN, blackouts=(blackout(0.5, 0.6),)))
+    far.send(bytes(60 * SEGMENT))
+    far.agenda.run(500 * MS)
+    far.times.clear()
+    far.send(bytes(20 * SEGMENT), 510 * MS)
+    assert [far.times.count(time) for time in sorted(set(far.times))] == [1, 2, 4, 8, 5]
+
+
+def test_a_new_receiver_has_room_for_64_kib():
+    """The fourth window has less than 80 segments."""
+    far = Far(PLAIN)
+    far.send(bytes(400_000))
+    counts = [far.times.count(time) for time in sorted(set(far.times))]
+    assert counts[:3] == [10, 20, 40]
+    assert 70 <= counts[3] < 80
+
+
 def test_losses_shrink_the_window_of_cubic_and_not_that_of_bbr():
     took = {
         kind: Far(profile_of(0.040, loss=0.02), kind=kind).send(bytes(1_500_000))
@@ -173,11 +222,21 @@ def test_losses_shrink_the_window_of_cubic_and_not_that_of_bbr():
 
 def test_jitter_depends_on_the_time_alone():
     medium = Medium(profile_of(0.040, 0.020), 1, True, 0)
-    delays = [medium.delay_ns(slot * 10 * MS) for slot in range(200)]
+    slots = [slot * 10 * MS for slot in range(200)]
+    delays = [medium.arrival_ns(now_ns) - now_ns for now_ns in slots]
     assert len(set(delays)) > 150
-    assert medium.delay_ns(19 * MS) == delays[1]
+    assert medium.arrival_ns(19 * MS) - 19 * MS == delays[1]
     assert min(delays) >= 20 * MS
     assert max(delays) <= 60 * MS
+
+
+def test_a_link_that_keeps_the_order_delays_each_packet_by_itself():
+    """A late packet holds up all behind it, also those of other connections."""
+    medium = Medium(profile_of(0.040, 0.020, keep_order=True), 1, True, 0)
+    times = [medium.cross(number % 3, number, 1, 100, 0) for number in range(100)]
+    assert times == sorted(times)
+    assert 5 < len(set(times)) < 30
+    assert times[-1] > 58 * MS
 
 
 def test_connections_share_one_bottleneck():
