@@ -26,7 +26,14 @@ from cloudrc.config.setpoints import read_setpoints
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import Array, Spheres
 from cloudrc.geometry.fence import HEIGHT_MIN, WIDTH_MIN, Fence
-from cloudrc.geometry.obstacles import Obstacle, body_names, fence_of, obstacles, surface
+from cloudrc.geometry.obstacles import (
+    Obstacle,
+    bodies_inside,
+    body_names,
+    fence_of,
+    obstacles,
+    surface,
+)
 from cloudrc.geometry.placement import (
     CLEARANCE_MIN,
     find_crossed,
@@ -117,6 +124,9 @@ def _check_touch(mission: MissionConfig, scene: Scene) -> ConfigProblem | None:
         has = ", ".join(others[:_REPORTED]) or "none but floor"
         known = f"the nearest name is {near[0]}" if near else f"its bodies: {has}"
         reason = f"the scene {scene.name} has no such body; {known}; or set mission.touch to null"
+        if inside := bodies_inside(scene, body):
+            parts = ", ".join(inside[:_REPORTED])
+            reason = f"it has no geom of its own; name a body inside of it: {parts}"
     return ConfigProblem(("touch", "body"), body, reason)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from itertools import count
 from math import inf
@@ -77,6 +77,7 @@ class Bodies(NamedTuple):
     solids: tuple[Solid, ...]  # everything that the robot can touch, except the floor
     extent: Corners  # of a box with the spawn, and with all that can be touched but planes
     ground: float  # height of what is below the spawn [m], world frame; else of the spawn
+    inner: dict[str, tuple[str, ...]]  # body without geoms of its own -> bodies inside with geoms
 
 
 def compile_error(what: str, error: Exception) -> CloudrcError:
@@ -165,7 +166,23 @@ def _read_bodies(path: Path, *version: tuple[str, int, int]) -> Bodies:
         if name != FLOOR and touchable[geom]
     ]
     extent, ground = _extent(model, data, spawn), _ground(model, data, spawn)
-    return Bodies(tuple(dict.fromkeys(names)), tuple(solids), extent, ground)
+    return Bodies(tuple(dict.fromkeys(names)), tuple(solids), extent, ground, _inner(spec, names))
+
+
+def _inner(spec: Any, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Return, for each body without geoms of its own, the bodies with geoms inside of it."""
+    found = {
+        body.name: tuple(child.name for child in _inside(body) if child.name in names)
+        for body in spec.bodies
+        if body.name not in {"", WORLD, *names}
+    }
+    return {name: inside for name, inside in found.items() if inside}
+
+
+def _inside(body: Any) -> Iterator[Any]:
+    for child in body.bodies:
+        yield child
+        yield from _inside(child)
 
 
 def _extent(model: Any, data: Any, spawn: Array) -> Corners:

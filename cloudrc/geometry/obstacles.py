@@ -57,6 +57,24 @@ def body_names(scene: Scene) -> tuple[str, ...] | None:
     return _compiled(scene)[0] or None
 
 
+def bodies_inside(scene: Scene, body: str) -> tuple[str, ...]:
+    """Return the bodies inside of a body that has no geoms of its own; none for all others."""
+    if scene.path is None or not known(scene):
+        return ()
+    from cloudrc.geometry.compiled import read_bodies
+
+    return read_bodies(scene.path).inner.get(body, ())
+
+
+def intangible(scene: Scene) -> tuple[str, ...]:
+    """Return the bodies that have geoms, and none that the robot can touch: no obstacles."""
+    names, solids = _compiled(scene)
+    if scene.path is None:
+        return scene.intangible
+    tangible = {solid.name for solid in solids}
+    return tuple(name for name in names if name not in {FLOOR, *tangible})
+
+
 def fence_of(scene: Scene) -> Fence:
     """Return the fence of a scene: the declared one, else the box around spawn and geoms.
 
@@ -91,7 +109,8 @@ def without_file(scene: Scene) -> Scene:
         BadInputError: If MuJoCo cannot read the scene.
     """
     solids, fence = _compiled(scene)[1], fence_of(scene)
-    return replace(scene, path=None, own_fence=fence, solids=solids)
+    flown_through = intangible(scene)
+    return replace(scene, path=None, own_fence=fence, solids=solids, intangible=flown_through)
 
 
 def known(scene: Scene) -> bool:

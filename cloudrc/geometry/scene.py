@@ -69,6 +69,7 @@ class Scene:
     path: Path | None = None  # of the file if it may have more bodies; None: this is all it has
     own_fence: Fence | None = None  # fence that is declared; None: see `obstacles.fence_of`
     solids: tuple[Solid, ...] = ()  # of a recorded scene without `path`: its other bodies
+    intangible: tuple[str, ...] = ()  # of such a scene: the bodies that the robot flies through
 
 
 def is_obstacle(body: str, *, touch: str | None) -> bool:

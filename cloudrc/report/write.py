@@ -15,7 +15,7 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import read, write_atomically
-from cloudrc.geometry.obstacles import has_surface, known, obstacles
+from cloudrc.geometry.obstacles import has_surface, intangible, known, obstacles
 from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
@@ -60,6 +60,7 @@ def assess(
     notes += _default_robot(experiment)
     notes += _clamped_horizon(flight, experiment)
     notes += _unknown_clearance(flight)
+    notes += _flown_through(flight)
     if flight.ending is not None:
         seen = operator_verdict(flight, evidence, numbers)
         if seen.outcome != verdict.outcome:
@@ -114,6 +115,20 @@ def _unknown_clearance(flight: Flight) -> list[str]:
     if unknown := sorted({each.name for each in found if not has_surface(each)}):
         return [f"{UNKNOWN} {', '.join(unknown)}: of a height field, only the box around it is."]
     return []
+
+
+def _flown_through(flight: Flight) -> list[str]:
+    """Return a note if the scene has bodies that the robot cannot touch."""
+    try:
+        names = intangible(flight.scene)
+    except BadInputError:  # `_unknown_clearance` tells it
+        return []
+    if not names:
+        return []
+    return [
+        f"The robot flies through {', '.join(names)}: by contype and conaffinity, their geoms "
+        "never meet those of the robot."
+    ]
 
 
 def write_report(

@@ -15,6 +15,7 @@ from cloudrc.config.document import parse_value
 from cloudrc.config.load import dump, fingerprint, load_experiment, load_profile, read_experiment
 from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
+from cloudrc.geometry.obstacles import intangible, without_file
 from cloudrc.geometry.scene import SCENES, load_scene
 from cloudrc.link.traces import link_profile
 
@@ -273,3 +274,28 @@ def test_a_flight_that_is_over_needs_no_files_and_keeps_its_limits(tmp_path):
     assert read_experiment(tmp_path / "config.yaml", flown=True) == flown
     with pytest.raises(BadInputError, match="3 problems"):
         read_experiment(tmp_path / "config.yaml")
+
+
+LAYERED = """<mujoco><option timestep=".002"/><worldbody><frame name="spawn" pos="0 0 .1"/>
+<body name="floor"><geom type="plane" size="9 9 .1"/></body>
+<body name="target" pos="3 0 1"><body name="arm"><body name="plate"><geom type="box" size=".1 1 1"/>
+</body></body></body><body name="ghost"><geom size=".1" contype="2" conaffinity="0"/></body>
+</worldbody></mujoco>"""
+
+
+def test_a_touch_of_a_body_without_geoms_names_the_body_inside_that_has_them(tmp_path):
+    (tmp_path / "lab.xml").write_text(LAYERED)
+    settings = [f"world.scene={tmp_path / 'lab.xml'}", "mission.waypoints=[{position_m: [1,0,1]}]"]
+    said = "target: it has no geom of its own; name a body inside of it: plate$"
+    with pytest.raises(BadInputError, match=said):
+        load_experiment("hover", [*settings, "mission.touch.body=target"])
+    with pytest.raises(BadInputError, match="no such body; its bodies: plate"):
+        load_experiment("hover", [*settings, "mission.touch.body=wall"])
+    load_experiment("hover", [*settings, "mission.touch.body=plate"])
+
+
+def test_a_recorded_scene_still_names_the_bodies_that_nothing_touches(tmp_path):
+    (tmp_path / "lab.xml").write_text(LAYERED)
+    scene = load_scene(str(tmp_path / "lab.xml"))
+    assert intangible(scene) == intangible(without_file(scene)) == ("ghost",)
+    assert intangible(load_scene("pipes")) == ()

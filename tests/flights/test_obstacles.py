@@ -64,6 +64,7 @@ def test_what_nothing_can_touch_is_no_obstacle(flown_into):
     seen = GEOM.replace("/>", ' contype="0" conaffinity="0"/>')
     found = flown_into(f'<body name="ghost" {PLACED}>{seen}</body>')
     assert (found.verdict.outcome, found.numbers["obstacle_contacts"].value) == ("success", 0)
+    assert [note for note in found.notes if note.startswith("The robot flies through ghost: ")]
 
 
 @pytest.mark.parametrize("contact", [True, False])
