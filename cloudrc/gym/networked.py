@@ -59,7 +59,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             chunk: Number of actions in an answer, for the ticks from the observation's on; None:
                 an answer is a single action.
             executor: How the robot executes answers: "newest", "time_indexed", "prefix", "broker",
-                or the path of a file.
+                "ensemble", or the path of a file.
             hold: What the robot executes in a tick without an action: "repeat", the last action, or
                 "start", the action `start`.
             start: Action before the first answer arrives; None: 0, or what is nearest to it;

@@ -1,5 +1,6 @@
 """How a robot executes chunks of actions that arrive late."""
 
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -61,6 +62,21 @@ def test_the_broker_asks_when_its_chunk_is_used_up_and_again_after_a_loss():
     found = flown("broker", deaf, steps=120)
     assert found[4:104] == [0.003] * 100  # the question at 40 ms is lost; it is asked again at 1 s
     assert found[104] == 104
+
+
+def test_the_ensemble_averages_what_all_answers_meant_for_the_tick():
+    found = flown("ensemble", both_ways(10, 10), chunk=4, steps=6)
+    assert found[:3] == [0, 0.001, 0.002]  # from one observation
+    older, newer, weight = 1.003, 2.002, np.exp(-0.01)
+    assert found[4] == pytest.approx((older + weight * newer) / (1 + weight), abs=1e-3)
+    assert flown("ensemble", both_ways(10, 10), chunk=3, steps=5)[4] == newer  # the older has ended
+
+
+def test_the_ensemble_refuses_actions_without_a_mean():
+    env = Networked(gymnasium.make("CartPole-v1"), chunk=4, executor="ensemble")
+    env.reset()
+    with pytest.raises(BadInputError, match="floating-point"):
+        env.step([0, 1, 0, 1])
 
 
 def test_the_policy_learns_the_actions_before_its_answer():
