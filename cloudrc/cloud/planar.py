@@ -55,5 +55,6 @@ class Planar(Controller):
         if isinstance(self._controller, OutsideController):
             self._lost = True
             _, invalid = CONTROLLER_LOST
-            raise ControllerLostError(invalid, f"{self._controller.place}: {text}")
+            place = self._controller.place or self._name  # ROS without a namespace has no place
+            raise ControllerLostError(invalid, f"{place}: {text}")
         raise InvalidResultError(f"{self._name}: {text}")

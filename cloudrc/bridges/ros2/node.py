@@ -235,7 +235,7 @@ class RosNode(OwnNode):
         estimate = self._names["estimate"]
         names = [name_of(info) for info in known(self.node.get_publishers_info_by_topic(estimate))]
         if len(names) > 1:
-            names.remove(self.node.get_fully_qualified_name())
+            names.sort(key=self.node.get_fully_qualified_name().__eq__)  # its own last
             raise ControllerLostError(
                 INVALID,
                 f"node {names[0]} publishes {estimate} in {self.domain}, too: give each flight a "
