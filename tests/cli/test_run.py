@@ -197,8 +197,13 @@ def test_a_run_in_real_time_needs_the_extra_of_the_api(monkeypatch, refused):
 def test_a_metric_without_a_value_is_told_on_the_terminal(tmp_path):
     report = {
         **{"verdict": "success", "failures": [], "numbers": {}},
-        "notes": ["metric own failed: GeneratorExit: ", "The recording is incomplete: a test."],
+        "notes": [
+            "metric own failed: GeneratorExit: ",
+            "The recording is incomplete: a test.",
+            "No clearance is known from hill.",
+        ],
     }
     text = summary(report, tmp_path)
     assert "metric own failed: GeneratorExit" in text
-    assert "incomplete" not in text
+    assert "incomplete" in text
+    assert "hill" not in text
