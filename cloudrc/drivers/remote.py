@@ -131,8 +131,11 @@ class RemoteLink:
     def exchange(self, observation: dict[str, Any]) -> tuple[float, list[list[float]]] | None:
         """Send an observation; return the newest answer and its age [s] if it may be flown."""
         now_ns = time.monotonic_ns()
-        if now_ns - self._asked_ns > PAUSE_NS:
+        paused_ns = now_ns - self._asked_ns
+        if not self._asked_ns:
             self._flown_ns = now_ns
+        elif paused_ns > PAUSE_NS:
+            self._flown_ns += paused_ns
         self._asked_ns = now_ns
         message = {"episode": self._episode, "sent_ns": now_ns, "observation": observation}
         self._peer.send_data(pack(message))

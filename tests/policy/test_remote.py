@@ -300,6 +300,19 @@ def test_answers_of_an_earlier_mission_do_not_count(flight):
     assert flight.step() == [2.0]
 
 
+def test_short_pauses_of_a_busy_loop_do_not_hide_that_a_program_is_silent(flight):
+    flight.step()
+    flight.answer(1.0)
+
+    def step_and_pause():
+        flight.step(10)
+        flight.now_ns += 150_000_000
+        return True
+
+    with pytest.raises(ControllerLostError, match="for 5 s"):
+        assert all(step_and_pause() for _ in range(60))
+
+
 def test_a_pause_of_the_loop_is_no_silence_of_the_program(flight):
     flight.step()
     flight.answer(1.0)
