@@ -194,13 +194,26 @@ def test_cubic_comes_back_to_the_window_of_the_last_loss():
 
 
 def test_after_a_time_out_the_window_opens_anew():
-    """A whole window is lost, and its probe: it is sent again 1, 2, 4, 8 segments at a time."""
-    far = Far(changed(PLAIN, blackouts=(blackout(0.5, 0.6),)))
+    """A whole window is lost, its probe, too, and a first try: 1, 2, 4, 8 are sent at a time."""
+    far = Far(changed(PLAIN, blackouts=(blackout(0.5, 1.2),)))
     far.send(bytes(60 * SEGMENT))
     far.agenda.run(500 * MS)
     far.times.clear()
     far.send(bytes(20 * SEGMENT), 510 * MS)
     assert [far.times.count(time) for time in sorted(set(far.times))] == [1, 2, 4, 8, 5]
+
+
+def test_a_loss_ends_slow_start_where_it_is_found():
+    """Of a window of 40 the middle is lost: 20 acknowledgements open the window before, not 40."""
+    far = Far(changed(PLAIN, blackouts=(blackout(0.16001, 0.0000001),)))
+    far.send(bytes(30 * SEGMENT))
+    far.agenda.run(160 * MS)
+    far.stream.write(bytes(20 * SEGMENT), 160 * MS)
+    far.agenda.run(160 * MS + 10_000)
+    far.stream.write(bytes(SEGMENT), 160 * MS + 10_050)
+    far.stream.write(bytes(19 * SEGMENT), 161 * MS)
+    far.agenda.run(300 * MS)
+    assert far.stream._congestion.window == pytest.approx(0.7 * 60, abs=2)
 
 
 def test_a_new_receiver_has_room_for_64_kib():
