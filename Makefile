@@ -34,7 +34,8 @@ BUILD_ARGS := $(BASE:%=--build-arg BASE=%) --build-arg VERSION=$(VERSION) \
 # Independent of the processor: the lock has the hashes of all wheels for Linux.
 COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python-platform linux \
 	--generate-hashes --no-emit-index-url --custom-compile-command 'make lock'
-ROS_PACKAGES := rclpy rmw-fastrtps-cpp nav-msgs geometry-msgs sensor-msgs rosgraph-msgs
+ROS_PACKAGES := rclpy rmw-fastrtps-cpp nav-msgs geometry-msgs sensor-msgs rosgraph-msgs std-msgs std-srvs \
+	diagnostic-msgs visualization-msgs
 # MuJoCo's viewers, a tenth of the image: a pod draws nothing.
 DRAWING := glfw pyopengl mujoco-studio
 

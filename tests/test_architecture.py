@@ -62,7 +62,10 @@ MAY_IMPORT: dict[str, set[str]] = {
         *("endpoint", "tunnel", "link", "exposition", "files", "policy", "policy.address"),
         *("record", "teleop"),
     },
-    "bridges": {"drivers", "policy", "record"},
+    "bridges": {
+        *("config", "console", "drivers", "geometry.vectors", "metrics.definitions", "policy"),
+        *("record", "report"),
+    },
     "record": {"endpoint", "files"},
     "metrics": {"metrics.definitions", "record", "config", "geometry", "plugins"},
     "metrics.definitions": set(),  # live metrics import it in every process, with no heavy library
@@ -102,7 +105,10 @@ ALWAYS = {
     "version",
 }
 
-ROS = ("rclpy", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs")
+ROS = (
+    *("rclpy", "diagnostic_msgs", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs"),
+    *("std_msgs", "std_srvs", "tf2_msgs", "visualization_msgs"),
+)
 # Packages of a sourced ROS 2, which no package registry is asked for.
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it. Ruff checks
 # clocks, sockets, threads, signals, chance, and calls such as `eval` and `print` (pyproject.toml).

@@ -22,6 +22,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "down": "end the session; it writes the report of its last mission",
         "mission": "start, steer and stop missions, here or in a cluster",
         "console": "show a flight in the browser, and steer it there",
+        "ros": "show a flight to nodes of ROS 2, which may steer it",
         "sweep": "fly a grid of settings with several seeds, on all cores",
         "report": "write the report of a recorded run again",
         "replay": "watch a recorded flight in 3-D, in a browser",

@@ -108,6 +108,7 @@ class CloudEndpoint(TunnelEnd):
     Attributes:
         teleop: Source of setpoints and operator requests.
         telemetry: The newest telemetry; None before the first.
+        watch: Is called with epoch, counter and content of each telemetry that cloud uses.
     """
 
     def __init__(
@@ -137,6 +138,7 @@ class CloudEndpoint(TunnelEnd):
         self._setpoint: Setpoint | None = None
         self._world = ""  # identifies the world process of the session
         self.telemetry: Telemetry | None = None
+        self.watch: Callable[[int, int, Telemetry], None] | None = None
         self._control: Control | None = None  # record of the session's last command
         self._uplink_delay = nan  # of the newest telemetry [s]
         self._alarm = EmergencyStopRepeater()
@@ -309,6 +311,8 @@ class CloudEndpoint(TunnelEnd):
         if outcome == LATE:
             self._loop.observe_late(telemetry, now_ns)
         if used:
+            if self.watch is not None:
+                self.watch(epoch, counter, telemetry)
             self._use_telemetry(telemetry, epoch, delay, now_ns)
 
     def _use_telemetry(self, telemetry: Telemetry, epoch: int, delay: float, now_ns: int) -> None:

@@ -139,18 +139,19 @@ class Steering:
         words = "starting; the robot is set back to its spawn" if back else "starting"
         self.ask(words, "/v1/missions", order)
 
-    def go_to(self, position: Sequence[float]) -> bool:
+    def go_to(self, position: Sequence[float], yaw_deg: float | None = None) -> bool:
         """Hold the present mission, if one is under way, then ask the robot to go to a position.
 
-        `position` [m] has two numbers for a robot that stays on the ground. Return whether teleop
-        has accepted the requests.
+        `position` [m] has two numbers for a robot that stays on the ground; `yaw_deg` is the yaw
+        there [deg], None for any. Return whether teleop has accepted the requests.
         """
         place = [round(float(value), 3) for value in position]
         mission = self.state.get("mission") or {"state": ""}
         if mission["state"] in ("starting", "flying") and not self.ask("hold", "/v1/hold"):
             return False
         words = f"going to ({', '.join(f'{value:g}' for value in place)})"
-        return self.ask(words, "/v1/goto", {"position_m": place})
+        yaw = {} if yaw_deg is None else {"yaw_deg": round(yaw_deg, 1)}
+        return self.ask(words, "/v1/goto", {"position_m": place, **yaw})
 
     def hold_key(self, key: str, velocity: Vector, lasts: float) -> None:
         """Drive the robot with `velocity` [m/s] for `lasts` [s], because the user holds `key`.

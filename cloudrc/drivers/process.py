@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
     from cloudrc.drivers.exporter import Exporter
+    from cloudrc.drivers.readers import RecordSender
     from cloudrc.link.verify.monitor import LinkMonitor
 
 PARENT = "CLOUDRC_PARENT"
@@ -318,6 +319,7 @@ class EndProcess:
     check: LinkMonitor  # compares the received datagrams with the link profile
     exporter: Exporter | None = None  # turns records into metrics
     flights_only: bool = False  # whether to record no samples while the robot does not fly
+    readers: RecordSender | None = None  # sends records to other programs of this machine
 
     def __post_init__(self) -> None:
         self._notes = LinkNotes(self.link, uplink=self.end == "world", check=self.check)
@@ -343,6 +345,8 @@ class EndProcess:
         def sink(records: list[Record]) -> None:
             records = records + self.look_around(records, slip_ns())
             self.recorder.put(choose(records))
+            if self.readers is not None:
+                self.readers.put(records)
             self.tell(records)
 
         self.recorder.start()

@@ -18,6 +18,7 @@ from cloudrc.config.robot import known_robot
 from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.machine import clock_id
 from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
+from cloudrc.drivers.readers import RecordSender
 from cloudrc.drivers.realtime import Address, Peer, bind
 from cloudrc.drivers.teleop import RemoteTeleop, UnixDatagrams, UnixPeer
 from cloudrc.errors import BadInputError
@@ -73,11 +74,16 @@ def run_cloud(settings: EndSettings, teleop_folder: Path, stop: StopSignal) -> N
     """Run cloud until `stop`; `teleop_folder` has the sockets between cloud and teleop."""
     experiment, identity, end = open_end(settings, "cloud")
     paths = teleop_folder / "cloud.sock", teleop_folder / "teleop.sock"
-    with closing(UnixPeer(*paths)) as peer, _remote_link(experiment, teleop_folder) as channel:
+    with (
+        closing(UnixPeer(*paths)) as peer,
+        _remote_link(experiment, teleop_folder) as channel,
+        closing(RecordSender(teleop_folder)) as readers,
+    ):
         teleop = RemoteTeleop(peer, time.monotonic_ns())
         cloud = assembly.build_cloud(
             experiment, identity, teleop, time.monotonic_ns, channel=channel
         )
+        end.readers, cloud.watch = readers, readers.see
 
         def flies() -> bool:
             return cloud.guard is GuardState.TRACK

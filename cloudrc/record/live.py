@@ -6,17 +6,16 @@ odometry is in its child frame `base_link`, as REP-103 and REP-105 say.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import cos, sin
-from typing import Any
+from typing import Any, NamedTuple
 
 from cloudrc.messages import Quaternion, Vector
-from cloudrc.record.ros import STORE, encode, header, part
-from cloudrc.record.topics import TOPICS
+from cloudrc.record.ros import STORE, build_odometry, header, part
 
-WORLD = "world"
-"""Frame of poses and of commanded velocities."""
-_ODOMETRY = TOPICS["/odometry"]
+WORLD, BASE = "world", "base_link"
+"""Frame of poses and of commanded velocities, and frame of the robot's base."""
+_ODOMETRY = "nav_msgs/msg/Odometry"
 _STAMPED = "geometry_msgs/msg/TwistStamped"
 
 
@@ -26,6 +25,7 @@ def encode_odometry(
     orientation_wxyz: Quaternion,
     velocity: Sequence[float],
     angular_velocity_body: Sequence[float],
+    child: str = BASE,
 ) -> bytes:
     """Encode a nav_msgs/Odometry as CDR.
 
@@ -35,9 +35,10 @@ def encode_odometry(
         orientation_wxyz: Orientation [1], body to world, shape (4,).
         velocity: Velocity [m/s], world frame, shape (3,).
         angular_velocity_body: Angular velocity [rad/s], body frame, shape (3,).
+        child: Name of the body frame.
     """
-    row = (stamp_ns, position, orientation_wxyz, velocity, angular_velocity_body)
-    return encode(_ODOMETRY, row)
+    values = (position, orientation_wxyz, velocity, angular_velocity_body)
+    return _bytes(build_odometry(header(stamp_ns), values, child), _ODOMETRY)
 
 
 def encode_pose(stamp_ns: int, position: Sequence[float], yaw: float) -> bytes:
@@ -58,8 +59,61 @@ def encode_clock(now_ns: int) -> bytes:
     return _pack("rosgraph_msgs/msg/Clock", header(now_ns).stamp)
 
 
+def encode_transforms(
+    stamp_ns: int,
+    poses: Mapping[str, tuple[Sequence[float], Sequence[float]]],
+    parent: str = WORLD,
+) -> bytes:
+    """Encode a tf2_msgs/TFMessage as CDR.
+
+    Args:
+        stamp_ns: Time of the poses [ns].
+        poses: Frame -> its position [m], shape (3,), and orientation wxyz [1], shape (4,).
+        parent: Frame in which the poses are.
+    """
+    transforms = []
+    for frame, (position, (w, x, y, z)) in poses.items():
+        move = part("geometry_msgs/msg/Vector3", *position)
+        turn = part("geometry_msgs/msg/Quaternion", x, y, z, w)
+        transform = part("geometry_msgs/msg/Transform", move, turn)
+        about = header(stamp_ns, parent), frame
+        transforms.append(part("geometry_msgs/msg/TransformStamped", *about, transform))
+    return _pack("tf2_msgs/msg/TFMessage", transforms)
+
+
+def encode_text(text: str) -> bytes:
+    """Encode a std_msgs/String as CDR."""
+    return _pack("std_msgs/msg/String", text)
+
+
+OK, WARN, ERROR, STALE = range(4)
+"""Levels of a `HealthStatus`."""
+
+
+class HealthStatus(NamedTuple):
+    """How well a part of the system does."""
+
+    level: int  # OK, WARN, ERROR or STALE
+    name: str  # of the part
+    text: str
+    values: Mapping[str, str]  # name -> value with its unit
+
+
+def encode_diagnostics(stamp_ns: int, statuses: Iterable[HealthStatus], robot: str = "") -> bytes:
+    """Encode a diagnostic_msgs/DiagnosticArray as CDR; `robot` is the name of the robot."""
+    found = []
+    for level, name, text, values in statuses:
+        pairs = [part("diagnostic_msgs/msg/KeyValue", *pair) for pair in values.items()]
+        found.append(part("diagnostic_msgs/msg/DiagnosticStatus", level, name, text, robot, pairs))
+    return _pack("diagnostic_msgs/msg/DiagnosticArray", header(stamp_ns, ""), found)
+
+
 def _pack(ros_type: str, *values: Any) -> bytes:
-    return bytes(STORE.serialize_cdr(part(ros_type, *values), ros_type, little_endian=True))
+    return _bytes(part(ros_type, *values), ros_type)
+
+
+def _bytes(message: Any, ros_type: str) -> bytes:
+    return bytes(STORE.serialize_cdr(message, ros_type, little_endian=True))
 
 
 def decode_stamped_twist(data: bytes) -> tuple[int, str, Vector, float]:

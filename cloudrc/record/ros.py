@@ -192,13 +192,14 @@ def _rotate(orientation_wxyz: Quaternion, vector: Vector) -> Vector:
     return a + 2 * (y * r - z * q), b + 2 * (z * p - x * r), c + 2 * (x * q - y * p)
 
 
-def _build_odometry(header: Any, values: Values) -> Any:
+def build_odometry(header: Any, values: Values, child: str = "base_link") -> Any:
+    """Make a message with pose and, in the frame `child`, twist: the values of a row of a topic."""
     position, (w, x, y, z), velocity = values[:3]
     rates = values[3] if len(values) > 3 else (np.nan, np.nan, np.nan)
     pose = _Pose(_Point(*position), _Quaternion(x, y, z, w))
     twist = _Twist(_Vector3(*_rotate((w, -x, -y, -z), velocity)), _Vector3(*rates))
     with_pose = _PoseWithCovariance(pose, _NO_COVARIANCE)
-    return _Odometry(header, "base_link", with_pose, _TwistWithCovariance(twist, _NO_COVARIANCE))
+    return _Odometry(header, child, with_pose, _TwistWithCovariance(twist, _NO_COVARIANCE))
 
 
 def _parse_odometry(message: Any) -> Values:
@@ -222,7 +223,7 @@ def _wxyz(quaternion: Any) -> Quaternion:
 
 _Codec: TypeAlias = tuple[Callable[[Any, Values], Any], Callable[[Any], Values]]
 _STANDARD: dict[str, _Codec] = {
-    "nav_msgs/msg/Odometry": (_build_odometry, _parse_odometry),
+    "nav_msgs/msg/Odometry": (build_odometry, _parse_odometry),
     "geometry_msgs/msg/TwistStamped": (
         _build_twist,
         lambda message: (_xyz(message.twist.linear), message.twist.angular.z),

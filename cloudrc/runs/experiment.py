@@ -57,7 +57,8 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
         if controller == ROS2:
             from cloudrc.bridges.ros2 import require_ros
 
-            require_ros()
+            packages = "nav_msgs, geometry_msgs and sensor_msgs"
+            require_ros("cloud.controller ros2", "node", packages)
     if mode != "cluster":
         check_world(experiment.world, turns=experiment.mission.turns)
 

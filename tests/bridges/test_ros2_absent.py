@@ -46,7 +46,7 @@ def test_a_ros_for_another_python_is_named(tmp_path, monkeypatch):
     for name in ("rclpy", "cloudrc.bridges.ros2.node"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     with pytest.raises(MissingPrerequisiteError, match=r"jazzy .* no _rclpy_pybind11"):
-        require_ros()
+        require_ros("a node", "node", "nav_msgs")
 
 
 def test_messages_of_another_ros_are_named(monkeypatch):
@@ -57,14 +57,14 @@ def test_messages_of_another_ros_are_named(monkeypatch):
     node = SimpleNamespace(load_messages=load_messages)
     monkeypatch.setitem(sys.modules, "cloudrc.bridges.ros2.node", node)
     with pytest.raises(MissingPrerequisiteError, match="for package 'geometry_msgs'"):
-        require_ros()
+        require_ros("a node", "node", "nav_msgs")
 
 
 @pytest.mark.parametrize("domain", ["233", "-1", "x", "1.5"])
 def test_a_domain_that_does_not_exist_is_bad_input(monkeypatch, domain):
     monkeypatch.setenv("ROS_DOMAIN_ID", domain)
     with pytest.raises(BadInputError, match="ROS_DOMAIN_ID"):
-        require_ros()
+        require_ros("a node", "node", "nav_msgs")
 
 
 @pytest.mark.parametrize("namespace", ["9", "a b", "/", "a//b", "~", "a-b"])

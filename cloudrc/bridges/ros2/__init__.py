@@ -5,6 +5,7 @@ Only this folder imports rclpy, and nothing imports this folder unless an experi
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
 import sys
@@ -15,26 +16,28 @@ DOMAIN_MAX = 232
 """Largest number of a domain of ROS 2: larger ones would need ports that do not exist."""
 
 
-def require_ros() -> None:
-    """Raise a MissingPrerequisiteError unless this process can be a node of ROS 2."""
+def require_ros(purpose: str, module: str, packages: str) -> None:
+    """Raise a MissingPrerequisiteError unless this process can be a node of ROS 2.
+
+    `purpose`, such as "cloud.controller ros2", is for the error text. `module` is the module of
+    this folder that is needed; its `load_messages` loads those of the ROS packages `packages`.
+    """
     domain = os.environ.get("ROS_DOMAIN_ID", "") or "0"
     if not domain.isdecimal() or int(domain) > DOMAIN_MAX:
         raise BadInputError(f"ROS_DOMAIN_ID={domain}: give a number from 0 to {DOMAIN_MAX}")
     python = f"Python {sys.version_info.major}.{sys.version_info.minor}"
     if importlib.util.find_spec("rclpy") is None:
         raise MissingPrerequisiteError(
-            "cloud.controller ros2 needs ROS 2, and there is no rclpy here: run "
+            f"{purpose} needs ROS 2, and there is no rclpy here: run "
             f"'source /opt/ros/DISTRIBUTION/setup.bash' of a ROS 2 for {python}, then cloudrc again"
         )
     try:
         import rclpy  # noqa: F401  first: its error says most
 
-        from cloudrc.bridges.ros2.node import load_messages
-
-        load_messages()
+        importlib.import_module(f"cloudrc.bridges.ros2.{module}").load_messages()
     except Exception as error:
         ros = os.environ.get("ROS_DISTRO", "this ROS 2")
         raise MissingPrerequisiteError(
             f"rclpy of {ros} cannot be used in {python}: {to_one_line(str(error))}; use cloudrc "
-            "in the Python of this ROS, with nav_msgs, geometry_msgs and sensor_msgs"
+            f"in the Python of this ROS, with {packages}"
         ) from None

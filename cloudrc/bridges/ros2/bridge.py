@@ -1,0 +1,257 @@
+"""A flight on ROS 2: publish what cloud knows of the robot, and take what nodes ask it for.
+
+Messages are published as CDR bytes, which is faster than by rclpy's Python objects. The stamps are
+times of the wall clock, as those of other nodes.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from importlib.util import find_spec
+from math import dist
+from typing import Any, NamedTuple
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.type_support import check_for_type_support
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+from cloudrc.bridges.ros2.health import FlightHealth
+from cloudrc.bridges.ros2.own_node import NEWEST, OwnNode
+from cloudrc.bridges.ros2.requests import SERVICES, RosRequests
+from cloudrc.console.steering import Steering
+from cloudrc.drivers.readers import RecordReader
+from cloudrc.messages import GuardState, Telemetry, Vector
+from cloudrc.record.live import (
+    BASE,
+    encode_diagnostics,
+    encode_odometry,
+    encode_text,
+    encode_transforms,
+)
+from cloudrc.records import Control, Record, TelemetrySent
+from cloudrc.report.markers import GOAL, encode_markers, path_shape
+
+STATE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+"""QoS of what changes all the time; all subscriptions match it."""
+KEPT = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""QoS of what changes rarely: a late subscriber gets the newest message, too."""
+STAMPED = "geometry_msgs/msg/TwistStamped"
+PERIOD = 1.0
+"""Time between two messages about health and path [s]."""
+WAKE = 0.05
+"""Longest wait for records [s]."""
+THREADS = 4
+"""Number of threads that serve requests: an emergency stop does not wait for another request."""
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+MAP = {"map": ((0.0, 0.0, 0.0), LEVEL)}
+"""Static frame: RViz and others start with `map`, which is the world."""
+TRAIL_STEP, TRAIL_MAX = 0.05, 1000
+"""Shortest distance between two points of the flown path [m], and their largest number."""
+JUMP = 0.5
+"""Distance between two positions above which a new path begins: the robot was set back [m]."""
+
+
+def load_messages() -> None:
+    """Load the code of all messages; raise an exception if it is not for this ROS or Python."""
+    for kind in (Odometry, PoseStamped, Twist, String, Trigger, MarkerArray, DiagnosticArray):
+        check_for_type_support(kind)
+
+
+class Surroundings(NamedTuple):
+    """What the bridge draws, and of which it publishes frames."""
+
+    prefix: str  # of the robot's frames, such as "drone1/"
+    scene: bytes  # markers of robot and scene, a visualization_msgs/MarkerArray
+
+
+class RosBridge(OwnNode):
+    """The node of a flight."""
+
+    def __init__(
+        self,
+        namespace: str,
+        surroundings: Surroundings,
+        steering: Steering,
+        requests: RosRequests,
+        tell: Callable[[str], None],
+    ) -> None:
+        """Open the node below `namespace`; `tell` gets words for the user."""
+        super().__init__("cloudrc_bridge", namespace)
+        self._robot = namespace.strip("/")
+        self._prefix, self._markers = surroundings
+        self._steering, self._requests = steering, requests
+        self._health = FlightHealth()
+        self._guard: GuardState | None = None
+        self._trail: list[Vector] = []
+        self._watchers = 0  # subscriptions to the scene
+        self._offset_ns = _wall_offset_ns()
+        publisher = self.node.create_publisher
+        self._odometry = publisher(Odometry, "odom", STATE)
+        self._guards = publisher(String, "cloudrc/guard", KEPT)
+        self._scene = publisher(MarkerArray, "cloudrc/scene", KEPT)
+        self._path = publisher(MarkerArray, "cloudrc/path", KEPT)
+        self._diagnostics = publisher(DiagnosticArray, "/diagnostics", STATE)
+        self._transforms = self._open_transforms(tell)
+        self._group = ReentrantCallbackGroup()
+        self._kind: Any = Twist
+        self._take_commands()
+        self.node.create_subscription(
+            PoseStamped, "goal_pose", self._go_to, NEWEST, callback_group=self._group
+        )
+        for name in SERVICES:
+            self.node.create_service(
+                Trigger, f"cloudrc/{name}", self._server(name), callback_group=self._group
+            )
+        self._ended = False
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        topic = self.node.resolve_topic_name("odom")
+        tell(f"{topic} and more topics in {self.domain}")
+
+    def run(self, reader: RecordReader, has_ended: Callable[[], bool]) -> None:
+        """Publish until `has_ended()` is true."""
+        self._listener.start()
+        due = time.monotonic()
+        while True:
+            for record in reader.take(WAKE):
+                self._publish(record)
+            self._requests.pass_on()
+            if (now := time.monotonic()) >= due:
+                due = now + PERIOD
+                if has_ended():
+                    return
+                self._publish_rest(reader.dropped)
+
+    def close(self) -> None:
+        """Leave ROS."""
+        self._ended = True
+        if self._listener.is_alive():
+            self._listener.join()
+        super().close()
+
+    def _open_transforms(self, tell: Callable[[str], None]) -> Any:
+        """Open /tf and publish the static frames; return None where ROS lacks their messages."""
+        if find_spec("tf2_msgs") is None:
+            tell("/tf and /tf_static are left out: this ROS 2 has no tf2_msgs")
+            return None
+        from tf2_msgs.msg import TFMessage
+
+        self._static = self.node.create_publisher(TFMessage, "/tf_static", KEPT)
+        self._static.publish(encode_transforms(time.time_ns(), MAP))
+        return self.node.create_publisher(TFMessage, "/tf", STATE)
+
+    def _publish(self, record: Record) -> None:
+        self._health.take(record)
+        if isinstance(record, TelemetrySent):
+            self._publish_telemetry(record.telemetry)
+        elif isinstance(record, Control) and self._transforms is not None:
+            poses = {
+                f"{self._prefix}estimate": (record.position, record.orientation_wxyz),
+                f"{self._prefix}setpoint": (record.setpoint, LEVEL),
+            }
+            stamp_ns = record.stamp_ns + self._offset_ns
+            self._transforms.publish(encode_transforms(stamp_ns, poses))
+
+    def _publish_telemetry(self, telemetry: Telemetry) -> None:
+        stamp_ns, position, orientation, velocity, rates = telemetry.odometry
+        stamp_ns += telemetry.slip_ns + self._offset_ns
+        base = self._prefix + BASE
+        pose = position, orientation
+        self._odometry.publish(encode_odometry(stamp_ns, *pose, velocity, rates, base))
+        if self._transforms is not None:
+            self._transforms.publish(encode_transforms(stamp_ns, {base: pose}))
+        if telemetry.guard is not self._guard:
+            self._guard = telemetry.guard
+            self._guards.publish(encode_text(telemetry.guard.name))
+        self._requests.see(*pose)
+        self._follow(position)
+
+    def _follow(self, position: Vector) -> None:
+        """Add a position to the flown path."""
+        moved = dist(position, self._trail[-1]) if self._trail else JUMP
+        if moved > JUMP:
+            self._trail = []
+        if moved > TRAIL_STEP:
+            self._trail = [*self._trail[1 - TRAIL_MAX :], position]
+
+    def _publish_rest(self, dropped: int) -> None:
+        """Publish health and path, and the scene if somebody new looks at it."""
+        self._offset_ns = _wall_offset_ns()  # the wall clock may have been set
+        now_ns = time.monotonic_ns()
+        statuses = self._health.report(now_ns, dropped)
+        stamp_ns = now_ns + self._offset_ns
+        self._diagnostics.publish(encode_diagnostics(stamp_ns, statuses, self._robot))
+        if self._guard is not None:  # a plain subscriber gets no old message
+            self._guards.publish(encode_text(self._guard.name))
+        watchers, before = self._scene.get_subscription_count(), self._watchers
+        self._watchers = watchers
+        if watchers > before:
+            self._scene.publish(self._markers)
+        if self._path.get_subscription_count():
+            lines = ("flown", self._trail), ("route", self._steering.route, GOAL)
+            shapes = [path_shape(*line) for line in lines if len(line[1]) > 1]
+            self._path.publish(encode_markers(0, shapes))
+        self._follow_type()
+
+    def _take_commands(self) -> None:
+        self._commands = self.node.create_subscription(
+            self._kind, "cmd_vel", self._drive, NEWEST, callback_group=self._group
+        )
+
+    def _follow_type(self) -> None:
+        """Take commands of the type that nodes publish, with or without a stamp.
+
+        The executor may still wait for a subscription that is destroyed: the next call makes the
+        new one.
+        """
+        if self._commands is None:
+            self._take_commands()
+        infos = self.node.get_publishers_info_by_topic(self.node.resolve_topic_name("cmd_vel"))
+        types = {info.topic_type for info in infos}
+        kind = TwistStamped if STAMPED in types else Twist
+        if types and kind is not self._kind:
+            self.node.destroy_subscription(self._commands)
+            self._commands, self._kind = None, kind
+
+    def _listen(self) -> None:
+        executor = MultiThreadedExecutor(THREADS, context=self.context)
+        executor.add_node(self.node)
+        while not self._ended:
+            executor.spin_once(timeout_sec=WAKE)
+        executor.shutdown()
+
+    def _server(self, name: str) -> Callable[[Any, Any], Any]:
+        def serve(request: Any, answer: Any) -> Any:
+            answer.success, answer.message = self._requests.serve(name)
+            return answer
+
+        return serve
+
+    def _go_to(self, goal: PoseStamped) -> None:
+        place, turn = goal.pose.position, goal.pose.orientation
+        wxyz = (turn.w, turn.x, turn.y, turn.z)
+        self._requests.go_to(goal.header.frame_id, (place.x, place.y, place.z), wxyz)
+
+    def _drive(self, command: Any) -> None:
+        frame, twist = "", command
+        if isinstance(command, TwistStamped):
+            frame, twist = command.header.frame_id, command.twist
+        linear = (twist.linear.x, twist.linear.y, twist.linear.z)
+        self._requests.drive(frame, linear, twist.angular.z)
+
+
+def _wall_offset_ns() -> int:
+    """Return the wall clock's time minus that of cloud's clock [ns]."""
+    return time.time_ns() - time.monotonic_ns()

@@ -1,0 +1,166 @@
+"""Carry out what nodes of ROS 2 ask the robot for, with teleop's API."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from math import cos, degrees, inf, isfinite, sin
+from typing import NamedTuple
+
+from cloudrc.console.steering import Steering
+from cloudrc.errors import CloudrcError
+from cloudrc.geometry.vectors import turn_to
+from cloudrc.messages import ZERO, Quaternion, Vector
+from cloudrc.record.live import BASE, WORLD
+
+GROUND_FRAMES = ("map", WORLD)
+"""Frames with the origin and the axes of the world; RViz starts with `map`."""
+DRIVE_LASTS = 0.5
+"""Time for which a velocity is flown [s]; then the robot holds, unless a new one has arrived."""
+DRIVE_PERIOD = 0.05
+"""Time between two velocities that are passed on [s]; nodes may send them much faster."""
+HEIGHT = 1.0
+"""Least height of a goal that has none [m]."""
+SAID_AGAIN = 5.0
+"""Time after which the same words are said again [s]."""
+SERVICES: Mapping[str, tuple[str, str]] = {
+    "hold": ("/v1/hold", "holding"),
+    "resume": ("/v1/resume", "resumed"),
+    "cancel": ("", "cancelled; the robot holds"),
+    "estop": ("/v1/estop", "emergency stop: sent, and repeated until the robot is switched off"),
+    "acknowledge": ("/v1/acknowledge", "acknowledged: the next mission may fly"),
+}
+"""Service -> path in teleop's API, and words of the answer; `cancel` names a mission there."""
+OBSERVES = "this bridge only observes; start it without --observe"
+
+
+class BridgedRobot(NamedTuple):
+    """What the bridge has to know of a robot."""
+
+    planar: bool  # whether it stays on the ground
+    turns: bool  # whether it obeys a yaw
+
+
+class RosRequests:
+    """Passes the requests of nodes on to teleop; says in one line what it refuses.
+
+    Attributes:
+        position: The robot's newest position [m], world frame, shape (3,).
+        yaw: Its newest yaw [rad].
+    """
+
+    def __init__(
+        self,
+        steering: Steering,
+        robot: BridgedRobot,
+        tell: Callable[[str], None],
+        *,
+        prefix: str = "",
+        observes: bool = False,
+    ) -> None:
+        """Make it.
+
+        Args:
+            steering: Sends requests to teleop.
+            robot: The robot.
+            tell: Gets words for the user.
+            prefix: Prefix of the robot's frames.
+            observes: Whether to refuse every request.
+        """
+        self._steering, self._robot, self._tell_user = steering, robot, tell
+        self._base, self._observes = prefix + BASE, observes
+        self.position: Vector = ZERO
+        self.yaw = 0.0
+        self._wanted: tuple[Vector, float] | None = None  # velocity, and end of its time [s]
+        self._passed = -inf  # time at which the newest velocity was passed on [s]
+        self._said: dict[str, float] = {}
+
+    def serve(self, name: str) -> tuple[bool, str]:
+        """Carry out a service of `SERVICES`; return whether teleop accepted it, and words."""
+        if self._observes:
+            self._tell(f"{name}: {OBSERVES}")
+            return False, OBSERVES
+        path, words = SERVICES[name]
+        api = self._steering.api
+        try:
+            if name == "cancel":
+                mission = api.get("/v1/state")["mission"]
+                if mission is None:
+                    return False, "no mission is under way"
+                path = f"/v1/missions/{mission['id']}/cancel"
+            answer = api.post(path)
+        except CloudrcError as error:
+            if name == "estop":
+                self._steering.stop()  # asks again until teleop answers
+            return False, str(error)
+        if name == "resume" and answer["by_hand"]:
+            return True, "the drive ends, and the robot holds"
+        return True, words
+
+    def go_to(self, frame: str, position: Sequence[float], wxyz: Quaternion) -> None:
+        """Let the robot go to a pose: `position` [m] and orientation `wxyz` [1] in `frame`."""
+        x, y, z = position
+        if not self._accepts("goal_pose", frame, GROUND_FRAMES, (*position, *wxyz)):
+            return
+        if z == 0.0:  # RViz clicks on the ground
+            z = max(self.position[2], HEIGHT)
+        place = (x, y) if self._robot.planar else (x, y, z)
+        yaw = degrees(-turn_to(0.0, wxyz)) if self._robot.turns and any(wxyz) else None
+        self._steering.go_to(place, yaw)
+        self._tell(self._steering.answer[0])
+
+    def drive(self, frame: str, linear: Sequence[float], yaw_rate: float) -> None:
+        """Drive with a velocity in `frame`; an empty frame is that of the base.
+
+        Args:
+            frame: Frame of the velocity.
+            linear: Velocity [m/s], shape (3,).
+            yaw_rate: Yaw rate [rad/s], which is ignored.
+        """
+        frame = frame or self._base
+        if not self._accepts("cmd_vel", frame, (self._base, *GROUND_FRAMES), linear):
+            return
+        if yaw_rate:
+            self._tell("cmd_vel: angular.z is ignored; a drive does not turn the robot")
+        x, y, z = linear
+        if frame == self._base:
+            x, y = (
+                x * cos(self.yaw) - y * sin(self.yaw),
+                x * sin(self.yaw) + y * cos(self.yaw),
+            )
+        self._wanted = (x, y, 0.0 if self._robot.planar else z), time.monotonic() + DRIVE_LASTS
+
+    def pass_on(self) -> None:
+        """Pass the newest velocity on, if it is due; say why teleop has refused a request."""
+        now = time.monotonic()
+        wanted = self._wanted
+        if wanted is not None and now - self._passed >= DRIVE_PERIOD:
+            self._passed, self._wanted = now, None
+            self._steering.hold_key("cmd_vel", wanted[0], wanted[1] - now)
+        text, is_refusal, said = self._steering.answer
+        if is_refusal and max(now - self._passed, now - said) < DRIVE_LASTS:
+            self._tell(text)
+
+    def see(self, position: Vector, wxyz: Quaternion) -> None:
+        """Note where the robot is: `position` [m] and orientation `wxyz` [1]."""
+        self.position, self.yaw = position, -turn_to(0.0, wxyz)
+
+    def _accepts(
+        self, topic: str, frame: str, known: Sequence[str], numbers: Sequence[float]
+    ) -> bool:
+        if self._observes:
+            self._tell(f"{topic}: {OBSERVES}")
+        elif frame and frame not in known:
+            self._tell(f"{topic}: unknown frame '{frame}'; use {' or '.join(known)}")
+        elif not all(map(isfinite, numbers)):
+            self._tell(f"{topic}: a number is not finite")
+        else:
+            return True
+        return False
+
+    def _tell(self, text: str) -> None:
+        now = time.monotonic()
+        if now - self._said.get(text, -inf) > SAID_AGAIN:
+            fresh = {text: at for text, at in self._said.items() if now - at <= SAID_AGAIN}
+            self._said = {**fresh, text: now}
+            self._tell_user(text)

@@ -1,0 +1,126 @@
+"""Run `cloudrc ros bridge`: a node of ROS 2 beside a flight, which shows and steers the robot."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cloudrc.cli.output import print_line
+from cloudrc.cli.parser import add_verbs
+from cloudrc.errors import BadInputError
+from cloudrc.runs.interrupts import interrupt_on_signals
+
+if TYPE_CHECKING:
+    from cloudrc.runs.under_way import RunInFlight
+
+VERBS = {"bridge": "publish a flight on ROS 2, and take goals and velocities from nodes"}
+"""Verb -> its line in the help."""
+EPILOG = """\
+examples:
+  cloudrc ros bridge                     beside 'cloudrc up' in another terminal
+  cloudrc ros bridge --namespace drone1  /drone1/odom and so on
+  cloudrc ros bridge --observe           nodes see the robot, but cannot steer
+
+It needs a sourced ROS 2 with rclpy for this Python. It publishes odom, /tf,
+cloudrc/guard, cloudrc/scene, cloudrc/path and /diagnostics, takes goal_pose and
+cmd_vel, and serves cloudrc/hold, resume, cancel, estop and acknowledge. It ends
+with the flight. docs/ros2.md describes the topics."""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    bridge = add_verbs(parser, VERBS)["bridge"]
+    bridge.epilog = EPILOG
+    add = bridge.add_argument
+    about = "folder of the flying run (default: the only run in flight)"
+    add("run", nargs="?", type=Path, metavar="RUN", help=about)
+    about = "namespace of topics and services, and prefix of the robot's frames (default: none)"
+    add("--namespace", type=_namespace, default="", metavar="NAME", help=about)
+    add("--observe", action="store_true", help="let nodes see the robot, but not steer it")
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Be the node of the flight until it ends or the user interrupts."""
+    interrupt_on_signals()
+    from cloudrc.bridges.ros2 import require_ros
+    from cloudrc.drivers.local import under_way
+
+    packages = "nav_msgs, geometry_msgs, std_msgs, std_srvs, diagnostic_msgs, visualization_msgs"
+    require_ros("ros bridge", "bridge", packages)
+    found = _find(options)
+    run, socket = found.folder.resolve(), Path(found.url.removeprefix("unix:"))
+
+    def has_ended() -> bool:
+        return not socket.exists() or under_way().get(run) != found.url
+
+    with ExitStack() as stack:
+        bridge, reader = _open(stack, options, found)
+        bridge.run(reader, has_ended)
+    print_line("the flight has ended", sys.stderr)
+    return 0
+
+
+def _find(options: argparse.Namespace) -> RunInFlight:
+    from cloudrc.runs.under_way import find_run
+
+    found = find_run(options.run, steers=not options.observe, flag="")
+    if found is None:
+        raise BadInputError("no run flies here; start one: cloudrc up")
+    if found.note:
+        print_line(f"cloudrc: {found.note}", sys.stderr)
+    return found
+
+
+def _open(stack: ExitStack, options: argparse.Namespace, found: RunInFlight) -> tuple[Any, Any]:
+    """Open the bridge and the reader of cloud's records; `stack` closes them."""
+    from cloudrc.bridges.ros2.bridge import RosBridge, Surroundings
+    from cloudrc.bridges.ros2.requests import BridgedRobot, RosRequests
+    from cloudrc.config.load import read_experiment
+    from cloudrc.config.robot import find_robot
+    from cloudrc.config.scene import scene_of
+    from cloudrc.console.steering import Steering
+    from cloudrc.drivers.readers import RecordReader
+    from cloudrc.report.markers import encode_markers, scene_shapes
+    from cloudrc.teleop.client import Api
+    from cloudrc.world.shapes import read_shapes
+
+    world = read_experiment(str(found.folder / "config.yaml")).world
+    robot = find_robot(world.robot)
+    name = options.namespace.strip("/")
+    prefix = f"{name}/" if name else ""
+    shapes = scene_shapes(read_shapes(world), scene_of(world).tubes, prefix)
+    surroundings = Surroundings(prefix, encode_markers(0, shapes))
+
+    def tell(text: str) -> None:
+        print_line(f"ros: {text}")
+
+    steering = Steering(Api(found.url))
+    requests = RosRequests(
+        steering,
+        BridgedRobot(robot.planar, robot.heading == "free"),
+        tell,
+        prefix=prefix,
+        observes=options.observe,
+    )
+    bridge = RosBridge(name, surroundings, steering, requests, tell)
+    stack.callback(bridge.close)
+    reader = RecordReader(Path(found.url.removeprefix("unix:")).parent)
+    stack.callback(reader.close)
+    steering.start()
+    stack.callback(steering.end_drive)
+    return bridge, reader
+
+
+def _namespace(text: str) -> str:
+    from pydantic import TypeAdapter, ValidationError
+
+    from cloudrc.config.schema import RosNamespace
+
+    try:
+        return TypeAdapter[str](RosNamespace).validate_python(text)
+    except ValidationError:
+        about = "is no namespace of ROS 2; give one such as drone1"
+        raise argparse.ArgumentTypeError(f"'{text}' {about}") from None

@@ -1,0 +1,136 @@
+"""Let other programs of this machine read cloud's records during a flight.
+
+A reader has a socket in the folder of the run's sockets. Cloud sends its records to each reader,
+and never waits for one: what a reader's full socket refuses is dropped. A datagram begins with the
+number of records before it, from which the reader counts the dropped ones.
+
+Each reader connects to cloud's socket: Linux then limits the bytes that wait for the reader, a
+second of records. Without a connection it limits the datagrams, usually to ten.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from cloudrc.drivers.process import from_line, to_line
+from cloudrc.messages import Telemetry
+from cloudrc.records import Record, TelemetrySent
+
+CLOUD = "records.sock"
+"""Name of cloud's socket."""
+READERS = "r[0-9]*.sock"
+"""Pattern of the names of the readers' sockets, which have the number of a process."""
+LOOK_NS = 500_000_000
+"""Time between two looks for readers [ns]."""
+SIZE_MAX = 60_000
+"""Size above which the records of a period are sent in several datagrams [bytes]."""
+DATAGRAM_MAX = 2 * SIZE_MAX
+"""Size limit of a datagram [bytes]: a single record is smaller than `SIZE_MAX`."""
+
+
+class RecordSender:
+    """Sends cloud's records, and the telemetry that has arrived, to all readers."""
+
+    def __init__(self, folder: Path) -> None:
+        """Send to the readers whose sockets are in `folder`."""
+        self._folder, self._due_ns = folder, 0
+        self._sent: dict[Path, int] = {}  # reader -> records for it so far
+        self._socket = _bind(folder / CLOUD)
+
+    def see(self, epoch: int, counter: int, telemetry: Telemetry) -> None:
+        """Send telemetry that cloud uses; datagrams of it have `epoch` and `counter`."""
+        if self._sent:
+            self._send([to_line(TelemetrySent(telemetry.stamp_ns, epoch, counter, telemetry))])
+
+    def put(self, records: Iterable[Record]) -> None:
+        """Send records, oldest first; look for new readers now and then."""
+        if (now_ns := time.monotonic_ns()) >= self._due_ns:
+            self._due_ns = now_ns + LOOK_NS
+            found = self._folder.glob(READERS)
+            self._sent = {path: self._sent.get(path, 0) for path in found}
+        if self._sent:
+            for lines in _parts(map(to_line, records)):
+                self._send(lines)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def _send(self, lines: list[str]) -> None:
+        body = "\n".join(lines)
+        for path, before in self._sent.items():
+            self._sent[path] = before + len(lines)
+            with suppress(OSError):  # the reader is slow, or has ended
+                self._socket.sendto(f"{before}\n{body}".encode(), str(path))
+
+
+class RecordReader:
+    """Receives cloud's records.
+
+    Attributes:
+        dropped: Number of records that were lost because this program was too slow.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Begin to receive; `folder` is that of the run's sockets."""
+        self._path = folder / f"r{os.getpid()}.sock"
+        self._cloud = str(folder / CLOUD)
+        self._socket = _bind(self._path)
+        self._connect()
+        self._next = 0
+        self.dropped = 0
+
+    def take(self, limit: float) -> list[Record]:
+        """Return the records that have arrived; if there are none, wait at most `limit` [s]."""
+        if not select.select([self._socket], [], [], limit)[0]:
+            self._connect()  # to a new process of cloud
+        found: list[Record] = []
+        with suppress(BlockingIOError, ConnectionResetError):
+            while True:
+                found += self._read(self._socket.recv(DATAGRAM_MAX))
+        return found
+
+    def close(self) -> None:
+        """Stop to receive."""
+        self._socket.close()
+        self._path.unlink(missing_ok=True)
+
+    def _connect(self) -> None:
+        with suppress(OSError):  # cloud does not run
+            self._socket.connect(self._cloud)
+
+    def _read(self, data: bytes) -> list[Record]:
+        number, *lines = data.decode().split("\n")
+        before = int(number)
+        self.dropped += max(0, before - self._next)
+        self._next = before + len(lines)  # a new process of cloud counts from 0
+        return [from_line(line) for line in lines]
+
+
+def _bind(path: Path) -> socket.socket:
+    """Open a socket for datagrams at `path`, in place of that of an earlier process."""
+    datagrams = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    datagrams.setblocking(False)
+    path.unlink(missing_ok=True)
+    datagrams.bind(str(path))
+    return datagrams
+
+
+def _parts(lines: Iterable[str]) -> Iterator[list[str]]:
+    """Yield the lines in groups that fit into a datagram."""
+    group: list[str] = []
+    size = 0
+    for line in lines:
+        if group and size + len(line) > SIZE_MAX:
+            yield group
+            group, size = [], 0
+        group.append(line)
+        size += len(line)
+    if group:
+        yield group

@@ -1,0 +1,115 @@
+"""Make ROS markers of the robot, its surroundings and paths, as RViz and Foxglove show them.
+
+A marker moves with its frame: the robot with `base_link`, the robot that cloud predicts with
+`estimate`, the ball at the setpoint with `setpoint`. The scene has the frame `world`.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from cloudrc.geometry.scene import Tube
+from cloudrc.geometry.shapes import Shapes, Surface
+from cloudrc.geometry.tubes import wall
+from cloudrc.record.ros import encode_view, header, part
+
+_Colour: TypeAlias = tuple[float, float, float, float]
+MarkerShape: TypeAlias = tuple[Any, ...]
+"""Arguments of `_marker`, from `name` on."""
+
+SPHERE, LINE_STRIP, TRIANGLE_LIST = 2, 4, 11
+"""Types of a ROS marker."""
+GOAL, PATH = (0.84, 0.37, 0.0, 0.9), (0.0, 0.45, 0.70, 1.0)
+GHOST, GLASS = (0.34, 0.71, 0.91, 0.45), (0.70, 0.74, 0.78, 0.35)
+"""Colours of setpoint, path, predicted robot and tubes: red, green, blue, opacity in [0, 1]."""
+GOAL_SIZE = 0.12
+"""Largest diameter of the setpoint's ball [m]; that of a small robot is smaller."""
+
+
+def scene_shapes(bodies: Shapes, tubes: Sequence[Tube], prefix: str = "") -> list[MarkerShape]:
+    """Make the shapes of the robot, the predicted robot, the setpoint and the scene.
+
+    `tubes` are the tubes among the bodies of the scene. `prefix` precedes the names of the robot's
+    frames.
+    """
+    shapes = []
+    if bodies.robot:
+        ghost = [replace(surface, rgba=GHOST) for surface in bodies.robot]
+        shapes.append(_solid("robot", f"{prefix}base_link", bodies.robot))
+        shapes.append(_solid("estimate", f"{prefix}estimate", ghost))
+    size = min(GOAL_SIZE, bodies.size / 4) if bodies.robot else GOAL_SIZE
+    shapes.append(("setpoint", SPHERE, f"{prefix}setpoint", size, GOAL))
+    shapes += [_solid(tube.name, "world", [wall(tube, GLASS, 24)]) for tube in tubes]
+    return shapes + _obstacles(bodies, {tube.name for tube in tubes})
+
+
+def path_shape(name: str, points: Iterable[Any], colour: _Colour = PATH) -> MarkerShape:
+    """Make a line through `points` [m], shape (n, 3), n > 1, world frame."""
+    return name, LINE_STRIP, "world", 0.02, colour, points
+
+
+def encode_markers(stamp_ns: int, shapes: Iterable[MarkerShape]) -> bytes:
+    """Encode a visualization_msgs/MarkerArray as CDR.
+
+    With the stamp 0, RViz uses the newest poses of the frames.
+    """
+    markers = [_marker(number, stamp_ns, *shape) for number, shape in enumerate(shapes)]
+    return encode_view("/scene", markers)
+
+
+def _marker(
+    number: int,
+    stamp_ns: int,
+    name: str,
+    kind: int,
+    frame: str,
+    size: float,
+    colour: _Colour,
+    points: Iterable[Any] = (),
+    colours: Iterable[_Colour] = (),
+) -> Any:
+    """Make a ROS marker at the origin of `frame`; `size` and `points`, shape (n, 3), in [m]."""
+    point, none = "geometry_msgs/msg/Point", np.zeros(0, np.uint8)
+    pose = part(
+        "geometry_msgs/msg/Pose",
+        part(point, 0.0, 0.0, 0.0),
+        part("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
+    )
+    forever = part("builtin_interfaces/msg/Duration", 0, 0)
+    picture = part("sensor_msgs/msg/CompressedImage", header(0, ""), "", none)
+    mesh = part("visualization_msgs/msg/MeshFile", "", none)
+    about = header(stamp_ns, frame), name, number, kind, 0, pose
+    look = part("geometry_msgs/msg/Vector3", *(size,) * 3), part("std_msgs/msg/ColorRGBA", *colour)
+    corners = [part(point, *xyz) for xyz in np.asarray(points, np.float32).tolist()]
+    paint = [part("std_msgs/msg/ColorRGBA", *each) for each in colours]
+    return part(
+        "visualization_msgs/msg/Marker",
+        *(*about, *look, forever, True, corners, paint),
+        *("", picture, [], "", "", mesh, False),  # no texture, text or mesh
+    )
+
+
+def _obstacles(bodies: Shapes, tubes: set[str]) -> list[MarkerShape]:
+    """Make a shape for each body of the scene that is not a tube."""
+    parts: defaultdict[str, list[Surface]] = defaultdict(list)
+    for surface in bodies.scene:
+        if surface.body not in tubes:
+            parts[surface.body].append(surface)
+    return [_solid(body, "world", surfaces) for body, surfaces in parts.items()]
+
+
+def _solid(name: str, frame: str, surfaces: Sequence[Surface]) -> MarkerShape:
+    """Make a shape of triangles; each triangle has the colour and opacity of its surface."""
+    points = [surface.corners[surface.triangles].reshape(-1, 3) for surface in surfaces]
+    colours = [
+        surface.rgba
+        for surface, corners in zip(surfaces, points, strict=True)
+        for _ in range(len(corners))
+    ]
+    several = colours if len(set(colours)) > 1 else []
+    return name, TRIANGLE_LIST, frame, 1.0, surfaces[0].rgba, np.concatenate(points), several

@@ -1,0 +1,248 @@
+"""What the bridge of a flight to ROS 2 publishes and asks for, without a ROS."""
+
+from math import nan
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from cloudrc.bridges.ros2.health import FlightHealth
+from cloudrc.bridges.ros2.requests import BridgedRobot, RosRequests
+from cloudrc.cli.main import main
+from cloudrc.console.steering import Steering
+from cloudrc.geometry.shapes import Shapes, Surface
+from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
+from cloudrc.record.live import (
+    ERROR,
+    OK,
+    STALE,
+    WARN,
+    HealthStatus,
+    encode_diagnostics,
+    encode_odometry,
+    encode_text,
+    encode_transforms,
+)
+from cloudrc.records import Arrival, Counted, Lateness, TelemetrySent
+from cloudrc.report.markers import encode_markers, path_shape, scene_shapes
+from tests.console.conftest import FakeApi
+
+STORE = get_typestore(Stores.ROS2_KILTED)
+LEFT = (2**-0.5, 0.0, 0.0, 2**-0.5)
+"""Orientation: turned by 90 degrees to the left."""
+
+
+def telemetry(stamp_ns=0, guard=GuardState.TRACK):
+    return Telemetry(
+        stamp_ns, Odometry(stamp_ns, ZERO, UPRIGHT, ZERO, ZERO), (), -1, 0, 0, 0, guard
+    )
+
+
+class Asking:
+    """Requests of nodes for a robot, and what came of them."""
+
+    def __init__(self, *, planar=False, turns=True, **options):
+        self.said = []
+        self.api = FakeApi()
+        self.steering = Steering(self.api)
+        robot = BridgedRobot(planar, turns)
+        self.requests = RosRequests(self.steering, robot, self.said.append, **options)
+
+    def velocity(self, now=0.0):
+        self.requests.pass_on()
+        return self.steering.velocity(now)
+
+
+def test_a_goal_is_a_goto_with_its_yaw():
+    asking = Asking()
+    asking.requests.go_to("map", (1.0, 2.0, 1.5), LEFT)
+    assert asking.api.posted == [("/v1/goto", {"position_m": [1.0, 2.0, 1.5], "yaw_deg": 90.0})]
+    assert asking.said == ["going to (1, 2, 1.5)"]
+
+
+@pytest.mark.parametrize(
+    ("options", "height", "goal"),
+    [
+        ({"turns": False}, 2.0, {"position_m": [1.0, 0.0, 2.0]}),
+        ({"turns": False}, 0.1, {"position_m": [1.0, 0.0, 1.0]}),
+        ({"turns": False, "planar": True}, 0.1, {"position_m": [1.0, 0.0]}),
+    ],
+)
+def test_a_goal_on_the_ground_as_rviz_sends_keeps_the_height(options, height, goal):
+    asking = Asking(**options)
+    asking.requests.see((0.0, 0.0, height), UPRIGHT)
+    asking.requests.go_to("", (1.0, 0.0, 0.0), UPRIGHT)
+    assert asking.api.posted == [("/v1/goto", goal)]
+
+
+@pytest.mark.parametrize(
+    ("frame", "flown"),
+    [("", (0.0, 0.5)), ("drone1/base_link", (0.0, 0.5)), ("world", (0.5, 0.0)), ("map", (0.5, 0))],
+)
+def test_a_velocity_is_turned_from_the_base_to_the_world(frame, flown):
+    asking = Asking(prefix="drone1/")
+    asking.requests.see(ZERO, LEFT)
+    asking.requests.drive(frame, (0.5, 0.0, 0.1), 0.0)
+    assert asking.velocity() == pytest.approx((*flown, 0.1))
+    assert asking.said == []
+
+
+def test_a_robot_on_the_ground_gets_no_vertical_velocity_and_a_turn_is_ignored_with_a_word():
+    asking = Asking(planar=True)
+    for _ in range(3):
+        asking.requests.drive("", (0.5, 0.0, 0.3), 0.2)
+    assert asking.velocity() == (0.5, 0.0, 0.0)
+    assert ["angular.z is ignored" in text for text in asking.said] == [True]
+
+
+@pytest.mark.parametrize("frame", ["odom", "drone2/base_link"])
+def test_an_unknown_frame_is_refused_in_one_line(frame):
+    asking = Asking()
+    asking.requests.go_to(frame, (1.0, 0.0, 1.0), UPRIGHT)
+    asking.requests.drive(frame, (1.0, 0.0, 0.0), 0.0)
+    assert asking.velocity() == ZERO
+    assert [text.partition(";")[0] for text in asking.said] == [
+        f"goal_pose: unknown frame '{frame}'",
+        f"cmd_vel: unknown frame '{frame}'",
+    ]
+    assert asking.api.posted == []
+
+
+def test_numbers_that_are_not_finite_are_refused():
+    asking = Asking()
+    asking.requests.go_to("", (nan, 0.0, 1.0), UPRIGHT)
+    asking.requests.go_to("", (1.0, 0.0, 1.0), (nan, 0.0, 0.0, 0.0))
+    asking.requests.drive("", (0.0, float("inf"), 0.0), 0.0)
+    assert asking.velocity() == ZERO
+    assert asking.api.posted == []
+    assert asking.said == ["goal_pose: a number is not finite", "cmd_vel: a number is not finite"]
+
+
+def test_a_bridge_that_observes_refuses_all():
+    asking = Asking(observes=True)
+    asking.requests.go_to("", (1.0, 0.0, 1.0), UPRIGHT)
+    asking.requests.drive("", (1.0, 0.0, 0.0), 0.0)
+    accepted, words = asking.requests.serve("estop")
+    assert (accepted, asking.velocity(), asking.api.posted) == (False, ZERO, [])
+    assert "--observe" in words
+    assert len(asking.said) == 3
+
+
+@pytest.mark.parametrize("name", ["hold", "estop", "acknowledge"])
+def test_a_service_is_a_request_to_teleop(name):
+    asking = Asking()
+    assert asking.requests.serve(name)[0]
+    assert asking.api.posted == [(f"/v1/{name}", None)]
+
+
+def test_cancel_needs_a_mission():
+    asking = Asking()
+    asking.api.answers["/v1/state"] = {"mission": None}
+    assert asking.requests.serve("cancel") == (False, "no mission is under way")
+    asking.api.answers["/v1/state"] = {"mission": {"id": "m3"}}
+    assert asking.requests.serve("cancel")[0]
+    assert asking.api.posted == [("/v1/missions/m3/cancel", None)]
+
+
+def test_a_refusal_of_teleop_is_the_answer_and_an_emergency_stop_is_asked_for_again():
+    asking = Asking()
+    asking.api.refused = dict.fromkeys(("/v1/hold", "/v1/estop"), "not now")
+    assert asking.requests.serve("hold") == (False, "not now")
+    assert not asking.steering._stops.is_set()
+    assert asking.requests.serve("estop") == (False, "not now")
+    assert asking.steering._stops.is_set()
+
+
+def health(*records, now_ns=1_000_000_000, dropped=0):
+    judge = FlightHealth()
+    for record in records:
+        judge.take(record)
+    return judge.report(now_ns, dropped)
+
+
+@pytest.mark.parametrize(
+    ("guard", "level"),
+    [("GROUND", OK), ("TRACK", OK), ("HOLD", WARN), ("LAND", ERROR), ("ESTOP", ERROR)],
+)
+def test_the_robot_is_as_well_as_its_guard(guard, level):
+    sent = TelemetrySent(0, 1, 1, telemetry(900_000_000, GuardState[guard]))
+    robot = health(sent)[0]
+    assert (robot.level, robot.values["guard"]) == (level, guard)
+    assert robot.values["telemetry age"] == "100.0 ms"
+    assert health(sent, now_ns=3_000_000_000)[0].level == STALE
+
+
+def test_loss_is_counted_as_everywhere_and_delays_are_those_of_the_last_seconds():
+    times = range(0, 10_000_000_000, 10_000_000)
+    arrivals = [Arrival(t, True, 1, t // 10_000_000, 0.04, True) for t in times if t % 40_000_000]
+    link = health(Arrival(0, True, 7, 1, 9.0, True), *arrivals, now_ns=times[-1])[1]
+    assert link.values["uplink loss"] == "24.9 %"
+    assert link.values["uplink delay, max"] == "40.0 ms"
+    assert health(*arrivals, now_ns=times[-1] + 600_000_000)[1].level == ERROR
+
+
+def test_a_cloud_that_misses_periods_or_a_bridge_that_is_slow_warns():
+    late = Lateness(900_000_000, "cloud", 0.002, 0.001, 0)
+    assert health(late)[2] == HealthStatus(
+        OK,
+        "cloud",
+        "lateness 2.0 ms",
+        {
+            "lateness, mean": "2.0 ms",
+            "lateness, max": "2.0 ms",
+            "missed periods": "0",
+            "records dropped": "0",
+        },
+    )
+    assert health(late, dropped=1)[2].level == WARN
+    assert health(Counted(0, "cloud", "missed_periods", 9))[2].level == WARN
+
+
+def test_before_the_first_record_nothing_is_known():
+    assert [status.level for status in health()] == [STALE, ERROR, OK]
+
+
+def test_ros_reads_health_guard_and_frames():
+    statuses = [HealthStatus(WARN, "link", "slow", {"loss": "1 %"})]
+    data = encode_diagnostics(2_000_000_003, statuses, "drone1")
+    message = STORE.deserialize_cdr(data, "diagnostic_msgs/msg/DiagnosticArray")
+    (status,) = message.status
+    assert (message.header.stamp.nanosec, status.level, status.hardware_id) == (3, WARN, "drone1")
+    assert (status.values[0].key, status.values[0].value) == ("loss", "1 %")
+    assert STORE.deserialize_cdr(encode_text("HOLD"), "std_msgs/msg/String").data == "HOLD"
+    data = encode_transforms(7, {"drone1/base_link": ((1.0, 2.0, 3.0), LEFT)})
+    (moved,) = STORE.deserialize_cdr(data, "tf2_msgs/msg/TFMessage").transforms
+    assert (moved.header.frame_id, moved.child_frame_id) == ("world", "drone1/base_link")
+    assert (moved.transform.translation.z, moved.transform.rotation.z) == (3.0, LEFT[3])
+    data = encode_odometry(0, ZERO, UPRIGHT, ZERO, ZERO, "drone1/base_link")
+    odometry = STORE.deserialize_cdr(data, "nav_msgs/msg/Odometry")
+    assert odometry.child_frame_id == "drone1/base_link"
+
+
+def test_markers_move_with_the_robots_frames_and_the_scene_stays():
+    corners, faces = np.eye(3), (np.array([[0, 1, 2]], np.int32),)
+    bodies = Shapes((Surface("", corners, faces),), (Surface("box", corners, faces),))
+    shapes = [*scene_shapes(bodies, (), "drone1/"), path_shape("flown", [ZERO, (1.0, 0.0, 0.0)])]
+    data = encode_markers(0, shapes)
+    markers = STORE.deserialize_cdr(data, "visualization_msgs/msg/MarkerArray").markers
+    assert [(marker.ns, marker.header.frame_id) for marker in markers] == [
+        ("robot", "drone1/base_link"),
+        ("estimate", "drone1/estimate"),
+        ("setpoint", "drone1/setpoint"),
+        ("box", "world"),
+        ("flown", "world"),
+    ]
+    assert len(markers[-1].points) == 2
+
+
+@pytest.mark.parametrize("name", ["9", "a b", "a-b", "/", "~x"])
+def test_a_namespace_that_ros_refuses_is_bad_input(name, capsys):
+    assert main(["ros", "bridge", "--namespace", name]) == 2
+    assert "is no namespace of ROS 2" in capsys.readouterr().err
+
+
+def test_without_ros_the_bridge_says_how_to_get_it(monkeypatch, capsys):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert main(["ros", "bridge"]) == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "ros bridge needs ROS 2" in line

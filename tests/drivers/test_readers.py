@@ -1,0 +1,105 @@
+"""Readers of cloud's records: each gets all records, or knows how many it has lost."""
+
+import time
+
+import pytest
+
+from cloudrc.drivers.readers import LOOK_NS, SIZE_MAX, RecordReader, RecordSender
+from cloudrc.messages import ZERO, Odometry, Telemetry
+from cloudrc.messages import GuardState as Guard
+from cloudrc.records import Arrival, Fault, TelemetrySent
+
+ODOMETRY = Odometry(7, (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), ZERO, ZERO)
+TELEMETRY = Telemetry(7, ODOMETRY, (), -1, 0, 0, 0, Guard.TRACK)
+
+
+def arrival(number):
+    return Arrival(number, True, 1, number, 0.05, True)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Return a function that moves the time at which the sender looks for readers."""
+    now_ns = 0
+    monkeypatch.setattr(time, "monotonic_ns", lambda: now_ns)
+
+    def wait():
+        nonlocal now_ns
+        now_ns += LOOK_NS
+
+    return wait
+
+
+@pytest.fixture
+def sender(tmp_path, clock):
+    sender = RecordSender(tmp_path)
+    yield sender
+    sender.close()
+
+
+@pytest.fixture
+def reader(tmp_path, sender, clock):
+    reader = RecordReader(tmp_path)
+    sender.put([])
+    yield reader
+    reader.close()
+
+
+def test_a_reader_gets_records_and_telemetry_in_order(sender, reader):
+    sender.see(1, 4, TELEMETRY)
+    sender.put([arrival(1), Fault(2, "late", "a\nb")])
+    sent = TelemetrySent(7, 1, 4, TELEMETRY)
+    got = reader.take(0)
+    assert [*map(str, got[:1])] == [str(sent)]  # a touch speed of NaN equals nothing
+    assert got[1:] == [arrival(1), Fault(2, "late", "a\nb")]
+    assert got[0].telemetry.guard is Guard.TRACK
+    assert (reader.take(0), reader.dropped) == ([], 0)
+
+
+def test_a_second_of_records_waits_for_a_reader(sender, reader):
+    for number in range(100):
+        sender.see(1, number, TELEMETRY)
+        sender.put([arrival(number)])
+    assert len(reader.take(0)) == 200
+    assert reader.dropped == 0
+
+
+def test_a_slow_reader_knows_how_many_records_it_has_lost(sender, reader):
+    for number in range(10_000):
+        sender.put([arrival(number)])
+    got = len(reader.take(0))
+    assert 0 < got < 10_000
+    sender.put([arrival(-1)])
+    assert reader.take(0) == [arrival(-1)]
+    assert got + reader.dropped == 10_000
+
+
+def test_many_records_of_a_period_arrive_in_several_datagrams(sender, reader):
+    texts = [Fault(k, "late", "x" * (SIZE_MAX // 2)) for k in range(4)]
+    sender.put(texts)
+    assert reader.take(0) == texts
+
+
+def test_a_reader_goes_on_with_a_new_process_of_cloud(tmp_path, sender, reader, clock):
+    sender.put([arrival(k) for k in range(9)])
+    assert len(reader.take(0)) == 9
+    sender.close()
+    again = RecordSender(tmp_path)
+    assert reader.take(0) == []
+    again.put([arrival(1)])
+    assert (reader.take(0), reader.dropped) == ([arrival(1)], 0)
+    again.close()
+
+
+def test_without_a_reader_nothing_is_encoded(sender, monkeypatch):
+    monkeypatch.setattr("cloudrc.drivers.readers.to_line", None)
+    sender.see(1, 1, TELEMETRY)
+    sender.put([arrival(1)])
+
+
+def test_a_reader_that_has_ended_is_forgotten(tmp_path, sender, reader, clock):
+    reader.close()
+    sender.put([arrival(1)])
+    clock()
+    sender.put([arrival(2)])
+    assert sender._sent == {}
