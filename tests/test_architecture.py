@@ -63,8 +63,8 @@ MAY_IMPORT: dict[str, set[str]] = {
         *("record", "teleop"),
     },
     "bridges": {
-        *("config", "console", "drivers", "geometry.vectors", "metrics.definitions", "policy"),
-        *("record", "report"),
+        *("config", "console", "drivers", "geometry.vectors", "link", "metrics.definitions"),
+        *("policy", "record", "report"),
     },
     "record": {"endpoint", "files"},
     "metrics": {"metrics.definitions", "record", "config", "geometry", "plugins"},

@@ -1,9 +1,10 @@
-"""Run `cloudrc relay tcp`: the emulated link for TCP connections, without privileges."""
+"""Run `cloudrc relay`: the emulated link for TCP connections, or for a topic of ROS 2."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.output import output_argument, print_line, print_result
@@ -11,9 +12,12 @@ from cloudrc.cli.parser import add_verbs, settings_from, whole_number
 from cloudrc.cli.processes import read_address
 from cloudrc.runs.interrupts import interrupt_on_signals
 
-VERBS = {"tcp": "carry TCP connections to a server over the emulated link"}
+VERBS = {
+    "tcp": "carry TCP connections to a server over the emulated link",
+    "ros": "carry a topic of ROS 2 to another topic over the emulated link",
+}
 """Verb -> its line in the help."""
-EPILOG = """\
+TCP_EPILOG = """\
 example:
   cloudrc relay tcp --listen 127.0.0.1:8001 --to gpu:8000 --link lte
   cloudrc link set downlink.delay_ms=120      (meanwhile, in another terminal)
@@ -29,32 +33,81 @@ It needs no privileges. 'cloudrc link exec' passes every IP packet through the
 link instead, also UDP: use it where it works."""
 
 
+ROS_EPILOG = """\
+examples:
+  cloudrc relay ros --from /odom --to /remote/odom --link lte
+  cloudrc relay ros --from /remote/cmd_vel --to /cmd_vel --link lte --direction downlink
+  cloudrc link set uplink.delay_ms=120      (meanwhile, in another terminal)
+
+Each message is a packet of the link, whatever its type and size. The relay
+waits for a node that publishes --from, and takes its type. Ctrl-C ends the
+relay, and prints what the profile asks for and what was measured.
+
+A subscription that wants RELIABLE hears the relay only with --reliable: then
+ROS repeats what it loses itself, but not what the link loses.
+
+Needs a sourced ROS 2, exit code 3 without it."""
+
+
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    tcp = add_verbs(parser, VERBS)["tcp"]
-    tcp.epilog = EPILOG
+    verbs = add_verbs(parser, VERBS)
+    tcp, ros = verbs["tcp"], verbs["ros"]
+    tcp.epilog, ros.epilog = TCP_EPILOG, ROS_EPILOG
     add = tcp.add_argument
     listen = "where clients connect"
     add("--listen", type=read_address, required=True, metavar="HOST:PORT", help=listen)
     add("--to", type=read_address, required=True, metavar="HOST:PORT", help="the server")
+    _link_arguments(tcp)
+    add = ros.add_argument
+    add("--from", required=True, metavar="TOPIC", dest="source", help="topic to hear")
+    add("--to", required=True, metavar="TOPIC", help="topic to publish")
+    way = "direction of the profile that the messages take (default: uplink)"
+    add("--direction", choices=("uplink", "downlink"), default="uplink", help=way)
+    add("--reliable", action="store_true", help="publish RELIABLE (default: BEST_EFFORT)")
+    _link_arguments(ros)
+    stream = "name of the link; links with one seed and other names draw other numbers"
+    add("--stream", default="", metavar="NAME", help=stream)
+    out = "new folder for link.json and the recording of the messages"
+    add("--out", type=Path, metavar="FOLDER", help=out)
+
+
+def _link_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     add("--link", default="ideal", metavar="PROFILE", help="shipped profile, or a file")
     setting = "change of the profile, such as uplink.loss=0.05; repeatable"
     add("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help=setting)
     add("--seed", type=whole_number(0, 2**53 - 1), default=1, metavar="S", help="seed (default: 1)")
-    output_argument(tcp)
+    output_argument(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Relay connections until a signal; print counts and turns, and return 0."""
+    """Relay until a signal; print what was measured, and return 0."""
     interrupt_on_signals()
+    return _tcp(options) if options.verb == "tcp" else _ros(options)
+
+
+def _tcp(options: argparse.Namespace) -> int:
     from cloudrc.processes.ports import warn_if_exposed
     from cloudrc.runs.links.streams import RelaySettings, relay_tcp
 
     warn_if_exposed(options.listen)
-    settings = settings_from(options, RelaySettings)
-    report = relay_tcp(settings, lambda text: print_line(f"cloudrc: {text}", sys.stderr))
+    report = relay_tcp(settings_from(options, RelaySettings), _tell)
     print_result(options.output, report, _as_text(report))
     return 0
+
+
+def _ros(options: argparse.Namespace) -> int:
+    from cloudrc.runs.links.programs_report import as_text
+    from cloudrc.runs.links.topics import TopicSettings, relay_topic
+
+    report = relay_topic(settings_from(options, TopicSettings), _tell)
+    print_result(options.output, report, as_text(report))
+    return 0
+
+
+def _tell(text: str) -> None:
+    print_line(f"cloudrc: {text}", sys.stderr)
 
 
 def _as_text(report: dict[str, Any]) -> str:

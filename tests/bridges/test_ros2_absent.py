@@ -38,6 +38,18 @@ def test_without_ros_a_flight_is_refused_before_a_folder_is_made(tmp_path, monke
     assert not (tmp_path / "run").exists()
 
 
+def test_a_relay_without_ros_is_refused_before_a_folder_is_made(tmp_path, monkeypatch, capsys):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda name: None if name == "rclpy" else find(name)
+    )
+    words = ["relay", "ros", "--from", "/a", "--to", "/b", "--out", str(tmp_path / "run")]
+    assert main(words) == 3
+    (error,) = capsys.readouterr().err.splitlines()
+    assert error.startswith("cloudrc: error: relay ros needs ROS 2")
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_ros_for_another_python_is_named(tmp_path, monkeypatch):
     (tmp_path / "rclpy").mkdir()
     (tmp_path / "rclpy" / "__init__.py").write_text("raise ImportError('no _rclpy_pybind11')")

@@ -72,8 +72,8 @@ def clash(info: Any, own: QoSProfile, topic: str) -> str:
         return ""
     verb = "publishes" if publishes else "subscribes to"
     return (
-        f"node {name_of(info)} {verb} {topic} with QoS {_in_words(theirs)}, which cannot match "
-        f"cloudrc's {_in_words(own)}"
+        f"node {name_of(info)} {verb} {topic} with QoS {in_words(theirs)}, which cannot match "
+        f"cloudrc's {in_words(own)}"
     )
 
 
@@ -88,5 +88,6 @@ def _matches(offered: Any, wanted: Any) -> bool:
     return bool(is_reliable and is_kept)
 
 
-def _in_words(qos: Any) -> str:
+def in_words(qos: Any) -> str:
+    """Return a QoS as users of ROS write it."""
     return f"{qos.reliability.name}, {qos.durability.name}"

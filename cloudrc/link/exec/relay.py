@@ -10,7 +10,7 @@ import os
 import select
 import time
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
@@ -39,6 +39,22 @@ class PacketLog:
 
     def __len__(self) -> int:
         return len(self.sent)
+
+    def enter(self, sent_ns: int, size: int, arrivals: Sequence[int]) -> None:
+        """Note the next packet, which is due at `arrivals` [ns]."""
+        if len(self.sent) < LOGGED_MAX:
+            self.sent.append(sent_ns)
+            self.size.append(size)
+            self.due.append(min(arrivals) if arrivals else LOST)
+            self.left.append(LOST)
+            self.copies.append(0)
+
+    def leave(self, number: int, now_ns: int) -> None:
+        """Note that a copy of the packet `number` has left."""
+        if number < len(self.copies):
+            if not self.copies[number]:
+                self.left[number] = now_ns
+            self.copies[number] += 1
 
 
 @dataclass(slots=True)
@@ -110,12 +126,7 @@ class TunRelay:
             way.received += 1
             # The model counts the bytes of UDP payload, and adds the headers itself.
             arrivals = send(1, KIND, number, size - HEADER_BYTES, now_ns)
-            if number < LOGGED_MAX:
-                log.sent.append(now_ns)
-                log.size.append(size)
-                log.due.append(min(arrivals) if arrivals else LOST)
-                log.left.append(LOST)
-                log.copies.append(0)
+            log.enter(now_ns, size, arrivals)
             if not arrivals:
                 way.lost += 1
                 continue
@@ -146,8 +157,4 @@ class TunRelay:
                 continue
             way.forwarded += 1
             self.errors.observe(now_ns - due_ns)
-            if number < LOGGED_MAX:
-                log = way.log
-                if not log.copies[number]:
-                    log.left[number] = now_ns
-                log.copies[number] += 1
+            way.log.leave(number, now_ns)

@@ -62,6 +62,11 @@ class ExecLink:
         self._thread = threading.Thread(target=self._work, args=(relay,), daemon=True)
         self._thread.start()
 
+    @property
+    def ways(self) -> Mapping[str, TunWay]:
+        """Direction -> what happened to its packets; empty before `start`."""
+        return self.relay.ways if self.relay else {}
+
     def period(self, name: str) -> Period:
         """Return which packets of a direction followed its present profile."""
         profile, origin_ns = self.live.profiles[name], self.live.origins_ns[name]

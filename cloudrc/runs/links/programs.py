@@ -92,11 +92,16 @@ def run_programs(settings: ExecSettings, tell: Tell) -> tuple[ExecOutcome, ExecL
     return outcome, link
 
 
-def link_folder(output: Path | None, stack: contextlib.ExitStack) -> tuple[Path, str]:
-    """Return a folder for the link's state, and the URL beside whose path its sockets are."""
+def link_folder(
+    output: Path | None, stack: contextlib.ExitStack, flag: str = "-o"
+) -> tuple[Path, str]:
+    """Return a folder for the link's state, and the URL beside whose path its sockets are.
+
+    `flag` is the flag of `output`.
+    """
     base = tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder())
     sockets = Path(stack.enter_context(base))
-    folder = sockets if output is None else new_folder(output, "", flag="-o")
+    folder = sockets if output is None else new_folder(output, "", flag=flag)
     url = f"unix:{sockets}/api.sock"  # as of a run, though nothing listens there
     stack.enter_context(announced(folder, url, LINK))
     return folder, url

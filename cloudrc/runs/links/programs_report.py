@@ -1,4 +1,4 @@
-"""Report on a link between two programs: the verdict on each direction, and a recording."""
+"""Report on a link of other programs: the verdict on each direction, and a recording."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from cloudrc.files import naming
-from cloudrc.link.exec.relay import LOGGED_MAX
-from cloudrc.link.exec.verdict import judge_packets, recording
+from cloudrc.link.exec.relay import LOGGED_MAX, PacketLog
+from cloudrc.link.exec.verdict import Period, judge_packets, recording
 from cloudrc.link.verify.causes import LATE, Findings, ShaperFacts, in_unit
 from cloudrc.link.verify.judge import FEWEST
 from cloudrc.runs.verify import Report, make_report
 from cloudrc.text import table
 
 if TYPE_CHECKING:
-    from cloudrc.runs.links.carrier import ExecLink
+    from cloudrc.runs.links.live import LiveLink
     from cloudrc.runs.links.programs import ExecOutcome, ExecSettings
 
 WAITED = 0.01
@@ -30,12 +30,50 @@ MEANINGS = {
 }
 
 
-def make_exec_report(settings: ExecSettings, outcome: ExecOutcome, link: ExecLink) -> Report:
-    """Judge both directions; return the content of link.json."""
-    assert link.relay is not None
-    judged = {
-        name: judge_packets(way.log, link.period(name)) for name, way in link.relay.ways.items()
+class Carried(Protocol):
+    """What happened to the packets of one direction."""
+
+    log: PacketLog
+    received: int  # number of packets read
+    waited: int  # packets of full batches: how long they waited to be read is not known
+
+
+class CarriedLink(Protocol):
+    """A link that a relay has carried."""
+
+    live: LiveLink
+    seed: int
+
+    @property
+    def ways(self) -> Mapping[str, Carried]:
+        """Direction -> what happened to its packets."""
+
+    @property
+    def unread(self) -> Mapping[str, int]:
+        """Direction -> number of packets that were dropped before the relay has read them."""
+
+    def period(self, name: str) -> Period:
+        """Return which packets of a direction followed its present profile."""
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of packets by outcome, and their lateness [ns]."""
+
+
+def make_exec_report(settings: ExecSettings, outcome: ExecOutcome, link: CarriedLink) -> Report:
+    """Judge the link between two programs; return the content of link.json."""
+    return {
+        **make_link_report(link),
+        "programs": {
+            name: {"command": getattr(settings, name), "exit_code": outcome.codes.get(name)}
+            for name in ("server", "client")
+        },
+        "interrupted": outcome.interrupted,
     }
+
+
+def make_link_report(link: CarriedLink) -> Report:
+    """Judge the directions of a link."""
+    judged = {name: judge_packets(way.log, link.period(name)) for name, way in link.ways.items()}
     late = link.counts().get("release_error_p99_ns", 0) * 1e-9
     findings = {}
     for name, rows in judged.items():
@@ -48,31 +86,24 @@ def make_exec_report(settings: ExecSettings, outcome: ExecOutcome, link: ExecLin
             row["applied"] = row.pop("asked")
             if (value := asked[row["name"]]) == value:
                 row["asked"] = value
-    states = {name: asdict(state) for name, state in link.live.states.items()}
+    states = {name: asdict(link.live.states[name]) for name in link.ways}
     return {
         "schemaVersion": 1,
         **report,
         "seed": link.seed,
-        "programs": {
-            name: {"command": getattr(settings, name), "exit_code": outcome.codes.get(name)}
-            for name in ("server", "client")
-        },
-        "interrupted": outcome.interrupted,
         "counts": link.counts(),
         "states": states,
     }
 
 
-def _packets(link: ExecLink, name: str) -> str:
-    assert link.relay is not None
+def _packets(link: CarriedLink, name: str) -> str:
     first = link.period(name).first
     since = ", since the last change" if first else ""
-    return f"{link.relay.ways[name].received - first} packets{since}"
+    return f"{link.ways[name].received - first} packets{since}"
 
 
-def _facts(link: ExecLink, name: str, late: float) -> ShaperFacts:
-    assert link.relay is not None
-    way, unread = link.relay.ways[name], link.unread[name]
+def _facts(link: CarriedLink, name: str, late: float) -> ShaperFacts:
+    way, unread = link.ways[name], link.unread[name]
     signs = (
         (late > LATE, f"1 % of packets left later than {in_unit(late, 's')}"),
         (way.waited > WAITED * way.received, f"{way.waited} packets waited to be read"),
@@ -106,13 +137,12 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
     return [f"  {row['name']}", *values[:3], f"{values[3]} .. {values[4]}", row["verdict"]]
 
 
-def write_report(folder: Path, report: Report, link: ExecLink) -> None:
+def write_report(folder: Path, report: Report, link: CarriedLink) -> None:
     """Write link.json, and a recording of the packets of each direction."""
     path = folder / "link.json"
     with naming(path):
         path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    assert link.relay is not None
-    for name, way in link.relay.ways.items():
+    for name, way in link.ways.items():
         path = folder / f"{name}.csv"
         with naming(path), path.open("w", encoding="utf-8") as file:
             if way.received > LOGGED_MAX:

@@ -1,0 +1,206 @@
+"""Hand the messages of a topic on to another topic, each one late, lost or doubled as a link does.
+
+Messages cross as raw bytes, so they may have any type. Each one is a packet of the link.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.type_support import check_for_type_support
+
+from cloudrc.bridges.ros2.own_node import LINGERS, OwnNode, clash, in_words, known, name_of
+from cloudrc.errors import BadInputError, MissingPrerequisiteError, to_one_line
+from cloudrc.link.exec.relay import PacketLog
+from cloudrc.link.library import KIND
+from cloudrc.link.model import HEADER_BYTES, LinkDirection
+from cloudrc.link.queue import PacketQueue
+from cloudrc.link.relay import SPIN_NS, ReleaseErrors
+
+DEPTH = 100
+"""Number of messages that ROS keeps until they are read: a burst is no loss of the link."""
+BATCH = 32
+"""Number of messages that the relay reads before it publishes, and the other way round."""
+CAPACITY = 10_000
+"""Largest number of messages on the link; a message beyond that is dropped and counted."""
+LOOK_PERIOD = 0.1
+"""Time between two looks for a publisher [s]."""
+SETTLE = 0.5
+"""Time for the other nodes of the topics after the first publisher is found [s]."""
+PATIENCE = 1.0
+"""Time after which the user is told that there is no publisher [s]: ROS takes time to find one."""
+
+
+def load_messages() -> None:
+    """Load nothing: the type of the messages is known once a node publishes them."""
+
+
+class TopicRelay(OwnNode):
+    """The node between two topics.
+
+    Attributes:
+        source: Full name of the topic that the relay hears.
+        target: Full name of the topic that it publishes.
+        kind: Type of the messages, such as "nav_msgs/msg/Odometry"; "" before `wait`.
+        log: What happened to the messages.
+        received: Number of messages heard.
+        forwarded: Number of messages published, copies included.
+        waited: Number of messages in full batches: how long they waited is not known.
+        errors: How late messages were published.
+        queue: The messages on the link.
+    """
+
+    def __init__(self, source: str, target: str) -> None:
+        """Join ROS; raise a BadInputError if the topics have wrong names, or the same name."""
+        super().__init__(f"cloudrc_relay_{os.getpid()}")
+        self.source, self.target = self._full("--from", source), self._full("--to", target)
+        if self.source == self.target:
+            raise BadInputError(f"--from and --to are both {self.source}: give --to another name")
+        self.kind = ""
+        self.log, self.queue, self.errors = PacketLog(), PacketQueue(CAPACITY), ReleaseErrors()
+        self.received = self.forwarded = self.waited = 0
+        self._waiting = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, self.context.handle)
+
+    def _full(self, flag: str, name: str) -> str:
+        try:
+            return str(self.node.resolve_topic_name(name))
+        except Exception as error:
+            text = to_one_line(str(error)).partition(", at ")[0].rpartition(": ")[2]
+            raise BadInputError(f"{flag} {name}: {text or 'no name of a topic'}") from None
+
+    def wait(self, tell: Callable[[str], None]) -> None:
+        """Wait until a node publishes the source; `tell` gets a word if that takes time.
+
+        Raises:
+            BadInputError: If one of the topics has another type, too.
+        """
+        began, told = time.monotonic(), False
+        while not (infos := self._publishers(self.source)):
+            if not told and time.monotonic() - began > PATIENCE:
+                told = True
+                tell(f"no node publishes {self.source} in {self.domain}: the relay waits for one")
+            time.sleep(LOOK_PERIOD)
+        time.sleep(SETTLE)
+        self.kind = infos[0].topic_type
+        if texts := self._other_types():
+            first = f"node {name_of(infos[0])} publishes {self.source} as {self.kind}"
+            raise BadInputError(f"{first}, but {texts[0]}; {LINGERS}")
+
+    def open(self, link: LinkDirection, *, reliable: bool) -> str:
+        """Begin to hear, with the QoS of the publishers; return the QoS of both topics in words.
+
+        The output is BEST_EFFORT, or RELIABLE if `reliable`.
+
+        Raises:
+            MissingPrerequisiteError: If this ROS does not have the type.
+        """
+        kind, infos = self._load(), self._publishers(self.source)
+        is_reliable = all(i.qos_profile.reliability == ReliabilityPolicy.RELIABLE for i in infos)
+        is_kept = all(i.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for i in infos)
+        heard, sent = (_qos(reliable=one, kept=is_kept) for one in (is_reliable, reliable))
+        self.link, self._type = link, kind
+        self._messages = self.node.create_subscription(
+            kind, self.source, lambda data: None, heard, raw=True
+        )
+        self._publisher = self.node.create_publisher(kind, self.target, sent)
+        return f"{in_words(heard)} in, {in_words(sent)} out"
+
+    def _load(self) -> Any:
+        package, _, name = self.kind.partition("/msg/")
+        try:
+            kind = getattr(importlib.import_module(f"{package}.msg"), name)
+            check_for_type_support(kind)
+        except Exception as error:
+            raise MissingPrerequisiteError(
+                f"{self.source} has the type {self.kind}, which this ROS cannot load: "
+                f"{to_one_line(str(error))}; source the workspace that has {package}"
+            ) from None
+        return kind
+
+    def problems(self) -> list[str]:
+        """Say which nodes do not take part, and which one publishes beside the relay."""
+        found = self._other_types()
+        for info in self._publishers(self.source):
+            found.append(clash(info, self._messages.qos_profile, self.source))
+        for info in self._subscribers():
+            if text := clash(info, self._publisher.qos_profile, self.target):
+                found.append(f"{text}; see --reliable")
+        own = self.node.get_fully_qualified_name()
+        for info in self._publishers(self.target):
+            if name_of(info) != own:
+                found.append(f"node {name_of(info)} publishes {self.target}, too, beside the link")
+        return [text for text in found if text]
+
+    def _other_types(self) -> list[str]:
+        """Name the nodes that use the topics with another type."""
+        return [
+            f"node {name_of(info)} {verb} {topic} as {info.topic_type}"
+            for verb, topic, infos in (
+                ("publishes", self.source, self._publishers(self.source)),
+                ("publishes", self.target, self._publishers(self.target)),
+                ("subscribes to", self.target, self._subscribers()),
+            )
+            for info in infos
+            if info.topic_type != self.kind
+        ]
+
+    def _publishers(self, topic: str) -> list[Any]:
+        return known(self.node.get_publishers_info_by_topic(topic))
+
+    def _subscribers(self) -> list[Any]:
+        return known(self.node.get_subscriptions_info_by_topic(self.target))
+
+    def step(self, timeout: float) -> None:
+        """Wait at most `timeout` [s] until messages arrive or are due; hear and publish them."""
+        due_ns = self.queue.next_ns
+        limit_ns = min(round(timeout * 1e9), due_ns - SPIN_NS - time.monotonic_ns())
+        self._waiting.clear_entities()
+        self._waiting.add_subscription(self._messages.handle)
+        self._waiting.wait(max(0, limit_ns))
+        if due_ns - time.monotonic_ns() <= SPIN_NS:
+            while time.monotonic_ns() < due_ns:
+                pass
+            self._release()
+        self._take_in()
+        self._release()  # messages without delay
+
+    def _take_in(self) -> None:
+        """Read up to `BATCH` messages, and compute when each is due."""
+        link, handle = self.link, self._messages.handle
+        for _ in range(BATCH):
+            with handle:
+                taken = handle.take_message(self._type, True)
+            if taken is None:
+                return
+            data, number, now_ns = taken[0], self.received, time.monotonic_ns()
+            arrivals = link.send(1, KIND, number, len(data), now_ns)
+            if link.corrupts and link.corrupted(1, KIND, number, data) != data:
+                arrivals = ()  # the checksum of UDP does not let it pass
+            self.received += 1
+            self.log.enter(now_ns, len(data) + HEADER_BYTES, arrivals)
+            self.queue.put(number, arrivals, data)
+        self.waited += BATCH
+
+    def _release(self) -> None:
+        """Publish up to `BATCH` messages that are due."""
+        for _ in range(BATCH):
+            now_ns = time.monotonic_ns()
+            if self.queue.next_ns > now_ns:
+                return
+            due_ns, number, data = self.queue.pop()
+            self._publisher.publish(data)
+            self.forwarded += 1
+            self.errors.observe(now_ns - due_ns)
+            self.log.leave(number, now_ns)
+
+
+def _qos(*, reliable: bool, kept: bool) -> QoSProfile:
+    reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE
+    return QoSProfile(depth=DEPTH, reliability=reliability, durability=durability)

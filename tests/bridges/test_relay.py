@@ -1,0 +1,194 @@
+"""`cloudrc relay ros` puts a link between two topics: `make ros2-test` runs these tests."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+import cloudrc.link
+from cloudrc.cli.main import main
+
+pytestmark = [
+    pytest.mark.ros2,
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # of ROS's own packages
+    pytest.mark.skipif(find_spec("rclpy") is None, reason="needs a sourced ROS 2: make ros2-test"),
+]
+if find_spec("rclpy"):
+    from geometry_msgs.msg import Point, Vector3
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+    from cloudrc.bridges.ros2.own_node import OwnNode
+
+    LOSSY = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+    SAFE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+WORDS = ["relay", "ros", "--from", "/odom", "--to", "/remote/odom"]
+PROFILE = {"uplink": {"delay_ms": 70, "jitter_ms": 40, "loss": 0.05, "duplicate": 0.05}}
+PERIOD = 0.005  # between two messages [s]
+
+
+@pytest.fixture(autouse=True)
+def own_domain(monkeypatch):
+    """Keep the tests apart from other nodes of this machine."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(101 + os.getpid() % 100))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+class Robot:
+    """A node that publishes numbered points on /odom, and hears them on /remote/odom."""
+
+    def __init__(self, heard):
+        own = OwnNode("robot")
+        self.node, self.close = own.node, own.close
+        self._publisher = self.node.create_publisher(Point, "/odom", SAFE)
+        self.node.create_subscription(Point, "/remote/odom", self._hear, heard)
+        self._executor = SingleThreadedExecutor(context=own.context)
+        self._executor.add_node(self.node)
+        self.sent, self.ages = {}, {}  # number -> time of sending, ages of the copies [s]
+
+    def _hear(self, point):
+        self.ages.setdefault(point.x, []).append(time.monotonic() - self.sent[point.x])
+
+    def spin(self, seconds):
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def meet(self):
+        """Wait for the relay; its subscription and its publisher may not come at once."""
+        end = time.monotonic() + 30
+        while time.monotonic() < end and not (
+            self._publisher.get_subscription_count() and self.node.count_publishers("/remote/odom")
+        ):
+            self.spin(0.1)
+        self.spin(0.5)
+
+    def publish(self, count):
+        for _ in range(count):
+            number = float(len(self.sent))
+            self.sent[number] = time.monotonic()
+            self._publisher.publish(Point(x=number, y=0.1, z=-1e300))
+            self.spin(PERIOD - (time.monotonic() - self.sent[number]))
+        self.spin(0.5)
+
+
+@contextmanager
+def robot(heard=None):
+    made = Robot(heard or LOSSY)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+class Relay:
+    """The command in a process of its own."""
+
+    def __init__(self, *words):
+        command = [sys.executable, "-m", "cloudrc", *WORDS, "-o", "json", *words]
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+    def end(self):
+        """End the relay; return its report and its words."""
+        self._process.terminate()
+        report, words = self._process.communicate(timeout=60)
+        assert self._process.returncode == 0, words
+        return json.loads(report), words.decode()
+
+
+@contextmanager
+def relay(*words):
+    made = Relay(*words)
+    try:
+        yield made
+    finally:
+        made._process.kill()
+
+
+def distance(found, wanted):
+    """Return the distance of Kolmogorov and Smirnov between two samples."""
+    places = np.concatenate((found, wanted))
+    shares = [np.searchsorted(np.sort(one), places, "right") / len(one) for one in (found, wanted)]
+    return np.max(np.abs(shares[0] - shares[1]))
+
+
+@pytest.mark.smoke
+def test_messages_cross_as_the_profile_and_the_seed_say(tmp_path):
+    profile = tmp_path / "profile.yaml"
+    profile.write_text(json.dumps(PROFILE))
+    words = ["--link", str(profile), "--seed", "5", "--stream", "b", "--out", str(tmp_path / "run")]
+    with robot() as one, relay(*words) as link:
+        one.meet()
+        one.publish(400)
+        report, _ = link.end()
+    up, _ = cloudrc.link.open(PROFILE, 5, stream="b")
+    fates = [up.send(1, number, 24, 0) for number in range(400)]
+    assert {n: len(ages) for n, ages in one.ages.items()} == {
+        float(n): len(fate) for n, fate in enumerate(fates) if fate
+    }
+    expected = up.table(10_000, PERIOD, first=1000)
+    ages = np.array([min(copies) for copies in one.ages.values()])
+    assert distance(ages, expected[np.isfinite(expected)]) < 1.95 / np.sqrt(len(ages))  # .1 %
+    assert (report["verdict"], report["type"]) == ("believed", "geometry_msgs/msg/Point")
+    assert report["counts"]["received"] == 400
+    rows = (tmp_path / "run" / "uplink.csv").read_text().splitlines()
+    assert len(rows) == 401
+    assert json.loads((tmp_path / "run" / "link.json").read_text()) == report
+
+
+def test_link_set_changes_the_messages_to_come(tmp_path):
+    with robot() as one, relay("--out", str(tmp_path / "run")) as link:
+        one.meet()
+        one.publish(20)
+        assert main(["link", "set", "uplink.delay_ms=200", "--run", str(tmp_path / "run")]) == 0
+        one.publish(20)
+        _, words = link.end()
+    ages = [copies[0] for copies in one.ages.values()]
+    assert len(ages) == 40
+    assert np.median(ages[:20]) < 0.1 < 0.2 <= min(ages[20:])
+    assert "the uplink has changed: uplink.delay_ms=200" in words
+
+
+@pytest.mark.parametrize("flags", [[], ["--reliable"]])
+def test_a_subscription_that_wants_reliable_needs_a_flag_and_is_told_so(flags):
+    with robot(SAFE) as one, relay(*flags) as link:
+        one.meet()
+        one.publish(500)
+        _, words = link.end()
+    assert len(one.ages) == (500 if flags else 0)
+    assert ("see --reliable" in words) is not bool(flags)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "text"),
+    [
+        (["--to", "odom"], 2, "--from and --to are both /odom"),
+        (["--to", "1x"], 2, "--to 1x: topic name token must not start with a number"),
+        ([], 2, "but node /other publishes /odom as geometry_msgs/msg/Vector3"),
+        (["--from", "/other"], 2, "but node /robot subscribes to /remote/odom as geometry_msgs"),
+        (["--set", "uplink.loss=2"], 2, "uplink.loss"),
+    ],
+)
+def test_topics_that_cannot_be_relayed_end_the_command_with_one_line(capsys, words, code, text):
+    with robot():
+        other = OwnNode("other")
+        publishers = [other.node.create_publisher(Vector3, name, 1) for name in ("/odom", "/other")]
+        assert len(publishers) == 2
+        assert main([*WORDS, *words]) == code
+        other.close()
+    (error,) = capsys.readouterr().err.splitlines()
+    assert text in error
+
+
+def test_a_type_that_this_ros_cannot_load_is_named(capsys, monkeypatch):
+    with robot():
+        monkeypatch.setitem(sys.modules, "geometry_msgs.msg", None)
+        monkeypatch.setattr("cloudrc.runs.links.topics.require_ros", lambda *words: None)
+        assert main(WORDS) == 3
+    assert "source the workspace that has geometry_msgs" in capsys.readouterr().err
