@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Collection
 from importlib.util import find_spec
 from math import dist
 from typing import Any, NamedTuple
@@ -25,11 +26,11 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from cloudrc.bridges.ros2.health import FlightHealth
-from cloudrc.bridges.ros2.own_node import NEWEST, OwnNode
+from cloudrc.bridges.ros2.own_node import LINGERS, NEWEST, OwnNode
 from cloudrc.bridges.ros2.requests import SERVICES, RosRequests
 from cloudrc.console.steering import Steering
 from cloudrc.drivers.readers import RecordReader
-from cloudrc.messages import GuardState, Telemetry, Vector
+from cloudrc.messages import ZERO, GuardState, Telemetry, Vector
 from cloudrc.record.live import (
     BASE,
     encode_diagnostics,
@@ -95,7 +96,7 @@ class RosBridge(OwnNode):
         self._steering, self._requests = steering, requests
         self._health = FlightHealth()
         self._guard: GuardState | None = None
-        self._trail: list[Vector] = []
+        self._trail: deque[Vector] = deque(maxlen=TRAIL_MAX)
         self._watchers = 0  # subscriptions to the scene
         self._offset_ns = _wall_offset_ns()
         publisher = self.node.create_publisher
@@ -117,8 +118,8 @@ class RosBridge(OwnNode):
             )
         self._ended = False
         self._listener = threading.Thread(target=self._listen, daemon=True)
-        topic = self.node.resolve_topic_name("odom")
-        tell(f"{topic} and more topics in {self.domain}")
+        self._tell, self._told_others = tell, False
+        tell(f"{self._odometry.topic_name} and more topics in {self.domain}")
 
     def run(self, reader: RecordReader, has_ended: Callable[[], bool]) -> None:
         """Publish until `has_ended()` is true."""
@@ -182,9 +183,9 @@ class RosBridge(OwnNode):
         """Add a position to the flown path."""
         moved = dist(position, self._trail[-1]) if self._trail else JUMP
         if moved > JUMP:
-            self._trail = []
+            self._trail.clear()
         if moved > TRAIL_STEP:
-            self._trail = [*self._trail[1 - TRAIL_MAX :], position]
+            self._trail.append(position)
 
     def _publish_rest(self, dropped: int) -> None:
         """Publish health and path, and the scene if somebody new looks at it."""
@@ -200,10 +201,18 @@ class RosBridge(OwnNode):
         if watchers > before:
             self._scene.publish(self._markers)
         if self._path.get_subscription_count():
-            lines = ("flown", self._trail), ("route", self._steering.route, GOAL)
-            shapes = [path_shape(*line) for line in lines if len(line[1]) > 1]
+            flown, route = _line(self._trail), _line(self._steering.route)
+            shapes = [path_shape("flown", flown), path_shape("route", route, GOAL)]
             self._path.publish(encode_markers(0, shapes))
         self._follow_type()
+        self._look_for_others()
+
+    def _look_for_others(self) -> None:
+        """Say it once if another node publishes the odometry, too: nobody could tell them apart."""
+        topic = self._odometry.topic_name
+        if not self._told_others and self.node.count_publishers(topic) > 1:
+            self._told_others = True
+            self._tell(f"another node publishes {topic}: end one, or give --namespace; {LINGERS}")
 
     def _take_commands(self) -> None:
         self._commands = self.node.create_subscription(
@@ -250,6 +259,11 @@ class RosBridge(OwnNode):
             frame, twist = command.header.frame_id, command.twist
         linear = (twist.linear.x, twist.linear.y, twist.linear.z)
         self._requests.drive(frame, linear, twist.angular.z)
+
+
+def _line(points: Collection[Vector]) -> Collection[Vector]:
+    """Return the points of a line; fewer than two become an invisible one, which hides the last."""
+    return points if len(points) > 1 else (ZERO, ZERO)
 
 
 def _wall_offset_ns() -> int:
