@@ -21,7 +21,8 @@ examples:
   cloudrc recover runs/latest/world.mcap
   cloudrc recover torn.mcap --to clean.mcap -o json
 
-exit codes: 0 complete, 1 some data is lost (printed), 2 nothing readable, or still in flight"""
+exit codes: 0 complete, 1 some data is lost (printed), 2 nothing readable, or
+  still in flight"""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -21,7 +21,6 @@ from cloudrc.cli.find_run import run_argument
 from cloudrc.cli.output import print_line
 from cloudrc.cli.processes import CliCommand
 from cloudrc.cli.run import experiment_arguments, fly_once
-from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError, CloudrcError, NothingFlownError
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import MODES, require
@@ -102,6 +101,7 @@ def propose(config: Path) -> tuple[str, str]:
     from cloudrc.config.load import load_experiment, read_experiment
     from cloudrc.config.robot import is_planar
     from cloudrc.config.scene import scene_of
+    from cloudrc.config.shipped import names
 
     world = read_experiment(config, flown=True).world
     x, y, z = scene_of(world).spawn
