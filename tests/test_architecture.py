@@ -128,6 +128,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "fcntl": ("drivers/local", "console/serve", "link/exec/namespace", "runs/lock"),
     "matplotlib": ("report/",),
     "viser": ("console/", "report/replay"),
+    "foxglove": ("processes/foxglove_live",),
     "gymnasium": ("gym/", "eval/episode"),
     "mcap": ("record/",),
     "rosbags": ("record/",),
@@ -155,6 +156,7 @@ ASKED_AS = {
     **dict.fromkeys(("pydantic_core", "annotated_types"), "pydantic"),
     "starlette": "fastapi",
     "urllib3": "kubernetes",
+    "foxglove": "foxglove_sdk",
 }
 
 

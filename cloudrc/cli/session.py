@@ -19,6 +19,7 @@ from typing import IO, Any
 
 from cloudrc.cli.find_run import run_argument
 from cloudrc.cli.output import print_line
+from cloudrc.cli.parser import whole_number
 from cloudrc.cli.processes import CliCommand
 from cloudrc.cli.run import experiment_arguments, fly_once
 from cloudrc.errors import BadInputError, CloudrcError, NothingFlownError
@@ -47,6 +48,7 @@ examples:
   cloudrc up
   cloudrc up hover --set link.profile=wifi
   cloudrc up --console
+  cloudrc up --foxglove                  live in Foxglove
 
 The session takes robot, controller and link from EXPERIMENT. The robot waits on
 the ground until 'cloudrc mission run' or 'cloudrc mission goto' lets it fly. At
@@ -60,6 +62,9 @@ does not end a flight of 'cloudrc run'; that flight ends with its mission."""
 def _up_arguments(parser: argparse.ArgumentParser) -> None:
     experiment_arguments(parser, parser)
     parser.add_argument("--console", action="store_true", help="also open the console's page")
+    about = "serve the flight to Foxglove at this port of 127.0.0.1 (default: 8765)"
+    port = whole_number(1, 65535)
+    parser.add_argument("--foxglove", type=port, nargs="?", const=8765, metavar="PORT", help=about)
     parser.set_defaults(output="table")
 
 
@@ -79,13 +84,17 @@ def _up(options: argparse.Namespace) -> int:
         text = NEXT if is_seen else NEXT_UNSEEN
         say(text.format(api=quote(escape(api)), mission=mission, point=point))
         if options.console:
-            stack.enter_context(_console(folder, say))
+            stack.enter_context(_beside(say, "cloudrc", "console", str(folder)))
+        if options.foxglove:
+            words = str(folder.resolve()), str(options.foxglove)
+            stack.enter_context(_beside(say, "cloudrc.processes.foxglove_live", *words))
 
     from cloudrc.drivers.local import under_way
     from cloudrc.runs.under_way import short
 
     interrupt_on_signals()
-    require("a session", (*MODES["local"], *(["console"] if options.console else [])))
+    more = [name for name in ("console", "foxglove") if getattr(options, name)]
+    require("a session", (*MODES["local"], *more))
     try:
         return fly_once(options, "local", ready)
     except NothingFlownError as nothing:
@@ -114,23 +123,23 @@ def propose(config: Path) -> tuple[str, str]:
 
 
 @contextmanager
-def _console(folder: Path, say: Say) -> Iterator[None]:
-    """Run `cloudrc console` during the `with` block; pass its address or its error to `say`."""
+def _beside(say: Say, *words: str) -> Iterator[None]:
+    """Run a module during the `with` block; pass its address or its error to `say`."""
     from cloudrc.cluster.client import end_process
     from cloudrc.drivers.machine import interpreter
 
     process: subprocess.Popen[Any] = subprocess.Popen(
-        interpreter("-m", "cloudrc", "console", str(folder)),
+        interpreter("-m", *words),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        start_new_session=True,  # Ctrl-C reaches only this process, which ends the console
+        start_new_session=True,  # Ctrl-C reaches only this process, which ends the other
     )
 
     def read(lines: IO[str]) -> None:
         for line in lines:
-            if line.startswith(("console:", "cloudrc:")):
+            if line.startswith(("console:", "cloudrc:", "foxglove:")):
                 say(escape(line.rstrip()))
 
     reader = Thread(target=read, args=[process.stdout], daemon=True)

@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 from cloudrc.drivers.machine import interpreter, usable_cores
 from cloudrc.drivers.namespaces import ProgramEnd
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
-from cloudrc.runs.requirements import EXTRAS, MODES, missing
+from cloudrc.runs.requirements import EXTRAS, MODES, PACKAGES, missing
 from cloudrc.text import Paint, plain, table
 
 FLYING, CLUSTER = ("local", "virtual"), ("cluster",)
@@ -90,8 +90,9 @@ def packages(extra: str) -> Check:
     if absent := missing(extra):
         fix = f"pip install 'cloudrc[{extra}]'"
         return Check(name, "missing", f"no {', '.join(absent)}", fix, modes)
-    versions = [f"{module} {importlib.metadata.version(module)}" for module in EXTRAS[extra]]
-    return Check(name, "ok", ", ".join(versions), "", modes)
+    names = [PACKAGES.get(module, module) for module in EXTRAS[extra]]
+    versions = ", ".join(f"{one} {importlib.metadata.version(one)}" for one in names)
+    return Check(name, "ok", versions, "", modes)
 
 
 def mujoco_steps(found: str) -> Check:

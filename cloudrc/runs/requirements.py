@@ -16,8 +16,11 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "console": ("viser",),
     "policy": ("msgpack", "websockets"),
     "gym": ("gymnasium",),
+    "foxglove": ("foxglove",),
 }
 """Name of an extra in pyproject.toml -> the modules that it installs."""
+PACKAGES = {"foxglove": "foxglove-sdk"}
+"""Module -> its package, where the names differ."""
 MODES: dict[str, tuple[str, ...]] = {
     "local": ("world", "record", "report", "api"),
     "virtual": ("world", "record", "report"),

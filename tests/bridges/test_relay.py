@@ -170,7 +170,7 @@ def test_a_subscription_that_wants_reliable_needs_a_flag_and_is_told_so(flags):
     [
         (["--to", "odom"], 2, "--from and --to are both /odom"),
         (["--to", "1x"], 2, "--to 1x: topic name token must not start with a number"),
-        ([], 2, "but node /other publishes /odom as geometry_msgs/msg/Vector3"),
+        ([], 2, "/other publishes /odom as geometry_msgs/msg/Vector3"),
         (["--from", "/other"], 2, "but node /robot subscribes to /remote/odom as geometry_msgs"),
         (["--set", "uplink.loss=2"], 2, "uplink.loss"),
     ],

@@ -14,6 +14,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+from websockets.sync.client import connect
 
 from cloudrc import assembly
 from cloudrc.cli import session
@@ -22,6 +23,7 @@ from cloudrc.config.setpoints import write_setpoints
 from cloudrc.config.shipped import file_of
 from cloudrc.drivers import local
 from cloudrc.drivers.machine import usable_cores
+from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Start
 from cloudrc.record.columns import Recording
@@ -99,7 +101,7 @@ def test_a_console_is_shown_and_a_missing_one_is_explained(folder, monkeypatch):
     def console(code):
         monkeypatch.setattr("cloudrc.drivers.machine.interpreter", lambda *words: [*PYTHON, code])
         said = []
-        with session._console(folder, said.append):
+        with session._beside(said.append, "cloudrc", "console"):
             wait_until(lambda: said)
         return said
 
@@ -196,6 +198,27 @@ def test_a_session_flies_missions_and_reports_the_last_one(folder, command, figu
     assert len(Recording.read(folder / "s/mission.mcap")["/mission"]["event"]) == 3
     assert list(Recording.read(folder / "s/cloud.mcap")["/mission"]["event"]).count("done") == 2
     assert local.under_way() == {}
+
+
+@pytest.mark.process
+def test_foxglove_sees_the_flight(folder):
+    (port,) = free_ports(1)
+    words = ("--foxglove", str(port))
+    with up(folder, *words) as process:
+        wait_until(lambda: f"foxglove: ws://127.0.0.1:{port}" in (folder / "said").read_text())
+        topics, wanted = {}, {"/tf", "/scene", "/guard", "/delay_estimate", "/uplink_delay"}
+        with connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"]) as client:
+            while wanted:
+                message = client.recv(timeout=20)
+                if isinstance(message, bytes):  # operation, number of the subscription
+                    wanted.discard(topics[int.from_bytes(message[1:5], "little")])
+                    continue
+                for one in json.loads(message).get("channels", []):
+                    topics[one["id"]] = one["topic"]
+                    asked = [{"id": one["id"], "channelId": one["id"]}]
+                    client.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
 
 
 @pytest.mark.process

@@ -1,0 +1,57 @@
+"""Make the messages of a recording from cloud's records during a flight, for Foxglove's layout."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from cloudrc.messages import GuardState
+from cloudrc.record.content import Message
+from cloudrc.record.live import encode_transforms
+from cloudrc.record.ros import encode
+from cloudrc.record.topics import TOPICS, topics_of
+from cloudrc.records import Control, GuardChange, Record, TelemetrySent
+from cloudrc.report.markers import MarkerShape, encode_markers
+
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+REPEAT_NS = 1_000_000_000
+"""Time after which /scene and /guard come again [ns]: a viewer that comes later needs them, too."""
+
+
+class LiveViews:
+    """Converts cloud's records to messages.
+
+    Of the robot, cloud knows what telemetry says: the frame `base_link` is its measured pose.
+    """
+
+    def __init__(self, shapes: Sequence[MarkerShape]) -> None:
+        """Set the bodies of /scene."""
+        self._shapes = shapes
+        self._guard: GuardState | None = None
+        self._repeated_ns = -REPEAT_NS
+
+    def of(self, record: Record) -> Iterator[Message]:
+        """Yield the messages of a record."""
+        for topic in topics_of(record):
+            row = topic.row(record)
+            yield topic.name, row[0], encode(topic, row)
+        if isinstance(record, TelemetrySent):
+            yield from self._of_telemetry(record)
+        elif isinstance(record, Control):
+            frames = {
+                "estimate": (record.position, record.orientation_wxyz),
+                "setpoint": (record.setpoint, LEVEL),
+            }
+            yield "/tf", record.stamp_ns, encode_transforms(record.stamp_ns, frames)
+
+    def _of_telemetry(self, record: TelemetrySent) -> Iterator[Message]:
+        telemetry, stamp_ns = record.telemetry, record.stamp_ns
+        pose = telemetry.odometry.position, telemetry.odometry.orientation_wxyz
+        yield "/tf", stamp_ns, encode_transforms(stamp_ns, {"base_link": pose})
+        repeats = stamp_ns - self._repeated_ns >= REPEAT_NS
+        if repeats or telemetry.guard is not self._guard:
+            self._guard = telemetry.guard
+            guard, change = TOPICS["/guard"], GuardChange(stamp_ns, self._guard, "")
+            yield guard.name, stamp_ns, encode(guard, guard.row(change))
+        if repeats:
+            self._repeated_ns = stamp_ns
+            yield "/scene", stamp_ns, encode_markers(stamp_ns, self._shapes)

@@ -1,0 +1,42 @@
+"""Messages for Foxglove from cloud's records during a flight."""
+
+from rosbags.typesys import Stores, get_typestore
+
+from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
+from cloudrc.record.topics import VIEWS
+from cloudrc.records import Lateness, TelemetrySent
+from cloudrc.report.live_views import REPEAT_NS, LiveViews
+
+STORE = get_typestore(Stores.ROS2_KILTED)
+
+
+def sent(stamp_ns, guard):
+    pose = Odometry(stamp_ns, (1.0, 2.0, 3.0), UPRIGHT, ZERO, ZERO)
+    return TelemetrySent(stamp_ns, 1, 1, Telemetry(stamp_ns, pose, (), -1, 0, 0, 0, guard))
+
+
+def topics(views, record):
+    return [topic for topic, _, _ in views.of(record)]
+
+
+def test_telemetry_moves_the_robot_and_shows_the_guard():
+    views = LiveViews([])
+    found = {topic: data for topic, _, data in views.of(sent(5, GuardState.GROUND))}
+    assert found.keys() == {"/odometry", "/telemetry", "/tf", "/guard", "/scene"}
+    (frame,) = STORE.deserialize_cdr(found["/tf"], VIEWS["/tf"]).transforms
+    place = frame.transform.translation
+    assert (frame.child_frame_id, place.x, place.y, place.z) == ("base_link", 1.0, 2.0, 3.0)
+
+
+def test_the_guard_comes_at_a_change_and_with_the_scene_once_a_second():
+    views = LiveViews([])
+    list(views.of(sent(0, GuardState.GROUND)))
+    assert "/guard" not in topics(views, sent(10, GuardState.GROUND))
+    changed = topics(views, sent(20, GuardState.TRACK))
+    assert ("/guard" in changed, "/scene" in changed) == (True, False)
+    assert {"/guard", "/scene"} <= set(topics(views, sent(REPEAT_NS, GuardState.TRACK)))
+
+
+def test_another_record_of_cloud_is_its_topic():
+    (message,) = LiveViews([]).of(Lateness(7, "cloud", 0.1, 0.2, 0))
+    assert message[:2] == ("/lateness", 7)
