@@ -16,6 +16,7 @@ which alone a caller reaches what the file of a plug-in defines.
 
 from __future__ import annotations
 
+import ast
 import difflib
 import importlib
 import inspect
@@ -29,6 +30,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from numbers import Real
 from pathlib import Path
 from types import CodeType, FrameType, ModuleType
@@ -196,7 +198,15 @@ def _packages(entry: EntryPoint) -> Iterator[str]:
 
 
 def describe(kind: str, name: str) -> str:
-    """Return the first line of a plug-in's docstring, or why the plug-in cannot be loaded."""
+    """Return the first line of a plug-in's docstring, or why the plug-in cannot be loaded.
+
+    A plug-in of cloudrc is read, not imported: an onboard controller would import MuJoCo.
+    """
+    is_shipped = name in _shipped(kind)
+    module = f"{PACKAGES[kind]}.{name}" if is_shipped else is_path(name) and _module_of(Path(name))
+    if module and (spec := find_spec(module)) is not None and spec.origin is not None:
+        tree = ast.parse(Path(spec.origin).read_text("utf-8"))
+        return (ast.get_docstring(tree) or "").partition("\n")[0]
     try:
         return find(kind, name).doc
     except CloudrcError as error:

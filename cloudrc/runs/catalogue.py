@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 
 from cloudrc.errors import CloudrcError
 from cloudrc.text import Paint, plain, table
 
-PLUGINS = ("estimators", "predictors", "controllers", "metrics")
+PLUGINS = ("estimators", "predictors", "controllers", "onboard", "metrics")
 YAML = ("experiments", "missions", "profiles", "robots")
 XML = ("scenes",)
 KINDS = (*YAML, *PLUGINS, *XML)
@@ -31,13 +32,26 @@ def describe_all(kind: str) -> dict[str, str]:
             from cloudrc.metrics import SHIPPED
 
             lines |= {metric.name: metric.meaning for metric in SHIPPED.values()}
+        elif kind == "onboard":
+            lines |= _onboard_of_robots()
     else:
         describe = shipped.describe if kind in YAML else _comment
         lines = {name: describe(one, name) for name in shipped.names(one)}
     # Remove the kind from a docstring such as "Predictor: trusts a share of the velocity."
-    prefix = re.compile(rf"^[^:]*\b{one}: ", re.IGNORECASE)
+    prefix = re.compile(rf"^[^:]*\b{one}( controller)?: ", re.IGNORECASE)
     found = {name: prefix.split(line, maxsplit=1)[-1] for name, line in sorted(lines.items())}
     return {name: line[:1].upper() + line[1:].rstrip(".") for name, line in found.items()}
+
+
+def _onboard_of_robots() -> dict[str, str]:
+    """Describe the onboard controllers that are files of a shipped robot, such as the Pelican's."""
+    from cloudrc import plugins
+    from cloudrc.config import shipped
+    from cloudrc.config.robot import find_robot
+
+    controllers = [find_robot(robot).onboard for robot in shipped.names("robot")]
+    files = [each.name for each in controllers if each is not None and plugins.is_path(each.name)]
+    return {"/".join(Path(file).parts[-2:]): plugins.describe("onboard", file) for file in files}
 
 
 def _comment(kind: str, name: str) -> str:

@@ -30,6 +30,15 @@ def test_help_imports_nothing_heavy(command):
     assert subprocess.run(words, capture_output=True, text=True).stderr.strip() == "[]"
 
 
+def test_the_list_names_all_onboard_controllers_without_physics():
+    words = [sys.executable, "-c", QUIET, "list"]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert "mujoco" not in done.stderr
+    (section,) = [each for each in done.stdout.split("\n\n") if each.startswith("onboard\n")]
+    names = [line.split()[0] for line in section.splitlines()[1:]]
+    assert names == ["diff_drive", "multirotor", "pelican/onboard.py"]
+
+
 @pytest.mark.parametrize("command", ["", *COMMANDS, *(f"link {verb}" for verb in VERBS)])
 def test_help_fits_80_columns(command, capsys):
     with pytest.raises(SystemExit) as end:
