@@ -139,3 +139,25 @@ def test_values_of_an_axis_are_paired_over_the_others(tmp_path):
 def test_values_that_make_no_pairs_are_refused(sides, tmp_path):
     with pytest.raises(BadInputError, match=r"must be two values of one axis.*delay_ms: 20, 5"):
         of_sweep(sweep(tmp_path / "s"), *sides)
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """Keep the figures that are drawn instead of saving them."""
+    kept = []
+    monkeypatch.setattr("cloudrc.report.figures.bands.save", lambda figure, _: kept.append(figure))
+    return kept
+
+
+def test_no_two_of_nine_lines_look_the_same(figures):
+    draw_sweep([row({"delay": d, "predictor": str(n)}, 1) for d in (1, 2) for n in range(9)], UNITS)
+    handles, names = figures[0].axes[0].get_legend_handles_labels()
+    looks = {(line.get_color(), line.get_marker()) for line in handles}
+    assert (len(names), len(looks)) == (9, 9)
+
+
+@pytest.mark.parametrize(("ending", "is_slanted"), [("", False), ("_acceleration", True)])
+def test_names_along_x_are_slanted_if_they_would_lie_over_each_other(figures, ending, is_slanted):
+    draw_sweep([row({"predictor": f"p{n}{ending}"}, 1) for n in range(7)], UNITS)
+    turns = {label.get_rotation() for label in figures[0].axes[-1].get_xticklabels()}
+    assert [turn > 0 for turn in turns] == [is_slanted]

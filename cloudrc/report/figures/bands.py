@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import radians, sin
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,11 +15,12 @@ from cloudrc.report.figures.style import Look, new_figure, panel
 
 UNITS = {"ms": "ms", "s": "s", "m": "m", "mps": "m/s", "kbit": "kbit/s", "deg": "deg"}
 """Suffix of a configuration key -> unit."""
-LOOKS = (
-    *((style.BLUE, "o", "-"), (style.VERMILION, "s", "--"), (style.GREEN, "^", "-.")),
-    *((style.PURPLE, "D", ":"), (style.ORANGE, "v", "-"), (style.BLACK, "P", "--")),
-)
-"""Colour, marker and dashes of each line."""
+_FIRST = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE)
+COLOURS = (*_FIRST, style.ORANGE, style.BLACK, style.SKY)
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+DASHES = ("-", "--", "-.", ":")
+"""Lines take them in turn. The counts of colours and markers have no common factor: only after 56
+lines does a pair of both come again."""
 
 
 class Point(NamedTuple):
@@ -49,14 +51,16 @@ def draw(
     line). With `x_names`, the x axis has names instead of numbers, and no line joins the points.
     """
     with own_settings(look):
-        figure = new_figure(0.7 + 1.3 * len(panels), look.width)
+        slant, rise = _slant(x_names, look)
+        figure = new_figure(0.7 + rise + 1.3 * len(panels), look.width)
         column = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
         for n, (axes, each) in enumerate(zip(column, panels, strict=True)):
             _draw_panel(axes, each, named=bool(x_names))
             panel(axes, chr(ord("a") + n), each.title + f" ({each.unit})" * bool(each.unit))
         column[-1].set_xlabel(_label(x))
         if x_names:
-            column[-1].set_xticks(range(len(x_names)), x_names)
+            turned = {"rotation": slant, "ha": "right", "rotation_mode": "anchor"} if slant else {}
+            column[-1].set_xticks(range(len(x_names)), x_names, **turned)
             column[-1].set_xlim(-0.5, len(x_names) - 0.5)
         if by:
             lines = column[0].get_legend_handles_labels()
@@ -65,13 +69,25 @@ def draw(
         return {kind: save(figure, kind) for kind in ("pdf", "png", "svg")}
 
 
+def _slant(names: Sequence[str], look: Look) -> tuple[float, float]:
+    """Return the angle of the names along x [deg], and the height that they need for it [in].
+
+    It is 0 if the names have room beside each other.
+    """
+    letter = 0.5 * (look.font_size - 1.0) / 72.0  # mean width of a letter [in]
+    longest = letter * max(map(len, names), default=0)
+    if longest * len(names) < 0.8 * look.width:  # the rest is the y axis and the gaps
+        return 0.0, 0.0
+    return 35.0, longest * sin(radians(35.0))
+
+
 def _draw_panel(axes: Axes, content: Panel, *, named: bool) -> None:
     for index, (name, points) in enumerate(content.lines.items()):
-        colour, marker, dashes = LOOKS[index % len(LOOKS)]
+        colour, marker, dashes = (each[index % len(each)] for each in (COLOURS, MARKERS, DASHES))
         look: dict[str, Any] = {"color": colour, "marker": marker, "ms": 4}
         x, middle, low, high, failed = np.array(points, dtype=float).T
         if named:  # side by side, so that no marker hides another
-            x = x + (index - (len(content.lines) - 1) / 2) * 0.12
+            x = x + (index - (len(content.lines) - 1) / 2) * min(0.12, 0.9 / len(content.lines))
             bars = (middle - low, high - middle)
             axes.errorbar(x, middle, bars, ls="none", capsize=2, label=name, **look)
         else:
