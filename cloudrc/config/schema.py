@@ -234,6 +234,7 @@ NameOr = Annotated[
 
 YAW_TOLERANCE_DEG = 5.0
 """Default of yaw_tolerance_deg of a waypoint [deg]."""
+Yaw = Annotated[float, Field(ge=-360, le=360)]
 YawTolerance = Annotated[float, Field(gt=0, le=180)]
 
 
@@ -243,7 +244,7 @@ class Waypoint(Section):
     position_m: Place
     """Position of the base [m], world frame; two numbers for a robot that stays on the ground. The
     guard must allow the point and the straight line to it, and both must be clear of obstacles"""
-    yaw_deg: Finite | None = None
+    yaw_deg: Yaw | None = None
     """Heading of the robot at the point [deg], counter-clockwise from the x axis. The robot turns
     the shorter way around, while it flies there. Only for a robot that obeys a yaw, see heading in
     robot.yaml. null: the robot keeps its heading"""

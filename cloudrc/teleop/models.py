@@ -26,6 +26,7 @@ from cloudrc.config.schema import (
     TimeLimit,
     Touch,
     Waypoint,
+    Yaw,
 )
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import Spheres
@@ -69,7 +70,7 @@ class GoToRequest(Section):
     """Order to fly to a point."""
 
     position_m: Place = Field(description="Base position [m], world frame")
-    yaw_deg: Finite | None = Field(
+    yaw_deg: Yaw | None = Field(
         None, description="Heading there [deg], for a robot that obeys a yaw; null: any"
     )
 

@@ -34,7 +34,9 @@ def flown(robot, point=(0, 0, 1), **keys):
         ("rover", (1, 0), {"yaw_deg": 0}, "0: the heading of this robot follows its velocity"),
         ("x2", (0, 0, 1), {"yaw_tolerance_deg": 3}, "3: is the tolerance of yaw_deg; give"),
         ("x2", (0, 0, 1), {"yaw_deg": 9, "yaw_tolerance_deg": 0}, "must be a number > 0"),
-        ("x2", (0, 0, 1), {"yaw_deg": "north"}, "must be a number or null"),
+        ("x2", (0, 0, 1), {"yaw_deg": "north"}, "must be a number >= -360 and <= 360 or null"),
+        ("x2", (0, 0, 1), {"yaw_deg": 1e9}, "must be a number >= -360 and <= 360 or null"),
+        ("x2", (0, 0, 1), {"yaw_deg": -360.5}, "must be a number >= -360 and <= 360 or null"),
     ],
 )
 def test_a_yaw_that_the_robot_does_not_obey_is_refused_in_one_line(robot, point, keys, message):
@@ -103,6 +105,8 @@ def test_teleop_takes_and_refuses_yaws_as_a_mission_does():
     assert read_order(order, SCENE, size, plan=plan).plan.legs[0].yaw == radians(90)
     assert read_goto(goto, SCENE, size).yaw == radians(90)
     assert read_goto(b'{"position_m": [0, 0, 1]}', SCENE, size).yaw is None
+    with pytest.raises(RefusedError, match=r"^yaw_deg: .*must be a number >= -360 and <= 360"):
+        read_goto(goto.replace(b"90", b"361"), SCENE, size)
     with pytest.raises(RefusedError, match=r"^yaw_deg: 90: the onboard controller"):
         read_goto(goto, SCENE, size, heading="fixed")
     with pytest.raises(RefusedError, match=r"waypoints.0.yaw_deg: 90: the heading"):
