@@ -576,7 +576,8 @@ CHANGEABLE_KEYS = ChangeConfig.model_fields.keys() - {"at_s"}
 """Keys of a direction that an entry of its list `changes` may set."""
 TIME_LINE_KEYS = ("changes", "trace", "blackouts")
 """Keys of a direction that make up its time line: how the link's conditions change over time."""
-_EXAMPLE = "for example downlink.delay_ms=120, or --profile handover"
+_SETTING = "downlink.delay_ms=120"
+_EXAMPLE = f"for example {_SETTING}, or --profile handover"
 
 
 class Edit(NamedTuple):
@@ -610,7 +611,7 @@ def edit_profile(
                 "guard keeps the limit that it started with, so the robot may hold"
             )
     changes: Settings = {}
-    for path, setting in overrides.parse_settings(settings, command).items():
+    for path, setting in overrides.parse_settings(settings, command, _SETTING).items():
         way, *keys = path[1:] if path[0] == "link" else path
         if not keys or way not in DIRECTIONS:
             raise BadInputError(f"{'.'.join(path)}: set a key of uplink or downlink, {_EXAMPLE}")

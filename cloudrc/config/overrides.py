@@ -104,16 +104,18 @@ def _directions(path: KeyPath) -> list[KeyPath]:
     return [(*path[:at], way, *path[at + 1 :]) for way in ("uplink", "downlink")]
 
 
-def parse_settings(texts: Iterable[str], label: str = "--set") -> Settings:
+def parse_settings(
+    texts: Iterable[str], label: str = "--set", example: str = "link.both.delay_ms=40"
+) -> Settings:
     """Parse texts `key=value`; a relative path in a value starts at the working folder.
 
-    Raise a BadInputError for a text of another form; its message begins with `label`.
+    Raise a BadInputError for a text of another form; its message begins with `label` and
+    ends with an `example` of the right form.
     """
     given, source = list[tuple[str, Any, Source]](), Source(label, Path.cwd())
     for text in texts:
         key, equals, value = text.partition("=")
         if not equals:
-            example = "link.both.delay_ms=40"
             raise BadInputError(f"{label} {text}: must be key=value; for example {example}")
         given.append((key, parse_value(value, f"{label} {key}"), source))
     return collect_settings(given)

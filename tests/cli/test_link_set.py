@@ -81,6 +81,7 @@ def test_a_profile_takes_the_place_of_all_values():
         ([], "nothing to set"),
         (["delay_ms=3"], "delay_ms: set a key of uplink or downlink"),
         (["uplink.delay=3"], "delay_ms"),
+        (["loss"], r"must be key=value; for example downlink\.delay_ms=120$"),
         (["uplink.loss=1.5"], "link set: uplink.loss: 1.5"),
     ],
 )
