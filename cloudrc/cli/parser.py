@@ -65,7 +65,7 @@ KUBECTL_PLUGIN = "kubectl-cloudrc"
 COUNT_MAX = 10_000
 """Largest number of repeats, seeds or processes that a flag accepts."""
 
-ABOUT = "Fly a simulated drone from a simulated cloud, over an emulated network."
+ABOUT = "Control a simulated robot from a simulated cloud, over an emulated network."
 EXAMPLES = """\
 examples:
   cloudrc run                          the paper's mission in real time
