@@ -310,11 +310,13 @@ class File:
             self._see_what_follows()
 
     def _has_all(self, kinds: Counter[type]) -> bool:
-        """Return whether all that the index counts was read, and the head; `kinds`: of records."""
+        """Return whether all that the index counts was read; `kinds`: of records.
+
+        The header may be damaged, since a copy gets its own.
+        """
         counts = self.statistics
         return (
             counts is not None
-            and kinds[mcap.Header] > 0
             and self._is_counted()
             and kinds[mcap.Attachment] >= counts.attachment_count
             and kinds[mcap.Metadata] >= counts.metadata_count
