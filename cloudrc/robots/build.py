@@ -15,15 +15,16 @@ from cloudrc.config.load import ResolvedGuard
 from cloudrc.config.overrides import BRAKING, build_plugin, check_plugin, default_parameters
 from cloudrc.config.problems import ConfigProblem, ProblemsError
 from cloudrc.config.robot import GENERAL, RobotFiles, find_robot, parameters
-from cloudrc.config.scene import steered_in
+from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.config.schema import PlugIn, World
 from cloudrc.config.shipped import ROBOT_FILE, file_of
 from cloudrc.errors import BadInputError
+from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import ZERO, Vector
 from cloudrc.robots.onboard._airframe import thrust_to_weight
 from cloudrc.world.accelerated import AcceleratedRobot
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.onboard import Accelerator, Actuators, Direct, Onboard
+from cloudrc.world.onboard import Accelerator, Actuators, Commands, Direct, Onboard
 from cloudrc.world.own_sensors import OwnSensor, find_sensors
 from cloudrc.world.plant import Wind
 from cloudrc.world.robot import STEP, Robot
@@ -33,6 +34,10 @@ from cloudrc.world.watched import WatchedActuators, WatchedOnboard
 
 KIND = "onboard"
 """Kind of plug-in."""
+REST_ERROR_MAX = 0.005
+"""Largest distance of a planar robot at rest from the height of the spawn [m]."""
+SETTLING = 1.0
+"""Time in which a planar robot comes to rest on the ground [s]."""
 THRUST_TO_WEIGHT_MIN = 1.5
 """Smallest ratio of the largest thrust to the weight [1]: a tilted robot still climbs."""
 
@@ -174,6 +179,9 @@ def _make_parts(world: World) -> Parts:
         _check_lift(world, where, true)
     actuators = _build_actuators(plugin, nominal, parameters(robot, world))
     _check_onboard(choice.name, onboard, nominal.nu if isinstance(actuators, Direct) else None)
+    if robot.planar:
+        stopped = onboard.stopped if isinstance(actuators, Direct) else (0.0,) * true.nu
+        _check_rest(world, where, true, stopped)
     if world.wind.blows and isinstance(actuators, Direct):
         _refuse_wind(world, plugin)
     try:
@@ -237,6 +245,27 @@ def _problem(world: World, path: KeyPath, reason: str) -> ConfigProblem:
     else:
         key, place = "robot", ("onboard", *path)
     return ConfigProblem(("world", key), "", f"{file}: {'.'.join(place)}: {reason}")
+
+
+def _check_rest(world: World, where: str, model: Any, stopped: Commands) -> None:
+    """Raise a BadInputError if a planar robot does not stand at the height of the spawn.
+
+    Missions have this height, and the robot cannot change it. `model` is the compiled `MjModel`,
+    `stopped` the commands of the robot at rest.
+    """
+    data = mujoco.MjData(model)
+    data.ctrl[:] = stopped
+    mujoco.mj_step(model, data, round(SETTLING / STEP))
+    base, spawn = float(data.qpos[2]), scene_of(world).spawn[2]
+    if abs(base - spawn) <= REST_ERROR_MAX:
+        return
+    move = f"{abs(base - spawn):.3f} m {'down' if base < spawn else 'up'}"
+    reason = (
+        f"the base of {world.robot} rests at a height of {base:.3f} m, but the spawn of the "
+        f"scene {world.scene} is at {spawn:.3f} m: move all parts inside the base {move}, or "
+        "set this height in the frame spawn of a scene of your own"
+    )
+    raise ProblemsError([ConfigProblem(("world", "robot"), where, reason)])
 
 
 def _check_lift(world: World, where: str, model: Any) -> None:

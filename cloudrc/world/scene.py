@@ -16,7 +16,7 @@ from cloudrc.config.problems import ConfigProblem, ProblemsError
 from cloudrc.config.schema import Plant
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.compiled import compile_error, mujoco, read_scene
-from cloudrc.geometry.scene import WORLD
+from cloudrc.geometry.scene import FLOOR, WORLD
 from cloudrc.world.plant import Array, Inertia, point_inertia, true_inertia
 
 ROBOT_PREFIX = "robot/"
@@ -31,12 +31,16 @@ NEEDED = {
 fly through walls."""
 MARGIN_MAX = 0.001
 """Largest distance at which a contact may push [m]: below the accuracy of a clearance."""
+INSIDE_MAX = 0.001
+"""Largest depth by which a robot may start inside the floor [m]; the floor pushes it out gently."""
 FUSES_WRONG = tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 11)
 """Whether MuJoCo computes a wrong inertia when it fuses static bodies, as it does up to 3.10."""
 
 
 def compile_model(robot: Path, scene: Path) -> Any:
     """Attach the robot to the scene's frame `spawn` and compile both into an `MjModel`.
+
+    A robot that would be inside the floor there starts higher, on the floor.
 
     `robot` and `scene` are MJCF files. In the result, names of the robot begin with `robot/`. The
     robot may have joints of its own, such as those of wheels; its free joint comes first. Static
@@ -111,9 +115,29 @@ def _compile(
         with warnings.catch_warnings():
             # Sizes in the robot's file, which the scene's replace.
             warnings.filterwarnings("ignore", "Attach conflict")
-            return spec.compile()
+            model = spec.compile()
     except (ValueError, KeyError) as error:
         raise compile_error(f"{robot_path} in {scene_path}", error) from None
+    _put_on_floor(model)
+    return model
+
+
+def _put_on_floor(model: Any) -> None:
+    """Raise the start of a robot that reaches further down than the spawn is above the floor."""
+    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+        return
+    bodies, data = bodies_of_geoms(model), mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_collision(model, data)
+    depths = [
+        -contact.dist
+        for contact in data.contact
+        if {bodies[geom] for geom in contact.geom.tolist()} == {"", FLOOR}
+    ]
+    depth = max(depths, default=0.0)
+    if depth > INSIDE_MAX:
+        model.qpos0[2] += depth
+        model.body_pos[model.jnt_bodyid[0], 2] += depth
 
 
 def _take_options(robot: Any, scene: Any) -> None:

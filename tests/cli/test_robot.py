@@ -1,6 +1,7 @@
 """`cloudrc new robot` and `cloudrc robot check`."""
 
 import json
+import shutil
 import subprocess
 import sys
 
@@ -8,6 +9,7 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
+from cloudrc.config.shipped import FOLDERS
 from cloudrc.geometry.compiled import odd_inertias
 from cloudrc.warnings import advise
 
@@ -67,6 +69,28 @@ def test_the_wheel_of_a_robot_with_a_wrong_inertia_is_named(mine):
     replace(mine / "robot.xml", '<body name="back_right"', text + '<body name="back_right"')
     (told,) = odd_inertias(mine / "robot.xml")
     assert "body wheel: an inertia of 0.1 kg m^2 does not fit 0.1 kg" in told
+
+
+@pytest.fixture
+def wheeled(tmp_path):
+    return shutil.copytree(FOLDERS["robot"] / "rover", tmp_path / "wheeled")
+
+
+@pytest.mark.parametrize(
+    ("size", "caster", "rests"), [(".25", "-.2", "0.2"), (".03", "-.02", "0.050")]
+)
+def test_a_planar_robot_that_does_not_rest_at_the_height_of_the_spawn_is_refused(
+    wheeled, capsys, tmp_path, size, caster, rests
+):
+    replace(wheeled / "robot.xml", 'size=".08 .01"', f'size="{size} .01"')
+    replace(wheeled / "robot.xml", 'pos="-.2 0 -.07"', f'pos="-.2 0 {caster}"')
+    run = ["run", "pillars", "--mode", "virtual", "--set", f"world.robot={wheeled}"]
+    for command in (["robot", "check", str(wheeled)], [*run, "--out", str(tmp_path / "run")]):
+        assert main(command) == 2
+        error = capsys.readouterr().err
+        assert f"rests at a height of {rests}" in error
+        assert "is at 0.100 m" in error
+        assert error.count("\n") == 1
 
 
 def test_a_folder_with_files_stays_as_it_is(mine, capsys):

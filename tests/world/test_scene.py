@@ -10,14 +10,14 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.config.robot import find_robot
-from cloudrc.config.schema import World
+from cloudrc.config.schema import Plant, World
 from cloudrc.config.shipped import file_of, names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError, OutOfMemoryError
 from cloudrc.geometry.compiled import import_mujoco, mujoco, read_bodies
 from cloudrc.geometry.scene import load_scene
 from cloudrc.robots.build import check_robot
 from cloudrc.robots.pelican.rotors import STOPPED
-from cloudrc.world.scene import bodies_of_geoms
+from cloudrc.world.scene import bodies_of_geoms, compile_model, compile_true
 from tests.world.conftest import model_of, simulate
 
 SHIPPED = {"robot": "pelican", "scene": "empty"}
@@ -36,6 +36,25 @@ def test_every_robot_compiles_in_every_scene(robot, scene, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     assert model_of(robot, scene).opt.timestep == 0.002
     assert not list(tmp_path.iterdir()), "MuJoCo wrote a log"
+
+
+@pytest.mark.parametrize(
+    "floor", ['type="plane" size="20 20 1"', 'type="box" size="9 9 1" pos="0 0 -1"']
+)
+@pytest.mark.parametrize("plant", [None, Plant(mass_factor=1.1)])
+@pytest.mark.parametrize(("leg", "start"), [(0.05, 0.1), (0.1, 0.1), (0.15, 0.15), (0.4, 0.4)])
+def test_a_robot_with_long_legs_starts_on_the_floor(tmp_path, floor, plant, leg, start):
+    robot, scene = tmp_path / "robot.xml", tmp_path / "scene.xml"
+    legs = f'<geom type="capsule" size=".01" fromto=".2 0 0 .2 0 {0.01 - leg}"/>'
+    robot.write_text(
+        f"""<mujoco><worldbody><body><freejoint/><geom size=".04"/>{legs}<site name="up"/></body>
+        </worldbody><actuator><motor site="up" gear="0 0 1 0 0 0"/></actuator></mujoco>"""
+    )
+    text = FILES["scene"].read_text()
+    assert 'type="plane" size="20 20 1"' in text
+    scene.write_text(text.replace('type="plane" size="20 20 1"', floor))
+    model = compile_true(robot, scene, compile_model(robot, scene), plant or Plant())
+    assert model.qpos0[:3] == pytest.approx([0, 0, start], abs=1e-6)
 
 
 @pytest.mark.parametrize("pipe", load_scene("pipes").tubes, ids=lambda pipe: pipe.name)
@@ -190,7 +209,7 @@ def test_a_lack_of_memory_is_no_error_of_the_files(tmp_path, monkeypatch, text):
 
 
 FLIES = """
-from cloudrc.config.schema import World
+from cloudrc.config.schema import Plant, World
 from cloudrc.robots.build import check_robot
 
 check_robot(World())
