@@ -60,9 +60,14 @@ def check_robot(world: World, *, turns: bool = False) -> None:
     """
     build_robot(world, ResolvedGuard.model_validate({}))
     advise(world, ZERO)
-    if turns and not getattr(_make_parts(world).onboard, "obeys_yaw", True):
+    if turns and not obeys_yaw(world):
         reason = f"the onboard controller of {world.robot} does not obey a yaw; leave yaw_deg out"
         raise ProblemsError([ConfigProblem(("mission", "waypoints"), "", reason)])
+
+
+def obeys_yaw(world: World) -> bool:
+    """Return whether the onboard controller of a robot follows a yaw rate."""
+    return bool(getattr(_make_parts(world).onboard, "obeys_yaw", True))
 
 
 def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -> Robot:

@@ -1,13 +1,14 @@
 """Check a robot: read its facts from the compiled model, and move it in virtual time.
 
 The robot moves without a network, a cloud and a guard: it stands or hovers, follows a step of the
-velocity, brakes, and turns if its heading is free.
+velocity, brakes, and turns: if its heading is free, at a yaw rate; if its heading follows its
+velocity, towards a velocity to its left.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from math import atan2, dist, hypot, remainder, tau
+from math import atan2, cos, dist, hypot, remainder, sin, tau
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +24,14 @@ from cloudrc.geometry.compiled import reach_of
 from cloudrc.geometry.shapes import Surface
 from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Vector
-from cloudrc.robots.build import advise, build_robot, check_robot, controller, onboard_values
+from cloudrc.robots.build import (
+    advise,
+    build_robot,
+    check_robot,
+    controller,
+    obeys_yaw,
+    onboard_values,
+)
 from cloudrc.robots.onboard._airframe import thrust_to_weight
 from cloudrc.text import table
 from cloudrc.world.guard.limits import REACTION
@@ -65,6 +73,7 @@ class CheckFlight(NamedTuple):
     braking: float  # least deceleration that explains the braking distance [m/s^2]
     rest: float  # speed at the end of braking [m/s]
     turned: float | None  # part of the turn that it did [1]; None: its heading is not free
+    aside: float | None  # part of a velocity to its side [1]; None: its heading is another
 
 
 def check(name: str) -> tuple[dict[str, Any], list[str]]:
@@ -98,10 +107,11 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
         "step_reached": motion.reached,
         "braking_measured_mps2": motion.braking,
         **({} if motion.turned is None else {"turn_reached": motion.turned}),
+        **({} if motion.aside is None else {"side_reached": motion.aside}),
     }
     if body.simulator.data.warning.number[DIVERGED : DIVERGED + 3].any():
         return facts, [*changes, "the simulation diverged: check masses and inertias of the model"]
-    return facts, changes + _judge(robot, motion)
+    return facts, changes + _judge(robot, motion, obeys=obeys_yaw(world))
 
 
 def read_surfaces(name: str) -> tuple[Surface, ...]:
@@ -145,7 +155,7 @@ def _judge_tunings(robot: RobotFiles, world: World) -> Iterator[str]:
 
 
 def _move(body: Robot, robot: RobotFiles) -> CheckFlight:
-    """Let the robot hover or stand, follow a step along x, brake, and turn."""
+    """Let the robot hover or stand, follow a step along x, brake, and turn if it can."""
     climb = (0.0, 0.0, 0.0 if robot.planar else CLIMB)
     body.simulator.reset()
     body.onboard.reset()
@@ -161,7 +171,8 @@ def _move(body: Robot, robot: RobotFiles) -> CheckFlight:
     way = hypot(*np.subtract(body.simulator.readings.position, start)[:2]) - REACTION * before
     braking = min(before * before / (2.0 * max(way, 1e-9)), BRAKING_MAX)
     rest = _speed(body)
-    return CheckFlight(drift, speed, before / speed, braking, rest, _turn(body, robot))
+    turned, aside = _turn(body, robot), _follow_aside(body, robot, speed)
+    return CheckFlight(drift, speed, before / speed, braking, rest, turned, aside)
 
 
 def _turn(body: Robot, robot: RobotFiles) -> float | None:
@@ -174,6 +185,20 @@ def _turn(body: Robot, robot: RobotFiles) -> float | None:
     start = _yaw(body)
     _follow(body, robot, ZERO, ZERO, TURNING, TURN)
     return remainder(_yaw(body) - start, tau) / (TURN * TURNING)
+
+
+def _follow_aside(body: Robot, robot: RobotFiles, speed: float) -> float | None:
+    """Let the robot follow a velocity to its left, and return the part that it reached [1].
+
+    None: its heading does not follow its velocity.
+    """
+    if robot.heading != "velocity":
+        return None
+    yaw = _yaw(body)
+    x, y = -sin(yaw), cos(yaw)
+    _follow(body, robot, ZERO, (speed * x, speed * y, 0.0), FAST)
+    reached = body.simulator.readings.velocity
+    return (reached[0] * x + reached[1] * y) / speed
 
 
 def _follow(
@@ -213,8 +238,11 @@ def _yaw(body: Robot) -> float:
     return atan2(axes[1], axes[0])
 
 
-def _judge(robot: RobotFiles, motion: CheckFlight) -> list[str]:
-    """Return what must change because of the robot's motion."""
+def _judge(robot: RobotFiles, motion: CheckFlight, *, obeys: bool) -> list[str]:
+    """Return what must change because of the robot's motion.
+
+    `obeys` tells whether its onboard controller obeys a yaw.
+    """
     found, verb = [], "stand" if robot.planar else "hover"
     if motion.drift > DRIFT_MAX:
         found.append(f"the robot does not {verb}: it drifts {motion.drift:.2f} m in {STEADY:g} s")
@@ -229,6 +257,18 @@ def _judge(robot: RobotFiles, motion: CheckFlight) -> list[str]:
         found.append(
             f"robot.yaml: heading is free, but the robot follows {share:.0%} of a yaw rate "
             f"of {TURN:g} rad/s: let the onboard controller follow it, or set heading: fixed"
+        )
+    elif motion.turned is not None and not obeys:
+        found.append(
+            "robot.yaml: heading is free, but the onboard controller does not obey a yaw: delete "
+            "heading, or choose another controller"
+        )
+    if motion.aside is not None and abs(motion.aside - 1.0) > SHORT:
+        share = round(motion.aside, 2) + 0.0  # no -0 %
+        found.append(
+            f"the robot reaches {share:.0%} of a velocity of {motion.speed:g} m/s to its left in "
+            f"{FAST:g} s: let it turn faster, with diff_drive by turn_rate_max or turn_gain; "
+            "wheels that skid sideways in a turn need a larger turn_gain"
         )
     if motion.rest > REST:
         found.append(f"the robot still moves at {motion.rest:.2f} m/s, {STOP:g} s after it brakes")

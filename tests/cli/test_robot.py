@@ -76,6 +76,34 @@ def wheeled(tmp_path):
     return shutil.copytree(FOLDERS["robot"] / "rover", tmp_path / "wheeled")
 
 
+def changes_of(robot, capsys):
+    code = main(["robot", "check", str(robot), "-o", "json"])
+    found = json.loads(capsys.readouterr().out)["changes"]
+    assert code == (2 if found else 0)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("onboard", "count"),
+    [("turn_rate_max: 0.05", 1), ("turn_gain: 0.1", 1), ("turn_rate_max: 1", 0)],
+)
+def test_the_check_lets_a_robot_with_wheels_turn(wheeled, capsys, onboard, count):
+    replace(
+        wheeled / "robot.yaml", "onboard: diff_drive", f"onboard: {{name: diff_drive, {onboard}}}"
+    )
+    found = changes_of(wheeled, capsys)
+    assert [("to its left" in text, "turn_rate_max" in text) for text in found] == [
+        (True, True)
+    ] * count
+
+
+def test_the_check_knows_that_diff_drive_obeys_no_yaw(wheeled, capsys):
+    with (wheeled / "robot.yaml").open("a") as file:
+        file.write("heading: free\n")
+    (told,) = changes_of(wheeled, capsys)
+    assert "does not obey a yaw" in told
+
+
 @pytest.mark.parametrize(
     ("size", "caster", "rests"), [(".25", "-.2", "0.2"), (".03", "-.02", "0.050")]
 )
