@@ -9,8 +9,10 @@ REGISTRY ?=
 # Base image, if not that of the Dockerfiles: BASE=python:3.11-slim-bookworm@sha256:...
 BASE :=
 CLUSTER ?= cloudrc
+# For ROS 2 in the cluster also cloud-ros: IMAGES=cloud-ros, and ROS=kilted for another distribution.
 IMAGES := world cloud
-SCRIPTS := .ci/run .ci/once_more
+ROS :=
+SCRIPTS := .ci/run .ci/once_more images/cloud-ros/with-ros
 # Number of flights at once in the search for faults.
 JOBS ?= $(shell nproc 2>/dev/null || echo 2)
 # Folder for the results of `make faults`, `make mutants` and `make nightly`.
@@ -28,7 +30,7 @@ PART = $(if $(T),$(if $(wildcard tests/$(T)),tests/$(T),$(T)))
 SLOW := %_any_input.py %_flight.py %_machine.py %_proof.py %_hostile.py
 CORE := $(filter-out $(SLOW),$(wildcard \
 	tests/world/guard/test_*.py tests/tunnel/test_*.py tests/teleop/test_store.py))
-BUILD_ARGS := $(BASE:%=--build-arg BASE=%) --build-arg VERSION=$(VERSION) \
+BUILD_ARGS := $(BASE:%=--build-arg BASE=%) $(ROS:%=--build-arg ROS=%) --build-arg VERSION=$(VERSION) \
 	--build-arg SOURCE=$(or $(filter https://%,$(shell git config remote.origin.url)),unpublished) \
 	--build-arg REVISION=$(or $(shell git rev-parse HEAD 2>/dev/null),unknown)
 # Independent of the processor: the lock has the hashes of all wheels for Linux.
@@ -283,6 +285,7 @@ lock: $(VENV)/bin/python ## update the locked requirements of images and tests
 	$(COMPILE) pyproject.toml --extra world --extra record --extra console --output-file images/world/requirements.txt \
 		$(DRAWING:%=--no-emit-package %)
 	$(COMPILE) pyproject.toml --extra record --extra api --output-file images/cloud/requirements.txt
+	$(COMPILE) pyproject.toml --extra record --extra api --extra policy --output-file images/cloud-ros/requirements.txt
 	printf 'hatchling\ntccbox\n' | $(COMPILE) - --output-file images/build-requirements.txt
 	$(COMPILE) pyproject.toml --extra dev --no-emit-package cloudrc \
 		--output-file tests/requirements.txt

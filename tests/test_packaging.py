@@ -117,13 +117,18 @@ def test_every_image_of_a_releases_chart_is_in_the_registry_that_it_publishes_to
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "wheel")
     chart = tmp_path / "wheel" / "cloudrc" / "_chart"
-    parts = "mission.enabled", "console.enabled", "cloud.backgroundLoad.enabled"
-    more = [f"--set={part}=true" for part in parts]
-    command = ["helm", "template", "x", pack(chart, tmp_path, 0), *more]
-    rendered = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    for text in (rendered, *(path.read_text() for path in (chart / "examples").glob("*-job.yaml"))):
+    packed = pack(chart, tmp_path, 0)
+    parts = ["mission.enabled=true", "console.enabled=true", "cloud.backgroundLoad.enabled=true"]
+
+    def rendered(*parts):
+        command = ["helm", "template", "x", packed, *(f"--set={part}" for part in parts)]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+    texts = rendered(*parts), rendered(*parts, "cloud.ros.enabled=true")
+    for text in (*texts, *(path.read_text() for path in (chart / "examples").glob("*-job.yaml"))):
         images = set(re.findall(r"\bimage: (\S+)", text))
-        roles = {f"ghcr.io/me/cloudrc/{role}:{cloudrc.__version__}" for role in ("world", "cloud")}
+        names = ("world", "cloud", "cloud-ros")
+        roles = {f"ghcr.io/me/cloudrc/{name}:{cloudrc.__version__}" for name in names}
         assert images
         assert images <= roles
 

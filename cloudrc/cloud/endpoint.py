@@ -23,6 +23,7 @@ from cloudrc.cloud.operator import (
     is_for_session,
     make_robot_status,
 )
+from cloudrc.errors import ControllerLostError
 from cloudrc.messages import (
     NEVER_NS,
     Datagram,
@@ -154,6 +155,11 @@ class CloudEndpoint(TunnelEnd):
         self._heard_ns = start_ns
         self._commanded_ns = NEVER_NS
         self._count_ns = start_ns + COUNT_PERIOD_NS
+
+    @property
+    def lost(self) -> ControllerLostError | None:
+        """Why the flight has to end, if a controller outside is lost; else None."""
+        return self._loop.lost
 
     @property
     def guard(self) -> GuardState:

@@ -85,6 +85,7 @@ class ControlLoop:
     Attributes:
         period_ns: Time between two commands [ns].
         faults: Faults since the last `take_faults`.
+        lost: Why the flight has to end, if a controller outside is lost; else None.
         plans: The plans that the robot may still follow.
         counts: Name of an event, such as "frozen" -> how often it happened.
     """
@@ -114,6 +115,7 @@ class ControlLoop:
         self.period_ns = period_ns
         self._planned = plan_length(plan)
         self.faults: list[Fault] = []
+        self.lost: ControllerLostError | None = None
         self.counts: Counter[str] = Counter()
         self._now_ns = 0  # stamp of faults
         estimator = build_estimator()
@@ -300,6 +302,7 @@ class ControlLoop:
         try:
             return check_output(self._controller.update(estimate, setpoint, dt))
         except ControllerLostError as error:  # the flight ends when its driver sees the fault
+            self.lost = error
             self.faults.append(Fault(self._now_ns, error.code, str(error)))
             return STAND_STILL
         except BaseException as error:

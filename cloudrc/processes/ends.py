@@ -21,7 +21,7 @@ from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
 from cloudrc.drivers.readers import RecordSender
 from cloudrc.drivers.realtime import Address, Peer, bind
 from cloudrc.drivers.teleop import RemoteTeleop, UnixDatagrams, UnixPeer
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, ControllerLostError
 from cloudrc.files import warn_if_readable
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import SIZE_MAX, link_profile
@@ -71,7 +71,11 @@ def run_world(settings: EndSettings, stop: StopSignal) -> None:
 
 
 def run_cloud(settings: EndSettings, teleop_folder: Path, stop: StopSignal) -> None:
-    """Run cloud until `stop`; `teleop_folder` has the sockets between cloud and teleop."""
+    """Run cloud until `stop`; `teleop_folder` has the sockets between cloud and teleop.
+
+    Raise a ControllerLostError if a program outside that controls the robot is lost, and no
+    supervisor ends the flight: then a new process begins anew.
+    """
     experiment, identity, end = open_end(settings, "cloud")
     paths = teleop_folder / "cloud.sock", teleop_folder / "teleop.sock"
     with (
@@ -89,8 +93,14 @@ def run_cloud(settings: EndSettings, teleop_folder: Path, stop: StopSignal) -> N
             return cloud.guard is GuardState.TRACK
 
         ends = GracefulStop(stop, lambda: not flies(), FORWARD_LIMIT_NS)
+
+        def lost() -> ControllerLostError | None:
+            return None if settings.feed else cloud.lost  # a supervisor ends the flight itself
+
         with apart():
-            end.run(cloud, ends, flies)
+            end.run(cloud, lambda: ends() or lost() is not None, flies)
+        if error := lost():
+            raise error
 
 
 @contextmanager

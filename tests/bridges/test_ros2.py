@@ -173,6 +173,28 @@ def test_a_robot_has_a_namespace(tmp_path):
     )
 
 
+def test_the_teleoperation_begins_anew_when_the_robot_is_set_back_for_another_flight(monkeypatch):
+    """In a session or in the cluster, cloud's clock runs on."""
+    monkeypatch.syspath_prepend(ROOT / "examples" / "ros2")
+    from cloudrc_nodes.teleop import Teleop
+    from nav_msgs.msg import Odometry
+
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context)
+    teleop = Teleop(context=context)
+    sent = []
+    monkeypatch.setattr(teleop, "_publish", lambda estimate: sent.append(teleop._index))
+    path = [(0.5, 0.0, 0.7), (0.5, 0.0, 0.7), (0.5, 1.8, 0.7), (0.5, 3.6, 0.7), (0.0, 0.0, 0.0)]
+    for second, place in enumerate(path):
+        estimate = Odometry()
+        estimate.header.stamp.sec = second
+        at = estimate.pose.pose.position
+        at.x, at.y, at.z = place
+        teleop._lead(estimate)
+    assert sent == [0, 1, 1, 2, 0]
+    context.try_shutdown()
+
+
 def test_a_node_flies_in_real_time(tmp_path):
     _, report = run(tmp_path, example(), mode="local")
     assert report["numbers"]["waypoints_reached"]["value"] == 1

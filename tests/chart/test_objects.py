@@ -85,7 +85,8 @@ def test_every_container_takes_environment_and_mounts_of_the_user():
     specs = pod_specs(objects)
     found = [containers(specs[pod]) for pod in ("world", "cloud", "mission")]
     named = {name: one for pod in found for name, one in pod.items() if name != "load"}
-    assert named.keys() == {"world", "cloud", "teleop", "console", "link", "mission"}
+    ends = {"world", "cloud", "link"}
+    assert named.keys() == {*ends, "teleop", "ros", "nodes", "console", "mission"}
     for name, one in named.items():
         assert {"name": "TZ", "value": "UTC"} in one["env"], name
         assert "certificates" in {mount["name"] for mount in one["volumeMounts"]}, name
@@ -123,7 +124,7 @@ def test_common_labels_are_on_every_object_and_pod_and_those_of_a_pod_win():
 def test_every_container_takes_environment_variables_and_mounts_of_its_own():
     pods = pod_specs(render(values_of(CHART / "ci" / "everything-values.yaml")))
     parts = [(name, pod, part) for name, pod in pods.items() for part in containers(pod).values()]
-    assert len(parts) == 10
+    assert len(parts) == 12
     for name, pod, part in parts:
         where = name, part["name"]
         assert {"name": "TZ", "value": "UTC"} in part.get("env", []), where

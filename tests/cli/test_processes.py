@@ -11,7 +11,9 @@ import pytest
 from cloudrc import assembly
 from cloudrc.cli.processes import read_address, read_size
 from cloudrc.config.load import load_experiment
+from cloudrc.drivers import realtime
 from cloudrc.drivers.realtime import free_ports, show_address
+from cloudrc.errors import ControllerLostError
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.processes import ends
 from cloudrc.processes.ports import ipv4_addresses
@@ -86,6 +88,28 @@ def test_an_end_stopped_at_its_start_completes_its_recording(end, key, tmp_path,
     errors = call(f"{end} --config hover {flags}").err
     assert (tmp_path / "end.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
     assert f"warning: {tmp_path / 'key'} can be read by others: chmod 600" in errors
+
+
+def test_cloud_without_a_supervisor_ends_if_its_controller_is_lost(key, monkeypatch, refused):
+    """In a pod, Kubernetes starts it again: the next mission gets a new controller."""
+    build, bound = assembly.build_cloud, []
+
+    def bind(address):
+        bound.append(realtime.bind(address))
+        return bound[-1]
+
+    def build_lost(*arguments, **named):
+        cloud = build(*arguments, **named)
+        cloud._loop.lost = ControllerLostError("controller_silent", "no node answers")
+        os.kill(os.getpid(), signal.SIGTERM)  # also ends a cloud that would go on
+        return cloud
+
+    monkeypatch.setattr(ends, "bind", bind)
+    monkeypatch.setattr(assembly, "build_cloud", build_lost)
+    flags = f"--listen 127.0.0.1:{free_ports(1)[0]} --route route {key} --record end.mcap"
+    line = refused(f"cloud --config hover {flags} --teleop teleop", code=5)
+    assert line == "cloudrc: error: no node answers\n"
+    bound[0].close()  # as at the end of the process
 
 
 def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch):

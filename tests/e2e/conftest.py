@@ -261,7 +261,7 @@ def cluster(request):
         if own:
             os.environ["KUBECONFIG"] = str(BUILD / "kubeconfig")
             _create()
-        _load()
+        load(IMAGES)
         metadata = {"name": NAMESPACE, "labels": RESTRICTED}
         apply({"apiVersion": "v1", "kind": "Namespace", "metadata": metadata})
         request.config.stash[UP] = True
@@ -284,12 +284,12 @@ def _create():
     command("kind", "create", "cluster", f"--name={CLUSTER}", "--config", config, timeout=300)
 
 
-def _load():
-    """Load the images into a kind cluster; any other cluster must be able to pull them."""
+def load(images):
+    """Load images into a kind cluster; any other cluster must be able to pull them."""
     context = command("kubectl", "config", "current-context").strip()
     if context.startswith("kind-"):
         name = f"CLUSTER={context.removeprefix('kind-')}"
-        command("make", "kind-load", name, f"IMAGES={IMAGES}", timeout=300)
+        command("make", "kind-load", name, f"IMAGES={images}", timeout=300)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -41,10 +41,11 @@ app.kubernetes.io/part-of: cloudrc
 {{- include "cloudrc.moreLabels" . }}
 {{- end }}
 
-{{/* Image of a role, "world" or "cloud", by digest if set, else by tag. */}}
+{{/* Image of a role, "world" or "cloud", by digest if set, else by tag. That of cloud may have ROS 2. */}}
 {{- define "cloudrc.image" -}}
 {{- $image := .root.Values.image -}}
-{{- $of := index $image .role -}}
+{{- $ros := .root.Values.cloud.ros -}}
+{{- $of := and (eq .role "cloud") $ros.enabled | ternary $ros.image (index $image .role) -}}
 {{- $name := $image.registry | empty | ternary $of.repository (printf "%s/%s" (trimSuffix "/" $image.registry) $of.repository) -}}
 {{- if $of.digest -}}
 {{ $name }}@{{ $of.digest }}

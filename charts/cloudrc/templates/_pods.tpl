@@ -57,6 +57,30 @@ env:
 {{- end -}}
 {{- end }}
 
+{{/* Common parts of the two containers with ROS 2. DDS stays inside the pod, whose containers share the
+     loopback address; they need not share memory, and share no numbers of processes. Logs of ROS are
+     in /tmp. */}}
+{{- define "cloudrc.rosSettings" -}}
+env:
+  - {name: ROS_AUTOMATIC_DISCOVERY_RANGE, value: LOCALHOST}
+  - {name: FASTDDS_BUILTIN_TRANSPORTS, value: UDPv4}
+  - {name: HOME, value: /tmp}
+  {{- with .Values.cloud.ros.extraEnv }}
+  {{- toYaml . | nindent 2 }}
+  {{- end }}
+terminationMessagePolicy: FallbackToLogsOnError
+{{ include "cloudrc.containerSecurity" . }}
+resources:
+  {{- toYaml .Values.cloud.ros.resources | nindent 2 }}
+{{- end }}
+
+{{- define "cloudrc.rosMounts" -}}
+- {name: ros, mountPath: /tmp}
+{{- with include "cloudrc.extraMounts" .Values.cloud.ros }}
+{{ . }}
+{{- end }}
+{{- end }}
+
 {{- define "cloudrc.placement" -}}
 {{- with .priorityClassName }}
 priorityClassName: {{ . }}

@@ -25,6 +25,8 @@ WAYPOINTS = [
     *(8.235, -6.422, 0.7, 0.25, 4.0),
 ]
 """The mission `pipes`; per waypoint x, y, z [m], tolerance [m], and time to stay there [s]."""
+JUMP = 2.0
+"""Distance between two estimates, above which the robot was set back for another flight [m]."""
 
 
 class Teleop(Node):
@@ -37,15 +39,17 @@ class Teleop(Node):
         self._setpoints = self.create_publisher(PoseStamped, "setpoint", NEWEST)
         self.create_subscription(Odometry, "cloudrc/estimate", self._lead, NEWEST)
         self._index, self._stamp_ns = 0, 0
+        self._place = (0.0, 0.0, 0.0)  # of the robot [m]
         self._near_ns: int | None = None  # time at which the robot came near the waypoint
 
     def _lead(self, estimate: Odometry) -> None:
         now, stamp_ns = estimate.pose.pose.position, nanoseconds(estimate.header.stamp)
-        if stamp_ns < self._stamp_ns:  # another flight
+        place = now.x, now.y, now.z
+        if stamp_ns < self._stamp_ns or dist(place, self._place) > JUMP:  # another flight
             self._index, self._near_ns = 0, None
-        self._stamp_ns = stamp_ns
+        self._stamp_ns, self._place = stamp_ns, place
         *position, tolerance, dwell = self._waypoints[self._index]
-        if dist(position, (now.x, now.y, now.z)) > tolerance:
+        if dist(position, place) > tolerance:
             self._near_ns = None
         elif self._near_ns is None:
             self._near_ns = stamp_ns

@@ -1,4 +1,4 @@
-{{/* The robot and the scene that a user brings as ConfigMaps, and the experiment with them. */}}
+{{/* The robot and the scene that a user brings as ConfigMaps, and the experiment with them and with ROS. */}}
 
 {{/* Path of the user's "robot" or "scene" in the pods; "" if the user brings none.
      Argument: (dict "root" $ "kind" KIND). */}}
@@ -26,9 +26,19 @@
 {{- end -}}
 {{- end }}
 
-{{/* The values' `experiment` with the user's robot and scene, in the format of `cloudrc run`. */}}
+{{/* Name of the controller in the values' `experiment`; "" if it names none. */}}
+{{- define "cloudrc.controllerName" -}}
+{{- $controller := (.Values.experiment.cloud | default dict).controller | default "" -}}
+{{ kindIs "map" $controller | ternary (get (kindIs "map" $controller | ternary $controller dict) "name") $controller }}
+{{- end }}
+
+{{/* The values' `experiment` with the user's robot and scene, and with the controller of cloud.ros, in
+     the format of `cloudrc run`. */}}
 {{- define "cloudrc.experiment" -}}
 {{- $experiment := deepCopy .Values.experiment -}}
+{{- if and .Values.cloud.ros.enabled (not (include "cloudrc.controllerName" .)) -}}
+{{- $_ := set $experiment "cloud" (set ($experiment.cloud | default dict) "controller" "ros2") -}}
+{{- end -}}
 {{- $world := $experiment.world | default dict -}}
 {{- range $kind := list "robot" "scene" -}}
 {{- with include "cloudrc.ownPath" (dict "root" $ "kind" $kind) -}}
