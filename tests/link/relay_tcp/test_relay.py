@@ -14,6 +14,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync import client as websocket_client
+from websockets.sync.server import serve as serve_websocket
 
 from cloudrc import link
 from cloudrc.drivers.realtime import free_ports
@@ -133,6 +136,33 @@ def test_what_arrives_is_what_was_sent(relayed, flags):
             threading.Thread(target=lambda: (client.sendall(data), client.shutdown(1))).start()
             found = b"".join(iter(lambda: client.recv(1 << 16), b""))
     assert hashlib.sha256(found).digest() == hashlib.sha256(data + b"end").digest()
+
+
+def test_a_stock_websocket_client_meets_its_server_over_lte(relayed):
+    closed = []
+
+    def handle(one):
+        try:
+            while True:
+                one.send(one.recv())
+        except ConnectionClosed as error:
+            closed.append((error.rcvd.code, error.rcvd.reason))
+
+    with serve_websocket(handle, "127.0.0.1", 0) as web:
+        threading.Thread(target=web.serve_forever).start()
+        relay = relayed(web.socket.getsockname()[1], "--link", "lte")
+        data = os.urandom(1_000_000)
+        with websocket_client.connect(f"ws://127.0.0.1:{relay.port}") as client:
+            for message in ("vélo", data):
+                client.send(message)
+                assert client.recv(timeout=20.0) == message
+            began = time.monotonic()
+            client.close(4001, "landed")
+            round_trip = time.monotonic() - began
+        assert (client.close_code, client.close_reason) == (4001, "landed")
+        assert relay.end()["turns"]["count"] >= 2
+    assert closed == [(4001, "landed")]
+    assert round_trip >= 0.03  # the answer to the close crossed the link, too
 
 
 def test_a_refused_port_refuses_the_client_after_a_round_trip(relayed):
