@@ -31,7 +31,8 @@ Needs root or unprivileged user namespaces, and /dev/net/tun: 'cloudrc doctor'
 says what works here. Without them, use 'cloudrc relay tcp'.
 
 exit codes: that of the client, or of the server if it fails first; 2 bad input,
-3 missing prerequisite, 4 the server does not listen, 130 interrupted"""
+3 missing prerequisite, 4 the server does not listen in time, 6 the server ended
+with 0 before it listened, or the relay failed, 130 interrupted"""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,8 +42,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=whole_number(0, 2**53 - 1), default=1, metavar="S", help="seed (default: 1)")
     setting = "change of the profile, such as uplink.loss=0.05; repeatable"
     add("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help=setting)
-    add("--server", required=True, metavar="COMMAND", help="the program that serves")
-    add("--client", required=True, metavar="COMMAND", help="the program that asks")
+    ends = {"--server": "the program that serves", "--client": "the program that asks"}
+    for flag, text in ends.items():
+        add(flag, type=_read_command, required=True, metavar="COMMAND", help=text)
     port = whole_number(1, 65535)
     expose = "forward this TCP port of 127.0.0.1 to the server, beside the link; repeatable"
     add("--expose", type=port, action="append", default=[], metavar="PORT", help=expose)
@@ -52,6 +54,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--metrics-port", type=port, metavar="PORT", help=metrics)
     output = "new folder for link.json and the recordings of both directions"
     add("-o", "--output", type=Path, metavar="FOLDER", help=output)
+
+
+def _read_command(text: str) -> str:
+    if not text.strip():
+        raise argparse.ArgumentTypeError("empty; give a command for the shell")
+    return text
 
 
 def execute(options: argparse.Namespace) -> int:

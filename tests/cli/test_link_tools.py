@@ -159,3 +159,12 @@ def test_a_trace_needs_no_ending_and_a_profile_no_name(folder, call):
     assert call("link show t.txt").out.startswith("t: a trace of 2 rows in 1 s\n")
     (folder / "mine.yaml").write_text("---\nuplink: {delay_ms: 30}\n")
     assert call("link show mine.yaml").out.startswith("mine\n")
+
+
+@pytest.mark.parametrize(
+    ("server", "client", "flag"),
+    [("", "true", "--server"), ("true", "", "--client"), (" \n", "true", "--server")],
+)
+def test_link_exec_refuses_an_empty_command(refused, server, client, flag):
+    said = refused("link exec", "--server", server, "--client", client)
+    assert f"{flag}: empty; give a command" in said

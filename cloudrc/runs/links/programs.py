@@ -186,7 +186,8 @@ class _Run:
         while (waited := time.monotonic() - began) < limit:
             state = server.state()
             if state.code is not None and (state.code or not state.lives):
-                self._tell(f"the server ended with exit code {state.code} before it listened")
+                hint = "" if state.code else "; --wait 0 starts the client without a server"
+                self._tell(f"the server ended with exit code {state.code} before it listened{hint}")
                 return state.code or InvalidRunError.exit_code
             if not all(is_loopback(host) for host, _ in state.listens):
                 return None
