@@ -161,11 +161,12 @@ def _obey(key: str | int, sent: str | int, steering: Steering) -> str:
         steering.ask("holding", "/v1/hold")
     elif key == " ":
         steering.release_keys()
-    elif isinstance(key, int):  # such as a changed size of the window
+    elif key == curses.KEY_RESIZE:  # the window has another size; nobody pressed a key
         return ""
     else:
+        name = curses.keyname(sent).decode() if isinstance(sent, int) else sent
         also = "; X is the emergency stop (with Caps Lock: x without Shift)" * (key == "x")
-        return f"the key {sent!r} has no meaning{also}"
+        return f"the key {name!r} has no meaning{also}"
     if isinstance(sent, str) and sent.isupper():
         return "Caps Lock is on: x without Shift is now the emergency stop"
     return ""
