@@ -14,8 +14,7 @@ from cloudrc.link.exec.verdict import Period
 from cloudrc.link.follow import Loaded
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.relay import ask_for_fifo, settle, tighten_slack
-from cloudrc.link.state import LinkState
-from cloudrc.runs.links.live import LiveLink
+from cloudrc.runs.links.live import Changed, LiveLink
 
 STEP = 0.05  # longest time until the relay reacts to a change [s]
 DRAIN_LIMIT = 1.0  # for the packets in flight at the end [s]
@@ -45,10 +44,10 @@ class ExecLink:
         self._thread: threading.Thread | None = None
         self._devices: list[int] = []
 
-    def start(self, devices: Mapping[str, int], changed: Callable[[LinkState], None]) -> None:
+    def start(self, devices: Mapping[str, int], changed: Changed) -> None:
         """Carry packets between the `devices` of "client" and "server", which this link closes.
 
-        The time line of the profile begins. `changed` gets each new state of a direction.
+        The time line of the profile begins.
         """
         self._devices = list(devices.values())
         self.live.serve(self._changes.append, self._follow, changed)

@@ -26,6 +26,9 @@ Apply = Callable[[str, Loaded, int], None]
 """Function that lets a direction follow a profile, at a time on the monotonic clock [ns]."""
 Check = Callable[[DirectionProfile, str], None]
 """Function that raises a BadInputError if a direction cannot have a profile."""
+Changed = Callable[[LinkState, str], None]
+"""Function that gets each new state of a direction, and a sentence for the user if the direction
+has changed; "" at the start, and for a change of the other direction."""
 
 
 class LiveLink:
@@ -64,18 +67,17 @@ class LiveLink:
         self.states: dict[str, LinkState] = {}
         self.origins_ns: dict[str, int] = {}
         self._servers: list[ControlServer] = []
-        self._changed: Callable[[LinkState], None] = lambda state: None
+        self._changed: Changed = lambda state, news: None
 
     def serve(
         self,
         queue: Callable[[Callable[[], None]], None],
         apply: Apply,
-        changed: Callable[[LinkState], None],
+        changed: Changed,
     ) -> None:
         """Begin the time line, and take changes from now on.
 
         `queue` gets a function for the thread that carries the packets, which then calls `apply`.
-        `changed` gets each new state.
         """
         now_ns, self._changed = time.monotonic_ns(), changed
         for way in DIRECTIONS:
@@ -143,4 +145,12 @@ class LiveLink:
         )
         with suppress(OSError):  # the link works even if the disk is full
             write_atomically(self._folder / way / STATE_FILE, to_text(state).encode())
-        self._changed(state)
+        self._changed(state, _news(before, state, restart=loaded.change.restart))
+
+
+def _news(before: LinkState | None, after: LinkState, *, restart: bool) -> str:
+    """Return a sentence about a change of the direction; "" if it is as before."""
+    way = after.direction
+    if before is None or not (restart or before.profile.get(way) != after.profile.get(way)):
+        return ""
+    return f"the {way} has changed: {after.cause}"

@@ -228,9 +228,9 @@ class _Run:
             counts = self._link.counts().items()
             self._exporter.see([Counted(0, "link", name, number) for name, number in counts])
 
-    def _changed(self, state: LinkState) -> None:
-        if state.changes:
-            self._tell(f"the {state.direction} has changed: {state.cause}")
+    def _changed(self, state: LinkState, news: str) -> None:
+        if news:
+            self._tell(news)
         if self._exporter:
             delay = state.asked["delay"] or 0.0
             self._exporter.link.shaped(state.shaper, state.direction, state.mode, delay)

@@ -67,9 +67,9 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
             origin_ns = at_ns if loaded.change.restart else None
             (up if way == "uplink" else down).replace_profile(loaded.direction, origin_ns)
 
-        def changed(state: LinkState) -> None:
-            if state.changes:
-                tell(f"the {state.direction} has changed: {state.cause}")
+        def changed(_: LinkState, news: str) -> None:
+            if news:
+                tell(news)
 
         live.serve(relay.changes.append, follow, changed)
         settle()

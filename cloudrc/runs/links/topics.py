@@ -99,9 +99,9 @@ class _TopicLink:
         """Begin the time line, and hear the topic; return the QoS of both topics in words."""
         way, seed = self._settings.direction, self.seed
 
-        def changed(state: LinkState) -> None:
-            if state.changes and state.direction == way:
-                tell(f"the {way} has changed: {state.cause}")
+        def changed(state: LinkState, news: str) -> None:
+            if news and state.direction == way:
+                tell(news)
 
         self.live.serve(self._changes.append, self._follow, changed)
         profile, origin_ns = self.live.profiles[way], self.live.origins_ns[way]
