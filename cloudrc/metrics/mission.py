@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from math import radians
+from math import degrees, radians
 
 import numpy as np
 
@@ -22,7 +22,8 @@ from cloudrc.metrics.flight import (
     turn_between,
     yaw_of,
 )
-from cloudrc.rounding import differences, exceeds
+from cloudrc.record.merge import machine_time_ns
+from cloudrc.rounding import differences, exceeds, format_beside
 
 IMPACT_NS = 100_000_000
 """Time from the first touch over which the impulse is summed [ns]: the impact and its bounces."""
@@ -94,7 +95,7 @@ def _count_reached(flight: Flight) -> float | None:
     if flight.mission.setpoints is not None:
         return flight.count(len(stamps) and missed_end(flight) is None)
     known = (i for i in stamps if i < len(points))
-    return flight.count(sum(_was_at(flight, points[i], stamps[i]) for i in known))
+    return flight.count(sum(_Visit(flight, points[i], stamps[i]).is_confirmed for i in known))
 
 
 def _yaw_error(flight: Flight) -> float | None:
@@ -135,29 +136,85 @@ def missed_end(flight: Flight) -> float | None:
     return error if exceeds(error, tolerance + NOISE * flight.position_noise) else None
 
 
-def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
-    """Return whether the robot stayed near a waypoint for its dwell time before `until_ns`.
+class _Visit:
+    """What the robot did near a waypoint before teleop reported it as reached, at `until_ns` [ns].
 
     The true position counts, give or take `NOISE` times the noise of the measured positions, which
-    are all that the operator sees, and likewise the true yaw if the waypoint has one. If the
-    mission has a `carrot` (a moving setpoint), a stay of any length is enough, because the setpoint
-    waits at the waypoint for the dwell time.
+    are all that the operator sees, and likewise the true yaw if the waypoint has one. Times count
+    on the operator's clock, as in teleop: it goes on while world's clock lags behind.
     """
-    truth, dwell = flight.truth, 0.0 if flight.mission.carrot else waypoint.dwell_s
-    rows = truth["stamp_ns"] <= until_ns
-    distance = np.linalg.norm(truth["position"][rows] - waypoint.position_m, axis=1)
-    tolerance = waypoint.tolerance_m + NOISE * flight.position_noise
-    there = differences(tolerance, distance) <= 0.0
-    if waypoint.yaw_deg is not None:
-        allowed = radians(waypoint.yaw_tolerance_deg or YAW_TOLERANCE_DEG)
-        turns = turn_between(yaw_of(truth["orientation_wxyz"][rows]), radians(waypoint.yaw_deg))
-        there &= differences(allowed + NOISE * flight.yaw_noise, np.abs(turns)) <= 0.0
-    near = np.append(there, [False])
-    edges = np.flatnonzero(np.diff(near, prepend=[False]))
-    stamps = np.append(truth["stamp_ns"][rows], until_ns)
-    stays_ns = stamps[edges[1::2] - 1] - stamps[edges[::2]]
-    # The dwell time may lie between two samples.
-    return bool((stays_ns >= dwell * 1e9 - ODOMETRY_NS).any())
+
+    def __init__(self, flight: Flight, waypoint: Waypoint, until_ns: int) -> None:
+        rows = flight.truth["stamp_ns"] <= until_ns
+        truth = select(flight.truth, rows)
+        self._flight, self._waypoint, self._stamps_ns = flight, waypoint, truth["stamp_ns"]
+        # If the mission has a `carrot` (a moving setpoint), a stay of any length is enough, because
+        # the setpoint waits at the waypoint for the dwell time.
+        self._dwell = 0.0 if flight.mission.carrot else waypoint.dwell_s
+        self._distance = np.linalg.norm(truth["position"] - waypoint.position_m, axis=1)
+        self._turn = np.zeros(len(self._distance))
+        if waypoint.yaw_deg is not None:
+            yaws = yaw_of(truth["orientation_wxyz"])
+            self._turn = np.abs(turn_between(yaws, radians(waypoint.yaw_deg)))
+        self._yaw_allowed = radians(waypoint.yaw_tolerance_deg or YAW_TOLERANCE_DEG)
+        tolerance = waypoint.tolerance_m + NOISE * flight.position_noise
+        self._near = differences(tolerance, self._distance) <= 0.0
+        self._faces = differences(self._yaw_allowed + NOISE * flight.yaw_noise, self._turn) <= 0.0
+        # At `until_ns` the robot is where the last row shows it.
+        stamps_ns = np.append(self._stamps_ns, until_ns)
+        self._operator_ns = machine_time_ns(flight.recording["/telemetry"], stamps_ns)
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether the robot stayed near the waypoint for its dwell time."""
+        there = self._near & self._faces
+        edges = np.flatnonzero(np.diff(np.pad(np.append(there, there[-1:]), 1)))
+        stays_ns = self._operator_ns[edges[1::2] - 1] - self._operator_ns[edges[::2]]
+        # The dwell time may lie between two samples.
+        return bool((stays_ns >= self._dwell * 1e9 - ODOMETRY_NS).any())
+
+    def describe(self) -> str:
+        """Say when and how far the robot was away in the dwell time; "" if it was not."""
+        begin_ns = self._operator_ns[-1] - self._dwell * 1e9
+        since = max(int(np.searchsorted(self._operator_ns[:-1], begin_ns, side="right")) - 1, 0)
+        if (self._near & self._faces)[since:].all():
+            return ""
+        if not self._near[since:].all():
+            row = since + int(np.argmax(self._distance[since:]))
+            limit = self._waypoint.tolerance_m
+            text = f"{format_beside(self._distance[row], limit)} m from it"
+            return f"{text}{self._measured(row)}, above tolerance_m {limit:g}, {self._at(row)}"
+        row = since + int(np.argmax(self._turn[since:]))
+        limit = degrees(self._yaw_allowed)
+        turn = format_beside(degrees(self._turn[row]), limit)
+        return f"turned {turn} deg away, above yaw_tolerance_deg {limit:g}, {self._at(row)}"
+
+    def _at(self, row: int) -> str:
+        return f"at {self._flight.seconds(self._stamps_ns[row]):.2f} s"
+
+    def _measured(self, row: int) -> str:
+        """Say which distance the last measurement up to `row` showed; "" without one."""
+        odometry = self._flight.during("/odometry")
+        last = int(np.searchsorted(odometry["stamp_ns"], self._stamps_ns[row], side="right")) - 1
+        if last < 0:
+            return ""
+        offset = odometry["position"][last] - self._waypoint.position_m
+        return f" (measured: {np.linalg.norm(offset):.2f} m)"
+
+
+def unconfirmed(flight: Flight) -> str:
+    """Say where the robot was at the first waypoint that teleop alone saw as reached; "" if none.
+
+    Teleop knows neither the noise of a measurement nor the path between two messages.
+    """
+    points = flight.mission.waypoints
+    for index, stamp_ns in reported(flight).items():
+        if index >= len(points):
+            continue
+        visit = _Visit(flight, points[index], stamp_ns)
+        if not visit.is_confirmed and (text := visit.describe()):
+            return f"in the dwell time at waypoint {index + 1} the robot was {text}"
+    return ""
 
 
 def _of_touch(measure: Callable[[Flight, dict[str, Array]], float | None]) -> Measure:
@@ -277,8 +334,8 @@ def _recorder_dropped(flight: Flight) -> float | None:
 add_metrics(
     "Mission",
     ("waypoints_reached", "1", "Number of waypoints at which the true position stayed within the "
-     "tolerance, plus 3 times the position noise, for the dwell time, and likewise the "
-     "true yaw if the waypoint has a yaw_deg. The last row of a "
+     "tolerance, plus 3 times the position noise, for the dwell time on the operator's clock, "
+     "and likewise the true yaw if the waypoint has a yaw_deg. The last row of a "
      "file of setpoints counts as one.", _waypoints_reached),
     ("yaw_error", "rad", "Largest difference between the yaw_deg of a waypoint and the true yaw "
      "when the waypoint was reached.", _yaw_error),

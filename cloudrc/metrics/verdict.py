@@ -35,6 +35,7 @@ from cloudrc.metrics.mission import (
     missed_end,
     obstacle_contacts,
     reported,
+    unconfirmed,
 )
 from cloudrc.metrics.response import responses
 from cloudrc.record.columns import Recording
@@ -130,6 +131,7 @@ class Evidence:
     violations: tuple[FlightFailure, ...] = ()  # other events that must not happen
     slow: str = ""  # why the run failed to keep real time; "" if it did not fail
     lost: str = ""  # what the recording has lost, in words; "" if it is complete
+    unconfirmed: str = ""  # how the truth contradicts a waypoint that teleop reported; "" if not
 
 
 def judge(evidence: Evidence) -> FlightVerdict:
@@ -176,6 +178,7 @@ def _unmet_goals(evidence: Evidence) -> Iterator[FlightFailure]:
         return
     if evidence.reached < evidence.waypoints:
         text = f"{evidence.reached} of {evidence.waypoints} waypoints reached"
+        text += f": {evidence.unconfirmed}" if evidence.unconfirmed else ""
         yield FlightFailure("waypoint_not_reached", text, *end)
     if evidence.wanted is not None and evidence.touch is None:
         text = f"the robot never touched {evidence.wanted.body}, which mission.touch requires"
@@ -222,6 +225,7 @@ def flight_evidence(
         violations=tuple(_violations(flight)),
         slow=_not_real_time(numbers) if real_time else "",
         lost=_lost(flight),
+        unconfirmed=unconfirmed(flight),
     )
 
 
@@ -407,6 +411,7 @@ def operator_verdict(
         touch=evidence.touch if touch is not None and touch["stamp_ns"] <= seen_ns else None,
         violations=tuple(_obstacles(flight, seen_ns)),
         time_limit=inf,
+        unconfirmed="",
         slow=_too_slow(factor.value) if evidence.slow and factor is not None else "",
     )
     return judge(seen)

@@ -110,6 +110,20 @@ def world_time_ns(telemetry: Table, machine_ns: NDArray[np.int64]) -> NDArray[np
     return at_ns
 
 
+def machine_time_ns(telemetry: Table, world_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Convert times [ns], shape (n,), from world's clock to the clock of world's machine.
+
+    This is the inverse of `world_time_ns`.
+    """
+    stamps_ns, lag_ns = telemetry["stamp_ns"], telemetry["slip_ns"]
+    if not lag_ns.any():
+        return world_ns
+    first: Any = stamps_ns[0]
+    since, known = (world_ns - first).astype(float), (stamps_ns - first).astype(float)
+    at_ns: NDArray[np.int64] = world_ns + np.rint(np.interp(since, known, lag_ns)).astype(int)
+    return at_ns
+
+
 def merge(world: Path, cloud: Path) -> Recording:
     """Merge the files of world and cloud, complete or torn, into one mission on world's clock.
 

@@ -9,6 +9,7 @@ from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Flight, measure_all
+from cloudrc.metrics.mission import unconfirmed
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
 from cloudrc.records import (
@@ -410,6 +411,31 @@ def test_a_waypoint_counts_if_the_true_position_confirms_it(x, tolerance, dwell,
     point = Waypoint(position_m=(x, 0.0, 1.0), tolerance_m=tolerance, dwell_s=dwell)
     flight = flown().flight(mission=MissionConfig(waypoints=(point,)))
     assert SHIPPED["waypoints_reached"].measure(flight) == reached
+
+
+@pytest.mark.parametrize(
+    ("stalled", "dwell", "reached"),
+    [
+        (9.5, 1.2, 1.0),
+        (9.5, 1.3, 0.0),
+        (8.0, 1.0, 1.0),  # the stall was over before
+        (8.0, 1.2, 0.0),
+        (99.0, 1.2, 0.0),
+    ],
+)
+def test_the_dwell_time_counts_on_the_operators_clock(stalled, dwell, reached):
+    """The robot is near for 1 s of world's clock, which loses 0.2 s at `stalled` [s]."""
+
+    def stall(n, sent):
+        lag = 200_000_000 if sent.stamp_ns >= at(stalled) else 0
+        return sent._replace(telemetry=sent.telemetry._replace(slip_ns=lag))
+
+    log = flown()
+    log.change(TelemetrySent, stall)
+    point = Waypoint(position_m=(9.5, 0.0, 1.0), tolerance_m=0.5, dwell_s=dwell)
+    flight = log.flight(mission=MissionConfig(waypoints=(point,)))
+    assert SHIPPED["waypoints_reached"].measure(flight) == reached
+    assert bool(unconfirmed(flight)) == (not reached)
 
 
 @pytest.mark.parametrize(("noise", "reached"), [(0.0, 0.0), (0.16, 0.0), (0.18, 1.0)])

@@ -15,6 +15,7 @@ from cloudrc.records import (
     GuardChange,
     MissionEvent,
     SessionOpened,
+    TelemetrySent,
 )
 from tests.metrics.conftest import ONE_PIPE, at, flown, good, touch
 
@@ -223,6 +224,24 @@ def test_the_operator_knows_what_had_arrived(log, mission, report, operator):
     evidence = flight_evidence(flight, numbers, real_time=True, interrupted=False)
     assert codes(judged(flight)) == report
     assert codes(operator_verdict(flight, evidence, numbers)) == operator
+
+
+def test_a_failure_says_when_and_how_far_the_robot_left_a_waypoint_in_its_dwell_time():
+    def path(seconds):
+        return (0.16 if 7.3 < seconds < 7.5 else 0.02, 0.0, 1.0)
+
+    def unseen(n, sent):
+        odometry = sent.telemetry.odometry
+        seen = odometry._replace(position=(min(odometry.position[0], 0.09), 0.0, 1.0))
+        return sent._replace(telemetry=sent.telemetry._replace(odometry=seen))
+
+    log = flown(path)
+    log.change(TelemetrySent, unseen)
+    point = Waypoint(position_m=(0.0, 0.0, 1.0), tolerance_m=0.1, dwell_s=8.0)
+    (failure,) = judged(log.flight(mission=MissionConfig(waypoints=(point,)))).failures
+    assert failure.code == "waypoint_not_reached"
+    for number in ("0.16 m", "0.09 m", "7.32 s"):
+        assert number in failure.text
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,13 @@ from hypothesis import strategies as st
 from cloudrc import records as rec
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
-from cloudrc.record.merge import clock_offset, cut_to_last_mission, merge, world_time_ns
+from cloudrc.record.merge import (
+    clock_offset,
+    cut_to_last_mission,
+    machine_time_ns,
+    merge,
+    world_time_ns,
+)
 from cloudrc.record.writer import McapWriter
 from tests.record.conftest import (
     MS,
@@ -153,6 +159,8 @@ def test_time_never_runs_backwards(steps, data):
     converted = world_time_ns(telemetry, machine_ns)
     assert (np.diff(converted) >= 0).all()
     assert (converted <= machine_ns).all()
+    # A nanosecond of world's clock is up to 26 ns of the machine's clock in these steps.
+    assert (np.abs(machine_time_ns(telemetry, converted) - machine_ns) <= 26).all()
     if not any(steps):
         assert converted.tolist() == machine_ns.tolist()
 
