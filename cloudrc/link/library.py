@@ -147,10 +147,20 @@ class OneWay:
         Returns:
             Times of arrival [ns]: none for a lost packet, two for a duplicated one, of which the
             second may be the first to arrive. A damaged packet counts as lost.
+
+        Raises:
+            BadInputError: If an argument is negative, or `episode` or `number` is not whole.
         """
         if episode != self._episode:
+            _check_whole(episode=episode)
             self._episode, self._link = episode, self._new()
-        arrivals = self._link.send(episode, KIND, number, size, now_ns)
+        try:  # takes less time than to check each packet
+            if size < 0 or now_ns < 0:
+                _check_whole(size=size, now_ns=now_ns)
+            arrivals = self._link.send(episode, KIND, number, size, now_ns)
+        except (OverflowError, TypeError):
+            _check_whole(number=number, size=size, now_ns=now_ns)
+            raise
         if self._link.corrupts and arrivals and self._is_damaged(episode, number):
             return ()
         return arrivals
@@ -179,9 +189,7 @@ class OneWay:
         Returns:
             The delays [s], shape (count,); NaN for a lost packet.
         """
-        for name, number in {"count": count, "first": first}.items():
-            if not isinstance(number, int | np.integer) or number < 0:
-                raise BadInputError(f"{name} {number!r}: give a whole number of packets, 0 or more")
+        _check_whole(count=count, episode=episode, first=first, size=size)
         period_ns = _to_ns(period)
         conditions = self._link.only
         if conditions and _is_independent(self.profile, conditions):
@@ -204,6 +212,7 @@ class OneWay:
         The random numbers are not those of the episodes. The packets leave once per `period` [s]
         from the start of the time line on and have `size` bytes.
         """
+        _check_whole(size=size)
         link = LinkDirection(
             self.profile, self._seed, self._uplink, stream=f"{self._stream} expected"
         )
@@ -263,6 +272,13 @@ class OneWay:
             if chance and isinstance(chance, float):
                 delays[draw(purpose) < chance] = np.nan
         return delays
+
+
+def _check_whole(**values: int) -> None:
+    """Raise a BadInputError for a value that is negative or no whole number."""
+    for name, value in values.items():
+        if not isinstance(value, int | np.integer) or value < 0:
+            raise BadInputError(f"{name} {value!r}: give a whole number, 0 or more")
 
 
 def _to_ns(period: float) -> int:

@@ -185,6 +185,26 @@ def test_a_seed_that_is_none_is_refused(seed):
         cloudrc.link.open("ideal", seed)
 
 
+@pytest.mark.parametrize("name", ["paper-p1", "lte"])  # without and with a rate
+@pytest.mark.parametrize(
+    ("packet", "words"),
+    [
+        ((-1, 0, 1, 0), "episode -1: give a whole number, 0 or more"),
+        (("x", 0, 1, 1), "episode 'x'"),
+        ((0, -1, 10, 0), "number -1"),
+        ((0, 1.5, 10, 0), "number 1.5"),
+        ((0, 0, -5, 0), "size -5"),
+        ((0, 0, None, 0), "size None"),
+        ((0, 0, 1, -5), "now_ns -5"),
+    ],
+)
+def test_a_packet_that_cannot_be_sent_is_refused(name, packet, words):
+    up, _ = cloudrc.link.open(name, 1)
+    with pytest.raises(BadInputError, match=re.escape(words)):
+        up.send(*packet)
+    assert up.send(0, 0, 1, 0) == cloudrc.link.open(name, 1)[0].send(0, 0, 1, 0)
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -200,8 +220,9 @@ def test_a_table_that_cannot_be_made_is_refused(name, arguments, words):
     up, _ = cloudrc.link.open(name, 1)
     with pytest.raises(BadInputError, match=re.escape(words)):
         up.table(*arguments)
-    with pytest.raises(BadInputError, match="first -1"):
-        up.table(3, 0.01, first=-1)
+    for key in ("first", "episode", "size"):
+        with pytest.raises(BadInputError, match=f"{key} -1"):
+            up.table(3, 0.01, **{key: -1})
 
 
 def test_the_examples_of_the_page_run(tmp_path, capsys):
