@@ -215,7 +215,9 @@ def test_ctrl_c_and_a_lack_of_memory_end_the_flight(kind, error, raised):
 def test_a_reset_that_fails_before_the_flight_is_refused(kind):
     plug_in = raises(SystemExit(0))()
     plug_in.reset = plug_in.update
-    with pytest.raises(BadInputError, match=rf"cloud\.{kind}: its reset\(\) failed: SystemExit"):
+    with pytest.raises(
+        BadInputError, match=rf"cloud\.{kind}: its reset\(\) failed: test_loop.py:\d+: SystemExit"
+    ):
         loop(**{kind: plug_in})
 
 
