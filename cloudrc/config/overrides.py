@@ -23,7 +23,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, create_model
 
 from cloudrc import plugins
 from cloudrc.config import problems, shipped
@@ -31,7 +31,7 @@ from cloudrc.config.document import Document, KeyPath, Source, child, parse_valu
 from cloudrc.config.problems import ConfigProblem, ProblemsError
 from cloudrc.config.reuse import reuse
 from cloudrc.config.robot import RobotFacts, facts, find_robot, known_robot, parameters
-from cloudrc.config.schema import Cloud, Experiment, PlugIn, Steps, World
+from cloudrc.config.schema import Cloud, Experiment, PlanTime, PlugIn, Steps, World
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.renamed import new_key
@@ -333,12 +333,19 @@ def _complete(
     if kind != "estimators":
         with plugins.refuse_failure(f"{path[-1]} {name!r}: its reset() failed"):
             plugin.reset()
-    if document.get("cloud", "plan_s"):
+    if _plans_ahead(document):
         if kind == "predictors":
             _check_model(plugin, name)
         if kind == "controllers" and name in OUTSIDE:
             raise BadInputError(f"'{name}' cannot plan ahead; set cloud.plan_s to 0")
     return values
+
+
+def _plans_ahead(document: Document) -> bool:
+    """Return whether cloud sends plans; a `cloud.plan_s` that is no valid one is refused later."""
+    with suppress(ValidationError):
+        return TypeAdapter(PlanTime).validate_python(document.get("cloud", "plan_s")) > 0
+    return False
 
 
 def _parameters_of(kind: str, name: str) -> type[BaseModel]:
