@@ -271,6 +271,10 @@ def odd_inertias(robot: Path) -> Iterator[str]:
             max(_reach(model, data, geom, data.xipos[body]) for geom in geoms)
             for geoms in (own, fixed)
         )
+        # What an actuator moves has mass, and in many models it is a site without a geom.
+        sites = model.body_weldid[model.site_bodyid] == model.body_weldid[body]
+        places = np.linalg.norm(data.site_xpos[sites] - data.xipos[body], axis=1)
+        far = max(far, places.max(initial=0.0))
         least, most = INERTIAS[0] * mass * near**2, INERTIAS[1] * mass * far**2
         if not least <= found <= most:
             yield (
