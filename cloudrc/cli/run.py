@@ -113,6 +113,25 @@ def _check_beside(options: argparse.Namespace, mode: str) -> None:
     split_command(options.beside)
 
 
+def _experiment(options: argparse.Namespace, *, is_session: bool) -> ResolvedExperiment:
+    """Return the experiment that `options` name.
+
+    The missions of a session come later. Its scene thus needs no body that the experiment's own
+    mission touches.
+    """
+    from cloudrc.runs.experiment import load
+
+    try:
+        return load(options.experiment, options.set, options.seed)
+    except BadInputError:
+        if not is_session:
+            raise
+        with contextlib.suppress(BadInputError):
+            settings = ["mission.touch=null", *options.set]
+            return load(options.experiment, settings, options.seed)
+        raise
+
+
 def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None) -> int:
     """Fly as `options` say, print the summary, and return the exit code.
 
@@ -120,12 +139,10 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
     for missions.
     """
     from cloudrc.metrics.verdict import exit_code
-    from cloudrc.runs.experiment import check_mode, load
+    from cloudrc.runs.experiment import check_mode
     from cloudrc.runs.own_files import describe_changes
 
-    # The missions of a session come later, with what they touch.
-    before = ["mission.touch=null"] if ready else []
-    experiment = load(options.experiment, [*before, *options.set], options.seed)
+    experiment = _experiment(options, is_session=ready is not None)
     check_mode(experiment, mode)
     warn(experiment)
     if changes := describe_changes(options.experiment, experiment):

@@ -116,6 +116,7 @@ def test_a_console_is_shown_and_a_missing_one_is_explained(folder, monkeypatch):
 def test_a_session_needs_no_body_that_a_shipped_mission_touches(folder, monkeypatch, call):
     seen = Mock(side_effect=BadInputError("enough"))
     monkeypatch.setattr("cloudrc.cli.run._local_flight", seen)
+    assert "enough" in call("up", code=2).err
     assert "enough" in call("up --set world.scene=empty", code=2).err
     own = call("up --set world.scene=empty --set mission.touch.body=board", code=2).err
     assert "--set: mission.touch.body: board: the scene empty has no such body" in own
