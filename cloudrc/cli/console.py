@@ -94,10 +94,11 @@ def _local(options: argparse.Namespace) -> ConsoleTarget:
     from cloudrc.console.steering import LinkControl
     from cloudrc.drivers.local import LINK_FOLDER, under_way
     from cloudrc.runs.links.change import read_states, set_here
+    from cloudrc.runs.under_way import not_found
 
     found = find_local_run(options, flag="")
     if found is None:
-        raise BadInputError("no run flies here; start one: cloudrc up")
+        raise BadInputError(not_found("no run flies here; start one: cloudrc up"))
     run, url = found.folder.resolve(), found.url
 
     def read() -> dict[str, Any]:

@@ -51,6 +51,7 @@ def no_run_error(
     """
     if options.context or options.namespace:
         return error
-    return MissingPrerequisiteError(
-        f"no run flies here (start one: cloudrc run; or name one: {flags}), and {error}"
-    )
+    from cloudrc.runs.under_way import not_found
+
+    text = not_found(f"no run flies here (start one: cloudrc run; or name one: {flags})")
+    return MissingPrerequisiteError(f"{text}, and {error}")

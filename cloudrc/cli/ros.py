@@ -64,11 +64,11 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _find(options: argparse.Namespace) -> RunInFlight:
-    from cloudrc.runs.under_way import find_run
+    from cloudrc.runs.under_way import find_run, not_found
 
     found = find_run(options.run, steers=not options.observe, flag="")
     if found is None:
-        raise BadInputError("no run flies here; start one: cloudrc up")
+        raise BadInputError(not_found("no run flies here; start one: cloudrc up"))
     if found.note:
         print_line(f"cloudrc: {found.note}", sys.stderr)
     return found

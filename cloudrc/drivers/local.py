@@ -58,7 +58,8 @@ LINK_FOLDER, ROUTE_FILE = "link", "route"
 the address of the relay (`ROUTE_FILE`) and the state of the link."""
 UNSEEN = (
     "warning: other commands do not find this flight ({unseen}): 'cloudrc mission' needs --api"
-    " {url}; 'console' and 'down' need a folder of your own in XDG_RUNTIME_DIR, here and there"
+    " {url}; 'console', 'link set', 'ros bridge' and 'down' need a folder of your own in"
+    " XDG_RUNTIME_DIR, here and there"
 )
 """Text if a flight has no flight file."""
 JOURNAL_FILE = "missions.journal"
@@ -115,10 +116,8 @@ def announced(run: Path, api: str, kind: str = RUN) -> Iterator[str]:
 
 def _write_flight_file(path: Path, flight: str, stack: contextlib.ExitStack) -> None:
     """Write and lock a flight file, until `stack` is closed; raise an OSError if it fails."""
-    if not path.is_absolute():
-        raise OSError("there is no home folder")
-    if other := make_own_folder(path.parent):
-        raise OSError(other)
+    if reason := _make_flights_folder(path.parent):
+        raise OSError(reason)
     new = path.with_suffix(".new")  # renamed after it is locked
     # Other users could lock a file that they can open.
     descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -128,6 +127,24 @@ def _write_flight_file(path: Path, flight: str, stack: contextlib.ExitStack) -> 
     fcntl.flock(file, fcntl.LOCK_EX)
     file.write(flight.encode())
     new.rename(path)
+
+
+def _make_flights_folder(folder: Path) -> str:
+    """Make the folder for flight files if it is missing; return why it is unusable, or ""."""
+    if not folder.is_absolute():
+        return "there is no home folder"
+    try:
+        return make_own_folder(folder)
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+def say_unused() -> str:
+    """Say why commands here find no flight, even if one is under way; "" if they find it."""
+    folder = flights_folder()
+    if reason := _make_flights_folder(folder):
+        return f"flight files in {folder} are not used: {reason}"
+    return ""
 
 
 def under_way(*, links: bool = False) -> dict[Path, str]:

@@ -65,6 +65,7 @@ def test_a_flight_without_a_writable_folder_is_not_found_and_says_so(tmp_path, m
     (fault,) = told
     assert fault.text.startswith("warning: other commands do not find this flight")
     assert "--api unix:/" in fault.text
+    assert "'link set'" in fault.text
 
 
 @pytest.mark.parametrize("where", ["folder", "file", "above"])
