@@ -69,6 +69,7 @@ def _scene(tree: dict[str, Any]) -> Scene:
         spawn=TypeAdapter(Vector).validate_python(tree["spawn"]),
         own_fence=TypeAdapter(Fence).validate_python(tree["own_fence"]),
         solids=tuple(map(_solid, tree["solids"])),
+        intangible=TypeAdapter(tuple[str, ...]).validate_python(tree.get("intangible", ())),
     )
 
 

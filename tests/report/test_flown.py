@@ -21,13 +21,17 @@ from cloudrc.report.flown import flown_shapes, flown_world
 from cloudrc.runs.fly import fly
 from cloudrc.world.shapes import read_shapes
 
+GHOST = '<body name="ghost"><geom size=".1" contype="0" conaffinity="0"/></body>'
+"""Body that nothing can touch."""
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """Fly the user's own rover; return the folders of the run and of the user's files."""
     files = tmp_path_factory.mktemp("mine")
     shutil.copytree(find_robot("rover").model.parent, files / "robot")
-    shutil.copy(file_of("pillars"), files / "scene.xml")
+    scene = file_of("pillars").read_text().replace("</worldbody>", f"{GHOST}</worldbody>")
+    (files / "scene.xml").write_text(scene)
     folder = tmp_path_factory.mktemp("run")
     sets = (
         f"world.robot={files / 'robot'}",
@@ -67,6 +71,11 @@ def measured(folder):
     """Return the numbers of a report; the last bit depends on how the memory is laid out."""
     numbers = json.loads((folder / "report.json").read_text())["numbers"]
     return {name: float(f"{number['value']:.9g}") for name, number in numbers.items()}
+
+
+def test_the_report_of_a_flight_names_the_body_that_nothing_can_touch(run):
+    notes = json.loads((run[0] / "report.json").read_text())["notes"]
+    assert [note for note in notes if note.startswith("The robot flies through ghost: ")]
 
 
 def test_a_report_is_that_of_the_flight_without_the_users_files(run, call):
