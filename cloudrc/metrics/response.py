@@ -1,7 +1,8 @@
 """Metrics of the response to steps of the setpoint: overshoot, settling, errors, and stability.
 
 A step begins when the setpoint changes and ends when it changes again, or when the mission ends.
-Steps of which messages are lost are left out.
+Steps of which messages are lost are left out. A last step whose end was not flown or recorded has
+neither settled nor failed to.
 Setpoints that last less than 0.5 s belong to a moving reference and are no steps. Where a moving
 reference stops, the robot is moving and still behind it: this end has no overshoot or settling time
 that describes the loop. Only the verdict judges it. All errors are distances between the setpoint
@@ -30,6 +31,8 @@ BAND = 0.05
 """Largest error of a settled robot, as a share of the step's length [1]."""
 RISE = 0.1, 0.9
 """Shares of the step's length between which the rise time is measured [1]."""
+ENDS_STEP = "done", "leg_timed_out"
+"""Events that end a mission at the end of its last step; all others cut this step short."""
 GROWTH_MIN = 0.15
 """Smallest amplitude of an unstable oscillation [m]; less may be noise."""
 
@@ -48,6 +51,12 @@ class Step(NamedTuple):
     effort: float  # integral of the squared commanded velocity over time [m^2/s]
     last_error: float  # largest error in the last 0.5 s [m]
     unstable: bool  # whether the error oscillates without decay
+    cut: bool  # whether the end of the step was not flown or recorded
+
+    @property
+    def is_unsettled(self) -> bool:
+        """Whether the step was flown to its end, and the robot had not settled there."""
+        return self.settling_time is None and not self.cut
 
 
 def steps(flight: Flight) -> tuple[Step, ...]:
@@ -72,20 +81,25 @@ def _measured(flight: Flight) -> list[tuple[Step, bool]]:
     ends_ns = np.append(begins_ns[1:], flight.end_ns)
     before = begins_ns.searchsorted(begins_ns - SHORTEST_NS)
     is_step = np.arange(len(begins)) - before < JUMP_MAX
+    is_cut = flight.ending is None or flight.ending[1] not in ENDS_STEP
     found = []
     before_ns = stamps[np.maximum(begins - 1, 0)]  # the step may have begun since then
     for number in np.flatnonzero(ends_ns - begins_ns >= SHORTEST_NS):
         span = int(before_ns[number]), int(ends_ns[number])
         if any(hole.meets(*span) for hole in flight.holes):
             continue
-        response = _measure(flight, int(begins[number]), int(ends_ns[number]))
+        cut = is_cut and number == len(begins) - 1
+        response = _measure(flight, int(begins[number]), int(ends_ns[number]), cut=cut)
         if response is not None:
             found.append((response, bool(is_step[number])))
     return found
 
 
-def _measure(flight: Flight, row: int, end_ns: int) -> Step | None:
-    """Measure the response to the setpoint in `row`, until `end_ns` [ns]; None for a tiny step."""
+def _measure(flight: Flight, row: int, end_ns: int, *, cut: bool) -> Step | None:
+    """Measure the response to the setpoint in `row`, until `end_ns` [ns]; None for a tiny step.
+
+    `cut` is True if the step has no end of its own.
+    """
     control, truth = flight.control, flight.truth
     begin_ns, setpoint = int(control["stamp_ns"][row]), control["setpoint"][row]
     rows = (truth["stamp_ns"] >= begin_ns) & (truth["stamp_ns"] < end_ns)
@@ -107,12 +121,13 @@ def _measure(flight: Flight, row: int, end_ns: int) -> Step | None:
         length=length,
         overshoot=max(0.0, float(share.max()) - 1.0),
         rise_time=_rise_time(times, share),
-        settling_time=_settling_time(times, sizes, BAND * length),
+        settling_time=None if cut else _settling_time(times, sizes, BAND * length),
         iae=_integral(sizes, times),
         ise=_integral(sizes**2, times),
         effort=_integral(speeds**2, sent),
         last_error=float(sizes[late].max(initial=0.0)),
         unstable=any(_grows(errors[:, axis]) for axis in range(3)),
+        cut=cut,
     )
 
 
@@ -174,8 +189,9 @@ add_metrics(
     ("settling_time_mean", "s", "Mean time until the error stays within 5 % of the step, over the "
      "steps that settled; unsettled_steps counts the others.",
      partial(_mean_of, name="settling_time")),
-    ("unsettled_steps", "1", "Number of steps whose error does not stay within 5 % of the step.",
-     lambda flight: flight.count(sum(step.settling_time is None for step in steps(flight)))),
+    ("unsettled_steps", "1", "Number of steps, flown to their end, whose error does not stay "
+     "within 5 % of the step.",
+     lambda flight: flight.count(sum(step.is_unsettled for step in steps(flight)))),
     ("iae_mean", "m s", "Integral of the error over time, mean of the steps.",
      partial(_mean_of, name="iae")),
     ("ise_mean", "m^2 s", "Integral of the squared error over time, mean of the steps.",

@@ -85,7 +85,7 @@ class FlightFailure:
 
 @dataclass(frozen=True, slots=True)
 class FlightVerdict:
-    """Outcome of a mission and all failures, the earliest failure first."""
+    """Outcome of a mission and all failures: `timed_out`, then the others, the earliest first."""
 
     outcome: Outcome
     failures: tuple[FlightFailure, ...] = ()
@@ -145,7 +145,7 @@ def judge(evidence: Evidence) -> FlightVerdict:
     unmet = [f for f in _unmet_goals(evidence) if f.code not in codes]
     proven = [f for f in unmet if not evidence.lost or f.code not in PROVEN_BY_ALL]
     failures = [*violations, *proven]
-    failures.sort(key=lambda failure: inf if failure.time is None else failure.time)
+    failures.sort(key=_rank)
     if evidence.slow:
         return FlightVerdict("invalid", (FlightFailure("not_real_time", evidence.slow), *failures))
     if evidence.lost and not failures:
@@ -154,6 +154,12 @@ def judge(evidence: Evidence) -> FlightVerdict:
         failure = FlightFailure("recording_incomplete", f"{known}: {evidence.lost}")
         return FlightVerdict("invalid", (failure,))
     return FlightVerdict("failure" if failures else "success", tuple(failures))
+
+
+def _rank(failure: FlightFailure) -> tuple[bool, float]:
+    """Return the key by which failures are sorted."""
+    time = inf if failure.time is None else failure.time
+    return failure.code != "timed_out", time
 
 
 def _too_fast(evidence: Evidence) -> Iterator[FlightFailure]:
@@ -349,12 +355,13 @@ def _count_periods(recording: Recording) -> int:
 def _responses(flight: Flight, settle: float) -> Iterator[FlightFailure]:
     """Yield a failure if a step did not settle to `settle` [m]; another for an unstable loop."""
     found, unit = responses(flight), "step" if flight.mission.steps else "waypoint"
-    far = [step for step in found if exceeds(step.last_error, settle)]
+    whole = [step for step in found if not step.cut]
+    far = [step for step in whole if exceeds(step.last_error, settle)]
     if far and flight.mission.steps:
         first = far[0]
         error = format_beside(first.last_error, settle)
         text = (
-            f"{len(far)} of {len(found)} steps did not settle: in step {first.waypoint + 1} the "
+            f"{len(far)} of {len(whole)} steps did not settle: in step {first.waypoint + 1} the "
             f"robot was {error} m from the setpoint in the last 0.5 s, above "
             f"criteria.settle_m {settle:g} m"
         )

@@ -8,8 +8,8 @@ from cloudrc.config.schema import MissionConfig, Steps
 from cloudrc.metrics import SHIPPED
 from cloudrc.metrics.response import responses, steps
 from cloudrc.metrics.verdict import flight_evidence, judge
-from cloudrc.records import Control
-from tests.metrics.conftest import SECOND, START, flown
+from cloudrc.records import Control, MissionEvent
+from tests.metrics.conftest import SECOND, START, at, flown
 
 
 def second_order(damping, frequency=3.0):
@@ -111,6 +111,40 @@ def test_random_steps_must_settle_and_null_switches_it_off():
     assert "in step 1 the robot was 0.30 m from the setpoint" in text
     assert "criteria.settle_m 0.15 m" in text
     assert "not_settled" not in judged(flight(*far, mission=mission, settle_m=None))
+
+
+@pytest.mark.parametrize("ending", ["timed_out", "guard_stopped", None])
+def test_a_step_whose_end_was_not_flown_has_neither_settled_nor_failed_to(ending):
+    """The second step begins 1.5 s before the end of the flight."""
+    log = flown(second_order(0.7))
+    log.change(
+        Control, lambda n, c: c._replace(setpoint=(1.0 if c.stamp_ns < at(8.5) else 2, 0, 1))
+    )
+
+    def end(_, event):
+        if event.event != "done":
+            return event
+        return event._replace(event=ending) if ending else None
+
+    done = log.flight(mission=MissionConfig(steps=Steps(count=2)))
+    assert judged(done)["not_settled"].startswith("1 of 2 steps")
+    log.change(MissionEvent, end)
+    cut = log.flight(mission=MissionConfig(steps=Steps(count=2)))
+    assert "not_settled" not in judged(cut)
+    assert [SHIPPED["unsettled_steps"].measure(each) for each in (done, cut)] == [1.0, 0.0]
+    assert [step.cut for step in responses(cut)] == [False, True]
+
+
+def test_timed_out_comes_before_a_step_that_did_not_settle():
+    log = flown(second_order(0.7))
+    log.change(
+        Control, lambda n, c: c._replace(setpoint=(2.0 if c.stamp_ns < at(8.5) else 1, 0, 1))
+    )
+    log.change(MissionEvent, lambda n, e: e._replace(event="timed_out") if e.event == "done" else e)
+    assert [*judged(log.flight(mission=MissionConfig(steps=Steps(count=2))))][:2] == [
+        "timed_out",
+        "not_settled",
+    ]
 
 
 def test_an_error_at_the_edge_of_the_band_is_settled():
