@@ -12,6 +12,8 @@ from cloudrc.record.holes import Hole
 
 Message: TypeAlias = tuple[str, int, bytes]
 """Topic, log time [ns] and CDR bytes of a message."""
+FOLLOWED = "something follows its end"
+"""What is wrong with a file in which another recording, or a part of one, follows the first."""
 
 
 @dataclass(eq=False)
@@ -37,7 +39,7 @@ class Content:
     def remedy(self, path: Path) -> str:
         """Return the end of an error about the damaged file `path`: what to do; "" for others."""
         how = f"; to copy what is readable: cloudrc recover {quote(str(path))}"
-        return how if "damaged" in self.lacking else ""
+        return how if "damaged" in self.lacking or FOLLOWED in self.lacking else ""
 
     @property
     def note(self) -> str:

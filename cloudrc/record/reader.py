@@ -32,7 +32,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file
-from cloudrc.record.content import Content
+from cloudrc.record.content import FOLLOWED, Content
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, between, of_metadata
 from cloudrc.record.ros import converter
 from cloudrc.record.topics import TOPICS, VIEWS
@@ -272,14 +272,21 @@ class File:
         self._see_what_follows()
 
     def _see_what_follows(self) -> None:
-        """Note what follows the end of the file: another recording, or bytes without records."""
+        """Note what follows the end of the file: another recording, or bytes that add nothing."""
         self._stream.seek(self.position)
         rest = self._stream.read()
-        if MCAP0_MAGIC in rest or self._next_intact(rest, 0) < len(rest):
-            self.fault = "something follows its end"
+        has_records = MCAP0_MAGIC in rest or self._next_intact(rest, 0) < len(rest)
+        if has_records and not self._is_repeated_by(rest):
+            self.fault = FOLLOWED
         elif rest:
             self.content.remarks += (f"had {len(rest)} bytes behind its end, which were left out",)
             self.position = self.size
+
+    def _is_repeated_by(self, rest: bytes) -> bool:
+        """Return whether what follows the file is the same file again, or its beginning."""
+        self._stream.seek(0)
+        own = self._stream.read(self.position)
+        return (own * (len(rest) // len(own) + 1)).startswith(rest)
 
     def _read_parts(self, found: _Found) -> None:
         """Read the intact parts of a damaged file."""

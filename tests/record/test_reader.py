@@ -36,6 +36,8 @@ def recorded(records):
 
 
 WHOLE, EXPECTED = recorded(RECORDS), Recording.from_records(RECORDS)
+OTHER = recorded(RECORDS[1:])
+"""Another recording."""
 MESSAGES = [
     (channel.topic, message.log_time, message.data)
     for _, channel, message in make_reader(io.BytesIO(WHOLE)).iter_messages()
@@ -277,10 +279,11 @@ def test_a_recovery_of_a_torn_file_says_what_is_kept_and_lost(path):
     kept = Recording.read(new)
     assert kept.note == "; ".join(recovery.notes)
     assert 40 < len(kept["/odometry"]) < 80
-    path.write_bytes(WHOLE * 2)
+    path.write_bytes(WHOLE + OTHER)
     assert Recording.read(path).lacking == "something follows its end"
     recovery = recover(path, new)
-    assert (recovery.bytes_lost, recovery.share) == (len(WHOLE), pytest.approx(0.5))
+    share = pytest.approx(len(WHOLE) / len(WHOLE + OTHER))
+    assert (recovery.bytes_lost, recovery.share) == (len(OTHER), share)
 
 
 def middle_of(number):
@@ -368,6 +371,9 @@ WHOLE_IN_ALL = {
     "zeros in front": bytes(512) + WHOLE,
     "padded": WHOLE + bytes(4096),
     "followed by rubbish": WHOLE + b"rubbish" * 99,
+    "appended a second time": WHOLE * 2,
+    "appended twice, then cut": WHOLE * 2 + WHOLE[:SECOND],
+    "its beginning appended": WHOLE + WHOLE[:SECOND],
     "repeated bytes": WHOLE[:THIRD] + WHOLE[CHUNKS[1][0] - 40 :],
     "cut out of a list of messages": WHOLE[: BEHIND + 20] + WHOLE[BEHIND + 90 :],
 }
@@ -419,10 +425,14 @@ def test_a_damaged_index_of_the_file_loses_nothing(path, call, opcode, inside):
     assert (copy.messages, copy.note) == (MESSAGES, "")
 
 
-@pytest.mark.parametrize("rest", [WHOLE, WHOLE[:SECOND], WHOLE[1000:-1000]])
-def test_a_second_recording_behind_the_first_is_not_passed_over(path, rest):
+@pytest.mark.parametrize(
+    "rest", [OTHER, OTHER[:SECOND], WHOLE + OTHER, OTHER + WHOLE, WHOLE[1000:-1000]]
+)
+def test_a_second_recording_behind_the_first_is_not_passed_over(path, call, rest):
     path.write_bytes(WHOLE + rest)
-    assert recover(path, path.with_name("new.mcap")).notes[0] == "something follows its end"
+    with pytest.raises(BadInputError, match=r"follows its end; .*: cloudrc recover "):
+        Recording.read(path).refuse_damaged(path)
+    assert "lossy: something follows its end" in call("recover", path, code=1).out
 
 
 def test_if_nothing_counts_the_lost_messages_each_topic_has_a_question_mark(path, call):
