@@ -8,6 +8,7 @@ import sys
 import tomllib
 import venv
 import zipfile
+from hashlib import sha256
 from pathlib import Path
 
 import pytest
@@ -87,7 +88,8 @@ def copied(tmp_path):
 
 
 def contents(folder):
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+    """Return file name -> hash of its bytes: of bytes, a failure would be described for minutes."""
+    return {path.name: sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
 
 
 def test_two_builds_of_one_tree_are_byte_equal(copied, tmp_path, monkeypatch):
