@@ -88,7 +88,7 @@ def _measured(flight: Flight) -> list[tuple[Step, bool]]:
         span = int(before_ns[number]), int(ends_ns[number])
         if any(hole.meets(*span) for hole in flight.holes):
             continue
-        cut = is_cut and number == len(begins) - 1
+        cut = is_cut and int(number) == len(begins) - 1
         response = _measure(flight, int(begins[number]), int(ends_ns[number]), cut=cut)
         if response is not None:
             found.append((response, bool(is_step[number])))
