@@ -134,6 +134,22 @@ def test_a_report_of_a_recovered_recording_says_in_its_first_line_that_it_is_inc
     assert [line.strip() for line in rest if "The recording is incomplete: damaged" in line]
 
 
+@pytest.mark.parametrize("was_interrupted", [False, True])
+def test_a_copy_whose_end_is_lost_is_invalid_unless_the_run_was_interrupted(run, was_interrupted):
+    (run / "report.json").unlink()
+    mission, facts = run / "mission.mcap", replace(RUN, interrupted=was_interrupted)
+    recording = Recording.read(mission)
+    recording.metadata |= facts.metadata
+    recording.write(mission)  # the facts about the run come first
+    cut(mission, run / "torn.mcap")
+    recover(run / "torn.mcap", mission)
+    found = write_report(run, *read_run(run), page=False)
+    verdict = "interrupted" if was_interrupted else "invalid"
+    assert (found["verdict"], exit_code(found)) == (verdict, 130 if was_interrupted else 6)
+    text = found["failures"][0]["text"]
+    assert was_interrupted or re.search(r"not known .*: all lost from \d\.\d\d s on", text)
+
+
 def test_the_hash_is_of_the_recording_beside_the_report(run):
     before, (world, cloud) = report(run), good().ends()
     longer = [*world, Counted(world[-1].stamp_ns, "world", "sent", 1)]
