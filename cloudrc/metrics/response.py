@@ -81,6 +81,8 @@ def _measured(flight: Flight) -> list[tuple[Step, bool]]:
     ends_ns = np.append(begins_ns[1:], flight.end_ns)
     before = begins_ns.searchsorted(begins_ns - SHORTEST_NS)
     is_step = np.arange(len(begins)) - before < JUMP_MAX
+    # In its last period, a mission may already have the setpoint of the stop, which is no waypoint.
+    last = np.flatnonzero(flight.control["waypoint"][begins] >= 0).max(initial=0)
     is_cut = flight.ending is None or flight.ending[1] not in ENDS_STEP
     found = []
     before_ns = stamps[np.maximum(begins - 1, 0)]  # the step may have begun since then
@@ -88,7 +90,7 @@ def _measured(flight: Flight) -> list[tuple[Step, bool]]:
         span = int(before_ns[number]), int(ends_ns[number])
         if any(hole.meets(*span) for hole in flight.holes):
             continue
-        cut = is_cut and int(number) == len(begins) - 1
+        cut = is_cut and bool(number >= last)
         response = _measure(flight, int(begins[number]), int(ends_ns[number]), cut=cut)
         if response is not None:
             found.append((response, bool(is_step[number])))

@@ -118,9 +118,13 @@ def test_random_steps_must_settle_and_null_switches_it_off():
 def test_a_step_whose_end_was_not_flown_has_neither_settled_nor_failed_to(ending):
     """The second step begins 1.5 s before the end of the flight."""
     log = flown(second_order(0.7))
-    log.change(
-        Control, lambda n, c: c._replace(setpoint=(1.0 if c.stamp_ns < at(8.5) else 2, 0, 1))
-    )
+
+    def aim(_, row):
+        if row.stamp_ns < at(9.99) or ending is None:
+            return row._replace(setpoint=(1.0 if row.stamp_ns < at(8.5) else 2, 0, 1), waypoint=0)
+        return row._replace(setpoint=(1.1, 0, 1), waypoint=-1)  # the robot has to stop
+
+    log.change(Control, aim)
 
     def end(_, event):
         if event.event != "done":
