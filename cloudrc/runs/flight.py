@@ -17,10 +17,11 @@ from cloudrc.report.write import assess
 ERROR = "error"
 """Verdict of a flight that raised an exception, and code of its only failure."""
 Row: TypeAlias = dict[str, Any]
-"""Result of a flight: `verdict`; `failures` (codes, the earliest first); `text` (the first failure,
-and why a metric has no value); `numbers` (metric -> value); `records_sha256`; `physics_steps`, the
-language of the physics steps and a hash of their machine code; and, if a plug-in failed,
-`traceback`. A row of a sweep also has `key`, `point`, `seed` and `code`, a hash of the sources."""
+"""Result of a flight: `verdict`; `failures` (codes, `timed_out` first, then the earliest); `text`
+(the first failure, and why a metric has no value); `numbers` (metric -> value); `records_sha256`;
+`physics_steps`, the language of the physics steps and a hash of their machine code; and, if a
+plug-in failed, `traceback`. A row of a sweep also has `key`, `point`, `seed` and `code`, a hash of
+the sources."""
 
 
 def fly_point(experiment: ResolvedExperiment) -> Row:

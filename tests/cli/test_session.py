@@ -263,7 +263,10 @@ def test_a_session_that_dies_in_flight_can_be_reported(folder, command, victim, 
         assert "the cloud process died in flight (signal 9)" in (folder / "said").read_text()
     command("report s", code=130)  # interrupted
     document = json.loads((folder / "s/report.json").read_text())
-    assert document["numbers"]["commands_applied"]["value"] > 10
+    numbers = document["numbers"]
+    assert numbers["rtt_mean"]["value"] > 0.04
+    # Cloud's last messages died with it: what counts datagrams is left out.
+    assert ("commands_applied" in numbers) == (not victim)
     (waypoint,) = read_experiment(folder / "s/config.yaml").mission.waypoints
     assert waypoint.position_m == (0.5, 0.0, 1.2)
 
