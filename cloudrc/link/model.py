@@ -22,6 +22,23 @@ HEADER_BYTES = 28  # size of the IPv4 and UDP headers (RFC 791, RFC 768), also o
 _TABLES = 64  # number of blocks of impairments that are kept in memory
 
 
+def enqueue(
+    departures: deque[int], size: int, rate: float, packets_max: int, now_ns: int
+) -> int | None:
+    """Queue a packet at a bottleneck; return when it leaves [ns], or None if the queue is full.
+
+    `departures`: when the packets before it leave [ns]; `size`: with its headers [bytes];
+    `rate`: of the bottleneck [bit/s].
+    """
+    while departures and departures[0] <= now_ns:
+        departures.popleft()
+    if len(departures) >= packets_max:
+        return None
+    start = departures[-1] if departures else now_ns
+    departures.append(start + round(size * 8e9 / rate))
+    return departures[-1]
+
+
 class LinkDirection:
     """Model of one direction of the link.
 
@@ -137,7 +154,13 @@ class LinkDirection:
         arrival = now_ns
         if entry != OVERTAKES:
             if conditions.rate is not None:
-                departure = self._queue(size, conditions.rate, now_ns)
+                departure = enqueue(
+                    self._departures,
+                    size + HEADER_BYTES,
+                    conditions.rate,
+                    self._profile.queue_packets,
+                    now_ns,
+                )
                 if departure is None:
                     return None
                 arrival = departure
@@ -147,18 +170,6 @@ class LinkDirection:
         if self._profile.keep_order:
             arrival = self._last_release_ns = max(arrival, self._last_release_ns)
         return arrival
-
-    def _queue(self, size: int, rate: float, now_ns: int) -> int | None:
-        """Queue a packet at the bottleneck; return when it leaves [ns], or None if it is full."""
-        departures = self._departures
-        while departures and departures[0] <= now_ns:
-            departures.popleft()
-        if len(departures) >= self._profile.queue_packets:
-            return None
-        start = departures[-1] if departures else now_ns
-        departure = start + round((size + HEADER_BYTES) * 8e9 / rate)
-        departures.append(departure)
-        return departure
 
     def _find_table(self, epoch: int, kind: int, block: int, conditions: Conditions) -> list[Fate]:
         jitter, loss = conditions.jitter, conditions.loss

@@ -14,6 +14,7 @@ from collections import deque
 from cloudrc.errors import BadInputError
 from cloudrc.link.draws import BLOCK, Fate, impairments, stream_key
 from cloudrc.link.library import KIND
+from cloudrc.link.model import enqueue
 from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
 
 SEGMENT = 1448
@@ -80,7 +81,8 @@ class Medium:
             return None
         leaves_ns: int | None = now_ns
         if now.rate is not None:
-            leaves_ns = self._queue(size + HEADERS, now.rate, now_ns)
+            packets_max = self._profile.queue_packets
+            leaves_ns = enqueue(self._departures, size + HEADERS, now.rate, packets_max, now_ns)
         return None if leaves_ns is None else self._pass(now, fate[0], leaves_ns)
 
     def _pass(self, now: Conditions, extra_ns: int, leaves_ns: int) -> int:
@@ -107,14 +109,3 @@ class Medium:
             stream = stream_key(self._seed, self._uplink, epoch, kind)
             self._tables[key] = impairments(stream, block, self._profile, jitter, loss)
         return self._tables[key][index]
-
-    def _queue(self, size: int, rate: float, now_ns: int) -> int | None:
-        """Put a packet into the bottleneck's queue; return when it leaves [ns], None if full."""
-        departures = self._departures
-        while departures and departures[0] <= now_ns:
-            departures.popleft()
-        if len(departures) >= self._profile.queue_packets:
-            return None
-        start = departures[-1] if departures else now_ns
-        departures.append(start + round(size * 8e9 / rate))
-        return departures[-1]
