@@ -285,7 +285,8 @@ lock: $(VENV)/bin/python ## update the locked requirements of images and tests
 	$(COMPILE) pyproject.toml --extra world --extra record --extra console --output-file images/world/requirements.txt \
 		$(DRAWING:%=--no-emit-package %)
 	$(COMPILE) pyproject.toml --extra record --extra api --output-file images/cloud/requirements.txt
-	$(COMPILE) pyproject.toml --extra record --extra api --extra policy --output-file images/cloud-ros/requirements.txt
+	$(COMPILE) pyproject.toml --extra world --extra record --extra api --extra policy \
+		--output-file images/cloud-ros/requirements.txt $(DRAWING:%=--no-emit-package %)
 	printf 'hatchling\ntccbox\n' | $(COMPILE) - --output-file images/build-requirements.txt
 	$(COMPILE) pyproject.toml --extra dev --no-emit-package cloudrc \
 		--output-file tests/requirements.txt

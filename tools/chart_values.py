@@ -13,9 +13,10 @@ from collections.abc import Iterator
 from typing import Any, TypeAlias
 
 import yaml
+from pydantic import TypeAdapter
 from pydantic.json_schema import models_json_schema
 
-from cloudrc.config.schema import Experiment, MissionConfig, Profile
+from cloudrc.config.schema import Experiment, MissionConfig, Profile, RosNamespace
 
 Schema: TypeAlias = dict[str, Any]
 Path: TypeAlias = tuple[str, ...]
@@ -96,6 +97,7 @@ RULES = {
     "plan": _either(STRING, _ref("MissionConfig"), NULL),
     "interval": _text(r"^[0-9]+(ms|s|m)$"),
     "name": NAME,
+    "namespace": TypeAdapter(RosNamespace).json_schema(),
     "ipFamilyPolicy": _either(_one_of("SingleStack", "PreferDualStack", "RequireDualStack"), NULL),
     "podSecurityContext": _either(OBJECT, NULL),
     "containerSecurityContext": _either(OBJECT, NULL),

@@ -60,6 +60,8 @@ def _cloud_arguments(parser: argparse.ArgumentParser) -> None:
     _end_arguments(parser)
     text = "folder of the sockets of 'cloudrc teleop --socket DIR'"
     _add(parser, "--teleop", "DIR", text, required=True)
+    text = "folder of the sockets of programs that read cloud's records (default: that of teleop)"
+    _add(parser, "--records", "DIR", text)
 
 
 def read_address(text: str) -> Address:
@@ -104,7 +106,7 @@ def _run_cloud(options: argparse.Namespace) -> int:
     stop = StopSignal()
     from cloudrc.processes.ends import EndSettings, run_cloud
 
-    run_cloud(settings_from(options, EndSettings), options.teleop, stop)
+    run_cloud(settings_from(options, EndSettings), options.teleop, options.records, stop)
     return 0
 
 

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 from cloudrc.cli.output import print_line
 from cloudrc.cli.parser import add_verbs
+from cloudrc.cli.token_flag import given_token, token_argument
 from cloudrc.errors import BadInputError
 from cloudrc.runs.interrupts import interrupt_on_signals
-
-if TYPE_CHECKING:
-    from cloudrc.runs.under_way import RunInFlight
+from cloudrc.runs.requirements import require
+from cloudrc.teleop.client import Api
 
 VERBS = {"bridge": "publish a flight on ROS 2, and take goals and velocities from nodes"}
 """Verb -> its line in the help."""
@@ -40,30 +41,45 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     about = "namespace of topics and services, and prefix of the robot's frames (default: none)"
     add("--namespace", type=_namespace, default="", metavar="NAME", help=about)
     add("--observe", action="store_true", help="let nodes see the robot, but not steer it")
+    pod = bridge.add_argument_group("in the container of the chart")
+    pod.add_argument("--config", type=Path, metavar="FILE", help="experiment file")
+    about = "folder of 'cloudrc cloud --records DIR'"
+    pod.add_argument("--records", type=Path, metavar="DIR", help=about)
+    about = "the API of teleop; without a token, nodes cannot steer"
+    pod.add_argument("--api", metavar="URL", help=about)
+    token_argument(pod)
+
+
+class _Flight(NamedTuple):
+    """The flight of which the bridge is the node."""
+
+    config: Path  # experiment file
+    records: Path  # folder of the sockets of cloud and its readers
+    api: Api
+    has_api: bool  # whether the API answers the bridge; otherwise nodes cannot steer
+    has_ended: Callable[[], bool]
 
 
 def execute(options: argparse.Namespace) -> int:
     """Be the node of the flight until it ends or the user interrupts."""
     interrupt_on_signals()
+    in_pod = (options.config, options.records, options.api, options.token_file)
+    flight = _in_pod(options) if any(in_pod) else None
     from cloudrc.bridges.ros2 import require_ros
-    from cloudrc.drivers.local import under_way
 
     packages = "nav_msgs, geometry_msgs, std_msgs, std_srvs, diagnostic_msgs, visualization_msgs"
     require_ros("ros bridge", "bridge", packages)
-    found = _find(options)
-    run, socket = found.folder.resolve(), Path(found.url.removeprefix("unix:"))
-
-    def has_ended() -> bool:
-        return not socket.exists() or under_way().get(run) != found.url
-
+    require("ros bridge", ("world", "record"))
+    flight = flight or _local(options)
     with ExitStack() as stack:
-        bridge, reader = _open(stack, options, found)
-        bridge.run(reader, has_ended)
+        bridge, reader = _open(stack, options, flight)
+        bridge.run(reader, flight.has_ended)
     print_line("the flight has ended", sys.stderr)
     return 0
 
 
-def _find(options: argparse.Namespace) -> RunInFlight:
+def _local(options: argparse.Namespace) -> _Flight:
+    from cloudrc.drivers.local import under_way
     from cloudrc.runs.under_way import find_run, not_found
 
     found = find_run(options.run, steers=not options.observe, flag="")
@@ -71,10 +87,24 @@ def _find(options: argparse.Namespace) -> RunInFlight:
         raise BadInputError(not_found("no run flies here; start one: cloudrc up"))
     if found.note:
         print_line(f"cloudrc: {found.note}", sys.stderr)
-    return found
+    run, socket = found.folder.resolve(), Path(found.url.removeprefix("unix:"))
+
+    def has_ended() -> bool:
+        return not socket.exists() or under_way().get(run) != found.url
+
+    return _Flight(run / "config.yaml", socket.parent, Api(found.url), True, has_ended)
 
 
-def _open(stack: ExitStack, options: argparse.Namespace, found: RunInFlight) -> tuple[Any, Any]:
+def _in_pod(options: argparse.Namespace) -> _Flight:
+    if options.run or not (options.config and options.records and options.api):
+        text = "are for the chart's container: give all of them, and no RUN"
+        raise BadInputError(f"--config, --records and --api {text}")
+    token = given_token(options)
+    api = Api(options.api, token or str)
+    return _Flight(options.config, options.records, api, token is not None, lambda: False)
+
+
+def _open(stack: ExitStack, options: argparse.Namespace, flight: _Flight) -> tuple[Any, Any]:
     """Open the bridge and the reader of cloud's records; `stack` closes them."""
     from cloudrc.bridges.ros2.bridge import RosBridge, Surroundings
     from cloudrc.bridges.ros2.requests import BridgedRobot, RosRequests
@@ -84,10 +114,9 @@ def _open(stack: ExitStack, options: argparse.Namespace, found: RunInFlight) -> 
     from cloudrc.console.steering import Steering
     from cloudrc.drivers.readers import RecordReader
     from cloudrc.report.markers import encode_markers, scene_shapes
-    from cloudrc.teleop.client import Api
     from cloudrc.world.shapes import read_shapes
 
-    world = read_experiment(str(found.folder / "config.yaml")).world
+    world = read_experiment(str(flight.config)).world
     robot = find_robot(world.robot)
     name = options.namespace.strip("/")
     prefix = f"{name}/" if name else ""
@@ -97,20 +126,21 @@ def _open(stack: ExitStack, options: argparse.Namespace, found: RunInFlight) -> 
     def tell(text: str) -> None:
         print_line(f"ros: {text}")
 
-    steering = Steering(Api(found.url))
+    steering = Steering(flight.api)
     requests = RosRequests(
         steering,
         BridgedRobot(robot.planar, robot.heading == "free"),
         tell,
         prefix=prefix,
-        observes=options.observe,
+        observes=options.observe or not flight.has_api,
     )
     bridge = RosBridge(name, surroundings, steering, requests, tell)
     stack.callback(bridge.close)
-    reader = RecordReader(Path(found.url.removeprefix("unix:")).parent)
+    reader = RecordReader(flight.records)
     stack.callback(reader.close)
-    steering.start()
-    stack.callback(steering.end_drive)
+    if flight.has_api:
+        steering.start()
+        stack.callback(steering.end_drive)
     return bridge, reader
 
 

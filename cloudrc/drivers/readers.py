@@ -1,8 +1,8 @@
 """Let other programs of this machine read cloud's records during a flight.
 
-A reader has a socket in the folder of the run's sockets. Cloud sends its records to each reader,
-and never waits for one: what a reader's full socket refuses is dropped. A datagram begins with the
-number of records before it, from which the reader counts the dropped ones.
+A reader has a socket in a folder, usually that of the run's sockets. Cloud sends its records to
+each reader, and never waits for one: what a reader's full socket refuses is dropped. A datagram
+begins with the number of records before it, from which the reader counts the dropped ones.
 
 Each reader connects to cloud's socket: Linux then limits the bytes that wait for the reader, a
 second of records. Without a connection it limits the datagrams, usually to ten.
@@ -78,7 +78,7 @@ class RecordReader:
     """
 
     def __init__(self, folder: Path) -> None:
-        """Begin to receive; `folder` is that of the run's sockets."""
+        """Begin to receive; `folder` has the sockets of cloud and its readers."""
         self._path = folder / f"r{os.getpid()}.sock"
         self._cloud = str(folder / CLOUD)
         self._socket = _bind(self._path)

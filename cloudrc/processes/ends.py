@@ -70,8 +70,13 @@ def run_world(settings: EndSettings, stop: StopSignal) -> None:
     end.run(world, stop, lambda: world.robot.guard.armed, lambda: world.slip_ns)
 
 
-def run_cloud(settings: EndSettings, teleop_folder: Path, stop: StopSignal) -> None:
-    """Run cloud until `stop`; `teleop_folder` has the sockets between cloud and teleop.
+def run_cloud(
+    settings: EndSettings, teleop_folder: Path, records_folder: Path | None, stop: StopSignal
+) -> None:
+    """Run cloud until `stop`.
+
+    `teleop_folder` has the sockets between cloud and teleop, `records_folder` those of the readers
+    of cloud's records: who can reach these alone cannot steer. None: the same folder.
 
     Raise a ControllerLostError if a program outside that controls the robot is lost, and no
     supervisor ends the flight: then a new process begins anew.
@@ -81,7 +86,7 @@ def run_cloud(settings: EndSettings, teleop_folder: Path, stop: StopSignal) -> N
     with (
         closing(UnixPeer(*paths)) as peer,
         _remote_link(experiment, teleop_folder) as channel,
-        closing(RecordSender(teleop_folder)) as readers,
+        closing(RecordSender(records_folder or teleop_folder)) as readers,
     ):
         teleop = RemoteTeleop(peer, time.monotonic_ns())
         cloud = assembly.build_cloud(

@@ -241,6 +241,21 @@ def test_a_namespace_that_ros_refuses_is_bad_input(name, capsys):
     assert "is no namespace of ROS 2" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--records", "here"],
+        ["--config", "experiment.yaml", "--records", "here"],
+        ["--token-file", "operator"],
+        ["runs/latest", "--config", "a.yaml", "--records", "here", "--api", "http://[::1]:8080"],
+    ],
+)
+def test_the_flags_of_the_pod_belong_together(words, capsys):
+    assert main(["ros", "bridge", *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--config, --records and --api are for the chart's container" in line
+
+
 def test_without_ros_the_bridge_says_how_to_get_it(monkeypatch, capsys):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert main(["ros", "bridge"]) == 3

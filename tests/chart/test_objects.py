@@ -86,7 +86,7 @@ def test_every_container_takes_environment_and_mounts_of_the_user():
     found = [containers(specs[pod]) for pod in ("world", "cloud", "mission")]
     named = {name: one for pod in found for name, one in pod.items() if name != "load"}
     ends = {"world", "cloud", "link"}
-    assert named.keys() == {*ends, "teleop", "ros", "nodes", "console", "mission"}
+    assert named.keys() == {*ends, "teleop", "ros", "nodes", "bridge", "console", "mission"}
     for name, one in named.items():
         assert {"name": "TZ", "value": "UTC"} in one["env"], name
         assert "certificates" in {mount["name"] for mount in one["volumeMounts"]}, name
@@ -124,7 +124,7 @@ def test_common_labels_are_on_every_object_and_pod_and_those_of_a_pod_win():
 def test_every_container_takes_environment_variables_and_mounts_of_its_own():
     pods = pod_specs(render(values_of(CHART / "ci" / "everything-values.yaml")))
     parts = [(name, pod, part) for name, pod in pods.items() for part in containers(pod).values()]
-    assert len(parts) == 12
+    assert len(parts) == 13
     for name, pod, part in parts:
         where = name, part["name"]
         assert {"name": "TZ", "value": "UTC"} in part.get("env", []), where
@@ -135,12 +135,20 @@ def test_every_container_takes_environment_variables_and_mounts_of_its_own():
 
 def test_the_command_line_accepts_every_containers_arguments():
     load = {"backgroundLoad": {"enabled": True, "workers": 3}}
-    more = {"mission": {"enabled": True, "queue": True}, "console": {"enabled": True}}
+    on = {"enabled": True}
+    more = {"mission": {**on, "queue": True}, "console": on, "ros": {**on, "steer": True}}
     pods = pod_specs(render({**more, "cloud": load}))
-    assert list(containers(pods["cloud"])) == ["link", "cloud", "teleop", "console", "load"]
+    assert list(containers(pods["cloud"])) == [
+        "link",
+        "cloud",
+        "teleop",
+        "bridge",
+        "console",
+        "load",
+    ]
     assert "seq 3" in containers(pods["cloud"])["load"]["command"][-1]
     parts = [part for pod in pods.values() for part in containers(pod).values() if "args" in part]
-    assert len(parts) == 9
+    assert len(parts) == 10
     for part in parts:
         arguments = [re.sub(r"\$\((\w+)\)", r"\1", text) for text in part["args"]]
         assert callable(build_parser([arguments[0]]).parse_args(arguments).execute)

@@ -26,7 +26,7 @@ def test_the_users_robot_and_scene_replace_those_of_the_experiment():
 
 
 def test_every_container_that_reads_the_experiment_reads_robot_and_scene():
-    pods = pod_specs(render({**OWN, "console": {"enabled": True}}))
+    pods = pod_specs(render({**OWN, "console": {"enabled": True}, "ros": {"enabled": True}}))
     seen = set()
     for end in ("world", "cloud"):
         volumes = {each["name"]: each for each in pods[end]["volumes"]}
@@ -38,7 +38,7 @@ def test_every_container_that_reads_the_experiment_reads_robot_and_scene():
             for kind, folder in FOLDERS.items():
                 source = volumes[mounts[folder]]["configMap"]["name"]
                 assert source == OWN[kind]["configMap"]
-    assert seen == {"world", "link", "cloud", "teleop", "console"}
+    assert seen == {"world", "link", "cloud", "teleop", "bridge", "console"}
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""ROS 2 in the cloud pod: cloudrc's node, and the nodes of the user."""
+"""ROS 2 in the cloud pod: cloudrc's node, the nodes of the user, and the bridge of the flight."""
 
 import pytest
 import yaml
@@ -8,6 +8,8 @@ from cloudrc.cli.main import build_parser
 from tests.chart.conftest import containers, of_kind, pod_specs, render
 
 ON = {"ros": {"enabled": True}}
+SHOWN = {"ros": {"enabled": True}, "cloud": ON}
+STEERED = {**SHOWN, "ros": {"enabled": True, "steer": True, "namespace": "drone1"}}
 NAMED = {"controller": {"name": "ros2", "namespace": "drone1"}}
 
 
@@ -20,9 +22,14 @@ def controller_of(values):
     return yaml.safe_load(text)["cloud"]["controller"]
 
 
+def mounts_of(part):
+    return {mount["mountPath"]: mount["name"] for mount in part["volumeMounts"]}
+
+
 def test_without_ros_the_pod_has_neither_its_containers_nor_its_image():
     parts = cloud_of({})
-    assert not {"ros", "nodes"} & parts.keys()
+    assert not {"ros", "nodes", "bridge"} & parts.keys()
+    assert "--records" not in str(parts["cloud"]["args"])
     assert "ros" not in str({part["image"] for part in parts.values()})
 
 
@@ -55,15 +62,52 @@ def test_one_image_with_ros_serves_the_whole_pod_and_the_missions():
 
 
 def test_dds_stays_in_the_pod_and_the_nodes_reach_no_socket_token_or_key():
-    parts = cloud_of({"cloud": ON})
-    for name in ("ros", "nodes"):
+    parts = cloud_of(SHOWN)
+    for name in ("ros", "nodes", "bridge"):
         env = {each["name"]: each["value"] for each in parts[name]["env"]}
         assert env["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
         assert env["FASTDDS_BUILTIN_TRANSPORTS"] == "UDPv4", "containers need not share memory"
         assert "ports" not in parts[name]
     assert [mount["mountPath"] for mount in parts["nodes"]["volumeMounts"]] == ["/tmp"]
-    policies = [of_kind(render({"cloud": each}), "NetworkPolicy") for each in ({}, ON)]
+    policies = [of_kind(render(each), "NetworkPolicy") for each in ({}, STEERED)]
     assert policies[0] == policies[1]
+
+
+def test_containers_share_no_home_from_which_python_would_run_files():
+    parts = cloud_of(SHOWN)
+    assert len({mounts_of(parts[name])["/tmp"] for name in ("ros", "nodes", "bridge")}) == 3
+
+
+def bridge_of(values):
+    """Return the container `bridge` and its arguments, as the command line reads them."""
+    part = cloud_of(values)["bridge"]
+    return part, build_parser(["ros"]).parse_args(part["args"])
+
+
+def test_a_bridge_reads_the_records_of_cloud_and_nothing_by_which_it_could_steer():
+    part, options = bridge_of(SHOWN)
+    cloud = cloud_of(SHOWN)["cloud"]
+    folder = str(options.records)
+    assert f"--records={folder}" in cloud["args"]
+    assert mounts_of(cloud)[folder] == mounts_of(part)[folder] == "records"
+    assert mounts_of(part).keys() == {"/etc/cloudrc", folder, "/tmp"}
+    assert options.token_file is None
+
+
+def test_a_bridge_steers_with_the_token_of_the_api():
+    part, options = bridge_of(STEERED)
+    assert mounts_of(part)[str(options.token_file.parent)] == "tokens"
+    assert (options.token_file.name, options.namespace) == ("operator", "drone1")
+
+
+def test_only_the_bridge_needs_the_image_with_ros():
+    parts = cloud_of({"ros": {"enabled": True}})
+    assert {name for name, part in parts.items() if "ros" in part["image"]} == {"bridge"}
+
+
+def test_a_namespace_that_ros_refuses_is_refused_at_the_install():
+    with pytest.raises(Exception, match="drone-1"):
+        render({"ros": {"enabled": True, "namespace": "drone-1"}})
 
 
 def test_the_controller_is_ros2_also_with_a_namespace():

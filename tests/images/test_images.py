@@ -15,7 +15,7 @@ ROLES = {"world": ("world", "record"), "cloud": ("record", "api")}
 LOCKS = {
     ROOT / "images" / "world" / "requirements.txt": ROLES["world"],
     ROOT / "images" / "cloud" / "requirements.txt": ROLES["cloud"],
-    ROOT / "images" / "cloud-ros" / "requirements.txt": ROLES["cloud"],
+    ROOT / "images" / "cloud-ros" / "requirements.txt": ("world", "record", "api", "policy"),
     ROOT / "tests" / "requirements.txt": ("dev",),
 }
 BUILD = ROOT / "images" / "build-requirements.txt"

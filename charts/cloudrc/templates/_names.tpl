@@ -41,11 +41,12 @@ app.kubernetes.io/part-of: cloudrc
 {{- include "cloudrc.moreLabels" . }}
 {{- end }}
 
-{{/* Image of a role, "world" or "cloud", by digest if set, else by tag. That of cloud may have ROS 2. */}}
+{{/* Image of a role, "world", "cloud" or "ros", by digest if set, else by tag. That of cloud may be that
+     of ros. */}}
 {{- define "cloudrc.image" -}}
 {{- $image := .root.Values.image -}}
 {{- $ros := .root.Values.cloud.ros -}}
-{{- $of := and (eq .role "cloud") $ros.enabled | ternary $ros.image (index $image .role) -}}
+{{- $of := or (eq .role "ros") (and (eq .role "cloud") $ros.enabled) | ternary $ros.image (get $image .role) -}}
 {{- $name := $image.registry | empty | ternary $of.repository (printf "%s/%s" (trimSuffix "/" $image.registry) $of.repository) -}}
 {{- if $of.digest -}}
 {{ $name }}@{{ $of.digest }}

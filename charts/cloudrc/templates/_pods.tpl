@@ -57,26 +57,28 @@ env:
 {{- end -}}
 {{- end }}
 
-{{/* Common parts of the two containers with ROS 2. DDS stays inside the pod, whose containers share the
+{{/* Common parts of the containers with ROS 2. DDS stays inside the pod, whose containers share the
      loopback address; they need not share memory, and share no numbers of processes. Logs of ROS are
-     in /tmp. */}}
+     in /tmp. Argument: (dict "root" $ "of" VALUES), the values of the container. */}}
 {{- define "cloudrc.rosSettings" -}}
 env:
   - {name: ROS_AUTOMATIC_DISCOVERY_RANGE, value: LOCALHOST}
   - {name: FASTDDS_BUILTIN_TRANSPORTS, value: UDPv4}
   - {name: HOME, value: /tmp}
-  {{- with .Values.cloud.ros.extraEnv }}
+  {{- with .of.extraEnv }}
   {{- toYaml . | nindent 2 }}
   {{- end }}
 terminationMessagePolicy: FallbackToLogsOnError
-{{ include "cloudrc.containerSecurity" . }}
+{{ include "cloudrc.containerSecurity" .root }}
 resources:
-  {{- toYaml .Values.cloud.ros.resources | nindent 2 }}
+  {{- toYaml .of.resources | nindent 2 }}
 {{- end }}
 
+{{/* /tmp is each container's own: Python would run what another one writes there, because it is HOME.
+     Argument: (dict "of" VALUES "name" NAME), the values and the name of the container. */}}
 {{- define "cloudrc.rosMounts" -}}
-- {name: ros, mountPath: /tmp}
-{{- with include "cloudrc.extraMounts" .Values.cloud.ros }}
+- {name: tmp-{{ .name }}, mountPath: /tmp}
+{{- with include "cloudrc.extraMounts" .of }}
 {{ . }}
 {{- end }}
 {{- end }}

@@ -31,7 +31,9 @@ SERVICES: Mapping[str, tuple[str, str]] = {
     "acknowledge": ("/v1/acknowledge", "acknowledged: the next mission may fly"),
 }
 """Service -> path in teleop's API, and words of the answer; `cancel` names a mission there."""
-OBSERVES = "this bridge only observes; start it without --observe"
+OBSERVES = (
+    "this bridge only observes; start it without --observe, in the cluster with ros.steer=true"
+)
 
 
 class BridgedRobot(NamedTuple):
