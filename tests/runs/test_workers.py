@@ -5,11 +5,13 @@ import os
 import signal
 import time
 from copy import copy
+from functools import partial
 
 import pytest
 
 from cloudrc.errors import BadInputError, DiskFullError
 from cloudrc.runs.workers import map_in_order, take_each
+from tests.conftest import wait_until
 
 KILLED = 5
 """The piece of work at which a worker kills its own process."""
@@ -28,9 +30,9 @@ def _slow_first(number):
     return number, os.getpid()
 
 
-def _kill_at_five(number):
+def _kill_at_five(folder, number):
     if number == KILLED:
-        time.sleep(0.5)  # until the other process has done the rest
+        wait_until((folder / str(KILLED - 1)).exists)
         os.kill(os.getpid(), signal.SIGKILL)
     return number
 
@@ -50,9 +52,14 @@ def test_results_keep_the_order_of_the_work(pieces, jobs, workers, monkeypatch):
     assert (os.getpid() in pids) is (workers == 0)
 
 
-def test_results_before_a_worker_was_killed_are_kept():
+def test_results_before_a_worker_was_killed_are_kept(tmp_path):
     results = []
-    end = take_each(map_in_order(_kill_at_five, range(9), 2), results.append)
+
+    def take(number):
+        results.append(number)
+        (tmp_path / str(number)).touch()
+
+    end = take_each(map_in_order(partial(_kill_at_five, tmp_path), range(9), 2), take)
     text = "a worker was killed, perhaps by the kernel because memory ran out; use fewer processes"
     assert (str(end), end.exit_code) == (text, 6)
     assert results == list(range(KILLED))
