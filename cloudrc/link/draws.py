@@ -33,6 +33,7 @@ OVERTAKES = -(1 << 62)  # entry of a packet that skips both queue and delay (`re
 PARETO_CUT = 1e-3  # probability of the tail that is cut off the Pareto distribution, in [0, 1]
 
 _CACHED = 256
+_PAGE = 4  # number of blocks whose uniform variates are drawn by one generator: making one is slow
 _OUTPUTS_PER_COUNT = 4
 _NORMAL_QUANTILE = NormalDist().inv_cdf
 _HALF_ROOT = sqrt(0.5)
@@ -71,16 +72,22 @@ def stream_key(seed: int, uplink: bool, epoch: int, kind: int, stream: str = "")
     return int.from_bytes(digest[:8], "little"), int.from_bytes(digest[8:], "little")
 
 
-@lru_cache(maxsize=_CACHED)
 def uniforms(key: StreamKey, purpose: Purpose, block: int) -> Floats:
     """Draw independent uniform variates in (0, 1) for the packets of a block, shape (256,).
 
     Source: J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011: Philox
     4x64-10.
     """
-    values = uniforms_of(key, purpose, block, 1)
-    values.flags.writeable = False
+    page, row = divmod(block, _PAGE)
+    values: Floats = _page_of_uniforms(key, purpose, page)[row]
     return values
+
+
+@lru_cache(maxsize=_CACHED)
+def _page_of_uniforms(key: StreamKey, purpose: Purpose, page: int) -> Floats:
+    values = uniforms_of(key, purpose, page * _PAGE, _PAGE)
+    values.flags.writeable = False
+    return values.reshape(_PAGE, BLOCK)
 
 
 def uniforms_of(key: StreamKey, purpose: Purpose, block: int, blocks: int) -> Floats:
@@ -225,7 +232,8 @@ def _offsets(
 def _packets_hit(key: StreamKey, purpose: Purpose, block: int, chance: float) -> list[int]:
     if not chance:
         return []
-    return [int(n) for n in np.flatnonzero(uniforms(key, purpose, block) < chance)]
+    hit: list[int] = np.flatnonzero(uniforms(key, purpose, block) < chance).tolist()
+    return hit
 
 
 def _lose_in_bursts(table: list[Fate], key: StreamKey, block: int, loss: GilbertElliott) -> None:

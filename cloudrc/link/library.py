@@ -158,7 +158,7 @@ class OneWay:
             if size < 0 or now_ns < 0:
                 _check_whole(size=size, now_ns=now_ns)
             arrivals = self._link.send(episode, KIND, number, size, now_ns)
-        except (OverflowError, TypeError):
+        except (IndexError, OverflowError, TypeError):
             _check_whole(number=number, size=size, now_ns=now_ns)
             raise
         if self._link.corrupts and arrivals and self._is_damaged(episode, number):
@@ -195,11 +195,12 @@ class OneWay:
         if conditions and _is_independent(self.profile, conditions):
             return self._independent(conditions, episode, first, count)
         fresh = self._new()
-        delays = np.full(count, np.nan)
+        found = []
         for n in range(first, first + count):
             now_ns = n * period_ns
-            if arrivals := fresh.send(episode, KIND, n, size, now_ns):
-                delays[n - first] = (min(arrivals) - now_ns) * 1e-9
+            arrivals = fresh.send(episode, KIND, n, size, now_ns)
+            found.append((min(arrivals) - now_ns) * 1e-9 if arrivals else np.nan)
+        delays = np.array(found)
         if fresh.corrupts:
             start, end = first // BLOCK, -(-(first + count) // BLOCK)
             draws = uniforms_of(self._key(episode), Purpose.CORRUPT, start, end - start)
