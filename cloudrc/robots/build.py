@@ -315,7 +315,10 @@ def _check_onboard(name: str, onboard: Onboard, size: int | None) -> None:
             if not callable(getattr(onboard, method, None)):
                 raise ValueError(f"{type(onboard).__name__} has no method {method}()")
         stopped = getattr(onboard, "stopped", None)
-        numbers = [float(value) for value in stopped] if isinstance(stopped, Iterable) else []
+        numbers = []
+        if isinstance(stopped, Iterable):
+            with suppress(plugins.InvalidResultError):
+                numbers = [plugins.to_number(value, "value") for value in stopped]
         fits = len(numbers) == (size or len(numbers)) and all(map(isfinite, numbers))
         if not numbers or not fits:
             raise ValueError(f"its stopped is {plugins.shorten(stopped)}, not {wanted}")

@@ -14,7 +14,7 @@ from typing import Any
 
 from cloudrc.errors import describe_error
 from cloudrc.messages import NEVER_NS, Vector
-from cloudrc.plugins import check_failure, locate, shorten, stack_of
+from cloudrc.plugins import check_failure, locate, shorten, stack_of, to_number
 from cloudrc.world.onboard import Actuators, Commands, Inputs, Onboard
 from cloudrc.world.readings import Readings
 
@@ -62,8 +62,8 @@ class WatchedOnboard:
         """Return the commands that make the robot follow a velocity [m/s] and yaw rate [rad/s]."""
         try:
             commands = self._update(readings, velocity, yaw_rate)
-            if type(commands) is tuple and len(commands) == self._size and isfinite(sum(commands)):
-                return commands  # `_numbers` takes a microsecond
+            if _are_floats(commands, self._size):
+                return commands
         except BaseException as error:
             raise failure_of(WHAT, self._update, error) from error
         return _numbers(commands, self._size, WHAT, self._update)
@@ -72,7 +72,7 @@ class WatchedOnboard:
         """Return commands as `update` does, while the guard brakes to a velocity [m/s]."""
         try:
             commands = self._brake(readings, velocity)
-            if type(commands) is tuple and len(commands) == self._size and isfinite(sum(commands)):
+            if _are_floats(commands, self._size):
                 return commands
         except BaseException as error:
             raise failure_of(WHAT, self._brake, error) from error
@@ -124,7 +124,7 @@ class WatchedActuators:
             return self._rest
         try:
             inputs = self._step(commands, readings)
-            if type(inputs) is tuple and len(inputs) == self._size and isfinite(sum(inputs)):
+            if _are_floats(inputs, self._size):
                 return inputs
         except BaseException as error:
             self._has_failed = True
@@ -136,10 +136,20 @@ class WatchedActuators:
             raise
 
 
+def _are_floats(values: Any, size: int) -> bool:
+    """Return whether `values` need no `_numbers`, which takes some microseconds."""
+    return (
+        type(values) is tuple
+        and len(values) == size
+        and {*map(type, values)} == {float}
+        and isfinite(sum(values))
+    )
+
+
 def _numbers(values: Any, size: int, what: str, call: Callable[..., Any]) -> tuple[float, ...]:
     """Return the values of a call as floats; refuse another number of values, and NaN."""
     try:
-        numbers = tuple([float(value) for value in values])
+        numbers = tuple([to_number(value, "value") for value in values])
         wrong = len(numbers) != size or not all(map(isfinite, numbers))
     except Exception:  # the values are the user's, and so may be what iterates them
         wrong = True

@@ -112,6 +112,8 @@ def fly(own, tmp_path):
         ("return [*commands, float('inf')]", "list ["),
         ("return None", "NoneType None, not 4 finite numbers"),
         ("return 'stop'", "str 'stop'"),
+        ("return (True, *commands[1:])", "tuple (True, "),
+        ("import numpy; return numpy.ones(4) > 0", "array([ True, "),
         ("raise KeyError('gyro')", "KeyError: 'gyro', own.py:19 in update"),
         ("raise SystemExit(0)", "sys.exit() was called"),
         ("assert False", "AssertionError"),
@@ -147,7 +149,10 @@ def test_the_actuators_of_a_robot_that_failed_push_nothing(fly):
     assert falls[-1] < -0.3
 
 
-@pytest.mark.parametrize("what", ["return (0.0,) * 9", "return [float('nan')] * 10", "1 / 0"])
+@pytest.mark.parametrize(
+    "what",
+    ["return (0.0,) * 9", "return [float('nan')] * 10", "return (0.0,) * 9 + (False,)", "1 / 0"],
+)
 def test_physics_of_actuators_that_fails_in_flight_is_onboard_failed_too(fly, what):
     late = f"if self.steps > 900: {what}"
     flight = fly(FAILS.replace("{what}", "pass") + ACTUATORS.replace("{what}", late))
@@ -216,6 +221,7 @@ def test_a_reset_that_fails_is_told_once(fly):
         ("law.stopped", "(0.0,) * 3", "stopped is tuple (0.0, 0.0, 0.0), not 4 finite numbers"),
         ("law.stopped", "None", "stopped is NoneType None"),
         ("law.stopped", "[float('nan')] * 4", "not 4 finite numbers, one per actuator"),
+        ("law.stopped", "(False,) * 4", "stopped is tuple (False, False, False, False), not 4"),
         ("def brake", "def halt", "Fails has no method brake()"),
         ("def update", "def go", "no method update()"),
         ("self.law.reset()", "raise OSError('no bus')", "no bus"),
