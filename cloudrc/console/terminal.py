@@ -42,6 +42,14 @@ PLACES = {
 PASTE_ON, PASTE_OFF = "\x1b[?2004h", "\x1b[?2004l"
 """Ask the terminal to mark pasted text, and no longer to mark it."""
 PASTE_BEGINS, PASTE_ENDS = "\x1b[200~", "\x1b[201~"
+ARROWS = {
+    "A": curses.KEY_UP,
+    "B": curses.KEY_DOWN,
+    "C": curses.KEY_RIGHT,
+    "D": curses.KEY_LEFT,
+}
+"""Last character of an arrow's sequence -> its key. Terminals send `Esc [ A` or `Esc O A`; curses
+knows only the one of both that TERM names."""
 PASTE_GAP = 1.0
 """Longest pause within pasted text [s]; later, a key counts even without the mark of the end."""
 SEQUENCE_MAX = 16
@@ -88,7 +96,10 @@ class KeyReader:
             self._sequence, self._is_paste = "", False
         self._until = now + PASTE_GAP
         if isinstance(key, str) and self._belongs_to_sequence(key):
-            return None
+            found = self._take_whole_sequence()
+            if found is None:
+                return None
+            key = found
         self._sequence = ""
         if self._is_paste:
             return None
@@ -96,7 +107,7 @@ class KeyReader:
         return meant_key(key)
 
     def _belongs_to_sequence(self, key: str) -> bool:
-        """Return whether a character is a part of a sequence; obey the marks of pasted text."""
+        """Return whether a character is a part of a sequence, and add it."""
         before = self._sequence
         if key == "\x1b":
             self._sequence = key
@@ -104,16 +115,19 @@ class KeyReader:
             return False  # Esc with another key means this key
         else:
             self._sequence += key
-            if len(before) > 1 and (key.isalpha() or key == "~"):
-                self._end_sequence()
         return True
 
-    def _end_sequence(self) -> None:
-        if self._sequence == PASTE_BEGINS:
-            self._is_paste, self.note = True, "pasted text has no effect"
-        elif self._sequence == PASTE_ENDS:
-            self._is_paste = False
+    def _take_whole_sequence(self) -> int | None:
+        """Return the arrow that a whole sequence means, else None; obey marks of pasted text."""
+        sequence = self._sequence
+        if len(sequence) < 3 or not (sequence[-1].isalpha() or sequence[-1] == "~"):
+            return None
         self._sequence = ""
+        if sequence == PASTE_BEGINS:
+            self._is_paste, self.note = True, "pasted text has no effect"
+        elif sequence == PASTE_ENDS:
+            self._is_paste = False
+        return ARROWS.get(sequence[2:])
 
 
 def meant_key(key: str | int) -> str | int:

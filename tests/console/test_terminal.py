@@ -39,10 +39,15 @@ def test_a_key_counts_again_if_the_end_of_pasted_text_never_arrives():
     assert keys(f"{PASTE_BEGINS}some", "X", pause=1.1 * PASTE_GAP) == ["X"]
 
 
+SIDEWAYS = [curses.KEY_RIGHT, curses.KEY_LEFT]
+
+
 @pytest.mark.parametrize(
     ("sent", "found"),
     [
         ("\x1b[I\x1b[1;5Aw", ["w"]),  # the window has the focus; Ctrl and an arrow
+        ("\x1bOA\x1b[B\x1bOC\x1b[D", [curses.KEY_UP, curses.KEY_DOWN, *SIDEWAYS]),
+        ("\x1b[200~\x1bOA\x1b[201~w", ["w"]),
         ("\x1bX", ["X"]),  # Alt and X
         ("\x1b\x1b[200~X\x1b[201~", []),
         ("\x1b[" + "1" * 40 + "X", ["1"] * 26 + ["X"]),
