@@ -24,6 +24,7 @@ EVENT = MissionEvent(5, "reached", 1, "waypoint 2 of 7 reached")
 @pytest.fixture(autouse=True)
 def flights(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))  # if others may write to `tmp_path`
     return local.flights_folder()
 
 
