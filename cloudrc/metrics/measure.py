@@ -162,6 +162,6 @@ def _choose(flight: Flight, choices: set[str]) -> tuple[set[str], list[str]]:
     left = choices & IN_SPITE_OF_HOLES if ends else set[str]()
     others = sorted(name_of(choice) for choice in choices - left if choice not in SHIPPED)
     notes = [f"{METRIC_NOTE}{name} is not measured: messages are lost in flight" for name in others]
-    about = "Ages, losses, counts, distances and extremes"
+    about = "All numbers that this can make wrong"
     about = about if ends else "The end of the flight is lost, too: all numbers"
     return left, [f"{about} are left out, because messages are lost in flight.", *notes]

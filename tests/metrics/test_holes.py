@@ -116,7 +116,9 @@ def test_numbers_in_spite_of_a_hole_are_those_of_the_whole_flight():
     whole = measure_all(flown().flight())[0]
     found, notes, _ = measure_all(lossy(flown(), (5.0, 5.5)))
     assert found.keys() <= IN_SPITE_OF_HOLES <= SHIPPED.keys()
-    assert {"duration", "rtt_mean", "uplink_delay_mean", "waypoints_reached"} <= found.keys()
+    assert {"duration", "age_of_information_mean", "waypoints_reached"} <= found.keys()
+    assert {"rtt_mean", "uplink_delay_mean", "obstacle_contacts"} <= found.keys()
+    assert not {"age_at_actuator_mean", "uplink_loss", "hold_count"} & found.keys()
     for name, number in found.items():
         assert number.value == pytest.approx(whole[name].value, rel=1e-3), name
     assert len(notes) == 1
