@@ -124,6 +124,15 @@ def test_numbers_in_spite_of_a_hole_are_those_of_the_whole_flight():
     assert len(notes) == 1
 
 
+def test_rows_behind_a_hole_are_known_by_their_stamps():
+    flight = flown().flight()
+    stamps_ns = flight.truth["stamp_ns"]
+    assert len(flight.rows_behind_holes(stamps_ns)) == 0
+    flight.recording.holes = (Hole(0, at(-1)), Hole(at(5), at(6)), Hole(at(20), END_NS), SOMEWHERE)
+    (row,) = flight.rows_behind_holes(stamps_ns)
+    assert stamps_ns[row - 1] < at(5.5) <= stamps_ns[row]
+
+
 def test_a_hole_outside_of_the_flight_changes_no_number():
     assert measure_all(lossy(flown(), (11.0, 12.0))) == measure_all(flown().flight())
 

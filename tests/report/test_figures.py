@@ -11,13 +11,14 @@ from matplotlib.collections import LineCollection, PolyCollection
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import DirectionConfig
 from cloudrc.geometry.shapes import Shapes, box, terrain
+from cloudrc.record.holes import Hole
 from cloudrc.records import Control
 from cloudrc.report.figures import FIGURES, draw_all, own_settings
 from cloudrc.report.figures.labels import FREE, place_labels
 from cloudrc.report.figures.projection import View, glass, simplified
-from cloudrc.report.figures.style import RC, Look, Subject
+from cloudrc.report.figures.style import RC, Look, Subject, sampled
 from cloudrc.world.shapes import read_shapes
-from tests.metrics.conftest import ONE_PIPE, OPEN_AIR, START, flown
+from tests.metrics.conftest import ONE_PIPE, OPEN_AIR, SECOND, START, flown
 
 CALM = DirectionConfig(delay_ms=50.0)
 
@@ -47,6 +48,38 @@ def test_figures_ignore_the_users_matplotlib_settings(monkeypatch):
     with matplotlib.rc_context(theirs):
         assert draw_all(subject_of(flown())) == [picture]
         assert matplotlib.rcParams["text.usetex"], "put back"
+
+
+@pytest.mark.parametrize("name", ["flight", "delay", "odom", "error"])
+def test_no_line_crosses_a_hole(name):
+    """The robot flies at 1 m/s along x, of which 3 s are lost."""
+    log, begin, end = flown(), START + 4 * SECOND, START + 7 * SECOND
+    for records in (log.world, log.cloud):
+        records[:] = [each for each in records if not begin < each.stamp_ns < end]
+    subject = subject_of(log)
+    assert longest(name, subject) > 2.9
+    subject.flight.recording.holes = (Hole(begin, end),)
+    assert longest(name, subject) < 1.1
+
+
+def longest(name, subject):
+    """Return the largest extent along x of a line between two points [m] or [s]."""
+    with own_settings(Look()):
+        figure = FIGURES[name][0](subject)
+    found = []
+    for axes in figure.axes:
+        found += [line.get_xydata() for line in axes.lines if line.get_linestyle() != "None"]
+        for each in axes.collections:
+            is_path = isinstance(each, LineCollection) and each.get_array() is not None
+            found += each.get_segments() if is_path else []
+    return max(np.nanmax(np.abs(np.diff(points[:, 0])), initial=0.0) for points in found)
+
+
+def test_a_sampled_path_has_both_sides_of_a_hole_and_no_line_between_them():
+    rows, is_line = sampled(12, np.array([7]))
+    assert rows.tolist() == [0, 5, 6, 7, 10, 11]
+    assert is_line.tolist() == [True, True, False, True, True]
+    assert [len(each) for each in sampled(0, np.zeros(0, int))] == [0, 0]
 
 
 def samples(figure, axes):

@@ -15,7 +15,7 @@ from cloudrc.metrics.flight import Array, rms
 from cloudrc.report.figures import style
 from cloudrc.report.figures.labels import is_free
 from cloudrc.report.figures.marks import bounds, mark_events
-from cloudrc.report.figures.style import Subject, dots, legend_above, new_figure, panel
+from cloudrc.report.figures.style import Subject, broken, dots, legend_above, new_figure, panel
 
 DELAY_ALT = "Two scatter plots over time: one-way delays, and the loop delay with its estimate."
 DELAY = (
@@ -71,8 +71,8 @@ def _draw_loop(axes: Axes, subject: Subject, time: Array, known: list[Limits]) -
     echoes, control = round_trips(flight), flight.control
     loop_delay, horizon = echoes["loop_delay"] * 1e3, control["horizon"] * 1e3
     dots(axes, flight.seconds(echoes["stamp_ns"]), loop_delay, style.SKY, "loop delay")
-    stamps = flight.seconds(control["stamp_ns"])
-    axes.plot(stamps, horizon, color=style.BLACK, label="estimate", zorder=4)
+    stamps, behind = _times(subject)
+    axes.plot(stamps, broken(horizon, behind), color=style.BLACK, label="estimate", zorder=4)
     shown = [loop_delay, horizon]
     if len(known) == 2:
         low, high = (sum(each) for each in zip(*known, strict=True))
@@ -81,6 +81,13 @@ def _draw_loop(axes: Axes, subject: Subject, time: Array, known: list[Limits]) -
         axes.plot(time, mean, color=style.GREEN, lw=0.8, ls="--", label="mean", zorder=3)
         shown.append(high * 1e3)
     _finish_delay(axes, subject, "loop delay (ms)", shown)
+
+
+def _times(subject: Subject) -> tuple[Array, Array]:
+    """Return the times of the control periods [s], broken at holes, and the rows behind holes."""
+    stamps_ns = subject.flight.control["stamp_ns"]
+    behind = subject.flight.rows_behind_holes(stamps_ns)
+    return broken(subject.flight.seconds(stamps_ns), behind), behind
 
 
 def _fill(axes: Axes, time: Array, low: Array, high: Array, label: str) -> None:
@@ -139,12 +146,12 @@ def draw_odom(subject: Subject) -> Figure:
     """Draw reference, measured and estimated position, one panel per axis."""
     names = "xy" if subject.shapes.planar else "xyz"
     figure, control = new_figure(1.4 * len(names), subject.look.width), subject.flight.control
-    time = subject.flight.seconds(control["stamp_ns"])
+    time, behind = _times(subject)
     rows = figure.subplots(len(names), 1, sharex=True)
     for index, (axes, name) in enumerate(zip(rows, names, strict=True)):
         panel(axes, "abc"[index])
         for column, look in LINES.items():
-            axes.plot(time, control[column][:, index], **look)
+            axes.plot(time, broken(control[column][:, index], behind), **look)
         mark_events(axes, subject)
         axes.set_ylabel(f"${name}$ (m)")
         axes.margins(y=0.12)
@@ -182,8 +189,9 @@ def _draw_inset(rows: Any, subject: Subject) -> None:
     # The numbers of the inset are inside the box, too.
     left, low = box.x0 + 0.2 * width, box.y0 + 0.14
     inset = rows[axis].inset_axes((left, low, box.x1 - left, box.y1 - low))
+    times, behind = _times(subject)
     for name, look in LINES.items():
-        inset.plot(time, control[name][:, axis], **look)
+        inset.plot(times, broken(control[name][:, axis], behind), **look)
     inset.set(xlim=(begin, begin + ZOOM), ylim=(shown.min() - room, shown.max() + room))
     inset.locator_params(nbins=3)
     inset.tick_params(labelsize="x-small", pad=1.5, length=2.0)
@@ -225,11 +233,11 @@ def draw_error(subject: Subject) -> Figure:
     flight, control = subject.flight, subject.flight.control
 
     panel(tracking, "a")
-    time = flight.seconds(control["stamp_ns"])
+    time, behind = _times(subject)
     for column in ("measured", "position"):
         error = tracking_errors(flight, control[column])
         look = LINES[column] | {"label": f"{LINES[column]['label']}{_rms(error, 'm', 1.0)}"}
-        tracking.plot(time, np.linalg.norm(error, axis=1), **look)
+        tracking.plot(time, broken(np.linalg.norm(error, axis=1), behind), **look)
     tracking.set_ylim(bottom=0.0)
     _finish(tracking, subject, "distance to reference (m)", 2)
 

@@ -31,10 +31,12 @@ from cloudrc.report.figures.style import (
     SKY,
     VERMILION,
     Subject,
+    broken,
     distance_moved,
     new_figure,
     own_bodies,
     panel,
+    sampled,
 )
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -121,23 +123,24 @@ def _arrange(subject: Subject) -> tuple[Figure, dict[str, Axes]]:
 
 
 def _draw_path(axes: Axes, subject: Subject, x: Array, y: Array) -> LineCollection | None:
-    clearance = subject.flight.clearance
+    clearance, points = subject.flight.clearance, np.stack([x, y], axis=1)
+    behind = subject.flight.rows_behind_holes(subject.flight.truth["stamp_ns"])
     if len(clearance) != len(x) or len(x) < 2:
-        axes.plot(x, y, color=BLACK, lw=1.4)
+        axes.plot(*broken(points, behind).T, color=BLACK, lw=1.4)
         return None
-    # Draw 20 of the 100 points per second: the path looks smooth, and the file is smaller.
-    ends = np.append(np.arange(0, len(x) - 1, 5), len(x) - 1)
-    points = np.stack([x, y], axis=1)[ends]
-    axes.plot(*points.T, color=BLACK, lw=3.0, solid_capstyle="round", zorder=3)
+    ends, is_line = sampled(len(x), behind)
+    points = points[ends]
+    around = broken(points, np.searchsorted(ends, behind))
+    axes.plot(*around.T, color=BLACK, lw=3.0, solid_capstyle="round", zorder=3)
     lines = LineCollection(
-        list(np.stack([points[:-1], points[1:]], axis=1)),
+        list(np.stack([points[:-1], points[1:]], axis=1)[is_line]),
         cmap="viridis",
         norm=Normalize(0.0, CLEARANCE_SHOWN),
         lw=1.8,
         capstyle="round",
         zorder=4,
     )
-    lines.set_array(np.minimum.reduceat(clearance, ends[:-1]))
+    lines.set_array(np.minimum.reduceat(clearance, ends[:-1])[is_line])
     axes.add_collection(lines)
     axes.autoscale_view()
     return lines

@@ -25,9 +25,11 @@ from cloudrc.report.figures.style import (
     GREY,
     LIGHT,
     Subject,
+    broken,
     distance_moved,
     new_figure,
     own_bodies,
+    sampled,
 )
 
 ALT = "A drawing of the scene in perspective from above: obstacles, the path, and the robot."
@@ -70,6 +72,7 @@ class _Stage:
     def __init__(self, subject: Subject) -> None:
         flight, shapes = subject.flight, subject.shapes
         self.path, self.robot = flight.truth["position"], shapes.robot
+        self.behind = flight.rows_behind_holes(flight.truth["stamp_ns"])
         self.planar = shapes.planar
         self.turns, self.scene = flight.truth["orientation_wxyz"], flight.scene
         self.obstacles = own_bodies(subject)
@@ -223,9 +226,10 @@ def draw(subject: Subject) -> Figure:
     corners = [np.concatenate([each.corners for each in robot]) for robot in robots if robot]
     parts = stage.surroundings(np.concatenate([np.zeros((0, 3)), *corners]))
     parts += view.polygons(chain(*robots))
-    steps = path[np.append(np.arange(0, len(path) - 1, 5), len(path) - 1)] if len(path) else path
+    ends, is_line = sampled(len(path), stage.behind)
+    steps = path[ends]
     if len(steps) > 1:
-        lines = np.stack([steps[:-1], steps[1:]], axis=1)
+        lines = np.stack([steps[:-1], steps[1:]], axis=1)[is_line]
         size = subject.shapes.size
         distance = np.linalg.norm(lines[:, None, 0] - path[stage.rows], axis=2).min(axis=1)
         for near, behind in ((distance < size / 2, size), (distance >= size / 2, 0.0)):
@@ -265,7 +269,8 @@ def _draw_floor(axes: Axes, stage: _Stage) -> None:
         ):
             axes.plot(*view.project(np.array(line)).T, color=LIGHT, lw=0.4, zorder=0)
     if stage.has_shadow:
-        axes.plot(*view.project(stage.shadow).T, color=GREY, lw=0.7, alpha=0.5, zorder=0)
+        shadow = broken(view.project(stage.shadow), stage.behind)
+        axes.plot(*shadow.T, color=GREY, lw=0.7, alpha=0.5, zorder=0)
 
 
 def _down(view: View, stage: _Stage, height: float) -> Array:

@@ -120,6 +120,26 @@ class Subject:
         return self.flight.mission.touched
 
 
+def broken(values: Array, behind: Array) -> Array:
+    """Insert NaN into `values`, any unit, shape (n, ...), so that no line crosses a hole.
+
+    `behind` are the rows behind the holes, shape (m,).
+    """
+    return np.insert(values, behind, np.nan, axis=0)
+
+
+def sampled(count: int, behind: Array) -> tuple[Array, Array]:
+    """Choose 20 of the 100 points per second of a path: it looks smooth, and the file is smaller.
+
+    `count` is the number of points, any unit. `behind` are the rows behind holes, shape (m,).
+    Return the chosen rows, and for each pair of neighbours whether a line joins them: not across a
+    hole.
+    """
+    every = [*range(0, count, 5), *range(count)[-1:]]
+    rows = np.unique(np.array([*every, *(behind - 1), *behind], dtype=int))
+    return rows, ~np.isin(rows[1:], behind)
+
+
 def own_bodies(subject: Subject) -> list[Surface]:
     """Return the surfaces of a scene that are not those of tubes: the file gives their shape."""
     tubes = {tube.name for tube in subject.flight.scene.tubes}
