@@ -213,7 +213,7 @@ def flight_evidence(
     """Collect the evidence for the verdict from the records and from the metrics of a flight.
 
     `real_time` is True if the run had to keep real time: in all modes except virtual. `interrupted`
-    is True if the run was stopped, or if its recording is cut short.
+    is True if the run was stopped.
     """
     criteria, end_ns = flight.criteria, flight.end_ns
     reached, touch = numbers.get("waypoints_reached"), None

@@ -12,7 +12,6 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.content import Message
 from cloudrc.record.reader import LISTED_MAX, File, list_some
 from cloudrc.record.topics import VIEWS
-from cloudrc.record.writer import DAMAGED
 
 LOSSY_SHARE_MAX = 0.999
 """Largest value of `Recovery.share` if something is missing [1]."""
@@ -75,8 +74,6 @@ def recover(
         counts = [f"{'?' if n is None else n} on {topic}" for topic, n in sorted(dropped.items())]
         missed.append(f"messages that are not in the copy: {list_some(counts)}")
     recording.told = "; ".join(filter(None, [recording.told, *missed]))
-    if bytes_lost := file.unread + file.left_out:
-        recording.metadata[DAMAGED] = str(bytes_lost)
     recording.write(target)
     notes += missed
     written = _written(recording)
@@ -90,7 +87,7 @@ def recover(
         topics=dict(sorted(written.items())),
         derived=derived,
         dropped=dropped,
-        bytes_lost=bytes_lost,
+        bytes_lost=file.unread + file.left_out,
         notes=notes,
         remarks=list(recording.remarks),
         index_is_new=not file.ended,

@@ -19,8 +19,6 @@ from cloudrc.geometry.obstacles import has_surface, intangible, known, obstacles
 from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
-from cloudrc.record.holes import goes_on
-from cloudrc.record.writer import DAMAGED
 from cloudrc.report.document import (
     ENVIRONMENT_FILE,
     INCOMPLETE,
@@ -49,11 +47,10 @@ def assess(
     """
     flight = flight_of(recording, experiment)
     numbers, metric_notes, traceback = measure_all(flight, own)
-    # A damaged file does not tell that the run was interrupted.
-    is_cut = bool(recording.note) and DAMAGED not in recording.metadata
-    is_cut = is_cut and not goes_on(recording.holes)
-    real_time, stopped = run.mode != "virtual", run.interrupted or is_cut
-    evidence = flight_evidence(flight, numbers, real_time=real_time, interrupted=stopped)
+    # A file that is cut short does not tell that the run was interrupted.
+    evidence = flight_evidence(
+        flight, numbers, real_time=run.mode != "virtual", interrupted=run.interrupted
+    )
     verdict, operator = judge(evidence), None
     notes = list(run.notes)
     if recording.note:

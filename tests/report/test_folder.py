@@ -114,7 +114,7 @@ def test_a_torn_recording_still_gives_a_report(run):
     mission = run / "mission.mcap"
     cut(mission, mission)
     found = write_report(run, *read_run(run), page=False)
-    assert (found["verdict"], found["complete"]) == ("interrupted", False)
+    assert (found["verdict"], found["complete"], exit_code(found)) == ("invalid", False, 6)
     assert found["notes"][0].startswith("The recording is incomplete: cut short")
     assert 0 < found["numbers"]["duration"]["value"] < 10
     assert "records_sha256" not in found
@@ -135,14 +135,18 @@ def test_a_report_of_a_recovered_recording_says_in_its_first_line_that_it_is_inc
 
 
 @pytest.mark.parametrize("was_interrupted", [False, True])
-def test_a_copy_whose_end_is_lost_is_invalid_unless_the_run_was_interrupted(run, was_interrupted):
+@pytest.mark.parametrize("copies", [False, True])
+def test_a_run_whose_end_is_lost_is_invalid_unless_it_was_interrupted(run, was_interrupted, copies):
     (run / "report.json").unlink()
     mission, facts = run / "mission.mcap", replace(RUN, interrupted=was_interrupted)
     recording = Recording.read(mission)
     recording.metadata |= facts.metadata
     recording.write(mission)  # the facts about the run come first
     cut(mission, run / "torn.mcap")
-    recover(run / "torn.mcap", mission)
+    if copies:
+        recover(run / "torn.mcap", mission)
+    else:
+        (run / "torn.mcap").replace(mission)
     found = write_report(run, *read_run(run), page=False)
     verdict = "interrupted" if was_interrupted else "invalid"
     assert (found["verdict"], exit_code(found)) == (verdict, 130 if was_interrupted else 6)
