@@ -32,14 +32,15 @@ class Content:
     remarks: tuple[str, ...] = ()  # what was ignored or sorted; "The recording" precedes each
 
     def refuse_damaged(self, path: Path) -> None:
-        """Raise a BadInputError if the file was damaged or changed; `path` is the file."""
-        if self.lacking:
-            raise BadInputError(f"{path}: {self.lacking}{self.remedy(path)}")
+        """Raise a BadInputError if the file is torn, damaged or changed; `path` is the file."""
+        if wrong := self.lacking or self.torn:
+            raise BadInputError(f"{path}: {wrong}{self.remedy(path)}")
 
     def remedy(self, path: Path) -> str:
         """Return the end of an error about the damaged file `path`: what to do; "" for others."""
         how = f"; to copy what is readable: cloudrc recover {quote(str(path))}"
-        return how if "damaged" in self.lacking or FOLLOWED in self.lacking else ""
+        is_damaged = self.torn or "damaged" in self.lacking or FOLLOWED in self.lacking
+        return how if is_damaged else ""
 
     @property
     def note(self) -> str:

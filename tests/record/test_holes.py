@@ -17,6 +17,11 @@ from cloudrc.runs.replay import write_replay
 from tests.record.conftest import MS, SECOND, cloud_records, rewrite, world_records, write
 
 RECORDS = world_records(200)  # four chunks
+READERS = [
+    lambda path: read_packets(path, LogSettings()),
+    identify,
+    lambda path: write_replay(path, path.with_name("page.html")),
+]
 HOLE = Hole(CHUNK_NS - 6 * MS, 2 * CHUNK_NS)
 
 
@@ -113,17 +118,17 @@ def test_a_mission_is_whole_if_both_files_contain_its_end(tmp_path, count, whole
     assert (mission.torn == "", mission.holes == ()) == (whole, whole)
 
 
-@pytest.mark.parametrize(
-    "read",
-    [
-        lambda path: read_packets(path, LogSettings()),
-        identify,
-        lambda path: write_replay(path, path.with_name("page.html")),
-    ],
-)
+@pytest.mark.parametrize("read", READERS)
 def test_every_reader_refuses_a_damaged_file_and_names_the_remedy(damaged, read):
     with pytest.raises(BadInputError, match=r"damaged at byte .*cloudrc recover .*x\.mcap$"):
         read(damaged)
+
+
+@pytest.mark.parametrize("read", READERS)
+def test_every_reader_refuses_a_torn_file_and_names_the_remedy(path, read):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(BadInputError, match=r"cut short: .*cloudrc recover .*x\.mcap$"):
+        read(path)
 
 
 def test_holes_are_described_in_words():
