@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.errors import DISK_FULL
+from cloudrc.record.holes import Hole
 from cloudrc.records import (
     Arrival,
     CommandApplied,
@@ -45,6 +46,8 @@ IDLE = 0.1
 """Sleep of the thread after it has written all records [s]."""
 BUSY = 0.001
 """Sleep of the thread while more records wait [s]."""
+APART_NS = 1_000_000_000
+"""Lost records belong to one hole of the recording if they are less than this apart [ns]."""
 FLUSH = 0.25
 """Shortest time between two flushes [s]. A killed process loses records of less than 0.5 s."""
 
@@ -74,8 +77,9 @@ class FlightsOnly:
 class Recorder:
     """Writes records to a file in the background, from `start` to `stop`.
 
-    If the queue is full, the oldest record is dropped and counted. A file error must not stop the
-    flight, so no method raises an exception.
+    If the queue is full, the oldest record is dropped, and the file names the number of dropped
+    records and the holes that they leave. A file error must not stop the flight, so no method
+    raises an exception.
     """
 
     def __init__(
@@ -95,7 +99,8 @@ class Recorder:
         self._queue: deque[Record] = deque()
         self._sink: McapWriter | None = None
         self._ended = False
-        self._overflowed = self._unwritten = 0
+        self._overflowed = self._unwritten = self._noted = 0
+        self._holes: list[Hole] = []
         self._sync_error: OSError | None = None
         self._safe_since: float | None = None
         self._stopping, self._flushed = threading.Event(), threading.Event()
@@ -115,8 +120,28 @@ class Recorder:
         while len(queue) > CAPACITY:
             # The other thread may have emptied the queue in the meantime.
             with contextlib.suppress(IndexError):
-                queue.popleft()
+                self._lose(queue.popleft())
                 self._overflowed += 1
+
+    def _lose(self, record: Record) -> None:
+        """Remember when a record was lost."""
+        begin_ns, end_ns = record.stamp_ns - 1, record.stamp_ns + 1
+        if self._holes and begin_ns - self._holes[-1].end_ns < APART_NS:
+            last = self._holes.pop()
+            begin_ns, end_ns = min(begin_ns, last.begin_ns), max(end_ns, last.end_ns)
+        self._holes.append(Hole(begin_ns, end_ns))
+
+    def _note_losses(self, sink: McapWriter) -> None:
+        """Note in the file which records are lost, if these are more than before."""
+        if self.dropped == self._noted:
+            return
+        self._noted = self.dropped
+        lost = {
+            "were dropped, because the disk was too slow": self._overflowed,
+            "could not be written": self._unwritten,
+        }
+        text = "; ".join(f"{count} records {how}" for how, count in lost.items() if count)
+        sink.note_losses(text, self._holes)
 
     def start(self) -> None:
         """Start the threads that write the file and sync it to the disk."""
@@ -168,6 +193,7 @@ class Recorder:
         """Pass data to the operating system; close the file if it is full or a sync has failed."""
         if self._sink and not self._ended:
             try:
+                self._note_losses(self._sink)
                 self._sink.flush()
                 if self._sync_error is not None:
                     raise self._sync_error
@@ -195,6 +221,7 @@ class Recorder:
         if self._sink and not self._ended:
             self._ended = True
             try:
+                self._note_losses(self._sink)
                 self._sink.close()
             except OSError as error:
                 self._end(error)
@@ -210,6 +237,7 @@ class Recorder:
             self._end(error)
         except Exception as error:  # one record that cannot be encoded must not stop the others
             self._unwritten += 1
+            self._lose(record)
             kind = type(record).__name__
             self.error = f"{self._path}: a record of type {kind} cannot be written: {error}"
 

@@ -156,7 +156,10 @@ class Recording(Content):
     def keep(self, first_ns: int, last_ns: int) -> None:
         """Remove what has a log time [ns] before `first_ns` or after `last_ns`."""
         self.messages = [each for each in self.messages if first_ns <= each[1] <= last_ns]
-        self.holes = tuple(hole for hole in self.holes if hole.meets(first_ns, last_ns))
+        holes = tuple(hole for hole in self.holes if hole.meets(first_ns, last_ns))
+        if self.holes and not holes:  # what the writers have missed is not in this time
+            self.told = ""
+        self.holes = holes
         self._tables.clear()
 
     def __getitem__(self, topic: str) -> Table:

@@ -569,7 +569,8 @@ def _holes(file: File) -> tuple[Hole, ...]:
     found = set(known or ())
     if not _has_all_rows(file):
         found |= {between(file.spans, gap.start) for gap in file.gaps}
-        if not file.data_ended or (content.told and known is None):
+        # Only a complete file has its counts; the holes in an incomplete one lack its lost end.
+        if not file.data_ended or (content.told and (known is None or not file.has_counts)):
             found.add(Hole(content.messages[-1][1] if content.messages else 0, END_NS))
         if content.note and not found:
             found.add(SOMEWHERE)

@@ -26,7 +26,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 from cloudrc.files import atomic_file
 from cloudrc.record import WALL_OFFSET, wall_time
 from cloudrc.record.content import Content
-from cloudrc.record.holes import to_metadata
+from cloudrc.record.holes import Hole, to_metadata
 from cloudrc.record.ros import definition, encode, type_hash
 from cloudrc.record.topics import TOPICS, VIEWS, topics_of
 from cloudrc.records import Record
@@ -149,6 +149,10 @@ class McapWriter:
     def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
         """Attach a file, such as report.json, to the recording."""
         self._mcap.add_attachment(0, self._latest_ns, name, media_type, data)
+
+    def note_losses(self, text: str, holes: Iterable[Hole]) -> None:
+        """Note in words what is missing from the file, and the times of the missing messages."""
+        self.note({MISSING: text} | to_metadata(holes))
 
     def flush(self) -> None:
         """Complete the present chunk and pass it to the operating system."""

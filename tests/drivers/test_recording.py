@@ -64,6 +64,25 @@ def test_the_oldest_are_dropped_and_counted(monkeypatch):
     assert recorder.error == ""
 
 
+def test_records_that_a_slow_disk_drops_are_told_and_leave_a_hole(tmp_path, monkeypatch):
+    path, records = tmp_path / "world.mcap", world_records(600)
+    monkeypatch.setattr("cloudrc.drivers.recording.CAPACITY", 200)
+    recorder = Recorder(path, open_mcap)
+    third = len(records) // 3
+    for start in (0, third, 2 * third):
+        for record in records[start : start + third]:
+            recorder.put([record])
+            if start != third:
+                recorder._drain()
+        recorder._flush()
+    recorder._close()
+    recording = Recording.read(path)
+    assert f"{recorder.dropped} records were dropped" in recording.note
+    (hole,) = recording.holes
+    stamps_ns = [each.stamp_ns for each in records[third : third + recorder.dropped]]
+    assert hole == (stamps_ns[0] - 1, stamps_ns[-1] + 1)
+
+
 def test_what_is_recorded_can_be_read(tmp_path):
     path, records = tmp_path / "world.mcap", world_records(160)
     recorder = Recorder(path, open_mcap)

@@ -191,6 +191,9 @@ class Shelf:
 
     sync = flush
 
+    def note_losses(self, text, holes):
+        self.lost = text, list(holes)
+
     def abandon(self, reason):
         self.closed = True
         return 0
