@@ -9,6 +9,7 @@ every wrong byte outside the index. A complete file has the number of its messag
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
 from collections import Counter
@@ -23,7 +24,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer, Metadata
 from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 
-from cloudrc.files import atomic_file
+from cloudrc.files import atomic_file, open_file
 from cloudrc.record import WALL_OFFSET, wall_time
 from cloudrc.record.content import Content
 from cloudrc.record.holes import Hole, to_metadata
@@ -77,6 +78,9 @@ class McapWriter:
         self._stream: IO[bytes] | FileIO = (
             target.open("wb", buffering=0) if isinstance(target, Path) else target
         )
+        if self._owned:
+            with suppress(OSError):  # a file system without locks
+                fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         # Any, because mcap's writer is not annotated throughout.
         self._mcap: Any = Writer(
             self._stream,
@@ -146,13 +150,13 @@ class McapWriter:
         self._noted |= metadata
         self._mcap.add_metadata(METADATA, dict(self._noted))
 
-    def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
-        """Attach a file, such as report.json, to the recording."""
-        self._mcap.add_attachment(0, self._latest_ns, name, media_type, data)
-
     def note_losses(self, text: str, holes: Iterable[Hole]) -> None:
         """Note in words what is missing from the file, and the times of the missing messages."""
         self.note({MISSING: text} | to_metadata(holes))
+
+    def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
+        """Attach a file, such as report.json, to the recording."""
+        self._mcap.add_attachment(0, self._latest_ns, name, media_type, data)
 
     def flush(self) -> None:
         """Complete the present chunk and pass it to the operating system."""
@@ -226,6 +230,16 @@ class McapWriter:
         channel = int(self._mcap.register_channel(topic, "cdr", schema, metadata))
         self._channels[topic] = channel
         return channel
+
+
+def is_open(path: Path) -> bool:
+    """Return whether a process still writes the recording at `path`."""
+    with suppress(OSError, ValueError), open_file(path) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 def write(content: Content, target: Path, attachments: Mapping[str, bytes]) -> None:

@@ -28,8 +28,7 @@ def identify(run: Path) -> tuple[list[Fit], float]:
     does not excite an axis.
     """
     path = run / "mission.mcap" if run.is_dir() else run
-    if not path.exists():
-        refuse_under_way(path.parent)
+    refuse_under_way(path.parent)
     recording = Recording.read(path)
     recording.refuse_damaged(path)
     given, measured = velocity_loop.series(recording, str(path))

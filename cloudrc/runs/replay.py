@@ -10,6 +10,7 @@ from cloudrc.files import write_atomically
 from cloudrc.report.attached import read_flight
 from cloudrc.report.flown import flight_of
 from cloudrc.report.replay import write_page
+from cloudrc.runs.session import refuse_under_way
 
 
 def write_replay(run: Path, out: Path | None = None) -> Path:
@@ -20,6 +21,7 @@ def write_replay(run: Path, out: Path | None = None) -> Path:
     """
     if out is not None and os.path.lexists(out):
         raise BadInputError(f"{out}: already there; name another file with --out")
+    refuse_under_way(run if run.is_dir() else run.parent)
     recording, experiment = read_flight(run)
     try:
         page = write_page(flight_of(recording, experiment), experiment)

@@ -17,6 +17,7 @@ from cloudrc.drivers.local import JOURNAL_FILE, under_way
 from cloudrc.errors import BadInputError, NothingFlownError
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import cut_to_last_mission, merge
+from cloudrc.record.writer import is_open
 from cloudrc.report.document import Run
 from cloudrc.report.write import attachments
 from cloudrc.teleop.store import MissionRecord, open_store
@@ -59,7 +60,7 @@ def read_last_mission(folder: Path) -> tuple[Recording, ResolvedExperiment, bool
 
 def refuse_under_way(folder: Path) -> None:
     """Raise a BadInputError if the flight whose files are in a folder has not ended."""
-    if folder.resolve() not in under_way():
+    if folder.resolve() not in under_way() and not is_open(folder / "mission.mcap"):
         return
     if (folder / JOURNAL_FILE).is_file():
         raise BadInputError(f"{folder}: the session has not ended; end it: cloudrc down")

@@ -117,6 +117,17 @@ def test_a_flight_under_way_is_not_read(journal, said, tmp_path, monkeypatch, re
     assert "has not ended" not in refused("identify --out model.yaml", tmp_path)
 
 
+def test_a_flight_whose_recording_is_still_written_is_not_read(tmp_path, call, refused):
+    mission = tmp_path / "mission.mcap"
+    with McapWriter(mission, clock="world") as writer:
+        writer.write(records())
+        writer.flush()
+        for line in ("identify", "link record -o t.csv", "replay --no-open", "recover"):
+            assert f"{tmp_path}: the flight has not ended" in refused(line, mission)
+        assert "the flight has not ended" in refused("report", tmp_path)
+    call("recover", mission)
+
+
 def test_the_command_writes_a_model_that_a_predictor_takes(tmp_path, call):
     with McapWriter(tmp_path / "mission.mcap", clock="world") as writer:
         writer.write(records())

@@ -87,8 +87,10 @@ def _from_log(path: Path, settings: LogSettings) -> Packets:
 def _recording(path: Path) -> Recording:
     from cloudrc.record.columns import Recording
     from cloudrc.record.holes import SOMEWHERE
+    from cloudrc.runs.session import refuse_under_way
 
     file = path / "mission.mcap" if path.is_dir() else path
+    refuse_under_way(file.parent)
     if not file.is_file():
         raise BadInputError(f"{path}: has no mission.mcap; name the folder of a run, or a file")
     recording = Recording.read(file)
