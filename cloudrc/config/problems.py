@@ -9,6 +9,8 @@ import difflib
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import is_dataclass
+from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin
 
@@ -28,8 +30,11 @@ _TYPES = {
     str: "text",
     bool: "true or false",
     NoneType: "null",
+    Path: "the path of a file",
 }
 _SIGNS = {Ge: ">=", Gt: ">", Le: "<=", Lt: "<"}
+INVALID = "is not valid"
+"""Expectation at a key that is not in the schema, or whose type has no words here."""
 _LISTED = 50
 """Largest number of problems in one error message."""
 
@@ -68,20 +73,24 @@ def expectation(model: type[BaseModel], path: KeyPath) -> str:
     """Describe which values are valid at `path`, such as "must be a number >= 0 [ms]"."""
     field = field_at(model, path)
     if field is None:
-        return "is not valid"
+        return INVALID
     kind = field.annotation
     if get_origin(kind) is Literal:
         return f"must be one of {', '.join(map(repr, get_args(kind)))}"
     if _is_list(kind) and not path[-1].isdecimal():
         words = [_list_words(kind)]
     else:
-        words = [_TYPES[plain] for plain in dict.fromkeys(_types(kind)) if plain in _TYPES]
+        types = dict.fromkeys(_types(kind))
+        words = [_TYPES[plain] for plain in types if plain in _TYPES]
         if words and words[0].endswith("number"):
             limits = " and ".join(dict.fromkeys(_limits(field)))
             share = "(1 % is 0.01)" if limits == ">= 0 and <= 1" else ""
             words[0] = " ".join([words[0], limits, share]).strip()
-        if any(_models(kind)):
+        sections = [*_models(kind), *filter(is_dataclass, types)]
+        if sections:
             words.append("a mapping of keys")
+        if types.keys() - _TYPES.keys() - set(sections):
+            return INVALID
     return " ".join(["must be", " or ".join(words), _unit(field)]).strip()
 
 
@@ -144,7 +153,7 @@ def _models(annotation: Any) -> Iterator[type[BaseModel]]:
 
 def _is_list(annotation: Any) -> bool:
     kinds = (annotation, *get_args(annotation))
-    return any(get_origin(kind) in (tuple, list, Sequence) for kind in kinds)
+    return any(get_origin(kind) in (tuple, list, set, frozenset, Sequence) for kind in kinds)
 
 
 def exceeds(model: type[BaseModel], path: KeyPath, value: float) -> bool:
@@ -273,6 +282,8 @@ def in_words(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
+_INPUT = "Input should be "
+"""Beginning of most of pydantic's messages."""
 _WITHOUT_VALUE = ("extra_forbidden", "missing", "value_error", "too_long")
 """Types of pydantic's errors whose message does not show the value."""
 _REASONS: Mapping[str, str] = {
@@ -282,9 +293,23 @@ _REASONS: Mapping[str, str] = {
     "string_pattern_mismatch": "must be text without slashes",
     "finite_number": "must be finite",
     "literal_error": "must be {expected}",
+    "unexpected_keyword_argument": "unknown key",
     "needs_python_object": "must be an object of a class, which YAML cannot contain",
 }
 """Type of pydantic's error -> format of `ConfigProblem.reason`."""
+
+
+def _expected(detail: ErrorDetails, model: type[BaseModel], path: KeyPath) -> str:
+    """Describe which values are valid at `path`; of a type that we do not know, as pydantic does.
+
+    Such a type is in the signature of a user's `build`.
+    """
+    known, text = expectation(model, path), detail["msg"]
+    if known != INVALID:
+        return known
+    if text.startswith(_INPUT):
+        return f"must be {text.removeprefix(_INPUT)}"
+    return text[:1].lower() + text[1:]
 
 
 def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> ConfigProblem:
@@ -301,7 +326,7 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> C
     elif unknown:
         reason = f"unknown key; {_nearest_key(model, path)}"
     else:
-        reason = "is missing; " * (kind == "missing") + expectation(model, path)
+        reason = "is missing; " * (kind == "missing") + _expected(detail, model, path)
     if kind == "literal_error" and (
         near := _near(str(detail["input"]), re.findall(r"'([^']*)'", detail["ctx"]["expected"]))
     ):

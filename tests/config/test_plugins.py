@@ -66,6 +66,29 @@ def test_parameters_are_checked_against_build(share, setting, reason):
     assert reason in found
 
 
+@pytest.mark.parametrize(
+    ("setting", "reason"),
+    [
+        ("limits=2.0", "limits: 2.0: must be a mapping of keys"),
+        ("limits={top: x}", "limits.top: 'x': must be a valid number"),
+        ("limits={tip: 1}", "limits.tip: 1: unknown key"),
+        ("kind=c", "kind: 'c': must be 'a' or 'b'"),
+        ("file=5", "file: 5: must be the path of a file or null"),
+    ],
+)
+def test_a_parameter_of_another_type_says_what_is_valid(share, setting, reason):
+    share.write_text(
+        "from dataclasses import dataclass\nfrom enum import Enum\nfrom pathlib import Path\n"
+        "@dataclass\nclass Limits:\n    top: float = 1.0\n"
+        "Kind = Enum('Kind', {'A': 'a', 'B': 'b'})\n"
+        "def build(limits: Limits, kind: Kind | None = None, file: Path | None = None): ...\n"
+    )
+    limits = "cloud.predictor.limits={top: 1.0}"
+    given = [limits] * (not setting.startswith("limits"))
+    found = refused("paper", f"cloud.predictor={share}", *given, f"cloud.predictor.{setting}")
+    assert f"cloud.predictor.{reason}" in found
+
+
 CHECKED = """from pydantic import AfterValidator
 from typing import Annotated
 def check(value):
