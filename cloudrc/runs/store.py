@@ -8,8 +8,9 @@ from __future__ import annotations
 import csv
 import io
 import json
+import logging
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
@@ -278,8 +279,17 @@ def _without_folder(file: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in file.items() if key != "folder"}
 
 
-def check_points(folder: Path, rows: Iterable[Row], axes: Mapping[str, Sequence[Any]]) -> None:
-    """Raise a BadInputError if a row has another point than those of the sweep in `folder`."""
+def check_points(folder: Path, rows: Collection[Row], axes: Mapping[str, Sequence[Any]]) -> None:
+    """Raise a BadInputError if a row has another point than those of the sweep in `folder`.
+
+    Warn if the rows are of more than one code, whose difference may be what the rows show.
+    """
+    codes = {str(row.get("code") or "without a hash") for row in rows}
+    if len(codes) > 1:
+        text = to_one_line(
+            f"{folder}: its flights are of different code: {' and '.join(sorted(codes))}"
+        )
+        logging.getLogger("cloudrc").warning("%s", text)
     for row in rows:
         point = row["point"]
         if point.keys() != axes.keys() or any(point[axis] not in axes[axis] for axis in axes):

@@ -27,6 +27,18 @@ def rows(grid):
     return [flight.row(flown(**found)) for flight, found in pairs]
 
 
+def test_rows_of_two_codes_are_told_with_both_hashes(grid, rows, tmp_path, caplog):
+    store.begin(tmp_path, grid)
+    write(tmp_path, rows[:2])
+    assert store.read_flights(tmp_path)
+    assert caplog.messages == []
+    write(tmp_path, [{**row, "code": "0ther"} for row in rows[2:]], 2)  # copied from elsewhere
+    store.read_flights(tmp_path)
+    (said,) = caplog.messages
+    assert f"{tmp_path}: its flights are of different code: " in said
+    assert {code_hash(), "0ther"} <= {*said.split()}
+
+
 def write(folder, rows, shard=None):
     with store.append_rows(folder, shard) as append:
         for row in rows:
