@@ -41,6 +41,9 @@ ROS_PACKAGES := rclpy rmw-fastrtps-cpp nav-msgs geometry-msgs sensor-msgs rosgra
 # MuJoCo's viewers, a tenth of the image: a pod draws nothing.
 DRAWING := glfw pyopengl mujoco-studio
 
+# Some environments set this variable: then each of the tests' processes compiles all modules again.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link pictures results meta-world docs dist images kind-load lock clean
 
