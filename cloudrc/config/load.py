@@ -32,7 +32,7 @@ from cloudrc.config.hull import hull_of
 from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import ConfigProblem
-from cloudrc.config.reuse import reuse
+from cloudrc.config.reuse import reuse, reuse_results
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, known_robot, parameters
 from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import (
@@ -173,6 +173,7 @@ class ResolvedExperiment(Experiment):
         return self.link.downlink
 
 
+@reuse_results()
 def load_experiment(
     name: str | Path,
     settings: Iterable[str] | Settings = (),

@@ -1,7 +1,7 @@
-"""Compute what many points of a sweep share only once: parsed files, checks and built plug-ins.
+"""Compute what an experiment, or many points of a sweep, share only once: parsed files, checks.
 
-Without `reuse_results` nothing is kept, because a user may edit a file between two commands of a
-session.
+Outside of `reuse_results` nothing is kept, because a user may edit a file between two commands of
+a session.
 """
 
 from __future__ import annotations
@@ -12,12 +12,15 @@ from typing import Any, TypeVar
 
 _Result = TypeVar("_Result")
 _kept: list[dict[Hashable, Any]] = []
-"""The results of the innermost `with reuse_results()`; empty outside of all."""
+"""The results of the outermost `with reuse_results()`; empty outside of all."""
 
 
 @contextmanager
 def reuse_results() -> Iterator[None]:
     """Keep results inside the block, in which files are taken as unchanged."""
+    if _kept:  # the outer block keeps them longer
+        yield
+        return
     _kept.append({})
     try:
         yield

@@ -299,3 +299,13 @@ def test_a_recorded_scene_still_names_the_bodies_that_nothing_touches(tmp_path):
     scene = load_scene(str(tmp_path / "lab.xml"))
     assert intangible(scene) == intangible(without_file(scene)) == ("ghost",)
     assert intangible(load_scene("pipes")) == ()
+
+
+def test_a_robot_is_read_once_in_a_load_and_again_in_the_next(monkeypatch):
+    read = []
+    monkeypatch.setattr(
+        "cloudrc.config.robot.find_robot", lambda n: read.append(n) or find_robot(n)
+    )
+    for _ in range(2):
+        load_experiment("hover")
+    assert read == ["pelican", "pelican"]

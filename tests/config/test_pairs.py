@@ -1,7 +1,8 @@
 """Two valid settings together load, or are refused by a line that names one of them.
 
 A pair may fail although each of its settings loads alone, for example because a derived value is
-taken for one that the user has set. The tests load every pair, without plug-ins: that takes 1 ms.
+taken for one that the user has set. The tests load every pair, without plug-ins and with what
+loads share read once: that takes 1 ms.
 """
 
 import json
@@ -12,6 +13,7 @@ import pytest
 
 from cloudrc.config import problems
 from cloudrc.config.load import dump, load_experiment
+from cloudrc.config.reuse import reuse_results
 from cloudrc.config.schema import Experiment
 from cloudrc.errors import BadInputError
 from tests.conftest import nightly
@@ -85,6 +87,12 @@ def blames_another_key(file, *settings):
         if not all(any(key in line for key in keys) for line in lines):
             return f"{settings}: {error}"
     return ""
+
+
+@pytest.fixture(autouse=True)
+def _files_are_read_once():
+    with reuse_results():
+        yield
 
 
 @pytest.fixture(params=["own", "resolved"])
