@@ -198,6 +198,7 @@ def test_the_notes_of_an_upgrade_give_the_same_commands_and_say_what_restarts():
 
 SLOW = "experiment.guard.command_age_max_ms=800"
 CLOSED = "No Prometheus may scrape"
+TOPICS = "topics of ROS 2, which know no token"
 
 
 @pytest.mark.parametrize(
@@ -208,6 +209,8 @@ CLOSED = "No Prometheus may scrape"
         ({"experiment": {"link": {"profile": "satellite"}}}, SLOW, False),
         ({}, CLOSED, True),
         ({"metrics": {"allowFrom": [{"ipBlock": {"cidr": "10.0.0.0/8"}}]}}, CLOSED, False),
+        ({"networkPolicy": {"enabled": False}}, TOPICS, False),
+        ({"networkPolicy": {"enabled": False}, "ros": {"enabled": True}}, TOPICS, True),
     ],
 )
 def test_the_notes_warn_of_what_will_not_work(values, words, warns):

@@ -66,9 +66,9 @@ def test_dds_stays_in_the_pod_and_the_nodes_reach_no_socket_token_or_key():
     for name in ("ros", "nodes", "bridge"):
         env = {each["name"]: each["value"] for each in parts[name]["env"]}
         assert env["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
-        assert env["FASTDDS_BUILTIN_TRANSPORTS"] == "UDPv4", "containers need not share memory"
+        assert mounts_of(parts[name])["/dev/shm"] == "shm", "Fast DDS takes messages through it"
         assert "ports" not in parts[name]
-    assert [mount["mountPath"] for mount in parts["nodes"]["volumeMounts"]] == ["/tmp"]
+    assert mounts_of(parts["nodes"]).keys() == {"/tmp", "/dev/shm"}
     policies = [of_kind(render(each), "NetworkPolicy") for each in ({}, STEERED)]
     assert policies[0] == policies[1]
 
@@ -90,7 +90,7 @@ def test_a_bridge_reads_the_records_of_cloud_and_nothing_by_which_it_could_steer
     folder = str(options.records)
     assert f"--records={folder}" in cloud["args"]
     assert mounts_of(cloud)[folder] == mounts_of(part)[folder] == "records"
-    assert mounts_of(part).keys() == {"/etc/cloudrc", folder, "/tmp"}
+    assert mounts_of(part).keys() == {"/etc/cloudrc", folder, "/tmp", "/dev/shm"}
     assert options.token_file is None
 
 

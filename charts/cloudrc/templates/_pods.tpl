@@ -58,12 +58,11 @@ env:
 {{- end }}
 
 {{/* Common parts of the containers with ROS 2. DDS stays inside the pod, whose containers share the
-     loopback address; they need not share memory, and share no numbers of processes. Logs of ROS are
-     in /tmp. Argument: (dict "root" $ "of" VALUES), the values of the container. */}}
+     loopback address. Logs of ROS are in /tmp. Argument: (dict "root" $ "of" VALUES), the values of
+     the container. */}}
 {{- define "cloudrc.rosSettings" -}}
 env:
   - {name: ROS_AUTOMATIC_DISCOVERY_RANGE, value: LOCALHOST}
-  - {name: FASTDDS_BUILTIN_TRANSPORTS, value: UDPv4}
   - {name: HOME, value: /tmp}
   {{- with .of.extraEnv }}
   {{- toYaml . | nindent 2 }}
@@ -74,10 +73,12 @@ resources:
   {{- toYaml .of.resources | nindent 2 }}
 {{- end }}
 
-{{/* /tmp is each container's own: Python would run what another one writes there, because it is HOME.
-     Argument: (dict "of" VALUES "name" NAME), the values and the name of the container. */}}
+{{/* With LOCALHOST, Fast DDS always takes messages through /dev/shm: a volume, because not every runtime
+     lets containers share it, and those without ROS need not. /tmp is each container's own: Python
+     would run what another one writes there, because it is HOME. Argument: (dict "of" VALUES "name" NAME), the values and the name of the container. */}}
 {{- define "cloudrc.rosMounts" -}}
 - {name: tmp-{{ .name }}, mountPath: /tmp}
+- {name: shm, mountPath: /dev/shm}
 {{- with include "cloudrc.extraMounts" .of }}
 {{ . }}
 {{- end }}
