@@ -60,6 +60,13 @@ def test_a_goal_is_a_goto_with_its_yaw():
     assert asking.said == ["going to (1, 2, 1.5)"]
 
 
+@pytest.mark.parametrize("size", [0.1, 1.0, 1e200])
+def test_the_length_of_a_goals_quaternion_does_not_change_its_yaw(size):
+    asking = Asking()
+    asking.requests.go_to("map", (1.0, 2.0, 1.5), (size, 0.0, 0.0, size))
+    assert asking.api.posted[0][1]["yaw_deg"] == 90.0
+
+
 @pytest.mark.parametrize(
     ("options", "height", "goal"),
     [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from math import cos, degrees, inf, isfinite, sin
+from math import cos, degrees, hypot, inf, isfinite, sin
 from typing import NamedTuple
 
 from cloudrc.console.steering import Steering
@@ -107,8 +107,7 @@ class RosRequests:
         if z == 0.0:  # RViz clicks on the ground
             z = max(self.position[2], HEIGHT)
         place = (x, y) if self._robot.planar else (x, y, z)
-        yaw = degrees(-turn_to(0.0, wxyz)) if self._robot.turns and any(wxyz) else None
-        self._steering.go_to(place, yaw)
+        self._steering.go_to(place, _yaw_deg(wxyz) if self._robot.turns else None)
         self._tell(self._steering.answer[0])
 
     def drive(self, frame: str, linear: Sequence[float], yaw_rate: float) -> None:
@@ -166,3 +165,12 @@ class RosRequests:
             fresh = {text: at for text, at in self._said.items() if now - at <= SAID_AGAIN}
             self._said = {**fresh, text: now}
             self._tell_user(text)
+
+
+def _yaw_deg(wxyz: Quaternion) -> float | None:
+    """Return the yaw of an orientation [deg], None if it is 0; users type one of any length."""
+    length = hypot(*wxyz)
+    if not length:
+        return None
+    w, x, y, z = (number / length for number in wxyz)
+    return degrees(-turn_to(0.0, (w, x, y, z)))
