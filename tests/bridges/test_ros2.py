@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+import time
 from collections import Counter
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,7 +16,9 @@ from cloudrc import assembly
 from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.companion import companion
+from cloudrc.errors import ControllerLostError
 from cloudrc.record.columns import Recording, RecordStore
+from tests.conftest import wait_until
 
 pytestmark = [
     pytest.mark.ros2,
@@ -24,8 +27,11 @@ pytestmark = [
 ]
 if find_spec("rclpy"):
     import rclpy
+    from geometry_msgs.msg import TwistStamped
 
+    from cloudrc.bridges.ros2 import lock_step
     from cloudrc.bridges.ros2.node import RosNode
+    from cloudrc.bridges.ros2.own_node import OwnNode
 ROOT = Path(__file__).parents[2]
 SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 0.5}]", "mission.touch=null")
 
@@ -142,6 +148,69 @@ def test_two_nodes_cannot_command(tmp_path, capsys, mode, second):
         code, _ = run(tmp_path, second, mode=mode)
     assert code == 5
     assert f"nodes /first and /{second} command both" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_no_answer_in_lock_step_replaces_another():
+    """A flight in which one of two answers replaced the other would not repeat."""
+    asks, user = RosNode("", virtual=True), OwnNode("user")
+    commands = user.node.create_publisher(TwistStamped, "/cloudrc/cmd_vel", 10)
+    wait_until(commands.get_subscription_count)
+    for x in (1.0, 2.0):
+        command = TwistStamped()
+        command.twist.linear.x = x
+        commands.publish(command)
+    time.sleep(0.2)
+    assert [asks.take(1.0).row[0] for _ in range(2)] == [1.0, 2.0]
+    for node in (asks, user):
+        node.close()
+
+
+class MetNode:
+    """A node of cloudrc that has found a user's node, which never answers."""
+
+    is_met = True
+
+    def __init__(self, namespace, *, virtual):
+        self.checks = 0
+
+    def check(self, *, crowded=False):
+        self.checks += 1
+        if self.checks > 2:
+            raise ControllerLostError("controller_invalid", "a clash of QoS")
+
+    def publish(self, observation):
+        return 1
+
+    def publish_again(self, observation, stamp_ns):
+        pass
+
+    def take(self, limit):
+        time.sleep(0.01)
+
+    def silence(self, limit):
+        return f"no answer for {limit} s"
+
+    def close(self):
+        pass
+
+
+def test_a_clash_that_ros_tells_late_is_told_before_the_first_answer_is_overdue(monkeypatch):
+    monkeypatch.setattr(lock_step, "RosNode", MetNode)
+    monkeypatch.setattr(lock_step, "REPEAT", 0.1)
+    way = lock_step.RosLockStep("", 5.0, lambda: False)
+    began = time.monotonic()
+    with pytest.raises(ControllerLostError, match="a clash of QoS"):
+        way.exchange({})
+    assert time.monotonic() - began < 2.0
+
+
+def test_a_program_that_ends_with_its_first_estimate_is_not_waited_for(monkeypatch):
+    monkeypatch.setattr(lock_step, "RosNode", MetNode)
+    monkeypatch.setattr(MetNode, "check", lambda self: None)
+    monkeypatch.setattr(lock_step, "VIRTUAL_LIMIT", 0.1)
+    way = lock_step.RosLockStep("", 5.0, lambda: True)
+    with pytest.raises(ControllerLostError, match=r"no answer for 0\.1 s"):
+        way.exchange({})
 
 
 def test_two_flights_at_once_need_a_domain_each(tmp_path, capsys):

@@ -26,7 +26,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from cloudrc.bridges.ros2.health import FlightHealth
-from cloudrc.bridges.ros2.own_node import LINGERS, NEWEST, OwnNode
+from cloudrc.bridges.ros2.own_node import LINGERS, NEWEST, QUEUED, OwnNode
 from cloudrc.bridges.ros2.requests import SERVICES, RosRequests
 from cloudrc.console.steering import Steering
 from cloudrc.drivers.readers import RecordReader
@@ -41,8 +41,6 @@ from cloudrc.record.live import (
 from cloudrc.records import Control, Record, TelemetrySent
 from cloudrc.report.markers import GOAL, encode_markers, path_shape
 
-STATE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS of what changes all the time; all subscriptions match it."""
 KEPT = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
@@ -100,11 +98,11 @@ class RosBridge(OwnNode):
         self._watchers = 0  # subscriptions to the scene
         self._offset_ns = _wall_offset_ns()
         publisher = self.node.create_publisher
-        self._odometry = publisher(Odometry, "odom", STATE)
+        self._odometry = publisher(Odometry, "odom", QUEUED)
         self._guards = publisher(String, "cloudrc/guard", KEPT)
         self._scene = publisher(MarkerArray, "cloudrc/scene", KEPT)
         self._path = publisher(MarkerArray, "cloudrc/path", KEPT)
-        self._diagnostics = publisher(DiagnosticArray, "/diagnostics", STATE)
+        self._diagnostics = publisher(DiagnosticArray, "/diagnostics", QUEUED)
         self._transforms = self._open_transforms(tell)
         self._group = ReentrantCallbackGroup()
         self._kind: Any = Twist
@@ -151,7 +149,7 @@ class RosBridge(OwnNode):
 
         self._static = self.node.create_publisher(TFMessage, "/tf_static", KEPT)
         self._static.publish(encode_transforms(time.time_ns(), MAP))
-        return self.node.create_publisher(TFMessage, "/tf", STATE)
+        return self.node.create_publisher(TFMessage, "/tf", QUEUED)
 
     def _publish(self, record: Record) -> None:
         self._health.take(record)

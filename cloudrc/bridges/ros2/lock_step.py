@@ -68,10 +68,13 @@ class RosLockStep:
                 if answer.stamp_ns == stamp_ns:
                     break
                 self._check_other(answer.stamp_ns, stamp_ns)
-            elif now - began > self._limit:
+                continue
+            limit = min(self._limit, VIRTUAL_LIMIT) if self._gone() else self._limit
+            if now - began > limit:
                 self._node.check()
-                raise self._silent(self._limit)
-            elif self._answered_ns is None and now - again > REPEAT:
+                raise self._silent(limit)
+            if self._answered_ns is None and now - again > REPEAT:
+                self._node.check()  # ROS may have found the node's topics one by one
                 again, self._repeated_ns = now, stamp_ns
                 self._node.publish_again(observation, stamp_ns)
         self._answered_ns, self._limit = stamp_ns, VIRTUAL_LIMIT
@@ -81,8 +84,9 @@ class RosLockStep:
         """Refuse an answer to another estimate, unless cloudrc itself has repeated that one."""
         if answered_ns is not None and answered_ns == self._repeated_ns:
             return
-        self._node.check()  # a second node may have come
-        if answered_ns == self._answered_ns:
+        twice = answered_ns == self._answered_ns
+        self._node.check(crowded=twice)  # a second node may have come
+        if twice:
             raise self._node.invalid("answers an estimate twice: publish one command for each")
         given = "-" if answered_ns is None else f"{answered_ns * 1e-9:.9f}"
         raise self._node.invalid(

@@ -18,6 +18,7 @@ from sensor_msgs.msg import TimeReference
 from cloudrc.bridges.ros2.own_node import (
     LINGERS,
     NEWEST,
+    QUEUED,
     RELIABLE,
     OwnNode,
     clash,
@@ -97,7 +98,7 @@ class RosNode(OwnNode):
             kind,
             self._names["cmd_vel"],
             _ignore,
-            RELIABLE if self._virtual else NEWEST,
+            QUEUED if self._virtual else NEWEST,
             raw=True,
         )
 
@@ -253,7 +254,7 @@ class RosNode(OwnNode):
     def silence(self, limit: float = 0.0) -> str:
         """Say why there was no answer, for `limit` [s] if it is given."""
         estimate = self._names["estimate"]
-        heard = self.node.get_subscriptions_info_by_topic(estimate)
+        heard = known(self.node.get_subscriptions_info_by_topic(estimate))
         for info in heard:
             if text := clash(info, RELIABLE, estimate):
                 return text

@@ -11,7 +11,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from cloudrc.errors import MissingPrerequisiteError, to_one_line
 
 RELIABLE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS of what cloudrc publishes, which all subscriptions match, and of answers in lock step."""
+"""QoS of what cloudrc publishes for a controller, which all subscriptions match."""
+QUEUED = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+"""QoS of the bridge's topics, and of answers in lock step, of which none may replace another."""
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """QoS of /clock, and of what arrives in real time: no message waits for an older one."""
 LINGERS = "a killed node stays for 20 s"
