@@ -243,6 +243,7 @@ def examples():
 
 
 @pytest.mark.process
+@pytest.mark.full
 def test_the_examples_with_many_flights_run(tmp_path):
     (tmp_path / "page.py").write_text("import cloudrc\n" + examples()[1])
     command = [sys.executable, "page.py"]

@@ -69,7 +69,7 @@ HANGS, DIES = signal.SIGSTOP, signal.SIGKILL
     ("victim", "how"),
     [
         ("uplink", HANGS),
-        ("cloud", DIES),
+        pytest.param("cloud", DIES, marks=pytest.mark.full),
         *(
             pytest.param(each, HANGS, marks=pytest.mark.full)
             for each in ("cloud", "downlink", "teleop", "world")

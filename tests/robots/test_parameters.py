@@ -17,6 +17,7 @@ from cloudrc.metrics.velocity_loop import identify, series
 from cloudrc.robots.build import check_robot, onboard_values
 from cloudrc.runs.experiment import load
 from cloudrc.runs.grid import read_grid
+from tests.conftest import nightly
 
 
 def world(**keys):
@@ -38,7 +39,7 @@ def test_each_tuning_of_a_shipped_robot_is_one_that_its_controller_takes(robot):
         check_robot(world(robot=robot, tuning=name))
 
 
-@pytest.mark.parametrize("robot", ["nano", "x2"])
+@pytest.mark.parametrize("robot", ["nano", *nightly("x2")])
 def test_the_experiment_fast_flies_other_robots_faster(robot):
     """Without an arm they do not touch the board, so that the mission does not succeed."""
     flight = cloudrc.fly("fast", {"world.robot": robot})

@@ -106,7 +106,11 @@ def test_the_limit_of_stability_is_that_of_the_linear_model(predictor, gains):
 
 
 @pytest.mark.parametrize(
-    ("predictor", "stable"), [("command_history", True), ("last_sample", False)]
+    ("predictor", "stable"),
+    [
+        ("command_history", True),
+        pytest.param("last_sample", False, marks=pytest.mark.full),
+    ],
 )
 def test_a_predictor_that_replays_the_commands_is_stable_at_3_s(predictor, stable):
     found = fly_step(flown(f"cloud.predictor={predictor}", rtt=3.0))
