@@ -26,7 +26,7 @@ import re
 import sys
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -34,7 +34,7 @@ from importlib.util import find_spec
 from numbers import Real
 from pathlib import Path
 from types import CodeType, FrameType, ModuleType
-from typing import Any, TextIO, cast
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from cloudrc.errors import (
     BadInputError,
@@ -46,6 +46,9 @@ from cloudrc.errors import (
     to_one_line,
 )
 from cloudrc.plugin_file import PREFIX, load_file
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 PACKAGES = {
     "estimators": "cloudrc.cloud.estimators",
@@ -409,6 +412,53 @@ def _is_disguised(value: Any, plain: Any) -> bool:
     kinds = (getattr(getattr(each, "dtype", None), "kind", "") for each in (value, plain))
     is_masked = value is not plain and bool(getattr(value, "mask", False))
     return is_masked or not {"m", "M"}.isdisjoint(kinds)
+
+
+def to_numbers(values: Any) -> NDArray[Any]:
+    """Return the numbers that a user gave in an array or in nested lists as an array.
+
+    Each of them is judged as by `to_number`. An array of numbers keeps its type.
+
+    Raises:
+        InvalidResultError: If one is no number, not finite or beyond `LARGEST`; the text has its
+            place.
+    """
+    import numpy as np
+
+    for place, value in _leaves_of(values):
+        to_number(value, _name_of(place))
+    array = np.asarray(values)
+    if array.dtype.kind not in "iuf":
+        array = array.astype(float)
+    fits = np.abs(array) <= LARGEST  # False for NaN
+    if not fits.all():
+        place = np.argwhere(~fits)[0].tolist()
+        number = array[tuple(place)]
+        why = f"beyond {LARGEST:g}" if np.isfinite(number) else "not finite"
+        raise InvalidResultError(f"its {_name_of(place)} is {number:g}, {why}")
+    return array
+
+
+def _name_of(place: list[int]) -> str:
+    return f"value at {place}" if place else "value"
+
+
+def _leaves_of(values: Any, place: tuple[int, ...] = ()) -> Iterator[tuple[list[int], Any]]:
+    """Yield place and value of what may be no number in nested lists and arrays."""
+    import numpy as np
+
+    if isinstance(values, np.ma.MaskedArray):
+        values = values.tolist()  # in which a masked value is None
+    if isinstance(values, Sequence) and not isinstance(values, str | bytes):
+        if {*map(type, values)} == {float}:  # the usual case, which must be fast
+            return
+        for number, each in enumerate(values):
+            yield from _leaves_of(each, (*place, number))
+    elif not hasattr(values, "__array__"):
+        yield [*place], values
+    elif (array := np.asarray(values)).dtype.kind not in "iuf":
+        for inside, each in np.ndenumerate(array):
+            yield [*place, *inside], each
 
 
 def shorten(value: Any) -> str:

@@ -73,13 +73,13 @@ def _read_hull(name: str, robot: RobotFiles) -> Hull:
 def _spheres(file: plugins.Found, part: str) -> Spheres:
     """Return the spheres of one function of a file."""
     with file.calling(part) as function:
-        numbers = np.asarray(function(), dtype=np.float64)
+        numbers = plugins.to_numbers(function()).astype(np.float64)
         if numbers.ndim != 2 or numbers.shape[1] != 4:
             raise ValueError(
                 f"it returned shape {numbers.shape}, not rows of x, y, z, radius [m]: shape (n, 4)"
             )
         if not len(numbers):
             raise ValueError("it returned no row; give at least one: x, y, z, radius [m]")
-        if not np.isfinite(numbers).all() or (numbers[:, 3] < 0.0).any():
-            raise ValueError("it returned a number that is not finite, or a radius below 0")
+        if (numbers[:, 3] < 0.0).any():
+            raise ValueError("it returned a radius below 0")
         return Spheres(numbers[:, :3], numbers[:, 3])
