@@ -153,7 +153,7 @@ class _Policy:
 
     def __init__(self, ask: Ask, setup: EvalSetup, space: spaces.Space[Any]) -> None:
         self._ask, self._setup, self._space = ask, setup, space
-        self._width = width_of(space)
+        self._width, self._may_switch = width_of(space), not isinstance(space, spaces.Box)
         self._count: int | None = None
         self.duration = 0.0  # of the last answer [s]
         self.size = 0  # of the last observation on the wire [bytes]
@@ -168,13 +168,13 @@ class _Policy:
         answer = self._ask(asked)
         self.duration = time.perf_counter() - start
         try:
-            actions = read_actions(answer, self._width)
+            actions = read_actions(answer, self._width, may_switch=self._may_switch)
             if self._count not in (None, len(actions)):
                 raise PolicyAnswerError(f"a chunk of {len(actions)} actions after {self._count}")
+            self._count = len(actions)
+            return as_actions(actions, self._space)
         except PolicyAnswerError as error:
             raise PolicyFailedError(f"policy '{self._setup.policy}': {error}") from None
-        self._count = len(actions)
-        return as_actions(actions, self._space)
 
 
 def width_of(space: spaces.Space[Any]) -> int:
@@ -190,11 +190,20 @@ def width_of(space: spaces.Space[Any]) -> int:
 
 
 def as_actions(actions: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
-    """Return a chunk, shape (H, A), as the space's actions have it; integers are rounded."""
-    if not isinstance(space, spaces.Box):
+    """Return a chunk, shape (H, A), as the space's actions have it; integers are rounded.
+
+    Raise a PolicyAnswerError if the space's type cannot hold a value.
+    """
+    if actions.dtype.kind == "f" and np.dtype(space.dtype).kind in "iu":
         actions = np.rint(actions)
-    shaped: NDArray[Any] = actions.reshape(len(actions), *(space.shape or ()))
-    return shaped.astype(space.dtype)
+    with np.errstate(over="ignore", invalid="ignore"):
+        held = actions.astype(space.dtype)
+    holds = np.isfinite(held) if held.dtype.kind == "f" else held == actions
+    if not holds.all():
+        value = actions[~holds][0]
+        raise PolicyAnswerError(f"the action {value:g} is beyond the type {held.dtype} of {space}")
+    shaped: NDArray[Any] = held.reshape(len(held), *(space.shape or ()))
+    return shaped
 
 
 def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask: Ask) -> Played:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.plugins import shorten
+from cloudrc.plugins import InvalidResultError, shorten, to_numbers
 
 ACTIONS = "actions"
 """Key of an answer: the chunk of actions, shape (H, A)."""
@@ -20,10 +20,13 @@ class PolicyAnswerError(ValueError):
     """A policy answered with something else than actions."""
 
 
-def read_actions(answer: Any, width: int | None = None) -> NDArray[Any]:
+def read_actions(
+    answer: Any, width: int | None = None, *, may_switch: bool = False
+) -> NDArray[Any]:
     """Return the actions of a policy's answer, shape (H, A), H > 0; raise a PolicyAnswerError.
 
-    `width` is A, if it is known. All values are finite numbers.
+    `width` is A, if it is known. All values are finite numbers; with `may_switch` they may also all
+    be booleans.
     """
     if not isinstance(answer, Mapping):
         raise PolicyAnswerError(f"the answer is {shorten(answer)}, not a map with '{ACTIONS}'")
@@ -32,14 +35,14 @@ def read_actions(answer: Any, width: int | None = None) -> NDArray[Any]:
         raise PolicyAnswerError(f"the answer has no key '{ACTIONS}'; its keys: {keys[:200]}")
     try:
         actions = np.asarray(answer[ACTIONS])
+        if not (may_switch and actions.dtype.kind == "b"):
+            actions = to_numbers(answer[ACTIONS])
+    except InvalidResultError as error:
+        raise PolicyAnswerError(f"'{ACTIONS}': {error}") from None
     except (TypeError, ValueError, RuntimeError):  # rows of unequal lengths, a tensor on a GPU
         raise PolicyAnswerError(f"'{ACTIONS}' is {shorten(answer[ACTIONS])}, no array") from None
-    if actions.dtype.kind not in "biuf":
-        raise PolicyAnswerError(f"'{ACTIONS}' has the type {actions.dtype}, not numbers")
     wanted = f"(H, {'A' if width is None else width})"
     is_chunk = actions.ndim == 2 and 0 < len(actions) <= HORIZON_MAX and actions.shape[1] > 0
     if not is_chunk or width not in (None, actions.shape[1]):
         raise PolicyAnswerError(f"'{ACTIONS}' has the shape {actions.shape}, not {wanted}")
-    if not np.isfinite(actions).all():
-        raise PolicyAnswerError(f"'{ACTIONS}' has values that are not finite")
     return actions

@@ -1,6 +1,7 @@
 """Evaluations: episodes over a link, their rows, tables and pages."""
 
 import json
+import re
 import sys
 from hashlib import sha256
 from pathlib import Path
@@ -23,6 +24,7 @@ from cloudrc.eval.setup import (
     read_mapped,
     slow_answers,
 )
+from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.observation import Mapped, observe
 from tests.policy.conftest import serving, stock_like
 
@@ -317,6 +319,31 @@ def test_spaces_without_numbers_are_refused_and_integers_are_rounded():
         width_of(gymnasium.spaces.Dict({}))
     discrete = gymnasium.spaces.Discrete(3)
     assert as_actions(np.array([[0.9], [2.0]]), discrete).tolist() == [1, 2]
+    integers = gymnasium.spaces.Box(0, 9, (1,), np.int8)
+    assert as_actions(np.array([[0.9]]), integers).tolist() == [[1]]
+
+
+@pytest.mark.parametrize(
+    ("action", "dtype"), [(1e30, np.float16), (300, np.int8), (-1.0, np.uint8), (1e20, np.int64)]
+)
+def test_an_action_that_the_type_of_the_space_cannot_hold_is_wrong(action, dtype):
+    with pytest.raises(PolicyAnswerError, match=re.escape(f"{action:g} is beyond")):
+        as_actions(np.array([[action]]), gymnasium.spaces.Box(0, 1, (1,), dtype))
+
+
+@pytest.mark.parametrize("action", [True, np.True_, "1", None, 1e300, 1j, np.timedelta64(1)])
+def test_no_number_is_an_action_among_numbers(action):
+    for answer in ([[0.5, action]], np.array([[0.5, action]], dtype=object)):
+        with pytest.raises(PolicyAnswerError, match=r"value at \[0, 1\]"):
+            read_actions({"actions": answer}, may_switch=True)
+
+
+def test_only_actions_that_are_no_reals_may_be_booleans(law):
+    path = law("def infer(observation):\n    return {'actions': [[True]]}\n")
+    row = play(Episode(None, "newest", 1), EvalSetup("CartPole-v1", path), {})
+    assert row["numbers"]["steps"] > 5
+    with pytest.raises(CloudrcError, match=r"value at \[0, 0\] is bool True"):
+        play(Episode(None, "newest", 1), EvalSetup("Pendulum-v1", path), {})
 
 
 def test_the_map_makes_the_policys_observation(tmp_path):

@@ -14,7 +14,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.drivers import remote
 from cloudrc.errors import BadInputError, ControllerLostError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
-from cloudrc.policy.codec import unpack
+from cloudrc.policy.codec import pack, unpack
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.runs.experiment import check_mode
 from cloudrc.runs.fly import fly
@@ -108,6 +108,8 @@ def after(count, last):
     [
         (actions(np.nan), "controller_invalid", "not finite"),
         (actions(np.inf), "controller_invalid", "not finite"),
+        (actions(True), "controller_invalid", r"value at \[0, 0\] is bool np.True_"),
+        (pack({"actions": [[0.1, 0.2, True, 0]]}), "controller_invalid", "bool True"),
         (actions(0.0, (4,)), "controller_invalid", r"shape \(4,\), not \(H, 4\)"),
         (actions(0.0, (1, 3)), "controller_invalid", r"shape \(1, 3\), not \(H, 4\)"),
         (actions(0.0, (0, 4)), "controller_invalid", "shape"),
@@ -118,7 +120,7 @@ def after(count, last):
         (lambda link: link.close(1011), "controller_silent", "closed the connection"),
         (lambda link: link.socket.shutdown(socket.SHUT_RDWR), "controller_silent", "ended before"),
     ],
-    ids=range(11),
+    ids=range(13),
 )
 def test_a_wrong_answer_in_flight_ends_it_with_one_line_and_a_recording(tmp_path, last, code, text):
     error = lost(after(20, last), tmp_path)

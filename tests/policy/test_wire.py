@@ -93,7 +93,8 @@ def infer(observation):
         raise SystemExit(3)
     return {"shape": {"actions": [1.0]}, "key": {"action": [[1.0]]}, "none": None,
             "nan": {"actions": [[float("nan")]]}, "object": {"actions": [[1.0]], "x": object()},
-            "text": {"actions": [["a"]]}, "empty": {"actions": []}}[kind]
+            "text": {"actions": [["1"]]}, "mixed": {"actions": [[0.5, True]]},
+            "empty": {"actions": []}}[kind]
 """
 
 
@@ -107,7 +108,8 @@ def infer(observation):
         ("none", "not a map"),
         ("nan", "not finite"),
         ("object", "cannot be packed"),
-        ("text", "not numbers"),
+        ("text", r"value at \[0, 0\] is str '1'"),
+        ("mixed", r"value at \[0, 1\] is bool True"),
         ("empty", "shape"),
     ],
 )
