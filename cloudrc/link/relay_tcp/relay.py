@@ -58,7 +58,7 @@ class RelayedConnection:
             for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
                 # Larger ones would hide from a sender that the receiver has stopped.
                 side.socket.setsockopt(socket.SOL_SOCKET, option, BUFFER)
-        self.greeted = False  # whether the first packets of the connection have crossed the link
+        self.trip_ns = 0  # of the first packets of the connection [ns]; 0 before they are back
         self.server.socket.connect_ex(relay.to)
         relay.watch(self, self.server, selectors.EVENT_WRITE)
         self._greet(1, time.monotonic_ns())
@@ -78,26 +78,26 @@ class RelayedConnection:
 
     def _greet(self, attempt: int, now_ns: int) -> None:
         """Send the first packet of the connection, again and again until it is answered."""
-        if self.dead or self.greeted:
+        if self.dead or self.trip_ns:
             return
         if attempt > GREETINGS:
             self._end(now_ns)
             return
         arrival_ns = self.relay.ways[0].cross(SYN, self.number, attempt, 0, now_ns)
         if arrival_ns is not None:
-            self.relay.agenda.at(arrival_ns, self._welcome, attempt)
+            self.relay.agenda.at(arrival_ns, self._welcome, attempt, now_ns)
         again_ns = now_ns + (FIRST_RETRY_NS << (attempt - 1))
         self.relay.agenda.at(again_ns, self._greet, attempt + 1)
 
-    def _welcome(self, attempt: int, now_ns: int) -> None:
-        """Answer the first packet."""
+    def _welcome(self, attempt: int, sent_ns: int, now_ns: int) -> None:
+        """Answer the first packet, which was sent at `sent_ns` [ns]."""
         arrival_ns = self.relay.ways[1].cross(SYN, self.number, attempt, 0, now_ns)
         if arrival_ns is not None and not self.dead:
-            self.relay.agenda.at(arrival_ns, self._welcomed)
+            self.relay.agenda.at(arrival_ns, self._welcomed, sent_ns)
 
-    def _welcomed(self, now_ns: int) -> None:
-        if not self.greeted:
-            self.greeted = True
+    def _welcomed(self, sent_ns: int, now_ns: int) -> None:
+        if not self.trip_ns:
+            self.trip_ns = max(1, now_ns - sent_ns)
             self._begin(now_ns)
 
     def _connected(self, now_ns: int) -> None:
@@ -122,13 +122,13 @@ class RelayedConnection:
 
     def _begin(self, now_ns: int) -> None:
         """Open the streams, or refuse the client, once the server and the link have answered."""
-        if self.dead or self.connecting or not self.greeted:
+        if self.dead or self.connecting or not self.trip_ns:
             return
         if self.client.source is None or self.server.source is None:
             self._end(now_ns)
             return
-        self.client.source.open(now_ns)
-        self.server.source.open(self.relay.ways[0].arrival_ns(now_ns))
+        self.client.source.open(now_ns, self.trip_ns)
+        self.server.source.open(self.relay.ways[0].arrival_ns(now_ns), self.trip_ns)
 
     def update(self) -> None:
         """Watch the sockets for what the streams can take and give."""

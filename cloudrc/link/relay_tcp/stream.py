@@ -65,16 +65,17 @@ class LinkStream:
         self._start_ns, self._next_ns, self._waits = NOTHING_NS, 0.0, False
         self._arrival_ns = self._sent_ns = 0
         self._trip_ns = self._spread_ns = 0
-        self._deadline_ns, self._timer, self._probed, self._retries = 0, False, False, 0
+        self._deadline_ns, self._look_ns, self._probed, self._retries = 0, NOTHING_NS, False, 0
 
     @property
     def room(self) -> int:
         """Number of bytes that the stream accepts now."""
         return 0 if self._ended else max(0, READ_AHEAD - len(self._unsent))
 
-    def open(self, start_ns: int) -> None:
-        """Send from the time `start_ns` on [ns]."""
+    def open(self, start_ns: int, trip_ns: int) -> None:
+        """Send from the time `start_ns` on [ns]; `trip_ns` is the first round trip's time [ns]."""
         self._start_ns = start_ns
+        self._measure(trip_ns)
         self._agenda.at(start_ns, self._pump)
 
     def write(self, data: bytes, now_ns: int) -> None:
@@ -253,8 +254,6 @@ class LinkStream:
         self._trip_ns += (trip_ns - self._trip_ns) // 8
 
     def _retry_ns(self) -> int:
-        if not self._trip_ns:
-            return 1_000_000_000
         return self._trip_ns + max(RETRY_MIN_NS, 4 * self._spread_ns)
 
     def _arm(self, now_ns: int) -> None:
@@ -264,21 +263,25 @@ class LinkStream:
             alone = RETRY_MIN_NS if len(self._waiting) == 1 else PROBE_NS
             wait_ns = min(wait_ns, 2 * self._trip_ns + alone)
         self._deadline_ns = now_ns + wait_ns
-        if not self._timer:
-            self._timer = True
-            self._agenda.at(self._deadline_ns, self._look)
+        self._await_deadline()
+
+    def _await_deadline(self) -> None:
+        if self._deadline_ns < self._look_ns:
+            self._look_ns = self._deadline_ns
+            self._agenda.at(self._look_ns, self._look)
 
     def _may_probe(self) -> bool:
-        return bool(self._trip_ns) and not (self._probed or self._retries or self._recovers)
+        return not (self._probed or self._retries or self._recovers)
 
     def _look(self, now_ns: int) -> None:
         """Send a probe or try again, if the deadline has come and segments have no answer."""
-        self._timer = False
+        if now_ns != self._look_ns:  # another look has come before
+            return
+        self._look_ns = NOTHING_NS
         if not self._waiting:
             return
         if now_ns < self._deadline_ns:
-            self._timer = True
-            self._agenda.at(self._deadline_ns, self._look)
+            self._await_deadline()
             return
         if self._may_probe():
             self._probed = True

@@ -27,7 +27,7 @@ class Far:
         ways = Medium(up, seed, True, 0), Medium(down or up, seed, False, 0)
         self.up = ways[0]
         self.stream = LinkStream(self.agenda, ways, 1, self.deliver, kind())
-        self.stream.open(start_ns)
+        self.stream.open(start_ns, 80 * MS)
 
     def deliver(self, data, now_ns):
         assert self.end_ns is None
@@ -134,6 +134,20 @@ def test_a_lost_single_segment_waits_for_a_time_out():
     far.agenda.run(1_000 * MS)
     took = far.send(b"y", 1_000 * MS)
     assert 240 <= took <= 400
+
+
+def test_a_new_connection_knows_the_round_trip_when_its_first_segment_is_lost():
+    """The handshake has measured it, so the stream waits 80 + 200 ms, and not one second."""
+    far = Far(changed(PLAIN, blackouts=(blackout(0.0, 0.01),)))
+    assert far.send(b"x") == pytest.approx(280 + 40)
+
+
+def test_a_loss_soon_after_time_outs_does_not_wait_for_their_longer_deadline():
+    """A message arrives at 1.16 s, in its third attempt; the next one is lost at 1.21 s."""
+    far = Far(changed(PLAIN, blackouts=(blackout(0.0, 1.0), blackout(1.205, 0.01))))
+    assert far.send(b"x") == pytest.approx(1160)
+    far.agenda.run(1_210 * MS)
+    assert far.send(b"y", 1_210 * MS) == pytest.approx(280 + 40)
 
 
 def test_losses_do_not_depend_on_how_the_bytes_are_cut():
