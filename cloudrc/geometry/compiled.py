@@ -67,7 +67,8 @@ INERTIAS = 0.005, 10.0
 of the distance of its farthest geom [1]. The small one is a ball of a ninth of this radius. The
 large one leaves room for a model that draws only a part of the body."""
 ROBOT_BITS = 1
-"""Value of contype and conaffinity of the robot's geoms."""
+"""Value of contype and conaffinity of the robot's geoms, as far as a scene is concerned: a flight
+whose robot meets other geoms is refused."""
 
 
 class Bodies(NamedTuple):

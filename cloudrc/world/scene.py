@@ -15,7 +15,7 @@ import numpy as np
 from cloudrc.config.problems import ConfigProblem, ProblemsError
 from cloudrc.config.schema import Plant
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.compiled import compile_error, mujoco, read_scene
+from cloudrc.geometry.compiled import ROBOT_BITS, compile_error, mujoco, read_scene
 from cloudrc.geometry.scene import FLOOR, WORLD
 from cloudrc.world.plant import Array, Inertia, point_inertia, true_inertia
 
@@ -46,8 +46,8 @@ def compile_model(robot: Path, scene: Path) -> Any:
     robot may have joints of its own, such as those of wheels; its free joint comes first. Static
     bodies are fused, so that a step takes half the time. Fused bodies lose their names; therefore
     each geom of the scene gets the name BODY/NUMBER. Raise a BadInputError if a file is
-    missing or does not compile, if the robot has no free base or no actuator, or if the scene has
-    another time step or contacts that push at a distance.
+    missing or does not compile, if the robot has no free base or no actuator or touches nothing, or
+    if the scene has another time step or contacts that push at a distance.
     """
     model = _compile(robot, scene)
     _check_names(robot)
@@ -237,6 +237,7 @@ def _check_parts(model: Any, robot_path: Path, scene_path: Path) -> None:
             f"{scene_path}: option timestep is {model.opt.timestep}, not {TIMESTEP}"
         )
     _check_margins(model, robot_path, scene_path)
+    _check_bits(model, robot_path, scene_path)
 
 
 def _check_margins(model: Any, robot_path: Path, scene_path: Path) -> None:
@@ -253,6 +254,32 @@ def _check_margins(model: Any, robot_path: Path, scene_path: Path) -> None:
     is_overriding = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE
     if is_overriding and model.opt.o_margin > MARGIN_MAX:
         raise BadInputError(f"{scene_path}: option o_margin is {model.opt.o_margin:g}, {text}")
+
+
+def _check_bits(model: Any, robot_path: Path, scene_path: Path) -> None:
+    """Refuse a robot that meets other geoms than the path checks, clearances and notes say.
+
+    These know the scene alone: for them, a robot meets the geoms that have one of ROBOT_BITS.
+    """
+    types, affinities = model.geom_contype, model.geom_conaffinity
+    is_robot = is_of_robot(model)
+    meeting = np.flatnonzero(is_robot & ((types | affinities) > 0)).tolist()
+    if not meeting:
+        raise BadInputError(
+            f"{robot_path}: no geom of the robot can touch anything: their contype and conaffinity "
+            "are 0; let some have 1 and 1"
+        )
+    for geom in meeting:
+        meets = ((types[geom] & affinities) | (types & affinities[geom])) > 0
+        expected = ((types | affinities) & ROBOT_BITS) > 0
+        for other in np.flatnonzero((meets != expected) & ~is_robot)[:1].tolist():
+            name = model.geom(geom).name.removeprefix(ROBOT_PREFIX) or geom
+            raise BadInputError(
+                f"{robot_path}: geom {name} has contype {types[geom]} and conaffinity "
+                f"{affinities[geom]}, so that it {'meets' if meets[other] else 'never meets'} body "
+                f"{bodies_of_geoms(model)[other]} of {scene_path} (contype {types[other]}, "
+                f"conaffinity {affinities[other]}); give it 1 and 1, or 0 and 0 if it is only seen"
+            )
 
 
 def rotation(quaternion: Any) -> Any:

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import nullcontext
 from math import pi, tan
 from unittest.mock import Mock
 
@@ -148,6 +149,8 @@ def test_each_geom_has_the_name_of_its_body_and_the_robot_none(tmp_path):
                   "option o_margin is 0.3, so"),
         ("robot", 'size=".05 .05 .10"', 'size=".05 .05 .10" margin=".3"',
                   "the robot has a geom with margin 0.3, so"),
+        ("robot", 'size=".05 .05 .10"', 'size=".05 .05 .10" contype="2" conaffinity="2"',
+                  "has contype 2 and conaffinity 2, so that it never meets body floor of"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_flown_is_refused_by_name(tmp_path, monkeypatch, kind, old, new, message):
@@ -161,6 +164,36 @@ def test_what_cannot_be_flown_is_refused_by_name(tmp_path, monkeypatch, kind, ol
         check_robot(World(**(SHIPPED | {kind: str(path)})))
     assert "\n" not in str(error.value)
     assert list(tmp_path.iterdir()) == [path], "MuJoCo wrote a log"
+
+
+POLE = '<body name="pole" pos="9 0 1"><geom size=".1" contype="{}" conaffinity="{}"/></body>'
+
+
+@pytest.mark.parametrize(
+    ("robot_bits", "pole_bits", "message"),
+    [
+        ((1, 0), (1, 1), ""),  # as of robots whose parts shall not touch one another
+        ((1, 0), (2, 2), ""),
+        ((0, 0), (1, 1), "no geom of the robot can touch anything"),
+        ((3, 3), (2, 2), "has contype 3 and conaffinity 3, so that it meets body pole of"),
+        ((1, 0), (1, 0), "so that it never meets body pole of"),
+    ],
+)
+def test_a_robot_meets_what_the_path_check_says_or_is_refused(
+    tmp_path, robot_bits, pole_bits, message
+):
+    """Otherwise it flies through a pole without a word, or hits a body that is no obstacle."""
+    robot, scene = tmp_path / "robot.xml", tmp_path / "scene.xml"
+    contype, conaffinity = robot_bits
+    text = find_robot("x2").model.read_text()
+    bits = f'<default><geom contype="{contype}" conaffinity="{conaffinity}"/>'
+    robot.write_text(text.replace("<default>", bits, 1))
+    assert bits in robot.read_text()
+    pole = POLE.format(*pole_bits)
+    scene.write_text(FILES["scene"].read_text().replace("</worldbody>", f"{pole}</worldbody>"))
+    expected = pytest.raises(BadInputError, match=message) if message else nullcontext()
+    with expected:
+        model_of(str(robot), str(scene))
 
 
 def test_options_of_a_robots_file_do_not_count_and_make_no_noise(tmp_path):
