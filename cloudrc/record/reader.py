@@ -335,7 +335,7 @@ class File:
         return counts is None or self.read == Counter(counts.channel_message_counts)
 
     def _search(self, position: int) -> _Found | None:
-        """Find the intact parts of a file from `position` on; None if that finds nothing new."""
+        """Find the intact parts of a file from `position` on; None if there is none."""
         self._stream.seek(0)
         data, found = self._stream.read(), _Found()
         listed: dict[int, list[tuple[int, int]]] | None = None  # messages of the chunk before
@@ -359,7 +359,7 @@ class File:
         if found.ended:
             found.size += len(MCAP0_MAGIC)
             found.read_index(data)
-        return found if found.parts and (found.holes or found.data_ended) else None
+        return found if found.parts else None
 
     def _list_messages(self, chunk: mcap.Chunk) -> dict[int, list[tuple[int, int]]]:
         """Return channel -> time and position in the intact `chunk`, for each of its messages."""
@@ -459,6 +459,12 @@ class File:
     def unread(self) -> int:
         """Size of the file's unread end [bytes]; 0 if only the file's index is damaged."""
         return 0 if self.data_ended and not self.ended else self.size - self.position
+
+    @property
+    def lost(self) -> list[int]:
+        """Positions in the file at which bytes of its data are lost."""
+        tail = [] if self.data_ended else [self.position]
+        return [*(part.start for part in self.gaps), *tail]
 
     @property
     def left_out(self) -> int:
@@ -568,9 +574,9 @@ def _holes(file: File) -> tuple[Hole, ...]:
     content, known = file.content, of_metadata(file.content.metadata)
     found = set(known or ())
     if not _has_all_rows(file):
-        found |= {between(file.spans, gap.start) for gap in file.gaps}
+        found |= {between(file.spans, position) for position in file.lost}
         # Only a complete file has its counts; the holes in an incomplete one lack its lost end.
-        if not file.data_ended or (content.told and (known is None or not file.has_counts)):
+        if content.told and (known is None or not file.has_counts):
             found.add(Hole(content.messages[-1][1] if content.messages else 0, END_NS))
         if content.note and not found:
             found.add(SOMEWHERE)
@@ -580,9 +586,11 @@ def _holes(file: File) -> tuple[Hole, ...]:
 def _has_all_rows(file: File) -> bool:
     """Return whether nothing is lost but views, as the counts in the file prove."""
     read = Counter(topic for topic, _, _ in file.content.messages)
-    lost = (file.stated - read).keys() & {*TOPICS, UNKNOWN}
+    lost = (file.stated - read).keys()
+    if file.has_counts:
+        return not lost & TOPICS.keys()
     is_ours = bool(file.content.metadata.get(CLOCK))  # else the index may be another program's
-    return not lost and (file.has_counts or (is_ours and file.statistics is not None))
+    return is_ours and file.statistics is not None and not lost & {*TOPICS, UNKNOWN}
 
 
 def _describe(gaps: list[FilePart]) -> str:

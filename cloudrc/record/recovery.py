@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.content import Message
-from cloudrc.record.reader import LISTED_MAX, File, list_some
-from cloudrc.record.topics import VIEWS
+from cloudrc.record.reader import LISTED_MAX, UNKNOWN, File, list_some
+from cloudrc.record.topics import TOPICS, VIEWS
 
 LOSSY_SHARE_MAX = 0.999
 """Largest value of `Recovery.share` if something is missing [1]."""
@@ -70,7 +70,7 @@ def recover(
     derived, missed = _make_views_again(file, recording, views) if views else ([], [])
     if file.unread:
         missed.insert(0, f"{file.unread} bytes after the last intact part were not read")
-    if dropped := _dropped(file, recording):
+    if dropped := _dropped(file, recording, derived):
         counts = [f"{'?' if n is None else n} on {topic}" for topic, n in sorted(dropped.items())]
         missed.append(f"messages that are not in the copy: {list_some(counts)}")
     recording.told = "; ".join(filter(None, [recording.told, *missed]))
@@ -98,7 +98,7 @@ def _make_views_again(
     file: File, recording: Recording, views: Callable[[Recording], list[Message]]
 ) -> tuple[list[str], list[str]]:
     """Make the topics for viewers again if messages are lost; return their names, and notes."""
-    if not _has_views(file) or not (file.unread or _dropped(file, recording)):
+    if not _has_views(file) or not _dropped(file, recording):
         return [], []
     try:
         recording.views = views(recording)
@@ -111,8 +111,7 @@ def _share(file: File, written: int, lost: int) -> float:
     """Return the share of the messages that were kept, in [0, 1]; if unknown, of the bytes."""
     if lost:
         return written / (written + lost)
-    unread = file.unread if file.data_ended else file.unread + file.left_out
-    return 1.0 - unread / file.size
+    return 1.0 - (file.unread + file.left_out) / file.size
 
 
 def _has_views(file: File) -> bool:
@@ -125,14 +124,26 @@ def _written(recording: Recording) -> Counter[str]:
     return Counter(topic for topic, _, _ in [*recording.messages, *recording.views])
 
 
-def _dropped(file: File, recording: Recording) -> dict[str, int | None]:
-    """Count the messages that `file` has lost, by topic; None: some, but nobody knows how many."""
-    written, stated = _written(recording), file.stated
-    dropped: dict[str, int | None] = dict(sorted((stated - written).items()))
-    is_uncounted = file.statistics is None and (recording.torn or file.gaps or file.unread)
-    if not is_uncounted:
-        return dropped
-    topics = VIEWS.keys() - written.keys() if _has_views(file) else set[str]()
-    if not file.has_counts:
-        topics |= stated.keys()
-    return dropped | dict.fromkeys(sorted(topics - dropped.keys()))
+def _dropped(
+    file: File, recording: Recording, derived: Collection[str] = ()
+) -> dict[str, int | None]:
+    """Count the messages that `file` has lost, by topic; None: some, but nobody knows how many.
+
+    `derived` are the topics for viewers that were made again.
+    """
+    dropped = dict[str, int | None](file.stated - _written(recording))
+    dropped |= dict.fromkeys(uncounted := _uncounted(file))
+    # Views that were made from all messages are complete, and messages without a topic were views.
+    is_made = bool(derived) and not dropped.keys() & TOPICS.keys()
+    made = {UNKNOWN, *uncounted} if is_made else set()
+    return {topic: n for topic, n in sorted(dropped.items()) if topic not in made}
+
+
+def _uncounted(file: File) -> set[str]:
+    """Return the topics that may have lost messages that nobody has counted."""
+    if not file.lost or file.statistics:
+        return set()
+    topics = file.stated.keys() - {UNKNOWN}
+    if _has_views(file):
+        topics |= VIEWS.keys()
+    return topics - TOPICS.keys() if file.has_counts else topics

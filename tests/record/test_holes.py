@@ -10,6 +10,7 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.holes import END_NS, HOLES, SOMEWHERE, Hole, describe, of_metadata
 from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.record.recovery import recover
+from cloudrc.record.topics import VIEWS
 from cloudrc.record.writer import CHUNK_NS, McapWriter
 from cloudrc.runs.identify import identify
 from cloudrc.runs.links.trace import LogSettings, read_packets
@@ -79,13 +80,39 @@ def test_an_intact_recording_and_one_with_damaged_views_have_no_hole(tmp_path):
     assert ("damaged" in found.lacking, found.holes) == (True, ())
 
 
+@pytest.mark.parametrize("index", [True, False])
+@pytest.mark.parametrize("chunk", [1, 4])
+def test_damaged_views_are_made_again_and_counted_if_all_other_messages_are_there(
+    path, chunk, index
+):
+    """Chunks 4 and 5 have views only; chunk 1 has none."""
+    views = [("/tf", n * 10 * MS, bytes(100)) for n in range(100)]
+    with McapWriter(path, clock="world") as writer:
+        writer.write(RECORDS)
+        writer.attach("config.yaml", b"")
+        writer.write_views(views)
+    without(path, [chunk])
+    if not index:
+        path.write_bytes(path.read_bytes()[:-100] + bytes(100))
+    recovery = recover(path, path.with_name("copy.mcap"), lambda recording: views[5:])
+    assert recovery.derived == ["/tf"]
+    lost = {topic: n for topic, n in recovery.dropped.items() if topic in VIEWS}
+    if index:
+        assert lost == {"/tf": 5}
+    else:
+        assert lost == ({} if chunk == 4 else dict.fromkeys(VIEWS))
+
+
 def test_nobody_knows_when_messages_were_that_another_program_removed(path, tmp_path):
     other = rewrite(path, tmp_path / "y.mcap", keep=lambda c, m: c.topic != "/contact")
     assert Recording.read(other).holes == copy(other).holes == (SOMEWHERE,)
 
 
-def test_a_torn_recording_has_lost_its_end(path):
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+@pytest.mark.parametrize("are_zeros", [False, True])
+def test_a_torn_recording_has_lost_its_end(path, are_zeros):
+    """After a power loss, a file may have its full length and zeros at its end."""
+    size = path.stat().st_size
+    path.write_bytes(path.read_bytes()[: size // 2] + bytes(are_zeros * (size - size // 2)))
     found = Recording.read(path)
     assert found.holes == (Hole(found.messages[-1][1], END_NS),) == copy(path).holes
 
