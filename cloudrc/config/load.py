@@ -236,12 +236,27 @@ def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> Res
     robot, found = known_robot(experiment.world.robot), list[ConfigProblem]()
     with _collect(found, ("world", "tuning")):
         parameters(robot, experiment.world)
+    found += _without_effect(document, experiment)
     mission = put_on_ground(mission, scene) if robot.planar else mission
     fit = _check_fit(mission, scene, experiment.world.robot)
     found += [_blame_scene(document, each) for each in fit]
     problems.raise_problems(document, found, name)
     mission = without_held_yaws(mission, robot.heading)
     return experiment.model_copy(update={"mission": mission})
+
+
+def _without_effect(document: Document, experiment: ResolvedExperiment) -> Iterator[ConfigProblem]:
+    """List the settings of the link that a trace replaces: their flights would all be equal."""
+    for way in DIRECTIONS:
+        trace = getattr(experiment, way).trace
+        if trace is None:
+            continue
+        has_losses = read_trace(Path(trace)).losses is not None
+        for key in ("delay_ms", "loss") if has_losses else ("delay_ms",):
+            path = "link", way, key
+            if document.source(path).is_setting:
+                text = f"has no effect, because link.{way}.trace replaces it; set that to null"
+                yield ConfigProblem(path, str(document.get(*path)), text)
 
 
 def _blame_scene(document: Document, problem: ConfigProblem) -> ConfigProblem:

@@ -35,7 +35,7 @@ NOT_IN_STEP = "mission.", "criteria.", "report."
 
 Trial: TypeAlias = dict[str, Any]
 """Result of the flights with one value: `value`, the guard's `speed_max_mps`, and the answer as
-`stable` or `settles`; for a delay `rtt_ms`; after a failure `code`, `text` and `seed`."""
+`stable` or `settles`; for a constant delay `rtt_ms`; after a failure `code`, `text` and `seed`."""
 
 
 class Asked(NamedTuple):
@@ -176,8 +176,8 @@ class Trials:
             if experiment is None:
                 trial |= {"code": "refused", "text": why}
             else:
-                if self.asked.key.endswith("delay_ms"):
-                    trial["rtt_ms"] = experiment.uplink.delay_ms + experiment.downlink.delay_ms
+                if (rtt := self._round_trip(experiment)) is not None:
+                    trial["rtt_ms"] = rtt
                 trial["speed_max_mps"] = experiment.guard.speed_max_mps
                 ask = _ask_stable if question == "stable" else _ask_settles
                 trial |= self._fly(experiment, ask, question)
@@ -208,10 +208,16 @@ class Trials:
     def name(self, number: int) -> str:
         """Return the value of a number with its unit and, for a delay, the round trip."""
         experiment, _ = self.experiment(number)
-        key, rtt = self.asked.key, ""
-        if key.endswith("delay_ms") and experiment is not None:
-            rtt = f" (RTT {experiment.uplink.delay_ms + experiment.downlink.delay_ms:g} ms)"
-        return f"{self.value(number):.12g}{' ms' if key.endswith('_ms') else ''}{rtt}"
+        rtt = None if experiment is None else self._round_trip(experiment)
+        text = f"{self.value(number):.12g}{' ms' if self.asked.key.endswith('_ms') else ''}"
+        return text if rtt is None else f"{text} (RTT {rtt:g} ms)"
+
+    def _round_trip(self, experiment: ResolvedExperiment) -> float | None:
+        """Return the round trip for a key that is a delay [ms]; None if it changes in flight."""
+        ways = experiment.uplink, experiment.downlink
+        if not self.asked.key.endswith("delay_ms") or any(way.trace or way.changes for way in ways):
+            return None
+        return sum(way.delay_ms for way in ways)
 
 
 def questions(trials: Trials) -> list[str]:

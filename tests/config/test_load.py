@@ -182,6 +182,32 @@ def test_a_value_may_be_a_number_a_list_or_quoted():
     assert parse_value("a: 1\nb: 2", "x") == {"a": 1, "b": 2}
 
 
+@pytest.mark.parametrize(
+    ("columns", "setting", "key"),
+    [
+        ("delay_ms", "link.both.delay_ms=20", "link.uplink.delay_ms: 20"),
+        ("delay_ms", "link.uplink.delay_ms=20", "link.uplink.delay_ms: 20"),
+        ("delay_ms", "link.downlink.delay_ms=20", ""),
+        ("delay_ms", "link.uplink.loss=0.1", ""),
+        ("delay_ms", "link.uplink.jitter_ms=5", ""),
+        ("delay_ms,loss", "link.uplink.loss=0.1", "link.uplink.loss: 0.1"),
+        ("delay_ms,loss", "link.uplink.loss={bad_start: 0.1, bad_end: 0.5}", "link.uplink.loss"),
+    ],
+)
+def test_a_setting_that_a_trace_replaces_is_refused(tmp_path, columns, setting, key):
+    """Otherwise all flights of a sweep over this key would be equal, without a word."""
+    trace = tmp_path / "trace.csv"
+    trace.write_text(f"time_s,{columns}\n0{',1' * len(columns.split(','))}\n")
+    settings = [f"link.uplink.trace={trace}", setting]
+    if not key:
+        load_experiment("hover", settings)
+        return
+    why = "has no effect, because link.uplink.trace replaces it; set that to null"
+    with pytest.raises(BadInputError, match=f"{key}.*: {why}") as error:
+        load_experiment("hover", settings)
+    assert "\n" not in str(error.value)
+
+
 def test_paths_start_at_the_file_that_names_them(tmp_path, monkeypatch):
     links = tmp_path / "links"
     links.mkdir()
