@@ -8,15 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from math import cos, sin
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
-from cloudrc.messages import Quaternion, Vector
+from cloudrc.messages import UPRIGHT, Quaternion, Vector
 from cloudrc.record.ros import STORE, build_odometry, header, part
+from cloudrc.records import Control
 
 WORLD, BASE = "world", "base_link"
 """Frame of poses and of commanded velocities, and frame of the robot's base."""
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _STAMPED = "geometry_msgs/msg/TwistStamped"
+Pose: TypeAlias = tuple[Sequence[float], Sequence[float]]
+"""Position [m], shape (3,), and orientation wxyz [1], shape (4,)."""
 
 
 def encode_odometry(
@@ -59,24 +62,22 @@ def encode_clock(now_ns: int) -> bytes:
     return _pack("rosgraph_msgs/msg/Clock", header(now_ns).stamp)
 
 
-def encode_transforms(
-    stamp_ns: int,
-    poses: Mapping[str, tuple[Sequence[float], Sequence[float]]],
-    parent: str = WORLD,
-) -> bytes:
-    """Encode a tf2_msgs/TFMessage as CDR.
+def frames_of(control: Control, prefix: str = "") -> dict[str, Pose]:
+    """Return the frames of a control period, in `world`; `prefix` precedes their names."""
+    return {
+        f"{prefix}estimate": (control.position, control.orientation_wxyz),
+        f"{prefix}setpoint": (control.setpoint, UPRIGHT),
+    }
 
-    Args:
-        stamp_ns: Time of the poses [ns].
-        poses: Frame -> its position [m], shape (3,), and orientation wxyz [1], shape (4,).
-        parent: Frame in which the poses are.
-    """
+
+def encode_transforms(stamp_ns: int, poses: Mapping[str, Pose]) -> bytes:
+    """Encode a tf2_msgs/TFMessage as CDR: frame -> its pose in `world` at `stamp_ns` [ns]."""
     transforms = []
     for frame, (position, (w, x, y, z)) in poses.items():
         move = part("geometry_msgs/msg/Vector3", *position)
         turn = part("geometry_msgs/msg/Quaternion", x, y, z, w)
         transform = part("geometry_msgs/msg/Transform", move, turn)
-        about = header(stamp_ns, parent), frame
+        about = header(stamp_ns), frame
         transforms.append(part("geometry_msgs/msg/TransformStamped", *about, transform))
     return _pack("tf2_msgs/msg/TFMessage", transforms)
 

@@ -6,13 +6,12 @@ from collections.abc import Iterator, Sequence
 
 from cloudrc.messages import GuardState
 from cloudrc.record.content import Message
-from cloudrc.record.live import encode_transforms
+from cloudrc.record.live import BASE, encode_transforms, frames_of
 from cloudrc.record.ros import encode
 from cloudrc.record.topics import TOPICS, topics_of
 from cloudrc.records import Control, GuardChange, Record, TelemetrySent
 from cloudrc.report.markers import MarkerShape, encode_markers
 
-LEVEL = (1.0, 0.0, 0.0, 0.0)
 REPEAT_NS = 1_000_000_000
 """Time after which /scene and /guard come again [ns]: a viewer that comes later needs them, too."""
 
@@ -37,16 +36,12 @@ class LiveViews:
         if isinstance(record, TelemetrySent):
             yield from self._of_telemetry(record)
         elif isinstance(record, Control):
-            frames = {
-                "estimate": (record.position, record.orientation_wxyz),
-                "setpoint": (record.setpoint, LEVEL),
-            }
-            yield "/tf", record.stamp_ns, encode_transforms(record.stamp_ns, frames)
+            yield "/tf", record.stamp_ns, encode_transforms(record.stamp_ns, frames_of(record))
 
     def _of_telemetry(self, record: TelemetrySent) -> Iterator[Message]:
         telemetry, stamp_ns = record.telemetry, record.stamp_ns
         pose = telemetry.odometry.position, telemetry.odometry.orientation_wxyz
-        yield "/tf", stamp_ns, encode_transforms(stamp_ns, {"base_link": pose})
+        yield "/tf", stamp_ns, encode_transforms(stamp_ns, {BASE: pose})
         repeats = stamp_ns - self._repeated_ns >= REPEAT_NS
         if repeats or telemetry.guard is not self._guard:
             self._guard = telemetry.guard

@@ -30,13 +30,14 @@ from cloudrc.bridges.ros2.own_node import LINGERS, NEWEST, QUEUED, OwnNode
 from cloudrc.bridges.ros2.requests import SERVICES, RosRequests
 from cloudrc.console.steering import Steering
 from cloudrc.drivers.readers import RecordReader
-from cloudrc.messages import ZERO, GuardState, Telemetry, Vector
+from cloudrc.messages import UPRIGHT, ZERO, GuardState, Telemetry, Vector
 from cloudrc.record.live import (
     BASE,
     encode_diagnostics,
     encode_odometry,
     encode_text,
     encode_transforms,
+    frames_of,
 )
 from cloudrc.records import Control, Record, TelemetrySent
 from cloudrc.report.markers import GOAL, encode_markers, path_shape
@@ -54,8 +55,7 @@ WAKE = 0.05
 """Longest wait for records [s]."""
 THREADS = 4
 """Number of threads that serve requests: an emergency stop does not wait for another request."""
-LEVEL = (1.0, 0.0, 0.0, 0.0)
-MAP = {"map": ((0.0, 0.0, 0.0), LEVEL)}
+MAP = {"map": (ZERO, UPRIGHT)}
 """Static frame: RViz and others start with `map`, which is the world."""
 TRAIL_STEP, TRAIL_MAX = 0.05, 1000
 """Shortest distance between two points of the flown path [m], and their largest number."""
@@ -156,12 +156,9 @@ class RosBridge(OwnNode):
         if isinstance(record, TelemetrySent):
             self._publish_telemetry(record.telemetry)
         elif isinstance(record, Control) and self._transforms is not None:
-            poses = {
-                f"{self._prefix}estimate": (record.position, record.orientation_wxyz),
-                f"{self._prefix}setpoint": (record.setpoint, LEVEL),
-            }
             stamp_ns = record.stamp_ns + self._offset_ns
-            self._transforms.publish(encode_transforms(stamp_ns, poses))
+            frames = frames_of(record, self._prefix)
+            self._transforms.publish(encode_transforms(stamp_ns, frames))
 
     def _publish_telemetry(self, telemetry: Telemetry) -> None:
         stamp_ns, position, orientation, velocity, rates = telemetry.odometry

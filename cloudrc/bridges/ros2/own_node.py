@@ -34,7 +34,7 @@ class OwnNode:
         self.context = rclpy.Context()
         try:
             rclpy.init(args=[], context=self.context)
-        except Exception as error:  # a wrong ROS_DOMAIN_ID, a missing RMW_IMPLEMENTATION
+        except Exception as error:
             text = to_one_line(str(error).partition(", at ")[0])
             raise MissingPrerequisiteError(f"ROS 2 does not start here: {text}") from None
         self.node = rclpy.create_node(
