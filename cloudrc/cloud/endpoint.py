@@ -33,7 +33,7 @@ from cloudrc.messages import (
     Setpoint,
     Telemetry,
 )
-from cloudrc.records import Arrival, Control, Counted, MissionEvent, SessionOpened
+from cloudrc.records import UNDER_WAY, Arrival, Control, Counted, MissionEvent, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import LATE, REPEATED, USED
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
@@ -189,6 +189,7 @@ class CloudEndpoint(TunnelEnd):
         if self._session.epoch:
             self._send_command_or_alive(now_ns)
         if now_ns >= self._count_ns:
+            self._count_ns = max(self._count_ns, now_ns - COUNT_PERIOD_NS) + COUNT_PERIOD_NS
             self._record_counts(now_ns)
         if self._loop.faults:
             self._records += self._loop.take_faults()
@@ -351,8 +352,16 @@ class CloudEndpoint(TunnelEnd):
                 self._relay(message)
             else:
                 self._records.append(message)
-                if isinstance(message, MissionEvent) and message.event == "started":
-                    self._loop.start_mission()
+                if isinstance(message, MissionEvent):
+                    self._follow_mission(message)
+
+    def _follow_mission(self, event: MissionEvent) -> None:
+        """Prepare the loop for a mission; record the counters as a mission begins and ends."""
+        if event.event == "started":
+            self._loop.start_mission()
+        elif event.event in UNDER_WAY:
+            return
+        self._record_counts(event.stamp_ns)
 
     def _relay(self, request: OperatorRequest) -> None:
         """Relay an operator's request to world, or drop it; teleop repeats a dropped request.
@@ -395,6 +404,5 @@ class CloudEndpoint(TunnelEnd):
         self._control = control
 
     def _record_counts(self, now_ns: int) -> None:
-        self._count_ns = max(self._count_ns, now_ns - COUNT_PERIOD_NS) + COUNT_PERIOD_NS
         for name, count in sorted(self.counts.items()):
             self._records.append(Counted(now_ns, "cloud", name, count))

@@ -211,7 +211,7 @@ def _real_time_factor(flight: Flight) -> float | None:
 def _missed_periods(flight: Flight) -> float | None:
     if not len(flight.recording["/lateness"]):
         return None
-    return flight.last_total("missed_periods") or 0.0
+    return flight.growth("missed_periods") or 0.0
 
 
 add_metrics(
@@ -262,5 +262,5 @@ add_metrics(
      "real time only.", _missed_periods),
     ("controller_gaps", "1", "Number of times that the program of cloud.controller remote was "
      "silent for 0.2 s, so that the robot stood still.",
-     lambda flight: flight.last_total("controller_gaps")),
+     lambda flight: flight.growth("controller_gaps")),
 )  # fmt: skip

@@ -22,6 +22,7 @@ from cloudrc.geometry.clearance import Hull, clearance, least_clearance, tube_in
 from cloudrc.geometry.obstacles import Obstacle, has_surface, obstacles
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
+from cloudrc.metrics.counters import growth
 from cloudrc.record.columns import Recording, Table
 from cloudrc.record.holes import Hole
 from cloudrc.records import UNDER_WAY
@@ -214,11 +215,25 @@ class Flight:
         """Return `number` [any unit] as the value of a metric; None if the robot never flew."""
         return None if self.start_ns is None else float(number)
 
-    def last_total(self, name: str) -> float | None:
-        """Return the last recorded value of a counter [1]; None if it was never recorded."""
+    @property
+    def span_ns(self) -> tuple[int, int] | None:
+        """Start and end of the flight [ns], world's clock; None if the robot never flew."""
+        if self.start_ns is None or self.end_ns is None:
+            return None
+        return self.start_ns, self.end_ns
+
+    def growth(self, name: str) -> float | None:
+        """Return by how much a counter rose in the flight [1]; None if it was never recorded.
+
+        If the robot never flew, the whole recording counts.
+        """
+        return growth(self.recording, name, self.span_ns)
+
+    def last_value(self, name: str) -> float | None:
+        """Return what was last recorded under /count as `name`; None if it was never recorded."""
         count = self.recording["/count"]
-        totals = count["total"][count["name"] == name]
-        return float(totals[-1]) if len(totals) else None
+        values = count["total"][count["name"] == name]
+        return float(values[-1]) if len(values) else None
 
     @cached_property
     def applied(self) -> Columns:
@@ -243,12 +258,10 @@ class Flight:
         return bool((self.during("/command_applied")["planned_ns"] >= 0).any())
 
     def _within(self, columns: Columns) -> Columns:
-        stamps = columns["stamp_ns"]
-        if self.start_ns is None or self.end_ns is None:
-            rows = np.zeros(len(stamps), dtype=bool)
-        else:
-            rows = (stamps >= self.start_ns) & (stamps <= self.end_ns)
-        return select(columns, rows)
+        stamps, span = columns["stamp_ns"], self.span_ns
+        if span is None:
+            return select(columns, np.zeros(len(stamps), dtype=bool))
+        return select(columns, (stamps >= span[0]) & (stamps <= span[1]))
 
 
 def yaw_of(orientations_wxyz: Array) -> Array:

@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 
+from cloudrc.metrics.counters import growth
 from cloudrc.metrics.definitions import WINDOW_MAX, DatagramTally
 from cloudrc.metrics.flight import Flight, add_metrics, finite, mean, select
 from cloudrc.record.columns import Recording, Table
@@ -80,32 +81,17 @@ def loss(flight: Flight, way: str) -> float | None:
 
 
 def _sent(flight: Flight, way: str, name: str) -> float | None:
-    """Return by how much the sender's counter `name` rose in the flight [1].
-
-    The counter is recorded once a second. Between the records, and in less than a second before the
-    first and after the last one, it is taken to rise evenly.
-    """
-    count = flight.recording["/count"]
-    rows = (count["end"] == SENDER[way]) & (count["name"] == name)
-    stamps, totals = count["stamp_ns"][rows], count["total"][rows]
-    if flight.start_ns is None or flight.end_ns is None or len(stamps) < 2:
+    """Return by how much the sender's counter `name` rose in the flight [1]."""
+    if flight.span_ns is None:
         return None
-    grown = np.diff(totals)
-    grown = np.where(grown < 0, totals[1:], grown)  # a process that restarts counts from 0
-    sums = np.cumsum([0, *grown])
-    at = (stamps - stamps[0]) * 1e-9
-    at = np.array([2 * at[0] - at[1], *at, 2 * at[-1] - at[-2]])
-    sums = np.array([2 * sums[0] - sums[1], *sums, 2 * sums[-1] - sums[-2]])
-    ends = (np.array([flight.start_ns, flight.end_ns]) - stamps[0]) * 1e-9
-    before, after = np.interp(ends, at, sums)
-    return float(np.rint(after - before))
+    return growth(flight.recording, name, flight.span_ns, end=SENDER[way], steady=True)
 
 
 def _add_direction(way: str, words: str) -> None:
     """Add the metrics of the direction `way`; `words` name the direction in descriptions."""
 
     def seconds(name: str, flight: Flight) -> float | None:
-        total = flight.last_total(f"{way}_release_error_{name}_ns")
+        total = flight.last_value(f"{way}_release_error_{name}_ns")
         return None if total is None else total * 1e-9
 
     add_metrics(
@@ -124,7 +110,7 @@ def _add_direction(way: str, words: str) -> None:
            f"{words} after they were due: {which}.", partial(seconds, name))
           for name, which in PERCENTILES.items()),
         *((f"{name}_{way}", "1", f"Datagrams {words} {which}", partial(
-            Flight.last_total, name=f"{way}_{name.removeprefix('relay_')}"))
+            Flight.growth, name=f"{way}_{name.removeprefix('relay_')}"))
           for name, which in COUNTS.items()),
     )  # fmt: skip
 

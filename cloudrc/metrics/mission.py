@@ -316,12 +316,14 @@ def _steady_error(flight: Flight, axis: int) -> float | None:
 
 
 def _fault_count(flight: Flight) -> float | None:
-    """Count each fault code once, but a code in `FAILURES` as often as its counter says."""
-    totals, count = dict.fromkeys(flight.recording["/fault"]["code"], 1), flight.recording["/count"]
-    for name, total in zip(count["name"], count["total"], strict=True):
-        if name in FAILURES:  # the largest total: a cloud that restarts counts from 0
-            totals[name] = max(totals.get(name, 0), int(total))
-    return flight.count(sum(totals.values()))
+    """Count each fault code once, but a code in `FAILURES` as often as it happened in the flight.
+
+    A fault from before the flight counts, too: it tells of the flight's programs or link.
+    """
+    found = dict.fromkeys(flight.recording["/fault"]["code"], 1.0)
+    for name in FAILURES:
+        found[name] = max(found.get(name, 0.0), flight.growth(name) or 0.0)
+    return flight.count(sum(found.values()))
 
 
 def _recorder_dropped(flight: Flight) -> float | None:
@@ -361,8 +363,8 @@ add_metrics(
      "missing.", lambda flight: flight.count(_measure_holds(flight)[0].count)),
     ("hold_time", "s", "Total time in HOLD, in which the guard flies without commands.",
      lambda flight: flight.count(_measure_holds(flight)[0].time(flight.end_ns or 0))),
-    ("fault_count", "1", "Number of faults that did not stop the flight, such as an exception in a "
-     "predictor.", _fault_count),
+    ("fault_count", "1", "Number of faults that did not stop the flight: each failed call of a "
+     "plug-in in the flight, and each other fault once.", _fault_count),
     ("recorder_dropped", "1", "Number of records that the recorder dropped because the loop must "
      "not wait for a disk.", _recorder_dropped),
 )  # fmt: skip

@@ -28,6 +28,7 @@ from cloudrc.config.schema import Touch
 from cloudrc.errors import DISK_FULL, DiskFullError
 from cloudrc.messages import Cause, GuardState, Vector
 from cloudrc.metrics import Flight, Number
+from cloudrc.metrics.counters import growth
 from cloudrc.metrics.definitions import real_time_factor
 from cloudrc.metrics.mission import (
     first_touch,
@@ -247,7 +248,7 @@ def _violations(flight: Flight) -> Iterator[FlightFailure]:
     yield from _onboard_failures(flight)
     yield from _interventions(flight)
     yield from _restarts(flight)
-    yield from plugin_failures(flight.recording)
+    yield from plugin_failures(flight.recording, flight.span_ns)
     if flight.criteria.settle_m is not None:
         yield from _responses(flight, flight.criteria.settle_m)
         yield from _missed_end(flight, flight.criteria.settle_m)
@@ -327,13 +328,17 @@ def _restarts(flight: Flight) -> Iterator[FlightFailure]:
             yield FlightFailure("world_restarted", text, *_moment(flight, int(stamp_ns)))
 
 
-def plugin_failures(recording: Recording) -> Iterator[FlightFailure]:
-    """Yield a failure for each plug-in that failed in too many control periods."""
-    periods, faults = _count_periods(recording), recording["/fault"]
-    count = recording["/count"]
+def plugin_failures(
+    recording: Recording, span_ns: tuple[int, int] | None
+) -> Iterator[FlightFailure]:
+    """Yield a failure for each plug-in that failed in too many control periods.
+
+    `span_ns` are the begin and the end of the time that counts [ns], or None for all.
+    """
+    periods, faults = _count_periods(recording, span_ns), recording["/fault"]
     for kind in ("estimator", "predictor", "controller"):
-        totals = count["total"][count["name"] == f"{kind}_failed"]
-        share = float(totals[-1] if len(totals) else 0.0) / max(periods, 1)
+        failed = growth(recording, f"{kind}_failed", span_ns)
+        share = (failed or 0.0) / max(periods, 1)
         if share > PLUGIN_FAILURES_MAX:
             first = faults["text"][faults["code"] == f"{kind}_failed"]
             why = f": {first[0]}" if len(first) else ""
@@ -343,13 +348,17 @@ def plugin_failures(recording: Recording) -> Iterator[FlightFailure]:
             yield FlightFailure("plugin_failed", text)
 
 
-def _count_periods(recording: Recording) -> int:
+def _count_periods(recording: Recording, span_ns: tuple[int, int] | None) -> int:
     """Count cloud's control periods; each has a datagram, whose number tells of lost rows."""
-    rows = recording["/delay_estimate"]
+    table = recording["/delay_estimate"]
+    stamps, epochs, numbers = table["stamp_ns"], table["epoch"], table["counter"]
+    if span_ns is not None:
+        rows = (stamps >= span_ns[0]) & (stamps <= span_ns[1])
+        epochs, numbers = epochs[rows], numbers[rows]
     if not recording.holes:
-        return len(rows)
-    sessions = [rows["counter"][rows["epoch"] == epoch] for epoch in np.unique(rows["epoch"])]
-    return sum(int(numbers.max() - numbers.min()) + 1 for numbers in sessions)
+        return len(numbers)
+    sessions = [numbers[epochs == epoch] for epoch in np.unique(epochs)]
+    return sum(int(each.max() - each.min()) + 1 for each in sessions)
 
 
 def _responses(flight: Flight, settle: float) -> Iterator[FlightFailure]:

@@ -153,9 +153,15 @@ class Recording(Content):
                     total.update(column.data)
         return total.hexdigest()
 
-    def keep(self, first_ns: int, last_ns: int) -> None:
-        """Remove what has a log time [ns] before `first_ns` or after `last_ns`."""
-        self.messages = [each for each in self.messages if first_ns <= each[1] <= last_ns]
+    def keep(self, first_ns: int, last_ns: int, counted_ns: int) -> None:
+        """Remove what has a log time [ns] before `first_ns` or after `last_ns`.
+
+        Counters remain from `counted_ns` [ns] on, because their growth from there is a number.
+        """
+        since_ns = {"/count": min(counted_ns, first_ns)}
+        self.messages = [
+            each for each in self.messages if since_ns.get(each[0], first_ns) <= each[1] <= last_ns
+        ]
         holes = tuple(hole for hole in self.holes if hole.meets(first_ns, last_ns))
         if self.holes and not holes:  # what the writers have missed is not in this time
             self.told = ""

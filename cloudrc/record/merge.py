@@ -34,6 +34,9 @@ from cloudrc.records import UNDER_WAY
 BEFORE_NS, AFTER_NS = 1_000_000_000, 2_000_000_000
 """A cut recording begins BEFORE_NS before the mission's start and ends AFTER_NS after its end [ns].
 It thus includes the start of the session and the guard's first change of state."""
+COUNTED_NS = 2_500_000_000
+"""Time before its other records from which a cut recording has the counters [ns]: longer than the
+2 s between two records of a counter of the link. So the growth in the flight is known."""
 
 
 class ClockOffset(NamedTuple):
@@ -196,7 +199,8 @@ def cut_to_last_mission(mission: Recording) -> bool:
     earlier = max((end for _, end in before if end is not None), default=-1)
     until = mission.messages[-1][1] if mission.messages else 0
     first = max((began or 0) - BEFORE_NS, earlier + 1)
-    mission.keep(first, ended + AFTER_NS if ended is not None else until)
+    last = ended + AFTER_NS if ended is not None else until
+    mission.keep(first, last, first - COUNTED_NS)
     if ended is None or until <= ended:
         return False
     if any(hole.begin_ns <= ended and hole.end_ns >= END_NS for hole in mission.holes):

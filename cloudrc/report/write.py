@@ -78,12 +78,11 @@ def assess(
 
 def _clamped_horizon(flight: Flight, experiment: ResolvedExperiment) -> list[str]:
     """Return a note if cloud had to limit the estimator's horizon."""
-    count = flight.recording["/count"]
-    rows = zip(count["name"], count["total"], strict=True)
-    clamped = max((int(total) for name, total in rows if name == "horizon_clamped"), default=0)
+    clamped = round(flight.growth("horizon_clamped") or 0)
     if not clamped:
         return []
-    periods = len(flight.recording["/delay_estimate"])
+    control = flight.recording["/delay_estimate"] if flight.span_ns is None else flight.control
+    periods = len(control["stamp_ns"])
     return [
         f"In {clamped} of {periods} periods, the estimator's horizon was not in the range 0 to "
         f"{experiment.cloud.horizon_max_s:g} s (cloud.horizon_max_s), and cloud limited it; a "

@@ -25,8 +25,10 @@ from cloudrc.errors import describe_error, machine_error
 from cloudrc.geometry.scene import load_scene
 from cloudrc.link.ages import simulate_ages
 from cloudrc.messages import GuardState
+from cloudrc.metrics.counters import growth
 from cloudrc.metrics.verdict import NOT_STARTED, plugin_failures
 from cloudrc.record.columns import Recording, RecordStore
+from cloudrc.record.holes import END_NS
 from cloudrc.records import Control, Counted, Fault, GroundTruth, GuardChange, MissionEvent, Record
 
 Array: TypeAlias = NDArray[np.float64]
@@ -170,16 +172,12 @@ def _track(recording: Recording) -> Track:
 
 def _limited(recording: Recording, since_ns: int) -> float:
     """Return how many commands after `since_ns` [ns] the guard's speed cap shortened."""
-    counts = recording["/count"]
-    rows = counts["name"] == "limited_speed"
-    stamps_ns, totals = counts["stamp_ns"][rows], counts["total"][rows]
-    before = totals[stamps_ns <= since_ns]
-    return float(totals[-1] - (before[-1] if len(before) else 0)) if len(totals) else 0.0
+    return growth(recording, "limited_speed", (since_ns, END_NS)) or 0.0
 
 
 def _problem(recording: Recording, step_ns: int) -> tuple[str, str] | None:
     """Return code and text of why a flight shows no response to the step at `step_ns` [ns]."""
-    for failure in plugin_failures(recording):  # the response is not that of the plug-in
+    for failure in plugin_failures(recording, None):  # the response is not that of the plug-in
         return failure.code, failure.text
     guard, mission = recording["/guard"], recording["/mission"]
     if not (guard["state"] == GuardState.TRACK).any():

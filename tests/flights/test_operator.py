@@ -7,7 +7,7 @@ import pytest
 from cloudrc import assembly
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
-from cloudrc.records import GuardChange
+from cloudrc.records import UNDER_WAY, Counted, GuardChange, MissionEvent
 from cloudrc.teleop.wire import ALARM
 from cloudrc.tunnel.codec import Kind, peek
 from tests.flights.conftest import HOVER, both_ways, fly_on
@@ -99,3 +99,16 @@ def test_an_acknowledgement_ends_one_alarm_not_the_next_stop(ends):
     teleop.outputs.append(ALARM)  # late, of before
     teleop.requests.ask(Request.ACKNOWLEDGE)
     assert states(ends, 2)[-1] is GuardState.GROUND
+
+
+def test_cloud_counts_as_a_mission_begins_and_ends(ends):
+    """The counters of the flight are then known to the period."""
+    ends.cloud.take_records()
+    for event in UNDER_WAY[1:]:
+        say(ends, MissionEvent(7, event, 0, ""))
+    assert not [one for one in ends.cloud.take_records() if isinstance(one, Counted)]
+    for stamp_ns, event in enumerate(("started", "done")):
+        say(ends, MissionEvent(stamp_ns, event, 0, ""))
+        found = [one for one in ends.cloud.take_records() if isinstance(one, Counted)]
+        assert {one.name: one.total for one in found} == ends.cloud.counts
+        assert {one.stamp_ns for one in found} == {stamp_ns}

@@ -108,7 +108,7 @@ def test_what_is_recorded_still_fails_the_mission():
 
 def test_a_plug_in_may_fail_in_one_percent_of_the_periods_also_of_those_lost():
     log = flown()
-    log.cloud.append(Counted(at(9), "cloud", "predictor_failed", 3))  # of 400
+    log.cloud.append(Counted(at(9), "cloud", "predictor_failed", 2))  # of 251
     assert judged(lossy(log, (1.0, 8.0))).failures[0].code == "recording_incomplete"
 
 
