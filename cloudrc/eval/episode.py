@@ -29,7 +29,7 @@ from cloudrc.eval.setup import (
 )
 from cloudrc.gym import Networked
 from cloudrc.gym.values import size_of
-from cloudrc.plugins import refuse_failure
+from cloudrc.plugins import InvalidResultError, refuse_failure, shorten, to_number
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
 from cloudrc.policy.observation import observe
@@ -70,8 +70,9 @@ class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Execute an action."""
         self.action = action
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self._note(action, observation, float(reward))
+        observation, given, terminated, truncated, info = self.env.step(action)
+        reward = _reward_of(given)
+        self._note(action, observation, reward)
         return observation, reward, terminated, truncated, info
 
     def _note(self, *values: Any) -> None:
@@ -82,6 +83,14 @@ class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
                 self._note(*value)
             else:
                 self.digest.update(np.asarray(value).tobytes())
+
+
+def _reward_of(given: Any) -> float:
+    """Return the reward of a step, which may be a boolean; raise a ValueError for a wrong value."""
+    reward = float(given) if isinstance(given, bool | np.bool_) else to_number(given, "reward")
+    if not isfinite(reward):
+        raise InvalidResultError(f"its reward is {reward}")
+    return reward
 
 
 def play(episode: Episode, setup: EvalSetup, identity: Mapping[str, Any]) -> dict[str, Any]:
@@ -223,7 +232,7 @@ def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask:
         world.compute = times(episode.seed + steps, policy.duration)
         seen_at = steps - round(about["observation_age"] / world.dt)
         observation, reward, terminated, truncated, info = world.step(chunk)
-        steps, total = steps + 1, total + float(reward)
+        steps, total = steps + 1, total + reward
         about = info["cloudrc"]
         fresh = steps - round(about["observation_age"] / world.dt) > seen_at
         stale += about["held"]
@@ -282,8 +291,11 @@ def _times(setup: EvalSetup) -> Callable[[int, float], float | None]:
 def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
     """Return whether the task was done in any step so far; None if the info never told."""
     for key in SUCCESS:
-        if key in info:
-            return bool(known) or bool(np.all(info[key]))
+        if info.get(key) is not None:
+            told = np.asarray(info[key])
+            if told.dtype.kind not in "biuf" or not np.isfinite(told).all():
+                raise InvalidResultError(f"{key} in its info is {shorten(info[key])}, no boolean")
+            return bool(known) or bool(told.all())
     return known
 
 

@@ -257,6 +257,31 @@ def test_a_failing_environment_is_one_line(law):
         play(Episode(None, "newest", 1), setup, {})
 
 
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ((np.nan, {}), "its reward is nan"),
+        (("1.0", {}), "its reward is str '1.0', which is no number"),
+        ((1.0, {"success": np.nan}), "success in its info is float nan"),
+        ((1.0, {"is_success": "False"}), "is_success in its info is str 'False'"),
+        ((True, {"success": np.array([1.0, 1.0])}), None),
+    ],
+)
+def test_a_wrong_value_of_an_environment_is_no_success(law, monkeypatch, told, words):
+    world = gymnasium.make("MountainCarContinuous-v0").unwrapped
+    monkeypatch.setattr(
+        type(world), "step", lambda env, action: (env.state, told[0], True, False, told[1])
+    )
+    setup = EvalSetup(
+        "MountainCarContinuous-v0", law("def infer(o): return {'actions': [[0.0]]}"), dt=0.1
+    )
+    if words is None:
+        assert play(Episode(None, "newest", 1), setup, {})["verdict"] == "success"
+        return
+    with pytest.raises(BadInputError, match=words):
+        play(Episode(None, "newest", 1), setup, {})
+
+
 ENDING = """
 import argparse
 import sys
