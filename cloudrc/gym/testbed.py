@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from math import dist
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from cloudrc.config.schema import Link
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Datagram, Odometry, Setpoint
+from cloudrc.plugins import shorten, to_numbers
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
@@ -189,12 +191,7 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         flight = self.flight
         if flight is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        values = np.asarray(action, dtype=np.float64)
-        count = len(self._parts)
-        if values.shape != (count,) or not np.isfinite(values).all():
-            parts = ", ".join(self._parts)
-            raise BadInputError(f"action {action!r}: give {count} finite numbers: {parts}")
-        x, y, *climb, yaw_rate = values.tolist()
+        x, y, *climb, yaw_rate = self._numbers_of(action)
         flight.policy.output = ControlOutput((x, y, climb[0] if climb else 0.0), yaw_rate)
         flight.step()
         observation, distance = self._observe(flight)
@@ -202,6 +199,15 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         late = not ended and flight.now_ns >= self._limit_ns
         info = self._judge(flight) if ended or late else {}
         return observation, -distance, ended, late, info
+
+    def _numbers_of(self, action: Any) -> list[float]:
+        count = len(self._parts)
+        with suppress(TypeError, ValueError):
+            values = to_numbers(action)
+            if values.shape == (count,):
+                return [*map(float, values)]
+        parts = ", ".join(self._parts)
+        raise BadInputError(f"action {shorten(action)}: give {count} finite numbers: {parts}")
 
     def __getstate__(self) -> object:
         """Return the state for a copy; refuse it in flight, whose tunnel has keys in C objects."""

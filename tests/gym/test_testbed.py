@@ -108,6 +108,7 @@ def test_what_a_robot_cannot_fly_is_refused():
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(4))
     env.reset(seed=1)
-    for action in (np.zeros(3), np.array([np.nan, 0, 0, 0]), None):
+    wrong = [True, False, False, False], ["0.1", 0, 0, 0], [1e31, 0, 0, 0], [[0], 1]
+    for action in (np.zeros(3), np.array([np.nan, 0, 0, 0]), None, np.ones(4) > 0, *wrong):
         with pytest.raises(BadInputError, match="give 4 finite numbers"):
             env.step(action)
