@@ -425,8 +425,9 @@ def to_numbers(values: Any) -> NDArray[Any]:
     """
     import numpy as np
 
-    for place, value in _leaves_of(values):
-        to_number(value, _name_of(place))
+    if type(values) is not np.ndarray or values.dtype.kind not in "iuf":
+        for place, value in _leaves_of(values):
+            to_number(value, _name_of(place))
     array = np.asarray(values)
     if array.dtype.kind not in "iuf":
         array = array.astype(float)

@@ -12,6 +12,7 @@ from cloudrc.gym.options import (
     Options,
     Profile,
     answer_space,
+    compute_times,
     connect,
     describe_answer,
     step_time,
@@ -93,7 +94,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     @compute.setter
     def compute(self, time: float | None) -> None:
-        self._loop.compute = time
+        self._loop.compute = None if time is None else compute_times((time, 0.0))[0]
 
     def summary(self) -> dict[str, Any]:
         """Return what `info["cloudrc"]["episode"]` has, also before the end of an episode."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from functools import partial
 from math import isfinite, nan
 from pathlib import Path
@@ -17,6 +18,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.gym.executors import Executor
 from cloudrc.gym.loop import RemoteLoop, Settings
 from cloudrc.gym.values import checker, copied, neutral, size_of
+from cloudrc.gym.watched import WatchedExecutor
 from cloudrc.link.library import LinkProfile, read_profile
 
 Profile: TypeAlias = str | Path | Mapping[str, Any] | LinkProfile
@@ -79,8 +81,9 @@ def connect(
         observation_bytes=observation_bytes,
         action_bytes=action_bytes,
     )
+    check = checker(actions, "one action, or None")
     return [
-        RemoteLoop(settings, find_executor(executor, chunked=chunk is not None), stream)
+        RemoteLoop(settings, find_executor(executor, check, chunked=chunk is not None), stream)
         for stream in streams
     ]
 
@@ -112,12 +115,11 @@ def step_time(env: Any, given: float | None) -> float:
     found: Any = given
     for name in ("step_dt", "dt", "tau"):
         found = getattr(base, name, None) if found is None else found
-    if found is None and (rate := (env.metadata or {}).get("render_fps")):
-        found = 1.0 / rate
-    try:
-        number = nan if found is None else float(found)
-    except (TypeError, ValueError):
-        number = nan
+    number = nan
+    with suppress(plugins.InvalidResultError):
+        if found is None and (rate := (env.metadata or {}).get("render_fps")):
+            found = 1.0 / plugins.to_number(rate, "rate")
+        number = plugins.to_number(found, "time step")
     if not (isfinite(number) and 0.0 < number <= 3600.0):
         told = "has no time step" if found is None else f"has the time step {found!r}"
         raise BadInputError(f"the environment {told}; give dt=, the time of a step in seconds")
@@ -128,8 +130,8 @@ def compute_times(compute: float | tuple[float, float]) -> tuple[float, float]:
     """Return mean and standard deviation of a compute time [s], given as a number or as both."""
     both = compute if isinstance(compute, tuple | list) else (compute, 0.0)
     try:
-        mean, deviation = (float(each) for each in both)
-    except (TypeError, ValueError):
+        mean, deviation = (plugins.to_number(each, "time") for each in both)
+    except ValueError:  # also for another number of values
         mean = deviation = nan
     if not (0.0 <= mean <= 3600.0 and 0.0 <= deviation <= 3600.0) or (deviation and not mean):
         raise BadInputError(
@@ -162,8 +164,11 @@ def describe_answer(chunk: int | None) -> str:
     return "one action" if chunk is None else f"a chunk of {chunk} actions"
 
 
-def find_executor(name: str | Path, *, chunked: bool) -> Executor:
-    """Build an executor by name or path; raise a BadInputError if it does not fit."""
+def find_executor(name: str | Path, check: Callable[[Any], None], *, chunked: bool) -> Executor:
+    """Build an executor by name or path; raise a BadInputError if it does not fit.
+
+    `check` raises an exception for a value that is no action.
+    """
     found = str(name)
     if not plugins.is_path(found):
         found = found.replace("-", "_")
@@ -178,4 +183,6 @@ def find_executor(name: str | Path, *, chunked: bool) -> Executor:
             f"executor {found!r} plays chunks of actions: give chunk=, the number of actions in "
             "an answer"
         )
-    return executor
+    if plugins.find("executors", found).is_shipped:
+        return executor
+    return WatchedExecutor(found, executor, check)

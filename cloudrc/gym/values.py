@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from functools import partial
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from cloudrc.errors import BadInputError
+from cloudrc.plugins import LARGEST, InvalidResultError, shorten, to_numbers
 
 _PLAIN = (int, float, bool, str, np.generic, type(None))
 
@@ -60,57 +61,62 @@ def neutral(space: spaces.Space[Any]) -> Any:
 
 
 def checker(space: spaces.Space[Any], what: str) -> Callable[[Any], None]:
-    """Return a function that raises a BadInputError if an action has another form than the space.
+    """Return a function that raises a BadInputError if an action is none of the space.
 
-    It does not look at values: the environment decides about them. `what` says in words what an
-    action is.
+    It does not look at the space's bounds: the environment decides about them. `what` says in words
+    what an action is.
     """
-    return partial(_check, _form_of(space), space, what)
+    return partial(_check, _judge_of(space), space, what)
 
 
 # Functions of this module and no closures: an environment that has them can be pickled.
-def _check(fits: Callable[[Any], bool], space: spaces.Space[Any], what: str, action: Any) -> None:
-    if fits(action):
-        return
-    shape = getattr(action, "shape", None)
-    given = type(action).__name__ + (f" of shape {shape}" if shape is not None else "")
-    raise BadInputError(f"the action is {given}; give {what}, in {space}")
-
-
-def _form_of(space: spaces.Space[Any]) -> Callable[[Any], bool]:
-    """Return a function that tells whether an action has the form of a space."""
-    if isinstance(space, spaces.Box | spaces.MultiDiscrete | spaces.MultiBinary):
-        return partial(_is_array, space.shape)
-    if isinstance(space, spaces.Discrete):
-        return _is_integer
-    if isinstance(space, spaces.Dict):
-        return partial(_has_keys, frozenset(space.spaces))
-    return _is_given
-
-
-def _is_array(shape: tuple[int, ...], action: Any) -> bool:
-    if type(action) is np.ndarray:
-        return bool(action.shape == shape)
-    return isinstance(action, list | tuple | np.number) and _shape(action) == shape
-
-
-def _is_integer(action: Any) -> bool:
-    if isinstance(action, np.ndarray):
-        return bool(action.shape == ())
-    return isinstance(action, int | np.integer)
-
-
-def _has_keys(keys: Set[str], action: Any) -> bool:
-    return isinstance(action, Mapping) and action.keys() == keys
-
-
-def _is_given(action: Any) -> bool:
-    return action is not None
-
-
-def _shape(action: Any) -> tuple[int, ...] | None:
+def _check(judge: Callable[[Any], None], space: spaces.Space[Any], what: str, action: Any) -> None:
     try:
-        found: tuple[int, ...] = np.shape(action)
-        return found
-    except ValueError:  # its parts have different lengths
-        return None
+        judge(action)
+    except (InvalidResultError, TypeError, ValueError) as error:
+        shape = getattr(action, "shape", None)
+        given = shorten(action) + (f" of shape {shape}" if shape is not None else "")
+        why = f" ({error})" if isinstance(error, InvalidResultError) else ""
+        raise BadInputError(f"the action is {given}{why}; give {what}, in {space}") from None
+
+
+def _judge_of(space: spaces.Space[Any]) -> Callable[[Any], None]:
+    """Return a function that raises a ValueError if an action does not have the form of a space."""
+    if isinstance(space, spaces.Box):
+        return partial(_judge_array, space.shape, False)
+    if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary):
+        return partial(_judge_array, space.shape, True)
+    if isinstance(space, spaces.Discrete):
+        return _judge_integer
+    if isinstance(space, spaces.Dict):
+        return partial(_judge_map, {key: _judge_of(each) for key, each in space.spaces.items()})
+    return _judge_given
+
+
+def _judge_array(shape: tuple[int, ...], may_switch: bool, action: Any) -> None:
+    if type(action) is np.ndarray and action.shape == shape:
+        if action.dtype.kind == "f" and float(np.vdot(action, action)) <= LARGEST:
+            return  # the usual case: `to_numbers` takes microseconds
+    elif not isinstance(action, list | tuple | np.generic) or np.shape(action) != shape:
+        raise ValueError
+    if not (may_switch and np.asarray(action).dtype.kind == "b"):
+        to_numbers(action)
+
+
+def _judge_integer(action: Any) -> None:
+    if type(action) is int:
+        return
+    if np.shape(action) != () or np.asarray(action).dtype.kind not in "biu":
+        raise ValueError
+
+
+def _judge_map(judges: Mapping[str, Callable[[Any], None]], action: Any) -> None:
+    if not isinstance(action, Mapping) or action.keys() != judges.keys():
+        raise ValueError
+    for key, judge in judges.items():
+        judge(action[key])
+
+
+def _judge_given(action: Any) -> None:
+    if action is None:
+        raise ValueError

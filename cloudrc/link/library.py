@@ -125,7 +125,8 @@ class OneWay:
         self, profile: DirectionProfile, seed: int, uplink: bool, *, stream: str = ""
     ) -> None:
         """Open a direction; `seed` and `stream` are those of `cloudrc.link.open`."""
-        if not isinstance(seed, int | np.integer) or not 0 <= seed <= SEED_MAX:
+        is_whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
+        if not is_whole or not 0 <= seed <= SEED_MAX:
             raise BadInputError(f"seed {seed!r}: give a whole number from 0 to 2^53 - 1")
         if not isinstance(stream, str):
             raise BadInputError(f"stream {stream!r}: give a text, the name of this link")

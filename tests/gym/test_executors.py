@@ -128,6 +128,67 @@ def test_an_executor_of_ones_own_is_found_by_its_path(tmp_path):
         flown(tmp_path / "empty.py", "ideal")
 
 
+WRONG = """
+import numpy
+from cloudrc.gym.executors import Executor
+
+class Own(Executor):
+    needs_chunk = False
+
+    def receive(self, chunk, tick):
+        self.basis = chunk.basis
+        if tick:
+            {receive}
+
+    def prefix(self, basis):
+        {prefix}
+
+    def action(self, tick):
+        if tick:
+            {action}
+
+def build():
+    return Own()
+"""
+PARTS = {"receive": "pass", "prefix": "return []", "action": "return numpy.zeros(1)"}
+
+
+@pytest.mark.parametrize(
+    ("part", "body", "words"),
+    [
+        ("action", "return numpy.array([numpy.nan])", r"value at \[0\] is nan, not finite"),
+        ("action", "return True", "action is bool True; give one action, or None, in Box"),
+        ("action", "return [True]", r"value at \[0\] is bool True"),
+        ("action", "return numpy.zeros(2)", r"of shape \(2,\)"),
+        ("action", "return '0.5'", "the action is str '0.5'"),
+        ("action", "return numpy.zeros(1) + tick", None),
+        ("action", "self.basis = float('nan'); return [0]", "its basis is float nan"),
+        ("action", "self.basis = True; return [0]", "its basis is bool True"),
+        ("action", "1 / 0", r"ex\.py:\d+: ZeroDivisionError"),
+        ("receive", "raise SystemExit(0)", r"receive\(\) failed: ex\.py:\d+: SystemExit"),
+        ("prefix", "return [[numpy.nan]]", r"prefix\(\) failed: .*value at \[0\] is nan"),
+        ("prefix", "return 3", r"prefix\(\) failed: TypeError"),
+    ],
+)
+def test_an_executor_of_ones_own_that_fails_is_named(tmp_path, part, body, words):
+    (tmp_path / "ex.py").write_text(WRONG.format(**{**PARTS, part: body}))
+    env = Networked(Counter(), executor=tmp_path / "ex.py")
+
+    def fly():
+        env.reset()
+        for _ in range(3):
+            env.step(np.ones(1))
+
+    if words is None:
+        fly()
+        assert [float(each[0]) for each in env.unwrapped.executed] == [0.0, 1.0, 2.0]
+        return
+    with pytest.raises(BadInputError, match=words) as caught:
+        fly()
+    assert str(caught.value).startswith(f"executor '{tmp_path}/ex.py': ")
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("name", plugins.names("executors"))
 def test_every_executor_takes_actions_of_several_values(name):
     space = spaces.Box(-1.0, 1.0, (2, 3))

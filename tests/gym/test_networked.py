@@ -283,6 +283,11 @@ def test_importing_the_wrapper_takes_no_heavy_package_along():
         ({"action_bytes": 2.0}, "action_bytes 2.0"),
         ({"dt": 0.0}, "the time step 0.0; give dt="),
         ({"dt": "10 ms"}, "give dt="),
+        ({"dt": True}, "time step True; give dt="),
+        ({"compute": True}, "compute True"),
+        ({"compute": (0.05, "0.02")}, "compute"),
+        ({"seed": True}, "seed True"),
+        ({"start": [np.nan]}, r"value at \[0\] is nan"),
         ({"stream": 3}, "stream 3"),
     ],
 )
@@ -295,24 +300,41 @@ def test_an_argument_that_cannot_be_used_is_refused_in_one_line(options, words):
 @pytest.mark.parametrize(
     ("space", "chunk", "action", "words"),
     [
-        (None, None, None, "the action is NoneType; give one action"),
+        (None, None, None, "the action is NoneType None; give one action"),
         (None, None, {"move": 1}, "the action is dict"),
-        (None, None, np.zeros(2), r"ndarray of shape \(2,\); give one action, in Box"),
+        (None, None, np.zeros(2), r"of shape \(2,\); give one action, in Box"),
+        (None, None, np.array([np.nan]), r"value at \[0\] is nan, not finite"),
+        (None, None, np.array([1e31]), "beyond 1e"),
+        (None, None, np.array([True]), r"value at \[0\] is bool"),
+        (None, None, [True], r"value at \[0\] is bool True"),
+        (None, None, ["0.5"], r"value at \[0\] is str '0.5'"),
+        (None, None, np.array([0.5], object), None),
+        (spaces.MultiBinary(2), None, np.array([True, False]), None),
+        (spaces.MultiBinary(2), None, [1, np.nan], r"value at \[1\] is nan"),
+        (spaces.Discrete(2), None, np.True_, None),
+        (spaces.Discrete(2), None, 0.5, "float 0.5"),
+        (spaces.Discrete(2), None, "1", "str '1'"),
+        (spaces.Dict(a=spaces.Box(-1, 1, (1,))), None, {"a": [np.nan]}, r"\[0\] is nan"),
         (None, 4, np.zeros(1), "give a chunk of 4 actions"),
         (None, 4, np.zeros((3, 1)), r"of shape \(3, 1\)"),
         (None, 4, [[1.0], [1.0, 2.0], [1.0], [1.0]], "the action is list"),
         (spaces.Discrete(2), None, None, "NoneType"),
         (spaces.Discrete(2), None, np.zeros(1, int), r"of shape \(1,\)"),
-        (spaces.Discrete(2), 4, 1, "the action is int; give a chunk of 4"),
+        (spaces.Discrete(2), 4, 1, "the action is int 1; give a chunk of 4"),
         (spaces.Dict(a=spaces.Discrete(2)), None, {"b": 1}, "the action is dict"),
         (spaces.Dict(a=spaces.Discrete(2)), None, 1, "the action is int"),
         (spaces.Dict(a=spaces.Discrete(2)), 3, None, "the action is NoneType"),
         (spaces.Tuple((spaces.Discrete(2),)), None, None, "NoneType"),
     ],
 )
-def test_an_action_of_another_form_is_refused_in_one_line(space, chunk, action, words):
+def test_an_action_of_another_form_or_a_wrong_value_is_refused_in_one_line(
+    space, chunk, action, words
+):
     env = Networked(Counter(space), chunk=chunk)
     env.reset()
+    if words is None:
+        env.step(action)
+        return
     with pytest.raises(BadInputError, match=words) as caught:
         env.step(action)
     assert "\n" not in str(caught.value)
