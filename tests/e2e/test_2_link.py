@@ -43,12 +43,12 @@ LIMIT_MEMORY = 320 * 2**20
 TOLERANCE = 0.002
 """Tolerance of a mean one-way delay [s]."""
 PROFILES = [
-    ("paper-p1", 0.020, 8.0),
+    ("paper-p1", 0.020, 4.0),
     pytest.param("paper-p3", 0.070, 20.0, marks=pytest.mark.full),
     ("paper-p2", 0.045, 10.0),
 ]
 """Profile, mean delay of each direction [s], time of the measurement [s]. In this time jitter alone
-changes the mean by 0.2, 0.5 and 0.5 ms. The release starts with paper-p2."""
+changes the mean by 0.3, 0.5 and 0.5 ms. The release starts with paper-p2."""
 SETTLE = 1.0
 """Time after a change until the datagrams sent before the change have arrived [s]."""
 INTERRUPTED = 130
@@ -126,7 +126,7 @@ def test_the_link_is_set_by_hand_and_read_back(readings, note):
             took.append(told["seconds"])
         assert told["links"]["downlink"]["asked"]["delay"] == 0.12
         time.sleep(SETTLE)
-        mean, _ = mean_delays(5.0)["downlink"]
+        mean, _ = mean_delays(3.0)["downlink"]
         note(f"set by hand downlink: {mean * 1e3:.2f} ms, wanted 120 ms")
         assert abs(mean - 0.12) < TOLERANCE
     finally:

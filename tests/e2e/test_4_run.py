@@ -1,7 +1,6 @@
 """The images; `cloudrc run --mode cluster` is like a run in virtual time; another robot drives."""
 
 import json
-import time
 
 import pytest
 
@@ -18,6 +17,8 @@ DELAY_TOLERANCE = 0.002
 """Largest deviation of a mean delay from that in virtual time [s]."""
 SIZES = {"world": 420, "cloud": 320}
 """Role -> largest size of its image, uncompressed [MB]."""
+ROVER = "rover"
+"""Release of another robot."""
 LOOK = """\
 import json, os, shutil
 from importlib.util import find_spec
@@ -27,6 +28,21 @@ found += filter(os.path.exists, ["/root/.cache"])
 print(json.dumps(found))
 """
 """Python code that lists the compilers, large packages, pip and cache that an image has."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def rover(installed):
+    """A release of its own whose Job drives the rover beside the first tests of this module.
+
+    Later than `installed`, which deletes the Jobs of an earlier session.
+    """
+    world = "experiment.world.robot=rover,experiment.world.scene=pillars"
+    given = f"--set=link.mode=relay,mission.enabled=true,experiment.mission=pillars,{world}"
+    try:
+        helm("install", ROVER, str(CHART), given)
+        yield
+    finally:
+        helm("uninstall", ROVER)
 
 
 @pytest.mark.parametrize(("role", "holds"), [("world", ["mujoco"]), ("cloud", [])])
@@ -85,17 +101,9 @@ def test_a_run_in_a_cluster_is_that_of_virtual_time(
     assert load_experiment(report / "config.yaml").name == name
 
 
-def test_a_job_drives_another_robot_through_its_mission(cluster, note):
-    name, began = "rover", time.monotonic()
-    world = "experiment.world.robot=rover,experiment.world.scene=pillars"
-    given = f"--set=link.mode=relay,mission.enabled=true,experiment.mission=pillars,{world}"
-    try:
-        helm("install", name, str(CHART), given)
-        (job,) = read("jobs", f"--selector=app.kubernetes.io/instance={name}")["items"]
-        lines: list[str] = []
-        end = follow(connect(None, NAMESPACE, name), job["metadata"]["name"], lines.append)
-    finally:
-        helm("uninstall", name)
+def test_a_job_drives_another_robot_through_its_mission(rover):
+    (job,) = read("jobs", f"--selector=app.kubernetes.io/instance={ROVER}")["items"]
+    lines: list[str] = []
+    end = follow(connect(None, NAMESPACE, ROVER), job["metadata"]["name"], lines.append)
     assert end.exit_code == 0, (end, lines)
     assert "waypoint 4 of 4 reached" in "\n".join(lines)
-    note(f"rover through pillars by a Job, with install: {time.monotonic() - began:.0f} s")

@@ -40,9 +40,9 @@ def constrained(installed, values, tmp_path):
         assert (tmp_path / name / "report.json").is_file(), done.stdout + done.stderr
         return done.returncode, json.loads((tmp_path / name / "report.json").read_text())
 
+    wait_ready(place(), timeout=120.0)
     yield fly
     helm("upgrade", NAME, str(CHART), f"--values={values}")
-    wait_ready(place(), timeout=120.0)
 
 
 def throttled(component):

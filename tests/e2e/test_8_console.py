@@ -14,16 +14,13 @@ from tests.e2e.conftest import CHART, NAME, NAMESPACE, ROOT, eventually, helm, k
 @pytest.fixture(scope="module")
 def console(installed):
     """`cloudrc console --cluster`, on the release with a console."""
-    upgrade = ("upgrade", NAME, str(CHART), "--reuse-values", "--set")
-    helm(*upgrade, "console.enabled=true")
+    helm("upgrade", NAME, str(CHART), "--reuse-values", "--set", "console.enabled=true")
     wait_ready(place(), timeout=120.0)
     words = ["console", "--cluster", "--no-open", "-n", NAMESPACE, "--release", NAME]
     command = [sys.executable, "-m", "cloudrc", *words]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         yield process
         process.terminate()
-    helm(*upgrade, "console.enabled=false")
-    wait_ready(place(), timeout=120.0)
 
 
 def delay_in_force():
