@@ -251,7 +251,7 @@ def write(content: Content, target: Path, attachments: Mapping[str, bytes]) -> N
     clock, machine = metadata.get(CLOCK, ""), metadata.get("clock_id", "")
     with atomic_file(target) as file, McapWriter(file, clock=clock, clock_id=machine) as writer:
         missing = {MISSING: content.note} | to_metadata(content.holes) if content.note else {}
-        writer.note({**metadata, **missing})
+        writer.note({**metadata, **missing, COUNTS: ""})  # the source's counts are not the copy's
         if messages and (began := wall_time(metadata, messages[0][1])):
             writer.note({STARTED: began.isoformat(timespec="milliseconds")})
         for name, data in {**content.attachments, **attachments}.items():

@@ -11,7 +11,7 @@ from cloudrc.record.holes import END_NS, HOLES, SOMEWHERE, Hole, describe, of_me
 from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.record.recovery import recover
 from cloudrc.record.topics import VIEWS
-from cloudrc.record.writer import CHUNK_NS, McapWriter
+from cloudrc.record.writer import CHUNK_NS, COUNTS, McapWriter
 from cloudrc.runs.identify import identify
 from cloudrc.runs.links.trace import LogSettings, read_packets
 from cloudrc.runs.replay import write_replay
@@ -106,6 +106,16 @@ def test_damaged_views_are_made_again_and_counted_if_all_other_messages_are_ther
 def test_nobody_knows_when_messages_were_that_another_program_removed(path, tmp_path):
     other = rewrite(path, tmp_path / "y.mcap", keep=lambda c, m: c.topic != "/contact")
     assert Recording.read(other).holes == copy(other).holes == (SOMEWHERE,)
+
+
+def test_a_copy_that_was_torn_again_is_counted_by_its_own_writer(path):
+    """The counts of the file that it was copied from prove nothing."""
+    whole = Recording.read(path)
+    whole.metadata[COUNTS] = '{"/odometry": 1}'
+    whole.write(path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    found = Recording.read(path)
+    assert found.holes == (Hole(found.messages[-1][1], END_NS),)
 
 
 @pytest.mark.parametrize("are_zeros", [False, True])
