@@ -206,6 +206,7 @@ class File:
         # Channel -> converter of its messages; None if cloudrc does not record its topic so.
         self.ours: dict[int, Callable[[bytes], bytes] | None] = {}
         self._schemas: dict[int, mcap.Schema] = {}
+        self.nameless = array("Q")  # log times of messages whose channel's definition is lost [ns]
         self._sequences = array("L")
         self._room = UNPACKED_MAX * max(self.size, 1 << 20)
 
@@ -421,6 +422,8 @@ class File:
                 self.ours[record.channel_id] = self._converter(self.channels.get(record.channel_id))
             convert = self.ours[record.channel_id]
             if convert is None:
+                if record.channel_id not in self.channels:
+                    self.nameless.append(record.log_time)
                 return
             topic = self.channels[record.channel_id].topic
             if topic in VIEWS:
@@ -575,6 +578,8 @@ def _holes(file: File) -> tuple[Hole, ...]:
     found = set(known or ())
     if not _has_all_rows(file):
         found |= {between(file.spans, position) for position in file.lost}
+        if file.nameless:
+            found.add(Hole(max(min(file.nameless) - 1, 0), min(max(file.nameless) + 1, END_NS)))
         # Only a complete file has its counts; the holes in an incomplete one lack its lost end.
         if content.told and (known is None or not file.has_counts):
             found.add(Hole(content.messages[-1][1] if content.messages else 0, END_NS))

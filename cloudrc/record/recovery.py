@@ -135,7 +135,7 @@ def _dropped(
     dropped |= dict.fromkeys(uncounted := _uncounted(file))
     # Views that were made from all messages are complete, and messages without a topic were views.
     is_made = bool(derived) and not dropped.keys() & TOPICS.keys()
-    made = {UNKNOWN, *uncounted} if is_made else set()
+    made = {UNKNOWN, *(uncounted & VIEWS.keys())} if is_made else set()
     return {topic: n for topic, n in sorted(dropped.items()) if topic not in made}
 
 

@@ -12,6 +12,7 @@ from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.record.recovery import recover
 from cloudrc.record.topics import VIEWS
 from cloudrc.record.writer import CHUNK_NS, COUNTS, McapWriter
+from cloudrc.records import Counted
 from cloudrc.runs.identify import identify
 from cloudrc.runs.links.trace import LogSettings, read_packets
 from cloudrc.runs.replay import write_replay
@@ -106,6 +107,15 @@ def test_damaged_views_are_made_again_and_counted_if_all_other_messages_are_ther
 def test_nobody_knows_when_messages_were_that_another_program_removed(path, tmp_path):
     other = rewrite(path, tmp_path / "y.mcap", keep=lambda c, m: c.topic != "/contact")
     assert Recording.read(other).holes == copy(other).holes == (SOMEWHERE,)
+
+
+def test_messages_whose_topic_is_lost_leave_a_hole(tmp_path):
+    """The first chunk defines the topics but /count, and no index repeats them."""
+    records = [record for record in RECORDS if not isinstance(record, Counted)]
+    records.insert(len(records) // 2, Counted(SECOND, "world", "sent", 1))
+    path = without(write(tmp_path / "x.mcap", records), [0], index=False)
+    holes = copy(path).holes
+    assert any(hole.begin_ns <= CHUNK_NS and hole.end_ns > RECORDS[-1].stamp_ns for hole in holes)
 
 
 def test_a_copy_that_was_torn_again_is_counted_by_its_own_writer(path):
