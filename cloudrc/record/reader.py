@@ -111,6 +111,7 @@ class _Found:
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)  # as the index says
     statistics: mcap.Statistics | None = None  # as the index says
     index: int = 0  # where the index begins, behind the data [bytes]; 0: not found
+    attachments: set[str] = field(default_factory=set)  # names, as the index says
     chunks: set[bytes] = field(default_factory=set)  # contents of the intact chunks
 
     def take(self, record: mcap.McapRecord, content: bytes, position: int) -> None:
@@ -147,8 +148,8 @@ class _Found:
         if isinstance(record, mcap.ChunkIndex):
             times = record.message_start_time * 1e-9, record.message_end_time * 1e-9
             contents[record.chunk_start_offset] = f"{times[0]:.2f} to {times[1]:.2f} s"
-        elif isinstance(record, mcap.AttachmentIndex | mcap.MetadataIndex):
-            contents[record.offset] = to_one_line(record.name)
+        elif isinstance(record, mcap.AttachmentIndex):
+            self.attachments.add(record.name)
         elif isinstance(record, mcap.Channel):
             self.channels[record.id] = record
         elif isinstance(record, mcap.Schema):
@@ -198,6 +199,7 @@ class File:
         self.fault = ""  # why reading stopped or what is wrong, in words; "" if nothing is wrong
         self.cut = False  # whether the file breaks off at the fault, as after a kill
         self.gaps = list[FilePart]()  # what was left out
+        self.listed = set[str]()  # names of attachments in the index of a damaged file
         # Position, first and last log time [ns] of each part with messages; of a damaged file only.
         self.spans = list[tuple[int, int, int]]()
         self.read = Counter[int]()  # channel -> number of messages, also of other programs
@@ -293,7 +295,7 @@ class File:
         """Read the intact parts of a damaged file."""
         self.channels |= found.channels
         self._schemas |= found.schemas
-        self.statistics, self.gaps = found.statistics, found.holes
+        self.statistics, self.gaps, self.listed = found.statistics, found.holes, found.attachments
         kinds = Counter[type]()
         for part in found.parts:
             self._stream.seek(part.start)
@@ -557,6 +559,8 @@ def _note(file: File) -> None:
         count, until = len(content.messages), content.messages[-1][1] * 1e-9
         fault += f": {count} messages were read, the last at {until:.2f} s"
     damage = [_describe(file.gaps)] if file.gaps else []
+    if lost := file.listed - content.attachments.keys():
+        damage.append(f"attachments lost: {', '.join(map(to_one_line, sorted(lost)))}")
     if nameless := file.stated[UNKNOWN]:
         damage.append(f"damaged: the topic of {nameless} messages is not known")
     if fault and not file.cut:

@@ -471,6 +471,13 @@ def test_an_attachment_that_was_changed_is_left_out(path):
     assert "config.yaml" in recovery.notes[0]
 
 
+def test_attachments_in_a_damaged_part_are_named(path):
+    """The damage begins in front of the attachment, and the index knows its name."""
+    start = next(start for code, start, _ in spans(WHOLE) if code == Opcode.ATTACHMENT)
+    path.write_bytes(WHOLE[: start - 40] + bytes(80) + WHOLE[start + 40 :])
+    assert "attachments lost: config.yaml" in recover(path, path.with_name("new.mcap")).notes[0]
+
+
 def test_a_channel_without_a_definition_is_damaged(path, tmp_path):
     source = write(tmp_path / "w.mcap", world_records(5))
     flat = rewrite(source, path, use_chunking=False).read_bytes()
