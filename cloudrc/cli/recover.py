@@ -8,6 +8,7 @@ import sys
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
+from shlex import quote
 
 from cloudrc.cli.output import output_argument, print_result
 from cloudrc.errors import BadInputError
@@ -16,6 +17,8 @@ from cloudrc.text import escape
 
 LOSSY = 1
 """Exit code if the copy lacks data of the recording."""
+READ_BY_REPORT = ("mission.mcap", "world.mcap", "cloud.mcap")
+"""Files of a run that `cloudrc report` reads."""
 EPILOG = """\
 examples:
   cloudrc recover runs/latest/world.mcap
@@ -48,6 +51,18 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"{target}: already there; name another file with --to")
     with closing(StepView(sys.stderr, f"copies what is readable of {source}")):
         recovery = recover(source, target, attached_views)
-    text = "\n".join(map(escape, [*recovery.as_lines(), str(target)]))
+    lines = [*recovery.as_lines(), str(target), *_next_steps(source, target)]
+    text = "\n".join(map(escape, lines))
     print_result(options.output, {"file": str(target), **asdict(recovery)}, text)
     return 0 if recovery.complete else LOSSY
+
+
+def _next_steps(source: Path, target: Path) -> list[str]:
+    """Return the line that puts the copy in place of a run's damaged file; none for other files."""
+    run = source.parent
+    if source.name not in READ_BY_REPORT or not (run / "config.yaml").is_file():
+        return []
+    old, aside, new = (quote(str(path)) for path in (source, f"{source}.damaged", target))
+    return [
+        f"to report on it: mv {old} {aside} && mv {new} {old} && cloudrc report {quote(str(run))}"
+    ]

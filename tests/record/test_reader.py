@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import re
+import subprocess
 import tracemalloc
 from collections import Counter
 from contextlib import suppress
@@ -476,6 +477,20 @@ def test_attachments_in_a_damaged_part_are_named(path):
     start = next(start for code, start, _ in spans(WHOLE) if code == Opcode.ATTACHMENT)
     path.write_bytes(WHOLE[: start - 40] + bytes(80) + WHOLE[start + 40 :])
     assert "attachments lost: config.yaml" in recover(path, path.with_name("new.mcap")).notes[0]
+
+
+def test_the_last_line_puts_the_copy_in_place_of_a_damaged_file_of_a_run(tmp_path, call):
+    """A shell that runs the line leaves the damaged file beside the copy."""
+    (run := tmp_path / "a run").mkdir()
+    (run / "config.yaml").write_text("")
+    data = WHOLE[: CHUNKS[1][1]]
+    (run / "world.mcap").write_bytes(data)
+    *_, last = call("recover", run / "world.mcap", code=1).out.splitlines()
+    moves, _, report = last.partition(": ")[2].rpartition(" && ")
+    subprocess.run(["sh", "-c", moves], check=True)
+    assert Recording.read(run / "world.mcap").lacking == ""
+    assert (run / "world.mcap.damaged").read_bytes() == data
+    assert report == f"cloudrc report '{run}'"
 
 
 def test_a_channel_without_a_definition_is_damaged(path, tmp_path):
