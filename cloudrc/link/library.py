@@ -125,8 +125,7 @@ class OneWay:
         self, profile: DirectionProfile, seed: int, uplink: bool, *, stream: str = ""
     ) -> None:
         """Open a direction; `seed` and `stream` are those of `cloudrc.link.open`."""
-        is_whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
-        if not is_whole or not 0 <= seed <= SEED_MAX:
+        if not _is_whole(seed) or not 0 <= seed <= SEED_MAX:
             raise BadInputError(f"seed {seed!r}: give a whole number from 0 to 2^53 - 1")
         if not isinstance(stream, str):
             raise BadInputError(f"stream {stream!r}: give a text, the name of this link")
@@ -156,7 +155,7 @@ class OneWay:
             _check_whole(episode=episode)
             self._episode, self._link = episode, self._new()
         try:  # takes less time than to check each packet
-            if size < 0 or now_ns < 0:
+            if not (size >= 0 and now_ns >= 0):  # also NaN
                 _check_whole(size=size, now_ns=now_ns)
             arrivals = self._link.send(episode, KIND, number, size, now_ns)
         except (IndexError, OverflowError, TypeError):
@@ -279,8 +278,12 @@ class OneWay:
 def _check_whole(**values: int) -> None:
     """Raise a BadInputError for a value that is negative or no whole number."""
     for name, value in values.items():
-        if not isinstance(value, int | np.integer) or value < 0:
+        if not _is_whole(value) or value < 0:
             raise BadInputError(f"{name} {value!r}: give a whole number, 0 or more")
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def _to_ns(period: float) -> int:

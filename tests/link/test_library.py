@@ -190,6 +190,7 @@ def test_a_seed_that_is_none_is_refused(seed):
     ("packet", "words"),
     [
         ((-1, 0, 1, 0), "episode -1: give a whole number, 0 or more"),
+        ((0, 0, 1, float("nan")), "now_ns nan: give a whole number, 0 or more"),
         (("x", 0, 1, 1), "episode 'x'"),
         ((0, -1, 10, 0), "number -1"),
         ((0, 1.5, 10, 0), "number 1.5"),
