@@ -98,7 +98,8 @@ def _unpack(value: Any, count: int, name: str) -> tuple[Any, ...]:
     if isinstance(value, tuple) and len(value) == count:
         return value
     parts: tuple[Any, ...] = ()
-    if isinstance(value, Iterable) and not isinstance(value, str | bytes | Set | Mapping):
+    is_row = isinstance(value, Iterable) and getattr(value, "shape", None) != ()
+    if is_row and not isinstance(value, str | bytes | Set | Mapping):
         parts = tuple(islice(value, count + 1))  # it may be endless
     if len(parts) != count:
         raise InvalidResultError(f"its {name} is {shorten(value)}, not {count} values")

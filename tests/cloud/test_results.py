@@ -97,7 +97,7 @@ def test_what_is_no_vector_is_refused(value):
             check()
 
 
-@pytest.mark.parametrize("value", [None, 3, SAMPLE[:4], "odometry", np.zeros(5)])
+@pytest.mark.parametrize("value", [None, 3, SAMPLE[:4], "odometry", np.zeros(5), np.array(1.0)])
 def test_what_is_no_result_is_refused(value):
     for check in (check_estimate, check_output):
         with pytest.raises(InvalidResultError):
