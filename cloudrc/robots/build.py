@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterable
 from contextlib import suppress
-from math import isfinite
 from typing import Any, NamedTuple
 
 from cloudrc import plugins
@@ -30,7 +28,7 @@ from cloudrc.world.plant import Wind
 from cloudrc.world.robot import STEP, Robot
 from cloudrc.world.scene import compile_model, compile_true
 from cloudrc.world.simulator import Simulator, find_site
-from cloudrc.world.watched import WatchedActuators, WatchedOnboard
+from cloudrc.world.watched import WatchedActuators, WatchedOnboard, to_commands
 
 KIND = "onboard"
 """Kind of plug-in."""
@@ -315,12 +313,10 @@ def _check_onboard(name: str, onboard: Onboard, size: int | None) -> None:
             if not callable(getattr(onboard, method, None)):
                 raise ValueError(f"{type(onboard).__name__} has no method {method}()")
         stopped = getattr(onboard, "stopped", None)
-        numbers = []
-        if isinstance(stopped, Iterable):
-            with suppress(plugins.InvalidResultError):
-                numbers = [plugins.to_number(value, "value") for value in stopped]
-        fits = len(numbers) == (size or len(numbers)) and all(map(isfinite, numbers))
-        if not numbers or not fits:
+        count = 0
+        with suppress(plugins.InvalidResultError):
+            count = len(to_commands(stopped))
+        if not count or count != (size or count):
             raise ValueError(f"its stopped is {plugins.shorten(stopped)}, not {wanted}")
         onboard.reset()
 

@@ -6,15 +6,24 @@ is an `OnboardFailedError`, on which the guard stops the robot.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import isfinite
+from collections.abc import Callable, Iterable, Mapping, Set
+from contextlib import suppress
+from math import hypot
 from pathlib import Path
 from types import CodeType
 from typing import Any
 
 from cloudrc.errors import describe_error
 from cloudrc.messages import NEVER_NS, Vector
-from cloudrc.plugins import check_failure, locate, shorten, stack_of, to_number
+from cloudrc.plugins import (
+    LARGEST,
+    InvalidResultError,
+    check_failure,
+    locate,
+    shorten,
+    stack_of,
+    to_number,
+)
 from cloudrc.world.onboard import Actuators, Commands, Inputs, Onboard
 from cloudrc.world.readings import Readings
 
@@ -142,22 +151,29 @@ def _are_floats(values: Any, size: int) -> bool:
         type(values) is tuple
         and len(values) == size
         and {*map(type, values)} == {float}
-        and isfinite(sum(values))
+        and hypot(*values) <= LARGEST  # False for NaN
     )
 
 
-def _numbers(values: Any, size: int, what: str, call: Callable[..., Any]) -> tuple[float, ...]:
-    """Return the values of a call as floats; refuse another number of values, and NaN."""
-    try:
-        numbers = tuple([to_number(value, "value") for value in values])
-        wrong = len(numbers) != size or not all(map(isfinite, numbers))
-    except Exception:  # the values are the user's, and so may be what iterates them
-        wrong = True
-    if wrong:
-        name = getattr(call, "__name__", "it")
-        text = f"{name}() returned {shorten(values)}, not {size} finite numbers"
-        raise OnboardFailedError(f"{what} failed ({text}, {where(call)})")
+def to_commands(values: Any) -> tuple[float, ...]:
+    """Return a user's values as floats, in order; raise an InvalidResultError for a wrong value."""
+    if not isinstance(values, Iterable) or isinstance(values, str | bytes | Set | Mapping):
+        raise InvalidResultError(f"{shorten(values)} is no row of numbers")
+    numbers = tuple([to_number(value, "value") for value in values])
+    if not hypot(*numbers) <= LARGEST:
+        raise InvalidResultError(f"{shorten(values)} is not finite, or beyond {LARGEST:g}")
     return numbers
+
+
+def _numbers(values: Any, size: int, what: str, call: Callable[..., Any]) -> tuple[float, ...]:
+    """Return the values of a call as floats; refuse another number of values, and wrong ones."""
+    with suppress(Exception):  # the values are the user's, and so may be what iterates them
+        numbers = to_commands(values)
+        if len(numbers) == size:
+            return numbers
+    name = getattr(call, "__name__", "it")
+    text = f"{name}() returned {shorten(values)}, not {size} finite numbers up to {LARGEST:g}"
+    raise OnboardFailedError(f"{what} failed ({text}, {where(call)})")
 
 
 def failure_of(what: str, call: Callable[..., Any], error: BaseException) -> OnboardFailedError:

@@ -108,11 +108,13 @@ def fly(own, tmp_path):
     ("what", "shown"),
     [
         ("return (float('nan'), *commands[1:])", "tuple (nan, "),
-        ("return commands[1:]", "not 4 finite numbers, own.py:15 in update"),
+        ("return commands[1:]", "not 4 finite numbers up to 1e+30, own.py:15 in update"),
         ("return [*commands, float('inf')]", "list ["),
         ("return None", "NoneType None, not 4 finite numbers"),
         ("return 'stop'", "str 'stop'"),
         ("return (True, *commands[1:])", "tuple (True, "),
+        ("return (1e300, *commands[1:])", "not 4 finite numbers up to 1e+30"),
+        ("return {1.0, 2.0, 3.0, 4.0}", "set {1.0, "),
         ("import numpy; return numpy.ones(4) > 0", "array([ True, "),
         ("raise KeyError('gyro')", "KeyError: 'gyro', own.py:19 in update"),
         ("raise SystemExit(0)", "sys.exit() was called"),
@@ -220,6 +222,7 @@ def test_a_reset_that_fails_is_told_once(fly):
     [
         ("law.stopped", "(0.0,) * 3", "stopped is tuple (0.0, 0.0, 0.0), not 4 finite numbers"),
         ("law.stopped", "None", "stopped is NoneType None"),
+        ("law.stopped", "{0.0, 0.1, 0.2, 0.3}", "stopped is set {"),
         ("law.stopped", "[float('nan')] * 4", "not 4 finite numbers, one per actuator"),
         ("law.stopped", "(False,) * 4", "stopped is tuple (False, False, False, False), not 4"),
         ("def brake", "def halt", "Fails has no method brake()"),
