@@ -35,7 +35,14 @@ def exceeds(value: float, limit: float) -> bool:
 
 
 def format_beside(value: float, limit: float) -> str:
-    """Format `value` with two decimals, or with as many as tell it from `limit` [any unit]."""
+    """Format `value` with two decimals, or with as many as show its side of `limit` [any unit]."""
     first, last = DECIMALS
+    side = np.sign(differences(limit, value))
     texts = [f"{value:.{digits}f}" for digits in range(first, last + 1)]
-    return next((text for text in texts if differences(limit, float(text))), texts[0])
+    seen = (text for text in texts if np.sign(differences(limit, float(text))) == side)
+    return next(seen, texts[0])
+
+
+def format_limit(limit: float) -> str:
+    """Format a `limit` [any unit] with all the digits that its user wrote."""
+    return f"{limit:.15g}"

@@ -5,7 +5,7 @@ from math import inf, nan
 import numpy as np
 import pytest
 
-from cloudrc.rounding import differences, exceeds, format_beside
+from cloudrc.rounding import differences, exceeds, format_beside, format_limit
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,17 @@ def test_differences_of_arrays_are_taken_one_by_one():
         (0.1504, 0.15, "0.1504"),
         (60.0004, 60.0, "60.0004"),
         (0.25, 0.25, "0.25"),
+        (0.1240013, 0.1240011, "0.1240013"),  # 0.12 is another number, but on the other side
+        (0.1249, 0.125, "0.12"),
+        (0.1299, 0.125, "0.13"),
+        (0.124001, 0.124001, "0.124001"),
+        (float("inf"), 1.0, "inf"),
     ],
 )
 def test_a_value_beside_its_limit_does_not_look_equal(value, limit, text):
     assert format_beside(value, limit) == text
+
+
+@pytest.mark.parametrize("written", ["0.15", "60", "0.1240012345", "1e-07", "120"])
+def test_a_limit_is_shown_as_it_was_written(written):
+    assert format_limit(float(written)) == written

@@ -42,7 +42,7 @@ from cloudrc.metrics.response import responses
 from cloudrc.record.columns import Recording
 from cloudrc.record.holes import describe
 from cloudrc.records import CONTROLLER_LOST, REAL_TIME_FACTOR_MIN
-from cloudrc.rounding import exceeds, format_beside
+from cloudrc.rounding import exceeds, format_beside, format_limit
 
 SLIP_MAX = 0.25
 """Largest time that world's clock may lose in a valid flight [s]: the guard's default limit on the
@@ -166,13 +166,13 @@ def _rank(failure: FlightFailure) -> tuple[bool, float]:
 def _too_fast(evidence: Evidence) -> Iterator[FlightFailure]:
     """Yield a failure if the robot touched too fast what it had to touch."""
     wanted, touch = evidence.wanted, evidence.touch
-    if wanted is None or touch is None or exceeds(wanted.speed_max_mps, touch[0]):
+    if wanted is None or touch is None or not exceeds(touch[0], wanted.speed_max_mps):
         return
     speed, moment = touch
     limit = wanted.speed_max_mps
     text = (
-        f"the robot met {wanted.body} at {format_beside(speed, limit)} m/s, not below "
-        f"mission.touch.speed_max_mps {limit:g}"
+        f"the robot met {wanted.body} at {format_beside(speed, limit)} m/s, above "
+        f"mission.touch.speed_max_mps {format_limit(limit)}"
     )
     yield FlightFailure("contact_too_fast", text, *moment)
 
@@ -191,7 +191,7 @@ def _unmet_goals(evidence: Evidence) -> Iterator[FlightFailure]:
         text = f"the robot never touched {evidence.wanted.body}, which mission.touch requires"
         yield FlightFailure("not_touched", text)
     if end.time is not None and exceeds(end.time, evidence.time_limit):
-        key = f"criteria.time_limit_s {evidence.time_limit:g}"
+        key = f"criteria.time_limit_s {format_limit(evidence.time_limit)}"
         text = f"the mission took {format_beside(end.time, evidence.time_limit)} s, more than {key}"
         yield FlightFailure("time_limit_exceeded", text, *end)
 
@@ -372,7 +372,7 @@ def _responses(flight: Flight, settle: float) -> Iterator[FlightFailure]:
         text = (
             f"{len(far)} of {len(whole)} steps did not settle: in step {first.waypoint + 1} the "
             f"robot was {error} m from the setpoint in the last 0.5 s, above "
-            f"criteria.settle_m {settle:g} m"
+            f"criteria.settle_m {format_limit(settle)} m"
         )
         yield FlightFailure("not_settled", text, first.start)
     if unstable := [step for step in found if step.unstable]:
@@ -391,8 +391,8 @@ def _missed_end(flight: Flight, settle: float) -> Iterator[FlightFailure]:
         return
     text = (
         f"setpoints flown to their end, but the robot was {format_beside(away, settle)} m from the "
-        f"last one, above criteria.settle_m {settle:g} m; give the robot time there: repeat the "
-        "last row with a later time_s"
+        f"last one, above criteria.settle_m {format_limit(settle)} m; give the robot time there: "
+        "repeat the last row with a later time_s"
     )
     yield FlightFailure("not_settled", text, *_moment(flight, ending[0]))
 

@@ -67,7 +67,9 @@ def met(speed):
         (good, {"time_limit": 9.9}, "failure", ["time_limit_exceeded"]),
         (flown, {}, "failure", ["not_touched"]),
         (lambda: met(0.249), {}, "success", []),
-        (lambda: met(0.25), {}, "failure", ["contact_too_fast"]),
+        (lambda: met(0.25), {}, "success", []),  # at its limit, as for every other one
+        (lambda: met(0.25 + 1e-15), {}, "success", []),
+        (lambda: met(0.2500001), {}, "failure", ["contact_too_fast"]),
         (lambda: world(GuardChange(at(5), GuardState.HOLD, "")), {}, "success", []),
         *((lambda e=e: ended(e), {}, "failure", [e]) for e in ("timed_out", "guard_stopped")),
         # Of a cancelled mission only what must never happen is a failure.
