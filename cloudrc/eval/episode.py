@@ -33,6 +33,7 @@ from cloudrc.plugins import InvalidResultError, refuse_failure, shorten, to_numb
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
 from cloudrc.policy.observation import observe
+from cloudrc.rounding import exceeds
 from cloudrc.source import code_hash
 
 SUCCESS = ("success", "is_success")
@@ -247,7 +248,7 @@ def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask:
             told = about["episode"]
             break
     if setup.success_at is not None:
-        success = total >= setup.success_at
+        success = not exceeds(setup.success_at, total)
     told = told or world.summary()
     return Played(total, steps, success, stale, jumps, told, witness.digest.hexdigest())
 

@@ -13,6 +13,7 @@ from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.eval.episode import play
 from cloudrc.eval.setup import Episode, EvalSetup
 from cloudrc.files import write_atomically
+from cloudrc.rounding import format_limit
 from cloudrc.runs.store import append_rows, read_rows
 from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.source import code_hash
@@ -150,7 +151,7 @@ def _outcome(rtt_ms: float | None, executor: str, rows: Sequence[Row]) -> EvalOu
 def describe_success(setup: EvalSetup, outcomes: Sequence[EvalOutcome]) -> str:
     """Say in words what counts as a success."""
     if setup.success_at is not None:
-        return f"a return of at least {setup.success_at:g}"
+        return f"a return of at least {format_limit(setup.success_at)}"
     if outcomes and any(each.successes is None for each in outcomes):
         return "unknown: the environment's info has no success; the return is measured"
     return "the environment's info says success in some step"

@@ -18,7 +18,7 @@ import numpy as np
 
 from cloudrc.metrics.control import tracking_errors
 from cloudrc.metrics.flight import Array, Flight, add_metrics, mean, percentile
-from cloudrc.rounding import differences
+from cloudrc.rounding import differences, exceeds
 
 SHORTEST_NS = 500_000_000
 """Shortest duration of a step, and its last part, in which the robot must have settled [ns]."""
@@ -165,7 +165,7 @@ def _grows(error: Array) -> bool:
     waves = np.split(np.abs(error), crossings)[1:]
     peaks = [float(wave.max()) for wave in waves if len(wave)]
     return any(
-        later >= earlier and later > GROWTH_MIN
+        not exceeds(earlier, later) and exceeds(later, GROWTH_MIN)
         for earlier, later in zip(peaks, peaks[2:], strict=False)
     )
 

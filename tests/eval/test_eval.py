@@ -189,6 +189,23 @@ def test_a_success_is_what_the_info_says_in_any_step(law, key, verdict):
     assert play(Episode(None, "newest", 1), setup, {})["verdict"] == verdict
 
 
+class Tenths(Task):
+    """Gives ten rewards of 0.1, whose sum is 0.9999999999999999."""
+
+    def step(self, action):
+        observation, _, _, *others = super().step(action)
+        return observation, 0.1, self.count == 10, *others
+
+
+gymnasium.register("Tenths-v0", Tenths)
+
+
+@pytest.mark.parametrize(("least", "verdict"), [(1.0, "success"), (1.0000001, "failure")])
+def test_a_return_that_equals_the_limit_up_to_rounding_is_a_success(law, least, verdict):
+    setup = EvalSetup("Tenths-v0", law(STILL), success_at=least)
+    assert play(Episode(None, "newest", 1), setup, {})["verdict"] == verdict
+
+
 class Seeing(Task):
     """Has an image of 1 MB, 0.8 s on the 10 Mbit/s of the profile lte."""
 

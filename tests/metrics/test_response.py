@@ -54,7 +54,12 @@ def test_a_step_of_a_second_order_system(damping):
     assert not step.unstable
 
 
-@pytest.mark.parametrize("path", [growing, second_order(0.0)])
+def fading(t):
+    """Oscillate with half-waves that are equal up to rounding."""
+    return 1.0 - (1.0 - 1e-13 * t) * cos(pi * t), 0.0, 1.0
+
+
+@pytest.mark.parametrize("path", [growing, second_order(0.0), fading])
 def test_an_oscillation_without_decay_is_unstable(path):
     assert "unstable" in judged(flight(path))
 
