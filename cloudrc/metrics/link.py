@@ -107,7 +107,7 @@ def _add_direction(way: str, words: str) -> None:
         (f"loss_{way}", "1", f"Share of the datagrams {words} that never arrived.",
          partial(loss, way=way)),
         *((f"release_error_{name}_{way}", "s", f"Delay with which the relay released datagrams "
-           f"{words} after they were due: {which}.", partial(seconds, name))
+           f"{words} after they were due: {which}, since the link came up.", partial(seconds, name))
           for name, which in PERCENTILES.items()),
         *((f"{name}_{way}", "1", f"Datagrams {words} {which}", partial(
             Flight.growth, name=f"{way}_{name.removeprefix('relay_')}"))

@@ -367,6 +367,6 @@ add_metrics(
      lambda flight: flight.count(_measure_holds(flight)[0].time(flight.end_ns or 0))),
     ("fault_count", "1", "Number of faults that did not stop the flight: each failed call of a "
      "plug-in in the flight, and each other fault once.", _fault_count),
-    ("recorder_dropped", "1", "Number of records that the recorder dropped because the loop must "
-     "not wait for a disk.", _recorder_dropped),
+    ("recorder_dropped", "1", "Number of records that the recorder dropped, since it started, "
+     "because the loop must not wait for a disk.", _recorder_dropped),
 )  # fmt: skip
