@@ -58,6 +58,7 @@ from cloudrc.geometry.obstacles import fence_of, known
 from cloudrc.geometry.scene import Scene
 from cloudrc.link.doubts import describe_heavy_shares
 from cloudrc.link.traces import read_table, read_trace
+from cloudrc.rounding import format_limit
 
 HORIZON_MAX_S = 1.0
 """Default of cloud.horizon_max_s [s]. Source: docs/reference/control.md, "Predictors"."""
@@ -120,11 +121,12 @@ class ResolvedGuard(GuardConfig):
         cap = speed_cap(age_max, plan_max, bounds)
         speed_max: float = cap if given is None else check(given)
         if speed_max > cap + 1e-6:
+            most = format_limit(cap)
             if cap == bounds.robot.speed_max_mps:
-                raise ValueError(f"must be at most {cap:g} m/s, the largest speed of the robot")
+                raise ValueError(f"must be at most {most} m/s, the largest speed of the robot")
             plan = f" and plans of {plan_max:g} s" if plan_max else ""
             raise ValueError(
-                f"must be at most {cap:g} m/s: above it the robot does not stop in time, within "
+                f"must be at most {most} m/s: above it the robot does not stop in time, within "
                 f"{bounds.room:g} m, with commands {age_max:g} ms old{plan}; lower it or "
                 "guard.command_age_max_ms"
             )
@@ -140,7 +142,7 @@ class ResolvedGuard(GuardConfig):
         acceleration: float = most if given is None else check(given)
         if info.context and acceleration > most + 1e-6:
             raise ValueError(
-                f"must be at most {most:g} m/s^2, the largest acceleration of the robot"
+                f"must be at most {format_limit(most)} m/s^2, the largest acceleration of the robot"
             )
         return acceleration
 

@@ -1,5 +1,7 @@
 """The limits of the guard come from the robot; an experiment may lower them."""
 
+import re
+
 import pytest
 
 from cloudrc.config.load import dump, load_experiment
@@ -60,6 +62,16 @@ def test_a_robot_that_brakes_less_gets_a_lower_speed_cap(own_robot):
     assert load_experiment("steps", settings).guard.speed_max_mps == pytest.approx(4.478, abs=1e-3)
     with pytest.raises(BadInputError, match=r"must be at most 4\.47\d* m/s: above it the robot"):
         load_experiment("steps", [*settings, "guard.speed_max_mps=5"])
+
+
+@pytest.mark.parametrize("age_ms", [300, 500, 700, 1100, 1700])
+def test_the_largest_speed_that_a_refusal_names_is_allowed(age_ms):
+    settings = [*FLIES, f"guard.command_age_max_ms={age_ms}"]
+    with pytest.raises(BadInputError) as refusal:
+        load_experiment("steps", [*settings, "guard.speed_max_mps=9.9"])
+    named = re.search(r"at most (\S+) m/s", str(refusal.value))[1]
+    guard = load_experiment("steps", [*settings, f"guard.speed_max_mps={named}"]).guard
+    assert guard.speed_max_mps == float(named)
 
 
 def test_a_speed_above_that_of_the_robot_is_refused_in_one_line():
