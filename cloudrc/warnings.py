@@ -13,6 +13,7 @@ from math import ceil, dist, floor
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.rounding import exceeds, format_limit
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
@@ -44,8 +45,8 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     yield from _robot(experiment)
     yield from _balance(experiment)
     carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
-    if carrot is not None and carrot.speed_mps > cap:
-        fits = f"--set mission.carrot.speed_mps={floor(cap * 100) / 100:g}"
+    if carrot is not None and exceeds(carrot.speed_mps, cap):
+        fits = f"--set mission.carrot.speed_mps={_round_down(cap)}"
         yield (
             f"the carrot moves at {cap:.3g} instead of {carrot.speed_mps:g} m/s, because the guard "
             f"caps the speed; a value that fits: {fits}"
@@ -150,10 +151,10 @@ def _time(experiment: ResolvedExperiment) -> Iterator[str]:
             what = "the steps of mission.steps last"
     limit = experiment.criteria.time_limit_s
     longer = min(ceil(1.2 * lasts), DURATION_MAX)
-    if limit is not None and lasts > limit:
+    if limit is not None and exceeds(lasts, limit):
         yield (
-            f"{what} {lasts:,.6g} s, longer than criteria.time_limit_s {limit:g}; give times in"
-            f" seconds, or a longer limit: --set criteria.time_limit_s={longer}"
+            f"{what} {lasts:,.6g} s, longer than criteria.time_limit_s {format_limit(limit)}; give"
+            f" times in seconds, or a longer limit: --set criteria.time_limit_s={longer}"
         )
     elif lasts > LONG:
         yield f"{what} {lasts:,.6g} s: this is {lasts / 3600:.3g} hours; give times in seconds"
@@ -170,7 +171,7 @@ def _fast_track(experiment: ResolvedExperiment) -> Iterator[str]:
         if end > begin
     ]
     fastest, begin = max(speeds, default=(0.0, 0.0))
-    if fastest > cap:
+    if exceeds(fastest, cap):
         yield (
             f"the setpoints of mission.setpoints move at {fastest:.3g} m/s after {begin:g} s, and "
             f"the guard caps the speed at {cap:.3g} m/s: the robot falls behind, and the mission "
@@ -248,6 +249,11 @@ def _round_up(value: float, step: float) -> float:
     return round((ceil(value / step) + 1) * step, 3)
 
 
+def _round_down(speed: float) -> str:
+    """Format a speed [m/s] with two decimals, not above it."""
+    return f"{floor(speed * 100) / 100:g}"
+
+
 def _control(experiment: ResolvedExperiment, delay: float) -> Iterator[str]:
     """Yield advice about the PID's gains; `delay` is the mean time from odometry to command [s]."""
     controller = experiment.cloud.controller
@@ -259,7 +265,7 @@ def _control(experiment: ResolvedExperiment, delay: float) -> Iterator[str]:
     if any(values["gain_i"]) and winds_up:
         yield (
             f"cloud.controller integrates while the guard caps the speed at {cap:.3g} m/s; "
-            f"a value that fits: --set cloud.controller.speed_max={cap:.3g}"
+            f"a value that fits: --set cloud.controller.speed_max={_round_down(cap)}"
         )
     gain = max(values["gain_p"])
     if experiment.cloud.predictor.name == "commanded_velocity" and gain * delay > 1.0:
