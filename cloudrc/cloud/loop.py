@@ -2,7 +2,7 @@
 
 If a plug-in raises an exception, or returns values that are not finite numbers, the loop uses a
 safe value: the last good horizon, the last sample, or zero velocity. The loop counts every failure,
-reports the first failure of each plug-in, and continues.
+reports the first failure of each plug-in, in each mission again, and continues.
 
 Telemetry echoes the stamp of the newest command that world has applied. It also contains the hold
 time: from the application of the command to the sending of the telemetry. If no new echo arrives
@@ -118,6 +118,8 @@ class ControlLoop:
         self.lost: ControllerLostError | None = None
         self.counts: Counter[str] = Counter()
         self._now_ns = 0  # stamp of faults
+        self._reported = set[str]()  # codes of faults that this mission has reported
+        self._missions = 0
         estimator = build_estimator()
         for kind, plug_in in (("predictor", predictor), ("controller", controller)):
             with refuse_failure(f"cloud.{kind}: its reset() failed"):
@@ -149,7 +151,13 @@ class ControlLoop:
         self.plans = PlanLog()
 
     def start_mission(self) -> None:
-        """Reset the controller at the start of a mission within the session."""
+        """Reset the controller at the start of a mission within the session.
+
+        Failures before the first mission are reported already, in the recording of that mission.
+        """
+        self._missions += 1
+        if self._missions > 1:
+            self._reported.clear()
         self._call("controller", self._controller.reset)
         self._echoed_ns = NEVER_NS
 
@@ -364,7 +372,7 @@ class ControlLoop:
             self._note(kind, error, "cloud goes on using it")
 
     def _note(self, kind: str, error: BaseException, instead: str = "") -> None:
-        """Count a failure of the plug-in `kind`, such as "estimator"; report the first one.
+        """Count a failure of the plug-in `kind`, such as "estimator"; report a mission's first one.
 
         `instead` tells the user what cloud does now; "" stands for the text in `INSTEAD`.
 
@@ -374,7 +382,8 @@ class ControlLoop:
         check_failure(error, f"cloud.{kind}")
         code = f"{kind}_failed"
         self.counts[code] += 1
-        if self.counts[code] == 1:
+        if code not in self._reported:
+            self._reported.add(code)
             where = "" if isinstance(error, InvalidResultError) else f", {locate(error)}"
             what = f"the {kind} failed ({describe_error(error)}{where})"
             text = f"{what}; {instead or INSTEAD[kind]}; fix cloud.{kind} or choose another"

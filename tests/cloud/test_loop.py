@@ -221,6 +221,19 @@ def test_a_reset_that_fails_before_the_flight_is_refused(kind):
         loop(**{kind: plug_in})
 
 
+def test_a_failing_plug_in_is_reported_in_each_mission():
+    """The report of a later mission in a session then tells why its plug-in failed."""
+    a_loop = loop(predictor=raises(ValueError)())
+    found = []
+    for k in range(4):
+        a_loop.observe(telemetry(100 + 10 * k, 1000 + 10 * k), (1090 + 10 * k) * MS)
+        command(a_loop, 1094 + 10 * k)
+        found.append(len(a_loop.take_faults()))
+        if k != 2:
+            a_loop.start_mission()
+    assert found == [1, 0, 1, 0]
+
+
 def test_a_failing_reset_is_reported():
     estimators, sample, steady = [Estimator()], LastSample(), Integrating()
     a_loop = loop(estimators.pop, sample, steady)  # there is no second estimator
