@@ -67,6 +67,18 @@ def between(spans: Iterable[tuple[int, int, int]], position: int) -> Hole:
     return Hole(begin_ns, end_ns) if begin_ns <= end_ns else SOMEWHERE  # a file without order
 
 
+def union(holes: Iterable[Hole]) -> tuple[Hole, ...]:
+    """Return holes of the same times, in their order and without an overlap."""
+    apart = list[Hole]()
+    for hole in sorted(set(holes)):
+        if apart and hole.begin_ns < apart[-1].end_ns:
+            begin_ns, end_ns = apart.pop()
+            apart.append(Hole(begin_ns, max(end_ns, hole.end_ns)))
+        else:
+            apart.append(hole)
+    return tuple(apart)
+
+
 def to_metadata(holes: Iterable[Hole]) -> dict[str, str]:
     """Return the holes as an entry of a file's metadata."""
     return {HOLES: json.dumps(sorted(set(holes)))}

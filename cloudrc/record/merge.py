@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording, Table
-from cloudrc.record.holes import END_NS, SOMEWHERE, Hole
+from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, union
 from cloudrc.record.ros import shifted
 from cloudrc.record.topics import TOPICS
 from cloudrc.records import UNDER_WAY
@@ -149,7 +149,8 @@ def merge(world: Path, cloud: Path) -> Recording:
     )
     mission.torn, mission.lacking = "; ".join(torn), "; ".join(lacking)
     mission.told = "; ".join([*told, *map(str, failures)])
-    mission.holes += (SOMEWHERE,) * bool(failures)
+    if failures:
+        mission.holes = (SOMEWHERE,)
     return mission
 
 
@@ -177,7 +178,7 @@ def _join(world: Recording, cloud: Recording) -> Recording:
         metadata={**cloud.metadata, **world.metadata, **offset.metadata()},
         attachments={**cloud.attachments, **world.attachments},
         source=f"{world.source} or {cloud.source}",
-        holes=world.holes + tuple(_moved(hole, moved) for hole in cloud.holes),
+        holes=union([*world.holes, *(_moved(hole, moved) for hole in cloud.holes)]),
     )
 
 

@@ -33,7 +33,7 @@ from mcap.writer import MCAP0_MAGIC
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file
 from cloudrc.record.content import FOLLOWED, Content
-from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, between, of_metadata
+from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, between, of_metadata, union
 from cloudrc.record.ros import converter
 from cloudrc.record.topics import TOPICS, VIEWS
 from cloudrc.record.writer import CHANGED, CLOCK, COUNTS, MISSING
@@ -589,7 +589,7 @@ def _holes(file: File) -> tuple[Hole, ...]:
             found.add(Hole(content.messages[-1][1] if content.messages else 0, END_NS))
         if content.note and not found:
             found.add(SOMEWHERE)
-    return tuple(sorted(found))
+    return union(found)
 
 
 def _has_all_rows(file: File) -> bool:

@@ -7,7 +7,7 @@ from mcap.reader import make_reader
 
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
-from cloudrc.record.holes import END_NS, HOLES, SOMEWHERE, Hole, describe, of_metadata
+from cloudrc.record.holes import END_NS, HOLES, SOMEWHERE, Hole, describe, of_metadata, union
 from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.record.recovery import recover
 from cloudrc.record.topics import VIEWS
@@ -176,6 +176,27 @@ def test_every_reader_refuses_a_torn_file_and_names_the_remedy(path, read):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(BadInputError, match=r"cut short: .*cloudrc recover .*x\.mcap$"):
         read(path)
+
+
+def test_holes_that_overlap_are_one_hole():
+    """A commanded phase must not begin behind one hole and inside of another."""
+    assert union([Hole(5, 9), Hole(0, 3), Hole(1, 4), Hole(0, 2), Hole(4, 4)]) == (
+        Hole(0, 4),
+        Hole(4, 4),
+        Hole(5, 9),
+    )
+    assert union([Hole(5, 9), SOMEWHERE]) == (SOMEWHERE,)
+
+
+def test_holes_of_both_ends_that_overlap_are_one_hole(tmp_path):
+    for end, records, chunks in (
+        ("world", world_records(200), [1, 2]),
+        ("cloud", cloud_records(200), [2]),
+    ):
+        without(write(tmp_path / f"{end}.mcap", records, end, "a"), chunks)
+    (hole,) = merge(tmp_path / "world.mcap", tmp_path / "cloud.mcap").holes
+    assert hole.begin_ns < 2 * CHUNK_NS
+    assert hole.end_ns >= 3 * CHUNK_NS
 
 
 def test_holes_are_described_in_words():
