@@ -208,7 +208,7 @@ class File:
         # Channel -> converter of its messages; None if cloudrc does not record its topic so.
         self.ours: dict[int, Callable[[bytes], bytes] | None] = {}
         self._schemas: dict[int, mcap.Schema] = {}
-        self.nameless = array("Q")  # log times of messages whose channel's definition is lost [ns]
+        self.nameless = set[int]()  # positions of parts with messages whose topic is lost
         self._sequences = array("L")
         self._room = UNPACKED_MAX * max(self.size, 1 << 20)
 
@@ -298,6 +298,7 @@ class File:
         self.statistics, self.gaps, self.listed = found.statistics, found.holes, found.attachments
         kinds = Counter[type]()
         for part in found.parts:
+            self.position = part.start
             self._stream.seek(part.start)
             record = _parse(self._stream.read(part.size))
             kinds[type(record)] += 1
@@ -425,7 +426,7 @@ class File:
             convert = self.ours[record.channel_id]
             if convert is None:
                 if record.channel_id not in self.channels:
-                    self.nameless.append(record.log_time)
+                    self.nameless.add(self.position)
                 return
             topic = self.channels[record.channel_id].topic
             if topic in VIEWS:
@@ -467,9 +468,9 @@ class File:
 
     @property
     def lost(self) -> list[int]:
-        """Positions in the file at which bytes of its data are lost."""
+        """Positions in the file at which messages may be lost."""
         tail = [] if self.data_ended else [self.position]
-        return [*(part.start for part in self.gaps), *tail]
+        return [*(part.start for part in self.gaps), *self.nameless, *tail]
 
     @property
     def left_out(self) -> int:
@@ -582,8 +583,6 @@ def _holes(file: File) -> tuple[Hole, ...]:
     found = set(known or ())
     if not _has_all_rows(file):
         found |= {between(file.spans, position) for position in file.lost}
-        if file.nameless:
-            found.add(Hole(max(min(file.nameless) - 1, 0), min(max(file.nameless) + 1, END_NS)))
         # Only a complete file has its counts; the holes in an incomplete one lack its lost end.
         if content.told and (known is None or not file.has_counts):
             found.add(Hole(content.messages[-1][1] if content.messages else 0, END_NS))

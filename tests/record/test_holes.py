@@ -118,6 +118,14 @@ def test_messages_whose_topic_is_lost_leave_a_hole(tmp_path):
     assert any(hole.begin_ns <= CHUNK_NS and hole.end_ns > RECORDS[-1].stamp_ns for hole in holes)
 
 
+def test_views_whose_topic_is_lost_leave_a_hole_behind_all_other_messages_only(path):
+    """The views are behind all messages, and their topic is defined in their first chunk."""
+    with McapWriter(path, clock="world") as writer:
+        writer.write(RECORDS)
+        writer.write_views([("/tf", n * 10 * MS, bytes(100)) for n in range(100)])
+    assert copy(without(path, [4], index=False)).holes == (Hole(RECORDS[-1].stamp_ns, END_NS),)
+
+
 def test_a_copy_that_was_torn_again_is_counted_by_its_own_writer(path):
     """The counts of the file that it was copied from prove nothing."""
     whole = Recording.read(path)
