@@ -159,8 +159,9 @@ def test_time_never_runs_backwards(steps, data):
     converted = world_time_ns(telemetry, machine_ns)
     assert (np.diff(converted) >= 0).all()
     assert (converted <= machine_ns).all()
-    # A nanosecond of world's clock is up to 26 ns of the machine's clock in these steps.
-    assert (np.abs(machine_time_ns(telemetry, converted) - machine_ns) <= 26).all()
+    # A slip grows by up to 1 s in 10 ms, so 1 ns of world's clock is up to 101 ns of the machine's
+    # clock. Each conversion rounds by half a nanosecond.
+    assert (np.abs(machine_time_ns(telemetry, converted) - machine_ns) <= 51).all()
     if not any(steps):
         assert converted.tolist() == machine_ns.tolist()
 
