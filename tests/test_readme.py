@@ -73,6 +73,10 @@ def folder(tmp_path_factory):
     return path
 
 
+PROGRESS = re.compile(r"((writes|flies) .*\n)*")
+"""What a quick command says on a busy machine."""
+
+
 def test_the_first_ten_lines_name_and_show_the_console():
     top = "\n".join(TEXT.splitlines()[:10])
     assert "cloudrc up --console" in top
@@ -83,7 +87,7 @@ def test_the_first_ten_lines_name_and_show_the_console():
 def test_a_command_works(command, folder):
     done = execute(command, folder)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stderr in ("", "writes the report\n")  # on a busy machine
+    assert PROGRESS.fullmatch(done.stderr)
     if command in FLIGHTS:
         assert (folder / done.stdout.splitlines()[-1]).name == "report.html"
         assert (folder / done.stdout.splitlines()[-1]).is_file()
@@ -116,7 +120,7 @@ def test_a_command_is_refused_as_the_page_shows(command, printed, folder):
 @pytest.mark.parametrize("command", FLIGHTS[1:])
 def test_another_flight_works(command, call):
     captured = call("", *shlex.split(command)[1:])
-    assert captured.err in ("", "writes the report\n")
+    assert PROGRESS.fullmatch(captured.err)
     assert "faults noted" not in captured.out
     folder = Path(captured.out.splitlines()[-1]).parent
     assert {"report.json", "mission.mcap"} <= {path.name for path in folder.iterdir()}
