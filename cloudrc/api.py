@@ -241,6 +241,7 @@ def sweep(
         cloudrc.errors.BadInputError: If the grid or a point of it is invalid, or if the folder
             belongs to another sweep.
     """
+    require("a sweep", ("world", "record"))
     from cloudrc.runs.grid import read_grid
 
     jobs = _count(jobs, "jobs")
@@ -357,6 +358,7 @@ def identify(run: str | Path) -> dict[str, Any]:
     The result is the content of a file that the predictor `command_history` reads: a value per axis
     of `time_constant` [s], `dead_time` [s] and `gain`, and their 95 % intervals.
     """
+    require("identify", ("record",))
     from cloudrc.runs.identify import describe
     from cloudrc.runs.identify import identify as fit
 

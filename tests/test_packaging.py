@@ -172,3 +172,44 @@ def test_the_wheel_alone_lists_then_flies_and_hands_out_the_exercise(tmp_path):
     assert (tmp_path / "run" / "report.html").exists()
     assert fresh.cloudrc("class", "new", "exercise").returncode == 0
     assert "score 0 of 100" in fresh.cloudrc("class", "check", "exercise").stdout
+
+
+BASE = """
+import importlib.util, sys
+from cloudrc.runs.requirements import EXTRAS
+
+gone = {module for modules in EXTRAS.values() for module in modules}
+found = importlib.util.find_spec
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in gone:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Absent())
+importlib.util.find_spec = lambda name: None if name in gone else found(name)
+
+import cloudrc
+from cloudrc.cli.main import main
+from cloudrc.errors import MissingPrerequisiteError
+
+assert main(["list", "metrics"]) == 0
+for words in (["sweep", "status", "runs"], ["sweep", "run", "s.yaml"], ["down"]):
+    assert main(words) == 3, words
+for call in (cloudrc.fly, lambda: cloudrc.sweep({}), lambda: cloudrc.identify("run")):
+    try:
+        call()
+    except MissingPrerequisiteError as error:
+        print(error, file=sys.stderr)
+"""
+
+
+def test_without_extras_numbers_are_listed_and_what_lacks_an_extra_names_it(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", BASE], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "duration" in done.stdout
+    lines = done.stderr.splitlines()
+    assert len(lines) == 6
+    assert all("run: pip install 'cloudrc[" in line for line in lines), lines

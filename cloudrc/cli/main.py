@@ -19,6 +19,7 @@ from cloudrc.errors import (
 )
 from cloudrc.files import naming
 from cloudrc.runs.leave import limit_exit
+from cloudrc.runs.requirements import name_extra
 from cloudrc.text import escape
 
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
@@ -85,7 +86,8 @@ def _explain(error: Exception) -> tuple[str, int]:
             return str(full), full.exit_code
         remedy = "check the path, and whether you have access to it ('--debug' shows where)"
         return f"{where}{error.strerror or error}; {remedy}", BadInputError.exit_code
-    if failure := machine_error(error):
+    lacking = name_extra(error) if isinstance(error, ModuleNotFoundError) else None
+    if failure := lacking or machine_error(error):
         return str(failure), failure.exit_code
     kind, text = type(error).__name__, " ".join(str(error).split())
     return f"internal error: {kind}: {text}; '--debug' shows where, please report it", INTERNAL

@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording, Table
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, union
-from cloudrc.record.ros import shifted
 from cloudrc.record.topics import TOPICS
 from cloudrc.records import UNDER_WAY
 
@@ -166,6 +165,9 @@ def _join(world: Recording, cloud: Recording) -> Recording:
         there_ns = np.array(times_ns, dtype=np.int64)
         here_ns: list[int] = world_time_ns(world["/telemetry"], there_ns).tolist()
         return here_ns
+
+    # Here, because metrics and names of numbers need no package of an extra.
+    from cloudrc.record.ros import shifted
 
     logged_ns = [message[1] for message in cloud.messages]
     messages = [

@@ -51,3 +51,18 @@ def require(purpose: str, extras: Iterable[str]) -> None:
             f"{purpose} needs {modules} (not installed); "
             f"run: pip install 'cloudrc[{','.join(names)}]'"
         )
+
+
+def name_extra(error: ModuleNotFoundError) -> MissingPrerequisiteError | None:
+    """Return the error that names the extra with a module that was not found; None if none has it.
+
+    For what loads a module of an extra before it knows whether it needs the extra.
+    """
+    module = (error.name or "").partition(".")[0]
+    for extra, modules in EXTRAS.items():
+        if module in modules:
+            named = "sim" if extra in SIM else extra
+            return MissingPrerequisiteError(
+                f"this needs {module} (not installed); run: pip install 'cloudrc[{named}]'"
+            )
+    return None
