@@ -168,6 +168,20 @@ def test_a_step_of_which_messages_are_lost_is_no_step():
     assert [round(each.start) for each in steps(lossy(log, (3.8, 4.3)))] == [0, 6, 8]
 
 
+@pytest.mark.parametrize("begin", [-2.0, -0.005])
+def test_a_first_step_whose_begin_is_lost_is_no_step(begin):
+    """With a part of it alone, its integrals and times would be too small."""
+    log = flown()
+
+    def setpoint(_, control):
+        moved = (control.stamp_ns - at(0)) // (2 * SECOND)
+        return control._replace(setpoint=(10.0 * (moved % 2), 5.0, 1.0))
+
+    log.change(Control, setpoint)
+    assert len(steps(log.flight())) == 5
+    assert len(steps(lossy(log, (begin, 0.4)))) == 4
+
+
 def test_no_position_is_known_in_a_hole():
     log = flown()
     log.change(GroundTruth, lambda n, e: None if at(5) < e.stamp_ns < at(6) else e)
