@@ -209,6 +209,7 @@ def faults_and_drops():
     log.world += [Counted(at(n), "world", "recorder_dropped", n) for n in (1, 2)]
     log.cloud += [Counted(at(n), "cloud", "recorder_dropped", 10 * n) for n in (1, 2)]
     log.cloud.append(Counted(at(2), "cloud", "controller_gaps", 3))
+    log.cloud.append(Counted(at(2), "cloud", "horizon_clamped", 453))  # a limit, and no fault
     return log.flight()
 
 
