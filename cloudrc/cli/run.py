@@ -176,7 +176,7 @@ def _place_of_recording(folder: Path) -> Iterator[None]:
         nothing = isinstance(error, NothingFlownError)  # the regular end of a session by a signal
         if isinstance(error, BadInputError) and is_interrupted() and not nothing:
             error = KeyboardInterrupt()  # a library has converted the exception
-        if folder.exists():
+        if any(folder.glob("*.mcap*")):
             text = f"the recording is in {folder}"
             if isinstance(error, KeyboardInterrupt):
                 text += f"; to write its report: cloudrc report {quote(str(folder))}"

@@ -20,7 +20,7 @@ from pydantic import Discriminator, Tag, create_model
 
 from cloudrc.cli import run
 from cloudrc.config.load import load_experiment
-from cloudrc.errors import BadInputError, InterruptedRunError
+from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 from cloudrc.runs import fly as flights
 from cloudrc.runs import interrupts, sweep
 from cloudrc.runs.grid import pack, read_grid
@@ -195,6 +195,7 @@ def test_a_signal_that_a_library_turned_into_an_error_of_the_report_interrupts(m
     """Matplotlib turns the exception into a ValueError."""
 
     def fly(folder):
+        (folder / "mission.mcap").touch()
         with suppress(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGTERM)
         raise BadInputError("the recorded values cannot be drawn")
@@ -202,6 +203,16 @@ def test_a_signal_that_a_library_turned_into_an_error_of_the_report_interrupts(m
     monkeypatch.setattr(run, "_local_flight", lambda *words: fly)
     error = call("run hover --mode virtual --out r", code=130).err
     assert error == "the recording is in r; to write its report: cloudrc report r\n"
+
+
+def test_a_flight_that_failed_before_its_recording_names_none(monkeypatch, call):
+    def fly(folder):
+        (folder / "with.log").touch()
+        raise CloudrcError("the program of --with has ended")
+
+    monkeypatch.setattr(run, "_local_flight", lambda *words: fly)
+    error = call("run hover --mode virtual --out r", code=CloudrcError.exit_code).err
+    assert error == "cloudrc: error: the program of --with has ended\n"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
