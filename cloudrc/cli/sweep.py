@@ -12,7 +12,7 @@ from cloudrc.cli.parser import COUNT_MAX, add_verbs, figure_arguments, read_coun
 from cloudrc.errors import BadInputError
 from cloudrc.renamed import new_name
 from cloudrc.runs.interrupts import interrupt_on_signals
-from cloudrc.runs.shards import read_shard
+from cloudrc.runs.shards import FLIGHTS_MAX, read_shard
 
 VERBS = {
     "run": "fly all points of a grid, or those that are missing in --out",
@@ -31,10 +31,6 @@ examples:
   cloudrc sweep run grid.yaml --on kubernetes --shards 8 -n lab
 
 docs/sweeps.md describes the file of a sweep and the shards of a cluster."""
-
-
-FLIGHTS_MAX = 100_000
-"""Default limit of flights: a sweep is a product, and one axis too many is hours of work."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -32,6 +32,7 @@ from cloudrc.runs.folder import new_folder
 from cloudrc.runs.grid import Grid, SweepPoint, read_grid, unpack
 from cloudrc.runs.pods import PodSettings, fly_in_pods
 from cloudrc.runs.requirements import MODES, require
+from cloudrc.runs.shards import FLIGHTS_MAX
 from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.text import escape
 
@@ -64,15 +65,25 @@ def _run_locked(
             flown = sweep.fly_missing(work, folder, options.jobs, options.record)
         rows, stopped = sweep.keep(flown, folder, grid, shard, work.before, view.see)
     if stopped:
-        flags = " --on kubernetes, and its other flags" if options.on else ""
-        again = f"cloudrc sweep run {quote(str(options.file))} --out {quote(str(folder))}{flags}"
-        print_line(f"cloudrc: {stopped}; to continue: {again}", sys.stderr)
+        print_line(f"cloudrc: {stopped}; to continue: {_again(options, folder)}", sys.stderr)
     name = store.TABLE if len(rows) == len(grid.flights) else store.SUMMARY
     text = f"\n{sweep.count_verdicts(rows.values())}\n\n{escape(str(folder / name))}"
     print_result(options.output, store.read_summary(folder), text)
     if stopped:
         return stopped.exit_code
     return int(any(rows[each.key]["verdict"] != "success" for each in mine))
+
+
+def _again(options: argparse.Namespace, folder: Path) -> str:
+    """Return the command that flies what is missing, without the shard: no job may fly it now."""
+    words = ["cloudrc", "sweep", "run", quote(str(options.file)), "--out", quote(str(folder))]
+    if options.max_flights != FLIGHTS_MAX:
+        words += ["--max-flights", str(options.max_flights)]
+    if options.record:
+        words += ["--record", options.record]
+    if options.on:
+        words += ["--on kubernetes, and its other flags"]
+    return " ".join(words)
 
 
 def _read(options: argparse.Namespace) -> Grid:

@@ -1,4 +1,4 @@
-"""Choose the part (shard) of a sweep that this job flies."""
+"""Limit the flights of a sweep, and choose the part (shard) that this job flies."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import os
 from typing import NamedTuple
 
 from cloudrc.errors import BadInputError
+
+FLIGHTS_MAX = 100_000
+"""Default limit of flights: a sweep is a product, and one axis too many is hours of work."""
 
 
 class JobArray(NamedTuple):

@@ -70,9 +70,11 @@ def test_a_sweep_goes_on_where_it_ended(write_sweep, monkeypatch, call):
         return fly_row(flight, **words)
 
     monkeypatch.setattr("cloudrc.runs.sweep.fly_row", fly)
-    said = call("sweep run", write_sweep(ONE, seeds=3), code=130)
+    flags = "--max-flights 200000 --record failed"
+    said = call(f"sweep run {flags}", write_sweep(ONE, seeds=3), code=130)
     assert said.out.endswith("runs/sweep-grid-1/sweep.json\n")
     again = said.err.partition("to continue: cloudrc ")[2]
+    assert flags in again
     assert Path("runs/latest-sweep").resolve() == Path("runs/sweep-grid-1").resolve()
     assert "1 points x 3 seeds: 3 flights, 1 done before" in call(again).out
     assert begun == [1, 2, 2, 3]
