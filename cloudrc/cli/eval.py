@@ -55,7 +55,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     about = "file from the environment's observation to the policy's (YAML)"
     add("--map", type=Path, metavar="FILE", help=about)
     about = "smallest return of a success (default: what the info says)"
-    add("--success-at", type=float, metavar="RETURN", help=about)
+    add("--success-at", type=number(-1e30, 1e30, "reward"), metavar="RETURN", help=about)
     about = "time of a step in s, if the environment does not tell it"
     add("--dt", type=number(1e-6, 3600, "seconds"), metavar="S", help=about)
     about = "longest episode in steps (default: 10000)"

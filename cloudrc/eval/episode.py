@@ -37,7 +37,7 @@ from cloudrc.rounding import exceeds
 from cloudrc.source import code_hash
 
 SUCCESS = ("success", "is_success")
-"""Keys of an environment's info that tell whether the task is done; in this order."""
+"""Keys of an environment's info that tell whether the task is done; one true value is enough."""
 Ask = Callable[[dict[str, Any]], Any]
 """Function that returns a policy's answer to its observation."""
 
@@ -182,7 +182,7 @@ class _Policy:
             if self._count not in (None, len(actions)):
                 raise PolicyAnswerError(f"a chunk of {len(actions)} actions after {self._count}")
             self._count = len(actions)
-            return as_actions(actions, self._space)
+            return _in_range(as_actions(actions, self._space), self._space)
         except PolicyAnswerError as error:
             raise PolicyFailedError(f"policy '{self._setup.policy}': {error}") from None
 
@@ -214,6 +214,18 @@ def as_actions(actions: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
         raise PolicyAnswerError(f"the action {value:g} is beyond the type {held.dtype} of {space}")
     shaped: NDArray[Any] = held.reshape(len(held), *(space.shape or ()))
     return shaped
+
+
+def _in_range(actions: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
+    """Return a chunk of actions; raise a PolicyAnswerError for a choice that the space has not.
+
+    A value outside of a `Box` is the environment's to judge: many clip it.
+    """
+    if not isinstance(space, spaces.Box):
+        for action in actions:
+            if not space.contains(action):
+                raise PolicyAnswerError(f"the action {action} is none of {space}")
+    return actions
 
 
 def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask: Ask) -> Played:
@@ -292,11 +304,12 @@ def _times(setup: EvalSetup) -> Callable[[int, float], float | None]:
 def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
     """Return whether the task was done in any step so far; None if the info never told."""
     for key in SUCCESS:
-        if info.get(key) is not None:
-            told = np.asarray(info[key])
-            if told.dtype.kind not in "biuf" or not np.isfinite(told).all():
-                raise InvalidResultError(f"{key} in its info is {shorten(info[key])}, no boolean")
-            return bool(known) or bool(told.all())
+        if info.get(key) is None:
+            continue
+        told = np.asarray(info[key])
+        if told.dtype.kind not in "biuf" or not np.isfinite(told).all():
+            raise InvalidResultError(f"{key} in its info is {shorten(info[key])}, no boolean")
+        known = bool(known) or bool(told.all())
     return known
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import sys
 from hashlib import sha256
 from pathlib import Path
@@ -187,6 +188,29 @@ STILL = "def infer(observation):\n    return {'actions': [[0.0, 0.0]]}\n"
 def test_a_success_is_what_the_info_says_in_any_step(law, key, verdict):
     setup = EvalSetup("Task-v0", law(STILL), (("key", key),))
     assert play(Episode(None, "newest", 1), setup, {})["verdict"] == verdict
+
+
+@pytest.mark.parametrize(
+    ("info", "verdict"),
+    [
+        ({"success": False, "is_success": True}, "success"),
+        ({"success": True, "is_success": False}, "success"),
+        ({"success": False, "is_success": False}, "failure"),
+    ],
+)
+def test_one_of_two_keys_is_enough_for_a_success(law, monkeypatch, info, verdict):
+    world = gymnasium.make("MountainCarContinuous-v0").unwrapped
+    monkeypatch.setattr(type(world), "step", lambda env, _: (env.state, 0.0, True, False, info))
+    policy = law("def infer(o): return {'actions': [[0.0]]}")
+    setup = EvalSetup("MountainCarContinuous-v0", policy, dt=0.1)
+    assert play(Episode(None, "newest", 1), setup, {})["verdict"] == verdict
+
+
+def test_a_choice_that_the_environment_has_not_is_the_policys(law):
+    policy = law("def infer(o): return {'actions': [[1], [2]]}")
+    setup = EvalSetup("CartPole-v1", policy)
+    with pytest.raises(CloudrcError, match=r"policy '.*': the action 2 is none of Discrete\(2\)"):
+        play(Episode(None, "newest", 1), setup, {})
 
 
 class Tenths(Task):
@@ -555,6 +579,7 @@ def test_wrong_actions_of_a_file_are_one_line(law, answer, text):
         (["--executor", "newest,"], "--executor"),
         (["--rtt", "0,x"], "--rtt"),
         (["--rtt", "-1"], "--rtt"),
+        (["--success-at", "nan"], "--success-at"),
         (["--link", "no-such"], "no-such"),
         (["--seeds", "0"], "--seeds"),
         (["--map", "no-such.yaml"], "no-such.yaml"),
@@ -573,3 +598,16 @@ def test_the_policy_of_the_documentation_stands_where_the_table_says(law, tmp_pa
     names = ("newest", "time-indexed", "broker")
     verdicts = [play(Episode(100.0, name, 1), setup, {})["verdict"] for name in names]
     assert verdicts == ["failure", "success", "failure"]
+
+
+@pytest.mark.full
+def test_the_command_of_the_documentation_prints_its_table(law, tmp_path, capsys, monkeypatch):
+    text = (Path(__file__).parents[2] / "docs" / "eval.md").read_text()
+    law(text.partition("```python\n")[2].partition("```")[0])
+    monkeypatch.chdir(tmp_path)
+    command = text.partition("```bash\ncloudrc eval")[2].partition("```")[0]
+    assert main(["eval", *shlex.split(command.replace("\\\n", " "))]) == 0
+    table = text.partition("```text\n")[2].partition("```")[0].strip().splitlines()
+    printed = capsys.readouterr().out.splitlines()
+    start = printed.index(table[0])
+    assert printed[start : start + len(table)] == table
