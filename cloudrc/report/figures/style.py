@@ -131,7 +131,7 @@ def broken(values: Array, behind: Array) -> Array:
 def sampled(count: int, behind: Array) -> tuple[Array, Array]:
     """Choose 20 of the 100 points per second of a path: it looks smooth, and the file is smaller.
 
-    `count` is the number of points, any unit. `behind` are the rows behind holes, shape (m,).
+    `count` is the number of points. `behind` are the rows behind holes [row numbers], shape (m,).
     Return the chosen rows, and for each pair of neighbours whether a line joins them: not across a
     hole.
     """
