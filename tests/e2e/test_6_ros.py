@@ -105,7 +105,9 @@ def test_a_plain_node_in_the_pod_sees_the_robot_and_steers_it_only_if_the_bridge
     try:
         heard = ask_bridge(tmp_path, values)
         note(f"a node in the cloud pod hears /odom {heard['rate']:.1f} times a second")
-        assert heard["rate"] > 40.0, "more than the 30 of the API; 100 where cloud is never late"
+        # More than the 30 of the API. On an ideal link they are 100: with jitter, packets are
+        # overtaken, and the tunnel drops them.
+        assert heard["rate"] > 40.0
         assert set(heard["guards"]) <= {guard.name for guard in GuardState}
         assert heard["guards"]
         assert (heard["accepts"], "ros.steer=true" in heard["said"]) == (False, True)
