@@ -256,7 +256,7 @@ def _without_effect(document: Document, experiment: ResolvedExperiment) -> Itera
         has_losses = read_trace(Path(trace)).losses is not None
         for key in ("delay_ms", "loss") if has_losses else ("delay_ms",):
             path = "link", way, key
-            if document.source(path).is_setting:
+            if document.get(*path) is not None and document.source(path).is_setting:
                 text = f"has no effect, because link.{way}.trace replaces it; set that to null"
                 yield ConfigProblem(path, str(document.get(*path)), text)
 
@@ -452,13 +452,14 @@ def _inline_direction(document: Document, way: str, profile: Document) -> None:
     if not isinstance(own, dict | None):
         return
     own = own or {}
+    kept = {("link", way, key): document.source(("link", way, key)) for key in own}
     document.tree["link"][way] = (profile.get(way) or {}) | own
     inserted = {
         ("link", *key): place
         for key, place in profile.sources.items()
         if key[:1] == (way,) and not (key[1:2] and key[1] in own)
     }
-    document.sources = inserted | document.sources
+    document.sources = inserted | kept | document.sources
 
 
 def _default_all(document: Document, values: dict[KeyPath, float]) -> None:

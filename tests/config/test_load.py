@@ -198,6 +198,7 @@ def test_a_setting_that_a_trace_replaces_is_refused(tmp_path, columns, setting, 
     """Otherwise all flights of a sweep over this key would be equal, without a word."""
     trace = tmp_path / "trace.csv"
     trace.write_text(f"time_s,{columns}\n0{',1' * len(columns.split(','))}\n")
+    load_experiment("hover", ["link.profile=ideal", f"link.uplink={{trace: {trace}}}"])
     settings = [f"link.uplink.trace={trace}", setting]
     if not key:
         load_experiment("hover", settings)
@@ -237,6 +238,8 @@ def test_paths_start_at_the_file_that_names_them(tmp_path, monkeypatch):
     texts = ["link.downlink.trace=trace.csv", "mission=../there.yaml"]
     from_here = load_experiment("hover", texts)
     assert from_here.downlink.trace == str(links / "trace.csv")
+    whole = load_experiment("hover", ["link={uplink: {trace: trace.csv}}"])
+    assert whole.uplink.trace == str(links / "trace.csv")
     assert from_here.mission == experiment.mission
 
 
