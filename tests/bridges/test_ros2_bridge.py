@@ -169,21 +169,32 @@ def test_a_plain_node_sees_the_robot_and_steers_it(tmp_path, watcher):
     assert "/drone1/odom" in " ".join(said)
 
 
-def test_frames_are_published_where_ros_has_their_messages(tmp_path, monkeypatch):
-    """The wheels of ROS have no tf2_msgs: another type carries the bytes here."""
-    from rclpy.qos import DurabilityPolicy, QoSProfile
-    from visualization_msgs.msg import MarkerArray
+@pytest.fixture
+def frames_type(tmp_path, monkeypatch):
+    """The type of /tf; the wheels of ROS have no tf2_msgs, so that another type carries the bytes.
 
-    package = tmp_path / "tf2_msgs"
-    package.mkdir()
-    (package / "__init__.py").touch()
-    (package / "msg.py").write_text("from visualization_msgs.msg import MarkerArray as TFMessage")
-    monkeypatch.syspath_prepend(tmp_path)
+    A raw subscription does not look into the bytes.
+    """
+    if find_spec("tf2_msgs") is None:
+        package = tmp_path / "tf2_msgs"
+        package.mkdir()
+        (package / "__init__.py").touch()
+        text = "from visualization_msgs.msg import MarkerArray as TFMessage"
+        (package / "msg.py").write_text(text)
+        monkeypatch.syspath_prepend(tmp_path)
+    from tf2_msgs.msg import TFMessage
+
+    return TFMessage
+
+
+def test_frames_are_published_where_ros_has_their_messages(tmp_path, frames_type):
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+
     watcher, got, said = Watcher(), {"/tf": [], "/tf_static": []}, []
     kept = QoSProfile(depth=9, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     for topic, messages in got.items():
         qos = kept if topic == "/tf_static" else 10
-        watcher.node.create_subscription(MarkerArray, topic, messages.append, qos, raw=True)
+        watcher.node.create_subscription(frames_type, topic, messages.append, qos, raw=True)
     with bridge(tmp_path, said):
         watcher.wait(lambda: len(got["/tf"]) > 20 and got["/tf_static"])
     watcher.close()
