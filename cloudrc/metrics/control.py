@@ -121,10 +121,11 @@ def compare_with_truth(
     at_ns, predicted = at_ns[known], predicted[known]
     order = np.argsort(at_ns, kind="stable")
     waiting = deque(zip(at_ns[order].tolist(), predicted[order].tolist(), strict=True))
-    # The rows of the true position around these instants.
+    # The rows of the true position around these instants; an instant that has the stamp of a row
+    # is judged with the row before.
     ends_ns = at_ns[order[[0, -1]]] if len(order) else np.zeros(2, np.int64)
     first, last = truth["stamp_ns"].searchsorted(ends_ns, "right").tolist()
-    rows = slice(max(first - 1, 0), last + 1)
+    rows = slice(max(first - 2, 0), last + 1)
     stamps, positions = truth["stamp_ns"][rows].tolist(), truth["position"][rows].tolist()
     for stamp_ns, position in zip(stamps, positions, strict=True):
         while waiting and waiting[0][0] <= stamp_ns:

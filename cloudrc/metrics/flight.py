@@ -79,8 +79,13 @@ class Flight:
             return None
         telemetry = self.recording["/telemetry"]
         before = telemetry["stamp_ns"] <= self.start_ns
-        changes = np.flatnonzero(np.diff(telemetry["mission_id"][before]))
-        return int(telemetry["stamp_ns"][changes[-1] + 1]) if len(changes) else self.start_ns
+        missions = telemetry["mission_id"][before]
+        changes = np.flatnonzero(np.diff(missions))
+        if len(changes):
+            return int(telemetry["stamp_ns"][changes[-1] + 1])
+        # In a session, the first telemetry may already be that of the first mission.
+        is_first = len(missions) and missions[0] and not self.recording.holes
+        return int(telemetry["stamp_ns"][0]) if is_first else self.start_ns
 
     @cached_property
     def end_ns(self) -> int | None:

@@ -9,6 +9,7 @@ from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Flight, measure_all
+from cloudrc.metrics.control import compare_with_truth
 from cloudrc.metrics.mission import unconfirmed
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
@@ -454,3 +455,28 @@ def test_the_noise_of_the_measured_positions_is_added_to_the_tolerance(noise, re
     point = Waypoint(position_m=(10.5, 0.0, 1.0), tolerance_m=0.2, dwell_s=0.0)
     flight = log.flight(mission=MissionConfig(waypoints=(point,)))
     assert SHIPPED["waypoints_reached"].measure(flight) == reached
+
+
+def test_the_first_telemetry_of_a_session_may_be_that_of_its_first_mission():
+    log = flown()
+
+    def number(_, sent):
+        if sent.stamp_ns < at(-0.4):
+            return None
+        return sent._replace(telemetry=sent.telemetry._replace(mission_id=7))
+
+    log.change(TelemetrySent, number)
+    numbers = measure_all(log.flight())[0]
+    assert numbers["start_delay"].value == approx(0.4)
+    assert numbers["duration"].value == approx(10.4)
+
+
+@pytest.mark.parametrize("row", [3, 4])
+def test_a_prediction_for_the_stamp_of_a_true_position_counts(row):
+    flight = flown().flight()
+    truth = flight.recording["/ground_truth"]
+    at_ns = truth["stamp_ns"][[row, row + 2]]
+    predicted = truth["position"][[row, row + 2]] + (0.003, 0.004, 0.0)
+    judge, instants, _ = compare_with_truth(flight, at_ns, predicted)
+    assert instants.tolist() == at_ns.tolist()
+    assert judge.rms == approx(0.005)
