@@ -217,7 +217,7 @@ def as_actions(actions: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
 
 
 def _in_range(actions: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
-    """Return a chunk of actions; raise a PolicyAnswerError for a choice that the space has not.
+    """Return a chunk of actions; raise a PolicyAnswerError for one outside of the space.
 
     A value outside of a `Box` is the environment's to judge: many clip it.
     """

@@ -156,21 +156,8 @@ def test_a_users_metric_is_not_measured_across_a_hole(tmp_path):
     assert any(note.startswith("metric mine is not measured") for note in notes)
 
 
-def test_a_step_of_which_messages_are_lost_is_no_step():
-    log = flown()
-
-    def setpoint(_, control):  # changes every 2 s
-        moved = (control.stamp_ns - at(0)) // (2 * SECOND)
-        return control._replace(setpoint=(10.0 * (moved % 2), 5.0, 1.0))
-
-    log.change(Control, setpoint)
-    assert [round(each.start) for each in steps(log.flight())] == [0, 2, 4, 6, 8]
-    assert [round(each.start) for each in steps(lossy(log, (3.8, 4.3)))] == [0, 6, 8]
-
-
-@pytest.mark.parametrize("begin", [-2.0, -0.005])
-def test_a_first_step_whose_begin_is_lost_is_no_step(begin):
-    """With a part of it alone, its integrals and times would be too small."""
+def stepping():
+    """Return the log of a flight whose setpoint changes every 2 s."""
     log = flown()
 
     def setpoint(_, control):
@@ -178,6 +165,19 @@ def test_a_first_step_whose_begin_is_lost_is_no_step(begin):
         return control._replace(setpoint=(10.0 * (moved % 2), 5.0, 1.0))
 
     log.change(Control, setpoint)
+    return log
+
+
+def test_a_step_of_which_messages_are_lost_is_no_step():
+    log = stepping()
+    assert [round(each.start) for each in steps(log.flight())] == [0, 2, 4, 6, 8]
+    assert [round(each.start) for each in steps(lossy(log, (3.8, 4.3)))] == [0, 6, 8]
+
+
+@pytest.mark.parametrize("begin", [-2.0, -0.005])
+def test_a_first_step_whose_begin_is_lost_is_no_step(begin):
+    """With a part of it alone, its integrals and times would be too small."""
+    log = stepping()
     assert len(steps(log.flight())) == 5
     assert len(steps(lossy(log, (begin, 0.4)))) == 4
 
