@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from cloudrc.errors import BadInputError
+from cloudrc.text import parse_number
 from cloudrc.version import __version__
 
 GROUPS: dict[str, dict[str, str]] = {
@@ -137,7 +138,7 @@ def number(low: float, high: float, unit: str) -> Callable[[str], float]:
 
     def parse(text: str) -> float:
         try:
-            value = float(text.removesuffix(unit[0]))
+            value = parse_number(text.removesuffix(unit[0]))
         except ValueError:
             value = nan
         if not low <= value <= high:  # or it is NaN

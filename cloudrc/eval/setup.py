@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
-from math import isfinite
+from math import nan
 from pathlib import Path
 from statistics import fmean
 from typing import Any, TypeAlias
@@ -17,10 +16,12 @@ from cloudrc.config.document import parse_value, read_document
 from cloudrc.errors import BadInputError
 from cloudrc.link.library import LinkProfile, read_profile
 from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.traces import read_lines
 from cloudrc.plugin_file import sources
 from cloudrc.plugins import is_path
 from cloudrc.policy.address import check_url
 from cloudrc.policy.observation import Mapped
+from cloudrc.text import parse_number
 
 Compute: TypeAlias = float | tuple[float, float] | tuple[str, str]
 """Time for an answer [s]: constant; or mean and deviation; or (FILE, name) or (MEASURED, "")."""
@@ -149,7 +150,7 @@ def read_compute(text: str) -> Compute:
     if text == MEASURED:
         return MEASURED, ""
     try:
-        numbers = [float(each) for each in text.split(",")]
+        numbers = [parse_number(each) for each in text.split(",")]
     except ValueError:
         if os.path.lexists(text):
             return FILE, text
@@ -185,24 +186,22 @@ def slow_answers(setup: EvalSetup, dt: float) -> str:
 
 def read_times(path: str) -> tuple[float, ...]:
     """Read the times of a file [s]: the last column of a CSV file; a head is skipped."""
-    try:
-        rows = [row for row in csv.reader(Path(path).read_text().splitlines()) if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        why = getattr(error, "strerror", None) or "it is no text"
-        raise BadInputError(f"--compute {path}: cannot be read: {why}") from None
-    found = list[float]()
-    for number, row in enumerate(rows, start=1):
+    what, found = f"--compute {path}", list[float]()
+    lines = read_lines(Path(path), what, "give a text file with one time in seconds per line")
+    rows = [(number, line) for number, line in enumerate(lines, start=1) if line.strip()]
+    for number, line in rows:
+        text = line.rpartition(",")[2].strip(' \t"')
         try:
-            time = float(row[-1])
+            time = parse_number(text)
         except ValueError:
-            if number == 1:
-                continue
-            raise BadInputError(f"--compute {path}: line {number} has no number") from None
-        if not (isfinite(time) and 0.0 <= time <= COMPUTE_MAX):
-            raise BadInputError(f"--compute {path}: line {number}: {time} is no time in seconds")
+            if number == rows[0][0] and not text.lstrip("+-.")[:1].isdigit():
+                continue  # the head
+            time = nan
+        if not 0.0 <= time <= COMPUTE_MAX:
+            raise BadInputError(f"{what}, line {number}: {text[:40]!r} is no time in seconds")
         found.append(time)
     if not found:
-        raise BadInputError(f"--compute {path}: has no times")
+        raise BadInputError(f"{what}: has no times")
     return tuple(found)
 
 

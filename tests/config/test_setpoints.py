@@ -30,7 +30,7 @@ def test_good_setpoints_are_read_without_an_object_for_each_row(tmp_path, monkey
 
 
 @pytest.mark.parametrize(
-    "row", ["1,0,0,1", "0.5,0,0,1", "3,900,0,1", "3,0,0", "3,nan,0,1", "3,a,0,1"]
+    "row", ["1,0,0,1", "0.5,0,0,1", "3,900,0,1", "3,0,0", "3,nan,0,1", "3,a,0,1", "3,0_1,0,1"]
 )
 def test_the_wrong_row_of_setpoints_is_named_by_its_line(tmp_path, row):
     path = tmp_path / "drive.csv"

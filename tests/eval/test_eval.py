@@ -23,6 +23,7 @@ from cloudrc.eval.setup import (
     read_compute,
     read_env_args,
     read_mapped,
+    read_times,
     slow_answers,
 )
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
@@ -473,12 +474,27 @@ def test_an_answer_that_takes_very_many_steps_is_a_warning(compute, warned):
     assert ("50 s, as long as 2,500 steps" in slow_answers(setup, 0.02)) is warned
 
 
-@pytest.mark.parametrize("content", ["", "x\n", "1\nx\n", "-1\n", "nan\n", "\xff"])
-def test_a_wrong_file_of_times_is_refused(law, tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        *(("", "no times"), ("x\n", "no times"), ("nan\n", "line 1: 'nan'"), ("\xff", "no times")),
+        *(("x\n\n1\nx\n", "line 4: 'x'"), ("1\n-1\n", "line 2: '-1'"), ("1\n1,\n", "line 2: ''")),
+        *(("0.1\n1_0\n", "line 2: '1_0'"), ("a,1_0\n1\n", "line 1: '1_0'"), ("5ms\n1\n", "line 1")),
+        ("\x00", "not a text file"),
+    ],
+)
+def test_a_wrong_file_of_times_is_refused(law, tmp_path, content, words):
     path = tmp_path / "times.csv"
     path.write_bytes(content.encode("latin-1"))
-    with pytest.raises(BadInputError, match="--compute"):
+    with pytest.raises(BadInputError, match=f"^--compute {path}.*{words}"):
         check_setup(EvalSetup("CartPole-v1", law(), compute=("file", str(path))))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_a_file_of_times_has_any_usual_encoding(tmp_path, encoding):
+    path = tmp_path / "times.csv"
+    path.write_text('n,time\n1,0.5\n\n2, "0.25"\n', encoding=encoding)
+    assert read_times(str(path)) == (0.5, 0.25)
 
 
 @pytest.mark.parametrize("policy", ["no_such.py", "ws://", "http://h:1", "law"])
@@ -579,6 +595,8 @@ def test_wrong_actions_of_a_file_are_one_line(law, answer, text):
         (["--executor", "newest,"], "--executor"),
         (["--rtt", "0,x"], "--rtt"),
         (["--rtt", "-1"], "--rtt"),
+        (["--rtt", "1_0"], "--rtt"),
+        (["--compute", "1_0"], "--compute"),
         (["--success-at", "nan"], "--success-at"),
         (["--link", "no-such"], "no-such"),
         (["--seeds", "0"], "--seeds"),

@@ -64,6 +64,7 @@ def test_a_file_that_includes_itself_or_is_missing_is_left_to_mujoco(tmp_path):
         ),
         ('<numeric name="pipe_1" data="0 0 0 1 0 0 5 .7 .6"/>', "0 < inner < outer"),
         ('<numeric name="floor" data="nan"/>', "floor: data must be 1 numbers"),
+        ('<numeric name="floor" data="1_0"/>', "floor: data must be 1 numbers"),
         ("<numeric", "not readable as XML"),
     ],
 )

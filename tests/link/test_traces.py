@@ -44,6 +44,7 @@ def test_a_trace_is_read_into_si(tmp_path, data, times, delays, losses):
         (f"{HEAD}\n0,-1", "line 2: delay_ms is '-1'; give a number that is finite and"),
         (f"{HEAD}\n0,fast", "line 2: delay_ms is 'fast'; give a number"),
         (f"{HEAD}\n0,", "line 2: delay_ms is nothing; give a number"),
+        (f"{HEAD}\n0,4_5", "line 2: delay_ms is '4_5'; give a number"),
         (f"{HEAD}\n0,1,234.5", "line 2: more values than columns; give 2"),
         (f"{HEAD}\n0,0.045\n1,0.07", "delay_ms is at most 0.07, which looks like sec"),
         (f"{HEAD},loss\n0,45,1.2", "line 2: loss is '1.2'; give a number from 0 to 1"),
@@ -104,7 +105,21 @@ def test_a_good_file_is_read_without_an_object_for_each_row(monkeypatch, text):
 
 
 @pytest.mark.parametrize(
-    "row", ["9,45,1", "9", "8,45", "9,x", '9,"46"', "9,nan", "9,inf", "-1,45", "9,-1", ""]
+    "row",
+    [
+        "9,45,1",
+        "9",
+        "8,45",
+        "9,x",
+        '9,"46"',
+        "9,nan",
+        "9,inf",
+        "-1,45",
+        "9,-1",
+        "",
+        "9,4_5",
+        "9_0,4",
+    ],
 )
 def test_the_fast_reader_takes_no_row_that_the_other_one_refuses(monkeypatch, row):
     lines = [HEAD, *(f"{n},45" for n in range(9)), row, "10,45"]
