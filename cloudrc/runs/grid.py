@@ -21,18 +21,17 @@ from pydantic import Field
 from cloudrc import files, metrics, source
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, Source, parse_yaml, read_document, write_yaml
-from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files
+from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.config.overrides import Settings, collect_settings
 from cloudrc.config.problems import ConfigProblem, ProblemsError, validate
 from cloudrc.config.reuse import reuse, reuse_results
-from cloudrc.config.robot import files_of
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError
 from cloudrc.renamed import new_key
 from cloudrc.runs.experiment import check_world
 from cloudrc.runs.flight import Row
 from cloudrc.runs.installed import installed_code
-from cloudrc.runs.own_files import hashes
+from cloudrc.runs.own_files import hash_all
 
 SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
 """Largest seed, and largest number of seeds."""
@@ -85,6 +84,7 @@ class Grid:
     file: dict[str, Any]  # content of the file, with `folder`
     axes: dict[str, list[Any]]  # axis -> its values or names
     seeds: tuple[int, ...]
+    files: dict[str, str]  # path of each of the user's files on which a flight depends -> its hash
     points: list[ResolvedExperiment]
     flights: dict[str, SweepPoint]  # key -> flight; all seeds of a point follow each other
 
@@ -127,11 +127,14 @@ def read_grid(
         raise BadInputError(f"{grid.name}: {text} {count * seeds}")
     see(0, count, seeds)
     points, flights = list[ResolvedExperiment](), dict[str, SweepPoint]()
+    files = dict[str, str]()
     with reuse_results():
         for choices in product(*grid.axes.values()):
             point = {axis: label for axis, (label, _) in zip(grid.axes, choices, strict=True)}
             points.append(grid.resolve(choices))
-            everything = _everything(points[-1])
+            own_files = hash_all(points[-1])
+            files |= own_files
+            everything = _everything(points[-1], own_files)
             for seed in grid.seeds:
                 key = _key(everything, seed)
                 if key in flights:
@@ -140,7 +143,7 @@ def read_grid(
                 flights[key] = SweepPoint(key, point, seed, points[-1])
             see(len(points), count, seeds)
     labels = {axis: [label for label, _ in choices] for axis, choices in grid.axes.items()}
-    return Grid(grid.file, labels, grid.seeds, points, flights)
+    return Grid(grid.file, labels, grid.seeds, files, points, flights)
 
 
 def read_flight(path: Path, point: Mapping[str, Any], seed: int) -> SweepPoint | None:
@@ -155,7 +158,8 @@ def read_flight(path: Path, point: Mapping[str, Any], seed: int) -> SweepPoint |
             return None
         choices.append(found[0])
     resolved = grid.resolve(choices)
-    return SweepPoint(_key(_everything(resolved), seed), dict(point), seed, resolved)
+    everything = _everything(resolved, hash_all(resolved))
+    return SweepPoint(_key(everything, seed), dict(point), seed, resolved)
 
 
 def _read_unchecked(given: Path | Mapping[str, Any]) -> _UncheckedGrid:
@@ -180,14 +184,10 @@ def _read_unchecked(given: Path | Mapping[str, Any]) -> _UncheckedGrid:
     return _UncheckedGrid(name, content, experiment, common, axes, seeds)
 
 
-def _everything(point: ResolvedExperiment) -> bytes:
-    """Return all that decides a flight, except its seed, as JSON."""
-    values = point.model_dump(mode="json")
-    named = [*local_files(values).values()] if '"/' in json.dumps(values) else []
-    named += map(str, files_of(point.world.robot))
-    contents = {file: each for path in named for file, each in hashes(path)}
+def _everything(point: ResolvedExperiment, files: Mapping[str, str]) -> bytes:
+    """Return all that decides a flight, except its seed, as JSON; `files`: path -> hash."""
     code = {"cloudrc": source.code_hash(), "installed": installed_code(point)}
-    everything = {**values, **code, "files": contents}
+    everything = {**point.model_dump(mode="json"), **code, "files": files}
     return json.dumps(everything, sort_keys=True).encode()
 
 
@@ -300,7 +300,7 @@ def unpack(path: Path) -> list[SweepPoint]:
         with reuse_results():
             for point, values in content["points"]:
                 resolved = ResolvedExperiment.model_validate_json(json.dumps(values))
-                points.append((point, resolved, _everything(resolved)))
+                points.append((point, resolved, _everything(resolved, hash_all(resolved))))
                 installed |= installed_code(resolved)
         _refuse_other_plugins(content["installed"], installed)
         chosen = ((*points[index], seed) for index, seed in content["flights"])

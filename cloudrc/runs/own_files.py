@@ -31,6 +31,14 @@ def hashes(path: str) -> list[tuple[str, str]]:
     )
 
 
+def hash_all(experiment: ResolvedExperiment) -> dict[str, str]:
+    """Return the path of each of the user's files on which a flight depends -> its hash."""
+    values = experiment.model_dump(mode="json")
+    named = [*local_files(values).values()] if '"/' in json.dumps(values) else []
+    named += map(str, files_of(experiment.world.robot))
+    return {file: each for path in named for file, each in hashes(path)}
+
+
 def hash_files(experiment: ResolvedExperiment) -> dict[str, str]:
     """Return the dotted key of each of the user's files -> hash of the file and what it needs."""
     named = {key: [path] for key, path in local_files(experiment.model_dump(mode="json")).items()}

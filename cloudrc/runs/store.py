@@ -39,6 +39,8 @@ LINE_MAX = 1 << 20
 """Largest length of a row [bytes]."""
 SUMMARY_MAX = 1 << 26
 """Largest length of the file SUMMARY [bytes]."""
+NAMED_MAX = 3
+"""Largest number of changed files that an error names."""
 
 
 class _Document(BaseModel):
@@ -159,8 +161,9 @@ def begin(folder: Path, grid: Grid, *, is_shared: bool = False) -> dict[str, Row
     _refuse_other_code(folder, rows.values(), is_shared)
     is_same = _has_same_file(folder, grid)
     if any(points.get(key) != row["point"] for key, row in rows.items()):
-        text = f"flights that are not in {FILE}, or a file that it names has changed since"
-        raise BadInputError(f"--out {folder}: has {text}; name a new folder")
+        text = f"has flights that are not in {FILE}, or a file that it names has changed since"
+        text = describe_changes(folder, grid.files) or text
+        raise BadInputError(f"--out {folder}: {text}; name a new folder")
     if not is_same:
         write_atomically(folder / FILE, write_yaml(grid.file).encode())
     _write_summary(folder, grid, rows)
@@ -168,6 +171,19 @@ def begin(folder: Path, grid: Grid, *, is_shared: bool = False) -> dict[str, Row
         for name in (TABLE, PARQUET):
             (folder / name).unlink(missing_ok=True)
     return rows
+
+
+def describe_changes(folder: Path, files: Mapping[str, str]) -> str:
+    """Say which of the user's files (path -> hash) have changed since they were flown; "" if none.
+
+    A folder of an earlier version does not have the hashes.
+    """
+    before: dict[str, str] = {}
+    with suppress(BadInputError):  # no summary
+        before = read_summary(folder)["files"]
+    changed = [path for path, each in files.items() if before.get(path, each) != each]
+    changed[NAMED_MAX:] = [f"{len(changed) - NAMED_MAX} more"] if changed[NAMED_MAX:] else []
+    return f"changed since its flights: {', '.join(changed)}" if changed else ""
 
 
 def _refuse_other_code(folder: Path, rows: Iterable[Row], is_shared: bool) -> None:
@@ -243,6 +259,7 @@ class _SummaryDocument(_Document):
     axes: dict[str, list[Any]]
     flights: int
     units: dict[str, str]
+    files: dict[str, str] = {}
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
@@ -348,6 +365,7 @@ def _write_summary(folder: Path, grid: Grid, rows: Mapping[str, Row]) -> dict[st
         "flights": len(grid.flights),
         "counts": dict(sorted(Counter(row["verdict"] for row in rows.values()).items())),
         "units": unit_of,
+        "files": grid.files,
     }
     write_atomically(folder / SUMMARY, f"{json.dumps(summary, indent=2)}\n".encode())
     return unit_of

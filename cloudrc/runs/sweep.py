@@ -16,6 +16,7 @@ from cloudrc.runs.fly import fly
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.grid import Grid, SweepPoint, read_flight
 from cloudrc.runs.lock import lock_folder
+from cloudrc.runs.own_files import hash_all
 from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.source import code_hash
 from cloudrc.text import table
@@ -132,8 +133,8 @@ def find_flight(folder: Path, begin: str) -> tuple[Row, SweepPoint]:
     """Return the row of a sweep whose key begins like this, and the flight that repeats it.
 
     Raises:
-        BadInputError: If no row, or more than one, has such a key.
-        InvalidRunError: If code or files have changed, so that the flight would be another.
+        BadInputError: If no row, or more than one, has such a key; or if the flight would be
+            another one, because code or files have changed.
     """
     store.read_summary(folder)
     rows = [row for key, row in store.read_rows(folder).items() if key.startswith(begin)]
@@ -146,8 +147,10 @@ def find_flight(folder: Path, begin: str) -> tuple[Row, SweepPoint]:
         code = row.get("code") or "without a hash"
         why = f"was flown by code {code}, this is code {code_hash()}"
         if code == code_hash():
+            files = hash_all(flight.resolved) if flight else {}
             why = "the experiment or a file of a plug-in, trace, robot or scene has changed since"
-        raise InvalidRunError(f"{key}: {why}; fly the sweep again")
+            why = store.describe_changes(folder, files) or why
+        raise BadInputError(f"{key}: {why}; fly the sweep again")
     return row, flight
 
 

@@ -157,7 +157,7 @@ def test_a_row_of_other_code_is_not_flown_again(write_sweep, call, monkeypatch):
     (row,) = rows("grid")
     for place in ("source.code_hash", "runs.sweep.code_hash"):
         monkeypatch.setattr(f"cloudrc.{place}", lambda: "0123456789abcdef")
-    error = call("sweep fly grid", row["key"], code=6).err
+    error = call("sweep fly grid", row["key"], code=2).err
     assert f"flown by code {row['code']}, this is code 0123456789abcdef" in error
     call("sweep status grid")
 
@@ -167,8 +167,8 @@ def test_a_row_of_a_changed_file_is_not_flown_again(write_sweep, call):
     call("sweep run --out grid", write_sweep({"cloud.predictor": [str(Path("mine.py").resolve())]}))
     (row,) = rows("grid")
     Path("mine.py").write_text("from cloudrc.cloud.predictors.last_sample import build  # new\n")
-    error = call("sweep fly grid", row["key"], code=6).err
-    assert "the experiment or a file of a plug-in, trace, robot or scene has changed" in error
+    error = call("sweep fly grid", row["key"], code=2).err
+    assert f"{row['key']}: changed since its flights: {Path('mine.py').resolve()}; fly" in error
 
 
 def test_code_that_changes_during_a_sweep_ends_it(write_sweep, call, monkeypatch):

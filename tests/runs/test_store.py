@@ -188,7 +188,12 @@ def test_a_changed_plugin_is_not_mixed_with_rows_of_the_old_one(write_sweep, tmp
     assert list(store.begin(tmp_path, read_grid(path))) == [flight.key]
     with (tmp_path / changed).open("a") as file:
         file.write("# changed\n")
-    with pytest.raises(BadInputError, match=r"a file that it names has changed since"):
+    with pytest.raises(BadInputError, match=rf"changed since its flights: {tmp_path / changed};"):
+        store.begin(tmp_path, read_grid(path))
+    summary = json.loads((tmp_path / "sweep.json").read_text())
+    del summary["files"]  # as in a folder of an earlier version
+    (tmp_path / "sweep.json").write_text(json.dumps(summary))
+    with pytest.raises(BadInputError, match="or a file that it names has changed since"):
         store.begin(tmp_path, read_grid(path))
 
 
