@@ -236,7 +236,7 @@ def read_document(path: Path, name: str) -> Document:
     try:
         text = files.read(path, SIZE_MAX).decode("utf-8")
     except UnicodeDecodeError as error:
-        raise BadInputError(f"{name}: is not UTF-8 text") from error
+        raise BadInputError(f"{name}: is not UTF-8 text; save it as UTF-8") from error
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error).removeprefix(f"{path}: ")
         raise BadInputError(f"{name}: cannot be read: {reason}; name a YAML file") from error

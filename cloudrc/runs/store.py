@@ -9,6 +9,7 @@ import csv
 import io
 import json
 import logging
+from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -80,11 +81,16 @@ def read_rows(folder: Path) -> dict[str, Row]:
 
 
 def _lines(path: Path) -> Iterator[bytes]:
-    """Yield the lines of a file that end; raise a BadInputError for what is no file of rows."""
+    """Yield the lines of a file that end; raise a BadInputError for what is no file of rows.
+
+    An editor may have saved the file with a byte order mark.
+    """
     try:
         with BufferedReader(open_file(path)) as file:
+            if file.peek(2).startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
+                raise BadInputError(f"{path}: is saved as UTF-16; save it as UTF-8")
             while (line := file.readline(LINE_MAX)).endswith(b"\n"):
-                yield line
+                yield line.removeprefix(BOM_UTF8)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it is not a file"
         raise BadInputError(f"{path}: cannot be read: {reason}; move it away") from error

@@ -89,6 +89,15 @@ def test_a_line_that_is_no_row_is_named(rows, tmp_path):
             store.read_rows(tmp_path)
 
 
+def test_rows_that_an_editor_saved_with_a_byte_order_mark_are_read(rows, tmp_path):
+    write(tmp_path, rows[:2])
+    path = tmp_path / "rows.jsonl"
+    path.write_text(path.read_text(), "utf-8-sig", newline="\r\n")
+    assert list(store.read_rows(tmp_path).values()) == rows[:2]
+    write(tmp_path, rows[2:])
+    assert list(store.read_rows(tmp_path).values()) == rows
+
+
 def _make_folder(path):
     path.mkdir()
 
@@ -100,6 +109,10 @@ BROKEN = {
     "dangling": (lambda path: path.symlink_to("lost"), "No such file"),
     "long": (lambda path: path.write_bytes(b"0" * 3_000_000), "a line above 1048576 bytes"),
     "binary": (lambda path: path.write_bytes(b"\0\xff\n"), ":1: is not a row"),
+    "UTF-16": (
+        lambda path: path.write_text('{"key": 1}', "utf-16"),
+        "is saved as UTF-16; save it as UTF-8$",
+    ),
     "nested": (lambda path: path.write_bytes(b"[" * 100_000 + b"\n"), ":1: is not a row"),
 }
 
