@@ -20,6 +20,7 @@ import ast
 import difflib
 import importlib
 import inspect
+import operator
 import os
 import pkgutil
 import re
@@ -396,22 +397,45 @@ def to_number(value: Any, name: str) -> float:
     """
     if type(value) is float:
         return value
-    plain = value.item() if getattr(value, "shape", None) == () else value
-    is_none = isinstance(plain, bool) or _is_disguised(value, plain)
-    if not is_none and isinstance(plain, Real):
+    plain = _plain(value)
+    if not isinstance(plain, bool) and isinstance(plain, Real):
         with suppress(OverflowError):
             return float(plain)
     raise InvalidResultError(f"its {name} is {shorten(value)}, which is no number")
 
 
-def _is_disguised(value: Any, plain: Any) -> bool:
-    """Return whether `plain`, the item of `value`, looks like a number but is none.
+def to_integer(value: Any, name: str) -> int:
+    """Convert an integer that a plug-in returned as `to_number` does; a float is none, also 3.0.
 
-    The item of a masked value of numpy is 0, and that of a time is a count of its unit, such as ns.
+    A float holds no stamp exactly that is above 104 days in ns.
     """
+    to_number(value, name)
+    with suppress(TypeError):
+        return operator.index(value)
+    raise InvalidResultError(f"its {name} is {shorten(value)}, which is no integer")
+
+
+def to_boolean(value: Any, name: str) -> bool:
+    """Convert a truth value that a user's code returned as `to_number` does.
+
+    The numbers 0 and 1 are truth values, too. A text is none: "False" would be true.
+    """
+    plain = _plain(value)
+    if isinstance(plain, bool | Real) and plain in (0, 1):
+        return bool(plain)
+    raise InvalidResultError(f"its {name} is {shorten(value)}, which is no boolean")
+
+
+def _plain(value: Any) -> Any:
+    """Return the item of a scalar of numpy, PyTorch or JAX, and any other value as it is.
+
+    Return None for a scalar whose item looks like a number but is none: the item of a masked value
+    of numpy is 0, and that of a time is a count of its unit, such as ns.
+    """
+    plain = value.item() if getattr(value, "shape", None) == () else value
     kinds = (getattr(getattr(each, "dtype", None), "kind", "") for each in (value, plain))
     is_masked = value is not plain and bool(getattr(value, "mask", False))
-    return is_masked or not {"m", "M"}.isdisjoint(kinds)
+    return None if is_masked or not {"m", "M"}.isdisjoint(kinds) else plain
 
 
 def to_numbers(values: Any) -> NDArray[Any]:

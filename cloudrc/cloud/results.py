@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 
 from cloudrc.cloud.controllers import ControlOutput
 from cloudrc.messages import Odometry, Quaternion, Vector
-from cloudrc.plugins import LARGEST, InvalidResultError, shorten, to_number
+from cloudrc.plugins import LARGEST, InvalidResultError, shorten, to_integer, to_number
 
 SQUARE_TOLERANCE = 0.01
 """Largest deviation from 1 of an orientation's squared length [1]. A smaller one, such as that of a
@@ -38,9 +38,8 @@ def check_estimate(estimate: Any) -> Odometry:
         length = sqrt(square)
         w, x, y, z = w / length, x / length, y / length, z / length
     if not (type(stamp_ns) is int and -LARGEST <= stamp_ns <= LARGEST):  # the usual case is fast
-        stamp = to_number(stamp_ns, "stamp")
-        refuse("stamp", stamp)
-        stamp_ns = round(stamp)
+        stamp_ns = to_integer(stamp_ns, "stamp")
+        refuse("stamp", stamp_ns)
     return _new(Odometry, (stamp_ns, position, (w, x, y, z), velocity, rate))
 
 

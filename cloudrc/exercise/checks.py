@@ -53,6 +53,11 @@ def _predict(build: Callable[[], Any], select: Callable[[Odometry], Any]) -> Any
     return [select(build().predict(STATE, horizon)) for horizon in (0.0, 0.1, 0.3)]
 
 
+def _velocity_and_stamp(odometry: Odometry) -> list[float]:
+    """Return velocity [m/s] and stamp [s]; the control loop takes no float as a stamp, either."""
+    return [*odometry.velocity, plugins.to_integer(odometry.stamp_ns, "stamp") * 1e-9]
+
+
 def _command(
     build: Callable[..., Any], n: int = 1, speed: float = 0.0, sign: bool = False, **gains: Any
 ) -> Any:
@@ -143,7 +148,7 @@ CHECKS: dict[str, tuple[Formula | Exam, ...]] = {
     "predictor": (
         Formula("position", 6, partial(_predict, select=lambda o: o.position)),
         Formula("orientation", 5, partial(_predict, select=lambda o: o.orientation_wxyz)),
-        Formula("velocity, stamp", 4, partial(_predict, select=lambda o: (*o[3], o[0] / 1e9))),
+        Formula("velocity, stamp", 4, partial(_predict, select=_velocity_and_stamp)),
         Exam("steps", 10, "steps", "paper-p3", "prediction_error_rms", 0.015, 0.04),
     ),
     "controller": (

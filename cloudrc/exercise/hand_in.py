@@ -16,6 +16,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterable, Mapping, Sequence, Set
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
@@ -117,12 +118,13 @@ def to_plain(value: Any) -> Any:
 
     The check decides whether numbers and shapes are right.
     """
-    if type(value) is int:
-        plugins.to_number(value, "result")
+    if type(value) is float:  # the usual case is fast
         return value
     is_list = isinstance(value, Iterable) and not isinstance(value, str | bytes | Set | Mapping)
     if is_list and getattr(value, "shape", None) != ():
         return [to_plain(each) for each in islice(value, PARTS_MAX)]
+    with suppress(plugins.InvalidResultError):
+        return plugins.to_integer(value, "result")
     return plugins.to_number(value, "result")
 
 

@@ -16,7 +16,7 @@ class StudentPredictor(Predictor):
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Predict the odometry for `horizon` [s] later; `horizon` is tau in the equations.
 
-        The stamp `stamp_ns` [ns] of the result is later by the same time.
+        The stamp `stamp_ns` [ns], an integer, of the result is later by the same time.
 
         `odometry._replace(position=(x, y, z))` returns a copy with another position.
         """

@@ -63,8 +63,8 @@ def neutral(space: spaces.Space[Any]) -> Any:
 def checker(space: spaces.Space[Any], what: str) -> Callable[[Any], None]:
     """Return a function that raises a BadInputError if an action is none of the space.
 
-    It does not look at the space's bounds: the environment decides about them. `what` says in words
-    what an action is.
+    It does not look at the bounds of a `Box`: the environment decides about them, and many clip.
+    `what` says in words what an action is.
     """
     return partial(_check, _judge_of(space), space, what)
 
@@ -83,17 +83,17 @@ def _check(judge: Callable[[Any], None], space: spaces.Space[Any], what: str, ac
 def _judge_of(space: spaces.Space[Any]) -> Callable[[Any], None]:
     """Return a function that raises a ValueError if an action does not have the form of a space."""
     if isinstance(space, spaces.Box):
-        return partial(_judge_array, space.shape, False)
+        return partial(_judge_array, space.shape)
     if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary):
-        return partial(_judge_array, space.shape, True)
+        return partial(_judge_choices, space)
     if isinstance(space, spaces.Discrete):
-        return _judge_integer
+        return partial(_judge_choice, int(space.start), int(space.start + space.n))
     if isinstance(space, spaces.Dict):
         return partial(_judge_map, {key: _judge_of(each) for key, each in space.spaces.items()})
     return _judge_given
 
 
-def _judge_array(shape: tuple[int, ...], may_switch: bool, action: Any) -> None:
+def _judge_array(shape: tuple[int, ...], action: Any, *, may_switch: bool = False) -> None:
     if type(action) is np.ndarray and action.shape == shape:
         if action.dtype.kind == "f" and float(np.vdot(action, action)) <= LARGEST:
             return  # the usual case: `to_numbers` takes microseconds
@@ -103,10 +103,18 @@ def _judge_array(shape: tuple[int, ...], may_switch: bool, action: Any) -> None:
         to_numbers(action)
 
 
-def _judge_integer(action: Any) -> None:
-    if type(action) is int:
-        return
-    if np.shape(action) != () or np.asarray(action).dtype.kind not in "biu":
+def _judge_choices(space: spaces.MultiDiscrete | spaces.MultiBinary, action: Any) -> None:
+    _judge_array(space.shape, action, may_switch=True)
+    if not space.contains(np.asarray(action)):
+        raise ValueError
+
+
+def _judge_choice(first: int, end: int, action: Any) -> None:
+    if type(action) is not int and (
+        np.shape(action) != () or np.asarray(action).dtype.kind not in "biu"
+    ):
+        raise ValueError
+    if not first <= int(action) < end:
         raise ValueError
 
 

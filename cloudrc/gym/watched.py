@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-import numpy as np
-
 from cloudrc.gym.executors import Chunk, Executor
-from cloudrc.plugins import refuse_failure, shorten
+from cloudrc.plugins import refuse_failure, to_boolean, to_integer
 
 
 class WatchedExecutor(Executor):
@@ -17,14 +16,13 @@ class WatchedExecutor(Executor):
     def __init__(self, name: str, own: Executor, check: Callable[[Any], None]) -> None:
         """Watch `own`; `check` raises an exception for a value that is no action."""
         self._name, self._own, self._check = name, own, check
-        self.repeats = own.repeats
 
-    def _call(self, method: str, *given: Any, read: Callable[[Any], Any] = bool) -> Any:
+    def _call(self, method: str, *given: Any, read: Callable[[Any], Any] | None = None) -> Any:
         """Call a method; return what `read` makes of its result."""
         with refuse_failure(f"executor {self._name!r}: {method}() failed"):
-            result = read(getattr(self._own, method)(*given))
-            self.repeats = bool(self._own.repeats)
-        return result
+            result = getattr(self._own, method)(*given)
+            self.repeats = to_boolean(self._own.repeats, "repeats")
+            return read(result) if read is not None else None
 
     def begin(self, ticks_late: int, period_ns: int) -> None:
         """Begin an episode; a tick takes `period_ns` [ns]."""
@@ -33,7 +31,8 @@ class WatchedExecutor(Executor):
 
     def asks(self, tick: int) -> bool:
         """Return whether the robot sends the observation of this tick."""
-        return bool(self._call("asks", tick))
+        found: bool = self._call("asks", tick, read=partial(to_boolean, name="result"))
+        return found
 
     def sent(self, chunk: Chunk) -> None:
         """Note that the policy has sent an answer."""
@@ -50,7 +49,7 @@ class WatchedExecutor(Executor):
 
     def action(self, tick: int) -> Any:
         """Return the action of this tick; None if there is none."""
-        return self._call("action", tick, read=self._read_action)
+        return self._call("action", tick, read=partial(self._read_action, tick))
 
     def _read_prefix(self, actions: Any) -> list[Any]:
         found = [] if actions is None else [*actions]
@@ -58,12 +57,12 @@ class WatchedExecutor(Executor):
             self._check(action)
         return found
 
-    def _read_action(self, action: Any) -> Any:
+    def _read_action(self, tick: int, action: Any) -> Any:
         if action is None:
             return None
         self._check(action)
-        basis = self._own.basis
-        if not isinstance(basis, int | np.integer) or isinstance(basis, bool):
-            raise ValueError(f"its basis is {shorten(basis)}, not the tick of an observation")
-        self.basis = int(basis)
+        basis = to_integer(self._own.basis, "basis")
+        if not 0 <= basis <= tick:
+            raise ValueError(f"its basis is {basis}, not the tick of an observation, 0 to {tick}")
+        self.basis = basis
         return action

@@ -80,6 +80,20 @@ def test_every_kind_of_number_becomes_a_float(value):
     assert to_number(np.int8(3), "speed") == to_number(3, "speed") == 3.0
 
 
+@pytest.mark.parametrize("stamp_ns", [7, np.int64(7), np.uint8(7), np.array(7), np.array([7])[0]])
+def test_every_kind_of_integer_is_a_stamp(stamp_ns):
+    checked = check_estimate(SAMPLE._replace(stamp_ns=stamp_ns)).stamp_ns
+    assert (checked, type(checked)) == (7, int)
+
+
+@pytest.mark.parametrize(
+    "stamp_ns", [7.0, 7.2, np.float64(7), np.float32(7), np.array(7.0), Fraction(7)]
+)
+def test_a_stamp_that_is_no_integer_is_refused(stamp_ns):
+    with pytest.raises(InvalidResultError, match=r"^its stamp is .*, which is no integer$"):
+        check_estimate(SAMPLE._replace(stamp_ns=stamp_ns))
+
+
 NO_VECTORS = (
     *(None, 1.0, "123", b"abc", {1.0, 2.0, 3.0}, {1: 0.0, 2: 0.0, 3: 0.0}, ()),
     *((1.0, 2.0), (1.0, 2.0, 3.0, 4.0), np.zeros((3, 1)), np.zeros((1, 3)), np.zeros(4), count()),
@@ -145,7 +159,6 @@ def test_a_length_near_1_is_scaled_away(length):
 def test_what_is_right_keeps_its_bits():
     rounded = SAMPLE._replace(orientation_wxyz=of_length(1.0 + 1e-12))
     assert check_estimate(rounded) == rounded
-    assert check_estimate(SAMPLE._replace(stamp_ns=7.2)).stamp_ns == 7
     assert check_output(OUTPUT) == OUTPUT
 
 

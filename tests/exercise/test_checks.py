@@ -12,19 +12,25 @@ from io import BytesIO
 from math import inf, nan
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cloudrc import exercise
 from cloudrc.cli.main import main
 from cloudrc.exercise import checks, scoring
 from cloudrc.exercise import files as written
-from cloudrc.exercise.hand_in import FILES, HandIn, serve
+from cloudrc.exercise.hand_in import FILES, HandIn, serve, to_plain
 from cloudrc.exercise.remote import HandInError, Remote
 from tests.conftest import wait_until
 
 SOLUTION = Path(__file__).with_name("solution")
 ALL = {part: [check.test for check in checks.CHECKS[part]] for part in FILES}
 STUBS = Path(exercise.__file__).parent
+
+
+@pytest.mark.parametrize(("value", "plain"), [(np.int64(3), 3), (3, 3), (np.float64(3), 3.0)])
+def test_an_integer_of_a_student_stays_one(value, plain):
+    assert (to_plain(value), type(to_plain(value))) == (plain, type(plain))
 
 
 def score(part, folder):
@@ -59,6 +65,13 @@ def test_a_stub_scores_nothing_and_the_solution_all(part, folder, points):
         ),
         ("predictor", "p + v *", "p - v *", ["position", "steps"], "predictor.py:7: gives [0.95"),
         ("predictor", "v * horizon", "v * 1e999", ALL["predictor"][::3], "gives [inf"),
+        (
+            "predictor",
+            "round(horizon * 1e9)",
+            "horizon * 1e9",
+            ALL["predictor"][2:],
+            "predictor.py:7: its stamp is float ",
+        ),
         ("predictor", "horizon):", "horizon)", ALL["predictor"], "predictor.py:7: SyntaxError: "),
         (
             "predictor",

@@ -140,6 +140,9 @@ class Own(Executor):
         if tick:
             {receive}
 
+    def asks(self, tick):
+        return {asks}
+
     def prefix(self, basis):
         {prefix}
 
@@ -150,7 +153,12 @@ class Own(Executor):
 def build():
     return Own()
 """
-PARTS = {"receive": "pass", "prefix": "return []", "action": "return numpy.zeros(1)"}
+PARTS = {
+    "asks": "numpy.True_",
+    "receive": "pass",
+    "prefix": "return []",
+    "action": "return numpy.zeros(1)",
+}
 
 
 @pytest.mark.parametrize(
@@ -164,6 +172,12 @@ PARTS = {"receive": "pass", "prefix": "return []", "action": "return numpy.zeros
         ("action", "return numpy.zeros(1) + tick", None),
         ("action", "self.basis = float('nan'); return [0]", "its basis is float nan"),
         ("action", "self.basis = True; return [0]", "its basis is bool True"),
+        ("action", "self.basis = 1.0; return [0]", "its basis is float 1.0, which is no integer"),
+        ("action", "self.basis = tick + 1; return [0]", "its basis is 2, .* observation, 0 to 1$"),
+        ("action", "self.basis = -1; return [0]", "its basis is -1, "),
+        ("action", "self.repeats = 'no'; return [0]", "its repeats is str 'no'"),
+        ("asks", "'False'", r"asks\(\) failed: its result is str 'False', which is no boolean$"),
+        ("asks", "None", r"asks\(\) failed: its result is NoneType"),
         ("action", "1 / 0", r"ex\.py:\d+: ZeroDivisionError"),
         ("receive", "raise SystemExit(0)", r"receive\(\) failed: ex\.py:\d+: SystemExit"),
         ("prefix", "return [[numpy.nan]]", r"prefix\(\) failed: .*value at \[0\] is nan"),
