@@ -29,7 +29,7 @@ from cloudrc.eval.setup import (
 )
 from cloudrc.gym import Networked
 from cloudrc.gym.values import size_of
-from cloudrc.plugins import InvalidResultError, refuse_failure, shorten, to_number
+from cloudrc.plugins import InvalidResultError, refuse_failure, shorten, to_boolean, to_number
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
 from cloudrc.policy.observation import observe
@@ -73,8 +73,11 @@ class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.action = action
         observation, given, terminated, truncated, info = self.env.step(action)
         reward = _reward_of(given)
+        ends = _flag_of(terminated, "terminated"), _flag_of(truncated, "truncated")
+        if not isinstance(info, Mapping):
+            raise InvalidResultError(f"its info is {shorten(info)}, which is no mapping")
         self._note(action, observation, reward)
-        return observation, reward, terminated, truncated, info
+        return observation, reward, *ends, dict(info)
 
     def _note(self, *values: Any) -> None:
         for value in values:
@@ -92,6 +95,15 @@ def _reward_of(given: Any) -> float:
     if not isfinite(reward):
         raise InvalidResultError(f"its reward is {reward}")
     return reward
+
+
+def _flag_of(given: Any, name: str) -> bool:
+    """Return a truth value of a step; raise a ValueError for a wrong value.
+
+    Environments that are made for vectors give an array of one value.
+    """
+    is_one = isinstance(given, np.ndarray) and given.size == 1
+    return to_boolean(given.reshape(()) if is_one else given, name)
 
 
 def play(episode: Episode, setup: EvalSetup, identity: Mapping[str, Any]) -> dict[str, Any]:
@@ -304,12 +316,8 @@ def _times(setup: EvalSetup) -> Callable[[int, float], float | None]:
 def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
     """Return whether the task was done in any step so far; None if the info never told."""
     for key in SUCCESS:
-        if info.get(key) is None:
-            continue
-        told = np.asarray(info[key])
-        if told.dtype.kind not in "biuf" or not np.isfinite(told).all():
-            raise InvalidResultError(f"{key} in its info is {shorten(info[key])}, no boolean")
-        known = bool(known) or bool(told.all())
+        if info.get(key) is not None:
+            known = _flag_of(info[key], f"info['{key}']") or bool(known)
     return known
 
 
