@@ -9,6 +9,7 @@ from collections.abc import Generator, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from shlex import quote
+from typing import TextIO
 
 from cloudrc import metrics
 from cloudrc.cli.cluster_flags import release_from_flags
@@ -29,7 +30,8 @@ from cloudrc.runs import seeds, store, sweep
 from cloudrc.runs.experiment import check_mode, load, refuse_seed
 from cloudrc.runs.flight import Row
 from cloudrc.runs.folder import new_folder
-from cloudrc.runs.grid import Grid, SweepPoint, read_grid, unpack
+from cloudrc.runs.grid import Grid, SweepPoint, UncheckedGrid, check, read_unchecked, unpack
+from cloudrc.runs.plan import check_shard
 from cloudrc.runs.pods import PodSettings, fly_in_pods
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.runs.shards import FLIGHTS_MAX
@@ -39,11 +41,14 @@ from cloudrc.text import escape
 
 def run(options: argparse.Namespace) -> int:
     """Fly the flights of a sweep whose results or recordings are missing; return the exit code."""
-    grid, (shard, count) = _read(options), options.shard or (None, 1)
-    name = f"sweep-{options.file.stem}"
+    _check_flags(options)
+    unchecked = read_unchecked(options.file, options.max_flights)
+    whole = None if options.shard else _check(options, unchecked)  # before there is a folder
+    name, (shard, count) = f"sweep-{options.file.stem}", options.shard or (None, 1)
     with sweep.open_folder(options.out, name, shard, count) as (folder, warning):
         if warning:
             print_line(f"cloudrc: warning: {warning}", sys.stderr)
+        grid = whole or _check(options, unchecked, folder)
         return _run_locked(options, grid, folder, shard, count)
 
 
@@ -54,10 +59,10 @@ def _run_locked(
     work = sweep.begin(grid, folder, shard, count, options.record)
     mine, missing = work.mine, work.missing
     part = f", shard {shard} of {count}" if shard else ""
-    head = f"{len(grid.points)} points x {len(grid.seeds)} seeds{part}: {len(mine)} flights"
-    stream = sys.stdout if options.output == "table" else sys.stderr
+    points = len(grid.point_of) // len(grid.seeds)
+    head = f"{points} points x {len(grid.seeds)} seeds{part}: {len(mine)} flights"
     head += f", {len(mine) - len(missing)} done before" if len(missing) < len(mine) else ""
-    view = SweepView(stream, f"{grid.points[0].name}: {head}", len(missing))
+    view = SweepView(_stream(options), f"{grid.name}: {head}", len(missing))
     with closing(view):
         if options.on:
             flown = _fly_in_pods(options, grid, missing)
@@ -66,7 +71,7 @@ def _run_locked(
         rows, stopped = sweep.keep(flown, folder, grid, shard, work.before, view.see)
     if stopped:
         print_line(f"cloudrc: {stopped}; to continue: {_again(options, folder)}", sys.stderr)
-    name = store.TABLE if len(rows) == len(grid.flights) else store.SUMMARY
+    name = store.TABLE if len(rows) == len(grid.point_of) else store.SUMMARY
     text = f"\n{sweep.count_verdicts(rows.values())}\n\n{escape(str(folder / name))}"
     print_result(options.output, store.read_summary(folder), text)
     if stopped:
@@ -86,22 +91,36 @@ def _again(options: argparse.Namespace, folder: Path) -> str:
     return " ".join(words)
 
 
-def _read(options: argparse.Namespace) -> Grid:
-    """Check the flags, read the grid, and print warnings; nothing is written yet."""
+def _check_flags(options: argparse.Namespace) -> None:
+    """Refuse flags that do not fit, and missing packages."""
     if not options.on:
         require("a sweep", MODES["virtual"] if options.record else ("world",))
     elif options.record or options.shard:
         raise BadInputError("--on kubernetes has no --record and no --shard; see --shards")
     if options.shard and options.out is None:
         raise BadInputError("--shard needs --out, the folder that all shards share")
-    stream = sys.stdout if options.output == "table" else sys.stderr
-    with closing(PlanView(stream)) as view:
-        grid = read_grid(options.file, flights_max=options.max_flights, see=view.see)
+
+
+def _check(
+    options: argparse.Namespace, unchecked: UncheckedGrid, folder: Path | None = None
+) -> Grid:
+    """Check all points, or those of a shard, which flies into `folder`; print warnings."""
+    with closing(PlanView(_stream(options))) as view:
+        if folder is None:
+            grid = check(unchecked, unchecked.points(), view.see)
+        else:
+            shard, count = options.shard
+            grid = check_shard(unchecked, folder, shard, count, view.see, view.wait)
     if options.on:
         for point in grid.points:
             refuse_local_files(point.model_dump(mode="json"), "or fly without --on")
     warn(*grid.points)
     return grid
+
+
+def _stream(options: argparse.Namespace) -> TextIO:
+    """Return the stream for progress: stdout, or stderr if stdout has a document for programs."""
+    return sys.stdout if options.output == "table" else sys.stderr
 
 
 def fly_again(options: argparse.Namespace) -> int:

@@ -88,8 +88,8 @@ def advice_on(*experiments: ResolvedExperiment) -> list[str]:
     their number. Of many experiments, only the first, the last and some between them are looked at,
     because each takes some milliseconds: together about `ADVISED_MAX`.
     """
-    some = dict.fromkeys(range(0, len(experiments), len(experiments) // ADVISED_MAX + 1))
-    some[len(experiments) - 1] = None
+    every = range(len(experiments))
+    some = dict.fromkeys([*every[:: len(every) // ADVISED_MAX + 1], *every[-1:]])
     advice = list(dict.fromkeys(text for index in some for text in advise(experiments[index])))
     if len(experiments) > 2 and len(advice) > WARNINGS_MAX:
         advice[WARNINGS_MAX:] = [f"{len(advice)} warnings; the others are alike"]

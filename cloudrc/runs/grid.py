@@ -1,14 +1,14 @@
 """Read the file of a sweep: a grid of settings of an experiment, flown with several seeds.
 
 docs/sweeps.md describes the file. A *point* has one value of each axis. Every point is loaded and
-checked before the first flight.
+checked before its first flight.
 """
 
 from __future__ import annotations
 
 import gzip
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from itertools import chain, product
@@ -29,7 +29,7 @@ from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError
 from cloudrc.renamed import new_key
 from cloudrc.runs.experiment import check_world
-from cloudrc.runs.flight import Row
+from cloudrc.runs.flight import Row, units
 from cloudrc.runs.installed import installed_code
 from cloudrc.runs.own_files import hash_all
 
@@ -37,10 +37,12 @@ SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
 """Largest seed, and largest number of seeds."""
 COLUMNS = ("key", "seed", "verdict", "failures", "code", "physics_steps")
 """Columns of the table besides the axes and the numbers."""
-See: TypeAlias = Callable[[int, int, int], None]
-"""Function that shows how far a sweep is checked: points checked, points, seeds."""
+See: TypeAlias = Callable[[int, int, str], None]
+"""Function that shows how far a check is: points checked, points to check, and these in words."""
 _Entry: TypeAlias = tuple[str, Any, Source]
 """A setting's key and value, and their place in the file."""
+_Point: TypeAlias = tuple[dict[str, Any], tuple[tuple[Any, list[_Entry]], ...]]
+"""A point with its choice of each axis: the label with its settings."""
 
 
 class SweepFile(Section):
@@ -79,17 +81,23 @@ class SweepPoint(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A checked sweep: the content of its file, its points, and the flights of each point."""
+    """A checked sweep: the content of its file, its points, and the flights of each point.
+
+    In a shard, only the points of its flights may be checked.
+    """
 
     file: dict[str, Any]  # content of the file, with `folder`
     axes: dict[str, list[Any]]  # axis -> its values or names
     seeds: tuple[int, ...]
+    name: str  # of the experiment
+    units: dict[str, str]  # metric -> unit
     files: dict[str, str]  # path of each of the user's files on which a flight depends -> its hash
-    points: list[ResolvedExperiment]
-    flights: dict[str, SweepPoint]  # key -> flight; all seeds of a point follow each other
+    point_of: dict[str, dict[str, Any]]  # key of each flight -> its point, in the grid's order
+    points: list[ResolvedExperiment]  # those that are checked
+    flights: dict[str, SweepPoint]  # key -> flight of a checked point
 
 
-class _UncheckedGrid(NamedTuple):
+class UncheckedGrid(NamedTuple):
     """The content of a sweep's file, whose points are not checked yet."""
 
     name: str
@@ -99,38 +107,56 @@ class _UncheckedGrid(NamedTuple):
     axes: dict[str, list[tuple[Any, list[_Entry]]]]
     seeds: tuple[int, ...]
 
+    @property
+    def flights(self) -> int:
+        """Number of all flights."""
+        return prod(len(choices) for choices in self.axes.values()) * len(self.seeds)
+
+    @property
+    def size(self) -> str:
+        """How many points, seeds and flights the sweep has, in words."""
+        seeds = len(self.seeds)
+        return f"{self.flights // seeds:,} points x {seeds:,} seeds: {self.flights:,} flights"
+
+    def points(self) -> list[_Point]:
+        """Return all points in the order of the grid."""
+        return [
+            ({axis: label for axis, (label, _) in zip(self.axes, choices, strict=True)}, choices)
+            for choices in product(*self.axes.values())
+        ]
+
     def resolve(self, choices: Iterable[tuple[Any, list[_Entry]]]) -> ResolvedExperiment:
         """Return the checked experiment of a point, which has one choice of each axis."""
         return _resolve(self.experiment, chain(self.common, *(entries for _, entries in choices)))
 
 
-def read_grid(
-    given: Path | Mapping[str, Any],
-    *,
-    flights_max: int | None = None,
-    see: See = lambda done, points, seeds: None,
-) -> Grid:
+def read_grid(given: Path | Mapping[str, Any]) -> Grid:
     """Read a sweep, the path of its file or its content, and check all of its points.
-
-    Call `see` with the number of points that are checked, that of all points, and that of seeds:
-    once before the first point, and after each.
 
     Raises:
         BadInputError: If the sweep or one of its points has problems, with file and line of each,
-            or with the key of the content; or if it has more than `flights_max` flights.
+            or with the key of the content.
     """
-    grid = _read_unchecked(given)
-    count, seeds = prod(len(choices) for choices in grid.axes.values()), len(grid.seeds)
-    if flights_max is not None and count * seeds > flights_max:
-        text = f"{count:,} points x {seeds:,} seeds: {count * seeds:,} flights are more than "
-        text += f"{flights_max:,}; take fewer values or seeds, or give --max-flights"
-        raise BadInputError(f"{grid.name}: {text} {count * seeds}")
-    see(0, count, seeds)
+    grid = read_unchecked(given)
+    return check(grid, grid.points())
+
+
+def check(
+    grid: UncheckedGrid,
+    chosen: Sequence[_Point],
+    see: See = lambda done, points, work: None,
+) -> Grid:
+    """Check the `chosen` points of a sweep: all, or those of a shard; raise a BadInputError.
+
+    Call `see` once before the first point, and after each.
+    """
+    count, total = len(chosen), grid.flights // len(grid.seeds)
+    work = grid.size if count == total else f"{count:,} of {total:,} points"
+    see(0, count, work)
     points, flights = list[ResolvedExperiment](), dict[str, SweepPoint]()
     files = dict[str, str]()
     with reuse_results():
-        for choices in product(*grid.axes.values()):
-            point = {axis: label for axis, (label, _) in zip(grid.axes, choices, strict=True)}
+        for point, choices in chosen:
             points.append(grid.resolve(choices))
             own_files = hash_all(points[-1])
             files |= own_files
@@ -141,14 +167,23 @@ def read_grid(
                     same = f"{point} is the same as {flights[key].point}; remove one of them"
                     raise BadInputError(f"{grid.name}: {same}")
                 flights[key] = SweepPoint(key, point, seed, points[-1])
-            see(len(points), count, seeds)
-    labels = {axis: [label for label, _ in choices] for axis, choices in grid.axes.items()}
-    return Grid(grid.file, labels, grid.seeds, files, points, flights)
+            see(len(points), count, work)
+    return Grid(
+        file=grid.file,
+        axes={axis: [label for label, _ in choices] for axis, choices in grid.axes.items()},
+        seeds=grid.seeds,
+        name=points[0].name if points else "",
+        units=units({metric for point in points for metric in point.report.metrics}),
+        files=files,
+        point_of={key: flight.point for key, flight in flights.items()},
+        points=points,
+        flights=flights,
+    )
 
 
 def read_flight(path: Path, point: Mapping[str, Any], seed: int) -> SweepPoint | None:
     """Read one flight of a sweep, without the others; None if the sweep does not have it."""
-    grid = _read_unchecked(path)
+    grid = read_unchecked(path)
     if point.keys() != grid.axes.keys() or seed not in grid.seeds:
         return None
     choices = []
@@ -162,8 +197,13 @@ def read_flight(path: Path, point: Mapping[str, Any], seed: int) -> SweepPoint |
     return SweepPoint(_key(everything, seed), dict(point), seed, resolved)
 
 
-def _read_unchecked(given: Path | Mapping[str, Any]) -> _UncheckedGrid:
-    """Read a sweep, and check all but its points; raise a BadInputError."""
+def read_unchecked(
+    given: Path | Mapping[str, Any], flights_max: int | None = None
+) -> UncheckedGrid:
+    """Read a sweep, and check all but its points; raise a BadInputError.
+
+    Refuse a sweep of more than `flights_max` flights.
+    """
     if isinstance(given, Path):
         name, start, document = str(given), given.resolve().parent, read_document(given, str(given))
     else:
@@ -181,7 +221,11 @@ def _read_unchecked(given: Path | Mapping[str, Any]) -> _UncheckedGrid:
     is_path = shipped.is_path(file.experiment)
     experiment = str(folder / file.experiment) if is_path else file.experiment
     content = document.tree | {"folder": str(folder)}
-    return _UncheckedGrid(name, content, experiment, common, axes, seeds)
+    grid = UncheckedGrid(name, content, experiment, common, axes, seeds)
+    if flights_max is not None and grid.flights > flights_max:
+        text = f"{grid.size} are more than {flights_max:,}; take fewer values or seeds, or give "
+        raise BadInputError(f"{name}: {text}--max-flights {grid.flights}")
+    return grid
 
 
 def _everything(point: ResolvedExperiment, files: Mapping[str, str]) -> bytes:

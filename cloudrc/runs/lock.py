@@ -53,5 +53,22 @@ def lock_folder(folder: Path, shard: int | None = None, count: int = 1) -> Itera
         yield warnings[-1]
 
 
+@contextmanager
+def lock_plan(folder: Path) -> Iterator[bool]:
+    """Lock the check of all points of a sweep; yield whether no other shard has locked it.
+
+    If the file system has no locks, each shard may check all points.
+    """
+    with (folder / f"{LOCK}-plan").open("a+") as file:
+        is_mine = True
+        try:
+            fcntl.flock(file, ALONE)
+        except BlockingIOError:
+            is_mine = False
+        except OSError:  # `lock_folder` has warned
+            pass
+        yield is_mine
+
+
 def _name(shard: int | str, count: int | str) -> str:
     return f"{LOCK}-{shard}-of-{count}"

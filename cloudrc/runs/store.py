@@ -26,13 +26,13 @@ from cloudrc.config.document import read_document, write_yaml
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file, write_atomically
 from cloudrc.renamed import NEW_NAMES, new_key
-from cloudrc.runs.flight import Row, units
+from cloudrc.runs.flight import Row
 from cloudrc.runs.grid import Grid, read_grid
 from cloudrc.runs.lock import LOCK
 from cloudrc.source import code_hash
 from cloudrc.version import __version__
 
-FILE, SUMMARY = "sweep.yaml", "sweep.json"
+FILE, SUMMARY, PLAN = "sweep.yaml", "sweep.json", "plan.json"
 TABLE, PARQUET = "table.csv", "table.parquet"
 NUMBERS = {int, float, type(None)}
 """Types of the values of an axis of numbers; None is the value null."""
@@ -163,17 +163,19 @@ def begin(folder: Path, grid: Grid, *, is_shared: bool = False) -> dict[str, Row
     Raises:
         BadInputError: If the folder belongs to another sweep or to other code.
     """
-    rows, points = read_rows(folder), {key: each.point for key, each in grid.flights.items()}
-    _refuse_other_code(folder, rows.values(), is_shared)
+    rows = read_rows(folder)
+    refuse_other_code(folder, rows.values(), is_shared)
     is_same = _has_same_file(folder, grid)
-    if any(points.get(key) != row["point"] for key, row in rows.items()):
+    if any(grid.point_of.get(key) != row["point"] for key, row in rows.items()):
         text = f"has flights that are not in {FILE}, or a file that it names has changed since"
         text = describe_changes(folder, grid.files) or text
         raise BadInputError(f"--out {folder}: {text}; name a new folder")
     if not is_same:
         write_atomically(folder / FILE, write_yaml(grid.file).encode())
     _write_summary(folder, grid, rows)
-    if len(rows) < len(grid.flights):  # tables of a smaller grid would look complete
+    if not is_shared:  # only shards keep a plan up to date
+        (folder / PLAN).unlink(missing_ok=True)
+    if len(rows) < len(grid.point_of):  # tables of a smaller grid would look complete
         for name in (TABLE, PARQUET):
             (folder / name).unlink(missing_ok=True)
     return rows
@@ -192,7 +194,7 @@ def describe_changes(folder: Path, files: Mapping[str, str]) -> str:
     return f"changed since its flights: {', '.join(changed)}" if changed else ""
 
 
-def _refuse_other_code(folder: Path, rows: Iterable[Row], is_shared: bool) -> None:
+def refuse_other_code(folder: Path, rows: Iterable[Row], is_shared: bool) -> None:
     """Raise a BadInputError if flights of other code are in `folder`, or fly into it now."""
     codes = {row.get("code") for row in rows}
     if is_shared and (folder / SUMMARY).exists():  # of a shard that may have no row yet
@@ -208,10 +210,10 @@ def _refuse_other_code(folder: Path, rows: Iterable[Row], is_shared: bool) -> No
 def finish(folder: Path, grid: Grid) -> dict[str, Row]:
     """Write the summary and, if no flight is missing, the tables; return flight key -> row."""
     rows = read_rows(folder)
-    unit_of = _write_summary(folder, grid, rows)
-    if rows.keys() == grid.flights.keys():
-        columns = columns_of([rows[key] for key in grid.flights], grid)
-        write_atomically(folder / TABLE, as_csv(columns, unit_of).encode())
+    _write_summary(folder, grid, rows)
+    if rows.keys() == grid.point_of.keys():
+        columns = columns_of([rows[key] for key in grid.point_of], grid)
+        write_atomically(folder / TABLE, as_csv(columns, grid.units).encode())
         if find_spec("pyarrow"):
             parquet, tables = import_module("pyarrow.parquet"), import_module("pyarrow")
             parquet.write_table(tables.table(columns), folder / PARQUET)
@@ -262,6 +264,7 @@ def as_text(value: Any) -> str:
 class _SummaryDocument(_Document):
     """The form of the file SUMMARY."""
 
+    experiment: str = ""
     axes: dict[str, list[Any]]
     flights: int
     units: dict[str, str]
@@ -293,7 +296,7 @@ def _has_same_file(folder: Path, grid: Grid) -> bool:
         raise BadInputError(
             f"{path}: was written or edited by hand; name a new folder with --out, or move the file"
         )
-    if not read_grid(path).flights.keys() <= grid.flights.keys():
+    if not read_grid(path).point_of.keys() <= grid.point_of.keys():
         raise BadInputError(f"--out {folder}: has another sweep, see {FILE}; name a new folder")
     return False
 
@@ -356,22 +359,19 @@ def values_of(rows: Sequence[Row]) -> dict[str, list[Any]]:
             for axis in rows[0]["point"]}  # fmt: skip
 
 
-def _write_summary(folder: Path, grid: Grid, rows: Mapping[str, Row]) -> dict[str, str]:
-    """Write the file SUMMARY of a sweep; return metric -> unit."""
-    own = {choice for point in grid.points for choice in point.report.metrics}
-    unit_of = units(own)
+def _write_summary(folder: Path, grid: Grid, rows: Mapping[str, Row]) -> None:
+    """Write the file SUMMARY of a sweep."""
     summary = {
         "schemaVersion": 1,
-        "experiment": grid.points[0].name,
+        "experiment": grid.name,
         "cloudrc": __version__,
         "code": code_hash(),
         "overrides": [f"{key}={as_text(value)}" for key, value in grid.file.get("set", {}).items()],
         "axes": grid.axes,
         "seeds": grid.seeds,
-        "flights": len(grid.flights),
+        "flights": len(grid.point_of),
         "counts": dict(sorted(Counter(row["verdict"] for row in rows.values()).items())),
-        "units": unit_of,
+        "units": grid.units,
         "files": grid.files,
     }
     write_atomically(folder / SUMMARY, f"{json.dumps(summary, indent=2)}\n".encode())
-    return unit_of

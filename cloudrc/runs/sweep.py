@@ -58,7 +58,7 @@ def begin(
     another sweep or of other code.
     """
     before = store.begin(folder, grid, is_shared=bool(shard))
-    mine = [*grid.flights.values()][(shard or 1) - 1 :: count]
+    mine = [grid.flights[key] for key in [*grid.point_of][(shard or 1) - 1 :: count]]
     missing = [
         each
         for each in mine

@@ -14,7 +14,7 @@ from cloudrc.assembly import build_links
 from cloudrc.config import document, load, overrides, scene
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import SCENES
-from cloudrc.runs.grid import pack, read_flight, read_grid, unpack
+from cloudrc.runs.grid import check, pack, read_flight, read_grid, read_unchecked, unpack
 from cloudrc.source import code_hash
 from tests.runs.conftest import SHORT
 
@@ -240,8 +240,9 @@ def test_one_flight_is_read_without_the_others(write_sweep):
 
 def test_the_progress_is_told_for_each_point(write_sweep):
     seen = []
-    read_grid(write_sweep(seeds=3), see=lambda *counts: seen.append(counts))
-    assert seen == [(done, 4, 3) for done in range(5)]
+    grid = read_unchecked(write_sweep(seeds=3))
+    check(grid, grid.points(), see=lambda *counts: seen.append(counts))
+    assert seen == [(done, 4, "4 points x 3 seeds: 12 flights") for done in range(5)]
 
 
 def test_the_key_takes_in_the_code(write_sweep, monkeypatch):
