@@ -114,20 +114,31 @@ def _nearest_key(model: type[BaseModel], path: KeyPath) -> str:
     """Return a hint about the unknown key at `path`: a similar known key, or all known keys."""
     *above, key = path
     field = field_at(model, tuple(above))
-    models = _models(field.annotation) if field else [] if above else [model]
-    siblings = {name: info for inner in models for name, info in inner.model_fields.items()}
-    if near := _near(key, list(siblings)):
+    siblings = _keys_of(field.annotation if field else None if above else model)
+    everywhere = {
+        leaf[n]: ".".join(leaf[: n + 1])
+        for leaf, _ in reversed(sorted(leaves(model), key=lambda each: len(each[0])))
+        for n in range(len(leaf))
+    }
+    if key not in everywhere and (near := _near(key, list(siblings))):
         return f"did you mean {near} {_unit(siblings[near])}".strip() + "?"
-    everywhere = {leaf[-1]: ".".join(leaf) for leaf, _ in reversed(list(leaves(model)))}
-    if near := _near(key, list(everywhere)):
-        return f"did you mean {everywhere[near]}?"
-    return f"known here: {', '.join(siblings)}" if siblings else "no keys are known here"
+    here = f"known here: {', '.join(siblings)}" if siblings else "no keys are known here"
+    # Of so many keys some key is a little like any word.
+    near = _near(key, list(everywhere), cutoff=0.8)
+    return f"{here}; did you mean {everywhere[near]}?" if near else here
 
 
-def _near(key: str, known: list[str]) -> str | None:
+def _keys_of(annotation: Any) -> dict[str, FieldInfo]:
+    """Return key -> field of all sections in an annotation."""
+    return {key: info for one in _models(annotation) for key, info in one.model_fields.items()}
+
+
+def _near(key: str, known: list[str], cutoff: float = 0.6) -> str | None:
+    """Return the key that is nearest to an unknown one; `cutoff` is that of difflib [1]."""
     # `delay` is nearest to `delay_ms`: a forgotten unit is more likely than a typo.
     without_unit = [name for name in known if name.startswith(f"{key}_")]
-    return next(iter(without_unit or difflib.get_close_matches(key, known, n=1)), None)
+    near = without_unit or difflib.get_close_matches(key, known, n=1, cutoff=cutoff)
+    return next(iter(near), None)
 
 
 def _types(annotation: Any) -> Iterator[Any]:
@@ -306,7 +317,9 @@ def _expected(detail: ErrorDetails, model: type[BaseModel], path: KeyPath) -> st
     """
     known, text = expectation(model, path), detail["msg"]
     if known != INVALID:
-        return known
+        field = field_at(model, path)
+        keys = ", ".join(_keys_of(field.annotation)) if field is not None else ""
+        return f"{known}: {keys}" if known.endswith("of keys") and keys else known
     if text.startswith(_INPUT):
         return f"must be {text.removeprefix(_INPUT)}"
     return text[:1].lower() + text[1:]

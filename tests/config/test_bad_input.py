@@ -83,6 +83,12 @@ def test_fifty_problems_at_most_are_listed(mine):
         ("name: ../../x", "name: '../../x': must be text without slashes"),
         ("mission: ./nowhere.yaml", "mission: no such file:"),
         ("delay_ms: 3", "did you mean link.uplink.delay_ms?"),
+        ("guard: {time_limit_s: 3}", "; did you mean criteria.time_limit_s?"),
+        ("link: wifi", "link: 'wifi': must be a mapping of keys: profile, uplink, downlink"),
+        ("uplink: {delay_ms: 3}", "criteria, report; did you mean link.uplink?"),
+        ("link: {delay_ms: 3}", "downlink; did you mean link.uplink.delay_ms?"),
+        ("link: {changes: []}", "downlink; did you mean link.uplink.changes?"),
+        ("predicter: kalman", "; did you mean cloud.predictor?"),
         ("zzz: 3", "known here: name, description, seed, mission"),
         ("guard: {speed_max_mps: 7}", "must be at most 6 m/s: above it the robot does not stop"),
         ("mission: {waypoints: []}",
@@ -103,6 +109,12 @@ def test_an_invalid_file_is_one_line(mine, text, reason):
     found = refused_text(mine, text)
     assert reason in found
     assert "\n" not in found
+
+
+@pytest.mark.parametrize("key", ["both", "up", "rtt_ms", "wifi"])
+def test_a_key_that_is_like_no_other_is_told_what_fits_there(mine, key):
+    found = refused_text(mine, f"link: {{{key}: {{delay_ms: 40}}}}")
+    assert found.endswith(f"link.{key}: unknown key; known here: profile, uplink, downlink")
 
 
 @pytest.mark.parametrize(
