@@ -35,6 +35,7 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     yield from _units(ways)
     yield from _jitter(ways)
     yield from _time(experiment)
+    yield from _never(experiment, ways)
     for number, waypoint in enumerate(experiment.mission.waypoints, start=1):
         if waypoint.tolerance_m >= FAR:
             yield (
@@ -158,6 +159,34 @@ def _time(experiment: ResolvedExperiment) -> Iterator[str]:
         )
     elif lasts > LONG:
         yield f"{what} {lasts:,.6g} s: this is {lasts / 3600:.3g} hours; give times in seconds"
+
+
+def _never(experiment: ResolvedExperiment, ways: Mapping[str, DirectionProfile]) -> Iterator[str]:
+    """Yield a warning if a change or a blackout of the link is later than the mission may last."""
+    from cloudrc.assembly import GRACE, build_plan
+
+    starts = list(_starts(ways))
+    if not starts:
+        return
+    limit = build_plan(experiment).time_limit
+    late = [(key, at) for key, at in starts if at > limit + GRACE]
+    if late:
+        key, at = late[0]
+        more = f" (and {len(late) - 1} more)" if late[1:] else ""
+        yield (
+            f"{key}{more} is {at:,.6g} s, after the mission's limit of {limit:,.6g} s: in a flight "
+            "of this mission it never begins; give times in seconds, or a longer "
+            "criteria.time_limit_s"
+        )
+
+
+def _starts(ways: Mapping[str, DirectionProfile]) -> Iterator[tuple[str, float]]:
+    """Yield key and time [s] of each change and blackout of the link."""
+    for name, profile in ways.items():
+        for number, change in enumerate(profile.changes):
+            yield f"link.{name}.changes.{number}.at_s", change.at_s
+        for number, blackout in enumerate(profile.blackouts):
+            yield f"link.{name}.blackouts.{number}.start_s", blackout.start_s
 
 
 def _fast_track(experiment: ResolvedExperiment) -> Iterator[str]:

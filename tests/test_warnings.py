@@ -146,6 +146,28 @@ def test_dwell_times_longer_than_the_mission_are_named(settings, words):
     assert all(words in text for text in told)
 
 
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (
+            ["link.both.changes=[{at_s: 3}, {at_s: 5000}, {at_s: 8000}]"],
+            r"link.uplink.changes.1.at_s \(and 3 more\) is 5,000 s, .* 60 s: .* never begins",
+        ),
+        (
+            ["link.downlink.blackouts=[{start_s: 1000, duration_s: 1}]"],
+            "link.downlink.blackouts.0.start_s is 1,000 s, .* limit of 60 s: .* never begins;",
+        ),
+        (["link.uplink.changes=[{at_s: 95}]"], "link.uplink.changes.0.at_s is 95 s, after"),
+        (["link.uplink.changes=[{at_s: 95}]", "criteria.time_limit_s=100"], ""),
+        (["link.uplink.blackouts=[{start_s: 59, duration_s: 5000}]"], ""),
+    ],
+)
+def test_what_a_flight_never_reaches_on_the_time_line_of_the_link_is_named(settings, words):
+    told = [text for text in advise(load_experiment("hover", settings)) if "never begins" in text]
+    assert len(told) == bool(words)
+    assert all(re.match(words, text) for text in told)
+
+
 @pytest.mark.parametrize(("tolerance", "count"), [(10, 1), (0.5, 0)])
 def test_a_tolerance_that_may_be_meant_in_centimetres_is_named(tolerance, count):
     settings = [f"mission.waypoints.0.tolerance_m={tolerance}"]

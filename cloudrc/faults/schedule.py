@@ -150,11 +150,16 @@ def load(path: Path) -> Schedule:
     """
     document = read_document(path, str(path))
     try:
-        return _SCHEDULE.validate_python(document.tree)
+        schedule = _SCHEDULE.validate_python(document.tree)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         text = ": ".join(filter(None, [".".join(map(str, first["loc"])), first["msg"]]))
         raise BadInputError(f"{path}: is no schedule of faults: {text}") from error
+    for each in schedule.events:
+        if each.at >= schedule.duration:
+            late = f"the fault {each.kind} at {each.at:g} s never begins"
+            raise BadInputError(f"{path}: {late}: duration is {schedule.duration:g} s")
+    return schedule
 
 
 CALM = 45.0  # time after which there are no faults and the robot must recover [s]

@@ -15,6 +15,13 @@ def test_a_drawn_schedule_is_what_its_file_says(draw, tmp_path):
         assert load(path) == draw(seed)
 
 
+def test_a_file_with_a_fault_that_never_begins_is_bad_input(tmp_path):
+    path = tmp_path / "schedule.yaml"
+    path.write_text("seed: 1\nevents: [{kind: blackout, at: 59}, {kind: held, at: 5000}]")
+    with pytest.raises(BadInputError, match=r"the fault held at 5000 s never begins: duration is"):
+        load(path)
+
+
 def test_random_schedules_have_all_faults_and_calm_at_the_end():
     drawn = [compose(seed) for seed in range(400)]
     events = [event for schedule in drawn for event in schedule.events]
