@@ -8,10 +8,11 @@ on NFS, a process loses its lock when it closes any other handle of the file.
 from __future__ import annotations
 
 import fcntl
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from shlex import quote
+from typing import IO
 
 from cloudrc.errors import BadInputError
 
@@ -54,20 +55,30 @@ def lock_folder(folder: Path, shard: int | None = None, count: int = 1) -> Itera
 
 
 @contextmanager
-def lock_plan(folder: Path) -> Iterator[bool]:
-    """Lock the check of all points of a sweep; yield whether no other shard has locked it.
+def lock_plan(folder: Path, wait: Callable[[], None]) -> Iterator[None]:
+    """Lock the check of all points of a sweep; call `wait` as long as another shard has locked it.
 
-    If the file system has no locks, each shard may check all points.
+    The first shard has the lock alone. All that had to wait for it get the lock together: if the
+    first one was refused or killed, they need not wait for each other, too. If the file system has
+    no locks, no shard waits.
     """
+    how = ALONE
     with (folder / f"{LOCK}-plan").open("a+") as file:
-        is_mine = True
-        try:
-            fcntl.flock(file, ALONE)
-        except BlockingIOError:
-            is_mine = False
-        except OSError:  # `lock_folder` has warned
-            pass
-        yield is_mine
+        while not _try_lock(file, how):
+            how = TOGETHER
+            wait()
+        yield
+
+
+def _try_lock(file: IO[str], how: int) -> bool:
+    """Return whether no other process has locked a file, or whether there are no locks."""
+    try:
+        fcntl.flock(file, how)
+    except BlockingIOError:
+        return False
+    except OSError:  # `lock_folder` has warned
+        pass
+    return True
 
 
 def _name(shard: int | str, count: int | str) -> str:

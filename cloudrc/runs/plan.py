@@ -54,14 +54,13 @@ def check_shard(
         BadInputError: If a point has problems, if the folder belongs to another sweep or to other
             code, or if a file has changed since the plan.
     """
-    while True:
-        with lock_plan(folder) as is_mine:
-            plan = _read(folder, grid)
-            if plan is None and is_mine:
+    plan = _read(folder, grid)
+    if plan is None:
+        with lock_plan(folder, lambda: wait(grid.size)):
+            plan = _read(folder, grid)  # another shard may have written it
+            if plan is None:
                 return _check_all(grid, folder, see)
-        if plan is not None:
-            return _check_part(grid, folder, plan, shard, count, see)
-        wait(grid.size)
+    return _check_part(grid, folder, plan, shard, count, see)
 
 
 def _check_all(grid: UncheckedGrid, folder: Path, see: See) -> Grid:

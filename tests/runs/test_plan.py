@@ -86,42 +86,56 @@ def test_the_progress_of_a_later_shard_is_that_of_its_own_points(write_sweep, ch
     assert seen == [(0, 1, "1 of 4 points"), (1, 1, "1 of 4 points")]
 
 
+@pytest.fixture
+def other(folder):
+    """Another shard that checks all points, until the stack is closed."""
+    with ExitStack() as stack:
+        stack.enter_context(lock_plan(folder, pytest.fail))
+        yield stack
+
+
 def test_shards_that_start_at_once_wait_for_the_one_that_checks_all_points(
-    write_sweep, check, folder
+    write_sweep, check, folder, tmp_path, other
 ):
     path, said = write_sweep(seeds=2), []
-    check(path)
-    plan = folder / store.PLAN
-    plan.rename(folder / "later")
+    shutil.copytree(folder, tmp_path / "ready")
+    check_shard(read_unchecked(path), tmp_path / "ready", 1, 8)
 
     def wait(work):
         said.append(work)
         if len(said) == 3:
-            (folder / "later").rename(plan)
+            shutil.copytree(tmp_path / "ready", folder, dirs_exist_ok=True)
+            other.close()
 
-    with lock_plan(folder) as is_mine:
-        assert is_mine
-        assert check(path, 8, 8, wait=wait)[1] == 1
+    assert check(path, 8, 8, wait=wait)[1] == 1
     assert said == ["4 points x 2 seeds: 8 flights"] * 3
 
 
-def test_another_shard_checks_all_points_if_the_first_one_is_killed(write_sweep, check, folder):
-    path, other = write_sweep(), ExitStack()
-    other.enter_context(lock_plan(folder))
+def test_another_shard_checks_all_points_if_the_first_one_is_killed(write_sweep, check, other):
+    path = write_sweep()
     assert check(path, 2, wait=lambda work: other.close())[1] == 4  # its end frees the lock
     assert check(path, 3)[1] == 1
 
 
-def test_without_locks_each_shard_checks_all_points_until_there_is_a_plan(
-    write_sweep, check, folder, monkeypatch
-):
+def test_shards_of_a_wrong_sweep_do_not_wait_for_each_other(folder, other):
+    """Once the first one is refused. Else each of hundred shards would wait for all the others."""
+    waited = []
+
+    def wait_once():
+        assert waited == []
+        waited.append(1)
+
+    with lock_plan(folder, other.close), lock_plan(folder, wait_once):
+        assert waited == [1]
+
+
+def test_without_locks_no_shard_waits(write_sweep, check, folder, monkeypatch, other):
     def refuse(file, how):
         raise OSError(errno.ENOLCK, "refused")
 
     path = write_sweep()
     monkeypatch.setattr(fcntl, "flock", refuse)
-    with lock_plan(folder):
-        assert check(path, 2)[1] == 4
+    assert check(path, 2, wait=pytest.fail)[1] == 4
     assert check(path, 3)[1] == 1
 
 
