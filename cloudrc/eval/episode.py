@@ -264,7 +264,8 @@ def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask:
         if isfinite(about["action_age"]) and not about["held"]:
             now = steps - 1 - round(about["action_age"] / world.dt)
             if before is not None and now != basis:
-                jumps.append(float(np.linalg.norm(np.subtract(witness.action, before))))
+                jump = np.subtract(witness.action, before, dtype=float)  # they may be booleans
+                jumps.append(float(np.linalg.norm(jump)))
             basis = now
         before = witness.action
         success = _success(success, world.world_info)

@@ -421,6 +421,19 @@ def test_only_actions_that_are_no_reals_may_be_booleans(law):
         play(Episode(None, "newest", 1), EvalSetup("Pendulum-v1", path), {})
 
 
+def test_the_jump_between_two_choices_that_are_booleans_is_1(law, tmp_path):
+    executor = tmp_path / "switch.py"
+    executor.write_text(
+        "from cloudrc.gym.executors.newest import Newest\n"
+        "class Switch(Newest):\n"
+        "    def action(self, tick):\n"
+        "        return bool(super().action(tick)) ^ bool(tick % 2)\n"
+        "build = Switch\n"
+    )
+    row = play(Episode(None, str(executor), 1), EvalSetup("CartPole-v1", law(), max_steps=9), {})
+    assert 0.0 < row["numbers"]["seam_jump"] <= 1.0
+
+
 def test_the_map_makes_the_policys_observation(tmp_path):
     path = tmp_path / "map.yaml"
     path.write_text("observation/state: robot.pose\nprompt: {value: go}\nall: .\n")
