@@ -30,7 +30,7 @@ NEEDED = {
 """Flag of MuJoCo that a scene must not disable -> its bit: without contacts, for example, robots
 fly through walls."""
 MARGIN_MAX = 0.001
-"""Largest distance at which a contact may push [m]: below the accuracy of a clearance."""
+"""Largest `margin` and `gap` of a geom [m]: below the accuracy of a clearance."""
 INSIDE_MAX = 0.001
 """Largest depth by which a robot may start inside the floor [m]; the floor pushes it out gently."""
 FUSES_WRONG = tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 11)
@@ -241,19 +241,33 @@ def _check_parts(model: Any, robot_path: Path, scene_path: Path) -> None:
 
 
 def _check_margins(model: Any, robot_path: Path, scene_path: Path) -> None:
-    """Refuse contacts that push at a distance: every clearance would be too large."""
-    text = f"so that contacts push more than {MARGIN_MAX * 1e3:g} mm away from it; remove margin"
-    reach = model.geom_margin - model.geom_gap
+    """Refuse contacts that begin at a distance from the surface: clearances would be wrong.
+
+    Before MuJoCo 3.9 a contact pushes from `margin` - `gap`, since then from `margin`. A model
+    with neither flies alike in all versions.
+    """
+    text = (
+        f"so that contacts do not begin at the surface; remove both, or give at most {MARGIN_MAX}"
+    )
     touchable = (model.geom_contype | model.geom_conaffinity) > 0
-    for geom in np.flatnonzero((reach > MARGIN_MAX) & touchable)[:1]:
+    for geom in np.flatnonzero(_is_off(model.geom_margin, model.geom_gap) & touchable)[:1]:
         body = bodies_of_geoms(model)[geom]
         where = f"{scene_path}: body {body}" if body else f"{robot_path}: the robot"
-        raise BadInputError(f"{where} has a geom with margin {model.geom_margin[geom]:g}, {text}")
-    if (model.pair_margin - model.pair_gap > MARGIN_MAX).any():
-        raise BadInputError(f"{robot_path} in {scene_path}: a pair has a margin, {text}")
+        numbers = f"margin {model.geom_margin[geom]:g} and gap {model.geom_gap[geom]:g}"
+        raise BadInputError(f"{where} has a geom with {numbers}, {text}")
+    if _is_off(model.pair_margin, model.pair_gap).any():
+        raise BadInputError(f"{robot_path} in {scene_path}: a pair has a margin or gap, {text}")
     is_overriding = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE
-    if is_overriding and model.opt.o_margin > MARGIN_MAX:
-        raise BadInputError(f"{scene_path}: option o_margin is {model.opt.o_margin:g}, {text}")
+    if is_overriding and abs(model.opt.o_margin) > MARGIN_MAX:
+        raise BadInputError(
+            f"{scene_path}: option o_margin is {model.opt.o_margin:g}, so that contacts do not "
+            "begin at the surface; remove it"
+        )
+
+
+def _is_off(margins: Array, gaps: Array) -> Any:
+    """Return for each geom whether its contacts may begin at a distance from its surface."""
+    return np.maximum(np.abs(margins), np.abs(gaps)) > MARGIN_MAX
 
 
 def _check_bits(model: Any, robot_path: Path, scene_path: Path) -> None:

@@ -139,16 +139,10 @@ def test_each_geom_has_the_name_of_its_body_and_the_robot_none(tmp_path):
         ("scene", "<option ", '<option><flag contact="disable"/></option><option ',
                   "option flag contact is disabled"),
         ("scene", '<body name="floor">', "<body>", "needs a body named floor"),
-        ("scene", '<body name="floor">', '<body name="a"><geom size=".1" margin=".3"/></body>'
-                   '<body name="floor">', "body a has a geom with margin 0.3, so"),
-        ("scene", '<body name="floor">', '<body name="a"><geom size=".1" margin=".3" gap=".1"/>'
-                   '</body><body name="floor">', "body a has a geom with margin 0.3, so"),
-        ("scene", "<option ", '<default><geom margin=".02"/></default><option ',
-                  "has a geom with margin 0.02, so"),
         ("scene", "<option ", '<option o_margin=".3"><flag override="enable"/></option><option ',
                   "option o_margin is 0.3, so"),
         ("robot", 'size=".05 .05 .10"', 'size=".05 .05 .10" margin=".3"',
-                  "the robot has a geom with margin 0.3, so"),
+                  "the robot has a geom with margin 0.3 and gap 0, so"),
         ("robot", 'size=".05 .05 .10"', 'size=".05 .05 .10" contype="2" conaffinity="2"',
                   "has contype 2 and conaffinity 2, so that it never meets body floor of"),
     ],
@@ -215,16 +209,47 @@ print(model.opt.timestep, model.opt.density)
     assert (done.stdout, done.stderr) == ("0.002 0.0\n", "")
 
 
-def test_margins_that_make_no_contact_push_are_flown(tmp_path):
+def scene_with(tmp_path, geom, default=""):
+    """Return a world whose scene has a body a, its geom with the attributes `geom`."""
     path, good = tmp_path / "mine.xml", FILES["scene"].read_text()
-    for geom in (
-        'margin=".001"',
-        'margin=".3" gap=".3"',
-        'margin=".3" contype="0" conaffinity="0"',
-    ):
-        body = f'<body name="a" pos="9 9 9"><geom size=".1" {geom}/></body>'
-        path.write_text(good.replace("</worldbody>", f"{body}</worldbody>"))
-        check_robot(World(**(SHIPPED | {"scene": str(path)})))
+    body = f'<body name="a" pos="9 9 9"><geom size=".1" {geom}/></body></worldbody>'
+    good = good.replace("</worldbody>", body)
+    path.write_text(good.replace("<option ", f"<default><geom {default}/></default><option "))
+    return World(**(SHIPPED | {"scene": str(path)}))
+
+
+@pytest.mark.parametrize(
+    ("geom", "message"),
+    [
+        ('margin=".3"', "margin 0.3 and gap 0, so"),
+        ('margin=".3" gap=".1"', "margin 0.3 and gap 0.1, so"),
+        ('margin=".3" gap=".3"', "margin 0.3 and gap 0.3, so"),
+        ('gap=".02"', "margin 0 and gap 0.02, so"),
+        ('margin="-.02"', "margin -0.02 and gap 0, so"),
+    ],
+)
+def test_contacts_that_begin_at_a_distance_are_refused(tmp_path, geom, message):
+    """What a gap takes from a margin depends on MuJoCo's version."""
+    with pytest.raises(BadInputError, match=f"body a has a geom with {message}"):
+        check_robot(scene_with(tmp_path, geom))
+    with pytest.raises(BadInputError, match=f"has a geom with {message}"):
+        check_robot(scene_with(tmp_path, "", default=geom))
+
+
+def test_a_pair_of_the_robot_with_a_margin_is_refused(tmp_path):
+    path, text = tmp_path / "robot.xml", find_robot("x2").model.read_text()
+    parts = '<geom name="p" size=".01"/><body><geom name="q" size=".01"/><joint/></body>'
+    pair = '<contact><pair geom1="p" geom2="q" margin=".1" gap=".1"/></contact></mujoco>'
+    text = re.sub("(<freejoint[^>]*/>)", rf"\1{parts}", text, count=1)
+    path.write_text(text.replace("</mujoco>", pair))
+    with pytest.raises(BadInputError, match="a pair has a margin or gap"):
+        model_of(str(path), "empty")
+
+
+def test_margins_that_change_no_contact_are_flown(tmp_path):
+    """Published robots often have a margin of 1 mm."""
+    for geom in ('margin=".001" gap=".001"', 'margin=".3" contype="0" conaffinity="0"'):
+        check_robot(scene_with(tmp_path, geom))
 
 
 @pytest.mark.parametrize(
