@@ -6,6 +6,11 @@ import errno
 
 DISK_FULL = {errno.ENOSPC: "disk full", errno.EDQUOT: "disk quota used up"}
 """Error number (errno) of a full disk -> text for the user."""
+TOO_MANY_FILES = {
+    errno.EMFILE: "raise 'ulimit -n', the limit of one process",
+    errno.ENFILE: "end other programs, the limit is that of the machine",
+}
+"""Error number (errno) of a limit of open files and connections -> what to do."""
 TEXT_MAX = 2000
 """Largest length of another program's text in a message [characters]; the rest is cut off."""
 
@@ -105,7 +110,8 @@ def machine_error(error: BaseException) -> MissingPrerequisiteError | None:
             return DiskFullError(str(error.filename or "a file"))
         where = f"{error.filename}: " if error.filename else ""
         text = to_one_line(f"{where}{error.strerror or error}")
-        return MissingPrerequisiteError(f"{text}; check disk, path and permissions")
+        remedy = TOO_MANY_FILES.get(error.errno or 0, "check disk, path and permissions")
+        return MissingPrerequisiteError(f"{text}; {remedy}")
     if isinstance(error, MemoryError) or tells_no_memory(describe_error(error)):
         return MissingPrerequisiteError(
             f"memory ran out ({describe_error(error)}); use fewer processes, or free some memory"

@@ -11,9 +11,9 @@ from cloudrc.cli.output import STDOUT, TABLE, discard_output, end_output, reserv
 from cloudrc.cli.parser import build_parser
 from cloudrc.errors import (
     DISK_FULL,
+    TOO_MANY_FILES,
     BadInputError,
     CloudrcError,
-    DiskFullError,
     InterruptedRunError,
     machine_error,
 )
@@ -79,13 +79,12 @@ def _dispatch(given: Sequence[str]) -> int:
 def _explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, CloudrcError):
         return str(error).rstrip(), error.exit_code  # one line, or one per wrong key
-    if isinstance(error, OSError):
-        where = f"{error.filename}: " if error.filename else ""
-        if error.errno in DISK_FULL:
-            full = DiskFullError(str(error.filename or "a file"))
-            return str(full), full.exit_code
-        remedy = "check the path, and whether you have access to it ('--debug' shows where)"
-        return f"{where}{error.strerror or error}; {remedy}", BadInputError.exit_code
+    if isinstance(error, OSError) and error.errno not in (*DISK_FULL, *TOO_MANY_FILES):
+        text, remedy = str(error.strerror or error), "'--debug' shows where"
+        if error.filename:
+            text = f"{error.filename}: {text}"
+            remedy = f"check the path, and whether you have access to it ({remedy})"
+        return f"{text}; {remedy}", BadInputError.exit_code
     lacking = name_extra(error) if isinstance(error, ModuleNotFoundError) else None
     if failure := lacking or machine_error(error):
         return str(failure), failure.exit_code

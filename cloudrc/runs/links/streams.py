@@ -8,6 +8,7 @@ import socket
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 from statistics import quantiles
 from typing import Any
@@ -56,6 +57,12 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
         stack.callback(live.close)
         family, to = _find(settings.to)
         listening = stack.enter_context(_listen(settings.listen))
+        where = show_address(listening.getsockname()[:2])
+        if _is_same(listening.getsockname(), to):
+            raise BadInputError(
+                f"--to {show_address(settings.to)}: this is the relay's own address, --listen"
+                f" {where}; name the server's host and port"
+            )
         now_ns = time.monotonic_ns()
         up, down = (
             Medium(live.profiles[way], settings.seed, way == "uplink", now_ns) for way in DIRECTIONS
@@ -74,7 +81,6 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
         live.serve(relay.changes.append, follow, changed)
         settle()
         tighten_slack()
-        where = show_address(listening.getsockname()[:2])
         with contextlib.suppress(KeyboardInterrupt):
             tell(f"{where} leads to {show_address(settings.to)}; link: {live.cause}")
             while True:
@@ -110,6 +116,27 @@ def _find(to: Address) -> tuple[int, tuple[str, int]]:
     # A server rarely listens at ::1 alone, but localhost often names it first.
     family, _, _, _, address = min(found, key=lambda one: one[0] != socket.AF_INET)
     return int(family), (str(address[0]), int(address[1]))
+
+
+def _is_same(listen: tuple[Any, ...], to: tuple[str, int]) -> bool:
+    """Return whether a connection to `to` reaches the socket that listens at `listen`."""
+    here, there = ip_address(listen[0]), ip_address(to[0])
+    there = getattr(there, "ipv4_mapped", None) or there
+    if (listen[1], here.version) != (to[1], there.version):
+        return False
+    if there.is_unspecified:  # the kernel connects to this machine
+        there = ip_address("127.0.0.1" if there.version == 4 else "::1")
+    return here == there or (here.is_unspecified and _is_of_machine(there))
+
+
+def _is_of_machine(address: IPv4Address | IPv6Address) -> bool:
+    family = socket.AF_INET if address.version == 4 else socket.AF_INET6
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((str(address), 0))
+        except OSError:
+            return False
+    return True
 
 
 def _summary(relay: StreamRelay) -> dict[str, Any]:
