@@ -9,6 +9,8 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 from cloudrc.cli.cluster_flags import release_arguments
@@ -145,19 +147,32 @@ def show(options: argparse.Namespace) -> int:
     if output.suffix[1:] not in PICTURES:
         raise BadInputError(f"-o {output}: not a picture; end its name in .png, .svg or .pdf")
     refuse_other_file(output, PICTURES[output.suffix[1:]])
+    from cloudrc.cli.progress import StepView
+
+    with closing(StepView(sys.stderr, f"reads {options.profile}")) as view:
+        title, text, picture = _drawn(options, output.suffix[1:], view.tell)
+    with naming(output):
+        output.write_bytes(picture)
+    print(title)
+    print(text)
+    print_line(str(output))
+    return 0
+
+
+def _drawn(
+    options: argparse.Namespace, kind: str, see: Callable[[str], None]
+) -> tuple[str, str, bytes]:
+    """Return title, statistics and picture of a profile; `see` gets each step of the work."""
     from cloudrc.report.figures.link import render_link
     from cloudrc.runs.links.sample import SampleSettings, sample_profile, statistics_table
 
     settings = settings_from(options, SampleSettings)
     about, ways = sample_profile(
-        options.profile, settings, lambda text: print_line(f"cloudrc: {text}", sys.stderr)
+        options.profile, settings, lambda text: print_line(f"cloudrc: {text}", sys.stderr), see
     )
+    see("draws the picture")
     title = escape(": ".join(filter(None, (Path(options.profile).stem, about))))
     samples = [sample for sample, _ in ways.values()]
-    picture = render_link(title, samples[0], samples[1] if samples[1:] else None, output.suffix[1:])
-    with naming(output):
-        output.write_bytes(picture)
-    print(title)
-    print(statistics_table({name: numbers for name, (_, numbers) in ways.items()}))
-    print_line(str(output))
-    return 0
+    picture = render_link(title, samples[0], samples[1] if samples[1:] else None, kind)
+    text = statistics_table({name: numbers for name, (_, numbers) in ways.items()})
+    return title, text, picture

@@ -128,6 +128,14 @@ def test_a_profile_is_drawn_and_its_statistics_printed(folder, call):
     assert (folder / "a.svg").read_bytes() == first, "the same link gives the same picture"
 
 
+def test_a_picture_of_many_packets_says_what_it_does(folder, call, monkeypatch):
+    monkeypatch.setattr("cloudrc.cli.progress.FIRST_WAIT", 0.02)
+    monkeypatch.setattr("cloudrc.cli.progress.PERIOD", 0.02)
+    said = call("link show lossy --packets 30000").err
+    assert "sends 30000 packets through the uplink (" in said
+    assert "sends 30000 packets through the downlink (" in said
+
+
 def test_a_trace_is_shown_row_by_row_whatever_its_span(folder, call):
     """Its time is Unix time; a row in a year would be 3 billion packets at 100 Hz."""
     rows = [f"{1_700_000_000 + n / 100},{40 + n % 7},{int(n % 10 == 0)}" for n in range(500)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from math import isnan, nan
 from pathlib import Path
 from statistics import fmean
@@ -46,12 +45,12 @@ class SampleSettings:
 
 
 def sample_profile(
-    name: str, settings: SampleSettings, tell: Tell
+    name: str, settings: SampleSettings, tell: Tell, see: Tell = lambda text: None
 ) -> tuple[str, dict[str, tuple[DirectionSample, Numbers]]]:
     """Simulate both directions of a profile, or the one of a trace.
 
     Return the description; and direction -> packets for the figure, and statistics. `tell` receives
-    a warning about a doubtful trace.
+    a warning about a doubtful trace, `see` the present step of the work.
     """
     for key, value in asdict(settings).items():
         least, most = RANGES[key]
@@ -59,7 +58,7 @@ def sample_profile(
             raise BadInputError(f"--{key} {value:g}: give a number from {least} to {most}")
     profile, is_trace = _profile(name)
     ways = ("uplink",) if is_trace else ("uplink", "downlink")
-    samples = {way: _way(getattr(profile, way), way, settings, tell) for way in ways}
+    samples = {way: _way(getattr(profile, way), way, settings, tell, see) for way in ways}
     return profile.description, samples
 
 
@@ -76,14 +75,19 @@ def _profile(name: str) -> tuple[Profile, bool]:
 
 
 def _way(
-    asked: DirectionConfig, name: str, settings: SampleSettings, tell: Tell
+    asked: DirectionConfig, name: str, settings: SampleSettings, tell: Tell, see: Tell
 ) -> tuple[DirectionSample, Numbers]:
     """Simulate one direction of the link; return the packets for the figure, and statistics.
 
     If the conditions are constant, the statistics come from more packets than the figure shows.
     """
     profile = link_profile(asked)
-    timeline, send = Timeline(profile), partial(_send, profile, name == "uplink", settings.seed)
+    timeline = Timeline(profile)
+
+    def send(sent_ns: Sequence[int]) -> Stream:
+        see(f"sends {len(sent_ns)} packets through the {name}")
+        return _send(profile, name == "uplink", settings.seed, sent_ns)
+
     period_ns = round(1e9 / settings.rate)
     if profile.rows is not None and settings.seconds is None:
         shown = send(_row_times(profile.rows))
