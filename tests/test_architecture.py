@@ -83,8 +83,8 @@ MAY_IMPORT: dict[str, set[str]] = {
         *("teleop", "tunnel", "warnings", "world"),
     },
     "gym": {
-        *("assembly", "cloud", "config", "drivers", "endpoint", "link", "plugins", "record"),
-        *("report", "runs"),
+        *("assembly", "cloud", "config", "drivers", "endpoint", "link", "metrics", "plugins"),
+        *("record", "report", "runs"),
     },
     "eval": {
         *("config", "files", "gym", "link", "plugin_file", "plugins", "policy"),

@@ -7,6 +7,7 @@ bit by bit, that of a flight whose controller sends the same commands.
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping
 from contextlib import suppress
 from math import dist
@@ -16,6 +17,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from cloudrc import metrics
 from cloudrc.assembly import assemble, build_links, flight_limit
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.loop import ControlLoop
@@ -158,15 +160,16 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         loaded = load_experiment(
             experiment, [f"{key}={json.dumps(value, default=str)}" for key, value in texts.items()]
         )
-        self._experiment = loaded.model_copy(update={"link": Link(profile="ideal")})
-        guard = self._experiment.guard
-        axes = PLANE if is_planar(self._experiment.world.robot) else SPACE
+        self.experiment = loaded.model_copy(update={"link": Link(profile="ideal")})
+        metrics.check(self.experiment.report.metrics)
+        guard = self.experiment.guard
+        axes = PLANE if is_planar(self.experiment.world.robot) else SPACE
         self._parts = (*axes, "yaw rate")
         most = np.array([guard.speed_max_mps] * len(axes) + [guard.yaw_rate_max_radps])
         self.action_space = spaces.Box(-most, most, dtype=np.float64)
         self.observation_space = spaces.Box(-np.inf, np.inf, (17,), dtype=np.float64)
-        self.dt = 1.0 / self._experiment.cloud.command_rate_hz
-        self._limit_ns = flight_limit(self._experiment) * 1e9
+        self.dt = 1.0 / self.experiment.cloud.command_rate_hz
+        self._limit_ns = flight_limit(self.experiment) * 1e9
         self.flight: _Flight | None = None
 
     def reset(
@@ -175,7 +178,7 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         """Begin a flight; return when the cloud is about to send its first command."""
         super().reset(seed=seed)
         own = int(self.np_random.integers(SEED_MAX)) if seed is None else seed
-        experiment = self._experiment.model_copy(update={"seed": own})
+        experiment = self.experiment.model_copy(update={"seed": own})
         first, periods = _Flight(experiment), 0
         while first.policy.setpoint is None:
             first.step()
@@ -230,7 +233,11 @@ class RobotEnv(gymnasium.Env[Any, Any]):
     def _judge(self, flight: _Flight) -> dict[str, Any]:
         """Judge the flight as its report does."""
         recording, run = Recording(records=flight.store), Run("virtual", "virtual")
-        found = assess(recording, flight.experiment, run)
+        own = flight.experiment.report.metrics
+        found = assess(recording, flight.experiment, run, own)
+        for note in found.notes:
+            if note.startswith(metrics.METRIC_NOTE):
+                warnings.warn(note, stacklevel=3)
         return {
             "verdict": found.verdict.outcome,
             "failures": [failure.code for failure in found.verdict.failures],

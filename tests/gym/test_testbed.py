@@ -68,6 +68,24 @@ def test_gymnasium_accepts_a_robot():
     check_env(gymnasium.make("cloudrc/Steps-v0").unwrapped, skip_render_check=True)
 
 
+def test_the_numbers_have_the_experiments_own_metrics_and_a_failing_one_is_a_warning(tmp_path):
+    (tmp_path / "mine.py").write_text("UNIT = 's'\ndef measure(flight):\n    return 1.5\n")
+    (tmp_path / "odd.py").write_text("UNIT = 's'\ndef measure(flight):\n    return 1 / 0\n")
+    own = {"report.metrics": [str(tmp_path / "mine.py"), str(tmp_path / "odd.py")]}
+    env = gymnasium.make("cloudrc/Steps-v0", settings=own).unwrapped
+    env.reset(seed=1)
+    with pytest.warns(UserWarning, match="metric odd failed"):
+        info = env._judge(env.flight)
+    assert info["numbers"]["mine"] == 1.5
+    assert "odd" not in info["numbers"]
+
+
+def test_an_own_metric_without_a_file_is_refused(tmp_path):
+    settings = {"report.metrics": [str(tmp_path / "missing.py")]}
+    with pytest.raises(BadInputError, match=r"metric '.*missing\.py': there is no such file"):
+        gymnasium.make("cloudrc/Steps-v0", settings=settings)
+
+
 def test_an_action_of_a_robot_on_the_ground_has_no_vertical_velocity():
     env = gymnasium.make("cloudrc/Steps-v0", experiment="pillars").unwrapped
     assert env.action_space.shape == (3,)
