@@ -268,7 +268,8 @@ def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask:
                 jumps.append(float(np.linalg.norm(jump)))
             basis = now
         before = witness.action
-        success = _success(success, world.world_info)
+        if setup.success_at is None:
+            success = _success(success, world.world_info)
         if terminated or truncated:
             told = about["episode"]
             break
@@ -317,8 +318,13 @@ def _times(setup: EvalSetup) -> Callable[[int, float], float | None]:
 def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
     """Return whether the task was done in any step so far; None if the info never told."""
     for key in SUCCESS:
-        if info.get(key) is not None:
+        if info.get(key) is None:
+            continue
+        try:
             known = _flag_of(info[key], f"info['{key}']") or bool(known)
+        except InvalidResultError as error:
+            text = f"{error}; say with --success-at which return is a success"
+            raise InvalidResultError(text) from None
     return known
 
 

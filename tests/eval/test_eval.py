@@ -232,6 +232,15 @@ def test_a_return_that_equals_the_limit_up_to_rounding_is_a_success(law, least, 
     assert play(Episode(None, "newest", 1), setup, {})["verdict"] == verdict
 
 
+def test_a_share_in_the_info_is_no_success_and_does_not_count_beside_a_limit(law, monkeypatch):
+    told = {"success": 0.5}
+    monkeypatch.setattr(Task, "step", lambda env, _: (env.reset()[0], 1.0, True, False, told))
+    with pytest.raises(BadInputError, match=r"float 0\.5, .*--success-at"):
+        play(Episode(None, "newest", 1), EvalSetup("Task-v0", law(STILL)), {})
+    setup = EvalSetup("Task-v0", law(STILL), success_at=1.0)
+    assert play(Episode(None, "newest", 1), setup, {})["verdict"] == "success"
+
+
 class Seeing(Task):
     """Has an image of 1 MB, 0.8 s on the 10 Mbit/s of the profile lte."""
 
