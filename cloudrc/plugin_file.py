@@ -206,39 +206,40 @@ def _package_of(module: str) -> str:
 sys.meta_path.insert(0, _Finder())  # before the finder of paths
 
 
-def sources(path: Path) -> list[Path]:
+def sources(path: Path, folders: list[str] | None = None) -> list[Path]:
     """Return the file of a plug-in and all files beside it that it names.
 
-    It names modules in its import statements, and data files as texts, such as "gains.json".
+    It names modules in its import statements, and data files as texts, such as "gains.json". For a
+    file that is no plug-in, `folders` are the places of modules.
     """
     file = path.resolve()
     found, left = {file: path}, [file]
     while left:
-        for other in _named(left.pop(), file.parent):
+        for other in _named(left.pop(), folders or [str(file.parent)]):
             if other not in found:
                 found[other] = other
                 left.append(other)
     return list(found.values())
 
 
-def _named(file: Path, folder: Path) -> Iterator[Path]:
-    """Yield the files that the source `file` names: modules in `folder`, data files beside it."""
+def _named(file: Path, folders: list[str]) -> Iterator[Path]:
+    """Yield the files that the source `file` names: modules in `folders`, data files beside it."""
     try:
         nodes = [*ast.walk(ast.parse(file.read_bytes()))] if file.suffix == ".py" else []
     except (OSError, SyntaxError, ValueError, RecursionError):
         return
     for node in nodes:
-        yield from _named_by(node, file, folder)
+        yield from _named_by(node, file, folders)
 
 
-def _named_by(node: ast.AST, file: Path, folder: Path) -> Iterator[Path]:
+def _named_by(node: ast.AST, file: Path, folders: list[str]) -> Iterator[Path]:
     """Yield the files that one node of the syntax tree of `file` names."""
     match node:
         case ast.Import(names=names):
             for alias in names:
-                yield from _files(folder, alias.name)
+                yield from _files(folders, alias.name)
         case ast.ImportFrom(module=module, names=names, level=level):
-            above = [*file.parents][:level][-1] if level else folder
+            above = [str([*file.parents][:level][-1])] if level else folders
             for alias in names:
                 yield from _files(above, f"{module or ''}.{alias.name}".lstrip("."))
         case ast.Constant(value=str(text)):
@@ -247,9 +248,9 @@ def _named_by(node: ast.AST, file: Path, folder: Path) -> Iterator[Path]:
                 yield Path(data).resolve()
 
 
-def _files(folder: Path, name: str) -> Iterator[Path]:
+def _files(folders: list[str], name: str) -> Iterator[Path]:
     """Yield the files of a module and of the packages that contain it, as far as they exist."""
-    places: list[str] | None = [str(folder)]
+    places: list[str] | None = folders
     for part in name.split("."):
         spec = PathFinder.find_spec(part, places) if places and part != OWN else None
         if spec is None:

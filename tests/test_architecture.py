@@ -135,7 +135,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "matplotlib": ("report/",),
     "viser": ("console/", "report/replay"),
     "foxglove": ("processes/foxglove_live",),
-    "gymnasium": ("gym/", "eval/episode"),
+    "gymnasium": ("gym/", "eval/environment", "eval/episode"),
     "mcap": ("record/",),
     "rosbags": ("record/",),
     "kubernetes": ("cluster/",),

@@ -30,7 +30,8 @@ examples:
 
 law.py has a function infer(observation), as for 'cloudrc policy serve'. The
 environment and its packages are yours. Each condition has the same seeds. With
---out DIR of an earlier call, only missing episodes are played."""
+--out DIR of an earlier call, only missing episodes are played, and those whose
+files have changed."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -91,12 +92,12 @@ def execute(options: argparse.Namespace) -> int:
 
     setup, episodes = _read(options)
     with closing(StepView(sys.stderr, f"makes the environment {setup.env}")):
-        dt = check_environment(setup, episodes)
+        dt, code = check_environment(setup, episodes)
         seeded = follows_seed(setup)
     if slow := slow_answers(setup, dt):
         print_line(f"cloudrc: warning: {slow}", sys.stderr)
+    setup = replace(setup, follows_seed=seeded, env_code=code)
     if not seeded:
-        setup = replace(setup, follows_seed=False)
         print_line(f"cloudrc: warning: --env {setup.env}: {results.SEEDLESS}", sys.stderr)
     folder = options.out
     if folder is None or not results.is_begun(folder):

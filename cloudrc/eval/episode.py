@@ -17,6 +17,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.eval.environment import environment_code
 from cloudrc.eval.setup import (
     FILE,
     MEASURED,
@@ -328,8 +329,8 @@ def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
     return known
 
 
-def check_environment(setup: EvalSetup, episodes: list[Episode]) -> float:
-    """Return the time of a step [s].
+def check_environment(setup: EvalSetup, episodes: list[Episode]) -> tuple[float, str]:
+    """Return the time of a step [s], and the hash of the environment's code and files.
 
     Raise a BadInputError if environment, policy file or executors cannot be used.
 
@@ -337,11 +338,12 @@ def check_environment(setup: EvalSetup, episodes: list[Episode]) -> float:
     """
     with make_env(setup, 1) as env:
         width_of(env.action_space)
+        code = environment_code(env, setup)
         for executor in dict.fromkeys(each.executor for each in episodes):
             world = Networked(env, dt=setup.dt, chunk=1, executor=executor)
     if not setup.is_remote:
         _load(setup.policy)
-    return world.dt
+    return world.dt, code
 
 
 def follows_seed(setup: EvalSetup) -> bool:

@@ -9,6 +9,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
+from cloudrc.config.reuse import reuse_results
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.eval.episode import play
 from cloudrc.eval.setup import Episode, EvalSetup
@@ -82,7 +83,9 @@ def play_missing(
             "folder with --out"
         )
     write(folder, setup, [])
-    missing = [each for each in episodes if each.key(identity) not in rows]
+    with reuse_results():  # the code of an executor is that of all its episodes
+        keys = [each.key(identity) for each in episodes]
+    missing = [each for each, key in zip(episodes, keys, strict=True) if key not in rows]
     # A server may serve one episode at a time.
     jobs = 1 if setup.is_remote else jobs
     played = map_in_order(partial(play, setup=setup, identity=identity), missing, jobs)
@@ -98,7 +101,6 @@ def play_missing(
             see(len(episodes) - left)
 
         stopped = take_each(played, take)
-    keys = [each.key(identity) for each in episodes]
     return [rows[key] for key in keys if key in rows], stopped
 
 

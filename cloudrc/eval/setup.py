@@ -13,6 +13,7 @@ from statistics import fmean
 from typing import Any, TypeAlias
 
 from cloudrc.config.document import parse_value, read_document
+from cloudrc.config.reuse import reuse
 from cloudrc.errors import BadInputError
 from cloudrc.link.library import LinkProfile, read_profile
 from cloudrc.link.profile import DirectionProfile
@@ -21,6 +22,7 @@ from cloudrc.plugin_file import sources
 from cloudrc.plugins import is_path
 from cloudrc.policy.address import check_url
 from cloudrc.policy.observation import Mapped
+from cloudrc.runs.installed import plugin_code
 from cloudrc.text import parse_number
 
 Compute: TypeAlias = float | tuple[float, float] | tuple[str, str]
@@ -50,6 +52,7 @@ class EvalSetup:
     max_steps: int = 10_000  # longest episode
     observation_bytes: int | None = None  # of an observation on the wire; None: that of its arrays
     follows_seed: bool = True  # whether equal seeds give equal episodes
+    env_code: str = ""  # hash of the environment's code and files
 
     @property
     def is_remote(self) -> bool:
@@ -70,11 +73,10 @@ class EvalSetup:
         """Return all that the result of an episode depends on, but its condition and seed."""
         told = asdict(self)
         if not self.is_remote:
-            told["policy"] = _hash_of(sources(Path(self.policy)))
-        if is_path(self.link):
-            told["link"] = _hash_of([Path(self.link)])
+            told["policy"] = hash_of(sources(Path(self.policy)))
+        told["link"] = _code_of_link(read_profile(self.link))
         if isinstance(self.compute, tuple) and self.compute[0] == FILE:
-            told["compute"] = _hash_of([Path(str(self.compute[1]))])
+            told["compute"] = hash_of([Path(str(self.compute[1]))])
         return told
 
 
@@ -93,16 +95,28 @@ class Episode:
 
     def key(self, identity: Mapping[str, Any]) -> str:
         """Return the name of the row: equal keys mean equal episodes."""
-        own = _hash_of([Path(self.executor)]) if is_path(self.executor) else ""
+        own = reuse(("executor", self.executor), self._executor_code)
         text = json.dumps([identity, self.point, own, self.seed], sort_keys=True, default=str)
         return sha256(text.encode()).hexdigest()[:16]
 
+    def _executor_code(self) -> str:
+        if is_path(self.executor):
+            return hash_of(sources(Path(self.executor)))
+        return plugin_code("executors", self.executor)
 
-def _hash_of(files: list[Path]) -> str:
+
+def hash_of(files: list[Path]) -> str:
+    """Return the hash of names and contents of files."""
     total = sha256()
     for path in sorted(files):
         total.update(f"{path.name}\n{sha256(path.read_bytes()).hexdigest()}\n".encode())
     return total.hexdigest()
+
+
+def _code_of_link(link: LinkProfile) -> str:
+    """Return the hash of a profile with the contents of its files, wherever they are."""
+    ways = [replace(way, trace=None, table=None) for way in (link.uplink, link.downlink)]
+    return sha256(repr(ways).encode()).hexdigest()
 
 
 def check_setup(setup: EvalSetup) -> None:

@@ -160,7 +160,7 @@ def check(
             points.append(grid.resolve(choices))
             own_files = hash_all(points[-1])
             files |= own_files
-            everything = _everything(points[-1], own_files)
+            everything = everything_of(points[-1], own_files)
             for seed in grid.seeds:
                 key = _key(everything, seed)
                 if key in flights:
@@ -193,7 +193,7 @@ def read_flight(path: Path, point: Mapping[str, Any], seed: int) -> SweepPoint |
             return None
         choices.append(found[0])
     resolved = grid.resolve(choices)
-    everything = _everything(resolved, hash_all(resolved))
+    everything = everything_of(resolved, hash_all(resolved))
     return SweepPoint(_key(everything, seed), dict(point), seed, resolved)
 
 
@@ -228,7 +228,7 @@ def read_unchecked(
     return grid
 
 
-def _everything(point: ResolvedExperiment, files: Mapping[str, str]) -> bytes:
+def everything_of(point: ResolvedExperiment, files: Mapping[str, str]) -> bytes:
     """Return all that decides a flight, except its seed, as JSON; `files`: path -> hash."""
     code = {"cloudrc": source.code_hash(), "installed": installed_code(point)}
     everything = {**point.model_dump(mode="json"), **code, "files": files}
@@ -344,7 +344,7 @@ def unpack(path: Path) -> list[SweepPoint]:
         with reuse_results():
             for point, values in content["points"]:
                 resolved = ResolvedExperiment.model_validate_json(json.dumps(values))
-                points.append((point, resolved, _everything(resolved, hash_all(resolved))))
+                points.append((point, resolved, everything_of(resolved, hash_all(resolved))))
                 installed |= installed_code(resolved)
         _refuse_other_plugins(content["installed"], installed)
         chosen = ((*points[index], seed) for index, seed in content["flights"])

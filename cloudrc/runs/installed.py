@@ -33,11 +33,22 @@ def installed_code(point: ResolvedExperiment) -> dict[str, str]:
     chosen = [(kind, getattr(point.cloud, key).name) for key, kind in KINDS.items()]
     chosen += [("onboard", onboard.name)] if onboard else []
     chosen += [("metrics", name) for name in _packages_of("metrics")]
-    return {
-        f"{kind} {name}": reuse(("packages", tops), partial(_hash, tops))
-        for kind, name in chosen
-        if (tops := _packages_of(kind).get(name))
-    }
+    return {f"{kind} {name}": code for kind, name in chosen if (code := plugin_code(kind, name))}
+
+
+def plugin_code(kind: str, name: str) -> str:
+    """Return the hash of an installed plug-in; "" for a shipped one."""
+    tops = _packages_of(kind).get(name)
+    return reuse(("packages", tops), partial(_hash, tops)) if tops else ""
+
+
+def package_code(top: str) -> str:
+    """Return the hash of the files of a top-level package; of a too large one, of their sizes."""
+    try:
+        return _hash((top,))
+    except BadInputError:
+        sizes = sorted((name, path.lstat().st_size) for name, path in _files(top))
+        return sha256(repr(sizes).encode()).hexdigest()[:16]
 
 
 def _packages_of(kind: str) -> dict[str, tuple[str, ...]]:

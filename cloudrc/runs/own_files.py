@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from pathlib import Path
 
 from cloudrc import plugin_file
@@ -27,8 +27,13 @@ def hashes(path: str) -> list[tuple[str, str]]:
     needs = model_files if path.endswith(".xml") else plugin_file.sources
     return reuse(
         ("hashes", path),
-        lambda: [(str(file), sha256(file.read_bytes()).hexdigest()) for file in needs(Path(path))],
+        lambda: [(str(file), _hash_of(file)) for file in needs(Path(path))],
     )
+
+
+def _hash_of(file: Path) -> str:
+    with file.open("rb") as stream:  # a data set may be larger than the memory
+        return file_digest(stream, "sha256").hexdigest()
 
 
 def hash_all(experiment: ResolvedExperiment) -> dict[str, str]:

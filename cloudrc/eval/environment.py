@@ -1,0 +1,89 @@
+"""Hash the code and the files behind an environment, as far as its class and arguments tell."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+from cloudrc.config.load import ResolvedExperiment
+from cloudrc.eval.setup import EvalSetup, hash_of
+from cloudrc.plugin_file import OWN, sources
+from cloudrc.plugins import INSTALLED
+from cloudrc.runs.grid import everything_of
+from cloudrc.runs.installed import package_code
+from cloudrc.runs.own_files import hash_all, hashes
+
+
+def environment_code(env: gymnasium.Env[Any, Any], setup: EvalSetup) -> str:
+    """Return the hash of all that is known to decide how the environment of a setup behaves.
+
+    It is that of the modules of its classes, of the files in its arguments, and of the experiment
+    of a testbed's robot.
+    """
+    found = dict[str, Any]()
+    for name in sorted(_modules(env, setup)):
+        top = name.partition(".")[0]
+        file = getattr(sys.modules.get(name), "__file__", None)
+        if file is None or top == OWN or top in sys.stdlib_module_names:
+            continue
+        if not _is_installed(file):
+            found[name] = _local_code(name, Path(file))
+        elif top not in found:
+            found[top] = package_code(top)
+    for path in _files_in(dict(setup.env_args)):
+        found[path] = hashes(path)
+    experiment = getattr(env.unwrapped, "experiment", None)
+    if isinstance(experiment, ResolvedExperiment):
+        found["experiment"] = everything_of(experiment, hash_all(experiment)).decode()
+    return sha256(json.dumps(found, sort_keys=True).encode()).hexdigest()
+
+
+def _modules(env: gymnasium.Env[Any, Any], setup: EvalSetup) -> set[str]:
+    """Return the names of the modules that register, make and define an environment.
+
+    The packages that contain them are also modules.
+    """
+    module, colon, _ = setup.env.partition(":")
+    names = {module} if colon else set[str]()
+    entry: Any = getattr(env.spec, "entry_point", None)
+    names.add(
+        entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "")
+    )
+    layer: gymnasium.Env[Any, Any] = env
+    while isinstance(layer, gymnasium.Wrapper):
+        names |= {each.__module__ for each in type(layer).__mro__}
+        layer = layer.env
+    names |= {each.__module__ for each in type(layer).__mro__}
+    parts = [name.split(".") for name in names]
+    return {".".join(each[:count]) for each in parts for count in range(1, len(each) + 1)}
+
+
+def _local_code(name: str, file: Path) -> str:
+    """Return the hash of the `file` of a module and of the local modules that it imports."""
+    depth = name.count(".") + (file.stem == "__init__")
+    others = [each for each in sys.path if os.path.isdir(each) and not _is_installed(each)]
+    root = [*file.parents][: depth + 1][-1]  # of the top-level package
+    return hash_of(sources(file, [str(root), *others]))
+
+
+def _is_installed(path: str) -> bool:
+    inside = f"{path}{os.sep}".startswith(INSTALLED)
+    return inside or not {"site-packages", "dist-packages"}.isdisjoint(Path(path).parts)
+
+
+def _files_in(value: Any) -> Iterator[str]:
+    """Yield each text in the value of an argument that is the path of a file."""
+    if isinstance(value, str) and os.path.isfile(value):
+        yield value
+    elif isinstance(value, Mapping):
+        yield from _files_in([*value.values()])
+    elif isinstance(value, list):
+        for each in value:
+            yield from _files_in(each)
