@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.errors import BadInputError
+from cloudrc.runs.lock import claim_folder
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
@@ -26,20 +27,29 @@ def run_folder(experiment: ResolvedExperiment, mode: str, out: Path | None) -> P
     return new_folder(out, name, "" if mode == "cluster" else "latest")
 
 
-def new_folder(out: Path | None, name: str, link: str = "latest", *, flag: str = "--out") -> Path:
+def new_folder(
+    out: Path | None,
+    name: str,
+    link: str = "latest",
+    *,
+    flag: str = "--out",
+    is_shared: bool = False,
+) -> Path:
     """Make the folder of a run: `out`, or the next free `runs/<name>-<n>`.
 
     Without `out`, point the symbolic link `runs/<link>` to the new folder; "" for no link. Raise a
-    BadInputError if `out` exists and is not an empty folder, or if no folder can be made. `flag` is
-    the flag that gave `out`.
+    BadInputError if `out` exists and is not an empty folder, if another command has just chosen it,
+    or if no folder can be made. `flag` is the flag that gave `out`. With `is_shared`, other shards
+    may choose the folder, too.
     """
-    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise BadInputError(
-            f"{flag} {out}: already exists; name a new folder, runs are never overwritten"
-        )
     try:
         if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
+            with contextlib.suppress(FileExistsError):
+                out.mkdir(parents=True)
+            if not out.is_dir() or not claim_folder(out, is_shared=is_shared):
+                raise BadInputError(
+                    f"{flag} {out}: already exists; name a new folder, runs are never overwritten"
+                )
             return out
         RUNS.mkdir(exist_ok=True)
         for n in itertools.count(1):

@@ -1,4 +1,4 @@
-"""Lock the folder of a sweep, so that no flight is flown by two commands at the same time.
+"""Lock the folder of a run or sweep, so that no two commands write into it at the same time.
 
 A command that flies all flights locks the folder for itself; shards lock it together, and each its
 own number. The kernel releases the locks when a process ends. Nothing else opens the locked files:
@@ -8,6 +8,7 @@ on NFS, a process loses its lock when it closes any other handle of the file.
 from __future__ import annotations
 
 import fcntl
+import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -19,6 +20,27 @@ from cloudrc.errors import BadInputError
 LOCK = ".lock"
 """File that each command locks; the names of further locks begin so."""
 ALONE, TOGETHER = fcntl.LOCK_EX | fcntl.LOCK_NB, fcntl.LOCK_SH | fcntl.LOCK_NB
+CLAIMS_MAX = 16
+"""Number of the newest claims that a process holds."""
+_claims = list[int]()
+
+
+def claim_folder(folder: Path, *, is_shared: bool) -> bool:
+    """Return whether a folder is empty, and no other command is about to write into it.
+
+    With `is_shared`, other shards may be. The folder is locked until this process ends, or until it
+    has claimed `CLAIMS_MAX` others: by then it has written into the folder. The lock leaves no
+    file, so that a folder without a result can be used again. If the file system has no locks,
+    nothing is locked.
+    """
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    if not _try_lock(handle, TOGETHER if is_shared else ALONE) or os.listdir(handle):
+        os.close(handle)
+        return False
+    _claims.append(handle)
+    if len(_claims) > CLAIMS_MAX:
+        os.close(_claims.pop(0))
+    return True
 
 
 @contextmanager
@@ -70,13 +92,13 @@ def lock_plan(folder: Path, wait: Callable[[], None]) -> Iterator[None]:
         yield
 
 
-def _try_lock(file: IO[str], how: int) -> bool:
-    """Return whether no other process has locked a file, or whether there are no locks."""
+def _try_lock(file: IO[str] | int, how: int) -> bool:
+    """Return whether no other process has locked a file (or folder), or there are no locks."""
     try:
         fcntl.flock(file, how)
     except BlockingIOError:
         return False
-    except OSError:  # `lock_folder` has warned
+    except OSError:  # `lock_folder` warns
         pass
     return True
 

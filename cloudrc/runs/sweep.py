@@ -42,7 +42,7 @@ def open_folder(
     if out is not None and shard and not out.exists():
         out.mkdir(parents=True, exist_ok=True)  # another shard may be faster
     elif out is None or not store.is_begun(out):
-        out = new_folder(out, name, "latest-sweep")
+        out = new_folder(out, name, "latest-sweep", is_shared=bool(shard))
     folder = out
     with lock_folder(folder, shard, count) as warning:
         yield folder, warning

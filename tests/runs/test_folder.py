@@ -1,6 +1,14 @@
 """The folder of a run, and the link to the newest one."""
 
+import os
+import subprocess
+import sys
+
+import pytest
+
+from cloudrc.errors import BadInputError
 from cloudrc.runs.folder import new_folder
+from cloudrc.runs.lock import CLAIMS_MAX
 
 
 def test_a_copy_of_the_link_to_the_newest_run_stays_and_is_told(tmp_path, monkeypatch, caplog):
@@ -13,3 +21,36 @@ def test_a_copy_of_the_link_to_the_newest_run_stays_and_is_told(tmp_path, monkey
     second = new_folder(None, "hover")
     assert second != first
     assert "runs/latest is no link and stays as it is" in caplog.text
+
+
+CLAIM = """
+import sys
+from pathlib import Path
+from cloudrc.runs.folder import new_folder
+new_folder(Path(sys.argv[1]), "", is_shared=sys.argv[2:] == ["shared"])
+print("has it", flush=True)
+input()
+"""
+
+
+@pytest.mark.parametrize("shared", [[], ["shared"]])
+def test_only_one_of_two_commands_gets_a_folder_which_shards_share(shared, tmp_path):
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", CLAIM, str(out), *shared]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, **pipes) as first:
+        assert first.stdout.readline() == "has it\n"
+        with pytest.raises(BadInputError, match="already exists; name a new folder"):
+            new_folder(out, "")
+        if shared:
+            assert new_folder(out, "", is_shared=True) == out
+        first.communicate("\n")
+    if not shared:
+        assert new_folder(out, "") == out, "the first command has left nothing"
+
+
+def test_a_process_that_makes_many_folders_keeps_few_files_open(tmp_path):
+    before = len(os.listdir("/proc/self/fd"))
+    for number in range(3 * CLAIMS_MAX):
+        new_folder(tmp_path / str(number), "")
+    assert len(os.listdir("/proc/self/fd")) <= before + CLAIMS_MAX
