@@ -55,9 +55,7 @@ class FlownWorld:
                 hull = Hull(spheres, spheres)
             return FlownWorld(_scene(tree["scene"]), hull, bool(tree["planar"]))
         except _UNREADABLE as error:
-            raise BadInputError(
-                f"the recording's {FLOWN_FILE} is not readable; use the original recording"
-            ) from error
+            raise BadInputError(f"{FLOWN_FILE} is not readable") from error
 
 
 def _scene(tree: dict[str, Any]) -> Scene:

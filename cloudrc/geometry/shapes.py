@@ -103,9 +103,7 @@ class Shapes:
             with np.load(BytesIO(data), allow_pickle=False) as file:
                 return _read({name: file[name] for name in file.files})
         except _UNREADABLE as error:
-            raise BadInputError(
-                f"the recording's {SHAPES_FILE} is not readable; use the original recording"
-            ) from error
+            raise BadInputError(f"{SHAPES_FILE} is not readable") from error
 
 
 def _joined(parts: Iterable[Any], dtype: Any) -> NDArray[Any]:

@@ -538,8 +538,9 @@ def _parse(data: bytes) -> mcap.McapRecord:
     )
     record = next(stream.records)
     if isinstance(record, mcap.Attachment):
+        # MCAP allows zero for "not computed", but in a damaged file it is a block of zeros.
         checksum = int.from_bytes(data[-4:], "little")
-        if checksum not in (0, zlib.crc32(data[RECORD_HEAD_SIZE:-4])):
+        if checksum != zlib.crc32(data[RECORD_HEAD_SIZE:-4]):
             raise CRCValidationError(checksum, 0, record)
     return record
 

@@ -479,6 +479,16 @@ def test_attachments_in_a_damaged_part_are_named(path):
     assert "attachments lost: config.yaml" in recover(path, path.with_name("new.mcap")).notes[0]
 
 
+@pytest.mark.parametrize("size", [4, 9, 200, 430])
+def test_an_attachment_whose_end_is_zeros_is_lost(path, size):
+    """Its checksum is zero then, which means "not computed" in MCAP."""
+    end = next(end for code, _, end in spans(WHOLE) if code == Opcode.ATTACHMENT)
+    path.write_bytes(WHOLE[: end - size] + bytes(size) + WHOLE[end:])
+    recovery = recover(path, new := path.with_name("new.mcap"))
+    assert "attachments lost: config.yaml" in recovery.notes[0]
+    assert Recording.read(new).attachments == {}
+
+
 def test_the_last_line_puts_the_copy_in_place_of_a_damaged_file_of_a_run(tmp_path, call):
     """A shell that runs the line leaves the damaged file beside the copy."""
     (run := tmp_path / "a run").mkdir()

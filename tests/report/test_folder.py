@@ -134,6 +134,27 @@ def test_a_report_of_a_recovered_recording_says_in_its_first_line_that_it_is_inc
     assert [line.strip() for line in rest if "The recording is incomplete: damaged" in line]
 
 
+@pytest.mark.parametrize("place", [0, 300, 2560])
+def test_the_copy_of_a_recording_with_a_block_of_zeros_has_a_report(run, place):
+    (run / "report.json").unlink()
+    mission = run / "mission.mcap"
+    Recording.read(mission).write(mission)  # the attachments come first
+    data = mission.read_bytes()
+    (run / "damaged.mcap").write_bytes(data[:place] + bytes(4096) + data[place + 4096 :])
+    mission.unlink()
+    assert "attachments lost: " in recover(run / "damaged.mcap", mission).notes[0]
+    assert exit_code(write_report(run, *read_run(run), page=False)) == 6
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "geometry.json", "shapes.npz"])
+def test_an_attachment_that_another_program_broke_is_named_with_its_file(run, refused, name):
+    mission = run / "mission.mcap"
+    recording = Recording.read(mission)
+    recording.attachments[name] = b"\0"
+    recording.write(mission)
+    assert f"{mission}: its attachment {name} is not readable" in refused("report", run)
+
+
 @pytest.mark.parametrize("was_interrupted", [False, True])
 @pytest.mark.parametrize("copies", [False, True])
 def test_a_run_whose_end_is_lost_is_invalid_unless_it_was_interrupted(run, was_interrupted, copies):
