@@ -356,7 +356,7 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
             tell(f"{error}; trying again")
             continue
         mission = merge(folder / "world.mcap", folder / "cloud.mcap")
-        if cut_to_last_mission(mission) or not want_end:
+        if cut_to_last_mission(mission, being_written=True) or not want_end:
             break
     for component in COMPONENTS:
         _fetch_previous(release, component, folder / f"{component}.before.mcap", tell)

@@ -84,7 +84,8 @@ class Flight:
         if len(changes):
             return int(telemetry["stamp_ns"][changes[-1] + 1])
         # In a session, the first telemetry may already be that of the first mission.
-        is_first = len(missions) and missions[0] and not self.recording.holes
+        is_lost = any(hole.begin_ns < self.start_ns for hole in self.recording.holes)
+        is_first = len(missions) and missions[0] and not is_lost
         return int(telemetry["stamp_ns"][0]) if is_first else self.start_ns
 
     @cached_property

@@ -163,8 +163,8 @@ class Recording(Content):
             each for each in self.messages if since_ns.get(each[0], first_ns) <= each[1] <= last_ns
         ]
         holes = tuple(hole for hole in self.holes if hole.meets(first_ns, last_ns))
-        if self.holes and not holes:  # what the writers have missed is not in this time
-            self.told = ""
+        if self.holes and not holes:  # what is lost is not in this time
+            self.torn = self.told = ""
         self.holes = holes
         self._tables.clear()
 

@@ -191,25 +191,27 @@ def _moved(hole: Hole, moved: Callable[[list[int]], list[int]]) -> Hole:
     return Hole(begin_ns, end_ns if hole.end_ns < END_NS else END_NS)
 
 
-def cut_to_last_mission(mission: Recording) -> bool:
-    """Reduce a pod's recording of several missions to the mission that was started last.
+def cut_to_last_mission(mission: Recording, *, being_written: bool = False) -> bool:
+    """Reduce a recording of several missions to the mission that was started last.
 
-    Return whether the recording contains the end of that mission. If it does, remove the remark
-    that the file is cut short from `mission.note`: the pod was still writing the file, but the
-    mission is complete.
+    `being_written` tells that pods still write the files. If such files contain the end of the
+    mission, they have lost nothing; files of a session that was killed may have.
+
+    Return whether the recording contains the end of that mission.
     """
     *before, (began, ended) = _missions(mission) or [(None, None)]
     earlier = max((end for _, end in before if end is not None), default=-1)
-    until = mission.messages[-1][1] if mission.messages else 0
     first = max((began or 0) - BEFORE_NS, earlier + 1)
-    last = ended + AFTER_NS if ended is not None else until
+    last = ended + AFTER_NS if ended is not None else END_NS
+    until = mission.messages[-1][1] if mission.messages else 0
     mission.keep(first, last, first - COUNTED_NS)
     if ended is None or until <= ended:
         return False
     if any(hole.begin_ns <= ended and hole.end_ns >= END_NS for hole in mission.holes):
         return False  # of one end, the file is cut short before the mission's end
-    mission.torn = ""
-    mission.holes = tuple(hole for hole in mission.holes if hole.begin_ns < ended)
+    if being_written:
+        mission.torn = ""
+        mission.holes = tuple(hole for hole in mission.holes if hole.begin_ns < ended)
     return True
 
 

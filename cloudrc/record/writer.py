@@ -27,7 +27,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 from cloudrc.files import atomic_file, open_file
 from cloudrc.record import WALL_OFFSET, wall_time
 from cloudrc.record.content import Content
-from cloudrc.record.holes import Hole, to_metadata
+from cloudrc.record.holes import HOLES, Hole, to_metadata
 from cloudrc.record.ros import definition, encode, type_hash
 from cloudrc.record.topics import TOPICS, VIEWS, topics_of
 from cloudrc.records import Record
@@ -247,7 +247,9 @@ def write(content: Content, target: Path, attachments: Mapping[str, bytes]) -> N
 
     The attachments come first: a copy that was cut short still contains the experiment.
     """
-    metadata, messages = content.metadata, content.messages
+    messages = content.messages
+    # What the source missed is in the note, unless the content was cut to another time.
+    metadata = {k: v for k, v in content.metadata.items() if k not in (MISSING, HOLES)}
     clock, machine = metadata.get(CLOCK, ""), metadata.get("clock_id", "")
     with atomic_file(target) as file, McapWriter(file, clock=clock, clock_id=machine) as writer:
         missing = {MISSING: content.note} | to_metadata(content.holes) if content.note else {}

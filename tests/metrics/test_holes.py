@@ -222,6 +222,17 @@ def test_the_velocity_loop_is_fitted_to_the_longest_time_without_a_hole(spans, s
     assert len(given) * 0.01 == pytest.approx(seconds, abs=0.3)
 
 
+def test_a_lost_end_does_not_change_the_start_of_the_first_mission():
+    log = flown()
+    log.change(
+        TelemetrySent,
+        lambda _, sent: sent._replace(telemetry=sent.telemetry._replace(mission_id=1)),
+    )
+    flight = log.flight()
+    flight.recording.holes = (Hole(at(6), END_NS),)
+    assert flight.mission_ns == flight.recording["/telemetry"]["stamp_ns"][0] < flight.start_ns
+
+
 def test_a_recording_cut_short_is_measured_up_to_its_end():
     log = flown()
     for records in (log.world, log.cloud):

@@ -12,7 +12,7 @@ from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.record.recovery import recover
 from cloudrc.record.topics import VIEWS
 from cloudrc.record.writer import CHUNK_NS, COUNTS, McapWriter
-from cloudrc.records import Counted
+from cloudrc.records import Counted, MissionEvent
 from cloudrc.runs.identify import identify
 from cloudrc.runs.links.trace import LogSettings, read_packets
 from cloudrc.runs.replay import write_replay
@@ -169,8 +169,25 @@ def test_a_mission_is_whole_if_both_files_contain_its_end(tmp_path, count, whole
     cloud = write(tmp_path / "cloud.mcap", cloud_records(150), "cloud", "a")
     without(world, [], index=False)
     mission = merge(world, cloud)
-    assert cut_to_last_mission(mission) == whole
+    assert cut_to_last_mission(mission, being_written=True) == whole
     assert (mission.torn == "", mission.holes == ()) == (whole, whole)
+
+
+@pytest.mark.parametrize(("ended", "is_whole"), [(2, True), (5, False), (None, False)])
+def test_the_last_mission_of_a_killed_session_and_of_its_copy_are_whole_alike(
+    tmp_path, ended, is_whole
+):
+    """The recording of a mission goes on for 2 s after its end; this session has 6 s."""
+    records = [Counted(n * 10 * MS, "cloud", "sent", n) for n in range(600)]
+    events = [(1, "started")] + [(ended, "done")] * (ended is not None)
+    records += [MissionEvent(at * SECOND, word, 0, "") for at, word in events]
+    records.sort(key=lambda record: record.stamp_ns)
+    session = without(write(tmp_path / "session.mcap", records), [], index=False)
+    for mission in (Recording.read(session), copy(session)):
+        cut_to_last_mission(mission)
+        mission.write(target := tmp_path / "mission.mcap")
+        for each in (mission, Recording.read(target)):
+            assert (each.note == "", each.holes == ()) == (is_whole, is_whole)
 
 
 @pytest.mark.parametrize("read", READERS)
