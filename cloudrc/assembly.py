@@ -249,16 +249,22 @@ def build_cloud(
     )
     if remote is not None and channel is not None:
         remote.connect(channel, loop.period_ns * 1e-9, loop.counts, lambda: loop.newest)
-    cpu_clock = cpu_clock if cloud.compute_measured else None
-    compute = None
-    if cloud.compute_ms or cpu_clock:
-        rng = _generator(experiment.seed, "compute time")
-        times = cloud.compute_ms * MS_TO_NS, cloud.compute_deviation_ms * MS_TO_NS
-        compute = ComputeTime(*times, rng, cpu_clock)
+    compute = build_compute_time(experiment, cpu_clock if cloud.compute_measured else None)
     newest_wins = experiment.tunnel.order == "newest"
     return CloudEndpoint(
         loop, teleop, identity, newest_wins=newest_wins, compute=compute, start_ns=clock()
     )
+
+
+def build_compute_time(
+    experiment: ResolvedExperiment, cpu_clock: Callable[[], int] | None = None
+) -> ComputeTime | None:
+    """Build the time that cloud needs for a command, plus that of `cpu_clock`; None: no time."""
+    cloud = experiment.cloud
+    if not (cloud.compute_ms or cpu_clock):
+        return None
+    times = cloud.compute_ms * MS_TO_NS, cloud.compute_deviation_ms * MS_TO_NS
+    return ComputeTime(*times, _generator(experiment.seed, "compute time"), cpu_clock)
 
 
 def build_controller(experiment: ResolvedExperiment) -> Controller:

@@ -1,7 +1,7 @@
 """Warn about settings that do not fit together, and suggest a value that fits.
 
-The delays come from a simulation of the link alone: `link/ages.py`. A warning never prevents the
-flight.
+The delays come from a simulation of link and computing time alone: `ages.py`. A warning never
+prevents the flight.
 """
 
 from __future__ import annotations
@@ -23,13 +23,15 @@ FAR = 1.0
 """Tolerance of a waypoint that may be meant in cm or mm [m]."""
 JITTER_MAX = 1.0
 """Jitter of a link that may be meant in another unit [s]."""
+GUARD_STEP = 0.002
+"""Time between two looks of the guard at the age of a command [s]."""
 LONG = 3600.0
 """Duration of a mission that may be meant in milliseconds [s]."""
 
 
 def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     """Yield a warning for each group of settings that do not fit together."""
-    from cloudrc.link.ages import simulate_ages
+    from cloudrc.ages import simulate_ages
 
     ways = _directions(experiment)
     yield from _units(ways)
@@ -115,8 +117,8 @@ def _jitter(ways: Mapping[str, DirectionProfile]) -> Iterator[str]:
 
 def _late(ways: Mapping[str, DirectionProfile]) -> Iterator[str]:
     """Yield a warning if delays are the reason why no command arrives in the simulated time."""
+    from cloudrc.ages import DURATION_NS
     from cloudrc.config.schema import COMMAND_AGE_MS
-    from cloudrc.link.ages import DURATION_NS
     from cloudrc.link.profile import Timeline
 
     parts, total = list[str](), 0.0
@@ -235,9 +237,9 @@ def _balance(experiment: ResolvedExperiment) -> Iterator[str]:
 def _long_link(
     experiment: ResolvedExperiment, ages: list[float], echoes: list[float]
 ) -> Iterator[str]:
-    """Yield warnings about limits of guard and cloud that are too short for the link's delays.
+    """Yield warnings about limits of guard and cloud that are too short for the delays.
 
-    Both lists have one value per simulated datagram [s]. `ages` has the age of the odometry from
+    The lists are those of `simulate_ages` [s]. `ages` has the age of the odometry from
     which cloud computed the command that the robot follows. `echoes` has the age of the newest
     command that telemetry has confirmed.
     """
@@ -247,7 +249,7 @@ def _long_link(
     mean, longest = sum(ages) / len(ages), max(ages)
     lasts = max(age_max, min(ages) + min(cloud.plan_s, experiment.guard.plan_max_s))
     delay = f"commands follow their odometry after {mean * 1e3:.0f} ms on average"
-    if min(ages) > age_max or longest > lasts:
+    if min(ages) > age_max or longest > lasts + GUARD_STEP:
         how = "never flies" if min(ages) > age_max else "holds again and again"
         yield (
             f"{delay}, after {longest * 1e3:.0f} ms at most, and the guard refuses commands after "

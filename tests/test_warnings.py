@@ -197,6 +197,13 @@ def test_a_hold_is_announced_if_and_only_if_the_guard_holds(conditions):
     assert warned == (numbers(fly("steps", *settings))["hold_count"] > 0)
 
 
+@pytest.mark.parametrize("compute_ms", [122, 126])  # with 122, 2 ms too old between two looks
+def test_a_hold_because_of_a_slow_cloud_is_announced_if_and_only_if_the_guard_holds(compute_ms):
+    settings = "link.profile=ideal", f"cloud.compute_ms={compute_ms}"
+    warned = any("guard" in text for text in advise(load_experiment("hover", settings)))
+    assert warned == (numbers(fly("hover", *settings))["hold_count"] > 0) == (compute_ms > 125)
+
+
 @pytest.mark.parametrize(("way", "words"), [(9, ["move at 7 m/s after 2 s", "at 6 m/s"]), (2, [])])
 def test_setpoints_that_are_faster_than_the_robot_are_named(way, words, tmp_path):
     (tmp_path / "d.csv").write_text(f"time_s,x_m,y_m,z_m\n0,0,0,1\n2,2,0,1\n3,{way},0,1\n")

@@ -11,12 +11,12 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args, get_origin
 
+from cloudrc.ages import simulate_ages
 from cloudrc.config.document import child
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.problems import exceeds, expectation
 from cloudrc.config.schema import COMMAND_AGE_MS, Experiment
 from cloudrc.errors import BadInputError
-from cloudrc.link.ages import simulate_ages
 from cloudrc.robots.build import onboard_values
 
 SLACK = 0.1

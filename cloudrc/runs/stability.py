@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc import assembly, plugins
+from cloudrc.ages import simulate_ages
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
 from cloudrc.errors import describe_error, machine_error
 from cloudrc.geometry.scene import load_scene
-from cloudrc.link.ages import simulate_ages
 from cloudrc.messages import GuardState
 from cloudrc.metrics.counters import growth
 from cloudrc.metrics.verdict import NOT_STARTED, plugin_failures
