@@ -30,6 +30,7 @@ from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Columns
 from cloudrc.metrics.response import Step, steps
 from cloudrc.metrics.verdict import FlightFailure
+from cloudrc.plugins import refuse_exit
 from cloudrc.record.columns import Recording, Table
 from cloudrc.runs.experiment import advice_on, check_mode, load
 from cloudrc.runs.flight import fly_in_memory
@@ -119,6 +120,7 @@ class Comparison:
     document: dict[str, Any]  # as `cloudrc compare -o json`: all metrics, success, the flights
 
 
+@refuse_exit()
 def fly(
     experiment: str = "paper",
     settings: Mapping[str, Any] | None = None,
@@ -161,7 +163,7 @@ def fly(
     resolved = load(str(experiment), _texts(settings or {}), seed)
     check_mode(resolved, mode)
     for text in advice_on(resolved):
-        warnings.warn(text, stacklevel=2)
+        warnings.warn(text, stacklevel=3)
     if mode == "virtual" and out is None:
         return _result(fly_in_memory(resolved))
     if mode == "cluster":
@@ -225,6 +227,7 @@ def _result(found: Assessment) -> Result:
     )
 
 
+@refuse_exit()
 def sweep(
     grid: str | Path | Mapping[str, Any], *, jobs: int = 1, out: str | Path | None = None
 ) -> SweepTable:
@@ -250,7 +253,7 @@ def sweep(
     else:
         read = read_grid(Path(grid))
     for text in advice_on(*read.points):
-        warnings.warn(text, stacklevel=2)
+        warnings.warn(text, stacklevel=3)
     with TemporaryDirectory(prefix="cloudrc-sweep-") as temporary:
         return _fly_sweep(read, None if out is None else Path(out), Path(temporary), jobs)
 
@@ -261,7 +264,7 @@ def _fly_sweep(grid: Grid, out: Path | None, temporary: Path, jobs: int) -> Swee
 
     with work.open_folder(out or temporary, "sweep") as (folder, warning):
         if warning:
-            warnings.warn(warning, stacklevel=3)
+            warnings.warn(warning, stacklevel=4)
         begun = work.begin(grid, folder)
         flown = work.fly_missing(begun, folder, jobs)
         rows, stopped = work.keep(flown, folder, grid, None, begun.before)
@@ -277,6 +280,7 @@ def _fly_sweep(grid: Grid, out: Path | None, temporary: Path, jobs: int) -> Swee
     return SweepTable(arrays, {name: units[name] for name in arrays if name in units}, out)
 
 
+@refuse_exit()
 def compare(
     a: str | Mapping[str, Any],
     b: str | Mapping[str, Any],
@@ -307,7 +311,7 @@ def compare(
     first, second = (pairs.split_settings(x) if isinstance(x, str) else _texts(x) for x in (a, b))
     sides, units = pairs.load_sides(of, _texts(settings or {}), first, second, numbers)
     for text in advice_on(*sides):
-        warnings.warn(text, stacklevel=2)
+        warnings.warn(text, stacklevel=3)
     flown, stopped = pairs.fly_pairs(sides, seeds, jobs)
     if stopped:
         raise _as_exception(stopped)
@@ -318,6 +322,7 @@ def compare(
     return Comparison(name, entry["p_wilcoxon"], entry["difference"], document)
 
 
+@refuse_exit()
 def margin(
     key: str,
     *,

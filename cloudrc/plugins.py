@@ -41,9 +41,11 @@ from cloudrc.errors import (
     BadInputError,
     CloudrcError,
     ControllerLostError,
+    MissingPrerequisiteError,
     OutOfMemoryError,
     PlacedError,
     describe_error,
+    machine_error,
     to_one_line,
 )
 from cloudrc.plugin_file import PREFIX, load_file
@@ -366,6 +368,40 @@ def place_of(error: BaseException) -> str:
         return ""
     frame, line = own[-1]
     return f"{Path(frame.f_code.co_filename).name}:{line}: "
+
+
+def stray_error(error: BaseException) -> BadInputError | None:
+    """Return the error to report if a user's code raised `error` outside of a guard; else None.
+
+    A signal handler of a plug-in may do so at any line of cloudrc. A SystemExit is always the
+    user's, because no command of cloudrc raises one.
+    """
+    if isinstance(error, CloudrcError | KeyboardInterrupt | MemoryError):
+        return None
+    place = place_of(error)
+    if isinstance(error, SystemExit):
+        place = place or f"{locate(error)}: "
+    return BadInputError(f"{place}{describe_error(error)}") if place else None
+
+
+def machine_failure(error: BaseException) -> MissingPrerequisiteError | None:
+    """Return what `machine_error` does; None if a user's code raised `error`, such as a timeout."""
+    return machine_error(error) if stray_error(error) is None else None
+
+
+@contextmanager
+def refuse_exit() -> Iterator[None]:
+    """Convert a SystemExit that a plug-in raises in the block to a BadInputError.
+
+    That of the program which calls cloudrc stays as it is.
+    """
+    try:
+        yield
+    except SystemExit as error:
+        frames = [frame for frame, _ in _own_frames(error)]
+        if frames and str(frames[-1].f_globals.get("__name__")).startswith(PREFIX):
+            raise stray_error(error) or error from error
+        raise
 
 
 def locate(error: BaseException) -> str:

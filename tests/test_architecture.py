@@ -93,7 +93,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "assembly": EVERYTHING,
     "ages": {"assembly", "config", "link", "tunnel"},
     "warnings": {"ages", "assembly", "config", "link", "robots", "tunnel"},
-    "api": {"runs", "cluster", "config", "metrics", "record", "report"},
+    "api": {"runs", "cluster", "config", "metrics", "plugins", "record", "report"},
     "processes": EVERYTHING,
     "exercise": {"cloud", "config", "drivers", "files", "plugins", "runs"},
     "faults": EVERYTHING,

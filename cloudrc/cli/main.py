@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import os
 import sys
@@ -70,13 +71,27 @@ def _dispatch(given: Sequence[str]) -> int:
     form = getattr(options, "output", TABLE)
     for_programs = isinstance(form, str) and form != TABLE
     with reserve_stdout() if for_programs else contextlib.nullcontext():
-        code: int = options.execute(options)
+        code = _execute(options)
         with naming(STDOUT):
             sys.stdout.flush()
     return code
 
 
+def _execute(options: argparse.Namespace) -> int:
+    """Run the command; a SystemExit in it is that of a user's code, such as a signal handler."""
+    try:
+        code: int = options.execute(options)
+    except SystemExit as error:
+        from cloudrc.plugins import stray_error
+
+        raise stray_error(error) or error from error
+    return code
+
+
 def _explain(error: Exception) -> tuple[str, int]:
+    from cloudrc.plugins import stray_error
+
+    error = stray_error(error) or error
     if isinstance(error, CloudrcError):
         return str(error).rstrip(), error.exit_code  # one line, or one per wrong key
     if isinstance(error, OSError) and error.errno not in (*DISK_FULL, *TOO_MANY_FILES):

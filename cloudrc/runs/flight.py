@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 from cloudrc import assembly, metrics, plugins
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.config.load import ResolvedExperiment, absolute_paths
-from cloudrc.errors import MissingPrerequisiteError, describe_error, machine_error
+from cloudrc.errors import MissingPrerequisiteError, describe_error
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Assessment, Run
 from cloudrc.report.write import assess
@@ -33,10 +33,11 @@ def fly_point(experiment: ResolvedExperiment) -> Row:
     try:
         return measure(experiment)
     except BaseException as error:  # one point that cannot fly must not stop the others
-        if failure := machine_error(error) or _lost_file(experiment):
+        if failure := plugins.machine_failure(error) or _lost_file(experiment):
             raise failure from error
         plugins.check_failure(error, "the flight")
-        text, none = describe_error(error), {"numbers": {}, "records_sha256": ""}
+        text = f"{plugins.place_of(error)}{describe_error(error)}"
+        none: Row = {"numbers": {}, "records_sha256": ""}
         return {"verdict": ERROR, "failures": [ERROR], "text": text, **none, "physics_steps": ""}
 
 

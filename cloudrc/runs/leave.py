@@ -17,6 +17,7 @@ def limit_exit(code: int) -> None:
 
     Call it last: Python then waits for all threads, without a limit of time.
     """
+    signal.setitimer(signal.ITIMER_REAL, 0.0)  # a plug-in's timer would change the exit code
     others = {*threading.enumerate()} - {threading.current_thread()}
     if all(each.daemon for each in others):
         return

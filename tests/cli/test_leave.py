@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -93,6 +94,12 @@ def test_a_worker_that_ends_itself_is_not_called_killed(status, monkeypatch):
     end = take_each(map_in_order(_exit_at_once, [status] * 2, 2), print)
     assert end.exit_code == 6
     assert str(end).startswith(f"a worker ended itself (exit status {status}); does a plug-in")
+
+
+def test_a_timer_of_a_plug_in_does_not_change_the_exit_code():
+    signal.setitimer(signal.ITIMER_REAL, 60.0)
+    limit_exit(1)
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
 
 def test_a_process_without_foreign_threads_ends_as_usual(monkeypatch):

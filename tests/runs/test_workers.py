@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import sys
 import time
 from copy import copy
 from functools import partial
@@ -37,6 +38,10 @@ def _kill_at_five(folder, number):
     return number
 
 
+def _exit(number):
+    sys.exit(0)
+
+
 def _abort(number):
     os.abort()
 
@@ -68,6 +73,11 @@ def test_results_before_a_worker_was_killed_are_kept(tmp_path):
 def test_a_worker_that_crashes_is_told_by_its_signal():
     end = take_each(map_in_order(_abort, range(4), 2), [].append)
     assert str(end).startswith("a worker crashed (SIGABRT); does a plug-in")
+
+
+def test_a_signal_handler_that_exits_in_a_worker_is_told_by_its_line():
+    with pytest.raises(BadInputError, match=r"^test_workers.py:\d+: SystemExit: 0 "):
+        list(map_in_order(_exit, range(4), 2))
 
 
 def test_ctrl_c_ends_the_workers_at_once():
