@@ -141,17 +141,22 @@ def _choices(experiment: ResolvedExperiment, names: Iterable[str]) -> tuple[Any,
     return get_args(kind) if get_origin(kind) is Literal else ()
 
 
-def limits(experiment: ResolvedExperiment, given: Iterable[str]) -> tuple[list[str], float]:
-    """Return settings KEY=VALUE that raise the time limits of cloud and guard as the link needs it.
+def limits(
+    experiment: ResolvedExperiment, given: Iterable[str], seeds: int
+) -> tuple[list[str], float]:
+    """Return settings KEY=VALUE that raise the time limits of cloud and guard as delays need it.
 
-    Limits that are long enough, and limits in `given`, stay. The second result is the time that the
-    limits need [s]. It may be above `LIMIT_MAX`, and then no setting is long enough; it is infinite
-    if no command arrives.
+    The delays are those of the seeds 1 to `seeds`. Limits that are long enough, and limits in
+    `given`, stay. The second result is the time that the limits need [s]. It may be above
+    `LIMIT_MAX`, and then no setting is long enough; it is infinite if no command arrives.
     """
-    ages, echoes = simulate_ages(experiment)
-    if not ages:  # no command arrives
-        return [], math.inf
-    needed = math.ceil((max([*ages, *echoes]) + SLACK) * 10) / 10
+    longest = 0.0
+    for seed in range(1, seeds + 1):
+        ages, echoes = simulate_ages(experiment.model_copy(update={"seed": seed}))
+        if not ages:  # no command arrives
+            return [], math.inf
+        longest = max(longest, *ages, *echoes)
+    needed = math.ceil((longest + SLACK) * 10) / 10
     time = min(needed, LIMIT_MAX)
     cloud, guard = experiment.cloud, experiment.guard
     present = {

@@ -139,7 +139,7 @@ class Trials:
         given = [text.partition("=")[0].strip() for text in settings]
         if asked.key == "guard.speed_max_mps":  # a longer limit would lower the largest speed
             given.append("guard.command_age_max_ms")
-        more, needed = limits(experiment, given)
+        more, needed = limits(experiment, given, asked.seeds)
         if needed > LIMIT_MAX and "guard.command_age_max_ms" not in given:
             age = f"a command would be {needed:g} s old"
             age = age if needed < math.inf else "no command arrives within 20 s"

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from cloudrc.ages import simulate_ages
 from tests.cli.conftest import SHORT
 
 KEY = "link.uplink.delay_ms"
@@ -113,6 +114,19 @@ def test_the_limits_of_cloud_and_guard_follow_the_delay(fly_with, call):
     assert 2200 <= limits.guard.command_age_max_ms <= 2400
     assert limits.cloud.freeze_after_s == 0.7
     assert seen[70].guard.command_age_max_ms == 400
+
+
+def test_the_limits_are_above_the_computing_times_of_all_seeds(fly_with, call):
+    """The longest age grows 1.3 s with seed 1, 2.1 s with seed 3."""
+    seen = {}
+    fly_with(lambda found: seen.update({found.seed: found}) or True)
+    call(
+        "margin cloud.compute_deviation_ms --max 240 --resolution 240 --seeds 3"
+        " --set link.profile=ideal --set cloud.compute_ms=100"
+    )
+    for seed, found in seen.items():
+        assert max(simulate_ages(found)[0]) * 1e3 < found.guard.command_age_max_ms, seed
+    assert len(seen) == 3
 
 
 def test_limits_of_the_experiment_that_are_long_enough_stay(fly_with, call):
