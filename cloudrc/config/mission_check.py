@@ -31,6 +31,7 @@ from cloudrc.geometry.obstacles import (
     bodies_inside,
     body_names,
     fence_of,
+    intangible,
     obstacles,
     surface,
 )
@@ -116,6 +117,9 @@ def _check_touch(mission: MissionConfig, scene: Scene) -> ConfigProblem | None:
         )
     if body == FLOOR:
         reason = "the robot stands on it; name another body, or set mission.touch to null"
+    elif body in intangible(scene):
+        give = "give its geoms contype and conaffinity 1, or name another body"
+        reason = f"the robot flies through it; {give}"
     elif names is None or body in names:
         return None
     else:

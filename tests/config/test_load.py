@@ -153,6 +153,20 @@ def test_a_touch_that_cannot_be_is_refused_in_one_line(name, setting, said):
     assert "\n" not in str(refused.value)
 
 
+def test_a_touch_of_a_body_that_the_robot_flies_through_is_refused(tmp_path):
+    """Otherwise each flight would fail, because the robot never touches it."""
+    ghost = '<body name="ghost" pos="2 0 1"><geom size=".1" contype="0" conaffinity="0"/></body>'
+    path = tmp_path / "mine.xml"
+    path.write_text(
+        shipped.file_of("empty").read_text().replace("</worldbody>", f"{ghost}</worldbody>")
+    )
+    chosen = [f"world.scene={path}", "mission.touch.body=ghost"]
+    with pytest.raises(
+        BadInputError, match=r"mission\.touch\.body: ghost: the robot flies through"
+    ):
+        load_experiment("hover", chosen)
+
+
 def test_single_values_override_the_profile(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("link: {profile: lossy, uplink: {delay_ms: 120}}\n")
