@@ -213,18 +213,18 @@ def width_of(space: spaces.Space[Any]) -> int:
 
 
 def as_actions(actions: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
-    """Return a chunk, shape (H, A), as the space's actions have it; integers are rounded.
+    """Return a chunk, shape (H, A), as the space's actions have it.
 
-    Raise a PolicyAnswerError if the space's type cannot hold a value.
+    Raise a PolicyAnswerError if the space's type cannot hold a value, as .5 among integers.
     """
-    if actions.dtype.kind == "f" and np.dtype(space.dtype).kind in "iu":
-        actions = np.rint(actions)
     with np.errstate(over="ignore", invalid="ignore"):
         held = actions.astype(space.dtype)
     holds = np.isfinite(held) if held.dtype.kind == "f" else held == actions
     if not holds.all():
         value = actions[~holds][0]
-        raise PolicyAnswerError(f"the action {value:g} is beyond the type {held.dtype} of {space}")
+        raise PolicyAnswerError(
+            f"the action {value:g} does not fit the type {held.dtype} of {space}"
+        )
     shaped: NDArray[Any] = held.reshape(len(held), *(space.shape or ()))
     return shaped
 

@@ -398,20 +398,21 @@ def test_an_environment_that_ends_itself_is_one_line_with_its_file(
     assert "sys.exit() was called" in error
 
 
-def test_spaces_without_numbers_are_refused_and_integers_are_rounded():
+def test_spaces_without_numbers_are_refused_and_whole_numbers_are_integers():
     with pytest.raises(BadInputError, match="Dict"):
         width_of(gymnasium.spaces.Dict({}))
     discrete = gymnasium.spaces.Discrete(3)
-    assert as_actions(np.array([[0.9], [2.0]]), discrete).tolist() == [1, 2]
+    assert as_actions(np.array([[1.0], [2.0]]), discrete).tolist() == [1, 2]
     integers = gymnasium.spaces.Box(0, 9, (1,), np.int8)
-    assert as_actions(np.array([[0.9]]), integers).tolist() == [[1]]
+    assert as_actions(np.array([[1.0]]), integers).tolist() == [[1]]
 
 
 @pytest.mark.parametrize(
-    ("action", "dtype"), [(1e30, np.float16), (300, np.int8), (-1.0, np.uint8), (1e20, np.int64)]
+    ("action", "dtype"),
+    [(1e30, np.float16), (300, np.int8), (-1.0, np.uint8), (1e20, np.int64), (0.5, np.int64)],
 )
 def test_an_action_that_the_type_of_the_space_cannot_hold_is_wrong(action, dtype):
-    with pytest.raises(PolicyAnswerError, match=re.escape(f"{action:g} is beyond")):
+    with pytest.raises(PolicyAnswerError, match=re.escape(f"{action:g} does not fit")):
         as_actions(np.array([[action]]), gymnasium.spaces.Box(0, 1, (1,), dtype))
 
 
