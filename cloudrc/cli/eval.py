@@ -92,11 +92,13 @@ def execute(options: argparse.Namespace) -> int:
 
     setup, episodes = _read(options)
     with closing(StepView(sys.stderr, f"makes the environment {setup.env}")):
-        dt, code = check_environment(setup, episodes)
+        checked = check_environment(setup, episodes)
         seeded = follows_seed(setup)
-    if slow := slow_answers(setup, dt):
+    if checked.doubt:
+        print_line(f"cloudrc: warning: --dt {setup.dt:g}: {checked.doubt}", sys.stderr)
+    if slow := slow_answers(setup, checked.dt):
         print_line(f"cloudrc: warning: {slow}", sys.stderr)
-    setup = replace(setup, follows_seed=seeded, env_code=code)
+    setup = replace(setup, follows_seed=seeded, env_code=checked.code)
     if not seeded:
         print_line(f"cloudrc: warning: --env {setup.env}: {results.SEEDLESS}", sys.stderr)
     folder = options.out

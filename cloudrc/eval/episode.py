@@ -29,6 +29,7 @@ from cloudrc.eval.setup import (
     read_times,
 )
 from cloudrc.gym import Networked
+from cloudrc.gym.options import doubt_step
 from cloudrc.gym.values import size_of
 from cloudrc.plugins import InvalidResultError, refuse_failure, shorten, to_boolean, to_number
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
@@ -53,6 +54,12 @@ class Played(NamedTuple):
     jumps: list[float]  # change of the action from one answer to the next, at each change [1]
     loop: dict[str, Any]  # summary of the loop
     records_sha256: str
+
+
+class _Network(Networked):
+    """An environment behind a link, about which the command has warned."""
+
+    _warns = False
 
 
 class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -293,7 +300,7 @@ def _connect(
         compute = mean_compute(compute)
     elif isinstance(compute, tuple) and compute[0] == MEASURED:
         compute = policy.duration
-    return Networked(
+    return _Network(
         env,
         link_at(setup.link, episode.rtt_ms),
         episode.seed,
@@ -329,8 +336,16 @@ def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
     return known
 
 
-def check_environment(setup: EvalSetup, episodes: list[Episode]) -> tuple[float, str]:
-    """Return the time of a step [s], and the hash of the environment's code and files.
+class CheckedEnvironment(NamedTuple):
+    """What is known about an environment that can be used."""
+
+    dt: float  # time of a step [s]
+    code: str  # hash of its code and files
+    doubt: str  # warning about --dt; "" for none
+
+
+def check_environment(setup: EvalSetup, episodes: list[Episode]) -> CheckedEnvironment:
+    """Return what is known about the environment.
 
     Raise a BadInputError if environment, policy file or executors cannot be used.
 
@@ -339,11 +354,12 @@ def check_environment(setup: EvalSetup, episodes: list[Episode]) -> tuple[float,
     with make_env(setup, 1) as env:
         width_of(env.action_space)
         code = environment_code(env, setup)
+        doubt = doubt_step(env, setup.dt)
         for executor in dict.fromkeys(each.executor for each in episodes):
-            world = Networked(env, dt=setup.dt, chunk=1, executor=executor)
+            world = _Network(env, dt=setup.dt, chunk=1, executor=executor)
     if not setup.is_remote:
         _load(setup.policy)
-    return world.dt, code
+    return CheckedEnvironment(world.dt, code, doubt)
 
 
 def follows_seed(setup: EvalSetup) -> bool:

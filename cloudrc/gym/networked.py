@@ -16,6 +16,7 @@ from cloudrc.gym.options import (
     connect,
     describe_answer,
     step_time,
+    warn_of_step,
 )
 from cloudrc.gym.values import checker, copied
 
@@ -37,6 +38,8 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         world_info: The environment's own info of the last step, without any delay: for whoever
             judges the episode, not for the policy.
     """
+
+    _warns = True
 
     def __init__(
         self,
@@ -81,6 +84,8 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, link=link, seed=seed, dt=dt, stream=stream, **options)
         gymnasium.Wrapper.__init__(self, env)
         self.dt = step_time(env, dt)
+        if self._warns:
+            warn_of_step(env, dt)
         both, chunk = (env.observation_space, env.action_space), options.get("chunk")
         (self._loop,) = connect(both, self.dt, link, seed, (stream,), **options)
         self.action_space, self._split = answer_space(env.action_space, chunk)

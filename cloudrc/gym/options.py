@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import partial
@@ -24,6 +25,8 @@ from cloudrc.link.library import LinkProfile, read_profile
 Profile: TypeAlias = str | Path | Mapping[str, Any] | LinkProfile
 CHUNK_MAX = 10_000
 """Largest number of actions in an answer."""
+STEP_RATIO = 10.0
+"""Ratio of two times of a step from which on one of them may have another unit."""
 ANSWER = "answer"
 """Start of an episode: the robot waits for the first answer."""
 
@@ -109,21 +112,45 @@ def step_time(env: Any, given: float | None) -> float:
 
     It is the environment's `dt` or `tau`, or that of a frame which it renders.
     """
-    base = env.unwrapped
-    # The environments of a vector know their step; metadata may have the rate of a film.
-    base = base.envs[0].unwrapped if getattr(base, "envs", ()) else base
-    found: Any = given
-    for name in ("step_dt", "dt", "tau"):
-        found = getattr(base, name, None) if found is None else found
+    found: Any = _told_step(env) if given is None else given
     number = nan
     with suppress(plugins.InvalidResultError):
-        if found is None and (rate := (env.metadata or {}).get("render_fps")):
-            found = 1.0 / plugins.to_number(rate, "rate")
         number = plugins.to_number(found, "time step")
     if not (isfinite(number) and 0.0 < number <= 3600.0):
         told = "has no time step" if found is None else f"has the time step {found!r}"
         raise BadInputError(f"the environment {told}; give dt=, the time of a step in seconds")
     return number
+
+
+def _told_step(env: Any) -> Any:
+    """Return the time of a step that an environment tells [s], whatever it is; else None."""
+    base = env.unwrapped
+    # The environments of a vector know their step; metadata may have the rate of a film.
+    base = base.envs[0].unwrapped if getattr(base, "envs", ()) else base
+    for name in ("step_dt", "dt", "tau"):
+        if (found := getattr(base, name, None)) is not None:
+            return found
+    with suppress(plugins.InvalidResultError):
+        if rate := (env.metadata or {}).get("render_fps"):
+            return 1.0 / plugins.to_number(rate, "rate")
+    return None
+
+
+def doubt_step(env: Any, given: float | None) -> str:
+    """Return a warning if the `given` time of a step is far from the environment's [s]; else ""."""
+    told = None
+    if given is not None:
+        with suppress(BadInputError):
+            told = step_time(env, None)
+    if given is None or told is None or 1 / STEP_RATIO < given / told < STEP_RATIO:
+        return ""
+    return f"a step of {given:g} s, but the environment says {told:.3g} s; the unit is s"
+
+
+def warn_of_step(env: Any, given: float | None) -> None:
+    """Warn the caller of the caller if the `given` time of a step [s] is doubtful."""
+    if doubt := doubt_step(env, given):
+        warnings.warn(f"dt={given:g}: {doubt}", stacklevel=3)
 
 
 def compute_times(compute: float | tuple[float, float]) -> tuple[float, float]:

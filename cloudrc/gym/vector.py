@@ -17,6 +17,7 @@ from cloudrc.gym.options import (
     connect,
     describe_answer,
     step_time,
+    warn_of_step,
 )
 from cloudrc.gym.values import checker, copied
 
@@ -58,6 +59,7 @@ class NetworkedVector(_Wrapper):
         names = [f"{stream}/{robot}" for robot in range(env.num_envs)]
         both = env.single_observation_space, space
         self._loops = connect(both, _step_time(env, dt), link, seed, names, **options)
+        warn_of_step(env, dt)
         self.single_action_space, self._split = answer_space(space, chunk)
         self.action_space = batch_space(self.single_action_space, env.num_envs)
         words = f"for each of {env.num_envs} robots {describe_answer(chunk)}"

@@ -505,6 +505,14 @@ def test_an_answer_that_takes_very_many_steps_is_a_warning(compute, warned):
     assert ("50 s, as long as 2,500 steps" in slow_answers(setup, 0.02)) is warned
 
 
+def test_a_time_of_a_step_in_another_unit_is_one_warning(law, tmp_path, capsys):
+    line = f"eval --env CartPole-v1 --policy {law()} --seeds 2 --jobs 1 --dt 20 --out {tmp_path}/a"
+    assert main(line.split()) == 0
+    said = [each for each in capsys.readouterr().err.splitlines() if "warning" in each]
+    about = "--dt 20: a step of 20 s, but the environment says 0.02 s; the unit is s"
+    assert said == [f"cloudrc: warning: {about}"]
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

@@ -5,6 +5,7 @@ import hashlib
 import pickle
 import subprocess
 import sys
+from contextlib import nullcontext
 from itertools import pairwise
 
 import gymnasium
@@ -14,7 +15,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from cloudrc.errors import BadInputError
-from cloudrc.gym import Networked
+from cloudrc.gym import Networked, NetworkedVector
 from cloudrc.gym.values import neutral
 from tests.gym.envs import Counter, Mixed, both_ways
 
@@ -71,7 +72,7 @@ def test_an_ideal_link_changes_no_bit(make):
             break
 
 
-@pytest.mark.parametrize("dt", [0.01, 1 / 30, 1 / 3, 0.0125])
+@pytest.mark.parametrize("dt", [0.01, 1 / 30, 1 / 11, 0.0125])
 @pytest.mark.parametrize(("up", "down"), [(0, 0), (3, 0), (0, 4), (2, 5)])
 def test_a_delay_of_n_steps_is_exactly_n(dt, up, down):
     env = Networked(Counter(), both_ways(up * dt * 1e3, down * dt * 1e3), dt=dt)
@@ -221,7 +222,25 @@ def test_the_time_step_is_that_of_the_environment():
     assert Networked(gymnasium.make("Pendulum-v1")).dt == 0.05  # its film has 30 frames a second
     assert Networked(gymnasium.make("CartPole-v1")).dt == 0.02
     assert Networked(gymnasium.make("MountainCar-v0")).dt == 1 / 30
-    assert Networked(Counter(), dt=0.5).dt == 0.5
+    assert Networked(Counter(), dt=0.05).dt == 0.05
+
+
+@pytest.mark.parametrize(
+    ("dt", "doubtful"), [(20.0, True), (0.2, True), (0.002, True), (0.19, False), (0.003, False)]
+)
+def test_a_time_step_far_from_that_of_the_environment_is_a_warning(dt, doubtful):
+    says = f"dt={dt:g}: a step of {dt:g} s, but the environment says 0.02 s; the unit is s"
+    for wrap, env in (
+        (Networked, gymnasium.make("CartPole-v1")),
+        (NetworkedVector, gymnasium.make_vec("CartPole-v1", 2, "sync")),
+    ):
+        with (
+            pytest.warns(UserWarning, match="the unit is s")
+            if doubtful
+            else nullcontext([]) as found
+        ):
+            wrap(env, dt=dt)
+        assert [str(each.message) for each in found] == [says] * doubtful
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of the bare environments
