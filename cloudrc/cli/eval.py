@@ -91,6 +91,10 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.eval.setup import slow_answers
 
     setup, episodes = _read(options)
+    folder = options.out
+    goes_on = folder is not None and results.is_begun(folder)
+    if goes_on:
+        results.refuse_other(folder, setup)
     with closing(StepView(sys.stderr, f"makes the environment {setup.env}")):
         checked = check_environment(setup, episodes)
         seeded = follows_seed(setup)
@@ -101,8 +105,7 @@ def execute(options: argparse.Namespace) -> int:
     setup = replace(setup, follows_seed=seeded, env_code=checked.code)
     if not seeded:
         print_line(f"cloudrc: warning: --env {setup.env}: {results.SEEDLESS}", sys.stderr)
-    folder = options.out
-    if folder is None or not results.is_begun(folder):
+    if not goes_on:
         folder = new_folder(folder, f"eval-{Path(setup.env).name}", "latest-eval")
     stream = sys.stdout if options.output == "table" else sys.stderr
     print_or_drop(escape(f"{setup.env}: {len(episodes)} episodes"), stream)

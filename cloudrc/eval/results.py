@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ from cloudrc.config.reuse import reuse_results
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.eval.episode import play
 from cloudrc.eval.setup import Episode, EvalSetup
-from cloudrc.files import write_atomically
+from cloudrc.files import read, write_atomically
 from cloudrc.rounding import format_limit
 from cloudrc.runs.store import append_rows, read_rows
 from cloudrc.runs.workers import map_in_order, take_each
@@ -58,6 +59,32 @@ class EvalOutcome(NamedTuple):
 def is_begun(folder: Path) -> bool:
     """Return whether a folder has an evaluation."""
     return (folder / FILE).is_file()
+
+
+def refuse_other(folder: Path, setup: EvalSetup) -> None:
+    """Raise a BadInputError if a folder has the evaluation of another environment or policy.
+
+    A policy is another one if its file has another place: of a file that has changed, the episodes
+    are missing.
+    """
+    try:
+        had = json.loads(read(folder / FILE))
+        words = [had["env"], *(f"{key}={value}" for key, value in had["env_args"].items())]
+        same = had["env_args"] == json.loads(json.dumps(dict(setup.env_args)))
+        same = same and had["env"] == setup.env and _place(had["policy"]) == _place(setup.policy)
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise BadInputError(
+            f"--out {folder}: its {FILE} is of no evaluation; name a new folder"
+        ) from None
+    if not same:
+        raise BadInputError(
+            f"--out {folder}: has the episodes of {' '.join(words)} with {had['policy']}; name a "
+            "new folder"
+        )
+
+
+def _place(policy: str) -> str:
+    return policy if "://" in policy else os.path.abspath(policy)
 
 
 def play_missing(
