@@ -28,7 +28,7 @@ import sys
 import sysconfig
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -48,6 +48,7 @@ from cloudrc.errors import (
     machine_error,
     to_one_line,
 )
+from cloudrc.patience import telling_if_slow
 from cloudrc.plugin_file import PREFIX, load_file
 
 if TYPE_CHECKING:
@@ -136,7 +137,11 @@ class Found:
         A failure in the block is the user's: it becomes a BadInputError with file and line.
         """
         function = self.get(name)
-        with self._refusing(f"{name}()", function, "failed"):
+        file = getattr(self._target, "__file__", None) or type(self._target).__name__
+        with (
+            self._refusing(f"{name}()", function, "failed"),
+            telling_if_slow(f"{name}() of {file} is still running"),
+        ):
             if function is None:
                 raise ValueError("there is no such function; write one")
             yield function
@@ -235,7 +240,8 @@ def signature(kind: str, name: str) -> inspect.Signature:
 def load(kind: str, name: str, /, **parameters: Any) -> Any:
     """Find a plug-in and build it; raise a BadInputError if it is missing or its `build` fails."""
     build = builder(kind, name, look=False)
-    with refuse_failure(f"{one(kind)} {name!r} cannot be built"):
+    what = f"{one(kind)} {name!r} cannot be built"
+    with refuse_failure(what, slow=f"{name} is still being built"):
         plugin = build(**parameters)
         _check_methods(kind, plugin)
     return plugin
@@ -295,7 +301,8 @@ def find(kind: str, name: str, *, look: bool = True) -> Found:
             return Found(importlib.import_module(f"{PACKAGES[kind]}.{name}"))
         # Last, because the search of all installed packages takes milliseconds.
         if (entry := _installed(kind).get(name)) is not None:
-            return Found(entry.load())
+            with telling_if_slow(f"{name} is still being imported"):
+                return Found(entry.load())
     raise BadInputError(unknown_name_text(one(kind), name, names(kind)))
 
 
@@ -342,14 +349,17 @@ def apart() -> Iterator[None]:
 
 
 @contextmanager
-def refuse_failure(what: str, *, keep: type[CloudrcError] | tuple[()] = ()) -> Iterator[None]:
+def refuse_failure(
+    what: str, *, keep: type[CloudrcError] | tuple[()] = (), slow: str = ""
+) -> Iterator[None]:
     """Convert the failure of a plug-in to a BadInputError; `what` says which one failed to do what.
 
     Use it before a flight and between flights; in flight, cloud goes on. Errors of the kind `keep`,
-    which the block's other code raises, stay as they are.
+    which the block's other code raises, stay as they are. `slow` is the text to log if the block
+    takes long; "" for none.
     """
     try:
-        with apart():
+        with apart(), telling_if_slow(slow) if slow else nullcontext():
             yield
     except keep:
         raise

@@ -122,7 +122,8 @@ class ControlLoop:
         self._missions = 0
         estimator = build_estimator()
         for kind, plug_in in (("predictor", predictor), ("controller", controller)):
-            with refuse_failure(f"cloud.{kind}: its reset() failed"):
+            what = f"cloud.{kind}: its reset() failed"
+            with refuse_failure(what, slow=f"reset() of cloud.{kind} is still running"):
                 plug_in.reset()
         self._begin(estimator)
 

@@ -331,7 +331,8 @@ def _complete(
     more = {"robot": robot} if _takes_robot(kind, name) else {}
     plugin = plugins.load(kind, name, **dict(checked), **more)
     if kind != "estimators":
-        with plugins.refuse_failure(f"{path[-1]} {name!r}: its reset() failed"):
+        what = f"{path[-1]} {name!r}: its reset() failed"
+        with plugins.refuse_failure(what, slow=f"reset() of {name} is still running"):
             plugin.reset()
     if _plans_ahead(document):
         if kind == "predictors":
@@ -354,7 +355,8 @@ def _parameters_of(kind: str, name: str) -> type[BaseModel]:
 
 def _check_model(predictor: Any, name: str) -> None:
     """Raise a BadInputError if the predictor has no robot model, which `cloud.plan_s` needs."""
-    with plugins.refuse_failure(f"predictor {name!r} cannot predict"):
+    what = f"predictor {name!r} cannot predict"
+    with plugins.refuse_failure(what, slow=f"predict() of {name} is still running"):
         predictor.predict(Odometry(0, ZERO, UPRIGHT, ZERO, ZERO), 0.0)
         model = predictor.model()
     if model is None:
@@ -435,7 +437,8 @@ def _check(kind: str, name: str, parameters: dict[str, Any]) -> BaseModel:
     Raise a ProblemsError about wrong parameters, a BadInputError if a validator of the user fails.
     """
     model, text = _parameters_of(kind, name), json.dumps(parameters)
-    with plugins.refuse_failure(f"{plugins.one(kind)} {name!r}: a check of a parameter failed"):
+    what = f"{plugins.one(kind)} {name!r}: a check of a parameter failed"
+    with plugins.refuse_failure(what, slow=f"{name} still checks its parameters"):
         try:
             return model.model_validate_json(text)
         except ValidationError as error:

@@ -150,7 +150,7 @@ def make_env(setup: EvalSetup, seed: int) -> Iterator[gymnasium.Env[Any, Any]]:
     """Make the environment of an episode; raise a BadInputError if it fails, also in the block."""
     words = {key: seed if value == SEED else value for key, value in setup.env_args}
     what = f"--env {setup.env}"
-    with refuse_failure(what, keep=CloudrcError):
+    with refuse_failure(what, keep=CloudrcError, slow=f"{what} is still being made"):
         env = gymnasium.make(setup.env, disable_env_checker=True, **words)
     with refuse_failure(f"{what}: the episode failed", keep=CloudrcError), closing(env):
         yield env

@@ -34,7 +34,8 @@ class LoadedPolicy:
             raise BadInputError(f"policy '{name}': name a Python file, such as ./{name}.py")
         policy = find("policies", name, look=False)
         build, infer = policy.get("build"), policy.get("infer")
-        with refuse_failure(f"policy '{name}' cannot be built"):
+        what = f"policy '{name}' cannot be built"
+        with refuse_failure(what, slow=f"{name} is still being built"):
             is_built = build is not None and infer is None
             read = partial(_attribute, build()) if is_built else policy.get
             infer, reset, metadata = read("infer"), read("reset"), read("metadata")

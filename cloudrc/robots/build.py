@@ -308,7 +308,8 @@ def _check_onboard(name: str, onboard: Onboard, size: int | None) -> None:
     `size` is the number of commands, None if unknown.
     """
     wanted = "finite numbers" if size is None else f"{size} finite numbers, one per actuator"
-    with plugins.refuse_failure(f"the onboard controller {name!r} does not hold the contract"):
+    what = f"the onboard controller {name!r} does not hold the contract"
+    with plugins.refuse_failure(what, slow=f"reset() of {name} is still running"):
         for method in ("reset", "update", "brake"):
             if not callable(getattr(onboard, method, None)):
                 raise ValueError(f"{type(onboard).__name__} has no method {method}()")

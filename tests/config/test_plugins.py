@@ -1,5 +1,6 @@
 """Plug-ins are found by name, entry point or path; an error lists the known names."""
 
+import logging
 import re
 import sys
 import traceback
@@ -318,3 +319,28 @@ def test_a_parameter_may_have_any_name_but_that_of_the_plug_in(share):
     share.write_text(source + build % ("name", "name"))
     text = refused("hover", f"cloud.predictor={share}")
     assert "no parameter of build() may be called name" in text
+
+
+@pytest.mark.parametrize("how", ["load", "calling"])
+def test_a_build_that_takes_long_is_named(share, monkeypatch, how):
+    monkeypatch.setattr("cloudrc.patience.SILENT", 0.0)
+    share.write_text(
+        "import logging, time\n"
+        "class build:\n"
+        "    def __init__(self):\n"
+        "        while not logging.getLogger('cloudrc').told: time.sleep(0.001)\n"
+        "    def predict(self, *given): ...\n"
+        "    observe = commanded = applied = reset = predict\n"
+    )
+    found = plugins.find("predictors", str(share))
+    told = logging.getLogger("cloudrc")
+    monkeypatch.setattr(told, "told", [], raising=False)
+    monkeypatch.setattr(told, "warning", lambda text, *more: told.told.append(text % more))
+    monkeypatch.setattr(plugins, "find", lambda *given, **more: found)
+    if how == "load":
+        plugins.load("predictors", str(share))
+        assert "share.py is still being built" in told.told[0]
+        return
+    with found.calling("build") as build:
+        build()
+    assert f"build() of {share} is still running" in told.told[0]
