@@ -14,7 +14,7 @@ from cloudrc.config.load import ResolvedExperiment, dump, read_experiment
 from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.drivers.local import JOURNAL_FILE, under_way
-from cloudrc.errors import BadInputError, NothingFlownError
+from cloudrc.errors import BadInputError, InvalidRunError, NothingFlownError
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.record.writer import is_open
@@ -41,9 +41,15 @@ def read_last_mission(folder: Path) -> tuple[Recording, ResolvedExperiment, bool
 
     Raises:
         NothingFlownError: If no mission flew.
+        InvalidRunError: If the recording of a killed session ends before its last mission.
     """
     if (last := last_mission(folder)) is None:
         raise NothingFlownError(f"{folder}: no mission flew, so there is no report")
+    recording = merge(folder / "world.mcap", folder / "cloud.mcap")
+    seen = recording["/telemetry"]["mission_id"]
+    if len(seen) and last.number not in seen:
+        text = f"the recording ends before mission {last.id}, the last one, so there is no report"
+        raise InvalidRunError(f"{folder}: {text}; world.mcap and cloud.mcap have the flight before")
     config = folder / "config.yaml"
     session = read_experiment(config, flown=True)
     if last.order.plan.by_hand:  # rest at the start, until the report has the setpoints
@@ -53,7 +59,6 @@ def read_last_mission(folder: Path) -> tuple[Recording, ResolvedExperiment, bool
     about = f"Mission {last.id} ({last.order.name}), the last one of a session"
     experiment = with_order(session, last.order, about)
     config.write_text(dump(experiment), encoding="utf-8")
-    recording = merge(folder / "world.mcap", folder / "cloud.mcap")
     cut_to_last_mission(recording)
     return recording, experiment, not last.ended
 

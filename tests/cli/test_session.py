@@ -27,12 +27,14 @@ from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Start
 from cloudrc.record.columns import Recording
+from cloudrc.records import TelemetrySent
 from cloudrc.teleop.client import Api, ApiError
 from cloudrc.teleop.store import Order, open_store
 from cloudrc.teleop.wire import Leg, Plan
 from tests.conftest import wait_until
 from tests.drivers.conftest import FAST, processes_of
 from tests.fences import FENCE
+from tests.record.conftest import cloud_records, world_records, write
 
 USING = "cloudrc: using the run in s\n"
 
@@ -94,6 +96,27 @@ def test_down_tells_a_missing_report_from_no_mission(folder, down):
         with closing(open_store(folder / "missions.journal", b"")) as store:
             store.note(store.find(mission.id), "started", "")
         assert "mission m1 flew, but has no report; to write it: cloudrc report" in down(1)
+
+
+def test_a_killed_session_whose_recording_lacks_the_last_mission_has_no_report(folder, call):
+    """The mission before the last one is not judged in its place."""
+    with closing(open_store(folder / "missions.journal", b"")) as store:
+        first, last = store.add(drive_order()), store.add(drive_order())
+        for mission in (first, last):
+            store.note(mission, "started", "")
+    (folder / "config.yaml").write_text(dump(load_experiment("hover")))
+    world = [
+        record._replace(telemetry=record.telemetry._replace(mission_id=first.number))
+        if isinstance(record, TelemetrySent)
+        else record
+        for record in world_records(100)
+    ]
+    write(folder / "world.mcap", world, clock_id="a")
+    write(folder / "cloud.mcap", cloud_records(100), "cloud", "a")
+    shown = "".join(call(f"report {folder}", code=6))
+    assert "the recording ends before mission m2, the last one, so there is no report" in shown
+    assert read_experiment(folder / "config.yaml").name == "hover"
+    assert not (folder / "mission.mcap").exists()
 
 
 @pytest.mark.process
