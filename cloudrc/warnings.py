@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from itertools import pairwise
-from math import ceil, dist, floor
+from math import ceil, dist, exp, floor
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.errors import MissingPrerequisiteError
@@ -17,6 +17,7 @@ from cloudrc.rounding import exceeds, format_limit
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.config.schema import Waypoint
     from cloudrc.link.profile import DirectionProfile
 
 FAR = 1.0
@@ -25,6 +26,11 @@ JITTER_MAX = 1.0
 """Jitter of a link that may be meant in another unit [s]."""
 GUARD_STEP = 0.002
 """Time between two looks of the guard at the age of a command [s]."""
+FAST = 5.0
+"""Noise of the measured velocity that may be meant in cm/s or mm/s [m/s]."""
+SEEN_MIN = 1e-3
+"""Chance to measure the robot within a tolerance for a whole dwell time, below which a waypoint
+counts as never reached [1]."""
 LONG = 3600.0
 """Duration of a mission that may be meant in milliseconds [s]."""
 
@@ -45,6 +51,8 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
                 f" mission.waypoints.{number - 1}.tolerance_m in metres"
             )
             break  # the others are alike
+    yield from _noise(experiment)
+    yield from _slow(experiment)
     yield from _robot(experiment)
     yield from _balance(experiment)
     carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
@@ -207,6 +215,78 @@ def _fast_track(experiment: ResolvedExperiment) -> Iterator[str]:
             f"the setpoints of mission.setpoints move at {fastest:.3g} m/s after {begin:g} s, and "
             f"the guard caps the speed at {cap:.3g} m/s: the robot falls behind, and the mission "
             "fails if the robot is not at the last row in time"
+        )
+
+
+def _noise(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Yield a warning if cloud cannot see from its measurements that the robot has arrived."""
+    sensors, mission = experiment.world.sensors, experiment.mission
+    noise, settle = sensors.position_noise_m, experiment.criteria.settle_m
+    key = "world.sensors.position_noise_m"
+    missed = [waypoint for waypoint in mission.waypoints if _is_missed(waypoint, experiment)]
+    most = FAR if settle is None or mission.waypoints else 3 * settle
+    if missed:
+        tightest = min(missed, key=lambda waypoint: waypoint.tolerance_m)
+        number, tolerance = mission.waypoints.index(tightest) + 1, tightest.tolerance_m
+        yield (
+            f"{key} is {noise:g}: cloud hardly ever measures the robot within {tolerance:g} m of "
+            f"waypoint {number} for {tightest.dwell_s:g} s, so the waypoint is not reached; give "
+            f"it in metres, a value that fits: --set {key}={tolerance / 5:.2g}"
+        )
+    elif noise >= most:
+        yield (
+            f"{key} is {noise:g}: cloud cannot bring the robot to a setpoint that it measures so "
+            f"badly; give it in metres, a value that fits: --set {key}={most / 10:.2g}"
+        )
+    if sensors.velocity_noise_mps >= FAST:
+        yield (
+            f"world.sensors.velocity_noise_mps is {sensors.velocity_noise_mps:g}, and cloud "
+            "predicts with the measured velocity; give it in m/s, a value that fits: "
+            "--set world.sensors.velocity_noise_mps=0.1"
+        )
+
+
+def _is_missed(waypoint: Waypoint, experiment: ResolvedExperiment) -> bool:
+    """Return whether the noise of the position hardly ever lets a waypoint count as reached."""
+    noise = experiment.world.sensors.position_noise_m
+    if not noise:
+        return False
+    # The chance in a plane; in space it is smaller.
+    within = 1.0 - exp(-0.5 * (waypoint.tolerance_m / noise) ** 2)
+    chance: float = within ** (waypoint.dwell_s * experiment.world.odometry_rate_hz)
+    return chance < SEEN_MIN
+
+
+def _slow(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Yield a warning if the robot may not move fast enough for its waypoints or steps."""
+    from cloudrc.assembly import build_plan
+    from cloudrc.config.scene import scene_of
+
+    mission, controller = experiment.mission, experiment.cloud.controller
+    plan, settle = build_plan(experiment), experiment.criteria.settle_m
+    if not plan.legs or plan.track or (mission.steps and settle is None):
+        return
+    speeds = {"guard.speed_max_mps": experiment.guard.speed_max_mps}
+    own = (controller.model_extra or {}).get("speed_max")
+    if controller.name == "pid" and own is not None:
+        speeds["cloud.controller.speed_max"] = own
+    key = min(speeds, key=lambda name: speeds[name])
+    dwell = sum(leg.dwell for leg in plan.legs)
+    time = min(plan.time_limit, sum(leg.time_limit for leg in plan.legs)) - dwell
+    if mission.steps:
+        time = dwell
+    way, first = 0.0, plan.legs[0]
+    if mission.waypoints and mission.start == "spawn":
+        spawn = scene_of(experiment.world).spawn
+        way = max(0.0, dist(spawn, first.position) - first.tolerance)
+    for before, leg in pairwise(plan.legs):
+        near = 2 * settle if mission.steps and settle else before.tolerance + leg.tolerance
+        way += max(0.0, dist(before.position, leg.position) - near)
+    if time > 0 and way > speeds[key] * time:
+        yield (
+            f"{key} is {speeds[key]:g} m/s, too slow for the {way:.3g} m of the "
+            f"mission's way in {time:.4g} s; a value that fits: "
+            f"--set {key}={_round_up(2 * way / time, 0.01):g}"
         )
 
 

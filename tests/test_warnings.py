@@ -168,6 +168,34 @@ def test_what_a_flight_never_reaches_on_the_time_line_of_the_link_is_named(setti
     assert all(re.match(words, text) for text in told)
 
 
+@pytest.mark.parametrize(
+    ("name", "settings", "words"),
+    [
+        ("paper", ["world.sensors.position_noise_m=5"], "noise_m is 5: cloud hardly ever"),
+        ("paper", ["world.sensors.position_noise_m=0.05"], "within 0.1 m of waypoint 3 for 0.5 s"),
+        ("paper", ["world.sensors.position_noise_m=0.02"], ""),
+        ("pillars", ["world.sensors.position_noise_m=0.05"], ""),
+        ("steps", ["world.sensors.position_noise_m=5"], "noise_m is 5: cloud cannot bring"),
+        ("steps", ["world.sensors.position_noise_m=0.2"], ""),
+        ("paper", ["world.sensors.velocity_noise_mps=10"], "velocity_noise_mps is 10, and"),
+        ("paper", ["world.sensors.velocity_noise_mps=0.5"], ""),
+        ("paper", ["guard.speed_max_mps=0.01"], "guard.speed_max_mps is 0.01 m/s, too slow for"),
+        ("paper", ["cloud.controller.speed_max=0.0005"], "controller.speed_max is 0.0005 m/s"),
+        ("pillars", ["guard.speed_max_mps=0.01"], ""),
+        ("hover", ["guard.speed_max_mps=0.01"], "guard.speed_max_mps is 0.01 m/s, too slow"),
+        ("steps", ["guard.speed_max_mps=0.01"], "guard.speed_max_mps is 0.01 m/s, too slow"),
+    ],
+)
+def test_noise_and_speeds_with_which_no_mission_succeeds_are_named(name, settings, words):
+    key = settings[0].partition("=")[0]
+    told = [text for text in advise(load_experiment(name, settings)) if text.startswith(key)]
+    assert len(told) == bool(words)
+    assert all(words in text for text in told)
+    for key, value in re.findall(r"--set ([\w.]+)=(\S+)", " ".join(told)):
+        fitting = advise(load_experiment(name, [f"{key}={value}"]))
+        assert not [text for text in fitting if text.startswith(key)]
+
+
 @pytest.mark.parametrize(("tolerance", "count"), [(10, 1), (0.5, 0)])
 def test_a_tolerance_that_may_be_meant_in_centimetres_is_named(tolerance, count):
     settings = [f"mission.waypoints.0.tolerance_m={tolerance}"]
