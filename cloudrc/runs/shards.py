@@ -82,4 +82,8 @@ def _find_array() -> JobArray:
         if index and (array, index) != (LSF, "0"):  # LSF gives 0 to a job that is in no array
             return array
     known = ", ".join(array.this for array in ARRAYS)
+    if os.environ.get(LSF.this):
+        raise BadInputError(
+            f"auto: {LSF.this}=0: this LSF job is no array; start it as one, or leave out --shard"
+        )
     raise BadInputError(f"auto needs one of {known}; give I/N")

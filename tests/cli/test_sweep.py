@@ -363,7 +363,7 @@ def slurm(index, count, first, last=None):
         ("auto", {"JOB_COMPLETION_INDEX": "0"}, "INDEX=0, but JOB_COMPLETIONS is not set; give au"),
         ("auto", {"PBS_ARRAY_INDEX": "3"}, "PBS_ARRAY_INDEX=3, but no variable has their number"),
         ("auto", {}, "auto needs one of SLURM_ARRAY_TASK_ID, PBS_ARRAY_INDEX, LSB_JOBINDEX, JOB_"),
-        ("auto", {"LSB_JOBINDEX": "0"}, "auto needs one of"),
+        ("auto", {"LSB_JOBINDEX": "0"}, "LSB_JOBINDEX=0: this LSF job is no array"),
         # The failed jobs 1, 3 and 7 of once 16 are submitted again: no job of them may fly.
         *(("auto", slurm(n, 3, 1, 7), rf"TASK_ID={n}, .*COUNT=3, .*shard 7/16") for n in (1, 3, 7)),
         *(("auto/16", slurm(n, 3, 1, 7), rf"TASK_ID={n}, .*all of its 16 jobs") for n in (1, 3, 7)),
