@@ -20,26 +20,29 @@ from cloudrc.errors import BadInputError
 LOCK = ".lock"
 """File that each command locks; the names of further locks begin so."""
 ALONE, TOGETHER = fcntl.LOCK_EX | fcntl.LOCK_NB, fcntl.LOCK_SH | fcntl.LOCK_NB
-CLAIMS_MAX = 16
-"""Number of the newest claims that a process holds."""
-_claims = list[int]()
+_claims = dict[tuple[int, int], int]()
+"""Folders that this process has claimed and not yet written into: device, inode -> open handle."""
 
 
 def claim_folder(folder: Path, *, is_shared: bool) -> bool:
-    """Return whether a folder is empty, and no other command is about to write into it.
+    """Return whether a folder is empty, and no other process is about to write into it.
 
-    With `is_shared`, other shards may be. The folder is locked until this process ends, or until it
-    has claimed `CLAIMS_MAX` others: by then it has written into the folder. The lock leaves no
-    file, so that a folder without a result can be used again. If the file system has no locks,
-    nothing is locked.
+    With `is_shared`, other shards may be. The folder stays locked until something is in it. The
+    lock leaves no file, so that a folder without a result can be used again. If the file system has
+    no locks, nothing is locked.
     """
+    for identity, handle in [*_claims.items()]:
+        if os.listdir(handle):  # so nobody takes this folder for a new one
+            os.close(_claims.pop(identity))
+    found = folder.stat()
+    identity = found.st_dev, found.st_ino
+    if identity in _claims:
+        return True
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     if not _try_lock(handle, TOGETHER if is_shared else ALONE) or os.listdir(handle):
         os.close(handle)
         return False
-    _claims.append(handle)
-    if len(_claims) > CLAIMS_MAX:
-        os.close(_claims.pop(0))
+    _claims[identity] = handle
     return True
 
 

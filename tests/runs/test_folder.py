@@ -8,7 +8,6 @@ import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.runs.folder import new_folder
-from cloudrc.runs.lock import CLAIMS_MAX
 
 
 def test_a_copy_of_the_link_to_the_newest_run_stays_and_is_told(tmp_path, monkeypatch, caplog):
@@ -49,8 +48,13 @@ def test_only_one_of_two_commands_gets_a_folder_which_shards_share(shared, tmp_p
         assert new_folder(out, "") == out, "the first command has left nothing"
 
 
-def test_a_process_that_makes_many_folders_keeps_few_files_open(tmp_path):
+def test_a_process_may_use_its_folder_again_until_something_is_in_it(tmp_path):
+    """A notebook repeats a call that has failed, and flies into many folders."""
     before = len(os.listdir("/proc/self/fd"))
-    for number in range(3 * CLAIMS_MAX):
-        new_folder(tmp_path / str(number), "")
-    assert len(os.listdir("/proc/self/fd")) <= before + CLAIMS_MAX
+    for number in range(5):
+        out = tmp_path / str(number)
+        assert new_folder(out, "") == new_folder(out, "") == out
+        (out / "config.yaml").touch()
+        with pytest.raises(BadInputError, match="already exists"):
+            new_folder(out, "")
+    assert len(os.listdir("/proc/self/fd")) == before
