@@ -384,9 +384,12 @@ def stray_error(error: BaseException) -> BadInputError | None:
     """Return the error to report if a user's code raised `error` outside of a guard; else None.
 
     A signal handler of a plug-in may do so at any line of cloudrc. A SystemExit is always the
-    user's, because no command of cloudrc raises one.
+    user's, because no command of cloudrc raises one. A full disk, say, is always the machine's.
     """
-    if isinstance(error, CloudrcError | KeyboardInterrupt | MemoryError):
+    if isinstance(error, CloudrcError | KeyboardInterrupt):
+        return None
+    is_of_system = not isinstance(error, OSError) or error.errno  # not a plug-in's TimeoutError
+    if machine_error(error) and is_of_system:
         return None
     place = place_of(error)
     if isinstance(error, SystemExit):

@@ -76,7 +76,7 @@ def fly(
             run = replace(run, files=files)
             return write_report(folder, recording, resolved, run, own=own, page=page)
     except OSError as error:
-        if plugins.place_of(error):  # a timeout that a plug-in's signal handler raised
+        if plugins.stray_error(error):  # a timeout that a plug-in's signal handler raised
             raise
         error.filename = str(error.filename or folder)
         raise machine_error(error) or error from error
