@@ -12,7 +12,6 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from shlex import quote
 from typing import IO
 
 from cloudrc.errors import BadInputError
@@ -63,9 +62,9 @@ def lock_folder(folder: Path, shard: int | None = None, count: int = 1) -> Itera
             try:
                 fcntl.flock(file, how)
             except BlockingIOError:
-                see = f"cloudrc sweep status {quote(str(folder))}"
-                text = f"{who} into it now; wait for its end, or see: {see}"
-                raise BadInputError(f"--out {folder}: {text}") from None
+                raise BadInputError(
+                    f"--out {folder}: {who} into it now; wait for its end"
+                ) from None
             except OSError as error:
                 text = f"{folder}: its file system has no locks ({error.strerror}); do not start "
                 warnings.append(f"{text}the same sweep or shard twice at the same time")
