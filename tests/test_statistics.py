@@ -141,3 +141,27 @@ def test_the_sign_test_holds_its_level_for_skewed_differences():
     found = [paired(sample.tolist()) for sample in samples]
     assert np.mean([each.p_sign < 0.05 for each in found]) < 0.06
     assert np.mean([each.p_wilcoxon < 0.05 for each in found]) > 0.1
+
+
+@given(
+    st.lists(st.integers(-9, 9) | st.integers(-9999, 9999), min_size=1, max_size=60),
+    st.sampled_from([1.0, 0.1, 1e-9, 1e9]),
+)
+def test_many_differences_are_evaluated_like_few(values, scale):
+    """Their means are counted, because all of them do not fit into memory."""
+    differences = [value * scale for value in values]
+    few = paired(differences)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(statistics, "MEANS_MAX", 0)
+        many = paired(differences)
+    assert many.difference == pytest.approx(few.difference)
+    assert many.interval == (few.interval and pytest.approx(few.interval))
+    assert many.pairs_needed == few.pairs_needed
+
+
+def test_fifty_thousand_differences_are_evaluated():
+    found = paired(range(-20_000, 30_000))
+    assert found.difference == 4999.5
+    low, high = found.interval
+    assert (low + high) / 2 == 4999.5
+    assert high - low == pytest.approx(2 * 1.96 * 50_000 / 12**0.5 / 50_000**0.5, rel=0.01)

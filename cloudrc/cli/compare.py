@@ -59,6 +59,7 @@ def flight_arguments(parser: argparse.ArgumentParser, seeds: int) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Compare A and B, print the result, and return the exit code: 0 if all flights were flown."""
     interrupt_on_signals()
+    from cloudrc.cli.progress import StepView
     from cloudrc.runs.compare import compare, of_sweep
     from cloudrc.runs.compare_text import as_text
 
@@ -66,17 +67,20 @@ def execute(options: argparse.Namespace) -> int:
     if options.set and options.sweep:
         raise BadInputError(f"--set {options.set[0]}: these flights are finished; leave it out")
     if options.sweep:
-        found = of_sweep(options.sweep, options.a, options.b)
+        with closing(StepView(sys.stderr, f"reads {options.sweep}")):
+            found = of_sweep(options.sweep, options.a, options.b)
     else:
         found, stopped = _fly_both(options)
     if stopped:
         print_or_drop(f"cloudrc: {stopped}: {len(found.pairs)} pairs are finished", sys.stderr)
         if not found.pairs:
             return stopped.exit_code
+    with closing(StepView(sys.stderr, f"compares {len(found.pairs):,} pairs of flights")):
+        compared = compare(found.pairs, found.units, options.number)
     document = {
         **{"a": options.a, "b": options.b, "of": found.what},
         **{"overrides": options.set, "interrupted": bool(stopped)},
-        **compare(found.pairs, found.units, options.number),
+        **compared,
     }
     print_result(options.output, document, as_text(document))
     return stopped.exit_code if stopped else 0

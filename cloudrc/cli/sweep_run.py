@@ -139,7 +139,8 @@ def fly_again(options: argparse.Namespace) -> int:
 
 def print_status(options: argparse.Namespace) -> int:
     """Print how many flights of a sweep are done, and how many succeeded per value of an axis."""
-    flights, rows, values = sweep.count_successes(options.folder)
+    with closing(StepView(sys.stderr, f"reads {options.folder}")):
+        flights, rows, values = sweep.count_successes(options.folder)
     document = {"flights": flights, "rows": len(rows), "axes": values}
     print_result(options.output, document, sweep.status_text(flights, rows, values))
     return 0
@@ -151,9 +152,10 @@ def draw_figure(options: argparse.Namespace) -> int:
     from cloudrc.report.figures.style import Look
     from cloudrc.runs.figure import draw_sweep
 
-    rows, units, missing = store.read_flights(options.folder)
     look = Look(options.width, options.font_size)
-    files, caption = draw_sweep(rows, units, options.number, options.x, options.by, look)
+    with closing(StepView(sys.stderr, f"draws {options.folder}")):
+        rows, units, missing = store.read_flights(options.folder)
+        files, caption = draw_sweep(rows, units, options.number, options.x, options.by, look)
     out = options.out or options.folder / "figure"
     stem = out.stem if out.suffix.removeprefix(".") in files else out.name
     paths = {kind: out.with_name(f"{stem}.{kind}") for kind in files}

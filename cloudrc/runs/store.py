@@ -11,7 +11,7 @@ import json
 import logging
 from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
@@ -316,9 +316,10 @@ def check_points(folder: Path, rows: Collection[Row], axes: Mapping[str, Sequenc
             f"{folder}: its flights are of different code: {' and '.join(sorted(codes))}"
         )
         logging.getLogger("cloudrc").warning("%s", text)
+    known = {axis: {*map(frozen, values)} for axis, values in axes.items()}
     for row in rows:
         point = row["point"]
-        if point.keys() != axes.keys() or any(point[axis] not in axes[axis] for axis in axes):
+        if point.keys() != known.keys() or any(frozen(point[a]) not in known[a] for a in known):
             text = f"the row {row['key']} has another point than those in {SUMMARY}: {point}"
             raise BadInputError(to_one_line(f"{folder}: {text}; name the folder of one sweep"))
 
@@ -332,9 +333,10 @@ def read_flights(folder: Path) -> tuple[list[Row], dict[str, str], str]:
     """
     summary = read_summary(folder)
     axes = summary["axes"]
+    places = {axis: {frozen(v): n for n, v in enumerate(axes[axis])} for axis in axes}
 
     def place(row: Row) -> list[int]:
-        return [*(axes[axis].index(value) for axis, value in row["point"].items()), row["seed"]]
+        return [*(places[axis][frozen(v)] for axis, v in row["point"].items()), row["seed"]]
 
     found = read_rows(folder).values()
     check_points(folder, found, axes)
@@ -351,6 +353,16 @@ def read_flights(folder: Path) -> tuple[list[Row], dict[str, str], str]:
         {**unknown, **_with_new_names(summary["units"])},
         f"{missing} flights are not done" if missing else "",
     )
+
+
+def frozen(value: Any) -> Hashable:
+    """Convert a value of an axis so that it can be looked up; equal values become equal."""
+    if isinstance(value, list):
+        return tuple(map(frozen, value))
+    if isinstance(value, dict):
+        return frozenset((key, frozen(each)) for key, each in value.items())
+    plain: Hashable = value
+    return plain
 
 
 def values_of(rows: Sequence[Row]) -> dict[str, list[Any]]:

@@ -167,9 +167,12 @@ def count_successes(folder: Path) -> tuple[int, list[Row], list[dict[str, Any]]]
     store.check_points(folder, rows, summary["axes"])
     values = []
     for axis, choices in summary["axes"].items():
+        of = [store.frozen(row["point"][axis]) for row in rows]
+        flights = Counter(of)
+        successes = Counter(of[n] for n, row in enumerate(rows) if row["verdict"] == "success")
         for value in choices:
-            found = [row["verdict"] for row in rows if row["point"][axis] == value]
-            counts = {"flights": len(found), "success": found.count("success")}
+            key = store.frozen(value)
+            counts = {"flights": flights[key], "success": successes[key]}
             values.append({"axis": axis, "value": value, **counts})
     return summary["flights"], rows, values
 

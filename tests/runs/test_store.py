@@ -243,3 +243,8 @@ def test_a_folder_from_before_the_hash_is_read_but_not_continued(grid, rows, tmp
 def test_another_folder_is_refused(tmp_path):
     with pytest.raises(BadInputError, match="is not a folder of"):
         store.read_summary(tmp_path)
+
+
+def test_equal_values_of_an_axis_are_one_value_also_lists_and_mappings():
+    assert store.frozen([0, {"a": [1.0]}]) == store.frozen([0.0, {"a": [1]}])
+    assert len({*map(store.frozen, [[0, 1], [1, 0], {"a": 1}, {"a": 2}, None, "a"])}) == 6
