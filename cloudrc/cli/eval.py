@@ -131,11 +131,12 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
-    """Check the flags; return the evaluation and its episodes."""
+    """Check the flags, print doubts about the link, and return the evaluation and its episodes."""
     from cloudrc.eval.setup import (
         Episode,
         EvalSetup,
         check_setup,
+        heavy_shares,
         link_at,
         read_compute,
         read_env_args,
@@ -156,6 +157,8 @@ def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
         options.observation_bytes,
     )
     check_setup(setup)
+    for text in heavy_shares(setup):
+        print_line(f"cloudrc: warning: --link {setup.link}: {text}", sys.stderr)
     for rtt in options.rtt:
         link_at(setup.link, rtt)
     if not all(executors):

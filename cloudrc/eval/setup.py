@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from math import nan
@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 from cloudrc.config.document import parse_value, read_document
 from cloudrc.config.reuse import reuse
 from cloudrc.errors import BadInputError
+from cloudrc.link.doubts import describe_heavy_shares
 from cloudrc.link.library import LinkProfile, read_profile
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.traces import read_lines
@@ -185,6 +186,13 @@ def mean_compute(compute: Compute) -> float:
     if kind == FILE:
         return fmean(read_times(str(value)))
     return 0.0 if kind == MEASURED else float(kind)
+
+
+def heavy_shares(setup: EvalSetup) -> Iterator[str]:
+    """Warn of each share of packets of the link of which 100 times less may be meant."""
+    link = read_profile(setup.link)
+    yield from describe_heavy_shares(link.uplink, "uplink")
+    yield from describe_heavy_shares(link.downlink, "downlink")
 
 
 def slow_answers(setup: EvalSetup, dt: float) -> str:

@@ -24,6 +24,7 @@ from cloudrc.config.robot import known_robot
 from cloudrc.config.schema import Experiment, Profile
 from cloudrc.drivers.programs import run_tool
 from cloudrc.errors import BadInputError, TimedOutError
+from cloudrc.link.doubts import describe_heavy_shares
 from cloudrc.link.netem import check, find_netems
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import link_profile
@@ -108,7 +109,10 @@ def verify(
         found = {way: now[way]._replace(rows=rows[way]) for way in now}
         if "off" not in {verdict_of(one.rows) for one in found.values()}:
             break
-    return make_report(target, found)
+    report = make_report(target, found)
+    for way in found:
+        report["notes"] += describe_heavy_shares(link_profile(getattr(experiment, way)), way)
+    return report
 
 
 def check_seconds(seconds: float | None) -> float | None:

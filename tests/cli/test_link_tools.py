@@ -128,6 +128,13 @@ def test_a_profile_is_drawn_and_its_statistics_printed(folder, call):
     assert (folder / "a.svg").read_bytes() == first, "the same link gives the same picture"
 
 
+def test_show_warns_of_a_loss_that_may_be_meant_in_percent(folder, call):
+    (folder / "lab.yaml").write_text("uplink: {delay_ms: 40, loss: 1}\n")
+    said = call("link show lab.yaml --packets 10 --seconds 1").err
+    assert "warning: the uplink loses 100 % of its packets" in said
+    assert "downlink" not in said
+
+
 def test_a_picture_of_many_packets_says_what_it_does(folder, call, monkeypatch):
     monkeypatch.setattr("cloudrc.cli.progress.FIRST_WAIT", 0.02)
     monkeypatch.setattr("cloudrc.cli.progress.PERIOD", 0.02)
