@@ -51,6 +51,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--executor", default="newest", metavar="NAME,...", help=about)
     about = "time for an answer in s: a number, MEAN,DEVIATION, a file, 'measured'"
     add("--compute", default="0", metavar="TIME", help=f"{about} (default: 0)")
+    about = "how long the robot waits in a step for an answer, in s (default: 5 %% of it)"
+    add("--answer-within", type=number(0, 3600, "seconds"), metavar="S", help=about)
     about = "seeds 1 to N of each condition (default: 20)"
     add("--seeds", type=read_count, default=20, metavar="N", help=about)
     about = "file from the environment's observation to the policy's (YAML)"
@@ -155,6 +157,7 @@ def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
         options.dt,
         options.max_steps,
         options.observation_bytes,
+        options.answer_within,
     )
     check_setup(setup)
     for text in heavy_shares(setup):

@@ -51,6 +51,7 @@ class Played(NamedTuple):
     steps: int
     success: bool | None  # None: the environment does not tell
     stale: int  # steps in which the robot had no action of an answer
+    ended: str  # "terminated", "truncated", or "limit": by the number of steps
     jumps: list[float]  # change of the action from one answer to the next, at each change [1]
     loop: dict[str, Any]  # summary of the loop
     records_sha256: str
@@ -124,8 +125,10 @@ def play(episode: Episode, setup: EvalSetup, identity: Mapping[str, Any]) -> dic
         "steps": found.steps,
         "success": None if found.success is None else int(found.success),
         "stale_share": found.stale / found.steps,
-        "observation_age": found.loop["observation_age_mean"],
-        "action_age": found.loop["action_age_mean"],
+        "loop_age": found.loop["loop_age"],
+        **_ages("observation_age", found.loop),
+        **_ages("action_age", found.loop),
+        "late_share": found.loop["late_share"],
         "seam_jump": fmean(found.jumps) if found.jumps else None,
         **{f"{name}_uplink": up[name] for name in ("delay_asked", "delay_measured")},
         **{f"{name}_downlink": down[name] for name in ("delay_asked", "delay_measured")},
@@ -137,12 +140,19 @@ def play(episode: Episode, setup: EvalSetup, identity: Mapping[str, Any]) -> dic
         "point": episode.point,
         "seed": episode.seed,
         "verdict": judged[found.success],
+        "ended": found.ended,
         "failures": [],
         "text": "",
         "numbers": {k: v for k, v in numbers.items() if v is not None and isfinite(v)},
         "records_sha256": found.records_sha256 if setup.is_repeatable else "",
         "code": code_hash(),
     }
+
+
+def _ages(name: str, loop: Mapping[str, Any]) -> dict[str, float]:
+    """Return mean and 99th percentile of an age [s], and of how many steps they are."""
+    mean, p99, steps = (loop[f"{name}_{part}"] for part in ("mean", "p99", "of"))
+    return {name: mean, f"{name}_p99": p99, f"{name}_of": steps}
 
 
 @contextmanager
@@ -255,23 +265,22 @@ def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask:
     world = _connect(witness, episode, setup, len(chunk), policy)
     witness.digest = sha256()
     observation, info = world.reset(seed=episode.seed)
-    times, fresh = _times(setup), True
-    total, steps, stale, told = 0.0, 0, 0, dict[str, Any]()
-    jumps, before, basis, success = list[float](), None, -1, None
-    while steps < setup.max_steps:
+    times, dt = _times(setup), world.dt
+    total, steps, stale, ended = 0.0, 0, 0, "limit"
+    jumps, before, basis, success = list[float](), None, -1.0, None
+    while steps < setup.max_steps and ended == "limit":
         about = info["cloudrc"]
-        if not about["busy"] and (fresh or about.get("prefix")) and steps:
+        if about["asked"] and steps:
             chunk = policy(observation, about.get("prefix", []))
-        world.compute = times(episode.seed + steps, policy.duration)
-        seen_at = steps - round(about["observation_age"] / world.dt)
+        seen = steps - round(about["observation_age"] / dt)
+        world.compute = times(episode.seed + seen, policy.duration)
         observation, reward, terminated, truncated, info = world.step(chunk)
         steps, total = steps + 1, total + reward
         about = info["cloudrc"]
-        fresh = steps - round(about["observation_age"] / world.dt) > seen_at
         stale += about["held"]
         if isfinite(about["action_age"]) and not about["held"]:
-            now = steps - 1 - round(about["action_age"] / world.dt)
-            if before is not None and now != basis:
+            now = steps - 1 - about["action_age"] / dt
+            if before is not None and abs(now - basis) > 1e-6:
                 jump = np.subtract(witness.action, before, dtype=float)  # they may be booleans
                 jumps.append(float(np.linalg.norm(jump)))
             basis = now
@@ -279,12 +288,11 @@ def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask:
         if setup.success_at is None:
             success = _success(success, world.world_info)
         if terminated or truncated:
-            told = about["episode"]
-            break
+            ended = "terminated" if terminated else "truncated"
     if setup.success_at is not None:
         success = not exceeds(setup.success_at, total)
-    told = told or world.summary()
-    return Played(total, steps, success, stale, jumps, told, witness.digest.hexdigest())
+    loop, played = world.summary(setup.deadline), witness.digest.hexdigest()
+    return Played(total, steps, success, stale, ended, jumps, loop, played)
 
 
 def _connect(
@@ -306,6 +314,7 @@ def _connect(
         episode.seed,
         dt=setup.dt,
         compute=compute,
+        answer_within=setup.answer_within,
         chunk=count,
         executor=episode.executor,
         observation_bytes=policy.size if sent is None else sent,

@@ -52,6 +52,8 @@ class EvalSetup:
     dt: float | None = None  # time of a step [s]; None: that of the environment
     max_steps: int = 10_000  # longest episode
     observation_bytes: int | None = None  # of an observation on the wire; None: that of its arrays
+    answer_within: float | None = None  # how long the robot waits in a step [s]; None: 5 % of it
+    deadline: float | None = None  # age of an action from which on it is late [s]
     follows_seed: bool = True  # whether equal seeds give equal episodes
     env_code: str = ""  # hash of the environment's code and files
 

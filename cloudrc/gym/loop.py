@@ -1,9 +1,19 @@
 """Carry observations and actions of one robot over a link, in the ticks of its environment.
 
-The world never waits: a tick is a step of the environment, and what is late is late. A tick of time
-t goes like this: the policy answers to the newest observation that it has, and the answer leaves at
-t plus the compute time; the robot takes the answers that have arrived, and executes an action; the
-world moves to the next tick, whose observation leaves at once.
+The world never waits: a tick is a step of the environment, and what is late is late. The policy is
+a server: it answers when an observation arrives. Times are whole nanoseconds; tick k is at
+t = round(k dt), and W is how long the robot waits in a tick for an answer:
+
+1. The robot receives the answers that have arrived by t.
+2. If its executor asks, the observation of tick k leaves at t.
+3. Policy, up to t + W: it begins when an observation has arrived and its last answer is computed.
+   It takes the newest observation that has arrived by then, and drops older ones. The answer leaves
+   after the compute time, as the packet whose number is the tick of the observation: so the fate of
+   a packet depends neither on the compute time nor on the executor.
+4. The robot receives the answers that have arrived by t + W, and executes an action.
+
+So the age of the loop is dt max(0, ceil((up + compute + down - W) / dt)). One call of `step` has
+one answer: of the questions that begin in one tick, the newest counts.
 """
 
 from __future__ import annotations
@@ -11,7 +21,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from heapq import heappop, heappush
 from math import ceil, inf, nan
 from typing import Any
 
@@ -20,12 +29,11 @@ from gymnasium.error import ResetNeeded
 
 from cloudrc.gym.executors import Chunk, Executor
 from cloudrc.gym.values import copied
-from cloudrc.link.draws import stream_key
+from cloudrc.link.draws import Floats, stream_key
 from cloudrc.link.library import LinkProfile, OneWay
 from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.queue import PacketQueue
 
-SLACK_NS = 1_000
-"""How much later than its tick a packet may arrive [ns]: ticks and delays are rounded."""
 EPISODES = 1 << 20
 """Number of episodes that belong to a seed of the environment."""
 _COMPUTE = 129  # kind of the random numbers of the compute time
@@ -38,6 +46,7 @@ class Settings:
     link: LinkProfile
     seed: int  # of the link
     dt: float  # time of a tick [s]
+    answer_within: float  # how long the robot waits in a tick for an answer [s]
     compute: tuple[float, float]  # mean and standard deviation of the time for an answer [s]
     repeats: bool  # whether the robot repeats its last action if it has none, or executes `start`
     start: Any  # action before the first answer
@@ -54,7 +63,11 @@ def expected(profile: DirectionProfile, period: float, size: int) -> tuple[float
 
 
 class Lane:
-    """The packets of one direction, in flight and counted."""
+    """The packets of one direction, in flight and counted.
+
+    Attributes:
+        queue: The packets in flight.
+    """
 
     def __init__(self, way: OneWay, size: int) -> None:
         """Send packets of `size` bytes."""
@@ -63,39 +76,31 @@ class Lane:
 
     def begin(self, episode: int) -> None:
         """Begin an episode without packets."""
-        self._episode = episode
-        self._flying: list[tuple[int, int, Any]] = []  # arrival [ns], number, message
-        self.sent = self.lost = self._delays_ns = 0
+        self._episode, self.queue = episode, PacketQueue()
+        self.sent = self._delays_ns = 0
 
     def send(self, number: int, now_ns: int, message: Any) -> None:
         """Send a message at `now_ns` [ns], or lose it."""
         self.sent += 1
         arrivals = self._way.send(self._episode, number, self._size, now_ns)
-        if not arrivals:
-            self.lost += 1
-            return
-        arrival_ns = arrivals[0] if len(arrivals) == 1 else min(arrivals)
-        self._delays_ns += arrival_ns - now_ns
-        heappush(self._flying, (arrival_ns, number, message))
-
-    def next(self, now_ns: int) -> Any:
-        """Take the next message that has arrived at `now_ns` [ns]; None if there is none."""
-        if self._flying and self._flying[0][0] <= now_ns + SLACK_NS:
-            return heappop(self._flying)[2]
-        return None
+        if len(arrivals) > 1:
+            arrivals = (min(arrivals),)  # of two copies
+        if arrivals:
+            self._delays_ns += arrivals[0] - now_ns
+        self.queue.put(None, arrivals, message)
 
     def summary(self, period: float) -> dict[str, float]:
         """Return delay [s] and loss: asked by the profile, and measured in this episode.
 
         One packet per `period` [s] is asked for.
         """
-        arrived = self.sent - self.lost
+        arrived = self.sent - self.queue.lost
         delay, loss = expected(self._way.profile, period, self._size)
         return {
             "delay_asked": delay,
             "delay_measured": self._delays_ns * 1e-9 / arrived if arrived else nan,
             "loss_asked": loss,
-            "loss_measured": self.lost / self.sent if self.sent else nan,
+            "loss_measured": self.queue.lost / self.sent if self.sent else nan,
             "sent": self.sent,
         }
 
@@ -104,7 +109,7 @@ class RemoteLoop:
     """One robot, one policy and the link between them.
 
     Attributes:
-        seen: The newest observation that the policy has, and the environment's info about it.
+        seen: The newest observation that the policy has taken, and the environment's info about it.
         compute: Time for the next answers [s], in place of that of the settings; None: the latter.
     """
 
@@ -116,7 +121,7 @@ class RemoteLoop:
         self._up = Lane(OneWay(link.uplink, seed, True, stream=stream), settings.observation_bytes)
         self._down = Lane(OneWay(link.downlink, seed, False, stream=stream), settings.action_bytes)
         self._stream, self._episode = stream, -1
-        self._compute_ns = round(settings.compute[0] * 1e9)
+        self._within_ns = round(settings.answer_within * 1e9)
         self._late: int | None = None
         self.compute: float | None = None
         self.seen: list[Any] = [None, {}]
@@ -130,109 +135,142 @@ class RemoteLoop:
         self._episode = self._episode + 1 if seed is None else (int(seed) + 1) * EPISODES
         self._up.begin(self._episode)
         self._down.begin(self._episode)
-        self._tick = self._now_ns = 0
-        self._free_ns = 0  # when the policy has computed its last answer
-        self._answered = -1  # newest observation to which the policy has answered
-        self._seen_tick = 0
+        self._tick = self._now_ns = self._seen_tick = 0
         self.seen = [copied(observation), info]
-        self._last, self._age = self._settings.start, inf
+        self._is_asked = True
+        self._begin_ns = self._free_ns = 0  # when the policy began its last answer, and has it
+        self._held = 0
+        self._last, self._basis = self._settings.start, -1.0
         self._is_held = False
-        self._held = self._skipped = self._acted = 0
-        self._observation_ages, self._action_ages = 0, 0.0  # sums, in ticks and in [s]
+        self._observation_ages = list[int]()  # [ticks], as the others
+        self._action_ages, self._loop_ages = list[float](), list[int]()
         self._executor.basis = -1
         self._executor.begin(self._ticks_late(), round(self._settings.dt * 1e9))
 
     def _ticks_late(self) -> int:
+        """Return the expected age of the loop [ticks]."""
         if self._late is None:
             settings, link = self._settings, self._settings.link
             up, _ = expected(link.uplink, settings.dt, settings.observation_bytes)
             down, _ = expected(link.downlink, settings.dt, settings.action_bytes)
-            lates = up, down + settings.compute[0]
-            self._late = sum(ceil(np.nan_to_num(each) / settings.dt - 1e-6) for each in lates)
+            late = np.nan_to_num(up + down) + settings.compute[0] - settings.answer_within
+            self._late = max(0, ceil(late / settings.dt - 1e-6))
         return self._late
 
     def act(self, actions: tuple[Any, ...]) -> Any:
-        """Take the policy's answer in this tick; return the action that the robot executes."""
+        """Take the policy's answer, if it is asked; return the action that the robot executes."""
         tick, executor = self._tick, self._executor
         if tick < 0:
             raise ResetNeeded("call reset() before step()")
-        now_ns = self._now_ns
-        if now_ns + SLACK_NS < self._free_ns:
-            self._skipped += 1
-        elif executor.repeats or self._seen_tick > self._answered:
-            self._answered = self._seen_tick
-            self._free_ns = now_ns + self._time_to_compute(tick)
-            chunk = Chunk(tick, self._seen_tick, actions)
-            executor.sent(chunk)
-            if tick or not self._settings.waits:
-                self._down.send(tick, self._free_ns, chunk)
-            else:  # the episode begins when this answer has arrived
-                self._free_ns = 0
-                executor.receive(chunk, 0)
-        while (arrived := self._down.next(now_ns)) is not None:
-            executor.receive(arrived, tick)
+        if self._is_asked:
+            self._answer(actions)
+        self._receive(self._now_ns + self._within_ns)
         action = executor.action(tick)
         self._is_held = action is None
         if action is not None:
-            self._last = action
-            self._age = (tick - executor.basis) * self._settings.dt
+            self._last, self._basis = action, executor.basis
         else:
             self._held += 1
             if not self._settings.repeats:
-                self._last, self._age = self._settings.start, inf
-            elif self._age < inf:
-                self._age = (tick - executor.basis) * self._settings.dt
-        if self._age < inf:
-            self._acted += 1
-            self._action_ages += self._age
+                self._last, self._basis = self._settings.start, -1.0
+        if self._basis > 0:
+            self._action_ages.append(tick - self._basis)
         return self._last
+
+    def _answer(self, actions: tuple[Any, ...]) -> None:
+        """Send the answer to the newest observation that the policy has taken."""
+        chunk = Chunk(self._seen_tick, actions)
+        self._executor.sent(chunk)
+        if self._settings.waits and not self._tick:
+            self._executor.receive(chunk, 0)  # the episode begins when this answer has arrived
+            return
+        self._free_ns = self._begin_ns + self._time_to_compute()
+        self._down.send(self._seen_tick, self._free_ns, chunk)
+
+    def _receive(self, limit_ns: int) -> None:
+        """Give the executor the answers that have arrived by `limit_ns` [ns]."""
+        queue = self._down.queue
+        while queue.next_ns <= limit_ns:
+            _, _, chunk = queue.pop()
+            if chunk.basis:
+                self._loop_ages.append(self._tick - chunk.basis)
+            self._executor.receive(chunk, self._tick)
 
     def observe(self, observation: Any, info: Mapping[str, Any]) -> None:
         """Move to the next tick, in which the world gives an observation and its info."""
         self._tick = tick = self._tick + 1
         self._now_ns = now_ns = round(tick * self._settings.dt * 1e9)
+        self._receive(now_ns)
         if self._executor.asks(tick):
             self._up.send(tick, now_ns, (tick, copied(observation), dict(info)))
-        while (message := self._up.next(now_ns)) is not None:
-            if message[0] > self._seen_tick:
-                self._seen_tick, *self.seen = message
-        self._observation_ages += tick - self._seen_tick
+        self._ask(now_ns + self._within_ns)
+        if self._seen_tick:
+            self._observation_ages.append(tick - self._seen_tick)
 
-    def _time_to_compute(self, tick: int) -> int:
-        """Return how long the policy computes the answer of a tick [ns]."""
+    def _ask(self, limit_ns: int) -> None:
+        """Let the policy begin with the observations that have arrived by `limit_ns` [ns]."""
+        queue, self._is_asked = self._up.queue, False
+        while (begin_ns := max(queue.next_ns, self._free_ns)) <= limit_ns:
+            before = self._seen_tick
+            while queue.next_ns <= begin_ns:
+                _, _, message = queue.pop()
+                if message[0] > self._seen_tick:
+                    self._seen_tick, *self.seen = message
+            if self._seen_tick > before:
+                self._is_asked, self._begin_ns = True, begin_ns
+                self._free_ns = begin_ns + self._time_to_compute()
+
+    def _time_to_compute(self) -> int:
+        """Return how long the policy computes the answer to its newest observation [ns]."""
         if self.compute is not None:
             return round(self.compute * 1e9)
         mean, deviation = self._settings.compute
         if not deviation:
-            return self._compute_ns
+            return round(mean * 1e9)
         key = stream_key(self._settings.seed, False, self._episode, _COMPUTE, self._stream)
-        bits = np.random.Philox(key=np.array(key, dtype=np.uint64), counter=[0, 0, 0, tick])
+        counter = [0, 0, 0, self._seen_tick]
+        bits = np.random.Philox(key=np.array(key, dtype=np.uint64), counter=counter)
         shape = (mean / deviation) ** 2
         return round(np.random.Generator(bits).gamma(shape, mean / shape) * 1e9)
 
     def told(self) -> dict[str, Any]:
         """Return what the policy may know about the loop, as `info["cloudrc"]`."""
+        dt = self._settings.dt
         found: dict[str, Any] = {
-            "observation_age": (self._tick - self._seen_tick) * self._settings.dt,
-            "action_age": self._age,
+            "asked": self._is_asked,
+            "observation_age": (self._tick - self._seen_tick) * dt,
+            "action_age": (self._tick - 1 - self._basis) * dt if self._basis >= 0 else inf,
             "held": self._is_held,
-            "busy": self._now_ns + SLACK_NS < self._free_ns,
-            "lost_uplink": self._up.lost,
-            "lost_downlink": self._down.lost,
+            "lost_uplink": self._up.queue.lost,
+            "lost_downlink": self._down.queue.lost,
         }
         if prefix := self._executor.prefix(self._seen_tick):
             found["prefix"] = prefix
         return found
 
-    def summary(self) -> dict[str, Any]:
-        """Return what the loop was like in this episode: asked and measured."""
+    def summary(self, deadline: float | None = None) -> dict[str, Any]:
+        """Return what the loop was like in this episode: asked and measured.
+
+        `late_share` is the share of steps whose action is older than `deadline` [s].
+        """
         ticks, dt = self._tick, self._settings.dt
+        actions = np.array(self._action_ages) * dt
+        late = nan
+        if deadline is not None and len(actions):
+            late = float(np.mean(actions > deadline + 1e-9))
         return {
             "ticks": ticks,
-            "observation_age_mean": self._observation_ages * dt / ticks if ticks else nan,
-            "action_age_mean": self._action_ages / self._acted if self._acted else nan,
+            "loop_age": float(np.mean(self._loop_ages)) * dt if self._loop_ages else nan,
+            **_describe("observation_age", np.array(self._observation_ages) * dt),
+            **_describe("action_age", actions),
+            "late_share": late,
             "held_share": self._held / ticks if ticks else nan,
-            "skipped": self._skipped,
             "uplink": self._up.summary(dt),
             "downlink": self._down.summary(dt),
         }
+
+
+def _describe(name: str, ages: Floats) -> dict[str, float]:
+    """Return mean and 99th percentile of ages [s], shape (n,), and of how many steps they are."""
+    mean, p99 = (ages.mean(), np.percentile(ages, 99.0)) if len(ages) else (nan, nan)
+    return {f"{name}_mean": float(mean), f"{name}_p99": float(p99), f"{name}_of": len(ages)}

@@ -25,14 +25,16 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """An environment whose policy is at the other end of a link, in virtual time.
 
     The world never waits: one step of the environment takes `dt`, and observations and actions that
-    are late are late. Rewards and the end of an episode are those of the world, told at once.
-    Nothing else leaks: the observation, and the environment's info with it, are the newest that
-    have arrived. The fate of a packet depends on seed, stream, direction, episode and tick alone,
-    so that another policy meets the same network.
+    are late are late. The policy answers when an observation arrives, once to each. Rewards and the
+    end of an episode are those of the world, told at once. Nothing else leaks: the observation, and
+    the environment's info with it, are the newest that the policy has taken. The fate of a packet
+    depends on seed, stream, direction, episode and tick alone, so that another policy meets the
+    same network.
 
-    `info["cloudrc"]` tells the ages of the observation and of the executed action [s], whether the
-    robot had no action (`held`), and what was lost. At the end of an episode it has a summary,
-    `episode`, with delays and losses: asked by the profile, and measured.
+    `info["cloudrc"]` tells whether the observation is new, so that the next action is its answer
+    (`asked`; any other action is ignored), the ages of the observation and of the executed action
+    [s], whether the robot had no action (`held`), and what was lost. At the end of an episode it
+    has a summary, `episode`, with delays and losses: asked by the profile, and measured.
 
     Attributes:
         world_info: The environment's own info of the last step, without any delay: for whoever
@@ -59,7 +61,10 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             seed: Seed of the network. `reset(seed=...)` seeds the environment, and selects the
                 episode of the network, too.
             compute: Time that the policy needs for an answer [s]; or a pair, mean and standard
-                deviation of a gamma distribution. While it computes, the policy cannot answer.
+                deviation of a gamma distribution. While it computes, the policy takes no other
+                observation.
+            answer_within: How long the robot waits in a step for an answer [s]; None: 5 % of the
+                step.
             chunk: Number of actions in an answer, for the ticks from the observation's on; None:
                 an answer is a single action.
             executor: How the robot executes answers: "newest", "time_indexed", "prefix", "broker",
@@ -101,9 +106,12 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def compute(self, time: float | None) -> None:
         self._loop.compute = None if time is None else compute_times((time, 0.0))[0]
 
-    def summary(self) -> dict[str, Any]:
-        """Return what `info["cloudrc"]["episode"]` has, also before the end of an episode."""
-        return self._loop.summary()
+    def summary(self, deadline: float | None = None) -> dict[str, Any]:
+        """Return what `info["cloudrc"]["episode"]` has, also before the end of an episode.
+
+        With a `deadline` [s], `late_share` is the share of steps whose action is older.
+        """
+        return self._loop.summary(deadline)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

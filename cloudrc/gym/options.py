@@ -27,6 +27,8 @@ CHUNK_MAX = 10_000
 """Largest number of actions in an answer."""
 STEP_RATIO = 10.0
 """Ratio of two times of a step from which on one of them may have another unit."""
+WAIT = 0.05
+"""How long a robot waits in a step for an answer, as a share of the step."""
 ANSWER = "answer"
 """Start of an episode: the robot waits for the first answer."""
 
@@ -35,6 +37,7 @@ class Options(TypedDict, total=False):
     """Further arguments of `Networked`, which describes them."""
 
     compute: float | tuple[float, float]
+    answer_within: float | None
     chunk: int | None
     executor: str | Path
     hold: str
@@ -51,6 +54,7 @@ def connect(
     streams: Iterable[str],
     *,
     compute: float | tuple[float, float] = 0.0,
+    answer_within: float | None = None,
     chunk: int | None = None,
     executor: str | Path = "newest",
     hold: str = "repeat",
@@ -77,6 +81,7 @@ def connect(
         link=read_profile(link),
         seed=seed,
         dt=dt,
+        answer_within=_read_wait(answer_within, dt),
         compute=compute_times(compute),
         repeats=hold == "repeat",
         start=copied(start),
@@ -151,6 +156,21 @@ def warn_of_step(env: Any, given: float | None) -> None:
     """Warn the caller of the caller if the `given` time of a step [s] is doubtful."""
     if doubt := doubt_step(env, given):
         warnings.warn(f"dt={given:g}: {doubt}", stacklevel=3)
+
+
+def _read_wait(given: float | None, dt: float) -> float:
+    """Return how long the robot waits in a step of `dt` [s] for an answer [s]."""
+    if given is None:
+        return WAIT * dt
+    wait = nan
+    with suppress(plugins.InvalidResultError):
+        wait = plugins.to_number(given, "time")
+    if not 0.0 <= wait <= dt:
+        raise BadInputError(
+            f"answer_within {given!r}: give how long the robot waits in a step for an answer, in "
+            f"seconds, from 0 to the step, {dt:g}"
+        )
+    return wait
 
 
 def compute_times(compute: float | tuple[float, float]) -> tuple[float, float]:

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 from cloudrc.gym.executors import Chunk, Executor
-from cloudrc.plugins import refuse_failure, to_boolean, to_integer
+from cloudrc.plugins import refuse_failure, to_boolean, to_number
 
 
 class WatchedExecutor(Executor):
@@ -21,7 +21,6 @@ class WatchedExecutor(Executor):
         """Call a method; return what `read` makes of its result."""
         with refuse_failure(f"executor {self._name!r}: {method}() failed"):
             result = getattr(self._own, method)(*given)
-            self.repeats = to_boolean(self._own.repeats, "repeats")
             return read(result) if read is not None else None
 
     def begin(self, ticks_late: int, period_ns: int) -> None:
@@ -61,8 +60,8 @@ class WatchedExecutor(Executor):
         if action is None:
             return None
         self._check(action)
-        basis = to_integer(self._own.basis, "basis")
+        basis = to_number(self._own.basis, "basis")
         if not 0 <= basis <= tick:
-            raise ValueError(f"its basis is {basis}, not the tick of an observation, 0 to {tick}")
+            raise ValueError(f"its basis is {basis:g}, not the tick of an observation, 0 to {tick}")
         self.basis = basis
         return action

@@ -120,7 +120,8 @@ def test_the_way_to_execute_chunks_decides(law):
     setup = EvalSetup("CartPole-v1", law(source), success_at=500)
     rows = [play(Episode(0.0, name, 1), setup, {}) for name in ("newest", "broker")]
     assert [row["verdict"] for row in rows] == ["success", "failure"]
-    assert rows[1]["numbers"]["observation_age"] > 0.02
+    ages = [row["numbers"]["observation_age"] for row in rows]
+    assert ages[0] == 0.0 < ages[1]
 
 
 @pytest.mark.parametrize("compute", [0.06, (0.06, 0.0), ("file", "times.csv")])

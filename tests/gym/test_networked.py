@@ -83,7 +83,8 @@ def test_a_delay_of_n_steps_is_exactly_n(dt, up, down):
         assert info["count"] == observation[0]
         assert info["cloudrc"]["observation_age"] == pytest.approx(min(tick, up) * dt)
     executed = [float(each[0]) for each in env.unwrapped.executed]
-    assert executed == [0.0] * down + [float(n) for n in range(1, 60 - down)]
+    first = [1.0] * (up + 1)  # the policy has the first observation at once, and answers once
+    assert executed == ([0.0] * down + first + [float(n) for n in range(up + 2, 60)])[:59]
     assert info["cloudrc"]["action_age"] == pytest.approx((up + down) * dt)
 
 
@@ -173,6 +174,39 @@ def test_a_policy_that_computes_answers_later_and_less_often():
     slow = executed(ideal, steps=300, compute=(0.02, 0.01))
     assert slow == executed(ideal, steps=300, compute=(0.02, 0.01))
     assert len(set(slow)) < 200
+
+
+def test_the_policy_is_asked_once_for_each_observation_that_it_takes():
+    env = Networked(Counter(), both_ways(25, 0))
+    asked = [env.reset()[1]["cloudrc"]["asked"]]
+    for _ in range(6):
+        asked.append(env.step(np.zeros(1, np.float32))[4]["cloudrc"]["asked"])
+    assert asked == [True, False, False, False, True, True, True]
+    busy = Networked(Counter(), compute=0.02)
+    asked = [busy.reset()[1]["cloudrc"]["asked"]]
+    for _ in range(4):
+        asked.append(busy.step(np.zeros(1, np.float32))[4]["cloudrc"]["asked"])
+    assert asked == [True, False, True, False, True]
+
+
+def test_an_answer_counts_in_its_own_step_if_the_robot_waits_for_it():
+    quick = both_ways(1, 1)
+    assert executed(quick, answer_within=0.002) == [1, 2, 3, 4, 5, 6]
+    assert executed(quick, answer_within=0.001) == [1, 1, 2, 3, 4, 5]
+    assert executed(quick, answer_within=0.002, compute=0.001) == [1, 1, 2, 3, 4, 5]
+
+
+def test_ages_count_from_the_first_observation_that_has_crossed_the_link():
+    env = Networked(Counter(limit=30), both_ways(20, 30), start="answer")
+    env.reset()
+    for tick in range(30):
+        info = env.step(np.full(1, tick, np.float32))[4]
+    found = info["cloudrc"]["episode"]
+    assert (found["observation_age_mean"], found["observation_age_of"]) == (pytest.approx(0.02), 28)
+    assert (found["action_age_mean"], found["action_age_of"]) == (pytest.approx(0.05), 24)
+    assert found["loop_age"] == found["action_age_p99"] == pytest.approx(0.05)
+    assert env.summary(0.05)["late_share"] == 0.0
+    assert env.summary(0.049)["late_share"] == 1.0
 
 
 def test_a_late_observation_never_replaces_a_newer_one():
@@ -289,6 +323,9 @@ def test_importing_the_wrapper_takes_no_heavy_package_along():
         ({"compute": "fast"}, "compute 'fast'"),
         ({"compute": (0.0, 0.1)}, "compute"),
         ({"compute": (0.1, 0.1, 0.1)}, "compute"),
+        ({"answer_within": -0.001}, "answer_within -0.001: give how long the robot waits"),
+        ({"answer_within": 0.02}, "from 0 to the step, 0.01"),
+        ({"answer_within": "1 ms"}, "answer_within '1 ms'"),
         ({"chunk": 0}, "chunk 0: give None or the number"),
         ({"chunk": 2.5}, "chunk 2.5"),
         ({"chunk": True}, "chunk True"),

@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 class Chunk(NamedTuple):
     """What the policy sends: the actions for successive ticks."""
 
-    number: int  # tick in which the policy answered
-    basis: int  # tick of the observation that the policy had
+    basis: int  # tick of the observation to which it is the answer
     actions: tuple[Any, ...]  # as the environment takes them
 
 
@@ -23,13 +22,12 @@ class Executor:
 
     Attributes:
         needs_chunk: Whether single actions make no sense.
-        repeats: Whether the policy answers in every tick, also if it has seen nothing new.
-        basis: Tick of the observation from which the last chosen action was computed.
+        basis: Tick of the observation from which the last chosen action was computed; of several,
+            their mean.
     """
 
     needs_chunk = True
-    repeats = True
-    basis = -1
+    basis: float = -1
 
     def begin(self, ticks_late: int, period_ns: int) -> None:
         """Begin an episode: the robot has sent the observation of tick 0.

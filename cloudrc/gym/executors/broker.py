@@ -13,15 +13,13 @@ from cloudrc.gym.executors import Chunk, Executor
 class Broker(Executor):
     """One observation leaves per chunk. If no answer comes, the robot asks again."""
 
-    repeats = False
-
     def __init__(self, patience: float) -> None:
         """Wait for `patience` [s] before asking again."""
         self._patience = patience
 
     def begin(self, ticks_late: int, period_ns: int) -> None:
         """Forget the last episode; the observation of tick 0 is the first question."""
-        self._chunk, self._start = Chunk(-1, -1, ()), 0
+        self._chunk, self._start = Chunk(-1, ()), 0
         self._asked, self._waits = 0, self._patience * 1e9 / period_ns
 
     def asks(self, tick: int) -> bool:
@@ -40,7 +38,7 @@ class Broker(Executor):
 
     def action(self, tick: int) -> Any:
         """Return the next action of the chunk."""
-        _, self.basis, actions = self._chunk
+        self.basis, actions = self._chunk
         place = tick - self._start
         return actions[place] if place < len(actions) else None
 

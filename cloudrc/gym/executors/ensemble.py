@@ -33,16 +33,17 @@ class Ensemble(Executor):
                 "numbers; use 'time-indexed' for other actions"
             )
         self._chunks.append(chunk)
-        self._chunks.sort(key=lambda each: each.number)
+        self._chunks.sort(key=lambda each: each.basis)
 
     def action(self, tick: int) -> Any:
         """Return the mean action of the answers for this tick."""
         self._chunks = [each for each in self._chunks if tick - each.basis < len(each.actions)]
         if not self._chunks:
             return None
-        self.basis = max(each.basis for each in self._chunks)
         meant = np.stack([each.actions[tick - each.basis] for each in self._chunks])
         weights = [exp(-DECAY * place) for place in range(len(meant))]
+        bases = [each.basis for each in self._chunks]
+        self.basis = float(np.average(bases, weights=weights))
         return np.average(meant, axis=0, weights=weights).astype(meant.dtype)
 
 

@@ -14,16 +14,16 @@ class Newest(Executor):
 
     def begin(self, ticks_late: int, period_ns: int) -> None:
         """Forget the last episode."""
-        self._chunk, self._start = Chunk(-1, -1, ()), 0
+        self._chunk, self._start = Chunk(-1, ()), 0
 
     def receive(self, chunk: Chunk, tick: int) -> None:
         """Take the answer if it is newer than the present one."""
-        if chunk.number > self._chunk.number:
+        if chunk.basis > self._chunk.basis:
             self._chunk, self._start = chunk, tick
 
     def action(self, tick: int) -> Any:
         """Return the next action of the newest answer."""
-        _, self.basis, actions = self._chunk
+        self.basis, actions = self._chunk
         place = tick - self._start
         return actions[place] if place < len(actions) else None
 

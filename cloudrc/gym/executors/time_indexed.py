@@ -12,17 +12,17 @@ class TimeIndexed(Executor):
 
     def begin(self, ticks_late: int, period_ns: int) -> None:
         """Forget the last episode."""
-        self._chunk = Chunk(-1, -1, ())
+        self._chunk = Chunk(-1, ())
 
     def receive(self, chunk: Chunk, tick: int) -> None:
         """Take the answer if it is newer than the present one."""
-        if chunk.number > self._chunk.number:
+        if chunk.basis > self._chunk.basis:
             self._chunk = chunk
 
     def action(self, tick: int) -> Any:
         """Return the action that the policy meant for this tick."""
-        _, self.basis, actions = self._chunk
-        place = tick - self.basis
+        self.basis, actions = self._chunk
+        place = tick - self._chunk.basis
         return actions[place] if place < len(actions) else None
 
 
