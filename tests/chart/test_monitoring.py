@@ -174,9 +174,9 @@ def dashboards(values=None, **where):
     return maps, {name: json.loads(text) for name, text in texts.items()}
 
 
-def queries():
+def queries(**where):
     """Return each query of all dashboards, with the values that Grafana shows first."""
-    found = dashboards()[1].values()
+    found = dashboards(**where)[1].values()
     return [
         query
         for one in found
@@ -238,7 +238,32 @@ def test_panels_query_metrics_of_the_release_alone():
         assert asked, query
         assert {name for name in asked if not name.startswith("process_")} <= series()
         for selector in re.findall(r"{(.*?)}", query):
-            assert 'namespace=~"lab",pod=~"demo-cloudrc(-.*)?"' in selector
+            assert 'namespace=~"lab",pod=~"demo-cloudrc-(world|cloud)-.*"' in selector
+
+
+def test_panels_show_the_pods_of_one_release_though_its_name_begins_that_of_another():
+    pods = {
+        thing["metadata"]["name"] + "-7d4b9c-x2x4z"
+        for release in ("cloudrc", "cloudrc-two")
+        for thing in of_kind(render(release=release), "Deployment").values()
+    }
+    own = {"cloudrc-world-7d4b9c-x2x4z", "cloudrc-cloud-7d4b9c-x2x4z"}
+    assert pods > own
+    for query in queries(release="cloudrc"):
+        for pattern in re.findall(r'pod=~"(.*?)"', query):
+            assert {pod for pod in pods if re.fullmatch(pattern, pod)} == own
+
+
+def test_all_shows_metrics_without_the_labels_of_the_operator():
+    (one, *_) = dashboards()[1].values()
+    every = {v["name"]: v["allValue"] for v in one["templating"]["list"] if "allValue" in v}
+    (panel, *_) = one["panels"]
+    asked = panel["targets"][0]["expr"]
+    for name, value in every.items():
+        asked = asked.replace(f"${name}", value)
+    patterns = re.findall(r'(?:namespace|pod)=~"(.*?)"', asked)
+    assert len(patterns) > 1
+    assert all(re.fullmatch(pattern, "") for pattern in patterns)
 
 
 @needs_promtool

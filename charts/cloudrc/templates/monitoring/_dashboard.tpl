@@ -41,13 +41,14 @@ panels:
   {{- end }}
 {{- end }}
 
-{{/* A variable whose values a query lists. Argument: the query, and the selected value. */}}
+{{/* A variable whose values a query lists. Argument: the query, and the selected value. All also matches
+     metrics without the label, whatever a query puts behind the variable. */}}
 {{- define "cloudrc.variable" -}}
 type: query
 datasource: {type: prometheus, uid: "${datasource}"}
 query: {query: {{ index . 0 | quote }}, refId: values}
 refresh: 2
 includeAll: true
-allValue: ".*"
+allValue: ".*|"
 current: {text: {{ index . 1 | quote }}, value: {{ index . 1 | quote }}}
 {{- end }}
