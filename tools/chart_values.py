@@ -163,6 +163,8 @@ def make_schema(text: str) -> Schema:
     made = part((), yaml.safe_load(text), "All values of the chart")
     about = "Values that Helm passes to subcharts; this chart ignores them"
     made["properties"]["global"] = {**_either(OBJECT, NULL), "description": about}
+    about = "A larger chart's condition for this one: if it is false, Helm leaves this one out"
+    made["properties"]["enabled"] = {"enum": [True], "description": about}
     models = [(model, "validation") for model in (Experiment, MissionConfig, Profile)]
     defined = _adapt(models_json_schema(models)[1]["$defs"])
     for name in ("PlugIn", "Parameters"):

@@ -90,9 +90,19 @@ def values_of(path):
 
 
 def render_texts(
-    values=None, *, release="demo", namespace="lab", lookup=nothing, apis=(), upgrade=False
+    values=None,
+    *,
+    release="demo",
+    namespace="lab",
+    lookup=nothing,
+    apis=(),
+    upgrade=False,
+    alias="cloudrc",
 ):
-    """Render every template: path -> text; raise if the schema refuses the values."""
+    """Render every template: path -> text; raise if the schema refuses the values.
+
+    `alias` is the chart's name as a dependency of a larger chart.
+    """
     import jsonschema
 
     merged = laid_over(values_of(CHART / "values.yaml"), values or {})
@@ -106,7 +116,11 @@ def render_texts(
             "IsInstall": not upgrade,
             "IsUpgrade": upgrade,
         },
-        "Chart": {"Version": METADATA["version"], "AppVersion": METADATA["appVersion"]},
+        "Chart": {
+            "Name": alias,
+            "Version": METADATA["version"],
+            "AppVersion": METADATA["appVersion"],
+        },
         "Capabilities": {"APIVersions": Versions(apis)},
         "Files": Files(),
     }

@@ -59,6 +59,25 @@ def test_an_invalid_name_is_refused(release):
         render(release=release)
 
 
+def test_a_chart_may_contain_this_one_several_times_under_aliases():
+    on = {"enabled": True}
+    values = {**on, "mission": on, "dashboards": on}
+    for release, *aliases in (("b-lab", "cloudrc", "robot_A", "b"), ("d" * 53, "robotA", "robotB")):
+        robots = [render(values, release=release, alias=alias) for alias in aliases]
+        named = [{(x["kind"], x["metadata"]["name"]) for x in objects} for objects in robots]
+        assert len(set.union(*named)) == sum(map(len, named))
+        pods = [
+            labels
+            for objects in robots
+            for x in objects
+            if (labels := x.get("spec", {}).get("template", {}).get("metadata", {}).get("labels"))
+        ]
+        assert len({labels["app.kubernetes.io/instance"] for labels in pods}) == len(robots)
+        for service in (x for o in robots for x in o if x["kind"] == "Service"):
+            selector = service["spec"]["selector"].items()
+            assert sum(selector <= labels.items() for labels in pods) == 1
+
+
 def test_annotations_and_placement_of_the_user_are_used():
     where = {
         "nodeSelector": {"disk": "fast"},

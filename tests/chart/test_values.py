@@ -34,13 +34,14 @@ def test_the_schema_is_closed_at_every_level():
 
 def test_the_defaults_are_valid_and_written_out():
     assert render({"global": {"anything": {"goes": True}}}), "values of a parent chart"
-    assert DEFAULTS.keys() == SCHEMA["properties"].keys() - {"global"}
+    assert DEFAULTS.keys() == SCHEMA["properties"].keys() - {"global", "enabled"}
 
 
 @pytest.mark.parametrize(
     ("values", "named"),
     [
         ({"lnk": {}}, "lnk"),
+        ({"enabled": False}, "True"),
         ({"link": {"mode": "tc"}}, "tc"),
         ({"link": {"profile": {"uplink": {"delay": 40}}}}, "delay"),
         ({"experiment": {"guard": {"command_age_max_ms": -1}}}, "-1"),

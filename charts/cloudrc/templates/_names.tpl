@@ -1,8 +1,21 @@
 {{/* Names, labels and images of the release. */}}
 
+{{/* What `--release` of cloudrc's commands names: the release of Helm. A larger chart may contain this one
+     several times, under aliases: then RELEASE-ALIAS, cut so that the alias stays. */}}
+{{- define "cloudrc.instance" -}}
+{{- if eq .Chart.Name "cloudrc" -}}
+{{ .Release.Name }}
+{{- else -}}
+{{- $alias := .Chart.Name | lower | replace "_" "-" | trunc 40 | trimSuffix "-" -}}
+{{ .Release.Name | trunc (sub 45 (len $alias) | int) }}-{{ $alias }}
+{{- end -}}
+{{- end }}
+
 {{/* Start of all names, cut to 46 characters: "-mission-" and 8 digits follow, and 63 is the limit. */}}
 {{- define "cloudrc.fullname" -}}
-{{- $name := .Values.fullnameOverride | default (contains "cloudrc" .Release.Name | ternary .Release.Name (printf "%s-cloudrc" .Release.Name)) -}}
+{{- $instance := include "cloudrc.instance" . -}}
+{{- $is := or (ne .Chart.Name "cloudrc") (contains "cloudrc" $instance) -}}
+{{- $name := .Values.fullnameOverride | default ($is | ternary $instance (printf "%s-cloudrc" $instance)) -}}
 {{- $name = $name | trunc 46 | trimSuffix "-" -}}
 {{- if not (regexMatch "^[a-z]([-a-z0-9]*[a-z0-9])?$" $name) -}}
 {{- fail (printf "the name '%s' must start with a letter and contain only a-z, 0-9 and '-': choose another release name, or set fullnameOverride" $name) -}}
@@ -13,7 +26,7 @@
 {{/* Selector of a component's pods. Argument, also below: (dict "root" $ "component" NAME). */}}
 {{- define "cloudrc.selector" -}}
 app.kubernetes.io/name: cloudrc
-app.kubernetes.io/instance: {{ .root.Release.Name }}
+app.kubernetes.io/instance: {{ include "cloudrc.instance" .root }}
 app.kubernetes.io/component: {{ .component }}
 {{- end }}
 
