@@ -1,4 +1,4 @@
-"""Survey a cluster before an install: permissions, admission of the pods, quota, nodes, images.
+"""Survey a cluster before an install: permissions, experiment, admission, quota, nodes, images.
 
 The pods of the chart are sent to the API server as a dry run, so that Pod Security, LimitRanges and
 quotas judge them themselves. A small pod on each node, which is deleted again, shows whether the
@@ -28,7 +28,8 @@ from cloudrc.cluster.client import (
 )
 from cloudrc.cluster.incidents import explain_refusal
 from cloudrc.cluster.pods import container_statuses, pod_failure, pod_log
-from cloudrc.errors import to_one_line
+from cloudrc.cluster.releases import as_files, is_of_experiment
+from cloudrc.errors import CloudrcError, to_one_line
 
 NEEDED = {
     "": "pods services configmaps secrets serviceaccounts persistentvolumeclaims",
@@ -80,7 +81,9 @@ def survey(release: Release, values: Sequence[str] = ()) -> Iterator[Finding]:
     yield (allowed := permissions(release))
     if allowed.state != "ok":
         return
-    pods = pods_of_chart(release, values)
+    rendered = render_chart(release, values)
+    yield experiment(rendered)
+    pods = pods_of_chart(rendered)
     for component, spec in pods.items():
         try:
             yield admission(release, component, spec)
@@ -123,18 +126,47 @@ def permissions(release: Release) -> Finding:
     return Finding("permissions", "ok", f"enough {release.where}")
 
 
-def pods_of_chart(release: Release, values: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Render the chart as `helm install` would; return component -> spec of its pod."""
+def render_chart(release: Release, values: Sequence[str]) -> list[Any]:
+    """Render the objects of the chart as `helm install` would."""
     arguments = ["template", release.name, str(chart_folder()), *release.helm_flags]
     arguments += ["--dry-run=server", *values]
-    rendered = yaml.safe_load_all(run("helm", arguments))
+    return [thing for thing in yaml.safe_load_all(run("helm", arguments)) if thing]
+
+
+def experiment(rendered: list[Any]) -> Finding:
+    """Read experiment and link of the chart's objects, as the pods do, with their plug-ins.
+
+    A robot or scene whose files are only in the cluster is not compared with the mission.
+    """
+    from cloudrc.config.load import load_experiment, load_link
+
+    files = dict[str, str]()
+    for thing in rendered:
+        if thing["kind"] == "ConfigMap" and is_of_experiment(thing["metadata"]["labels"]):
+            files |= thing["data"]
+    world = (yaml.safe_load(files.get("experiment.yaml", "")) or {}).get("world", {})
+    with as_files(files) as folder:
+        path = folder / "experiment.yaml"
+        away = any(str(world.get(kind)).startswith("/") for kind in ("robot", "scene"))
+        try:
+            load_experiment(path, flown=away)
+            load_link(folder / "profile.yaml", path)
+        except CloudrcError as error:
+            text = to_one_line(str(error).replace(f"{folder}/", ""))
+            fix = "correct the values; if your image has the plug-in, install its package here, too"
+            return Finding("experiment", "missing", text, fix)
+    return Finding("experiment", "ok", "its values and plug-ins are valid")
+
+
+def pods_of_chart(rendered: list[Any]) -> dict[str, dict[str, Any]]:
+    """Return component -> spec of its pod, of the chart's objects."""
     return {
         thing["metadata"]["labels"]["app.kubernetes.io/component"]: {
             **thing["spec"]["template"]["spec"],
             "serviceAccountName": "default",  # the chart's own accounts do not exist yet
         }
         for thing in rendered
-        if thing and thing["kind"] == "Deployment"
+        if thing["kind"] == "Deployment"
     }
 
 

@@ -55,7 +55,8 @@ def found(release):
 def test_a_cluster_that_is_fit_has_no_problem_and_keeps_no_pod(cluster, release):
     cluster.nodes = ["one", "two"]
     seen = found(release)
-    assert list(seen) == ["permissions", "world pod", "cloud pod", "node one", "node two"]
+    checks = ["permissions", "experiment", "world pod", "cloud pod", "node one", "node two"]
+    assert list(seen) == checks
     assert {one.state for one in seen.values()} == {"ok"}
     assert "has sch_netem" in seen["node two"].found
     assert not [name for kind, name in cluster.objects if kind == "pods"]
@@ -82,6 +83,44 @@ def test_the_charts_values_go_to_helm_and_its_pull_secrets_to_the_probes(
     assert {one.state for one in survey.survey(release, values)} == {"ok"}
     assert (tmp_path / "asked").read_text().split()[-2:] == values
     assert [spec["imagePullSecrets"] for spec in made] == [[{"name": "lab"}]] * 3
+
+
+FILES = """\
+apiVersion: v1
+kind: ConfigMap
+metadata: {name: x, labels: {app.kubernetes.io/component: COMPONENT}}
+data:
+  NAME: |
+    TEXT
+---
+"""
+
+
+@pytest.mark.parametrize(
+    ("experiment", "profile", "words"),
+    [
+        ("cloud: {predictor: nosuch}", "{}", "no predictor named 'nosuch'"),
+        ("cloud: {predictor: {name: kalman, gian: 1}}", "{}", "cloud.predictor.gian: unknown key"),
+        ("world: {robot: rover}", "{}", "stays on the ground"),
+        ("seed: 1", "uplink: {delay_ms: 0, trace: none.csv}", "none.csv"),
+        ("world: {robot: /etc/cloudrc-robot/mine}", "{}", ""),
+        ("world: {robot: /opt/mine}\n    cloud: {estimator: x}", "{}", "no estimator named 'x'"),
+        ("link: {profile: lte}", "profile: satellite", ""),
+    ],
+)
+def test_experiment_and_link_are_read_as_the_pods_read_them(
+    cluster, release, pretend, experiment, profile, words
+):
+    files = (("experiment", "experiment.yaml", experiment), ("link", "profile.yaml", profile))
+    rendered = "".join(CHART.replace("COMPONENT", each) for each in ("world", "cloud"))
+    for component, name, text in files:
+        made = FILES.replace("COMPONENT", component).replace("NAME", name)
+        rendered += made.replace("TEXT", text)
+    pretend("helm", f"cat <<'END'\n{rendered}END")
+    seen = found(release)["experiment"]
+    assert seen.state == ("missing" if words else "ok")
+    assert words in seen.found
+    assert "/tmp" not in seen.found
 
 
 def test_missing_permissions_end_the_survey(cluster, release):
@@ -119,5 +158,5 @@ def test_a_quota_is_compared_with_both_pods_together(cluster, release):
 def test_a_namespace_that_does_not_exist_is_told_once(cluster, release):
     cluster.refuse["POST", "pods"] = (404, 'namespaces "demo" not found')
     seen = found(release)
-    assert list(seen) == ["permissions", "namespace"]
+    assert list(seen) == ["permissions", "experiment", "namespace"]
     assert seen["namespace"].fix == "make the namespace: kubectl create namespace demo"
