@@ -23,7 +23,13 @@ from cloudrc.cli.token_flag import given_token, token_argument
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.missions import MissionFollower, read_mission
-from cloudrc.teleop.client import Api, describe_mission, describe_verdict, mission_path
+from cloudrc.teleop.client import (
+    Api,
+    UnreachableError,
+    describe_mission,
+    describe_verdict,
+    mission_path,
+)
 from cloudrc.teleop.telling import (
     describe_event,
     describe_history,
@@ -337,13 +343,29 @@ def _release(options: argparse.Namespace) -> Release:
 
 @contextmanager
 def _forwarded_api(options: argparse.Namespace) -> Iterator[Api]:
-    """Yield the API of a release, which is reachable over a forwarded port while the block runs."""
+    """Yield the API of a release, which is reachable over a forwarded port while the block runs.
+
+    If the API does not answer, and after a status, say which containers of the release end.
+    """
+    from cloudrc.cluster.client import ClusterError
+    from cloudrc.cluster.incidents import troubles
     from cloudrc.cluster.missions import release_api
 
-    with release_api(_release(options), given_token(options)) as api:
-        if options.verb in READS and not (options.context or options.namespace or options.release):
-            print_line(f"cloudrc: using {api.place}", sys.stderr)
-        yield api
+    release = _release(options)
+    try:
+        with release_api(release, given_token(options)) as api:
+            named = options.context or options.namespace or options.release
+            if options.verb in READS and not named:
+                print_line(f"cloudrc: using {api.place}", sys.stderr)
+            yield api
+    except UnreachableError as error:
+        if found := troubles(release):
+            raise ClusterError("; ".join(found)) from error
+        raise
+    if options.verb == "status":
+        file = sys.stdout if options.output == "table" else sys.stderr
+        for line in troubles(release):
+            print_line(line, file)
 
 
 def _run_job(options: argparse.Namespace) -> int:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import re
-import signal
 from collections.abc import Iterable, Iterator
 from typing import Any
 
 from cloudrc.cluster.client import COMPONENTS, Release
-from cloudrc.cluster.pods import container_statuses, error_in, pod_failure
+from cloudrc.cluster.pods import (
+    container_statuses,
+    describe_end,
+    list_pods,
+    pod_failure,
+    value_key,
+)
 from cloudrc.errors import to_one_line
 
 EVICTIONS = {
@@ -19,10 +24,6 @@ EVICTIONS = {
     "DeletionByPodGC": "lost with its node",
 }
 """Reason of the condition DisruptionTarget of a pod -> text."""
-KILLED = 128
-"""Exit code of a process that a signal ended, without the number of the signal."""
-LOADED = "load"
-"""Container of the artificial load in cloud's pod; its resources are in another value."""
 _RANGE = re.compile(
     r"(minimum|maximum) (\S+) usage per (?:Container|Pod) is ([^,\s]+), "
     r"but (request|limit) is ([^,\]\s]+)"
@@ -54,7 +55,7 @@ def explain_refusal(message: str, pod: Any) -> str:
         order = "at least" if bound == "minimum" else "at most"
         own = [
             f"container '{name}' has the {field} {value} of {resource}, {order} {limit} is "
-            f"allowed: set {_value_key(name)}.{field}s.{resource}"
+            f"allowed: set {value_key(name)}.{field}s.{resource}"
             for name, kind, key, value in asks
             if (kind, key) == (f"{field}s", resource) and quantity(value) == quantity(asked)
         ]
@@ -80,23 +81,25 @@ def _container_resources(pod: Any) -> Iterator[tuple[str, str, str, str]]:
             yield from ((container.name, kind, key, str(value)) for key, value in amounts.items())
 
 
-def _value_key(container: str) -> str:
-    """Return the chart's value with the resources of a container."""
-    return "cloud.backgroundLoad.resources" if container == LOADED else f"{container}.resources"
+def troubles(release: Release) -> list[str]:
+    """Say which containers of world and cloud end before they work, and why their pods wait."""
+    found = list[str]()
+    for component in COMPONENTS:
+        for pod in list_pods(release, component):
+            ends = [text for one, _, text in _ended_containers(component, pod) if not one.started]
+            why = "" if ends else pod_failure(pod)
+            found += [f"the {component} pod waits: {why}"] if why else ends
+    return found
 
 
-def describe_end(container: str, ended: Any) -> str:
-    """Describe the end of a container; `ended` is its state `terminated`."""
-    if ended.reason == "OOMKilled":
-        key = f"{_value_key(container)}.limits.memory"
-        return f"was killed, because it used more memory than its limit: raise {key}"
-    code = ended.exit_code
-    try:
-        name = signal.Signals(code - KILLED).name
-    except ValueError:
-        *_, last = (ended.message or "").strip().splitlines() or [""]
-        return f"ended with exit code {code}" + (f": {error_in(last)}" if last else "")
-    return f"was ended by {name} (exit code {code})"
+def _ended_containers(component: str, pod: Any) -> Iterator[tuple[Any, str, str]]:
+    """Yield status, time and a sentence about the last end of each container of a pod."""
+    for status in container_statuses(pod):
+        ended = status.last_state and status.last_state.terminated
+        if ended:
+            how = describe_end(status.name, ended)
+            text = f"container '{status.name}' of the {component} pod {how}; it starts again"
+            yield status, str(ended.finished_at), text
 
 
 class ReleaseWatch:
@@ -113,8 +116,9 @@ class ReleaseWatch:
     def look(self) -> Iterator[str]:
         """Yield a sentence about each container or pod that has ended, and each pod that waits."""
         for component, pod in self._pods():
-            uid, found = pod.metadata.uid, [*self._ended_containers(component, pod)]
-            cause = eviction(pod)
+            uid, cause = pod.metadata.uid, eviction(pod)
+            ends = _ended_containers(component, pod)
+            found = [(f"{one.name} {time}", text) for one, time, text in ends]
             if cause or pod.metadata.deletion_timestamp is not None:
                 cause = cause or "it was deleted or replaced"
                 found.append(("end", f"the {component} pod ends: {cause}"))
@@ -131,12 +135,3 @@ class ReleaseWatch:
         """List the pods with their components, the oldest first."""
         pods = [(each, pod) for each in COMPONENTS for pod in self._release.find("pods", each)]
         return sorted(pods, key=lambda pair: str(pair[1].metadata.creation_timestamp))
-
-    def _ended_containers(self, component: str, pod: Any) -> Iterator[tuple[str, str]]:
-        """Yield a key and a sentence about the last end of each container of a pod."""
-        for status in container_statuses(pod):
-            ended = status.last_state and status.last_state.terminated
-            if ended:
-                how = describe_end(status.name, ended)
-                text = f"container '{status.name}' of the {component} pod {how}; it starts again"
-                yield f"{status.name} {ended.finished_at} {status.restart_count}", text

@@ -22,6 +22,7 @@ from cloudrc.cluster.incidents import ReleaseWatch, eviction, explain_refusal
 from cloudrc.cluster.pods import (
     UNSCHEDULED,
     container_statuses,
+    describe_end,
     find_deployment,
     pod_failure,
     pod_log,
@@ -211,7 +212,13 @@ def follow(release: Release, name: str, write: Callable[[str], None]) -> Ended:
         JobGoneError: If the Job was deleted or suspended, or has ended without a verdict.
     """
     states, watch = list[Any](), ReleaseWatch(release)
-    reader = JobReader(release, name, write, states.append, watch.look)
+
+    def see_end(state: Any) -> str | None:
+        states.append(state)
+        killed = state.reason == "OOMKilled"
+        return f"the Job's pod {describe_end(COMPONENT, state)}" if killed else None
+
+    reader = JobReader(release, name, write, see_end, watch.look)
     for line in reader.read():
         write(line)
     cause = failure_of(reader.job) or ""

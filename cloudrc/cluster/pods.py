@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import os
 import re
+import signal
 import subprocess
 import tempfile
 import time
@@ -36,6 +37,13 @@ FATAL = {
     **dict.fromkeys(("CrashLoopBackOff", "Error"), "container '{name}' ends repeatedly{end}"),
 }
 """Kubernetes' reason why a container will never run -> text of the error message."""
+VALUES = {
+    **{"load": "cloud.backgroundLoad", "ros": "cloud.ros", "nodes": "cloud.ros"},
+    "bridge": "ros",
+}
+"""Container -> section of the chart's values with its resources, if it has another name."""
+KILLED = 128
+"""Exit code of a process that a signal ended, without the number of the signal."""
 UNSCHEDULED = "no node takes it"
 """Beginning of the text about a pod that waits for a node."""
 RESTARTS_MAX = 2
@@ -120,14 +128,29 @@ def _container_failure(status: Any) -> str:
     if reason not in FATAL:
         return ""
     message = to_one_line(waiting and waiting.message)
-    end = f" (exit code {ended.exit_code}): {error_in(ended.message)}" if ended else ""
+    end = f": it {describe_end(status.name, ended)}" if ended else ""
     words = {"name": status.name, "image": status.image, "reason": reason}
-    return FATAL[reason].format(**words, message=message, end=end.removesuffix(": "))
+    return FATAL[reason].format(**words, message=message, end=end)
 
 
-def error_in(output: str | None) -> str:
-    """Return the error in the last output of one of our commands, as one line; else the output."""
-    return to_one_line((output or "").rpartition("cloudrc: error: ")[2])
+def describe_end(container: str, ended: Any) -> str:
+    """Describe the end of a container; `ended` is its state `terminated`."""
+    if ended.reason == "OOMKilled":
+        key = f"{value_key(container)}.limits.memory"
+        return f"was killed, because it used more memory than its limit: raise {key}"
+    code = ended.exit_code
+    try:
+        name = signal.Signals(code - KILLED).name
+    except ValueError:
+        _, marked, error = (ended.message or "").rpartition("cloudrc: error: ")
+        words = to_one_line(error if marked else error.strip().rpartition("\n")[2])
+        return f"ended with exit code {code}" + (f": {words}" if words else "")
+    return f"was ended by {name} (exit code {code})"
+
+
+def value_key(container: str) -> str:
+    """Return the chart's value with the resources of a container."""
+    return f"{VALUES.get(container, container)}.resources"
 
 
 def mount_failure(release: Release, pod: Any) -> str:

@@ -26,7 +26,7 @@ def describe_robot(seen: Mapping[str, Any] | None, cloud_age: float | None) -> I
     """
     heard = "never" if cloud_age is None else f"{cloud_age:.1f} s ago"
     if seen is None:
-        yield f"no telemetry from the robot yet; is the link up? last message from cloud: {heard}"
+        yield f"no telemetry from the robot yet; last message from cloud: {heard}"
         return
     where = describe_point(seen["position_m"])
     if seen["guard_for_s"] is None:

@@ -237,8 +237,7 @@ NEW = {
         (NEW, 0.02, ["robot at (1.00, 2.00, 0.70) m, seen 0.02 s ago, round trip 90 ms",
                      "guard TRACK for 4.5 s: fresh command",
                      "sensors: battery 11.9 V, range ? m", "next: the robot flies"]),
-        (None, None, ["no telemetry from the robot yet; is the link up? "
-                      "last message from cloud: never"]),
+        (None, None, ["no telemetry from the robot yet; last message from cloud: never"]),
     ],
     ids=["not heard", "heard", "never heard"],
 )  # fmt: skip

@@ -173,6 +173,7 @@ class FakeTeleop:
     def __init__(self):
         self.mission = None
         self.missions = list  # makes the list of all missions
+        self.state = None  # answers every GET, if it is set
         self.posted = []
         self.tokens = set()
         self.server = serve(self._answer)
@@ -180,7 +181,7 @@ class FakeTeleop:
     def _answer(self, request, body):
         self.tokens.add(request.headers["Authorization"])
         if request.command == "GET":
-            return 200, {"missions": self.missions(), "mission": self.mission}
+            return 200, self.state or {"missions": self.missions(), "mission": self.mission}
         self.posted.append(request.path)
         return 200, {}
 
@@ -339,3 +340,6 @@ MISSION = {"name": "short", "start": "spawn", "waypoints": [{"position_m": [0, 0
 
 def terminated(exit_code, message):
     return {"terminated": {"exitCode": exit_code, "message": message}}
+
+
+OUT_OF_MEMORY = {"terminated": {"exitCode": 137, "reason": "OOMKilled"}}

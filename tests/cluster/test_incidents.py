@@ -1,12 +1,17 @@
 """What happens to pods in flight is told: evictions, killed containers, refusals of a quota."""
 
+import functools
+from types import SimpleNamespace
+
 import pytest
 
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.incidents import ReleaseWatch
 from cloudrc.cluster.jobs import JobGoneError, follow, run_job
-from tests.cluster.conftest import MISSION, deployment, pod, terminated
+from cloudrc.cluster.pods import describe_end
+from tests.chart.conftest import CHART, values_of
+from tests.cluster.conftest import MISSION, OUT_OF_MEMORY, deployment, pod, terminated
 
 DRAINED = {"type": "DisruptionTarget", "status": "True", "reason": "EvictionByEvictionAPI"}
 
@@ -41,6 +46,32 @@ def test_a_container_that_ends_in_flight_is_told_once_with_its_cause(running, wa
     again = ended(137, at="2026-01-01T00:09:00Z")
     running.put("pods", {**pod("cloud-1", "cloud", restarts=2, last=again), **kept(running)})
     assert len(list(watch.look())) == 1, "it was killed a second time"
+
+
+@pytest.mark.parametrize(
+    ("container", "key"),
+    [
+        ("load", "cloud.backgroundLoad.resources"),
+        ("nodes", "cloud.ros.resources"),
+        ("bridge", "ros.resources"),
+        ("link", "link.resources"),
+    ],
+)
+def test_the_value_of_a_container_without_memory_is_one_of_the_chart(container, key):
+    state = SimpleNamespace(reason="OOMKilled")
+    assert describe_end(container, state).endswith(f"raise {key}.limits.memory")
+    values = values_of(CHART / "values.yaml")
+    assert functools.reduce(dict.__getitem__, key.split("."), values)["limits"]["memory"]
+
+
+def test_a_watcher_without_memory_is_told_with_the_value_to_raise(running, release):
+    gone(running, release)
+    running.start_pod("first", state=OUT_OF_MEMORY)
+    running.at_look(3, lambda: delete(running))
+    lines = []
+    with pytest.raises(JobGoneError):
+        follow(release, "first", lines.append)
+    assert "raise mission.resources.limits.memory" in lines[0]
 
 
 def kept(api, name="cloud-1"):

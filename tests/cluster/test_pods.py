@@ -10,7 +10,7 @@ from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.pods import list_pods, operator_token, pod_failure
 from cloudrc.errors import TimedOutError
-from tests.cluster.conftest import TOKEN, deployment, pod, terminated
+from tests.cluster.conftest import OUT_OF_MEMORY, TOKEN, deployment, pod, terminated
 
 
 def waiting(reason, message=""):
@@ -27,8 +27,12 @@ def unscheduled(message):
         ({"state": waiting("ImagePullBackOff")}, "cloudrc/cloud:0.1.0.*make kind-load"),
         ({"state": waiting("CreateContainerConfigError", "no 'mine'")}, "cannot be created: no 'm"),
         (
-            {"state": waiting("CrashLoopBackOff"), "last": terminated(3, "port 9100 is\ntaken")},
-            r"ends repeatedly \(exit code 3\): port 9100 is taken",
+            {"state": waiting("CrashLoopBackOff"), "last": terminated(3, "a\nport 9100 is taken")},
+            "ends repeatedly: it ended with exit code 3: port 9100 is taken",
+        ),
+        (
+            {"state": waiting("CrashLoopBackOff"), "last": OUT_OF_MEMORY},
+            r"'cloud' ends repeatedly: it was killed.*raise cloud\.resources\.limits\.memory",
         ),
         ({"restarts": 5}, "ends repeatedly$"),
         ({"conditions": unscheduled("0/1 nodes: Insufficient cpu")}, "no node takes it.*cpu"),
@@ -92,8 +96,9 @@ def test_a_wrong_secret_of_both_pods_is_told_once_and_named(running, release):
     with pytest.raises(ClusterError) as told:
         wait_ready(release, timeout=1.0, tell=lines.append)
     assert str(told.value).startswith(
-        "the pods of world and cloud cannot run: the main container ends repeatedly (exit code 2): "
-        "--key /etc/key/key: not a key; /etc/key has the content of Secret 'lab-key'; see: "
+        "the pods of world and cloud cannot run: the main container ends repeatedly: it ended with "
+        "exit code 2: --key /etc/key/key: not a key; /etc/key has the content of Secret 'lab-key'; "
+        "see: "
     )
     assert lines == []
 
