@@ -48,7 +48,7 @@ class Step(NamedTuple):
     settling_time: float | None  # time after which the error stays within 5 % of `length` [s]
     iae: float  # integral of the error over time [m s]
     ise: float  # integral of the squared error over time [m^2 s]
-    effort: float  # integral of the squared commanded velocity over time [m^2/s]
+    squared_command: float  # integral of the squared commanded velocity over time [m^2/s]
     last_error: float  # largest error in the last 0.5 s [m]
     unstable: bool  # whether the error oscillates without decay
     cut: bool  # whether the end of the step was not flown or recorded
@@ -127,7 +127,7 @@ def _measure(flight: Flight, row: int, end_ns: int, *, cut: bool) -> Step | None
         settling_time=None if cut else _settling_time(times, sizes, BAND * length),
         iae=_integral(sizes, times),
         ise=_integral(sizes**2, times),
-        effort=_integral(speeds**2, sent),
+        squared_command=_integral(speeds**2, sent),
         last_error=float(sizes[late].max(initial=0.0)),
         unstable=any(_grows(errors[:, axis]) for axis in range(3)),
         cut=cut,
@@ -199,8 +199,8 @@ add_metrics(
      partial(_mean_of, name="iae")),
     ("ise_mean", "m^2 s", "Integral of the squared error over time, mean of the steps.",
      partial(_mean_of, name="ise")),
-    ("control_effort_mean", "m^2/s", "Integral of the squared commanded velocity over time, mean "
-     "of the steps.", partial(_mean_of, name="effort")),
+    ("squared_command_integral_mean", "m^2/s", "Integral of the squared commanded velocity over "
+     "time, mean of the steps.", partial(_mean_of, name="squared_command")),
     ("unstable_steps", "1", "Number of steps in which the error oscillates without decay.",
      lambda flight: flight.count(sum(step.unstable for step in responses(flight)))),
 )  # fmt: skip
