@@ -40,7 +40,7 @@ def test_the_largest_age_is_that_of_a_flight(settings):
     raised = "guard.command_age_max_ms=3000", "cloud.freeze_after_s=3"
     settings = "link.profile=ideal", *settings, *raised
     expected, _ = simulate_ages(load_experiment("hover", settings))
-    peak = numbers(fly("hover", *settings))["age_at_actuator_peak"]
+    peak = numbers(fly("hover", *settings))["age_at_actuator_max"]
     assert peak == pytest.approx(max(expected), abs=0.0021)  # the guard looks every 2 ms
 
 

@@ -583,6 +583,9 @@ class Criteria(Section):
     time_limit_s: TimeLimit | None = None
     """Time limit of the mission [s], counted from its start; after this time the mission fails.
     null: 3 times the expected time, but at least 60 s"""
+    age_deadline_s: Positive | None = None
+    """Age of information at the actuator [s], for the number `age_violation`: the share of the time
+    above this age. No flight fails for it. null: no such number"""
 
 
 class Report(Section):

@@ -27,6 +27,7 @@ from cloudrc.metrics.flight import (
     select,
 )
 from cloudrc.record.columns import Table
+from cloudrc.rounding import differences
 
 
 def round_trips(flight: Flight) -> Columns:
@@ -114,6 +115,26 @@ def compare_with_truth(
 
     Returns:
         The judge with the sum of all errors. Then, of the predictions that it compared, the
+def peak_ages(flight: Flight) -> Array:
+    """Compute the age at the actuator just before each command that lowers it [s].
+
+    Only commands that end the use of another one count, so none that ends a HOLD. A step of the
+    low-level controller is up to `STEP_NS` earlier, and its age lower by as much.
+    Source: M. Costa, M. Codreanu, A. Ephremides, "On the age of information in status update
+    systems with packet management", IEEE Transactions on Information Theory 60 (4), 2014.
+    """
+    applied, guard = flight.during("/command_applied"), flight.during("/guard")
+    stamps_ns, bases_ns = applied["stamp_ns"][1:], applied["basis_stamp_ns"]
+    before = guard["stamp_ns"].searchsorted(stamps_ns) - 1
+    lowers = (np.diff(bases_ns) > 0) & (guard["state"][before] == GuardState.TRACK)
+    return np.asarray(age(stamps_ns[lowers], bases_ns[:-1][lowers]))
+
+
+def _age_violation(flight: Flight) -> float | None:
+    limit = flight.criteria.age_deadline_s
+    return None if limit is None else mean(differences(limit, ages_at_actuator(flight)) > 0.0)
+
+
         instants [ns], shape (m,), and the errors [m], shape (m, 3).
     """
     truth, judge, found = flight.recording["/ground_truth"], PredictionJudge(), []
@@ -230,7 +251,7 @@ add_metrics(
      lambda flight: mean(ages_at_actuator(flight))),
     ("age_at_actuator_p99", "s", "Age of information at the actuator: 99th percentile.",
      lambda flight: percentile(ages_at_actuator(flight), 99.0)),
-    ("age_at_actuator_peak", "s", "Largest age of information at the actuator.",
+    ("age_at_actuator_max", "s", "Largest age of information at the actuator.",
      lambda flight: percentile(ages_at_actuator(flight), 100.0)),
     ("commands_applied", "1", "Number of commands that reached the low-level controller.",
      lambda flight: flight.count(len(flight.during("/command_applied")["epoch"]))),
@@ -247,6 +268,10 @@ add_metrics(
      "that cloud used.",
      lambda flight: rms(tracking_errors(flight, flight.control["measured"]))),
     ("tracking_rms_estimated", "m", "RMS distance between the setpoint and cloud's estimated "
+    ("peak_age_mean", "s", "Mean peak age: age of information at the actuator just before each "
+     "command that lowers it.", lambda flight: mean(peak_ages(flight))),
+    ("age_violation", "1", "Share of the time with a command in use whose age of information is "
+     "above criteria.age_deadline_s.", _age_violation),
      "position.", lambda flight: rms(tracking_errors(flight, flight.control["position"]))),
 )  # fmt: skip
 add_metrics(

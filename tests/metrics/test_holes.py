@@ -144,7 +144,7 @@ def test_without_the_end_of_the_flight_there_are_no_numbers():
 def test_without_the_start_of_the_flight_its_duration_is_not_known():
     found, *_ = measure_all(lossy(flown(), (-0.5, 0.5)))
     assert "rtt_mean" in found
-    assert not {"duration", "age_at_actuator_peak"} & found.keys()
+    assert not {"duration", "age_at_actuator_max"} & found.keys()
 
 
 def test_a_users_metric_is_not_measured_across_a_hole(tmp_path):
@@ -239,7 +239,7 @@ def test_a_recording_cut_short_is_measured_up_to_its_end():
         records[:] = [each for each in records if each.stamp_ns <= at(6)]
     flight = log.flight()
     flight.recording.holes, flight.recording.torn = (Hole(at(6), END_NS),), "cut short"
-    assert "age_at_actuator_peak" in measure_all(flight)[0]
+    assert "age_at_actuator_max" in measure_all(flight)[0]
     flight = replace(flight, scene=OPEN_AIR)
     flight.recording.holes = (SOMEWHERE,)
     assert measure_all(flight)[0] == {}

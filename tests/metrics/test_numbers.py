@@ -251,7 +251,9 @@ NUMBERS = {
         "age_of_information_mean": approx(0.05),
         # Applied 90 ms after the measurement, in use for 40 ms, in 20 steps.
         "age_at_actuator_mean": approx(0.109),
-        **dict.fromkeys(("age_at_actuator_p99", "age_at_actuator_peak"), approx(0.128)),
+        **dict.fromkeys(("age_at_actuator_p99", "age_at_actuator_max"), approx(0.128)),
+        "peak_age_mean": approx(0.13),  # an instant after the last of the 20 steps
+        "age_violation": None,  # without a limit
         "commands_applied": 251.0,  # 25 per second for 10 s, both ends included
         # The HOLD after the mission's end does not count.
         **dict.fromkeys(("hold_count", "hold_time", "fault_count", "obstacle_contacts"), 0.0),
@@ -303,7 +305,7 @@ NUMBERS = {
         "packets_sent_downlink": 500.0,
         "bytes_sent_downlink": None,
     },
-    held: {"age_at_actuator_mean": approx(0.109, abs=1e-3), "age_at_actuator_peak": approx(0.128)},
+    held: {"age_at_actuator_mean": approx(0.109, abs=1e-3), "age_at_actuator_max": approx(0.128)},
     planned: {
         "prediction_error_rms": approx(0.005),  # off by (3, 4, 0) mm
         "delay_estimate_error_rms": None,
@@ -358,7 +360,7 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight():
     numbers, notes, _ = measure_all(flight_of(paper()[1]))
     assert (notes, list(numbers)) == ([], sorted(numbers))
     resting = {f"steady_error_{axis}" for axis in "xyz"}
-    others = {"recorder_dropped", "final_error", "controller_gaps", "yaw_error"}
+    others = {"recorder_dropped", "final_error", "controller_gaps", "yaw_error", "age_violation"}
     assert set(SHIPPED) - set(numbers) == REAL_TIME | OF_RELAYS | resting | others
     for name, number in numbers.items():
         assert set(number.unit) <= set("smNB12^/ "), name

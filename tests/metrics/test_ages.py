@@ -1,0 +1,74 @@
+"""Ages at the actuator: computed by hand, by closed forms, and step by step."""
+
+from random import Random
+
+import pytest
+
+from cloudrc.messages import ZERO, GuardState
+from cloudrc.metrics import SHIPPED
+from cloudrc.records import CommandApplied, GuardChange, MissionEvent
+from tests.metrics.conftest import Log, at
+
+# Time of application and stamp of the odometry, since the start of the flight [s].
+APPLIED = [
+    (0.00, -0.05),
+    (0.10, 0.06),  # its predecessor was .15 s old
+    (0.14, 0.05),  # overtaken: the age rises
+    (0.30, 0.25),  # .25 s
+    (0.70, 0.66),  # ends a HOLD
+    (0.80, 0.78),  # .14 s
+]
+CHANGES = [(0.0, GuardState.TRACK), (0.5, GuardState.HOLD), (0.7, GuardState.TRACK)]
+
+
+def flight(applied, end, changes=CHANGES[:1], limit=None):
+    """Make a flight of commands; `applied` and `changes` begin with their times [s]."""
+    log = Log()
+    log.world += [GuardChange(at(time), state, "") for time, state in changes]
+    log.world += [
+        CommandApplied(at(time), 1, n, at(basis), ZERO) for n, (time, basis) in enumerate(applied)
+    ]
+    log.cloud.append(MissionEvent(at(end), "done", 0, ""))
+    return log.flight(age_deadline_s=limit)
+
+
+def measured(flight, name):
+    return SHIPPED[name].measure(flight)
+
+
+def test_a_peak_is_the_age_just_before_a_command_that_lowers_it():
+    peak = measured(flight(APPLIED, 1.0, CHANGES), "peak_age_mean")
+    assert peak == pytest.approx((0.15 + 0.25 + 0.14) / 3)
+
+
+@pytest.mark.parametrize("limit_ms", [1, 60, 120, 198, 200, 248, 300])
+def test_the_violation_is_the_share_of_the_steps_with_a_command_in_use(limit_ms):
+    ages = []
+    for now in range(0, 1000, 2):  # [ms]
+        if not 500 <= now < 700:
+            basis = next(b for time, b in reversed(APPLIED) if round(1000 * time) <= now)
+            ages.append(now - round(1000 * basis))
+    share = sum(age > limit_ms for age in ages) / len(ages)
+    found = flight(APPLIED, 1.0, CHANGES, limit_ms / 1000)
+    assert measured(found, "age_violation") == pytest.approx(share)
+    assert measured(found, "age_at_actuator_max") == pytest.approx(max(ages) / 1000)
+    assert measured(found, "age_at_actuator_mean") == pytest.approx(sum(ages) / len(ages) / 1000)
+
+
+@pytest.mark.parametrize("loss", [0.3, 0.5])
+def test_a_constant_delay_with_losses_gives_the_closed_forms(loss):
+    """Period T, delay D, loss p: mean peak D + T / (1 - p), P(age > D + k T) = p^k."""
+    delay, period, count, rng = 0.2, 0.01, 60_000, Random(1)
+    applied = [
+        (n * period + delay, n * period) for n in range(count) if not n or rng.random() >= loss
+    ]
+    start = [(delay, GuardState.TRACK)]
+    found = flight(applied, count * period, start, delay + 2 * period - 1e-6)
+    assert measured(found, "peak_age_mean") == pytest.approx(delay + period / (1 - loss), rel=1e-3)
+    assert measured(found, "age_violation") == pytest.approx(loss**2, rel=0.05)
+
+
+def test_without_a_limit_or_a_command_there_are_no_such_numbers():
+    assert measured(flight(APPLIED, 1.0), "age_violation") is None
+    for name in ("age_violation", "peak_age_mean"):
+        assert measured(flight([], 1.0, limit=0.1), name) is None
