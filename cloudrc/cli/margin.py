@@ -26,10 +26,11 @@ examples:
   cloudrc margin link.uplink.loss --resolution 0.05 -o json
 
 Two answers. The loop is stable if the response to a step of 0.1 m per axis dies
-out, in the scene 'empty'. It settles in time if the flights of the experiment
-succeed with all seeds. The search begins at the present value and goes up and
-down. It raises cloud.horizon_max_s, cloud.freeze_after_s and
-guard.command_age_max_ms as the delays need it, unless --set gives them."""
+out, in the scene 'empty': this is small-signal, the delay margin of the linear
+loop. It settles in time if the flights of the experiment succeed with all
+seeds. The search begins at the present value and goes up and down. It raises
+cloud.horizon_max_s, cloud.freeze_after_s and guard.command_age_max_ms as the
+delays need it, unless --set gives them."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
