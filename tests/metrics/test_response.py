@@ -54,6 +54,22 @@ def test_a_step_of_a_second_order_system(damping):
     assert not step.unstable
 
 
+def test_the_squared_command_is_integrated_over_each_step():
+    """Commands of (1, 2, 2) m/s until 4 s, then of (0, 0, -1) m/s; the mean is over both steps."""
+    log = flown(lambda t: (1.0 if t < 4.0 else 3.0, 0.0, 1.0))
+
+    def command(n, period):
+        early = period.stamp_ns < at(4.0)
+        setpoint = (2.0, 0.0, 1.0) if early else (4.0, 0.0, 1.0)
+        return period._replace(
+            setpoint=setpoint, command=(1.0, 2.0, 2.0) if early else (0.0, 0.0, -1.0)
+        )
+
+    log.change(Control, command)
+    mean = SHIPPED["squared_command_integral_mean"].measure(log.flight())
+    assert mean == pytest.approx((9.0 * 4.0 + 1.0 * 6.0) / 2, rel=0.02)
+
+
 def fading(t):
     """Oscillate with half-waves that are equal up to rounding."""
     return 1.0 - (1.0 - 1e-13 * t) * cos(pi * t), 0.0, 1.0
