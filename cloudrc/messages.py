@@ -24,6 +24,9 @@ ZERO: Vector = (0.0, 0.0, 0.0)
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 NEVER_NS = -1
 """Stamp that stands for "never" [ns]."""
+FRESH_ECHO_PERIODS = 5
+"""Longest hold time of an echo that gives a delay sample [command periods]. While no commands reach
+world, the hold time grows although the delay of the link does not change."""
 
 
 class GuardState(IntEnum):

@@ -126,6 +126,8 @@ class Arrival(NamedTuple):
     If a session has more repeated datagrams than the peer has sent, only an attacker can be the
     cause. Further repeats then get no record, so that they cannot fill the recording. Cloud writes
     the topic /uplink_delay, world the topic /downlink_delay.
+
+    The echo is that in telemetry, for live metrics; a recording has it in the topic /telemetry.
     """
 
     stamp_ns: int
@@ -134,6 +136,9 @@ class Arrival(NamedTuple):
     counter: Number
     delay: Annotated[float, "s", "one way; NaN unless the ends share a clock"]
     used: Annotated[bool, "", "true if it became the newest, false if late, repeated or refused"]
+    echo_stamp_ns: int = NEVER_NS  # stamp of the newest applied command [ns], cloud's clock
+    echo_hold_ns: int = 0  # time since this command was applied [ns]
+    is_sample: bool = False  # whether the estimator got the echo as a delay sample
 
 
 class CommandApplied(NamedTuple):

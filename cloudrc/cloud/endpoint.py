@@ -314,7 +314,10 @@ class CloudEndpoint(TunnelEnd):
         if self._clock_is_shared:
             delay = (now_ns - telemetry.stamp_ns - telemetry.slip_ns) * 1e-9
         if outcome != REPEATED or not self._channel.is_flooded:
-            self._records.append(_new(Arrival, (now_ns, True, epoch, counter, delay, used)))
+            echo = telemetry.echo_stamp_ns, telemetry.echo_hold_ns
+            fields = now_ns, True, epoch, counter, delay, used, *echo
+            is_sample = used and self._loop.gives_sample(*echo)
+            self._records.append(_new(Arrival, (*fields, is_sample)))
         if outcome == LATE:
             self._loop.observe_late(telemetry, now_ns)
         if used:

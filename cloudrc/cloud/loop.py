@@ -29,6 +29,7 @@ from cloudrc.cloud.predictors import Predictor
 from cloudrc.cloud.results import check_estimate, check_output, refuse, to_vector
 from cloudrc.errors import ControllerLostError, describe_error
 from cloudrc.messages import (
+    FRESH_ECHO_PERIODS,
     NEVER_NS,
     PLAN_STEP_NS,
     ZERO,
@@ -54,9 +55,6 @@ from cloudrc.tunnel.codec import as_planned
 PERIOD_NS = 10_000_000
 """Time between two commands, unless an experiment sets another rate [ns].
 Source: docs/reference/plant.md, "Commands"."""
-FRESH_ECHO_PERIODS = 5
-"""Longest hold time of an echo that gives a delay sample [command periods]. While no commands reach
-world, the hold time grows although the delay of the link does not change."""
 ECHOES, ECHOES_NS = 32, 320_000_000
 """Smallest number of stored echoes, and the time for which echoes are stored [ns]. With the stored
 echoes, the loop calls `add_applied` only once per command."""
@@ -197,16 +195,23 @@ class ControlLoop:
         self._now_ns = now_ns
         self._call("estimator", self._observe_echo, telemetry)
 
-    def _observe_delay(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Process the delays in telemetry that is newer than all earlier telemetry.
+    def gives_sample(self, echo_stamp_ns: int, echo_hold_ns: int) -> bool:
+        """Return whether telemetry that cloud uses gives the estimator a delay sample.
+
+        `echo_stamp_ns` is the stamp of the command that it echoes [ns], `echo_hold_ns` the time
+        since world applied this command [ns].
 
         Every telemetry datagram gives one sample of the paper's eq. (1), even if an earlier
         datagram had the same echo. A datagram whose hold time is above the limit gives none.
         Source: docs/reference/control.md, "The delay sample".
         """
+        return echo_stamp_ns != NEVER_NS and echo_hold_ns <= FRESH_ECHO_PERIODS * self.period_ns
+
+    def _observe_delay(self, telemetry: Telemetry, now_ns: int) -> None:
+        """Process the delays in telemetry that is newer than all earlier telemetry."""
         echo_ns, hold_ns = telemetry.echo_stamp_ns, telemetry.echo_hold_ns
         self._observe_echo(telemetry)
-        if echo_ns == NEVER_NS or hold_ns > FRESH_ECHO_PERIODS * self.period_ns:
+        if not self.gives_sample(echo_ns, hold_ns):
             return
         loop_ns = now_ns - echo_ns
         self._loop_delay, self._rtt = loop_ns * 1e-9, (loop_ns - hold_ns) * 1e-9

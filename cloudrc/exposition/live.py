@@ -17,6 +17,7 @@ from cloudrc.exposition.parts import Histogram, Readings, samples
 from cloudrc.exposition.table import LiveMetric, MetricKind, of_role
 from cloudrc.messages import NEVER_NS, Cause, GuardState
 from cloudrc.metrics.definitions import (
+    WAITING_MAX,
     DatagramTally,
     DelayJudge,
     Echoes,
@@ -120,7 +121,7 @@ class End:
         self._values[f"cloudrc_{name}_seconds"].observe(seconds)
 
     def _on_arrival(self, record: Arrival) -> None:
-        stamp_ns, _, epoch, counter, delay, used = record
+        stamp_ns, _, epoch, counter, delay, used, *_ = record
         values, stream, incoming = self._values, self._stream, self._incoming
         if stream.take(epoch, counter):  # not a replay, which anybody can send
             if not self._silent:
@@ -244,6 +245,7 @@ class CloudEnd(End):
         super().__init__(table.CLOUD, values)
         self._prediction, self._delay = PredictionJudge(), DelayJudge()
         self._echoes, self._used_count = Echoes(), 0
+        self._echoed: dict[int, None] = {}  # stamps of the commands whose echo arrived [ns]
         self._has_plans = False
 
     def _on_sessionopened(self, record: SessionOpened) -> None:
@@ -254,6 +256,18 @@ class CloudEnd(End):
     def _on_arrival(self, record: Arrival) -> None:
         super()._on_arrival(record)
         self._used_count += record.used
+        echo_ns, echoed = record.echo_stamp_ns, self._echoed
+        if not record.used or echo_ns == NEVER_NS:
+            return
+        loop_delay = age(record.stamp_ns, echo_ns)
+        if record.is_sample:
+            self._observe("delay_sample", loop_delay)
+        if echo_ns not in echoed:
+            self._observe("loop_delay", loop_delay)
+            self._observe("rtt", loop_delay - record.echo_hold_ns * 1e-9)
+            echoed[echo_ns] = None
+            if len(echoed) > WAITING_MAX:
+                del echoed[next(iter(echoed))]  # the oldest
 
     def _on_planfollowed(self, record: PlanFollowed) -> None:
         self._has_plans = True  # their horizon is the beginning of the plan, not the true delay
@@ -261,11 +275,9 @@ class CloudEnd(End):
     def _on_control(self, record: Control) -> None:
         self._count_age(record.stamp_ns)
         self._prediction.take(record)
-        if self._echoes.take(record.rtt, record.loop_delay):
-            self._observe("loop_delay", record.loop_delay)
-            self._observe("rtt", record.rtt)
-            if self._used_count == 1:  # else it is unknown which odometry had the echo
-                self._delay.echoed(record, self._newest_ns)
+        if self._echoes.take(record.rtt, record.loop_delay) and self._used_count == 1:
+            # With several telemetries it is unknown which odometry had the echo.
+            self._delay.echoed(record, self._newest_ns)
         self._used_count = 0
         self._delay.sent(record)
         values = self._values

@@ -134,8 +134,10 @@ cloud
 cloudrc_uplink_delay_seconds: One-way delay from world to cloud, late datagrams included; absent
     unless both ends prove that they share a clock.
 cloudrc_rtt_seconds: Round trip of applied commands, without their time in world.
-cloudrc_loop_delay_seconds: Round trip of applied commands, with their time in world: the paper's
-    tau.
+cloudrc_loop_delay_seconds: Round trip of applied commands, with their time in world; each command
+    counts once.
+cloudrc_delay_sample_seconds: Delay samples of the estimator, one per telemetry that cloud used: the
+    paper's tau_n, which eq. (1) averages.
 cloudrc_delay_estimate_seconds: Clamped delay estimate: how far ahead cloud predicts the odometry.
 cloudrc_delay_estimate_error_seconds: Delay estimate minus the true time from the odometry to the
     application of the command, for the newest command that the robot confirmed; absent with plans.
@@ -218,10 +220,14 @@ _LABELS: Mapping[str, Labels] = {
     "cloudrc_link_datagrams_total outcome": LINK_OUTCOMES,
 }
 """Label, or metric and label -> all values of the label; () if the values are not known."""
-_DELAYS = "uplink_delay downlink_delay age_of_information rtt loop_delay command_age"
+_DELAYS = "uplink_delay downlink_delay age_of_information rtt command_age"
 _BUCKETS: Mapping[str, tuple[float, ...]] = {
-    # Jitter causes gaps below 50 ms; after 250 ms the guard holds.
-    "cloudrc_link_gap_seconds": (0.05, 0.25),
+    # Jitter causes gaps below 50 ms; after 250 ms the guard holds. Of the two delays the mean is
+    # of interest: cloudrc_rtt_seconds has finer buckets.
+    **{
+        f"cloudrc_{name}_seconds": (0.05, 0.25)
+        for name in ("link_gap", "loop_delay", "delay_sample")
+    },
     **{
         f"cloudrc_{name}_seconds": (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 1.0)
         for name in _DELAYS.split()

@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from cloudrc.messages import NEVER_NS, GuardState
+from cloudrc.messages import FRESH_ECHO_PERIODS, NEVER_NS, GuardState
 from cloudrc.metrics.definitions import (
     PredictionJudge,
     age,
@@ -30,15 +30,13 @@ from cloudrc.record.columns import Table
 from cloudrc.rounding import differences
 
 
-def round_trips(flight: Flight) -> Columns:
-    """Measure the round trip of each applied command whose echo arrived, in order of arrival.
-
-    The first telemetry that names the command and that cloud used measures it. So each command
-    counts once, even if several echoes arrive in one control period; `Echoes` sees the last one.
+def _echoes(flight: Flight) -> Columns:
+    """Measure the loop with each telemetry that cloud used, in order of arrival.
 
     Returns:
-        `stamp_ns` of the arrival [ns]; `loop_delay`, from the command to this arrival [s]; `rtt`,
-        the same without the hold time in world [s].
+        `stamp_ns` of the arrival [ns]; `loop_delay`, from the newest applied command to this
+        arrival [s]; `rtt`, the same without the hold time in world [s]; `is_first`, whether no
+        earlier row is about the same command; `is_sample`, whether the estimator got the row.
     """
     applied, sent = flight.recording["/command_applied"], flight.recording["/telemetry"]
     estimates, arrivals = flight.recording["/delay_estimate"], flight.during("/uplink_delay")
@@ -50,22 +48,36 @@ def round_trips(flight: Flight) -> Columns:
     applied_ns, holds_ns = sent["stamp_ns"] - sent["echo_hold_ns"], sent["echo_hold_ns"]
     rows = zip(applied_ns[echoed].tolist(), holds_ns[echoed].tolist(), strict=True)
     telemetry = dict(zip(_numbers(sent, echoed), rows, strict=True))
-    known, found = set[tuple[int, int]](), list[tuple[int, int, int]]()
+    known, found = set[tuple[int, int]](), list[tuple[int, int, int, bool]]()
     used = arrivals["used"]
     for number, stamp_ns in zip(
         _numbers(arrivals, used), arrivals["stamp_ns"][used].tolist(), strict=True
     ):
         at_ns, hold_ns = telemetry.get(number, (NEVER_NS, 0))
         command = commands.get(at_ns)
-        if command in made and command not in known:
+        if command in made:
+            found.append((stamp_ns, stamp_ns - made[command], hold_ns, command not in known))
             known.add(command)
-            found.append((stamp_ns, stamp_ns - made[command], hold_ns))
-    stamps_ns, loops_ns, held_ns = np.array(found, np.int64).reshape(-1, 3).T
+    stamps_ns, loops_ns, held_ns, is_first = np.array(found, np.int64).reshape(-1, 4).T
     return {
         "stamp_ns": stamps_ns,
         "loop_delay": loops_ns * 1e-9,
         "rtt": (loops_ns - held_ns) * 1e-9,
+        "is_first": is_first.astype(bool),
+        "is_sample": held_ns <= FRESH_ECHO_PERIODS * round(1e9 / flight.command_rate_hz),
     }
+
+
+def round_trips(flight: Flight) -> Columns:
+    """Measure the round trip of each applied command whose echo arrived: its first in `_echoes`."""
+    rows = _echoes(flight)
+    return select(rows, rows["is_first"])
+
+
+def delay_samples(flight: Flight) -> Array:
+    """Return the loop delays that the estimator got as samples [s], in order of arrival."""
+    rows = _echoes(flight)
+    return np.asarray(rows["loop_delay"][rows["is_sample"]])
 
 
 def _numbers(table: Table | Columns, rows: Array | slice = slice(None)) -> list[tuple[int, int]]:
@@ -103,18 +115,6 @@ def ages_at_actuator(flight: Flight) -> Array:
     return np.asarray(age(steps_ns[in_use], applied["basis_stamp_ns"][newest[in_use]]))
 
 
-def compare_with_truth(
-    flight: Flight, at_ns: Array, predicted: Array
-) -> tuple[PredictionJudge, Array, Array]:
-    """Compare predicted positions with the true position at the same instants.
-
-    Args:
-        flight: The flight.
-        at_ns: Instants on world's clock [ns], shape (n,).
-        predicted: Predicted positions [m], shape (n, 3).
-
-    Returns:
-        The judge with the sum of all errors. Then, of the predictions that it compared, the
 def peak_ages(flight: Flight) -> Array:
     """Compute the age at the actuator just before each command that lowers it [s].
 
@@ -135,6 +135,18 @@ def _age_violation(flight: Flight) -> float | None:
     return None if limit is None else mean(differences(limit, ages_at_actuator(flight)) > 0.0)
 
 
+def compare_with_truth(
+    flight: Flight, at_ns: Array, predicted: Array
+) -> tuple[PredictionJudge, Array, Array]:
+    """Compare predicted positions with the true position at the same instants.
+
+    Args:
+        flight: The flight.
+        at_ns: Instants on world's clock [ns], shape (n,).
+        predicted: Predicted positions [m], shape (n, 3).
+
+    Returns:
+        The judge with the sum of all errors. Then, of the predictions that it compared, the
         instants [ns], shape (m,), and the errors [m], shape (m, 3).
     """
     truth, judge, found = flight.recording["/ground_truth"], PredictionJudge(), []
@@ -242,8 +254,11 @@ add_metrics(
      lambda flight: mean(round_trips(flight)["rtt"])),
     ("rtt_p95", "s", "Round trip from command to echo, without the hold time in world: 95th "
      "percentile.", lambda flight: percentile(round_trips(flight)["rtt"], 95.0)),
-    ("loop_delay_mean", "s", "Mean round trip from command to echo, with the hold time in world: "
-     "the paper's tau_n.", lambda flight: mean(round_trips(flight)["loop_delay"])),
+    ("loop_delay_mean", "s", "Mean round trip from command to echo, with the hold time in world; "
+     "each command counts once.", lambda flight: mean(round_trips(flight)["loop_delay"])),
+    ("delay_sample_mean", "s", "Mean of the estimator's delay samples, one per telemetry that "
+     "cloud used: the paper's tau_n, which eq. (1) averages.",
+     lambda flight: mean(delay_samples(flight))),
     ("age_of_information_mean", "s", "Mean age of cloud's newest odometry when it computes a "
      "command.", _age_of_information),
     ("age_at_actuator_mean", "s", "Mean age of information at the actuator: of the odometry behind "
@@ -253,6 +268,10 @@ add_metrics(
      lambda flight: percentile(ages_at_actuator(flight), 99.0)),
     ("age_at_actuator_max", "s", "Largest age of information at the actuator.",
      lambda flight: percentile(ages_at_actuator(flight), 100.0)),
+    ("peak_age_mean", "s", "Mean peak age: age of information at the actuator just before each "
+     "command that lowers it.", lambda flight: mean(peak_ages(flight))),
+    ("age_violation", "1", "Share of the time with a command in use whose age of information is "
+     "above criteria.age_deadline_s.", _age_violation),
     ("commands_applied", "1", "Number of commands that reached the low-level controller.",
      lambda flight: flight.count(len(flight.during("/command_applied")["epoch"]))),
 )  # fmt: skip
@@ -268,10 +287,6 @@ add_metrics(
      "that cloud used.",
      lambda flight: rms(tracking_errors(flight, flight.control["measured"]))),
     ("tracking_rms_estimated", "m", "RMS distance between the setpoint and cloud's estimated "
-    ("peak_age_mean", "s", "Mean peak age: age of information at the actuator just before each "
-     "command that lowers it.", lambda flight: mean(peak_ages(flight))),
-    ("age_violation", "1", "Share of the time with a command in use whose age of information is "
-     "above criteria.age_deadline_s.", _age_violation),
      "position.", lambda flight: rms(tracking_errors(flight, flight.control["position"]))),
 )  # fmt: skip
 add_metrics(

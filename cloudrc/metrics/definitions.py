@@ -2,9 +2,8 @@
 
 Each quantity is computed step by step. Live metrics and console do so while the records arrive, the
 report does so afterwards, with the same functions. So the same records give the same value, except
-for three quantities of which the report knows more: it waits longer for a missing datagram before
-it counts the datagram as lost (`WINDOW_MAX`), it knows the true positions (`PredictionJudge`), and
-it sees each echo of a command (`cloudrc.metrics.control.round_trips`), not one per control period.
+for two quantities of which the report knows more: it waits longer for a missing datagram before
+it counts the datagram as lost (`WINDOW_MAX`), and it knows the true positions (`PredictionJudge`).
 """
 
 from __future__ import annotations

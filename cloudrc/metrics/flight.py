@@ -44,6 +44,7 @@ class Flight:
     mission: MissionConfig  # with its waypoints or random steps
     scene: Scene  # its tubes and all other obstacles
     hull: Hull | None = None  # of the robot; None: not known
+    command_rate_hz: int = 100  # cloud.command_rate_hz
 
     @property
     def waypoints(self) -> int:

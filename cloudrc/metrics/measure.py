@@ -26,6 +26,7 @@ METRIC_NOTE = "metric "
 
 IN_SPITE_OF_HOLES = {
     *("duration", "waypoints_reached", "obstacle_contacts", "rtt_mean", "rtt_p95"),
+    "delay_sample_mean",
     *("uplink_delay_mean", "downlink_delay_mean", "late_uplink", "late_downlink"),
     *("age_of_information_mean", "prediction_error_rms", "estimate_error_rms"),
     *("delay_estimate_error_rms", "tracking_rms_measured", "tracking_rms_estimated"),

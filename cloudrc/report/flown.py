@@ -16,7 +16,9 @@ from cloudrc.record.columns import Recording
 def flight_of(recording: Recording, experiment: ResolvedExperiment) -> Flight:
     """Return a flight for metrics and figures; raise errors as `flown_world` does."""
     flown = flown_world(recording, experiment)
-    return Flight(recording, experiment.criteria, experiment.mission, flown.scene, flown.hull)
+    rate_hz = experiment.cloud.command_rate_hz
+    known = flown.scene, flown.hull, rate_hz
+    return Flight(recording, experiment.criteria, experiment.mission, *known)
 
 
 def flown_world(recording: Recording, experiment: ResolvedExperiment) -> FlownWorld:

@@ -371,7 +371,8 @@ class WorldEndpoint(TunnelEnd):
         used = outcome == USED
         delay = (now_ns - command.stamp_ns) * 1e-9 if self._clock_is_shared else nan
         if outcome != REPEATED or not self._channel.is_flooded:
-            self._records.append(_new(Arrival, (world_ns, False, epoch, counter, delay, used)))
+            fields = world_ns, False, epoch, counter, delay, used, NEVER_NS, 0, False
+            self._records.append(_new(Arrival, fields))
         if used and guard.state is TRACK:
             self._waiting = (epoch, counter, command)
         self.counts[outcome] += 1

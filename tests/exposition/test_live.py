@@ -10,6 +10,7 @@ from cloudrc.exposition import table
 from cloudrc.exposition.live import ONE_SHAPER, LiveMetrics
 from cloudrc.exposition.parts import Histogram
 from cloudrc.messages import UPRIGHT, ZERO, Cause, GuardState, Odometry, Telemetry
+from cloudrc.metrics.definitions import WAITING_MAX
 from cloudrc.records import (
     Arrival,
     CommandApplied,
@@ -89,15 +90,41 @@ def test_a_cloud_is_admitted_once_however_many_missions_start():
 
 def test_control_periods_give_delays_errors_and_terms():
     live, seen = LiveMetrics("cloud"), {"setpoint": (1.0, 2.0, 3.0), "measured": (0.0, 2.5, 3.0)}
-    for k, rtt in enumerate((math.nan, 0.04, 0.04, 0.04, 0.05)):
-        at = {"rtt": rtt, "loop_delay": rtt + 0.005, "derivative": (0.0, 0.0, -0.7)}
-        live.see([control(0.01 * k, **seen, **at)])
-    assert histogram(live, "cloudrc_rtt_seconds").cumulative()[-1] == 2, "once per echo"
-    assert histogram(live, "cloudrc_loop_delay_seconds").total == pytest.approx(0.1)
+    live.see([control(0.01 * k, **seen, derivative=(0.0, 0.0, -0.7)) for k in range(5)])
     assert value(live, "cloudrc_tracking_error_meters", "x") == 1.0
     assert value(live, "cloudrc_tracking_error_meters", "y") == -0.5
     assert value(live, "cloudrc_pid_output", "derivative", "z") == -0.7
     assert "cloudrc_estimate_error_meters" not in live.read(), "no prediction compared yet"
+
+
+def test_each_command_has_one_round_trip_and_each_used_echo_may_be_a_sample():
+    live = LiveMetrics("cloud")
+    for at_ms, echo_ms, hold_ms, used, is_sample in (
+        (50, 0, 10, True, True),
+        (60, 0, 20, True, True),  # the same command again
+        (70, 20, 8, False, False),  # late
+        (90, 30, 55, True, False),  # held too long for a sample
+        (95, 0, 10, True, True),  # overtaken
+    ):
+        echo = echo_ms * MS, hold_ms * MS, is_sample
+        live.see([Arrival(at_ms * MS, True, 1, at_ms, math.nan, used, *echo)])
+    live.see([arrived("cloud", 100)])  # before the first applied command
+    for name, delays in {
+        "loop_delay": (0.05, 0.06),
+        "rtt": (0.04, 0.005),
+        "delay_sample": (0.05, 0.06, 0.095),
+    }.items():
+        found = histogram(live, f"cloudrc_{name}_seconds")
+        assert found.total == pytest.approx(sum(delays)), name
+        assert found.cumulative()[-1] == len(delays), name
+
+
+def test_a_cloud_remembers_few_echoes():
+    live = LiveMetrics("cloud")
+    for n in range(2 * WAITING_MAX):
+        live.see([Arrival((n + 5) * MS, True, 1, n, math.nan, True, n * MS, 0, True)])
+    assert histogram(live, "cloudrc_rtt_seconds").cumulative()[-1] == 2 * WAITING_MAX
+    assert len(live.end._echoed) == WAITING_MAX
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cloudrc.cloud.estimators import DelaySample
+from cloudrc.cloud.estimators.running_mean import RunningMean
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
@@ -176,14 +178,56 @@ def seen_in(flight, cloud):
     return live
 
 
-def test_round_trips_over_an_even_link_are_equal_live_and_in_the_report():
-    settings = ("link.both.delay_ms=33", "link.both.jitter_ms=0")
-    flight, cloud = fly("hover", *settings).flight, records(load_experiment("hover", settings))[1]
+def test_round_trips_over_an_even_link_have_its_delay():
+    flight = fly("hover", "link.both.delay_ms=33", "link.both.jitter_ms=0").flight
     assert measured(flight, "rtt_mean") == pytest.approx(0.066, abs=1e-3)
-    live = seen_in(flight, cloud)
-    for name in ("rtt", "loop_delay"):
+
+
+SAMPLED = [
+    ("paper-verbatim", "link.profile=paper-p3"),
+    ("hover", "link.profile=paper-p3", "cloud={estimator: running_mean, command_rate_hz: 50}"),
+    ("hover", "link.profile=lossy", "cloud.estimator=running_mean"),
+]
+
+
+@pytest.mark.parametrize("flown", SAMPLED)
+def test_delays_of_the_loop_are_equal_live_and_in_the_report(flown):
+    flight, live = fly(*flown).flight, LiveMetrics("cloud")
+    _, cloud = records(load_experiment(flown[0], flown[1:]))
+    live.see(
+        each
+        for each in cloud
+        if isinstance(each, Arrival) and flight.start_ns <= each.stamp_ns <= flight.end_ns
+    )
+    for name in ("rtt", "loop_delay", "delay_sample"):
         true = measured(flight, f"{name}_mean")
-        assert average(live, f"cloudrc_{name}_seconds") == pytest.approx(true, abs=1e-5)
+        assert average(live, f"cloudrc_{name}_seconds") == pytest.approx(true, rel=1e-9), name
+
+
+@pytest.mark.parametrize("flown", SAMPLED)
+def test_the_mean_delay_sample_is_what_eq_1_averages(flown):
+    """The estimator gets, from the records alone, what telemetry said; cloud had the same mean."""
+    flight, estimator = fly(*flown).flight, RunningMean()
+    experiment = load_experiment(flown[0], flown[1:])
+    world, cloud = records(experiment)
+    longest_ns = 5 * SECOND // experiment.cloud.command_rate_hz
+    sent = {(r.epoch, r.counter): r.telemetry for r in world if isinstance(r, TelemetrySent)}
+    for arrival in (r for r in cloud if isinstance(r, Arrival) and r.used):
+        told = sent[arrival.epoch, arrival.counter]
+        known = told.echo_stamp_ns >= 0 and told.echo_hold_ns <= longest_ns
+        if known and flight.start_ns <= arrival.stamp_ns <= flight.end_ns:
+            loop_delay = (arrival.stamp_ns - told.echo_stamp_ns) * 1e-9
+            estimator.update(DelaySample(loop_delay, math.nan))
+    mean = measured(flight, "delay_sample_mean")
+    assert mean == pytest.approx(estimator.horizon(0.0), rel=1e-9)
+    assert mean == pytest.approx(flight.control["horizon"][-1], abs=2e-4)
+    assert mean > measured(flight, "loop_delay_mean") + 0.003
+
+
+def test_each_command_once_has_another_mean_than_all_samples():
+    flight = fly(*SAMPLED[0]).flight
+    assert measured(flight, "loop_delay_mean") == pytest.approx(0.142, abs=5e-4)
+    assert measured(flight, "delay_sample_mean") == pytest.approx(0.150, abs=5e-4)
 
 
 def test_each_command_has_one_round_trip_even_if_telemetry_arrives_at_once():

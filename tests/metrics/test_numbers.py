@@ -246,6 +246,7 @@ NUMBERS = {
         "rtt_mean": approx(0.09),
         "rtt_p95": approx(0.09),
         "loop_delay_mean": approx(0.13),  # with the 40 ms in world
+        "delay_sample_mean": approx(0.13),
         "uplink_delay_mean": approx(0.05),
         "downlink_delay_mean": approx(0.04),
         "age_of_information_mean": approx(0.05),

@@ -21,7 +21,7 @@ DELAY_ALT = "Two scatter plots over time: one-way delays, and the loop delay wit
 DELAY = (
     "Delays. (a) Each dot is the one-way delay of a datagram that arrived, late ones included; the "
     "band is the link profile, with gaps in blackouts. (b) Each dot is the loop delay of one echo: "
-    "the time from a command's stamp to its echo (the paper's τₙ). The solid line is the delay "
+    "the time from a command's stamp to its first echo. The solid line is the delay "
     "estimate, over which the controller predicts. The band is the sum of both directions of the "
     "link profile, the dashed line its mean. Only applied commands have echoes; if the newest "
     "command wins, these are the fast ones, so the loop delay lies below the mean of the profile."
