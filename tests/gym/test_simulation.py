@@ -1,0 +1,544 @@
+"""The link between environment and policy equals a simulation that is written from its rule alone.
+
+The rule is in docs/gym.md. The simulation shares no code with cloudrc.gym: it takes the fates of
+packets from the link library, and has the executors as functions of all answers received so far.
+"""
+
+from functools import cache
+from itertools import count, product
+from math import ceil, cos, exp, inf, sin
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+import pytest
+
+from cloudrc.gym import Networked
+from cloudrc.link.library import OneWay, read_profile
+from tests.gym.envs import Counter, both_ways
+
+SEED = 1
+DT = {"CartPole-v1": 0.02, "Pendulum-v1": 0.05}
+BYTES = {"observation_bytes": 60, "action_bytes": 40}
+LINKS = {
+    "constant": both_ways(30, 30),
+    "uniform, loss": both_ways(40, 40, jitter_ms=15, distribution="uniform", loss=0.1),
+    "lte": "lte",
+}
+EPISODES = 2**20
+
+
+class Answer(NamedTuple):
+    """What the robot has received."""
+
+    basis: int  # tick of the observation
+    tick: int  # in which it was received
+    actions: list
+
+
+class Setup(NamedTuple):
+    """Environment, executor and times of an episode [s]."""
+
+    name: str
+    link: str
+    executor: str
+    chunk: int | None = None
+    compute: float = 0.0
+    wait: float | None = None  # None: 5 % of a step
+    start: Any = "answer"
+    uses_prefix: bool = False
+
+    @property
+    def dt(self):
+        return DT[self.name]
+
+    @property
+    def wait_ns(self):
+        return round((0.05 * self.dt if self.wait is None else self.wait) * 1e9)
+
+
+class Episode(NamedTuple):
+    """What is compared. Ages are those of single steps [s]."""
+
+    result: float  # sum of the rewards
+    observation_ages: list
+    action_ages: list
+    held: list
+    asked: list
+    means: dict
+
+
+# The simulation ---------------------------------------------------------------------------------
+
+
+def played(got, tick):
+    """Play the newest answer from its first action, beginning when it was received."""
+    basis, start, actions = max(got)
+    return (actions[tick - start], basis) if tick - start < len(actions) else None
+
+
+def indexed(got, tick):
+    """Action i of the newest answer belongs to the tick basis + i."""
+    basis, _, actions = max(got)
+    return (actions[tick - basis], basis) if tick - basis < len(actions) else None
+
+
+def averaged(got, tick):
+    """Weighted mean of all answers with an action for the tick, and of their ticks."""
+    kept = sorted(each for each in got if tick - each.basis < len(each.actions))
+    weights = [exp(-0.01 * place) for place in range(len(kept))]
+    if not kept:
+        return None
+    mean = np.average([each.actions[tick - each.basis] for each in kept], axis=0, weights=weights)
+    return mean.astype(np.float32), np.average([each.basis for each in kept], weights=weights)
+
+
+CHOOSE = {
+    "newest": played,
+    "broker": played,
+    "time_indexed": indexed,
+    "prefix": indexed,
+    "ensemble": averaged,
+}
+
+
+def asks(setup, got, asked, tick):
+    """Return whether the robot sends the observation of the tick."""
+    if setup.executor != "broker":
+        return True
+    basis, start, actions = max(got, default=Answer(-1, 0, []))
+    is_open = asked > basis and (tick - asked) * setup.dt < 1.0 - 1e-9
+    return tick >= start + len(actions) and not is_open
+
+
+def simulate(env, setup, seed, answer, neutral, exact=False):
+    """Play an episode by the rule; `exact`: all questions of a tick are answered."""
+    ways = links(setup.link)
+    up, down = (OneWay(way, SEED, is_up) for way, is_up in zip(ways, (True, False), strict=True))
+    number, compute_ns, late = (seed + 1) * EPISODES, round(setup.compute * 1e9), ticks_late(setup)
+    observations, executed = [env.reset(seed=seed)[0]], neutral
+    at_policy, taken, free = {0: 0}, -1, 0  # arrivals [ns] of observations not yet taken
+    flying, got, sent, asked, basis = [], [], {}, 0, None
+    rewards, is_over, rows, loop = 0.0, False, [], []
+    if setup.start == "answer":
+        got, at_policy, taken = [Answer(0, 0, answer(observations[0], []))], {}, 0
+        sent = dict(enumerate(got[0].actions))
+
+    def receive(until_ns, tick):
+        for packet in sorted(each for each in flying if each[0] <= until_ns):
+            flying.remove(packet)
+            got.append(Answer(packet[1], tick, packet[2]))
+            loop.append((tick - packet[1], packet[1]))
+
+    for tick in count():
+        now_ns = round(tick * setup.dt * 1e9)
+        receive(now_ns, tick)
+        if tick and asks(setup, got, asked, tick):
+            asked = tick
+            if arrivals := up.send(number, tick, BYTES["observation_bytes"], now_ns):
+                at_policy[tick] = min(arrivals)
+        questions = []
+        while at_policy and max(min(at_policy.values()), free) <= now_ns + setup.wait_ns:
+            begin = max(min(at_policy.values()), free)
+            taken = max(each for each, arrival in at_policy.items() if arrival <= begin)
+            at_policy = {each: at for each, at in at_policy.items() if each > taken}
+            free = begin + compute_ns
+            questions.append((taken, free))
+        rows.append([taken, bool(questions), None, None])
+        if is_over:
+            break
+        for place, (of, leaves_ns) in enumerate(questions):
+            if not exact and place < len(questions) - 1:
+                continue
+            known = []
+            while len(known) < late and of + len(known) in sent:
+                known.append(sent[of + len(known)])
+            actions = answer(observations[of], known)
+            sent.update({of + place: action for place, action in enumerate(actions)})
+            if arrivals := down.send(number, of, BYTES["action_bytes"], leaves_ns):
+                flying.append((min(arrivals), of, actions))
+        receive(now_ns + setup.wait_ns, tick)
+        chosen = CHOOSE[setup.executor](got, tick) if got else None
+        executed, basis = chosen or (executed, basis)
+        rows[-1][2:] = inf if basis is None else tick - basis, chosen is None
+        observation, reward, terminated, truncated, _ = env.step(executed)
+        observations.append(observation)
+        rewards += reward
+        is_over = terminated or truncated
+    return told(setup, rewards, rows, loop)
+
+
+def told(setup, rewards, rows, loop):
+    """Return ages and means of a simulated episode."""
+    taken, asked, old, held = zip(*rows, strict=True)
+    after = [(tick - each, each) for tick, each in enumerate(taken)][1:]
+    ages = [age for age, of in after if of > 0]
+    acted = [age for tick, age in enumerate(old[:-1]) if age < tick]  # of an observation after 0
+    crossed = [age for age, of in loop if of > 0]
+    means = {"observation_age_of": len(ages), "action_age_of": len(acted)}
+    for name, found in (("observation_age", ages), ("action_age", acted), ("loop_age", crossed)):
+        key = name if name == "loop_age" else f"{name}_mean"
+        means[key] = setup.dt * float(np.mean(found)) if found else None
+    return Episode(
+        rewards,
+        [setup.dt * age for age, _ in after],
+        [setup.dt * age for age in old[:-1]],
+        list(held[:-1]),
+        list(asked[1:]),
+        means,
+    )
+
+
+@cache
+def links(name):
+    """Return the two directions of a link."""
+    profile = read_profile(LINKS[name])
+    return profile.uplink, profile.downlink
+
+
+@cache
+def mean_delay(link, dt):
+    """Return the delay of both ways that the profile asks for [s]."""
+    both = zip(links(link), (True, False), BYTES.values(), strict=True)
+    return sum(OneWay(way, SEED, is_up).expected(dt, size).mean for way, is_up, size in both)
+
+
+def ticks_late(setup):
+    """Return how many actions the executor `prefix` tells."""
+    if setup.executor != "prefix":
+        return 0
+    late = mean_delay(setup.link, setup.dt) + setup.compute - setup.wait_ns * 1e-9
+    return max(0, ceil(late / setup.dt))
+
+
+# Policies ---------------------------------------------------------------------------------------
+
+
+def push(x, speed, angle, turn):
+    """Choose an action for CartPole: the law of docs/eval.md."""
+    return int(10.0 * angle + 2.0 * turn + 0.1 * x + 0.3 * speed > 0.0)
+
+
+def moved(x, speed, angle, turn, action):
+    """Simulate a step of CartPole."""
+    sine, cosine = sin(angle), cos(angle)
+    force = ((10.0 if action else -10.0) + 0.05 * turn * turn * sine) / 1.1
+    turning = (9.8 * sine - cosine * force) / (0.5 * (4.0 / 3.0 - 0.1 * cosine**2 / 1.1))
+    moving = force - 0.05 * turning * cosine / 1.1
+    return x + 0.02 * speed, speed + 0.02 * moving, angle + 0.02 * turn, turn + 0.02 * turning
+
+
+@cache
+def hold_pole(state, known, many):
+    """Return actions for CartPole, the first of which are known."""
+    actions = []
+    for place in range(many):
+        actions.append(known[place] if place < len(known) else push(*state))
+        state = moved(*state, actions[-1])
+    return actions
+
+
+def swing(state, known, many):
+    """Return torques for Pendulum, the first of which are known; the others fade."""
+    torque = -2.0 * state[1] - 0.5 * state[2]
+    torques = [np.array([torque * (1.0 - 0.04 * place)], np.float32) for place in range(many)]
+    return [*known, *torques[len(known) :]][:many]
+
+
+def policy(setup):
+    """Return the policy: from observation and prefix to a list of actions."""
+    law = {"CartPole-v1": hold_pole, "Pendulum-v1": swing}[setup.name]
+    if setup.name == "Pendulum-v1":
+        return lambda observation, known: law(
+            observation.tolist(), known if setup.uses_prefix else [], setup.chunk or 1
+        )
+    return lambda observation, known: law(
+        tuple(observation.tolist()),
+        tuple(map(int, known)) if setup.uses_prefix else (),
+        setup.chunk or 1,
+    )
+
+
+# Measured ---------------------------------------------------------------------------------------
+
+
+def make(setup, steps):
+    """Return the environment without a link, and the action of a robot without answers."""
+    env = gymnasium.make(setup.name, max_episode_steps=steps)
+    return env, 0 if setup.name == "CartPole-v1" else np.zeros(1, np.float32)
+
+
+def networked(setup, steps):
+    """Return the environment behind the link."""
+    return Networked(
+        make(setup, steps)[0],
+        LINKS[setup.link],
+        SEED,
+        compute=setup.compute,
+        chunk=setup.chunk,
+        executor=setup.executor,
+        start=setup.start,
+        **({} if setup.wait is None else {"answer_within": setup.wait}),
+        **BYTES,
+    )
+
+
+def measure(env, setup, seed, answer, idle):
+    """Play an episode with cloudrc. The action without a question is not used."""
+
+    def packed(actions):
+        return actions[0] if setup.chunk is None else np.stack(actions)
+
+    idle, rows = packed([idle] * (setup.chunk or 1)), []
+    observation, info = env.reset(seed=seed)
+    is_over, rewards, asked = False, 0.0, info["cloudrc"]["asked"]
+    while not is_over:
+        known = list(info["cloudrc"].get("prefix", []))
+        given = packed(answer(observation, known)) if asked else idle
+        observation, reward, terminated, truncated, info = env.step(given)
+        rewards += reward
+        is_over, found = terminated or truncated, info["cloudrc"]
+        asked = found["asked"]
+        rows.append((found["observation_age"], found["action_age"], found["held"], asked))
+    return Episode(rewards, *map(list, zip(*rows, strict=True)), info["cloudrc"]["episode"])
+
+
+def assert_equal(found, expected):
+    """Compare an episode with the simulated one."""
+    for name in ("asked", "held"):
+        assert getattr(found, name) == getattr(expected, name), name
+    for name in ("observation_ages", "action_ages"):
+        pair = getattr(found, name), getattr(expected, name)
+        np.testing.assert_allclose(*pair, rtol=0, atol=1e-9, err_msg=name)
+    for name, value in expected.means.items():
+        if value is not None:
+            assert found.means[name] == pytest.approx(value, abs=1e-9), name
+    assert found.result == expected.result
+
+
+EXECUTORS = {
+    "one action": ("newest", None, False),
+    "newest": ("newest", 8, False),
+    "time_indexed": ("time_indexed", 16, False),
+    "prefix": ("prefix", 16, False),
+    "prefix, used": ("prefix", 16, True),
+    "broker": ("broker", 8, False),
+    "ensemble": ("ensemble", 16, False),
+}
+SETUPS = [
+    Setup(name, link, executor, chunk, compute, uses_prefix=uses)
+    for name in DT
+    for link in LINKS
+    for executor, chunk, uses in EXECUTORS.values()
+    for compute in (0.0, 0.025, 0.08)
+    if executor != "ensemble" or name == "Pendulum-v1"
+]
+OTHER_STARTS = [
+    Setup(name, link, executor, chunk, 0.025, wait, start, uses)
+    for name, start in (("CartPole-v1", 1), ("Pendulum-v1", None))
+    for link, wait in (("constant", 0.0), ("uniform, loss", 0.012), ("lte", None))
+    for executor, chunk, uses in EXECUTORS.values()
+    if executor != "ensemble" or name == "Pendulum-v1"
+]
+
+
+def compare(setup, seeds, steps):
+    """Compare episodes of cloudrc with those of the simulation."""
+    bare, neutral = make(setup, steps)
+    env, answer = networked(setup, steps), policy(setup)
+    first = neutral if setup.start in (None, "answer") else setup.start
+    for seed in seeds:
+        expected = simulate(bare, setup, seed, answer, first)
+        assert_equal(measure(env, setup, seed, answer, neutral), expected)
+
+
+def named(setup):
+    """Return the name of a test."""
+    return ", ".join(str(each) for each in setup)
+
+
+@pytest.mark.parametrize("setup", [*SETUPS, *OTHER_STARTS], ids=named)
+def test_every_episode_equals_the_simulation(setup):
+    compare(setup, range(2), 60)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("setup", [*SETUPS, *OTHER_STARTS], ids=named)
+def test_twenty_whole_episodes_equal_the_simulation(setup):
+    compare(setup, range(20), 500 if setup.name == "CartPole-v1" else 200)
+
+
+# The rule of step() -----------------------------------------------------------------------------
+
+
+def averages(episodes):
+    """Return the mean ages [s]: of all steps of all episodes, and of the loop."""
+    means = [each.means for each in episodes if each.means["action_age_of"]]
+    return [
+        *(
+            np.average([each[f"{name}_mean"] for each in means], weights=weights)
+            for name in ("observation_age", "action_age")
+            if (weights := [each[f"{name}_of"] for each in means])
+        ),
+        np.mean([each["loop_age"] for each in means]),
+    ]
+
+
+OFTEN = ("one action", 0.0), ("prefix, used", 0.008)
+CASES = [
+    pytest.param(*each, marks=() if each in OFTEN else pytest.mark.full)
+    for each in product([name for name in EXECUTORS if name != "ensemble"], [0.0, 0.008])
+]
+
+
+@pytest.mark.parametrize(("executor", "compute"), CASES)
+@pytest.mark.parametrize("link", ["uniform, loss", "lte"])
+def test_one_answer_a_step_is_close_to_an_answer_for_each_question(link, executor, compute):
+    way, chunk, uses = EXECUTORS[executor]
+    setup, steps = Setup("CartPole-v1", link, way, chunk, compute, uses_prefix=uses), 100
+    bare, neutral = make(setup, steps)
+    env, answer = networked(setup, steps), policy(setup)
+    exact = [simulate(bare, setup, seed, answer, neutral, exact=True) for seed in range(20)]
+    found = [measure(env, setup, seed, answer, neutral) for seed in range(20)]
+    assert averages(found) == pytest.approx(averages(exact), abs=0.003)
+    stood = [sum(each.result == steps for each in episodes) for episodes in (found, exact)]
+    assert abs(stood[0] - stood[1]) <= 4
+
+
+# A link without delay ---------------------------------------------------------------------------
+
+
+class Recorded(gymnasium.Wrapper):
+    """Keeps what is executed and what happens."""
+
+    def reset(self, **options):
+        observation, info = super().reset(**options)
+        self.told = [observation.tobytes()]
+        return observation, info
+
+    def step(self, action):
+        found = super().step(action)
+        self.told += [np.asarray(action).tobytes(), found[0].tobytes(), *found[1:4]]
+        return found
+
+
+def play(env, seed, act):
+    """Play an episode on the bare environment; return all that happens."""
+    env = Recorded(env)
+    observation, is_over, tick = env.reset(seed=seed)[0], False, 0
+    while not is_over:
+        observation, _, terminated, truncated, _ = env.step(act(observation, tick))
+        is_over, tick = terminated or truncated, tick + 1
+    return env.told
+
+
+def own_loop(answer):
+    return lambda observation, tick: answer(observation, [])[0]
+
+
+def open_loop(answer, many):
+    chunk = []
+
+    def act(observation, tick):
+        if tick % many == 0:
+            chunk[:] = answer(observation, [])
+        return chunk[tick % many]
+
+    return act
+
+
+def weighted_mean(answer, many):
+    past = []
+
+    def act(observation, tick):
+        past.append(answer(observation, []))
+        del past[:-many]
+        meant = [chunk[len(past) - 1 - place] for place, chunk in enumerate(past)]
+        weights = np.exp(-0.01 * np.arange(len(meant)))
+        return np.average(meant, axis=0, weights=weights).astype(np.float32)
+
+    return act
+
+
+def behind_link(setup, steps, seed, link):
+    """Play an episode behind a link; return all that happens to the environment."""
+    inner, neutral = make(setup, steps)
+    inner = Recorded(inner)
+    options = {"executor": setup.executor, "chunk": setup.chunk, "start": setup.start}
+    env = Networked(inner, link, SEED, **options, **BYTES)
+    measure(env, setup, seed, policy(setup), neutral)
+    return inner.told
+
+
+FAST = {
+    "uplink": {"delay_ms": 0, "rate_kbit": 10000},
+    "downlink": {"delay_ms": 0, "rate_kbit": 40000},
+}
+WHOLE = [
+    Setup(name, "ideal", executor, chunk, start=start)
+    for name in DT
+    for executor in CHOOSE
+    for chunk in (None, 1, 4, 16)
+    for start in ("answer", None)
+    if (executor != "ensemble" or name == "Pendulum-v1") and (chunk or executor == "newest")
+]
+
+
+@pytest.mark.parametrize("setup", WHOLE, ids=named)
+def test_an_ideal_link_and_that_of_lte_without_delay_are_the_bare_environment(setup):
+    answer, many, steps = policy(setup), setup.chunk or 1, 60
+    act = {
+        "broker": lambda: open_loop(answer, many),
+        "ensemble": lambda: weighted_mean(answer, many),
+    }.get(setup.executor, lambda: own_loop(answer))
+    expected = play(make(setup, steps)[0], 5, act())
+    assert behind_link(setup, steps, 5, "ideal") == expected
+    assert behind_link(setup, steps, 5, FAST) == expected
+
+
+# The loop's age ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("start", "dt_ms", "up_ms", "compute_ms", "down_ms", "wait_ms", "steps"),
+    [
+        ("answer", 10, 0, 0, 0, 0, 0),
+        (None, 10, 0, 0, 0, 0.5, 0),
+        ("answer", 10, 0.25, 0, 0.25, 0.5, 0),
+        (None, 10, 0.25, 0, 0.26, 0.5, 1),
+        ("answer", 10, 0.5, 0, 0.5, 0, 1),
+        (None, 20, 20, 0, 20, 1, 2),
+        ("answer", 20, 20, 0, 20, 0, 2),
+        (None, 20, 13.7, 4.5, 12.9, 1, 2),
+        ("answer", 20, 30, 20, 31, 1, 4),
+        (None, 20, 30, 20, 31.001, 1, 5),
+        ("answer", 20, 7.3, 20, 12.6, 19.9, 1),
+        (None, 20, 1, 0.1, 98.8, 0, 5),
+        ("answer", 50, 90, 33.3, 76.6, 2.5, 4),
+        (None, 12.5, 3.3, 12.5, 9.2, 0, 2),
+        ("answer", 100, 1, 0, 1, 5, 0),
+        (None, 100, 190, 50, 0.5, 40, 3),
+    ],
+)
+def test_the_age_of_the_loop_is_one_ceiling(
+    start, dt_ms, up_ms, compute_ms, down_ms, wait_ms, steps
+):
+    micro = [round(each * 1e3) for each in (up_ms, compute_ms, down_ms, -wait_ms, dt_ms)]
+    assert steps == max(0, -(-sum(micro[:4]) // micro[4]))  # the table is right
+    inner = Counter(limit=40)
+    inner.dt = dt_ms * 1e-3
+    env = Networked(
+        inner,
+        both_ways(up_ms, down_ms),
+        compute=compute_ms * 1e-3,
+        answer_within=wait_ms * 1e-3,
+        start=start,
+        **BYTES,
+    )
+    observation, info = env.reset(seed=3)
+    is_over, age = False, steps * dt_ms * 1e-3
+    while not is_over:
+        observation, _, is_over, _, info = env.step(observation.astype(np.float32))
+    assert info["cloudrc"]["action_age"] == pytest.approx(age, abs=1e-9)
+    assert info["cloudrc"]["episode"]["loop_age"] == pytest.approx(age, abs=1e-9)
+    assert info["cloudrc"]["episode"]["action_age_mean"] == pytest.approx(age, abs=1e-9)
