@@ -18,6 +18,7 @@ from cloudrc.cli.output import is_live, print_or_drop
 from cloudrc.drivers.process import in_words
 from cloudrc.messages import NEVER_NS, GuardState, Vector
 from cloudrc.records import (
+    CONTROLLER_LOST,
     Control,
     Fault,
     GuardChange,
@@ -162,6 +163,8 @@ class FlightView(StatusLine):
                 case MissionEvent():
                     self._ended = record.event in ENDINGS
                     self._event(record.text, record.stamp_ns)
+                case Fault(code=code) if code in CONTROLLER_LOST:
+                    pass  # the error at the end of the command says it
                 case Fault() | LinkChanged():
                     self._event(in_words(record), record.stamp_ns)
 

@@ -24,7 +24,7 @@ from cloudrc.link.follow import prepare_link
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.record.merge import merge
 from cloudrc.record.writer import CODE, McapWriter
-from cloudrc.records import Record
+from cloudrc.records import CONTROLLER_LOST, Record
 from cloudrc.report.document import Run
 from cloudrc.report.views import views
 from cloudrc.report.write import attachments, write_report
@@ -54,7 +54,8 @@ def fly(
     """Fly in mode "virtual" or "local"; write all files into `folder`, and return the report.
 
     During the flight `see` is called with new records; in local mode some are left out. An
-    interrupted flight also gets a report. Without `page`, write no report.html.
+    interrupted flight also gets a report, but not one whose controller outside never gave a
+    command. Without `page`, write no report.html.
 
     With `session`, teleop waits for missions, and the report is that of the last one. When all
     processes are ready, `session` gets the API's address and process -> HOST:PORT of its metrics.
@@ -73,6 +74,8 @@ def fly(
             else:
                 flown = _record_local(experiment, folder, see, gone, landed, session=session)
             recording, resolved, run = stack.enter_context(flown)
+            if _is_refused(recording):
+                return {}  # the end of the block raises the error
             run = replace(run, files=files)
             return write_report(folder, recording, resolved, run, own=own, page=page)
     except OSError as error:
@@ -100,6 +103,12 @@ def _raise_if_lost(records: list[Record]) -> None:
     """Raise the error with which a flight ends if a controller outside is lost."""
     for error in assembly.lost_controller(records):
         raise error
+
+
+def _is_refused(recording: Recording) -> bool:
+    """Return whether a controller outside was lost before a command of it was flown."""
+    lost = {*CONTROLLER_LOST} & {*recording["/fault"]["code"]}
+    return bool(lost) and not recording["/cmd_vel"]["command"].any()
 
 
 def _interruptible(see: See) -> See:

@@ -14,6 +14,8 @@ from rclpy.utilities import remove_ros_args
 KIND, *MORE = remove_ros_args(sys.argv)[1:]
 AFTER = 30
 """Number of answers before a node becomes wrong."""
+PAUSES = {"late": 0.1, "tardy": 0.6}
+"""Time for which such a node thinks about each answer [s]."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LOSSY = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -37,8 +39,8 @@ def answer(estimate):
         return
     if KIND == "slow" and count > AFTER:
         time.sleep(10)
-    if KIND == "late":
-        time.sleep(0.1)
+    if KIND in PAUSES:
+        time.sleep(PAUSES[KIND])
     command = kind()
     if KIND in ("unstamped", "type"):
         twist = command if KIND == "unstamped" else None

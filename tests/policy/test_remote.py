@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cloudrc import assembly
+from cloudrc.cli.main import main
 from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers import remote
@@ -86,18 +87,20 @@ def lost(answer, tmp_path, metadata=b"\x80", settings=()):
     assert "\n" not in str(raised.value)
     assert raised.value.exit_code == 5
     assert (tmp_path / "mission.mcap").stat().st_size > 1000
+    if not (tmp_path / "report.json").exists():
+        return raised.value, None
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["verdict"], report["failures"][0]["code"]) == ("failure", raised.value.code)
-    return raised.value
+    return raised.value, report
 
 
 def after(count, last):
-    """Answer `count` observations with zeros, then as `last` does."""
+    """Answer `count` observations, then as `last` does."""
     left = iter(range(count))
 
     def answer(connection, frame):
         if next(left, None) is not None:
-            return actions(0.0)
+            return actions(0.1)
         return last(connection) if callable(last) else last
 
     return answer
@@ -123,8 +126,9 @@ def after(count, last):
     ids=range(13),
 )
 def test_a_wrong_answer_in_flight_ends_it_with_one_line_and_a_recording(tmp_path, last, code, text):
-    error = lost(after(20, last), tmp_path)
+    error, report = lost(after(20, last), tmp_path)
     assert error.code == code
+    assert report is not None
     with pytest.raises(ControllerLostError, match=text):
         raise error
 
@@ -132,7 +136,8 @@ def test_a_wrong_answer_in_flight_ends_it_with_one_line_and_a_recording(tmp_path
 def test_a_late_answer_in_flight_ends_it(tmp_path, monkeypatch):
     monkeypatch.setattr(remote, "VIRTUAL_LIMIT", 0.05)
     ended = threading.Event()
-    error = lost(after(20, lambda link: ended.wait(0.3) and None), tmp_path)
+    error, report = lost(after(20, lambda link: ended.wait(0.3) and None), tmp_path)
+    assert report is not None
     assert error.code == "controller_silent"
     assert "no answer within 0.05 s" in str(error)
 
@@ -140,16 +145,34 @@ def test_a_late_answer_in_flight_ends_it(tmp_path, monkeypatch):
 def test_the_first_answer_has_a_limit_of_its_own(tmp_path):
     ended = threading.Event()
     settings = ["cloud.controller.start_limit_s=0.05"]
-    error = lost(after(0, lambda link: ended.wait(0.3) and None), tmp_path, settings=settings)
+    last = after(0, lambda link: ended.wait(0.3) and None)
+    error, report = lost(last, tmp_path, settings=settings)
     assert "no answer within 0.05 s" in str(error)
+    assert report is None, "nothing has flown"
 
 
-def test_nobody_listening_ends_a_flight_before_it_begins(tmp_path):
+@pytest.fixture
+def free_port():
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        url = f"ws://127.0.0.1:{taken.getsockname()[1]}"
+        return taken.getsockname()[1]
+
+
+def test_nobody_listening_ends_a_flight_before_it_begins(tmp_path, free_port):
+    url = f"ws://127.0.0.1:{free_port}"
     with pytest.raises(ControllerLostError, match="nobody listens") as raised:
         fly(experiment(url), "virtual", tmp_path, page=False)
     assert raised.value.code == "controller_silent"
+    assert not (tmp_path / "report.json").exists()
+
+
+def test_a_flight_that_is_refused_at_once_says_its_reason_once(tmp_path, capsys, free_port):
+    controller = f"cloud.controller={{name: remote, url: 'ws://127.0.0.1:{free_port}'}}"
+    out = str(tmp_path / "run")
+    words = ["run", "hover", "--mode", "virtual", "--out", out, "--set", controller]
+    assert main(words) == 5
+    said = capsys.readouterr()
+    assert (said.out + said.err).count("nobody listens") == 1
+    assert said.err.splitlines()[0] == f"the recording is in {out}"
 
 
 @pytest.mark.parametrize("url", ["127.0.0.1:8000", "http://h:1", "ws://", "", "ws://h:0"])
@@ -256,6 +279,16 @@ def test_answers_that_are_always_too_late_end_the_flight(flight):
 
     flight.step(30)
     with pytest.raises(ControllerLostError, match="too slow"):
+        assert all(answer_late() == [0.0] for _ in range(600))
+
+
+def test_a_node_whose_answers_are_always_too_late_is_named(flight):
+    def answer_late():
+        flight.answer(1.0, late=29, trouble="node /slow answers too late")
+        return flight.step()
+
+    flight.step(30)
+    with pytest.raises(ControllerLostError, match="for 5 s: node /slow answers too late"):
         assert all(answer_late() == [0.0] for _ in range(600))
 
 

@@ -35,6 +35,7 @@ class RosDriver:
         self._episode, self._sent_ns = 0, 0  # of the newest observation
         self._strange = self._repeats = 0
         self._answered_ns: int | None = None  # stamp of the newest answer
+        self._late = ""  # what to say if answers come, but too late
         self._ended = False
 
     def run(self, stop: Callable[[], bool]) -> None:
@@ -73,6 +74,7 @@ class RosDriver:
         crowded, self._repeats = self._repeats > REPEATS_MAX, 0
         if word := self._node.check(crowded=crowded):
             self._tell(word)
+        self._late = f"{self._node.who()} answers too late"
         if silent:
             self._send({"trouble": self._node.silence()})
 
@@ -85,7 +87,8 @@ class RosDriver:
             self._answered_ns = answer.stamp_ns
         if known:
             self._strange = 0
-            return {"episode": known[0], "sent_ns": known[1], "rows": [answer.row]}
+            flown = {"episode": known[0], "sent_ns": known[1], "rows": [answer.row]}
+            return {**flown, "trouble": self._late}
         self._strange += 1
         text = "answers with a stamp that no estimate has: copy its header.stamp"
         error = self._node.invalid(text)
