@@ -243,7 +243,7 @@ def build(
         tilt_max_deg: Largest commanded tilt [deg].
         drag_s_per_m: Drag of the rotors, which `actuators` simulates and the controller does not
             know: force relative to the thrust of a rotor and to the velocity of its hub across its
-            axis [s/m]. Default: no drag.
+            axis [s/m]. Default: no drag. The robots nano and x2 have 0.0258 and 0.0282.
         braking_mps2: Deceleration that the guard expects [m/s^2]; a robot without the thrust to
             stop a descent with it is refused. It comes from `guard` in robot.yaml.
 
