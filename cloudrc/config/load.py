@@ -26,10 +26,10 @@ from pydantic import (
 from cloudrc import plugins, renamed
 from cloudrc.config import overrides, problems, shipped
 from cloudrc.config.document import Document, KeyPath, read_document, write_yaml
-from cloudrc.config.ground import put_on_ground
+from cloudrc.config.ground import ABOVE, put_on_ground
 from cloudrc.config.heading import without_held_yaws
 from cloudrc.config.hull import hull_of
-from cloudrc.config.mission_check import check_mission, check_scene
+from cloudrc.config.mission_check import UNREACHED, check_mission, check_reach, check_scene
 from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.reuse import reuse, reuse_results
@@ -241,10 +241,20 @@ def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> Res
     found += _without_effect(document, experiment)
     mission = put_on_ground(mission, scene) if robot.planar else mission
     fit = _check_fit(mission, scene, experiment.world.robot)
+    if fit and (other := _other_command(fit[0], experiment.world)):
+        found, fit = [], [fit[0]._replace(reason=f"{fit[0].reason}; this flies: {other}")]
     found += [_blame_scene(document, each) for each in fit]
     problems.raise_problems(document, found, name)
     mission = without_held_yaws(mission, robot.heading)
     return experiment.model_copy(update={"mission": mission})
+
+
+def _other_command(problem: ConfigProblem, world: World) -> str:
+    """Return a command that flies a robot for which a mission does not fit; "" if unknown."""
+    setting = f"--set world.robot={world.robot}"
+    if problem.reason == UNREACHED and "fast" in known_robot(world.robot).tunings:
+        return f"cloudrc run fast {setting} --set mission=legs"
+    return f"cloudrc run pillars {setting}" if ABOVE in problem.reason else ""
 
 
 def _without_effect(document: Document, experiment: ResolvedExperiment) -> Iterator[ConfigProblem]:
@@ -285,6 +295,8 @@ def _check_fit(mission: MissionConfig, scene: Scene, robot: str) -> list[ConfigP
         if above := check_scene(scene, size, touch=mission.touched, planar=planar):
             return above
         wrong = check_mission(mission, scene, size, planar=planar, heading=heading)
+        if not wrong and known_robot(robot).probe is None:
+            wrong = check_reach(mission, scene, size)
         return [problem._replace(path=("mission", *problem.path)) for problem in wrong]
 
     return reuse(("mission", mission.model_dump_json(), repr(scene), robot), check)

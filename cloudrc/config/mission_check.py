@@ -46,6 +46,8 @@ from cloudrc.geometry.scene import FLOOR, Scene, Tube
 from cloudrc.messages import Vector
 
 FLIES = "a robot that flies needs a height: give three numbers, x, y and z"
+UNREACHED = "no waypoint brings the robot to it: they are for a longer robot, or too far away"
+"""Reason of the problem of a body to touch that the robot does not reach."""
 _REPORTED = 20
 """Largest number of problems of one kind in an error message."""
 TOUCHING = 1e-3
@@ -236,6 +238,24 @@ def _check_waypoints(
         yield _at_point(index, positions[index], reason)
     if not len(wrong):
         yield from _check_ways(np.vstack([start or positions[0], positions]), yaws, place)
+
+
+def check_reach(mission: MissionConfig, scene: Scene, robot: Spheres) -> list[ConfigProblem]:
+    """List the problem of a body to touch that the `robot` reaches on no way to a waypoint.
+
+    It must touch the body `CLEARANCE_MIN` before the end of a way: a controller may end so far off.
+    """
+    body = [each for each in obstacles(scene, touch=None) if each.name == mission.touched]
+    if not body or not mission.waypoints:
+        return []
+    points = np.array([waypoint.position_m for waypoint in mission.waypoints])
+    starts = np.vstack([scene.spawn if mission.start == "spawn" else points[0], points[:-1]])
+    length = np.linalg.norm(points - starts, axis=1, keepdims=True)
+    ends = points - CLEARANCE_MIN * (points - starts) / np.maximum(length, CLEARANCE_MIN)
+    near = robot._replace(radii=robot.radii - CLEARANCE_MIN)  # touching is at a distance of 0
+    if (find_crossed(body, near, starts, ends, _yaws(mission)[:-1]) >= 0).any():
+        return []
+    return [ConfigProblem(("touch", "body"), body[0].name, UNREACHED)]
 
 
 def _yaws(mission: MissionConfig) -> Array:
