@@ -31,6 +31,8 @@ FAST = 5.0
 SEEN_MIN = 1e-3
 """Chance to measure the robot within a tolerance for a whole dwell time, below which a waypoint
 counts as never reached [1]."""
+FITTED = "command_history", "kalman", "model_based"
+"""Predictors that use the response of a robot that has no better model."""
 LONG = 3600.0
 """Duration of a mission that may be meant in milliseconds [s]."""
 
@@ -54,6 +56,7 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     yield from _noise(experiment)
     yield from _slow(experiment)
     yield from _robot(experiment)
+    yield from _tuning(experiment)
     yield from _balance(experiment)
     carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
     if carrot is not None and exceeds(carrot.speed_mps, cap):
@@ -297,6 +300,22 @@ def _robot(experiment: ResolvedExperiment) -> Iterator[str]:
     if "/" in experiment.world.robot:
         with suppress(MissingPrerequisiteError):
             yield from doubts(experiment.world.robot)
+
+
+def _tuning(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Yield a warning if a predictor uses the response of the robot without its tuning."""
+    from cloudrc.config.robot import known_robot
+
+    name, predictor = experiment.world.tuning, experiment.cloud.predictor
+    robot, given = known_robot(experiment.world.robot), predictor.model_extra or {}
+    own = given.get("model_file", given.get("model"))  # a file of `cloudrc identify`
+    if name in {None, *robot.responses} or robot.motion or predictor.name not in FITTED or own:
+        return
+    yield (
+        f"{predictor.name} predicts with the response of {experiment.world.robot} without the "
+        f"tuning {name}; fly steps with the tuning, fit them with 'cloudrc identify', and write "
+        f"the result to tunings.{name}.response in its robot.yaml"
+    )
 
 
 def _balance(experiment: ResolvedExperiment) -> Iterator[str]:

@@ -40,8 +40,8 @@ def execute(options: argparse.Namespace) -> int:
     if os.path.lexists(out):
         raise BadInputError(f"{out}: already there; name another file with --out")
     with closing(StepView(sys.stderr, f"reads {options.run} and fits the model")):
-        fits, seconds = identify(options.run)
-    document = describe(fits, seconds)
+        found = identify(options.run)
+    document = describe(*found)
     write_atomically(out, f"{format_document(document, 'yaml')}\n".encode())
-    print_result(options.output, document, f"{as_text(fits, seconds)}\n{escape(str(out))}")
+    print_result(options.output, document, f"{as_text(*found)}\n{escape(str(out))}")
     return 0

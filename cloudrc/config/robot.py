@@ -82,6 +82,13 @@ class Response(Parameters):
     """Velocity per commanded velocity [1]"""
 
 
+class Tuning(Parameters):
+    """Parameters of the onboard controller, and the model of the velocity loop that they make."""
+
+    response: Response | None = None
+    """As response of the robot, but with this tuning. null: predictors take that of the robot"""
+
+
 def _check_name(name: str) -> str:
     if not re.fullmatch("[a-z][a-z0-9_]{0,39}", name):
         raise ValueError("a name has small letters, digits and _, begins with a letter, at most 40")
@@ -117,12 +124,12 @@ class RobotFile(Section):
     onboard: NameOr[PlugIn]
     """Controller on board, which follows the velocity that the guard allows: the name of a plug-in,
     the path of a Python file, or a mapping with parameters"""
-    tunings: dict[str, Parameters] = Field(default_factory=dict)
+    tunings: dict[str, Tuning] = Field(default_factory=dict)
     """Named sets of parameters, in place of those of onboard; world.tuning chooses one. The shipped
-    experiment fast needs one named fast"""
+    experiment fast needs one named fast. Each may have a response of its own"""
     response: Response | None = None
-    """Model of the velocity loop for predictors, the content of a file of `cloudrc identify`; null:
-    predictors that need a model refuse the robot"""
+    """Model of the velocity loop for predictors without a tuning, the content of a file of `cloudrc
+    identify`; null: predictors that need a model refuse the robot"""
     motion: str | None = None
     """Python file with a better model for predictors than response: `build(acceleration_max,
     **parameters)` gets the parameters of the onboard controller. null: there is none"""
@@ -174,6 +181,7 @@ class RobotFiles:
     # Name -> parameters of the onboard controller, in place of those in `onboard`.
     tunings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     response: Response | None = None  # first-order model of the velocity loop
+    responses: Mapping[str, Response] = field(default_factory=dict)  # those of tunings, by name
     motion: str | None = None  # path of a Python file with a better model
     probe: str | None = None  # site with which the robot touches; None: any part of it touches
     sensors: Mapping[str, SensorConfig] = field(default_factory=dict)  # the robot's own
@@ -200,6 +208,7 @@ def find_robot(name: str) -> RobotFiles:
     given = robot.guard.model_dump(exclude_unset=True)
     limits = usual.model_copy(update={**given, "stop": stop})
     tunings = {key: tuning.model_extra or {} for key, tuning in robot.tunings.items()}
+    responses = {key: each.response for key, each in robot.tunings.items() if each.response}
     model = folder / robot.model
     motion = robot.motion and str((folder / robot.motion).resolve())
     files = RobotFiles(model, onboard, robot.planar, limits, robot.hull_m)
@@ -208,6 +217,7 @@ def find_robot(name: str) -> RobotFiles:
         hull_points=robot.hull_points and str((folder / robot.hull_points).resolve()),
         tunings=tunings,
         response=robot.response,
+        responses=responses,
         motion=motion,
         probe=robot.probe,
         sensors=robot.sensors,
@@ -276,7 +286,7 @@ class RobotFacts:
     """What cloud knows of a robot: a predictor gets it as the argument `robot` of its `build`."""
 
     name: str  # as in world.robot
-    response: Response | None  # first-order model of the velocity loop
+    response: Response | None  # first-order model of the velocity loop, with its tuning
     motion: PlugIn | None  # file of a better model, with the parameters of the onboard controller
     acceleration_max: float  # limit of the guard [m/s^2]
 
@@ -290,7 +300,8 @@ def facts(world: World, acceleration_max: float) -> RobotFacts:
     robot, motion = known_robot(world.robot), None
     if robot.motion is not None:
         motion = PlugIn.model_validate({**parameters(robot, world), "name": robot.motion})
-    return RobotFacts(world.robot, robot.response, motion, acceleration_max)
+    response = robot.responses.get(world.tuning or "", robot.response)
+    return RobotFacts(world.robot, response, motion, acceleration_max)
 
 
 def files_of(name: str) -> list[Path]:

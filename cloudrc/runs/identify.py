@@ -21,8 +21,10 @@ from cloudrc.text import table
 NAMES = ("time_constant", "dead_time", "gain")
 
 
-def identify(run: Path) -> tuple[list[Fit], float]:
-    """Fit a model per axis to a run, the folder or its MCAP file; also return its duration [s].
+def identify(run: Path) -> tuple[list[Fit], float, str]:
+    """Fit a model per axis to a run, the folder or its MCAP file.
+
+    Also return its duration [s], and the key of robot.yaml to which the model belongs.
 
     Raise a BadInputError if there is no recording, if the flight has not ended, or if the recording
     does not excite an axis.
@@ -32,23 +34,24 @@ def identify(run: Path) -> tuple[list[Fit], float]:
     recording = Recording.read(path)
     recording.refuse_damaged(path)
     given, measured = velocity_loop.series(recording, str(path))
-    axes = "xy" if _is_planar(recording, path.parent) else "xyz"
+    planar, tuning = _flown(recording, path.parent)
+    axes = "xy" if planar else "xyz"
     fits = [
         velocity_loop.identify(given[:, axis], measured[:, axis], f"{path}: {name}")
         for axis, name in enumerate(axes)
     ]
     if len(fits) < 3:
         fits.append(_still(fits[0]))
-    return fits, len(given) * DT
+    return fits, len(given) * DT, f"tunings.{tuning}.response" if tuning else "response"
 
 
-def _is_planar(recording: Recording, folder: Path) -> bool:
-    """Return whether the robot of a run stays on the ground; False if nothing says so."""
+def _flown(recording: Recording, folder: Path) -> tuple[bool, str | None]:
+    """Return whether the robot of a run stays on the ground, and its tuning, if a file says so."""
     try:
         experiment = read_experiment(folder / "config.yaml", flown=True)
-        return flown_world(recording, experiment).planar
+        return flown_world(recording, experiment).planar, experiment.world.tuning
     except BadInputError:
-        return False
+        return False, None
 
 
 def _still(fit: Fit) -> Fit:
@@ -62,22 +65,22 @@ def _rounded(value: float) -> float | None:
     return None if isnan(value) else round(float(value), 4)
 
 
-def describe(fits: Sequence[Fit], seconds: float) -> dict[str, Any]:
+def describe(fits: Sequence[Fit], seconds: float, key: str) -> dict[str, Any]:
     """Return the content of a file that the predictor `command_history` reads.
 
-    `seconds` is the duration of the recording [s].
+    `seconds` is the duration of the recording [s], `key` the place of the model in robot.yaml.
     """
     values, halves = (
         {name: [_rounded(fit[:2][part][n]) for fit in fits] for n, name in enumerate(NAMES)}
         for part in (0, 1)
     )
     shares = [_rounded(fit.share) for fit in fits]
-    more = {"seconds": round(seconds, 2), "input": INPUT, "output": OUTPUT}
+    more = {"seconds": round(seconds, 2), "input": INPUT, "output": OUTPUT, "robot_yaml": key}
     return {**values, "half_width_95": halves, "explained": shares, **more}
 
 
-def as_text(fits: Sequence[Fit], seconds: float) -> str:
-    """Format the model of each axis for people; `seconds` is the recording's duration [s]."""
+def as_text(fits: Sequence[Fit], seconds: float, key: str) -> str:
+    """Format the model of each axis for people; the arguments are those of `describe`."""
     head = f"velocity loop from {round(seconds, 2)} s, input {INPUT}, output {OUTPUT}"
     rows = [("axis", "time constant [s]", "dead time [s]", "gain", "explained")]
     for name, fit in zip("xyz", fits, strict=True):
@@ -86,4 +89,4 @@ def as_text(fits: Sequence[Fit], seconds: float) -> str:
             continue
         constant, dead, gain = (f"{v:.3f} ± {h:.3f}" for v, h in zip(*fit[:2], strict=True))
         rows.append((name, constant, dead, gain, f"{fit.share:.1%}"))
-    return f"{head}\n\n{table(rows, right=(1, 2, 3, 4))}\n\n± : 95 % interval"
+    return f"{head}\n\n{table(rows, right=(1, 2, 3, 4))}\n\n± : 95 % interval\nin robot.yaml: {key}"

@@ -145,5 +145,9 @@ def test_the_command_writes_a_model_that_a_predictor_takes(tmp_path, call):
         assert predictor.model_extra[key] == str(tmp_path / "model.yaml")
     error = call("identify", tmp_path, code=2).err
     assert "model.yaml: already there; name another file with --out" in error
+    (tmp_path / "config.yaml").write_text("world: {robot: nano, tuning: fast}\nmission: steps\n")
+    tuned = call("identify --out tuned.yaml", tmp_path).out
+    assert "in robot.yaml: tunings.fast.response" in tuned
+    (tmp_path / "config.yaml").unlink()
     document = json.loads(call("identify --out second.yaml -o json", tmp_path).out)
     assert document == {"schemaVersion": 1, **model}
