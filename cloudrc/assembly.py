@@ -322,7 +322,8 @@ def mission_plan(
         legs = tuple(_leg(way, fence, limits, carrot) for way in ways)
         needed = sum(leg.time_limit for leg in legs)
     start = Start.SPAWN if mission.start == "spawn" else Start.HERE
-    return Plan(legs, start, time_limit or max(LIMIT_MIN, needed), track=track)
+    limit = time_limit or max(LIMIT_MIN, needed)
+    return Plan(legs, start, limit, track=track, judged_by=mission.judged_by)
 
 
 def with_order(
@@ -352,6 +353,7 @@ def with_order(
         waypoints=waypoints,
         setpoints=DRIVE_FILE if order.plan.by_hand else None,
         carrot=carrot,
+        judged_by=order.plan.judged_by,
         touch=order.touch,
     )
     judged = {"time_limit_s": order.plan.time_limit}

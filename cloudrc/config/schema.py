@@ -304,6 +304,9 @@ class Touch(Section):
         return body
 
 
+JudgedBy = Literal["measured", "predicted"]
+
+
 class MissionConfig(Section):
     """A mission: waypoints, random steps, or setpoints from a file."""
 
@@ -323,6 +326,10 @@ class MissionConfig(Section):
     drive by hand writes such a file, drive.csv"""
     carrot: Carrot | None = None
     """Moves the setpoint at limited speed from waypoint to waypoint; null: the setpoint jumps"""
+    judged_by: JudgedBy = "measured"
+    """Position by which teleop sees that the robot has reached a waypoint. measured: the newest one
+    in telemetry, so that the robot waits a round trip at each waypoint; predicted: that of cloud's
+    predictor, for the time at which the next command arrives. The report judges by the true path"""
     touch: Touch | None = None
     """What the robot has to touch; null: nothing, every body but floor is an obstacle"""
 

@@ -178,6 +178,12 @@ class Flight:
         """True states of the robot during the flight."""
         return self.during("/ground_truth")
 
+    def truth_until(self, end_ns: int) -> Columns:
+        """Select the true states from the start of the flight to `end_ns` [ns], even after it."""
+        columns = _columns(self.recording["/ground_truth"])
+        stamps, start_ns = columns["stamp_ns"], self.start_ns or 0
+        return select(columns, (stamps >= start_ns) & (stamps <= end_ns))
+
     @cached_property
     def control(self) -> Columns:
         """One row per control period of the flight, with the columns of all `CONTROL_TOPICS`."""

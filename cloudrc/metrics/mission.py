@@ -71,10 +71,18 @@ def _measure_holds(flight: Flight) -> tuple[Holds, list[tuple[int, int]]]:
 
 
 def reported(flight: Flight) -> dict[int, int]:
-    """Return the waypoints that teleop reported as reached: index -> stamp of the report [ns]."""
+    """Return the waypoints that teleop reported as reached: index -> stamp of the report [ns].
+
+    If the mission is judged by predictions, it is the time for which the prediction was made.
+    """
     mission = flight.during("/mission")
     rows = mission["event"] == "reached"
-    pairs = zip(mission["waypoint"][rows], mission["stamp_ns"][rows], strict=True)
+    stamps = mission["stamp_ns"][rows]
+    if flight.mission.judged_by == "predicted" and len(flight.control["stamp_ns"]):
+        row = np.searchsorted(flight.control["stamp_ns"], stamps, side="right") - 1
+        ahead = select(flight.control, np.maximum(row, 0))
+        stamps = ahead["basis_stamp_ns"] + np.round(ahead["horizon"] * 1e9).astype(np.int64)
+    pairs = zip(mission["waypoint"][rows], stamps, strict=True)
     return {int(waypoint): int(stamp_ns) for waypoint, stamp_ns in pairs}
 
 
@@ -145,8 +153,7 @@ class _Visit:
     """
 
     def __init__(self, flight: Flight, waypoint: Waypoint, until_ns: int) -> None:
-        rows = flight.truth["stamp_ns"] <= until_ns
-        truth = select(flight.truth, rows)
+        truth = flight.truth_until(until_ns)
         self._flight, self._waypoint, self._stamps_ns = flight, waypoint, truth["stamp_ns"]
         # If the mission has a `carrot` (a moving setpoint), a stay of any length is enough, because
         # the setpoint waits at the waypoint for the dwell time.

@@ -268,6 +268,10 @@ class Teleop:
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process telemetry that has arrived at `now_ns`."""
+        if self._plan.judged_by == "predicted" and (ahead := seen.control) is not None:
+            # It is where the robot will be when the setpoint that follows now reaches it.
+            turned = ahead.orientation_wxyz
+            seen = seen._replace(position=ahead.position, orientation_wxyz=turned)
         before, self.seen = self.seen, seen
         if seen.guard is ESTOP:
             self.stopping = False
@@ -405,7 +409,7 @@ class Teleop:
             place = "the spawn" if self._plan.start is Start.SPAWN else "here"
             text = f"mission started from {place}, {self._plan.contents}"
             if self._plan.unit == "waypoint":
-                text += ", judged by the measured position"
+                text += f", judged by the {self._plan.judged_by} position"
             self._report("started", 0, text, now_ns)
         if self._was_held or self._plan.by_hand:
             self._hold(now_ns)

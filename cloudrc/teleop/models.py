@@ -20,6 +20,7 @@ from cloudrc.config.schema import (
     MAX_WAYPOINTS,
     Carrot,
     Finite,
+    JudgedBy,
     MissionConfig,
     Place,
     Section,
@@ -56,6 +57,9 @@ class MissionRequest(Section):
     )
     waypoints: tuple[Waypoint, ...] = Field((), max_length=MAX_WAYPOINTS, description="In order")
     carrot: Carrot | None = Field(None, description="How the setpoint moves; null: it jumps")
+    judged_by: JudgedBy = Field(
+        "measured", description="Position by which waypoints count as reached"
+    )
     touch: Touch | None = Field(None, description="What the robot has to touch; null: nothing")
     key: Text = Field("", description="Teleop makes one mission for each key")
     queue: bool = Field(False, description="Wait for the mission under way, if there is one")
@@ -273,6 +277,7 @@ def read_order(
         start=request.start,
         waypoints=request.waypoints,
         carrot=request.carrot,
+        judged_by=request.judged_by,
         touch=request.touch,
     )
     mission = put_on_ground(mission, scene) if planar else mission

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeAlias
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_json
 
-from cloudrc.config.schema import YAW_TOLERANCE_DEG
+from cloudrc.config.schema import YAW_TOLERANCE_DEG, JudgedBy
 from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import (
     NEVER_NS,
@@ -80,6 +80,7 @@ class Plan:
     track: tuple[
         tuple[float, Vector], ...
     ] = ()  # times [s] and setpoints [m]; none, or two or more
+    judged_by: JudgedBy = "measured"  # position that shows that the robot is at a waypoint
 
     @property
     def contents(self) -> str:

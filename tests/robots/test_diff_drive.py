@@ -2,10 +2,11 @@
 
 from math import atan2, cos, degrees, hypot, pi, radians, sin
 
+import numpy as np
 import pytest
 
 import cloudrc
-from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.load import ResolvedGuard, load_experiment
 from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import Plant, World
 from cloudrc.config.shipped import file_of
@@ -186,3 +187,30 @@ def test_factors_for_four_actuators_do_not_fit_two_wheels():
     plant = Plant(actuator_factor=(1.0, 1.0, 1.0, 0.9))
     with pytest.raises(BadInputError, match=r"has 4 factors, but .*robot\.xml has 2 actuators"):
         compile_true(MODEL, EMPTY, nominal, plant)
+
+
+def fly_pillars(rtt_ms, judged_by, predictor="command_history"):
+    """Return a flight of `pillars`, and the time of its last waypoint [s]."""
+    keys = {"link.profile": "ideal", "link.both.delay_ms": rtt_ms / 2, "cloud.predictor": predictor}
+    keys |= {"guard.command_age_max_ms": 700, "mission.judged_by": judged_by}
+    flight = cloudrc.fly("pillars", keys)
+    mission = flight["/mission"]
+    return flight, 1e-9 * int(np.ptp(mission["stamp_ns"][mission["event"] != "done"]))
+
+
+def test_a_mission_that_is_judged_by_predictions_loses_no_round_trip_at_its_waypoints():
+    cases = ((400, "measured"), (400, "predicted"), (0, "measured"))
+    slow, fast, still = (fly_pillars(*case) for case in cases)
+    assert [each.verdict for each, _ in (slow, fast, still)] == ["success"] * 3
+    assert fast[1] < slow[1] - 3 * 0.4  # three waypoints without a dwell time
+    assert fast[1] == pytest.approx(still[1], abs=0.2)
+    truth = fast[0]["/ground_truth"]["position"]
+    for waypoint in load_experiment("pillars").mission.waypoints:
+        away = np.linalg.norm(truth - waypoint.position_m, axis=1)
+        assert away.min() <= waypoint.tolerance_m
+
+
+def test_the_true_path_decides_even_if_predictions_say_that_a_waypoint_is_reached():
+    flight, _ = fly_pillars(400, "predicted", "constant_velocity")
+    assert [each.code for each in flight.failures] == ["waypoint_not_reached"]
+    assert flight.numbers["waypoints_reached"] < 4
