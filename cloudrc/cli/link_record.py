@@ -15,7 +15,7 @@ EPILOG = """\
 sources:
   a run         its folder or mission.mcap: one-way delays of the datagrams that
                 arrived, and the losses
-  ping -D HOST  its output, with --halve-rtt
+  ping -D HOST  output of Linux' ping in English, with --halve-rtt
   irtt client -o FILE.json HOST
                 with --direction, or with --halve-rtt
   a CSV file    columns time_s and delay_ms (units: _s, _ms, _us or _ns);
@@ -38,8 +38,6 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--direction", choices=("uplink", "downlink"), help="take this direction only")
     halve = "take half of each round trip of a log; correct only if both directions are equal"
     add("--halve-rtt", action="store_true", help=halve)
-    trust = "accept values that look as if they had another unit"
-    add("--trust-units", action="store_true", help=trust)
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -47,8 +45,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.runs.links.trace import LogSettings, read_packets, write_trace_file
 
     source, output = options.source, options.output
-    settings = LogSettings(options.direction, options.halve_rtt, options.trust_units)
-    found = read_packets(source, settings)
+    found = read_packets(source, LogSettings(options.direction, options.halve_rtt))
     paths = {
         way: output.with_stem(f"{output.stem}-{way}") if len(found) > 1 else output for way in found
     }

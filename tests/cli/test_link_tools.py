@@ -79,7 +79,7 @@ def test_a_picture_replaces_a_picture_of_its_kind_alone(kind, folder, call, refu
 @pytest.mark.parametrize(
     ("name", "data", "says"),
     [
-        ("a.csv", b"time_s,delay_ms\n0,0.045\n", "looks like seconds"),
+        ("a.csv", b"time_s,rtt_ms\n0,45\n", "has round trips"),
         ("a.json", b'{"round_trips": []}', "choose --direction uplink"),
         ("a.json", b"{\0", "a.json: it is not a text file; give a run, a log of ping"),
         ("a.json.gz", b"\x1f\x8b\x08", "a.json.gz: is compressed with gzip; unpack it first with"),

@@ -2,7 +2,6 @@
 
 import json
 from math import isnan, nan
-from random import Random
 
 import numpy as np
 import pytest
@@ -14,14 +13,13 @@ from cloudrc.link.logs import (
     read_csv,
     read_irtt,
     read_ping,
-    refuse_others,
     trace_of,
 )
 from cloudrc.link.model import numbers
 
 
-def read(text, *, halve=False, trust_units=False):
-    return read_csv(text.splitlines(), "x.csv", halve=halve, trust_units=trust_units)
+def read(text, *, halve=False):
+    return read_csv(text.splitlines(), "x.csv", halve=halve)
 
 
 def delays_of(packets):
@@ -59,26 +57,19 @@ def test_units_and_separators_are_those_of_the_header(text, delays):
 
 
 @pytest.mark.parametrize(
-    ("header", "row", "note"),
+    ("header", "row"),
     [
-        ("time_s,delay_ms,loss", "1,0,yes", ""),
-        ("time_s,delay_ms,loss", "1,0,1.000", ""),
-        ("time_s,delay_ms", "1,nan", ""),
-        ("time_s,delay_ms", "1,no answer yet", ""),
-        ("time_s,delay_ms", "1,-1", "1 with delay_ms -1 taken as lost"),
-        ("time_s,delay_ms", "1,0", "1 with delay_ms 0 taken as lost"),
+        ("time_s,delay_ms,loss", "1,0,True"),
+        ("time_s,delay_ms,lost", "1,0,1.000"),
+        ("time_s,delay_ms", "1,"),
+        ("time_s,delay_ms", "1,NaN"),
     ],
 )
-def test_marks_of_lost_packets_are_recognised(header, row, note):
-    end = ",0" if "loss" in header else ""
-    packets = read(f"{header}\n0,45{end}\n{row}\n2,46{end}")
-    assert delays_of(packets) == pytest.approx((0.045, None, 0.046))
-    assert packets.notes == ((note,) if note else ())
-
-
-def test_zero_is_a_delay_if_rounded_or_marked_as_arrived():
-    assert delays_of(read("time_s,delay_ms\n0,0\n1,1\n2,2"))[0] == 0
-    assert delays_of(read("time_s,delay_ms,loss\n0,0,0\n1,90,0"))[0] == 0
+def test_marks_of_lost_packets_are_recognised(header, row):
+    end = ",0" if "los" in header else ""
+    packets = read(f"{header}\n0,45{end}\n{row}\n2,0{end}")
+    assert delays_of(packets) == pytest.approx((0.045, None, 0.0))
+    assert packets.notes == ()
 
 
 def test_round_trips_are_halved_only_on_request():
@@ -92,26 +83,25 @@ def test_round_trips_are_halved_only_on_request():
         read("time_s,rtt_ms\n0,90")
     with pytest.raises(BadInputError, match=r"ping measures round trips; .*--halve-rtt"):
         read_ping(list(PING), "x", halve=False)
-    trusted = read("time_s,delay_ms\n0,0.045\n1,0.07", trust_units=True)
-    assert trusted.delays.tolist() == pytest.approx((45e-6, 70e-6))
+    wire = read("time_s,delay_ms\n0,0.045\n1,0.07")
+    assert wire.delays.tolist() == pytest.approx((45e-6, 70e-6))
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("time_s,delay_ms\n0,0.045\n1,0.07", "delay_ms is at most 0.07 ms, which looks like sec"),
-        ("time_s,delay_s\n0,45\n1,70", "delay_s has a median of 57.5 s, which looks like ms"),
-        ("time_s,delay_ms\n1700000000000,45", "time_s is 1700000000000, a finer unit than s"),
-        ("time,delay_ms\n0,45", "column time does not say its unit; call it time_s, time_ms"),
+        ("time,delay_ms\n99.5,45", "column time does not say its unit; call it time_s, time_ms"),
         ("time_s,latency\n0,45", "no column delay, found time_s,latency; name them time_s"),
         ("", "no column time, found nothing"),
         ("time_s,delay_ms,rtt_ms\n0,45,90", "has delay_ms and rtt_ms; keep only one"),
-        ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms is 'fast'; give a finite number"),
+        ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms is 'fast'; give a number that is n"),
+        ("time_s,delay_ms\n0,45\n1,timeout", "or nothing for a lost packet"),
+        ("time_s,delay_ms\n0,45\n5", "line 3: delay_ms is nothing; give a number"),
         ("time_s,delay_ms\n,45", "line 2: time_s is nothing; give a finite number"),
         ("time_s,delay_ms,loss\n0,45,0.5", "line 2: loss is '0.5'; give 0 or 1"),
         ("time_s,delay_ms,loss\n0,45,maybe", "line 2: loss is 'maybe'"),
         ("time_s,delay_ms\n0,45\n1,-3", "arrived 3 ms before it was sent: the two clocks differ;"),
-        ("time_s,rtt_ms\n0,45\n1,-3\n2,-1", "rtt_ms is -3, which is no round trip"),
+        ("time_s,delay_ms\n0,45\n1,-1", "; leave the delay of a lost packet empty"),
         (
             "time,delay_ms\n20.01.2024 10:00:00.000,45",
             "time is '20.01.2024 10:00:00.000'; give date",
@@ -119,13 +109,13 @@ def test_round_trips_are_halved_only_on_request():
         ("time,delay_ms\n01/20/2024 10:00,45", "line 2: time is '01/20/2024 10:00'; give date and"),
         (
             "time,delay_ms\n,45",
-            "line 2: time is nothing; give date and time as 2024-01-20T10:00:00",
+            "line 2: time is ''; give date and time as 2024-01-20T10:00:00",
         ),
         ("time_s,delay_ms,loss_percent\n0,45,2", "column loss_percent is not read; call it loss"),
         ("time_s,delay_ms,Packet loss\n0,45,2", "column packet_loss is not read; call it loss"),
         ("time_s,delay_ms", "no packet has a delay"),
         ("sent_ms,delay_ms\n" + "1.7212E+12,20\n" * 50, "49 of 50 packets have the same time"),
-        ("time_s,delay_ms\n98,4\n99,4\n100,4\n0,4\n1,4", "after row 3 the times go back by 100 s"),
+        ("time_s,delay_ms\n98,4\n99,4\n100,4\n0,4\n1,4", "at packet 4 the times go back by 100 s"),
     ],
 )
 def test_an_unusable_csv_log_is_refused(text, says):
@@ -136,25 +126,19 @@ def test_an_unusable_csv_log_is_refused(text, says):
     assert "\n" not in str(caught.value)
 
 
-def test_up_to_1_percent_may_be_unusable_and_all_is_counted():
-    """Of 200 rows, one is cut off, one is out of order, one repeats a time; a pause follows."""
+def test_what_is_sorted_or_left_out_is_counted():
+    """Of 200 rows, one is out of order, one repeats a time; a pause follows."""
     rows = [f"{n / 10:g},{40 + n % 5}" for n in range(200)]
-    rows[20:22], rows[50], rows[60] = [rows[21], rows[20]], "5", rows[59]
+    rows[20:22], rows[60] = [rows[21], rows[20]], rows[59]
     packets = read("\n".join(["time_s,delay_ms", *rows, "919.9,40"]))
-    pause = (
-        "nothing sent for 900 s after packet 198: a pause, two sessions in one log, or a step of"
-    )
-    assert packets.notes[:3] == (
+    assert packets.notes[:2] == (
         "1 out of order, sorted",
         "1 left out, at the time of another one",
-        "1 left out, unreadable",
     )
-    assert packets.notes[3:] == (f"{pause} the clock",)
-    assert len(packets.sent) == 199
+    pause = "a pause, two sessions in one log, or a step of the clock"
+    assert packets.notes[2:] == (f"nothing sent for 900 s after packet 199: {pause}",)
+    assert len(packets.sent) == 200
     assert packets.sent.tolist() == sorted(packets.sent)
-    rows[70] = rows[80] = "7"
-    with pytest.raises(BadInputError, match=r"line 52: .* \(3 of 200 rows cannot be used\)"):
-        read("\n".join(["time_s,delay_ms", *rows]))
 
 
 def rows(*times):
@@ -164,24 +148,12 @@ def rows(*times):
 
 
 def test_appended_sessions_are_never_sorted_into_one_another():
-    """Sessions of 0.5 s may be packets out of order, so they are only named."""
+    """Sessions of 0.5 s may be packets out of order, so they are only counted."""
     long = [n / 10 + session / 100 for session in range(5) for n in range(60)]
-    with pytest.raises(BadInputError, match=r"after row 60 .* by 5.89 s, the longest of 4 such ju"):
+    with pytest.raises(BadInputError, match=r"at packet 61 the times go back by 5\.89 s"):
         read(rows(*long))
     short = [n / 100 + session / 1000 for session in range(5) for n in range(50)]
-    says = "after row 50 the times go back by 0.489 s, the longest of 4 such jumps: a step of "
-    assert says in read(rows(*short)).notes[1]
-
-
-def test_rows_out_of_order_are_sorted_however_far_they_are_from_their_place():
-    times = [n / 10 for n in range(300)]
-    for n in (20, 80, 140, 200, 240):
-        times.insert(n + 40, times.pop(n))
-    times.insert(5, times.pop())
-    for order in (times, times[::-1], Random(1).sample(times, 300)):
-        packets = read(rows(*order))
-        assert packets.sent == pytest.approx(np.arange(300) / 10)
-        assert [note.partition(" ")[2] for note in packets.notes] == ["out of order, sorted"]
+    assert read(rows(*short)).notes == ("196 out of order, sorted",)
 
 
 def test_rows_in_the_order_of_arrival_are_no_step_of_a_clock():
@@ -191,46 +163,9 @@ def test_rows_in_the_order_of_arrival_are_no_step_of_a_clock():
     assert len(read(text).notes) == 1
 
 
-@pytest.mark.parametrize("period", [0.01, 0.1])
-@pytest.mark.parametrize(
-    ("step", "says"),
-    [(-0.5537, "after row 150 the times go back by"), (0.9, "nothing sent for")],
-)
-def test_a_step_of_the_clock_below_a_second_is_named(period, step, says):
-    packets = read(rows(*(1.0 + n * period + step * (n >= 150) for n in range(300))))
-    assert says in packets.notes[-1]
-    assert "a step of the clock" in packets.notes[-1]
-
-
-def test_packets_of_equal_time_after_a_step_are_not_blamed_on_the_digits():
-    with pytest.raises(BadInputError, match=r"same time as another one; after row 150 .* by 0.54"):
-        read(rows(*(1.0 + n / 100 - 0.55 * (n >= 150) for n in range(300))))
-
-
-@pytest.mark.parametrize(("times", "every"), [(range(0, 30_000, 100), "100"), ((0, 1e-5), "1e-05")])
-def test_times_that_may_have_another_unit_are_named(times, every):
-    said = (f"one packet in {every} s, if time_s is in the unit that its name says",)
-    assert read(rows(*times)).notes == said
-    assert read(rows(*times), trust_units=True).notes == ()
-
-
-def test_two_rows_in_years_are_refused_unless_trusted():
-    with pytest.raises(BadInputError, match=r"one packet in 1e\+09 s, .*--trust-units"):
-        read(rows(0, 1e9))
-    assert len(read(rows(0, 1e9), trust_units=True).sent) == 2
-
-
-@pytest.mark.parametrize(
-    ("line", "says"),
-    [
-        ('{"start":{"version":"iperf 3.16"}}', "iperf"),
-        ("Antwort von 192.0.2.7: Bytes=32 Zeit<1ms TTL=57", "ping of Windows"),
-        ("traceroute to 192.0.2.1, 30 hops max", "traceroute or mtr"),
-    ],
-)
-def test_output_of_another_tool_is_refused_by_its_name(line, says):
-    with pytest.raises(BadInputError, match=f"x: the output of {says}, which lacks the number, "):
-        refuse_others(["", line], "x")
+def test_a_pause_that_may_be_a_step_of_the_clock_is_named():
+    packets = read(rows(*(1.0 + n / 10 + 0.9 * (n >= 150) for n in range(300))))
+    assert packets.notes[-1].startswith("nothing sent for 1 s after packet 150: a pause, ")
 
 
 def trip(number, lost=False, send=30, receive=20):
@@ -245,8 +180,8 @@ def trip(number, lost=False, send=30, receive=20):
     return {"lost": "false", "timestamps": stamps, "delay": delay}
 
 
-def irtt(trips, direction=None, **stats):
-    text = json.dumps({"round_trips": trips, "stats": stats})
+def irtt(trips, direction=None):
+    text = json.dumps({"round_trips": trips})
     return read_irtt(text, "x", direction, halve=direction is None)
 
 
@@ -263,11 +198,11 @@ TRIPS = [trip(0), trip(1, "true_up"), trip(2, "true_down"), trip(3, True), trip(
 )
 def test_irtt_gives_the_delays_of_each_direction(direction, sent, delays):
     """A packet lost on the way back has arrived; one that never arrived is not sent back."""
-    packets = irtt(TRIPS, direction, packets_sent=5, packets_received=3, duplicates=1)
+    packets = irtt(TRIPS, direction)
     assert packets.sent == pytest.approx(sent)
     assert delays_of(packets) == pytest.approx(delays)
     unknown = ("1 lost on the way back, delay unknown",) * (direction == "uplink")
-    assert packets.notes == ("1 duplicates left out", *unknown)
+    assert packets.notes == unknown
     lost = [n for n, copies in enumerate(packets.copies) if not copies]
     assert lost == {"uplink": [1, 3], "downlink": [1, 2], None: [1, 2, 3]}[direction]
 
@@ -306,20 +241,19 @@ del NO_STAMPS[0]["delay"]["send"]
 
 @pytest.mark.parametrize("direction", ["uplink", "downlink"])
 @pytest.mark.parametrize(
-    ("trips", "stats", "says"),
+    ("trips", "says"),
     [
-        ([trip(0, send=-5, receive=60)], {}, "arrived 5 ms before it was sent: the two clocks dif"),
-        ([trip(0, send=60, receive=-5)], {}, "arrived 5 ms before it was sent: the two clocks dif"),
-        (STEPPED, {}, "the clock of irtt's server made a step of 30 ms"),
-        (CLIENT_STEPPED, {}, "the clock of irtt's client made a step of 9 ms"),
-        (NO_STAMPS, {}, r"server sent no stamps.*--halve-rtt"),
-        (TRIPS, {"packets_sent": 6}, "counts are 6 sent and 2 received, but it has 5 packets and "),
-        ([], {}, "no packet has a delay"),
+        ([trip(0, send=-5, receive=60)], "arrived 5 ms before it was sent: the two clocks dif"),
+        ([trip(0, send=60, receive=-5)], "arrived 5 ms before it was sent: the two clocks dif"),
+        (STEPPED, "the clock of irtt's server made a step of 30 ms"),
+        (CLIENT_STEPPED, "the clock of irtt's client made a step of 9 ms"),
+        (NO_STAMPS, r"server sent no stamps.*--halve-rtt"),
+        ([], "no packet has a delay"),
     ],
 )
-def test_irtt_that_contradicts_itself_is_refused(trips, stats, says, direction):
+def test_irtt_without_good_clocks_is_refused(trips, says, direction):
     with pytest.raises(BadInputError, match=says):
-        irtt(trips, direction, **stats)
+        irtt(trips, direction)
 
 
 @pytest.mark.parametrize("text", ["{", "{}", '{"round_trips": [{}]}', "[" * 100_000])
@@ -348,10 +282,10 @@ PING = (
     HEAD,
     reply(1, 100.04, "40.0"),
     reply(2, 100.23, "30").replace("192.0.2.1", "host.example (192.0.2.1)"),
-    "[100.410000] no answer yet for icmp_seq=3",
+    "[100.600000] no answer yet for icmp_seq=3",
     reply(4, 100.7, "100"),
     reply(4, 100.71, "110", " (DUP!)"),
-    "[100.900000] no answer yet for icmp_seq=5",
+    "[101.000000] no answer yet for icmp_seq=5",
 )
 END = (
     "--- 192.0.2.1 ping statistics ---",
@@ -379,74 +313,6 @@ def test_losses_before_the_first_reply_count_if_reported():
     assert len(ping(HEAD, reply(75, 10.02), reply(76, 11.02)).sent) == 2
 
 
-STAMPED = "[1700000000.5] "
-
-
-@pytest.mark.parametrize(
-    ("lines", "delays"),
-    [
-        ([f"{STAMPED}64 octets de 192.0.2.7 : icmp_seq=1 ttl=53 temps=20,1 ms"], (10.05,)),
-        ([f"{STAMPED}64 字节, 来自 192.0.2.7: icmp_seq=1 ttl=53 时间=20.1 毫秒"], (10.05,)),
-        ([f"{STAMPED}64 bytes from ::1, icmp_seq=0 hlim=64 time=2 ms", summary(2, 1)], (1, None)),
-        (
-            [
-                "PING h (192.0.2.7): 56 data bytes",
-                "23:59:57.123456 64 bytes from 192.0.2.7: icmp_seq=0 ttl=53 time=20.5 ms",
-                "Request timeout for icmp_seq 1",
-                "23:59:59.123456 64 bytes from 192.0.2.7: icmp_seq=2 ttl=53 time=20.5 ms",
-                "3 packets transmitted, 2 packets received, 33.3% packet loss",
-            ],
-            (10.25, None, 10.25),
-        ),
-        (
-            [
-                f"{STAMPED}192.0.2.7 : [0], 64 bytes, 20.1 ms (20.1 avg, 0% loss)",
-                "[1700000001.5] 192.0.2.7 : [1], timed out (20.1 avg, 50% loss)",
-            ],
-            (10.05, None),
-        ),
-        (
-            [
-                "1700000000.500000 64 bytes from 192.0.2.7: seq=0 ttl=53 time=20.000 ms",
-                "From 192.0.2.9 icmp_seq=1 Destination Host Unreachable",
-                "2024-01-20T10:00:00.5 ping: sendmsg: Network is unreachable",
-            ],
-            (10, None),
-        ),
-    ],
-)
-def test_other_pings_and_languages_are_read(lines, delays):
-    packets = ping(*lines)
-    assert packets.sent[-1] - packets.sent[0] == pytest.approx(len(delays) - 1)
-    found = [delay and delay * 1e3 for delay in delays_of(packets)]
-    assert found == pytest.approx(list(delays))
-
-
-TS = (
-    "PING 192.0.2.7 (192.0.2.7): 56 data bytes",
-    "64 bytes from 192.0.2.7: seq=0 ttl=57 time=20.0 ms",
-    "64 bytes from 192.0.2.7: seq=2 ttl=57 time=20.0 ms",
-    "",
-    "--- 192.0.2.7 ping statistics ---",
-    "4 packets transmitted, 2 packets received, 50% packet loss",
-    "round-trip min/avg/max = 20.0/20.0/20.0 ms",
-)
-"""Output of BusyBox's ping."""
-
-
-@pytest.mark.parametrize("stamp", ["[170000000{}.200000] ", "170000000{}.200000 ", "10:00:0{}.5 "])
-def test_a_stamp_on_every_line_changes_nothing(stamp):
-    """As from `ping HOST | ts '[%.s]'`, the remedy for BusyBox and BSD."""
-    lines = [stamp.format(n) + line for n, line in enumerate(TS)]
-    packets = ping(*lines)
-    assert delays_of(packets) == pytest.approx((0.010, None, 0.010, None))
-    assert packets.notes == ()
-    with pytest.raises(BadInputError, match="counts 4 sent and 2 received, but it has 1 replies"):
-        ping(*lines[:2], *lines[3:])
-    with pytest.raises(BadInputError, match="more than one session of ping"):
-        ping(*lines[:3], lines[0])
-
-
 def test_ping_counts_on_after_65535():
     """A late reply from before the wrap keeps its place."""
     packets = ping(reply(65534, 1.0), reply(0, 3.0), reply(65535, 2.0), reply(1, 4.0))
@@ -461,22 +327,37 @@ FIVE = [reply(number, number / 5) for number in range(1, 6)]
 @pytest.mark.parametrize(
     ("lines", "says"),
     [
-        ([reply(1, 1.0)[11:]], "its lines have no time stamps; Linux: ping -D; macOS: .*apple-t"),
-        (["64 bytes from 192.0.2.1: seq=0 ttl=57 time=40 ms"], "no time stamps; .*BusyBox"),
-        (["192.0.2.7 : [0], 64 bytes, 20.1 ms (20.1 avg, 0% loss)"], "no time stamps; .*fping"),
         ([HEAD], "has no replies"),
-        (["[1.0] 64 bytes from h: icmp_seq=1 ttl=57 tid=1 xx"], "cannot? ?be read|LC_ALL=C"),
         ([*FIVE, summary(5, 4)], "summary counts 5 sent and 4 received, but it has 5 replies"),
         ([*FIVE[:2], summary(5, 5)], "summary counts 5 sent and 5 received, but it has 2 replies"),
         ([HEAD, *FIVE, HEAD], "more than one session of ping .2 beginnings"),
         ([*FIVE, reply(1, 900.0)], "more than one session of ping .number 1 comes twice"),
         (
             [reply(n, 50.0 + n - 10.0 * (n > 5)) for n in range(1, 12)],
-            "after row 5 the times go back by 9 s: a step of the clock",
+            "at packet 6 the times go back by 9 s: .* a step of the clock",
         ),
-        ([reply(1, 1.0), reply(999_999_999_999, 2.0)], "span 999999999999 packets"),
     ],
 )
 def test_a_ping_that_cannot_be_used_is_refused(lines, says):
     with pytest.raises(BadInputError, match=f"^x: [^\\n]*(?:{says})"):
         ping(*lines)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        reply(1, 1.0)[11:],
+        reply(999_999_999_999, 2.0),
+        "[1.0] 64 bytes from h: icmp_seq=1 ttl=57 tid=1 xx",
+        "[1700000000.5] 64 octets de 192.0.2.7 : icmp_seq=1 ttl=53 temps=20,1 ms",
+        "[1700000000.5] 64 bytes from 192.0.2.1: seq=0 ttl=57 time=40 ms",
+        "[1700000000.5] PING h (192.0.2.7): 56 data bytes",
+        "23:59:57.123456 64 bytes from 192.0.2.7: icmp_seq=0 ttl=53 time=20.5 ms",
+        "Antwort von 192.0.2.7: Bytes=32 Zeit<1ms TTL=57",
+    ],
+)
+def test_another_ping_or_language_is_refused_with_what_works(line):
+    with pytest.raises(
+        BadInputError, match=r"^x: [^\n]* LC_ALL=C ping -D -O HOST; Apple's .* irtt"
+    ):
+        ping(line)

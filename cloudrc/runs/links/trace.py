@@ -25,7 +25,6 @@ from cloudrc.link.logs import (
     read_csv,
     read_irtt,
     read_ping,
-    refuse_others,
     trace_of,
 )
 from cloudrc.link.model import numbers
@@ -45,7 +44,6 @@ class LogSettings:
 
     direction: Direction | None = None  # take this direction only
     halve_rtt: bool = False  # take half of each round trip
-    trust_units: bool = False  # accept values that look as if they had another unit
 
 
 def read_packets(source: Path, settings: LogSettings) -> dict[Direction, Packets]:
@@ -71,17 +69,15 @@ def _is_run(path: Path) -> bool:
 
 
 def _from_log(path: Path, settings: LogSettings) -> Packets:
-
     name, halve = str(path), settings.halve_rtt
     remedy = "give a run, a log of ping or irtt, or a CSV file"
     lines = read_lines(path, name, remedy)
-    refuse_others(lines, name)
     if lines and lines[0].lstrip().startswith(("{", "[{")):
         return read_irtt("\n".join(lines), name, settings.direction, halve=halve)
     if is_ping(lines):
         return read_ping(lines, name, halve=halve)
     with telling_rows(path, lines):
-        return read_csv(lines, name, halve=halve, trust_units=settings.trust_units)
+        return read_csv(lines, name, halve=halve)
 
 
 def _recording(path: Path) -> Recording:
