@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import fields
 from functools import lru_cache
@@ -39,7 +39,6 @@ LATEST = 1e11  # largest plausible time since 1970 [s]; a larger time has anothe
 SILENT = 1.0  # time after which a command says that it reads a large file [s]
 _GZIP = b"\x1f\x8b"  # first bytes of a compressed file (RFC 1952)
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
-_ROWS_TO_JUDGE = 10  # with fewer rows, delays of 0 are accepted, as a user may have typed them
 
 
 def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
@@ -159,7 +158,6 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
             raise BadInputError(f"{place}: no rows; give at least one, for example: 0,45")
         table = dict(zip(wanted, zip(*found, strict=True), strict=True))
     times, delays, *losses = (table[column] for column in wanted)
-    _check_delays(delays, delay, place, may_be_lost=not losses)
     if times[0] > LATEST:
         raise BadInputError(f"{place}: time_s begins at {times[0]:.15g}, which is not in seconds")
     start = times[0] if times[0] > START_MAX else 0.0
@@ -192,17 +190,11 @@ def _rising(rows: Iterable[Row], columns: Sequence[str]) -> list[list[float]]:
 
 
 def write_trace(trace: Trace) -> str:
-    """Format a trace as a CSV text that `read_trace` can read.
-
-    If all delays are below 1 ms, the column is `delay_us`. In a column `delay_ms`, `read_trace`
-    would reject such values, because they could be seconds.
-    """
-    short = 0.0 < max(trace.delays) < 1e-3
-    unit, scale = ("us", 1e6) if short else ("ms", 1e3)
-    lines = [f"time_s,delay_{unit}" + ",loss" * (trace.losses is not None)]
+    """Format a trace as a CSV text that `read_trace` can read."""
+    lines = ["time_s,delay_ms" + ",loss" * (trace.losses is not None)]
     for row, (time, delay) in enumerate(zip(trace.times, trace.delays, strict=True)):
         loss = "" if trace.losses is None else f",{trace.losses[row]:g}"
-        lines.append(f"{_short(time, 9)},{_short(delay * scale, 6)}{loss}")
+        lines.append(f"{_short(time, 9)},{_short(delay * 1e3, 6)}{loss}")
     return "\n".join(lines) + "\n"
 
 
@@ -317,16 +309,6 @@ def _cells(line: str, separator: str, where: str) -> list[str]:
         raise BadInputError(f"{where}: {error}; give a CSV file") from None
 
 
-def looks_lost(values: Collection[float]) -> bool:
-    """Return whether a 0 in `values`, delays in any unit, probably means a lost packet.
-
-    A 0 means loss if all other delays are far from 0. Otherwise it may be a rounded short delay.
-    """
-    decimals = max((len(f"{value:.12g}".partition(".")[2]) for value in values), default=0)
-    shortest = min((value for value in values if value > 0.0), default=0.0)
-    return 0.0 in values and shortest > 2 * 10.0**-decimals
-
-
 def _parse(text: str) -> float | None:
     try:
         return parse_number(text)
@@ -345,21 +327,3 @@ def _number(row: Row, column: str) -> float:
         return row.number(column, 0.0, 1.0, "a number from 0 to 1")
     mark = "; a lost packet has loss 1" if column in _SCALES else ""
     return row.number(column, 0.0, inf, f"a number that is finite and not negative{mark}")
-
-
-def _check_delays(delays: Sequence[float], column: str, place: str, *, may_be_lost: bool) -> None:
-    """Raise a BadInputError if delays in `delay_ms` are probably seconds.
-
-    With `may_be_lost`, also raise it if delays of 0 probably mean lost packets.
-    """
-    longest = max(delays)
-    if column == "delay_ms" and 0.0 < longest < 1.0:
-        raise BadInputError(
-            f"{place}: delay_ms is at most {longest:g}, which looks like seconds; "
-            f"multiply by 1000, or name the column delay_us and give {longest * 1e3:g}"
-        )
-    if may_be_lost and len(delays) >= _ROWS_TO_JUDGE and looks_lost(delays):
-        raise BadInputError(
-            f"{place}: {column} is 0 in {delays.count(0.0)} of {len(delays)} rows, which "
-            "looks like lost packets; add the column loss: 1 where a packet was lost, else 0"
-        )

@@ -19,7 +19,7 @@ HEAD = "time_s,delay_ms"
         ("time_s;delay_ms\n0;45,5\n".encode("utf-16"), (0,), (45.5,), 0),
         (b"# measured\ntime_s,delay_ms\n1705744800.5,45\n1705744801.5,46\n", (0, 1), (45, 46), 0),
         (b"time_s,delay_ms\n39504.8,45\n39505.8,46\n", (0, 1), (45, 46), 0),
-        (b"time_s,delay_ms\n0,0\n1,0\n", (0, 1), (0, 0), 0),
+        (b"time_s,delay_ms\n0,0\n1,0.07\n", (0, 1), (0, 0.07), 0),
     ],
 )
 def test_a_trace_is_read_into_si(tmp_path, data, times, delays, losses):
@@ -46,10 +46,8 @@ def test_a_trace_is_read_into_si(tmp_path, data, times, delays, losses):
         (f"{HEAD}\n0,", "line 2: delay_ms is nothing; give a number"),
         (f"{HEAD}\n0,4_5", "line 2: delay_ms is '4_5'; give a number"),
         (f"{HEAD}\n0,1,234.5", "line 2: more values than columns; give 2"),
-        (f"{HEAD}\n0,0.045\n1,0.07", "delay_ms is at most 0.07, which looks like sec"),
         (f"{HEAD},loss\n0,45,1.2", "line 2: loss is '1.2'; give a number from 0 to 1"),
         (f"{HEAD}\n1705744800500,45", "time_s begins at 1705744800500, which is not in seconds"),
-        (f"{HEAD}\n" + "".join(f"{n},{n % 3 * 50}\n" for n in range(12)), "is 0 in 4 of 12 rows"),
         ("45.1\n46.2\n44", "numbers without a header; a rate trace of mahimahi .* a trace: awk"),
         (f'{HEAD}\n0,"' + "9" * 200_000, "field larger than field limit"),
     ],
