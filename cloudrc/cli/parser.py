@@ -65,6 +65,8 @@ KUBECTL_PLUGIN = "kubectl-cloudrc"
 """Name of this program when kubectl starts it as a plug-in."""
 COUNT_MAX = 10_000
 """Largest number of repeats, seeds or processes that a flag accepts."""
+FLIGHTS_MAX = 100_000
+"""Default limit of flights: a sweep is a product, and one axis too many is hours of work."""
 
 ABOUT = "Control a simulated robot from a simulated cloud, over an emulated network."
 EXAMPLES = """\

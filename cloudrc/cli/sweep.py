@@ -8,11 +8,16 @@ from pathlib import Path
 
 from cloudrc.cli.cluster_flags import release_arguments
 from cloudrc.cli.output import output_argument
-from cloudrc.cli.parser import COUNT_MAX, add_verbs, figure_arguments, read_count, whole_number
-from cloudrc.errors import BadInputError
+from cloudrc.cli.parser import (
+    COUNT_MAX,
+    FLIGHTS_MAX,
+    add_verbs,
+    figure_arguments,
+    read_count,
+    whole_number,
+)
 from cloudrc.renamed import new_name
 from cloudrc.runs.interrupts import interrupt_on_signals
-from cloudrc.runs.shards import FLIGHTS_MAX, read_shard
 
 VERBS = {
     "run": "fly all points of a grid, or those that are missing in --out",
@@ -46,7 +51,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument("--max-flights", type=limit, default=FLIGHTS_MAX, metavar="N", help=about)
     about = "fly the failed or all flights again with a recording, into DIR/KEY"
     run.add_argument("--record", choices=("failed", "all"), help=about)
-    about = "fly only part I of N; 'auto' takes I and N from the variables of a job array"
+    about = "fly only part I of N, counted from 1"
     run.add_argument("--shard", type=_shard, metavar="I/N", help=about)
     rows.add_argument("file", type=Path, metavar="FILE", help="file of flights, of a Job")
     rows.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N", help=about)
@@ -85,11 +90,11 @@ def _cpu(text: str) -> str:
 
 
 def _shard(text: str) -> tuple[int, int]:
-    """Parse "I/N", "auto" or "auto/N" for argparse."""
-    try:
-        return read_shard(text)
-    except BadInputError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+    """Parse "I/N", shard I of N shards, counted from 1."""
+    index, _, count = text.partition("/")
+    if index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count):
+        return int(index), int(count)
+    raise argparse.ArgumentTypeError(f"'{text}' is not I/N with I from 1 to N")
 
 
 def execute(options: argparse.Namespace) -> int:

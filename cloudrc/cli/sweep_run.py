@@ -20,6 +20,7 @@ from cloudrc.cli.output import (
     print_result,
     warn,
 )
+from cloudrc.cli.parser import FLIGHTS_MAX
 from cloudrc.cli.progress import PlanView, SeedsView, StepView, SweepView
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.cluster.pods import refuse_local_files
@@ -34,7 +35,6 @@ from cloudrc.runs.grid import Grid, SweepPoint, UncheckedGrid, check, read_unche
 from cloudrc.runs.plan import check_shard
 from cloudrc.runs.pods import PodSettings, fly_in_pods
 from cloudrc.runs.requirements import MODES, require
-from cloudrc.runs.shards import FLIGHTS_MAX
 from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.text import escape
 

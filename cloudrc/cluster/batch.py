@@ -66,7 +66,7 @@ def start(
     job["spec"] |= {"completions": shards, "parallelism": shards}
     (container,) = job["spec"]["template"]["spec"]["containers"]
     container["image"] = image or container["image"]
-    container["args"][-1] = f"--shard=auto/{shards}"
+    container["args"] = [str(shards)]
     container["resources"]["requests"]["cpu"] = cpu
     files["binaryData"] = {FILE: base64.b64encode(flights).decode()}
     create_job(release, job, files)

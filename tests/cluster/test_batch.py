@@ -1,6 +1,7 @@
 """The Job of a sweep is created once, its log is read, and its failures are named."""
 
 import base64
+import subprocess
 
 import pytest
 
@@ -39,7 +40,14 @@ def test_the_job_flies_each_index_with_its_flights(started, api, release):
     assert (spec["completionMode"], spec["completions"], spec["parallelism"]) == ("Indexed", 4, 4)
     (container,) = spec["template"]["spec"]["containers"]
     assert container["image"] == "my/world:1"
-    assert container["args"] == ["sweep", "rows", "/flights/flights.json.gz", "--shard=auto/4"]
+    run = [*container["command"], *container["args"]]
+    run[2] = run[2].replace("exec cloudrc", "echo")
+    said = [
+        subprocess.run(run, env={"JOB_COMPLETION_INDEX": str(n)}, capture_output=True, text=True)
+        for n in (0, 3)
+    ]
+    wanted = "sweep rows /flights/flights.json.gz --shard={}/4\n"
+    assert [each.stdout for each in said] == [wanted.format(1), wanted.format(4)]
     assert "kueue.x-k8s.io/queue-name" not in job["metadata"]["labels"]
     batch.start(release, "sweep-2", b"flights", 4, **{**WORDS, "image": None, "queue": "lab"})
     queued = api.get("jobs", "sweep-2")
