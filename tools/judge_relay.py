@@ -1,6 +1,6 @@
 """Compare `cloudrc relay tcp` with `cloudrc link exec`: how long turns take, on the same link.
 
-    python -m tools.judge_relay [--only lte] [--rounds 6] [--control bbr]
+    python -m tools.judge_relay [--only lte] [--rounds 6]
 
 A turn sends a number of bytes, and gets eight back: on a new connection (cold) or on a used one
 (warm). A round measures both at the same time, because other load on the machine changes; each
@@ -29,7 +29,6 @@ from statistics import quantiles
 
 from cloudrc.cli.main import main as run_command
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.runs.links import streams
 
 TURNS = {200: 30, 300_000: 15, 1_400_000: 5}
 """Bytes of a request -> turns of a round."""
@@ -48,17 +47,17 @@ Times = dict[tuple[int, str], list[float]]
 """Bytes and "cold" or "warm" -> times of turns [ms]."""
 
 
-def tune(one: socket.socket, control: str) -> None:
+def tune(one: socket.socket) -> None:
     """Set the options of a socket of both programs."""
     one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    one.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, control.encode())
+    one.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, b"cubic")
 
 
-def serve(port: int, control: str) -> None:
+def serve(port: int) -> None:
     """Answer each request, which begins with its length, by eight bytes."""
 
     def answer(one: socket.socket) -> None:
-        tune(one, control)
+        tune(one)
         with one, contextlib.suppress(OSError):  # the client resets
             while len(head := one.recv(4, socket.MSG_WAITALL)) == 4:
                 left = int.from_bytes(head, "big")
@@ -72,13 +71,13 @@ def serve(port: int, control: str) -> None:
         threading.Thread(target=answer, args=(one,), daemon=True).start()
 
 
-def ask(where: tuple[str, int], control: str) -> None:
+def ask(where: tuple[str, int]) -> None:
     """Print bytes, kind and time [ms] of the turns of a round."""
     for size, turns in TURNS.items():
         for _ in range(turns):
-            tell(size, "cold", next(on_one_connection(where, size, control)))
+            tell(size, "cold", next(on_one_connection(where, size)))
         for _ in range(max(1, turns // WARM)):
-            times = list(on_one_connection(where, size, control))
+            times = list(on_one_connection(where, size))
             for taken in times[WARM_UP:]:
                 tell(size, "warm", taken)
 
@@ -88,12 +87,12 @@ def tell(size: int, kind: str, taken: float) -> None:
     sys.stdout.write(f"{size} {kind} {taken}\n")
 
 
-def on_one_connection(where: tuple[str, int], size: int, control: str) -> Iterator[float]:
+def on_one_connection(where: tuple[str, int], size: int) -> Iterator[float]:
     """Connect, and yield how long turns take; the first one includes the connection."""
     request = size.to_bytes(4, "big") + bytes(size)
     began = time.perf_counter()
     with socket.socket() as one:
-        tune(one, control)
+        tune(one)
         one.connect(where)
         for _ in range(WARM_UP + WARM):
             one.sendall(request)
@@ -103,36 +102,36 @@ def on_one_connection(where: tuple[str, int], size: int, control: str) -> Iterat
             began = time.perf_counter()
 
 
-def words(control: str, *given: object) -> list[str]:
+def words(*given: object) -> list[str]:
     """Return the command line of this module with other arguments."""
-    return [PYTHON, "-m", "tools.judge_relay", "--control", control, *map(str, given)]
+    return [PYTHON, "-m", "tools.judge_relay", *map(str, given)]
 
 
-def through_exec(link: str, seed: int, control: str, crowd: int) -> str:
+def through_exec(link: str, seed: int, crowd: int) -> str:
     """Measure over `link exec`; return what `ask` prints."""
     command = [PYTHON, "-m", "cloudrc", "link", "exec", "--link", link, "--seed", str(seed)]
-    command += ["--server", " ".join(words(control, "--serve", 9000))]
-    asking = words(control, "--ask", "{server}:9000", "--crowd", crowd)
+    command += ["--server", " ".join(words("--serve", 9000))]
+    asking = words("--ask", "{server}:9000", "--crowd", crowd)
     command += ["--client", " ".join(asking)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return done.stdout.replace("[client] ", "")
 
 
-def through_relay(link: str, seed: int, control: str, crowd: int) -> str:
+def through_relay(link: str, seed: int, crowd: int) -> str:
     """Measure over `relay tcp`, or without it if `link` is ""; return what `ask` prints."""
     port, entry = free_ports(2)
-    server = subprocess.Popen(words(control, "--serve", port))
+    server = subprocess.Popen(words("--serve", port))
     relay = None
     try:
         wait_until_listening(port)
         if link:
             relay = subprocess.Popen(
-                words(control, "--relay", link, seed, entry, port), stderr=subprocess.PIPE
+                words("--relay", link, seed, entry, port), stderr=subprocess.PIPE
             )
             assert relay.stderr is not None
             relay.stderr.readline()
         where = f"127.0.0.1:{entry if link else port}"
-        asking = words(control, "--ask", where, "--crowd", crowd)
+        asking = words("--ask", where, "--crowd", crowd)
         return subprocess.run(asking, capture_output=True, text=True, check=True).stdout
     finally:
         for process in filter(None, (relay, server)):
@@ -149,31 +148,27 @@ def wait_until_listening(port: int) -> None:
         time.sleep(0.05)
 
 
-def relay(link: str, seed: str, entry: str, port: str, control: str) -> None:
-    """Run `cloudrc relay tcp` as on a machine whose kernel uses a congestion control."""
-    with tempfile.NamedTemporaryFile("w") as file:
-        file.write(control)
-        file.flush()
-        streams.CONTROL = Path(file.name)
-        sockets = ("--listen", f"127.0.0.1:{entry}", "--to", f"127.0.0.1:{port}")
-        run_command(["relay", "tcp", "--link", link, "--seed", seed, *sockets])
+def relay(link: str, seed: str, entry: str, port: str) -> None:
+    """Run `cloudrc relay tcp`."""
+    sockets = ("--listen", f"127.0.0.1:{entry}", "--to", f"127.0.0.1:{port}")
+    run_command(["relay", "tcp", "--link", link, "--seed", seed, *sockets])
 
 
-def measure(way: str, link: str, seed: int, control: str, crowd: int, times: Times) -> None:
+def measure(way: str, link: str, seed: int, crowd: int, times: Times) -> None:
     """Measure a round, and add it to `times`."""
     if way == "exec":
-        text = through_exec(link, seed, control, crowd)
+        text = through_exec(link, seed, crowd)
     else:
-        text = through_relay(link if way == "relay" else "", seed, control, crowd)
+        text = through_relay(link if way == "relay" else "", seed, crowd)
     for line in text.splitlines():
         size, kind, taken = line.split()
         times[int(size), kind].append(float(taken))
 
 
-def judge(names: Sequence[str], rounds: int, control: str) -> int:
+def judge(names: Sequence[str], rounds: int) -> int:
     """Print the table; return 1 if a difference is too large."""
     off = 0
-    print(f"congestion control: {control}; {rounds} rounds\n")
+    print(f"{rounds} rounds\n")
     print(f"{'link':6}{'bytes':>9} {'':5}{'turns':>6}", end="")
     for share in SHARES:
         print(f"{f'exec {share}':>10}{'relay':>9}{'ratio':>7}  {'':7}", end="")
@@ -189,8 +184,7 @@ def judge(names: Sequence[str], rounds: int, control: str) -> int:
                 for seed in range(1, rounds + 1):
                     crowd = CROWDS.get(name, 1)
                     doing = [
-                        pool.submit(measure, way, link, seed, control, crowd, found[way])
-                        for way in ways
+                        pool.submit(measure, way, link, seed, crowd, found[way]) for way in ways
                     ]
                     for one in doing:
                         one.result()
@@ -228,30 +222,27 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", choices=LINKS, help="judge one link")
     parser.add_argument("--rounds", type=int, default=6, help="rounds of each (default: 6)")
-    parser.add_argument("--control", default="cubic", help="congestion control (default: cubic)")
     parser.add_argument("--serve", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--ask", help=argparse.SUPPRESS)
     parser.add_argument("--crowd", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--relay", nargs=4, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.serve:
-        serve(options.serve, options.control)
+        serve(options.serve)
     if options.ask:
         host, _, port = options.ask.rpartition(":")
         with ThreadPoolExecutor(options.crowd) as pool:
-            doing = [
-                pool.submit(ask, (host, int(port)), options.control) for _ in range(options.crowd)
-            ]
+            doing = [pool.submit(ask, (host, int(port))) for _ in range(options.crowd)]
             for one in doing:
                 one.result()
         return 0
     if options.relay:
         link, seed, entry, port = options.relay
-        relay(link, seed, entry, port, options.control)
+        relay(link, seed, entry, port)
         return 0
     # Other programs of this machine would delay the packets of `link exec`, each one a little.
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-    return judge([options.only] if options.only else list(LINKS), options.rounds, options.control)
+    return judge([options.only] if options.only else list(LINKS), options.rounds)
 
 
 if __name__ == "__main__":

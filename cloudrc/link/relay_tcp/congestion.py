@@ -1,14 +1,11 @@
-"""How many segments of a stream may be on their way, as Linux decides it with CUBIC or with BBR.
+"""How many segments of a stream may be on their way, as Linux decides it with CUBIC.
 
-Source: RFC 6928 (10 segments), RFC 9438 (CUBIC), Linux, net/ipv4/tcp_cubic.c (HyStart's trains),
-net/ipv4/tcp_bbr.c. Deviation: BBR starts and paces, but does not probe round trip and rate later.
+Source: RFC 6928 (10 segments), RFC 9438 (CUBIC), Linux, net/ipv4/tcp_cubic.c (HyStart's trains).
 """
 
 from __future__ import annotations
 
-from collections import deque
 from math import inf
-from typing import Protocol
 
 FIRST_WINDOW = 10.0  # segments
 SHRINK, GROWTH = 0.7, 0.4  # CUBIC's factor after a loss, and constant of growth [segments/s^3]
@@ -18,54 +15,25 @@ TRAIN_NS, TRAIN_WINDOW = 2_000_000, 16
 """HyStart: largest gap between acknowledgements of one train [ns], smallest window [segments]."""
 SAMPLES, LONGER_NS = 8, (4_000_000, 16_000_000)
 """HyStart: round trips that it measures in a round, and by how much they must be longer [ns]."""
-START_GAIN, STEADY_GAIN, ROUNDS = 2.885, 2.0, 10
-"""BBR: gain while it looks for the rate of the link and later; rounds that it remembers."""
-PLATEAU, PLATEAUS = 1.25, 3
-"""BBR: the start ends after this number of rounds whose rate has not grown by this factor."""
-
-
-class Congestion(Protocol):
-    """The window of one stream.
-
-    Attributes:
-        window: Largest number of segments on their way.
-    """
-
-    window: float
-
-    def acknowledged(self, sent: SentSegment, count: int, now_ns: int, most: int) -> None:
-        """Note `count` acknowledged segments, the last of which is `sent`.
-
-        At most `most` segments were on their way in the last round trip.
-        """
-
-    def lost(self, now_ns: int) -> None:
-        """Note the first loss of a window."""
-
-    def timed_out(self, now_ns: int) -> None:
-        """Note that no answer has come."""
-
-    def rested(self, pause_ns: int, retry_ns: int) -> None:
-        """Note a pause [ns]; without an answer, a segment is sent again after `retry_ns` [ns]."""
-
-    def spacing_ns(self) -> float:
-        """Return the shortest time between two segments [ns]."""
 
 
 class SentSegment:
     """What a stream knows about a segment that is acknowledged."""
 
-    __slots__ = ("delivered", "limited", "new_round", "rate_of", "recovers", "sent_ns")
+    __slots__ = ("new_round", "recovers", "sent_ns")
 
-    def __init__(self, sent_ns: int, delivered: int, *, limited: bool) -> None:
-        """Note the time, the segments acknowledged so far, and whether the program limits."""
-        self.sent_ns, self.delivered, self.limited = sent_ns, delivered, limited
+    def __init__(self, sent_ns: int) -> None:
+        """Note the time [ns]."""
+        self.sent_ns = sent_ns
         self.new_round = self.recovers = False
-        self.rate_of = 0  # segments acknowledged between its sending and its acknowledgement
 
 
 class Cubic:
-    """CUBIC, with its early end of slow start."""
+    """CUBIC of one stream, with its early end of slow start.
+
+    Attributes:
+        window: Largest number of segments on their way.
+    """
 
     def __init__(self) -> None:
         self.window, self._threshold = FIRST_WINDOW, inf
@@ -75,7 +43,11 @@ class Cubic:
         self._round_least_ns = self._samples = 0  # of this round trip
 
     def acknowledged(self, sent: SentSegment, count: int, now_ns: int, most: int) -> None:
-        """Grow the window, if it has limited the stream."""
+        """Grow the window by `count` acknowledged segments, the last of which is `sent`.
+
+        It grows only if it has limited the stream: at most `most` segments were on their way in the
+        last round trip.
+        """
         trip_ns = now_ns - sent.sent_ns
         if not self._began_ns or now_ns - self._began_ns >= SETTLED_NS:
             self._least_ns = min(self._least_ns or trip_ns, trip_ns)
@@ -123,7 +95,7 @@ class Cubic:
             self._threshold = self.window
 
     def lost(self, now_ns: int) -> None:
-        """Shrink the window."""
+        """Shrink the window, at its first loss."""
         falls = self.window < self._peak  # another stream wants room, too
         self._peak = self.window * ((1.0 + SHRINK) / 2 if falls else 1.0)
         self._began_ns = 0
@@ -136,76 +108,14 @@ class Cubic:
         self.window = 1.0
 
     def rested(self, pause_ns: int, retry_ns: int) -> None:
-        """Grow as if there had been no pause; after time-outs, the window may not fit the link."""
+        """Grow as if there had been no pause [ns]; after a long one, shrink the window.
+
+        It may not fit the link any more. Without an answer, a segment is sent again after
+        `retry_ns` [ns].
+        """
         if self._began_ns:
             self._began_ns += pause_ns
         while pause_ns > retry_ns and self.window > FIRST_WINDOW:
             self._threshold = max(self._threshold, 0.75 * self.window)
             self.window = max(FIRST_WINDOW, 0.5 * self.window)
             pause_ns -= retry_ns
-
-    def spacing_ns(self) -> float:
-        """Return 0: CUBIC sends as acknowledgements arrive."""
-        return 0.0
-
-
-class Bbr:
-    """BBR: it measures the rate at which segments arrive, and paces by it, whatever is lost."""
-
-    def __init__(self) -> None:
-        self.window = FIRST_WINDOW
-        self._rates = deque([0.0], maxlen=ROUNDS)  # fastest of each round [segments/ns]
-        self._least_ns, self._full, self._plateaus = 0, 0.0, 0
-        self._held_ns = 0  # until then, the window does not grow
-
-    def acknowledged(self, sent: SentSegment, count: int, now_ns: int, most: int) -> None:
-        """Measure the rate, and set the window to what the link then holds."""
-        trip_ns = max(1, now_ns - sent.sent_ns)
-        self._least_ns = min(self._least_ns or trip_ns, trip_ns)
-        rate = sent.rate_of / trip_ns
-        fastest = max(self._rates)
-        if sent.new_round:
-            self._look_for_plateau(sent)
-            self._rates.append(0.0)
-        if rate > fastest or not sent.limited:
-            self._rates[-1] = max(self._rates[-1], rate)
-        elif not max(self._rates):
-            self._rates[-1] = fastest
-        gain = START_GAIN if self._plateaus < PLATEAUS else STEADY_GAIN
-        target = max(4.0, gain * max(self._rates) * self._least_ns)
-        if self._plateaus < PLATEAUS:
-            grows = self.window < target and now_ns >= self._held_ns
-            self.window += count if grows else 0
-        else:
-            self.window = min(self.window + count, target)
-
-    def _look_for_plateau(self, sent: SentSegment) -> None:
-        if sent.limited:
-            return
-        fastest = max(self._rates)
-        if fastest >= PLATEAU * self._full:
-            self._full, self._plateaus = fastest, 0
-        else:
-            self._plateaus += 1
-
-    def lost(self, now_ns: int) -> None:
-        """Let the window not grow for one round trip."""
-        self._held_ns = now_ns + self._least_ns
-
-    def timed_out(self, now_ns: int) -> None:
-        """Change nothing."""
-
-    def rested(self, pause_ns: int, retry_ns: int) -> None:
-        """Change nothing."""
-
-    def spacing_ns(self) -> float:
-        """Return the time between two segments at the measured rate [ns]; 0 at first."""
-        rate = max(self._rates)
-        if not rate:
-            return 0.0
-        return 1.0 / (rate * (START_GAIN if self._plateaus < PLATEAUS else 1.0))
-
-
-def of_machine(name: str) -> type[Cubic] | type[Bbr]:
-    """Return the kind that is nearest to the kernel's congestion control `name`."""
-    return Bbr if name.startswith("bbr") else Cubic

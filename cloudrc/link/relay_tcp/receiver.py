@@ -24,7 +24,7 @@ class Segment:
 
     def __init__(self, data: bytes, number: int, place: int) -> None:
         self.data, self.number, self.place = data, number, place
-        self.attempts, self.sent = 0, SentSegment(0, 0, limited=True)
+        self.attempts, self.sent = 0, SentSegment(0)
         self.arrived = self.acked = False
         self.crossing = False  # whether the sender believes that it is on its way
 

@@ -15,7 +15,6 @@ from contextlib import suppress
 from functools import partial
 
 from cloudrc.link.relay_tcp.agenda import Agenda
-from cloudrc.link.relay_tcp.congestion import Congestion
 from cloudrc.link.relay_tcp.medium import Medium
 from cloudrc.link.relay_tcp.stream import LinkStream
 
@@ -116,8 +115,7 @@ class RelayedConnection:
 
     def _join(self, source: Side, target: Side, way: Ways) -> None:
         """Make the stream from one side to the other."""
-        put, window = partial(self._put, target), self.relay.congestion()
-        stream = LinkStream(self.relay.agenda, way, self.number, put, window)
+        stream = LinkStream(self.relay.agenda, way, self.number, partial(self._put, target))
         source.source = target.origin = stream
 
     def _begin(self, now_ns: int) -> None:
@@ -233,13 +231,8 @@ class StreamRelay:
         to: tuple[str, int],
         family: int,
         ways: Ways,
-        congestion: Callable[[], Congestion],
     ) -> None:
-        """Accept connections at the socket `listening`, to a server at the address `to`.
-
-        `congestion` makes the congestion control of a stream.
-        """
-        self.congestion = congestion
+        """Accept connections at the socket `listening`, to a server at the address `to`."""
         self.to, self.family, self.ways = to, family, ways
         self.agenda, self.connections = Agenda(), set[RelayedConnection]()
         self.connected = self.refused = self.up_bytes = self.down_bytes = 0

@@ -11,11 +11,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from math import ceil
 
 from cloudrc.link.queue import NOTHING_NS
 from cloudrc.link.relay_tcp.agenda import Agenda
-from cloudrc.link.relay_tcp.congestion import Congestion, SentSegment
+from cloudrc.link.relay_tcp.congestion import Cubic, SentSegment
 from cloudrc.link.relay_tcp.medium import SEGMENT, Medium
 from cloudrc.link.relay_tcp.receiver import Receiver, Segment, Transmission
 
@@ -38,15 +37,13 @@ class LinkStream:
         way: tuple[Medium, Medium],
         connection: int,
         deliver: Callable[[bytes, int], None],
-        congestion: Congestion,
     ) -> None:
         """Make an empty stream, which sends nothing before `open`.
 
         `way` is the direction of the bytes and that of the acknowledgements. `deliver` gets the
         bytes and the time; b"" is the end of the stream.
-        `congestion` is that of this stream alone.
         """
-        self._agenda, self._connection, self._congestion = agenda, connection, congestion
+        self._agenda, self._connection, self._congestion = agenda, connection, Cubic()
         self._way, self._back = way
         self._deliver = deliver
         self._far = Receiver(agenda, self._back, deliver, self._take_answer)
@@ -62,7 +59,7 @@ class LinkStream:
         self._round = 0  # number of the first segment of the next round trip
         self._offered = FIRST_OFFER  # most segments that the receiver has room for
         self._recovery, self._recovers = -1, False  # last segment of the window with a loss
-        self._start_ns, self._next_ns, self._waits = NOTHING_NS, 0.0, False
+        self._start_ns = NOTHING_NS
         self._arrival_ns = self._sent_ns = 0
         self._trip_ns = self._spread_ns = 0
         self._deadline_ns, self._look_ns, self._probed, self._retries = 0, NOTHING_NS, False, 0
@@ -96,9 +93,6 @@ class LinkStream:
         if not self._waiting:
             self._restart(now_ns)
         while self._crossing + 1 <= self._congestion.window and (self._lost or self._has_more()):
-            if self._next_ns > now_ns:
-                self._pace()
-                return
             segment = self._lost.popleft() if self._lost else self._next_segment()
             if not (segment.acked or segment.crossing):
                 self._send(segment, now_ns)
@@ -143,21 +137,10 @@ class LinkStream:
         if self._sent_ns:
             self._congestion.rested(now_ns - self._sent_ns, self._retry_ns())
 
-    def _pace(self) -> None:
-        """Send on when the congestion control allows the next segment."""
-        if not self._waits:
-            self._waits = True
-            self._agenda.at(ceil(self._next_ns), self._resume)
-
-    def _resume(self, now_ns: int) -> None:
-        self._waits = False
-        self._pump(now_ns)
-
     def _send(self, segment: Segment, now_ns: int) -> None:
         segment.attempts += 1
-        segment.sent = SentSegment(now_ns, self._delivered, limited=not self._unsent)
+        segment.sent = SentSegment(now_ns)
         self._sent_ns = now_ns
-        self._next_ns = max(self._next_ns, float(now_ns)) + self._congestion.spacing_ns()
         self._flight.append(segment)
         segment.crossing = True
         self._crossing += 1
@@ -195,7 +178,6 @@ class LinkStream:
         self._recovers = self._recovers and self._first() <= self._recovery
         if self._first() > self._round:
             self._round, segment.sent.new_round = self._count, True
-        segment.sent.rate_of = self._delivered - segment.sent.delivered
         segment.sent.recovers = self._recovers
         if is_known:
             self._congestion.acknowledged(segment.sent, len(fresh), now_ns, self._most)

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv6Address, ip_address
-from pathlib import Path
 from statistics import quantiles
 from typing import Any
 
@@ -19,7 +18,6 @@ from cloudrc.drivers.realtime import Address, show_address
 from cloudrc.errors import BadInputError
 from cloudrc.link.follow import Loaded
 from cloudrc.link.relay import settle, tighten_slack
-from cloudrc.link.relay_tcp.congestion import of_machine
 from cloudrc.link.relay_tcp.medium import Medium, refuse_unsupported
 from cloudrc.link.relay_tcp.relay import StreamRelay
 from cloudrc.link.state import LinkState
@@ -27,7 +25,6 @@ from cloudrc.runs.links.live import LiveLink
 from cloudrc.runs.links.programs import link_folder
 
 STEP = 0.05  # longest time until the relay reacts to a change or a signal [s]
-CONTROL = Path("/proc/sys/net/ipv4/tcp_congestion_control")
 WAITING = 512  # connections that the kernel keeps until the relay accepts them
 
 
@@ -67,7 +64,7 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
         up, down = (
             Medium(live.profiles[way], settings.seed, way == "uplink", now_ns) for way in DIRECTIONS
         )
-        relay = StreamRelay(listening, to, family, (up, down), of_machine(_control()))
+        relay = StreamRelay(listening, to, family, (up, down))
         stack.callback(relay.close)
 
         def follow(way: str, loaded: Loaded, at_ns: int) -> None:
@@ -86,14 +83,6 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
             while True:
                 relay.step(STEP)
         return _summary(relay)
-
-
-def _control() -> str:
-    """Return the congestion control of this machine's TCP; "" if it is not known."""
-    try:
-        return CONTROL.read_text(encoding="ascii").strip()
-    except OSError:  # not Linux
-        return ""
 
 
 def _listen(where: Address) -> socket.socket:

@@ -20,7 +20,6 @@ from websockets.sync.server import serve as serve_websocket
 
 from cloudrc import link
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.link.relay_tcp.congestion import of_machine
 from cloudrc.link.relay_tcp.medium import Medium
 from cloudrc.link.relay_tcp.relay import StreamRelay
 
@@ -297,7 +296,7 @@ def test_a_signal_in_the_middle_of_a_change_does_not_spoil_the_end():
     ways = (Medium(profile.uplink, 1, True, 0), Medium(profile.downlink, 1, False, 0))
     with socket.create_server(("127.0.0.1", 0)) as far, socket.create_server(("", 0)) as here:
         to = far.getsockname()
-        relay = StreamRelay(here, to, socket.AF_INET, ways, of_machine("cubic"))
+        relay = StreamRelay(here, to, socket.AF_INET, ways)
         with socket.create_connection(("127.0.0.1", here.getsockname()[1])) as client:
             relay.step(1.0)
             (connection,) = relay.connections
