@@ -30,7 +30,6 @@ from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Columns
 from cloudrc.metrics.response import Step, steps
 from cloudrc.metrics.verdict import FlightFailure
-from cloudrc.plugins import refuse_exit
 from cloudrc.record.columns import Recording, Table
 from cloudrc.runs.experiment import advice_on, check_mode, load
 from cloudrc.runs.flight import fly_in_memory
@@ -120,7 +119,6 @@ class Comparison:
     document: dict[str, Any]  # as `cloudrc compare -o json`: all metrics, success, the flights
 
 
-@refuse_exit()
 def fly(
     experiment: str = "paper",
     settings: Mapping[str, Any] | None = None,
@@ -227,7 +225,6 @@ def _result(found: Assessment) -> Result:
     )
 
 
-@refuse_exit()
 def sweep(
     grid: str | Path | Mapping[str, Any], *, jobs: int = 1, out: str | Path | None = None
 ) -> SweepTable:
@@ -280,7 +277,6 @@ def _fly_sweep(grid: Grid, out: Path | None, temporary: Path, jobs: int) -> Swee
     return SweepTable(arrays, {name: units[name] for name in arrays if name in units}, out)
 
 
-@refuse_exit()
 def compare(
     a: str | Mapping[str, Any],
     b: str | Mapping[str, Any],
@@ -322,7 +318,6 @@ def compare(
     return Comparison(name, entry["p_wilcoxon"], entry["difference"], document)
 
 
-@refuse_exit()
 def margin(
     key: str,
     *,

@@ -35,7 +35,7 @@ from importlib.util import find_spec
 from numbers import Real
 from pathlib import Path
 from types import CodeType, FrameType, ModuleType
-from typing import TYPE_CHECKING, Any, TextIO, cast
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.errors import (
     BadInputError,
@@ -320,19 +320,6 @@ def check_failure(error: BaseException, what: str) -> None:
         raise OutOfMemoryError(f"{text}; let it use less memory, or free some") from error
 
 
-class _Stderr:
-    """The standard error for a plug-in, which cannot close it."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def close(self) -> None:
-        """Leave the stream open, because the command needs it."""
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-
 @contextmanager
 def apart() -> Iterator[None]:
     """Call plug-ins inside the block: what they print goes to stderr, as stdout has the result.
@@ -340,7 +327,7 @@ def apart() -> Iterator[None]:
     Afterwards, working folder and standard streams are again those before the block.
     """
     folder, out, err = os.getcwd(), sys.stdout, sys.stderr
-    sys.stdout = sys.stderr = cast(TextIO, _Stderr(err))
+    sys.stdout = err
     try:
         yield
     finally:
@@ -383,8 +370,8 @@ def place_of(error: BaseException) -> str:
 def stray_error(error: BaseException) -> BadInputError | None:
     """Return the error to report if a user's code raised `error` outside of a guard; else None.
 
-    A signal handler of a plug-in may do so at any line of cloudrc. A SystemExit is always the
-    user's, because no command of cloudrc raises one. A full disk, say, is always the machine's.
+    A signal handler of a plug-in may do so at any line of cloudrc. A full disk, say, is always the
+    machine's.
     """
     if isinstance(error, CloudrcError | KeyboardInterrupt):
         return None
@@ -392,29 +379,12 @@ def stray_error(error: BaseException) -> BadInputError | None:
     if machine_error(error) and is_of_system:
         return None
     place = place_of(error)
-    if isinstance(error, SystemExit):
-        place = place or f"{locate(error)}: "
     return BadInputError(f"{place}{describe_error(error)}") if place else None
 
 
 def machine_failure(error: BaseException) -> MissingPrerequisiteError | None:
     """Return what `machine_error` does; None if a user's code raised `error`, such as a timeout."""
     return machine_error(error) if stray_error(error) is None else None
-
-
-@contextmanager
-def refuse_exit() -> Iterator[None]:
-    """Convert a SystemExit that a plug-in raises in the block to a BadInputError.
-
-    That of the program which calls cloudrc stays as it is.
-    """
-    try:
-        yield
-    except SystemExit as error:
-        frames = [frame for frame, _ in _own_frames(error)]
-        if frames and str(frames[-1].f_globals.get("__name__")).startswith(PREFIX):
-            raise stray_error(error) or error from error
-        raise
 
 
 def locate(error: BaseException) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import sys
@@ -19,7 +18,6 @@ from cloudrc.errors import (
     machine_error,
 )
 from cloudrc.files import naming
-from cloudrc.runs.leave import limit_exit
 from cloudrc.runs.requirements import name_extra
 from cloudrc.text import escape
 
@@ -32,13 +30,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _run(list(arguments))
     if sys.stdout is None:  # closed by the shell (>&-): nobody wants the result
         sys.stdout = open(os.devnull, "w")
-    code = INTERNAL
     try:
-        code = _run(sys.argv[1:])
+        return _run(sys.argv[1:])
     finally:
         end_output()
-        limit_exit(code)
-    return code
 
 
 def _run(given: list[str]) -> int:
@@ -71,20 +66,9 @@ def _dispatch(given: Sequence[str]) -> int:
     form = getattr(options, "output", TABLE)
     for_programs = isinstance(form, str) and form != TABLE
     with reserve_stdout() if for_programs else contextlib.nullcontext():
-        code = _execute(options)
+        code: int = options.execute(options)
         with naming(STDOUT):
             sys.stdout.flush()
-    return code
-
-
-def _execute(options: argparse.Namespace) -> int:
-    """Run the command; a SystemExit in it is that of a user's code, such as a signal handler."""
-    try:
-        code: int = options.execute(options)
-    except SystemExit as error:
-        from cloudrc.plugins import stray_error
-
-        raise stray_error(error) or error from error
     return code
 
 

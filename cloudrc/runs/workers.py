@@ -13,7 +13,6 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from itertools import chain, islice
 from multiprocessing.process import BaseProcess
-from multiprocessing.util import Finalize
 from queue import Empty, SimpleQueue
 from types import ModuleType
 from typing import Any, TypeVar
@@ -22,7 +21,6 @@ from cloudrc import plugins
 from cloudrc.drivers.machine import usable_cores
 from cloudrc.errors import CloudrcError, InterruptedRunError, InvalidRunError
 from cloudrc.runs.interrupts import is_interrupted, noted_interrupts, raise_if_interrupted
-from cloudrc.runs.leave import limit_exit
 
 Work = TypeVar("Work")
 Result = TypeVar("Result")
@@ -40,11 +38,7 @@ class WorkerDiedError(InvalidRunError):
 
 
 def _start_worker() -> None:
-    """Let this worker process end with its work, and with the parent process.
-
-    It ends even if SIGKILL ended the parent, and even if a plug-in has left a thread running.
-    """
-    Finalize(None, limit_exit, args=(0,), exitpriority=0)
+    """Let this worker process end with the parent process, even if SIGKILL ended the parent."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 

@@ -224,15 +224,6 @@ def test_a_failure_is_at_the_line_of_the_plug_in_not_of_a_library(share):
     assert plugins.locate(caught.value) == f"share.py:{len(share.read_text().splitlines())} in fail"
 
 
-def test_in_a_program_a_plug_in_cannot_exit_but_the_program_can(share):
-    share.write_text(f"{SOURCE}\ndef late(*signal): raise SystemExit(0)\n")
-    late = plugins.find("predictors", str(share)).get("late")
-    with pytest.raises(BadInputError, match=r"^share.py:\d+: SystemExit: 0"), plugins.refuse_exit():
-        late()
-    with pytest.raises(SystemExit), plugins.refuse_exit():
-        raise SystemExit(0)
-
-
 def test_a_timeout_of_a_plug_in_is_no_failure_of_the_machine(share, monkeypatch):
     share.write_text(f"{SOURCE}\ndef late(*signal): raise TimeoutError('too slow')\n")
     late = plugins.find("predictors", str(share)).get("late")
