@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Callable, Iterable
 from threading import Event, Lock, Thread
-from time import monotonic, sleep
+from time import monotonic
 from typing import TYPE_CHECKING, TextIO
 
 from rich.console import Console
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 ENDINGS = ("done", "cancelled", "timed_out")
 FIRST_WAIT, PERIOD = 3.0, 10.0
 """Time to the first line on a stream that is no terminal, and from one line to the next [s]."""
-WAIT_PERIOD = 0.5
-"""Time from one look at the work of another command to the next [s]."""
 STEP_WAIT = 1.0
 """Time after which a terminal shows the step of a command, or the check of a sweep [s]."""
 
@@ -265,22 +263,13 @@ class PlanView:
     def __init__(self, stream: TextIO) -> None:
         """Print nothing yet."""
         self._stream, self._began = stream, monotonic()
-        self._view: StatusLine | None = None
-
-    def wait(self, work: str) -> None:
-        """Wait a moment for another shard, which checks the points: `work` says how many."""
-        if self._view is None:
-            self._view = StepView(self._stream, f"waits for another shard, which checks {work}")
-        sleep(WAIT_PERIOD)
+        self._view: CountView | None = None
 
     def see(self, done: int, points: int, work: str) -> None:
         """Show that `done` of the points are checked; `work` has their number in words."""
-        if done == 0:
-            self.close()
-            self._view, self._began = None, monotonic()
         if monotonic() - self._began < STEP_WAIT or done == points:
             return
-        if not isinstance(self._view, CountView):
+        if self._view is None:
             print_or_drop(f"checks {work}", self._stream)
             self._view = CountView(self._stream, points, "points")
         self._view.count(done)

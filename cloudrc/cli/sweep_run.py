@@ -31,8 +31,7 @@ from cloudrc.runs import seeds, store, sweep
 from cloudrc.runs.experiment import check_mode, load, refuse_seed
 from cloudrc.runs.flight import Row
 from cloudrc.runs.folder import new_folder
-from cloudrc.runs.grid import Grid, SweepPoint, UncheckedGrid, check, read_unchecked, unpack
-from cloudrc.runs.plan import check_shard
+from cloudrc.runs.grid import Grid, SweepPoint, check, read_unchecked, unpack
 from cloudrc.runs.pods import PodSettings, fly_in_pods
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.runs.workers import map_in_order, take_each
@@ -42,13 +41,11 @@ from cloudrc.text import escape
 def run(options: argparse.Namespace) -> int:
     """Fly the flights of a sweep whose results or recordings are missing; return the exit code."""
     _check_flags(options)
-    unchecked = read_unchecked(options.file, options.max_flights)
-    whole = None if options.shard else _check(options, unchecked)  # before there is a folder
+    grid = _check(options)  # before there is a folder
     name, (shard, count) = f"sweep-{options.file.stem}", options.shard or (None, 1)
     with sweep.open_folder(options.out, name, shard, count) as (folder, warning):
         if warning:
             print_line(f"cloudrc: warning: {warning}", sys.stderr)
-        grid = whole or _check(options, unchecked, folder)
         return _run_locked(options, grid, folder, shard, count)
 
 
@@ -101,16 +98,10 @@ def _check_flags(options: argparse.Namespace) -> None:
         raise BadInputError("--shard needs --out, the folder that all shards share")
 
 
-def _check(
-    options: argparse.Namespace, unchecked: UncheckedGrid, folder: Path | None = None
-) -> Grid:
-    """Check all points, or those of a shard, which flies into `folder`; print warnings."""
+def _check(options: argparse.Namespace) -> Grid:
+    """Check all points; print warnings."""
     with closing(PlanView(_stream(options))) as view:
-        if folder is None:
-            grid = check(unchecked, unchecked.points(), view.see)
-        else:
-            shard, count = options.shard
-            grid = check_shard(unchecked, folder, shard, count, view.see, view.wait)
+        grid = check(read_unchecked(options.file, options.max_flights), view.see)
     if options.on:
         for point in grid.points:
             refuse_local_files(point.model_dump(mode="json"), "or fly without --on")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import gzip
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from itertools import chain, product
@@ -138,25 +138,23 @@ def read_grid(given: Path | Mapping[str, Any]) -> Grid:
             or with the key of the content.
     """
     grid = read_unchecked(given)
-    return check(grid, grid.points())
+    return check(grid)
 
 
 def check(
     grid: UncheckedGrid,
-    chosen: Sequence[_Point],
     see: See = lambda done, points, work: None,
 ) -> Grid:
-    """Check the `chosen` points of a sweep: all, or those of a shard; raise a BadInputError.
+    """Check the points of a sweep; raise a BadInputError.
 
     Call `see` once before the first point, and after each.
     """
-    count, total = len(chosen), grid.flights // len(grid.seeds)
-    work = grid.size if count == total else f"{count:,} of {total:,} points"
-    see(0, count, work)
+    count = grid.flights // len(grid.seeds)
+    see(0, count, grid.size)
     points, flights = list[ResolvedExperiment](), dict[str, SweepPoint]()
     files = dict[str, str]()
     with reuse_results():
-        for point, choices in chosen:
+        for point, choices in grid.points():
             points.append(grid.resolve(choices))
             own_files = hash_all(points[-1])
             files |= own_files
@@ -167,7 +165,7 @@ def check(
                     same = f"{point} is the same as {flights[key].point}; remove one of them"
                     raise BadInputError(f"{grid.name}: {same}")
                 flights[key] = SweepPoint(key, point, seed, points[-1])
-            see(len(points), count, work)
+            see(len(points), count, grid.size)
     return Grid(
         file=grid.file,
         axes={axis: [label for label, _ in choices] for axis, choices in grid.axes.items()},

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import IO
 
 from cloudrc.errors import BadInputError
 
@@ -78,24 +77,8 @@ def lock_folder(folder: Path, shard: int | None = None, count: int = 1) -> Itera
         yield warnings[-1]
 
 
-@contextmanager
-def lock_plan(folder: Path, wait: Callable[[], None]) -> Iterator[None]:
-    """Lock the check of all points of a sweep; call `wait` as long as another shard has locked it.
-
-    The first shard has the lock alone. All that had to wait for it get the lock together: if the
-    first one was refused or killed, they need not wait for each other, too. If the file system has
-    no locks, no shard waits.
-    """
-    how = ALONE
-    with (folder / f"{LOCK}-plan").open("a+") as file:
-        while not _try_lock(file, how):
-            how = TOGETHER
-            wait()
-        yield
-
-
-def _try_lock(file: IO[str] | int, how: int) -> bool:
-    """Return whether no other process has locked a file (or folder), or there are no locks."""
+def _try_lock(file: int, how: int) -> bool:
+    """Return whether no other process has locked a folder, or there are no locks."""
     try:
         fcntl.flock(file, how)
     except BlockingIOError:

@@ -32,7 +32,7 @@ from cloudrc.runs.lock import LOCK
 from cloudrc.source import code_hash
 from cloudrc.version import __version__
 
-FILE, SUMMARY, PLAN = "sweep.yaml", "sweep.json", "plan.json"
+FILE, SUMMARY = "sweep.yaml", "sweep.json"
 TABLE, PARQUET = "table.csv", "table.parquet"
 NUMBERS = {int, float, type(None)}
 """Types of the values of an axis of numbers; None is the value null."""
@@ -165,7 +165,7 @@ def begin(folder: Path, grid: Grid, *, is_shared: bool = False) -> dict[str, Row
     """
     rows = read_rows(folder)
     refuse_other_code(folder, rows.values(), is_shared)
-    is_same = _has_same_file(folder, grid)
+    is_same = _has_same_file(folder, grid, is_shared)
     if any(grid.point_of.get(key) != row["point"] for key, row in rows.items()):
         text = f"has flights that are not in {FILE}, or a file that it names has changed since"
         text = describe_changes(folder, grid.files) or text
@@ -173,8 +173,6 @@ def begin(folder: Path, grid: Grid, *, is_shared: bool = False) -> dict[str, Row
     if not is_same:
         write_atomically(folder / FILE, write_yaml(grid.file).encode())
     _write_summary(folder, grid, rows)
-    if not is_shared:  # only shards keep a plan up to date
-        (folder / PLAN).unlink(missing_ok=True)
     if len(rows) < len(grid.point_of):  # tables of a smaller grid would look complete
         for name in (TABLE, PARQUET):
             (folder / name).unlink(missing_ok=True)
@@ -279,7 +277,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
     raise BadInputError(f"{folder}: is not a folder of 'cloudrc sweep run'; name one")
 
 
-def _has_same_file(folder: Path, grid: Grid) -> bool:
+def _has_same_file(folder: Path, grid: Grid, is_shared: bool) -> bool:
     """Return whether the file of a sweep in `folder` says the same; if so, it stays as it is.
 
     Raise a BadInputError if something would be lost with the file: what a user has written, or a
@@ -292,6 +290,8 @@ def _has_same_file(folder: Path, grid: Grid) -> bool:
     tree = read_document(path, str(path)).tree
     if tree in (grid.file, _without_folder(grid.file)):
         return True
+    if is_shared and _without_folder(tree) == _without_folder(grid.file):
+        return True  # shards of several machines may have it in different places
     if write_yaml(tree).encode() != old:
         raise BadInputError(
             f"{path}: was written or edited by hand; name a new folder with --out, or move the file"

@@ -123,10 +123,6 @@ def test_a_check_of_more_than_a_second_says_how_far_it_is(write_sweep, call, mon
         "checks 4 points x 1 seeds: 4 flights",
         "steps: 4 points x 1 seeds, shard 5 of 5: 0 flights",
     ]
-    said = call("sweep run --out grid --shard 4/5", write_sweep())
-    assert (said.out.splitlines()[0], said.err) == ("checks 1 of 4 points", "")
-    said = call("sweep run --out grid --shard 5/5", write_sweep())  # it has no point
-    assert said.out.startswith("steps: 4 points x 1 seeds, shard 5 of 5: 0 flights\n")
 
 
 def test_alike_warnings_of_many_points_are_counted(write_sweep, monkeypatch, call):

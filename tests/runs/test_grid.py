@@ -241,7 +241,7 @@ def test_one_flight_is_read_without_the_others(write_sweep):
 def test_the_progress_is_told_for_each_point(write_sweep):
     seen = []
     grid = read_unchecked(write_sweep(seeds=3))
-    check(grid, grid.points(), see=lambda *counts: seen.append(counts))
+    check(grid, see=lambda *counts: seen.append(counts))
     assert seen == [(done, 4, "4 points x 3 seeds: 12 flights") for done in range(5)]
 
 
