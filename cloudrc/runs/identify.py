@@ -80,7 +80,7 @@ def describe(fits: Sequence[Fit], seconds: float, key: str) -> dict[str, Any]:
 
 
 def as_text(fits: Sequence[Fit], seconds: float, key: str) -> str:
-    """Format the model of each axis for people; the arguments are those of `describe`."""
+    """Format the model of each axis for people; `seconds` [s] and `key` are as in `describe`."""
     head = f"velocity loop from {round(seconds, 2)} s, input {INPUT}, output {OUTPUT}"
     rows = [("axis", "time constant [s]", "dead time [s]", "gain", "explained")]
     for name, fit in zip("xyz", fits, strict=True):
