@@ -89,9 +89,35 @@ def sign_test(less: int, more: int) -> float:
     Source: Q. McNemar, "Note on the sampling error of the difference between correlated
     proportions or percentages", 1947.
     """
-    n, few = less + more, min(less, more)
-    tail = sum(_choices(n, few + 1))
-    return min(1.0, float(2 * tail / 2**n))
+    return min(1.0, 2 * tail(min(less, more), less + more))
+
+
+def tail(few: int, n: int) -> float:
+    """Return the probability of at most `few` of `n` events that have a probability of 1/2 each."""
+    return float(sum(_choices(n, few + 1)) / 2**n)
+
+
+def holm(ps: Sequence[float]) -> list[float]:
+    """Return the adjusted p of each of the p-values `ps`, in their order.
+
+    If all null hypotheses are true, or some of them, an adjusted p of a true one is below 5 % with
+    a probability of at most 5 %, however the tests depend on each other.
+
+    Source: S. Holm, "A simple sequentially rejective multiple test procedure", 1979.
+    """
+    adjusted, largest = [1.0] * len(ps), 0.0
+    for rank, place in enumerate(sorted(range(len(ps)), key=ps.__getitem__)):
+        largest = max(largest, min(1.0, (len(ps) - rank) * ps[place]))
+        adjusted[place] = largest
+    return adjusted
+
+
+def by_chance(count: int) -> str:
+    """Say how many of several tests and intervals are wrong by chance."""
+    return (
+        f"{count} tests and intervals at 95 %: about {LEVEL * count:.2g} of them are wrong by "
+        "chance alone; Holm's p, over all tests, allows for this"
+    )
 
 
 def _choices(n: int, count: int) -> Iterator[int]:

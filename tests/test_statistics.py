@@ -1,5 +1,6 @@
 """Intervals and tests have the values of published tables."""
 
+from itertools import combinations
 from math import comb
 
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from cloudrc import statistics
 from cloudrc.statistics import (
     exact_interval,
+    holm,
     median_interval,
     paired,
     sign_test,
@@ -165,3 +167,25 @@ def test_fifty_thousand_differences_are_evaluated():
     low, high = found.interval
     assert (low + high) / 2 == 4999.5
     assert high - low == pytest.approx(2 * 1.96 * 50_000 / 12**0.5 / 50_000**0.5, rel=0.01)
+
+
+def closed(ps):
+    """Adjust by the closed test of Bonferroni: the largest p of all groups that have this test."""
+    groups = [set(each) for n in range(1, len(ps) + 1) for each in combinations(range(len(ps)), n)]
+    return [
+        max(min(1, len(each) * min(ps[i] for i in each)) for each in groups if place in each)
+        for place in range(len(ps))
+    ]
+
+
+def test_holms_p_has_the_values_of_a_calculation_by_hand():
+    """4 · .005, then 3 · .01, then 2 · .03, then the p before it, which is above .04."""
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.5, 0.6]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+@given(st.lists(st.floats(0, 1), max_size=6))
+@settings(max_examples=50, deadline=None)
+def test_holms_p_is_the_closed_test_of_bonferroni(ps):
+    assert holm(ps) == pytest.approx(closed(ps))
