@@ -1,8 +1,9 @@
-"""Texts for people: tables, numbers, positions, and text from files that a terminal may show."""
+"""Texts: tables for people, programs and papers; numbers, positions; text from files."""
 
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
@@ -78,3 +79,45 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
     drawn = io.StringIO()
     Console(file=drawn, width=10_000).print(grid)  # no line is wrapped
     return "\n".join(line.rstrip() for line in drawn.getvalue().splitlines())
+
+
+def cells(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> list[tuple[str, ...]]:
+    """Return a table as text: `columns` are head -> form of a cell, such as "{age_ms:.0f} ms".
+
+    A cell whose value a row lacks is "-"; a column with such cells alone is left out.
+    """
+
+    def cell(form: str, row: Mapping[str, Any]) -> str:
+        try:
+            return form.format_map(row)
+        except (KeyError, TypeError):  # None has no digits
+            return "-"
+
+    found = [(head, *(cell(form, row) for row in rows)) for head, form in columns.items()]
+    return list(zip(*(each for each in found if {*each[1:]} - {"-"}), strict=True))
+
+
+def latex_table(rows: Sequence[Sequence[str]]) -> str:
+    """Return rows, the first of them the head, as a table of LaTeX; it needs booktabs."""
+    head, *lines = [" & ".join(map(_latex, row)) + r" \\" for row in rows]
+    begin = r"\begin{tabular}{l" + "r" * (len(rows[0]) - 1) + "}  % \\usepackage{booktabs}"
+    parts = (begin, r"\toprule", head, r"\midrule", *lines, r"\bottomrule", r"\end{tabular}")
+    return "\n".join(parts)
+
+
+def _latex(cell: str) -> str:
+    """Escape a cell; a hyphen before a number becomes a minus."""
+    text = re.sub(r"[&%$#_{}]", r"\\\g<0>", cell.replace(" .. ", " to "))
+    return re.sub(r"(?<!\w)-(?=\d)", "$-$", text)
+
+
+def csv_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return rows of plain values as CSV; a value that a row lacks, or that is None, is empty."""
+    import csv
+
+    names = dict.fromkeys(name for row in rows for name in row)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(names), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue().rstrip("\n")

@@ -8,12 +8,19 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.output import output_argument, print_or_drop, print_result, warn
+from cloudrc.cli.output import (
+    TABLES,
+    output_argument,
+    print_or_drop,
+    print_result,
+    warn,
+)
 from cloudrc.cli.parser import read_count
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.renamed import new_name
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import MODES, require
+from cloudrc.text import csv_table, latex_table
 
 if TYPE_CHECKING:
     from cloudrc.runs.compare import Pairs
@@ -42,7 +49,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--in", type=Path, dest="sweep", metavar="DIR", help="compare flights of this sweep")
     about = "compare this metric instead of the default ones; repeatable"
     add("--number", action="append", type=new_name, default=[], metavar="NAME", help=about)
-    output_argument(parser)
+    output_argument(parser, forms=TABLES)
 
 
 def flight_arguments(parser: argparse.ArgumentParser, seeds: int) -> None:
@@ -61,7 +68,7 @@ def execute(options: argparse.Namespace) -> int:
     interrupt_on_signals()
     from cloudrc.cli.progress import StepView
     from cloudrc.runs.compare import compare, of_sweep
-    from cloudrc.runs.compare_text import as_text
+    from cloudrc.runs.compare_text import as_text, cells
 
     stopped = None
     if options.set and options.sweep:
@@ -82,7 +89,13 @@ def execute(options: argparse.Namespace) -> int:
         **{"overrides": options.set, "interrupted": bool(stopped)},
         **compared,
     }
-    print_result(options.output, document, as_text(document))
+    rows = []
+    for name, each in document["numbers"].items():
+        ends = dict(zip(("low", "high"), each["interval"] or (), strict=False))
+        rows.append({"number": name, **each, **ends})
+        del rows[-1]["interval"]
+    tables = {"csv": csv_table(rows), "latex": latex_table(cells(document))}
+    print_result(options.output, document, as_text(document), **tables)
     return stopped.exit_code if stopped else 0
 
 

@@ -8,7 +8,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TextIO
 
 from cloudrc.errors import DISK_FULL
@@ -22,13 +22,17 @@ _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1"}
 
 TABLE = "table"
 """Form of the output that is for people."""
+TABLES = ("csv", "latex")
+"""Further forms of a command whose result is a table."""
 STDOUT = "the output (stdout)"
 """Place of the output in errors."""
 
 
-def output_argument(parser: argparse.ArgumentParser, what: str = "output format") -> None:
-    """Declare the flag `--output`; `what` is its help text."""
-    forms, about = (TABLE, "json", "yaml"), f"{what} (default: table)"
+def output_argument(
+    parser: argparse.ArgumentParser, what: str = "output format", *, forms: Sequence[str] = ()
+) -> None:
+    """Declare the flag `--output`; `what` is its help text, `forms` are further forms."""
+    forms, about = (TABLE, "json", "yaml", *forms), f"{what} (default: table)"
     parser.add_argument("-o", "--output", choices=forms, default=TABLE, help=about)
 
 
@@ -42,13 +46,16 @@ def format_document(document: object, form: str) -> str:
     return write_yaml(json.loads(text)).rstrip("\n")
 
 
-def print_result(form: str, document: Mapping[str, Any], text: str) -> None:
+def print_result(form: str, document: Mapping[str, Any], text: str, **others: str) -> None:
     """Print the result of a command: `text` if `form` is "table", else the document in this form.
 
+    `others` are the texts of further forms.
     The document begins with the version of its schema. Print nothing if the reader closed the pipe.
     Raise an OSError if stdout is a file on a full disk, because the result is then incomplete.
     """
-    shown = text if form == "table" else format_document({"schemaVersion": 1, **document}, form)
+    shown = {TABLE: text, **others}.get(form)
+    if shown is None:
+        shown = format_document({"schemaVersion": 1, **document}, form)
     try:
         with naming(STDOUT):
             print(shown, flush=True)

@@ -20,7 +20,7 @@ from cloudrc.runs import flight, store
 from cloudrc.runs.experiment import load, refuse_seed
 from cloudrc.runs.flight import Row, counts
 from cloudrc.runs.workers import map_in_order, take_each
-from cloudrc.statistics import LEVEL, exact_interval, paired, sign_test
+from cloudrc.statistics import LEVEL, exact_interval, holm, paired, sign_test
 
 NUMBERS = (
     *("prediction_error_rms", "tracking_error_p95", "iae_mean", "settling_time_mean"),
@@ -124,15 +124,20 @@ def compare(
         check_names(names, known)
     chosen = names or [name for name in NUMBERS if name in known]
     lacking = {name: _lacking(flown, name) for name in chosen}
-    return {
-        "pairs": len(flown),
-        "left_out": len(pairs) - len(flown),
-        "success": _success(flown),
-        "numbers": {
-            name: _number(flown, name, units[name])
+    success, numbers = (
+        compare_success(flown),
+        {
+            name: compare_number(flown, name, units[name])
             for name in chosen
             if lacking[name]["left_out"] < len(flown)
         },
+    )
+    adjust([success, *numbers.values()])
+    return {
+        "pairs": len(flown),
+        "left_out": len(pairs) - len(flown),
+        "success": success,
+        "numbers": numbers,
         "lacking": {name: each for name, each in lacking.items() if each["left_out"]},
         "method": METHOD,
         "flights": [
@@ -165,7 +170,15 @@ def _lacking(pairs: Sequence[Pair], name: str) -> dict[str, int]:
     return {"a": a, "b": b, "left_out": sum(map(any, lacks))}
 
 
-def _number(pairs: Sequence[Pair], name: str, unit: str) -> dict[str, Any]:
+def adjust(tests: Sequence[dict[str, Any]]) -> None:
+    """Set Holm's p in the results of `compare_number` and `compare_success`, one family."""
+    ps = [each["p_mcnemar"] if "p_mcnemar" in each else each["p_wilcoxon"] for each in tests]
+    for each, p in zip(tests, holm(ps), strict=True):
+        each["p_holm"] = p
+
+
+def compare_number(pairs: Sequence[Pair], name: str, unit: str) -> dict[str, Any]:
+    """Evaluate a number of pairs of which at least one has it on both sides; return JSON."""
     known = [pair for pair in pairs if name in pair.a["numbers"] and name in pair.b["numbers"]]
     both = [(a["numbers"][name], b["numbers"][name]) for _, a, b in known]
     return {
@@ -179,7 +192,8 @@ def _number(pairs: Sequence[Pair], name: str, unit: str) -> dict[str, Any]:
     }
 
 
-def _success(pairs: Sequence[Pair]) -> dict[str, Any]:
+def compare_success(pairs: Sequence[Pair]) -> dict[str, Any]:
+    """Evaluate the successes of pairs; return JSON."""
     done = [(a["verdict"] == "success", b["verdict"] == "success") for _, a, b in pairs]
     count = len(pairs)
     a, b = (sum(each) for each in zip(*done, strict=True))

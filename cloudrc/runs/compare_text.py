@@ -7,18 +7,17 @@ from typing import Any
 
 from cloudrc.metrics import scale
 from cloudrc.runs.compare import LEFT_OUT
-from cloudrc.statistics import LEVEL
+from cloudrc.statistics import LEVEL, by_chance
 from cloudrc.text import FAILED_MARK, FAILED_NOTE, format_number, table
 
 TITLES = (
-    *("number", "A median", "B median", "B - A", "95 % interval", "B lower in", "p", "p sign"),
-    *("decided", "unit"),
+    *("number", "A median", "B median", "B - A", "95 % interval", "B lower in", "p", "p Holm"),
+    *("p sign", "decided", "unit"),
 )
 
 
 def as_text(document: Mapping[str, Any]) -> str:
     """Format the result of a comparison: a table and, in the last lines, the conclusion."""
-    body = [_row(name, entry) for name, entry in document["numbers"].items()]
     success, left_out = document["success"], document["left_out"]
     rates = [
         "{} {} of {} ({:.0%} .. {:.0%})".format(
@@ -30,14 +29,21 @@ def as_text(document: Mapping[str, Any]) -> str:
         *(f"{side.upper()}: {document[side]}" for side in "ab"),
         f"of {document['of']}; pairs: {document['pairs']}"
         + (f"; {left_out} left out with {LEFT_OUT}" if left_out else ""),
-        *("", table([TITLES, *body], right=(1, 2, 3)), ""),
+        *("", table(cells(document), right=(1, 2, 3)), ""),
         *map(lacking_text, document["lacking"].items()),
-        f"success: {', '.join(rates)}, p = {success['p_mcnemar']:.2g}",
+        f"success: {', '.join(rates)}, p = {success['p_mcnemar']:.2g}, "
+        f"p Holm = {success['p_holm']:.2g}",
         document["method"],
+        by_chance(1 + len(document["numbers"])),
         *([FAILED_NOTE] if any(_failed(entry) for entry in document["numbers"].values()) else []),
         *("", _answer(document)),
     ]
     return "\n".join(lines)
+
+
+def cells(document: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Return the table of the numbers as text, with its head."""
+    return [TITLES, *(_row(name, entry) for name, entry in document["numbers"].items())]
 
 
 def _row(name: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
@@ -48,7 +54,7 @@ def _row(name: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
     between = " .. ".join(format_number(bound * factor) for bound in entry["interval"] or ())
     return (
         *(name, *values, between or "-", f"{entry['lower']} of {entry['count']}"),
-        *(f"{entry['p_wilcoxon']:.2g}", f"{entry['p_sign']:.2g}"),
+        *(f"{entry[key]:.2g}" for key in ("p_wilcoxon", "p_holm", "p_sign")),
         *("yes" if entry["decided"] else f"no: {_needed(entry)}", unit),
     )
 

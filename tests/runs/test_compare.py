@@ -31,6 +31,18 @@ def test_success_is_compared_by_pairs():
     assert found["p_mcnemar"] == pytest.approx(2 * (1 + 8) / 2**8)
 
 
+def test_holms_p_is_over_the_success_and_all_numbers():
+    """The p of ten equal gains is 2 / 2^10: three times this, then 2 and 1 times larger ones."""
+    both = [(flown(iae_mean=5.0 + n, rtt_mean=n % 3), flown(iae_mean=4.0)) for n in range(10)]
+    both = [(a, {**b, "numbers": {**b["numbers"], "rtt_mean": 1}}) for a, b in both]
+    document = compare(pairs(*both), UNITS, ["iae_mean", "rtt_mean"])
+    found = document["numbers"]
+    assert found["iae_mean"]["p_holm"] == pytest.approx(3 * found["iae_mean"]["p_wilcoxon"])
+    assert document["success"]["p_holm"] == found["rtt_mean"]["p_holm"] == 1.0
+    text = as_text({"a": "x=1", "b": "x=2", "of": "steps", **document})
+    assert "3 tests and intervals at 95 %: about 0.15 of them" in text
+
+
 def test_incomplete_pairs_are_left_out_and_counted():
     whole, torn = flown(iae_mean=1.0, rtt_mean=1.0), flown(rtt_mean=2.0)
     found = compare(pairs((whole, whole), (whole, torn), (whole, flown("error"))), UNITS)

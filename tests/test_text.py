@@ -1,0 +1,39 @@
+"""Tables for papers and programs keep each value."""
+
+import csv
+
+from cloudrc.text import cells, csv_table, latex_table
+
+ROWS = [
+    ("round trip", "95 %", "x_y", "note"),
+    ("no network", "83-100 %", "-1.2 .. -3", "a & b"),
+    ("time-indexed", "0-17 %", "-", "{}#$"),
+]
+
+
+def test_a_table_of_latex_has_minus_signs_and_no_bare_special_character():
+    assert latex_table(ROWS).splitlines() == [
+        r"\begin{tabular}{lrrr}  % \usepackage{booktabs}",
+        r"\toprule",
+        r"round trip & 95 \% & x\_y & note \\",
+        r"\midrule",
+        r"no network & 83-100 \% & $-$1.2 to $-$3 & a \& b \\",
+        r"time-indexed & 0-17 \% & - & \{\}\#\$ \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
+
+
+def test_a_table_of_csv_has_a_column_for_each_value_that_a_row_has():
+    rows = [{"name": 'a,"b"', "low": 0.1}, {"name": "c", "low": None, "failed": 0}]
+    assert list(csv.DictReader(csv_table(rows).splitlines())) == [
+        {"name": 'a,"b"', "low": "0.1", "failed": ""},
+        {"name": "c", "low": "", "failed": "0"},
+    ]
+    assert csv_table([]) == ""
+
+
+def test_a_cell_without_a_value_is_a_dash_and_a_column_of_them_is_left_out():
+    rows = [{"age": 1.5, "a": 1}, {"age": None, "a": 2, "b": {"p": 0.25}}]
+    columns = {"age": "{age:.0f} ms", "a, b": "{a}/{b[p]:.1g}", "late": "{late:.0%}"}
+    assert cells(rows, columns) == [("age", "a, b"), ("2 ms", "-"), ("-", "2/0.2")]
