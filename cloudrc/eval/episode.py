@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from functools import cache
 from hashlib import sha256
 from math import isfinite
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.eval.environment import environment_code
 from cloudrc.eval.setup import (
+    BARE,
     FILE,
     MEASURED,
     SEED,
@@ -49,9 +51,9 @@ class Played(NamedTuple):
 
     total: float  # sum of the rewards [1]
     steps: int
+    ended: str  # "terminated" or "truncated" by the environment, or "limit": by the longest episode
     success: bool | None  # None: the environment does not tell
     stale: int  # steps in which the robot had no action of an answer
-    ended: str  # "terminated", "truncated", or "limit": by the number of steps
     jumps: list[float]  # change of the action from one answer to the next, at each change [1]
     loop: dict[str, Any]  # summary of the loop
     records_sha256: str
@@ -117,8 +119,11 @@ def _flag_of(given: Any, name: str) -> bool:
 
 def play(episode: Episode, setup: EvalSetup, identity: Mapping[str, Any]) -> dict[str, Any]:
     """Play an episode; return its row. Raise a CloudrcError if policy or environment fail."""
+    played = episode
+    if episode.is_baseline:
+        setup, played = replace(setup, **BARE), replace(episode, executor="newest")
     with make_env(setup, episode.seed) as env, asking(setup) as ask:
-        found = _play(episode, setup, env, ask)
+        found = _play(played, setup, env, ask)
     up, down = found.loop["uplink"], found.loop["downlink"]
     numbers = {
         "return": found.total,
@@ -140,9 +145,9 @@ def play(episode: Episode, setup: EvalSetup, identity: Mapping[str, Any]) -> dic
         "point": episode.point,
         "seed": episode.seed,
         "verdict": judged[found.success],
-        "ended": found.ended,
         "failures": [],
         "text": "",
+        "ended": found.ended,
         "numbers": {k: v for k, v in numbers.items() if v is not None and isfinite(v)},
         "records_sha256": found.records_sha256 if setup.is_repeatable else "",
         "code": code_hash(),
@@ -292,7 +297,7 @@ def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask:
     if setup.success_at is not None:
         success = not exceeds(setup.success_at, total)
     loop, played = world.summary(setup.deadline), witness.digest.hexdigest()
-    return Played(total, steps, success, stale, ended, jumps, loop, played)
+    return Played(total, steps, ended, success, stale, jumps, loop, played)
 
 
 def _connect(

@@ -31,6 +31,10 @@ Compute: TypeAlias = float | tuple[float, float] | tuple[str, str]
 FILE, MEASURED = "file", "measured"
 SEED = "{seed}"
 """Value of an environment's argument that stands for the seed of the episode."""
+BASELINE = "no network"
+"""Executor of the episodes without a network: the policy answers each observation in its step."""
+BARE: dict[str, Any] = {"link": "ideal", "compute": 0.0, "observation_bytes": None}
+"""What these episodes have in place of the values of the setup."""
 COMPUTE_MAX = 3600.0
 """Largest time for an answer [s]."""
 
@@ -53,9 +57,9 @@ class EvalSetup:
     max_steps: int = 10_000  # longest episode
     observation_bytes: int | None = None  # of an observation on the wire; None: that of its arrays
     answer_within: float | None = None  # how long the robot waits in a step [s]; None: 5 % of it
-    deadline: float | None = None  # age of an action from which on it is late [s]
     follows_seed: bool = True  # whether equal seeds give equal episodes
     env_code: str = ""  # hash of the environment's code and files
+    deadline: float | None = None  # an action of an older observation is late [s]
 
     @property
     def is_remote(self) -> bool:
@@ -96,8 +100,15 @@ class Episode:
         """The condition without its seed."""
         return {"rtt_ms": self.rtt_ms, "executor": self.executor}
 
+    @property
+    def is_baseline(self) -> bool:
+        """Whether the episode has no network."""
+        return self.executor == BASELINE
+
     def key(self, identity: Mapping[str, Any]) -> str:
         """Return the name of the row: equal keys mean equal episodes."""
+        if self.is_baseline:
+            identity = {**identity, **BARE}
         own = reuse(("executor", self.executor), self._executor_code)
         text = json.dumps([identity, self.point, own, self.seed], sort_keys=True, default=str)
         return sha256(text.encode()).hexdigest()[:16]
@@ -105,7 +116,7 @@ class Episode:
     def _executor_code(self) -> str:
         if is_path(self.executor):
             return hash_of(sources(Path(self.executor)))
-        return plugin_code("executors", self.executor)
+        return plugin_code("executors", "newest" if self.is_baseline else self.executor)
 
 
 def hash_of(files: list[Path]) -> str:
