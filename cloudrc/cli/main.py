@@ -60,7 +60,7 @@ def _dispatch(given: Sequence[str]) -> int:
     if not given:
         parser.print_help()
         return 0
-    options = parser.parse_args(given)
+    options = parser.parse_args(given, argparse.Namespace(given=given))
     if name is None:
         raise BadInputError("a command is missing; see 'cloudrc --help'")
     form = getattr(options, "output", TABLE)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
@@ -118,16 +118,10 @@ def environment_document(
     unknown. `code` is a hash of the sources that have flown; None if this is unknown. `files` are
     the hashes of the user's files, by key.
     """
-    packages = {}
-    for name in PACKAGES:
-        try:
-            packages[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
     return {
         "schemaVersion": SCHEMA_VERSION,
         "python": platform.python_version(),
-        "packages": packages,
+        "packages": versions(PACKAGES),
         "system": f"{platform.system()} {platform.release()}",
         "architecture": platform.machine(),
         "processor": _processor(),
@@ -136,6 +130,15 @@ def environment_document(
         **({"physics_steps": physics_steps} if physics_steps else {}),
         **({FILES: dict(files)} if files else {}),
     }
+
+
+def versions(names: Iterable[str]) -> dict[str, str]:
+    """Return the versions of packages; leave out those that are not installed."""
+    found = dict[str, str]()
+    for name in names:
+        with suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
 
 
 def _processor() -> str:
