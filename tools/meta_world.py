@@ -56,9 +56,8 @@ def evaluate(task: str, seeds: int) -> list[Outcome]:
 
 def point(outcome: Outcome) -> Point:
     """Return the share of successes [%], with its 95 % interval."""
-    low, high = outcome["success_interval"]
-    share = outcome["successes"] / outcome["episodes"]
-    return Point(outcome["rtt_ms"], 100 * share, 100 * low, 100 * high, failed=False)
+    share, low, high = (100 * outcome[f"success{end}"] for end in ("", "_low", "_high"))
+    return Point(outcome["rtt_ms"], share, low, high, failed=False)
 
 
 def table(found: dict[str, list[Outcome]], seeds: int) -> str:
@@ -73,9 +72,10 @@ def table(found: dict[str, list[Outcome]], seeds: int) -> str:
     for row in zip(*found.values(), strict=True):
         cells = []
         for each in row:
-            low, high = (100 * end for end in each["success_interval"])
+            low, high = (100 * each[f"success_{end}"] for end in ("low", "high"))
             cells.append(f"{each['successes']} ({low:.0f}-{high:.0f} %)")
-        lines.append(f"| {row[0]['rtt_ms']:g} | {' | '.join(cells)} |")
+        rtt = row[0]["rtt_ms"]
+        lines.append(f"| {'no network' if rtt is None else rtt} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
@@ -89,7 +89,7 @@ def main() -> None:
     print(made)
     if seeds < SEEDS:
         return
-    lines = {task: [point(each) for each in outcomes] for task, outcomes in found.items()}
+    lines = {task: [point(each) for each in outcomes[1:]] for task, outcomes in found.items()}
     panels = [Panel("success", "%", lines)]
     FIGURE.write_bytes(draw(panels, "round trip_ms", [], "task", look=Look(width=5.0))["png"])
     before, _, rest = PAGE.read_text().partition(BEGIN)

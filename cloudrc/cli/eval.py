@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.output import output_argument, print_line, print_or_drop, print_result
+from cloudrc.cli.output import (
+    TABLES,
+    output_argument,
+    print_line,
+    print_or_drop,
+    print_result,
+)
 from cloudrc.cli.parser import COUNT_MAX, number, read_count
 from cloudrc.errors import BadInputError
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.lock import lock_folder
 from cloudrc.runs.requirements import require
-from cloudrc.text import escape
+from cloudrc.text import cells, csv_table, escape, latex_table
 
 if TYPE_CHECKING:
+    from cloudrc.eval.evidence import Row
     from cloudrc.eval.setup import Episode, EvalSetup
 
 EPILOG = """\
@@ -63,13 +71,17 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--dt", type=number(1e-6, 3600, "seconds"), metavar="S", help=about)
     about = "longest episode in steps (default: 10000)"
     add("--max-steps", type=read_count, default=10_000, metavar="N", help=about)
+    about = "largest age of an observation behind an action, in s; older: late"
+    add("--deadline", type=number(1e-6, 3600, "seconds"), metavar="S", help=about)
     about = "size of an observation on the wire (default: that of its arrays)"
     add("--observation-bytes", type=_bytes, metavar="N", help=about)
     about = "parallel processes for a policy in a file (default: one per core)"
     add("--jobs", type=read_count, default=COUNT_MAX, metavar="N", help=about)
     about = "folder (default: a new one in runs/); if it has rows, play the others"
     add("--out", type=Path, metavar="DIR", help=about)
-    output_argument(parser)
+    about = "folder of another policy's evaluation, to compare with in pairs"
+    add("--versus", type=Path, metavar="DIR", help=about)
+    output_argument(parser, forms=TABLES)
 
 
 def _bytes(text: str) -> int:
@@ -78,7 +90,7 @@ def _bytes(text: str) -> int:
 
 def _round_trips(text: str) -> tuple[float, ...]:
     read = number(0, 60_000, "ms")
-    return tuple(dict.fromkeys(read(each.strip()) for each in text.split(",")))
+    return tuple(sorted({read(each.strip()) for each in text.split(",")}))
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -89,8 +101,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.cli.progress import CountView, StepView
     from cloudrc.eval import results
     from cloudrc.eval.episode import check_environment, follows_seed
-    from cloudrc.eval.page import write_page
-    from cloudrc.eval.setup import slow_answers
+    from cloudrc.eval.setup import BASELINE, Episode, slow_answers
 
     setup, episodes = _read(options)
     folder = options.out
@@ -107,6 +118,8 @@ def execute(options: argparse.Namespace) -> int:
     setup = replace(setup, follows_seed=seeded, env_code=checked.code)
     if not seeded:
         print_line(f"cloudrc: warning: --env {setup.env}: {results.SEEDLESS}", sys.stderr)
+    episodes = [*(Episode(None, BASELINE, n + 1) for n in range(options.seeds)), *episodes]
+    before = results.read_versus(options.versus, setup, episodes) if options.versus else []
     if not goes_on:
         folder = new_folder(folder, f"eval-{Path(setup.env).name}", "latest-eval")
     stream = sys.stdout if options.output == "table" else sys.stderr
@@ -123,13 +136,28 @@ def execute(options: argparse.Namespace) -> int:
         if stopped:
             print_line(f"cloudrc: {stopped}; to continue, add --out {folder}", sys.stderr)
             return stopped.exit_code
-        outcomes = results.summarize(rows)
-        document = results.write(folder, setup, outcomes)
-        page = write_page(folder, setup, outcomes)
-    told = results.describe_success(setup, outcomes)
-    text = f"{results.as_text(outcomes)}\n\nsuccess: {told}\n{escape(str(page))}"
-    print_result(options.output, document, text)
+        document, page = _report(options, setup, folder, rows, before)
+    rows = document["outcomes"]
+    tables = {"csv": csv_table(rows), "latex": latex_table(cells(rows, results.COLUMNS))}
+    text = f"{results.as_text(document)}\n{escape(str(page))}"
+    print_result(options.output, document, text, **tables)
     return 0
+
+
+def _report(
+    options: argparse.Namespace, setup: EvalSetup, folder: Path, rows: list[Row], before: list[Row]
+) -> tuple[dict[str, Any], Path]:
+    """Judge the rows; write and return the file of the evaluation, and the path of its page."""
+    from cloudrc.eval import results
+    from cloudrc.eval.evidence import judge
+    from cloudrc.eval.page import write_page
+    from cloudrc.eval.provenance import provenance
+
+    found = judge(rows, before, str(options.versus or ""))
+    found["success"] = results.describe_success(setup, found["outcomes"])
+    found |= provenance(setup, shlex.join(["cloudrc", *options.given]))
+    document = results.write(folder, setup, found)
+    return document, write_page(folder, setup, document)
 
 
 def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
@@ -158,6 +186,7 @@ def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
         options.max_steps,
         options.observation_bytes,
         options.answer_within,
+        deadline=options.deadline,
     )
     check_setup(setup)
     for text in heavy_shares(setup):

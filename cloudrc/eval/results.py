@@ -7,20 +7,20 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 
 from cloudrc.config.reuse import reuse_results
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.eval.episode import play
+from cloudrc.eval.evidence import Row
 from cloudrc.eval.setup import Episode, EvalSetup
 from cloudrc.files import read, write_atomically
 from cloudrc.rounding import format_limit
 from cloudrc.runs.store import append_rows, read_rows
 from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.source import code_hash
-from cloudrc.statistics import exact_interval, median_interval
-from cloudrc.text import format_number, table
+from cloudrc.statistics import LEVEL
+from cloudrc.text import cells, table
 
 FILE = "eval.json"
 """File in the folder of an evaluation: what it plays, and the summary of its rows."""
@@ -29,31 +29,42 @@ SEEDLESS = (
     "if it takes a seed, add --env-arg 'seed={seed}'"
 )
 """Warning about an environment that does not follow the seed of its reset."""
-AVERAGED = {
-    "stale_share": "steps without a new action",
-    "observation_age": "age of the observation",
-    "action_age": "age of the action's observation",
-    "seam_jump": "jump between answers",
-    "delay_measured_uplink": "delay up",
-    "delay_measured_downlink": "delay down",
-    "loss_uplink": "loss up",
-    "loss_downlink": "loss down",
+PAIRED = ("env", "env_args", "env_code", "link", "success_at", "dt", "max_steps", "code")
+"""What two evaluations must share for a comparison of their policies."""
+LEGEND = (
+    "loop: time from an observation to its action; ended: terminated/truncated/by --max-steps; "
+    "held: steps without a\nnew action; age: of the observation behind an action, in so many steps"
+)
+COLUMNS = {
+    "round trip": "{rtt_ms:g} ms",
+    "loop": "{loop_age_ms:.0f} ms",
+    "executor": "{executor}",
+    "return": "{return:.5g}",
+    "95 %": "{return_low:.5g} .. {return_high:.5g}",
+    "success": "{successes}/{episodes}",
+    "95 % ": "{success_low:.0%} .. {success_high:.0%}",
+    "steps": "{steps:g}",
+    "ended": "{terminated}/{truncated}/{limit}",
+    "held": "{stale_share:.1%}",
+    "age": "{action_age_ms:.0f} ms",
+    "p99": "{action_age_p99_ms:.0f} ms",
+    "late": "{late_share:.1%}",
+    "of steps": "{action_age_of:.0f}",
 }
-"""Number of a row whose mean a summary has -> what it is."""
-Row = dict[str, Any]
-
-
-class EvalOutcome(NamedTuple):
-    """The episodes of one condition, summarised."""
-
-    rtt_ms: float | None  # mean round trip [ms]; None: that of the profile
-    executor: str
-    episodes: int
-    successes: int | None  # None: nothing tells what a success is
-    success_interval: tuple[float, float] | None  # 95 %, Clopper and Pearson [1]
-    total: float  # median of the returns [1]
-    total_interval: tuple[float, float] | None  # 95 % interval of the median [1]
-    means: dict[str, float]  # number -> mean over the episodes
+"""Head -> cell of the table of outcomes."""
+TESTS = {
+    "round trip": "{rtt_ms:g} ms",
+    "A": "{a}",
+    "B": "{b}",
+    "A only": "{success[only_a]}",
+    "B only": "{success[only_b]}",
+    "p": "{success[p_mcnemar]:.2g}",
+    "p Holm": "{success[p_holm]:.2g}",
+    "return B - A": "{return[difference]:.4g}",
+    "p ": "{return[p_wilcoxon]:.2g}",
+    "p Holm ": "{return[p_holm]:.2g}",
+}
+"""Head -> cell of the table of tests."""
 
 
 def is_begun(folder: Path) -> bool:
@@ -67,20 +78,27 @@ def refuse_other(folder: Path, setup: EvalSetup) -> None:
     A policy is another one if its file has another place: of a file that has changed, the episodes
     are missing.
     """
-    try:
-        had = json.loads(read(folder / FILE))
-        words = [had["env"], *(f"{key}={value}" for key, value in had["env_args"].items())]
-        same = had["env_args"] == json.loads(json.dumps(dict(setup.env_args)))
-        same = same and had["env"] == setup.env and _place(had["policy"]) == _place(setup.policy)
-    except (KeyError, TypeError, ValueError, AttributeError):
-        raise BadInputError(
-            f"--out {folder}: its {FILE} is of no evaluation; name a new folder"
-        ) from None
+    had = _read(folder, "--out")
+    words = [had["env"], *(f"{key}={value}" for key, value in had["env_args"].items())]
+    same = had["env_args"] == json.loads(json.dumps(dict(setup.env_args)))
+    same = same and had["env"] == setup.env and _place(had["policy"]) == _place(setup.policy)
     if not same:
         raise BadInputError(
             f"--out {folder}: has the episodes of {' '.join(words)} with {had['policy']}; name a "
             "new folder"
         )
+
+
+def _read(folder: Path, flag: str) -> dict[str, Any]:
+    """Return the content of the file of an evaluation."""
+    try:
+        found: dict[str, Any] = json.loads(read(folder / FILE))
+        found["env_args"].items(), found["identity"].items()
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise BadInputError(
+            f"{flag} {folder}: its {FILE} is of no evaluation; name a new folder"
+        ) from None
+    return found
 
 
 def _place(policy: str) -> str:
@@ -109,7 +127,7 @@ def play_missing(
             f"{folder}: has episodes of code {other.pop()}, this is code {code_hash()}; name a new "
             "folder with --out"
         )
-    write(folder, setup, [])
+    write(folder, setup, {})
     with reuse_results():  # the code of an executor is that of all its episodes
         keys = [each.key(identity) for each in episodes]
     missing = [each for each, key in zip(episodes, keys, strict=True) if key not in rows]
@@ -131,8 +149,8 @@ def play_missing(
     return [rows[key] for key in keys if key in rows], stopped
 
 
-def write(folder: Path, setup: EvalSetup, outcomes: Sequence[EvalOutcome]) -> dict[str, Any]:
-    """Write the file of an evaluation, and return its content."""
+def write(folder: Path, setup: EvalSetup, found: Mapping[str, Any]) -> dict[str, Any]:
+    """Write the file of an evaluation with what was `found`, and return its content."""
     document = {
         "schemaVersion": 1,
         "env": setup.env,
@@ -141,77 +159,52 @@ def write(folder: Path, setup: EvalSetup, outcomes: Sequence[EvalOutcome]) -> di
         "link": setup.link,
         "compute": setup.compute,
         "repeatable": setup.is_repeatable,
-        "success": describe_success(setup, outcomes),
         "code": code_hash(),
-        "outcomes": [each._asdict() for each in outcomes],
+        "identity": setup.identity(),
+        **found,
     }
     write_atomically(folder / FILE, f"{json.dumps(document, indent=2)}\n".encode())
     return document
 
 
-def summarize(rows: Sequence[Row]) -> list[EvalOutcome]:
-    """Summarise rows, one outcome per condition, in the order in which they first occur."""
-    found = dict[tuple[float | None, str], list[Row]]()
-    for row in rows:
-        found.setdefault((row["point"]["rtt_ms"], row["point"]["executor"]), []).append(row)
-    return [_outcome(*point, some) for point, some in found.items()]
+def read_versus(folder: Path, setup: EvalSetup, episodes: Sequence[Episode]) -> list[Row]:
+    """Return the rows of the same episodes in the folder of another policy's evaluation.
+
+    Raise a BadInputError if more differs than the policy and its time for an answer.
+    """
+    had = _read(folder, "--versus")
+    before = {**had["identity"], "code": had["code"]}
+    now = {**json.loads(json.dumps(setup.identity())), "code": code_hash()}
+    if other := [name for name in PAIRED if before.get(name) != now[name]]:
+        raise BadInputError(f"--versus {folder}: differs in {', '.join(other)}; evaluate it again")
+    rows = read_rows(folder)
+    return [rows[key] for each in episodes if (key := each.key(had["identity"])) in rows]
 
 
-def _outcome(rtt_ms: float | None, executor: str, rows: Sequence[Row]) -> EvalOutcome:
-    numbers: list[Mapping[str, float]] = [row["numbers"] for row in rows]
-    known = [each["success"] for each in numbers if "success" in each]
-    successes = int(sum(known)) if len(known) == len(rows) else None
-    totals, means = [each["return"] for each in numbers], dict[str, float]()
-    for name in AVERAGED:
-        if values := [each[name] for each in numbers if name in each]:
-            means[name] = sum(values) / len(values)
-    return EvalOutcome(
-        rtt_ms,
-        executor,
-        len(rows),
-        successes,
-        None if successes is None else exact_interval(successes, len(rows)),
-        median(totals),
-        median_interval(totals),
-        means,
-    )
-
-
-def describe_success(setup: EvalSetup, outcomes: Sequence[EvalOutcome]) -> str:
+def describe_success(setup: EvalSetup, outcomes: Sequence[Mapping[str, Any]]) -> str:
     """Say in words what counts as a success."""
     if setup.success_at is not None:
         return f"a return of at least {format_limit(setup.success_at)}"
-    if outcomes and any(each.successes is None for each in outcomes):
+    if any("successes" not in each for each in outcomes):
         return "unknown: the environment's info has no success; the return is measured"
     return "the environment's info says success in some step"
 
 
-def cells(outcomes: Sequence[EvalOutcome]) -> list[tuple[str, ...]]:
-    """Return the table of outcomes as text, with its head."""
-    head = ("round trip", "executor", "success", "95 %", "return", "95 %")
-    rows: list[tuple[str, ...]] = [(*head, "no new action", "observation age", "jump")]
-    for each in outcomes:
-        rate, interval = "-", "-"
-        if each.successes is not None and each.success_interval is not None:
-            rate = f"{each.successes}/{each.episodes}"
-            interval = "{:.0f}-{:.0f} %".format(*(100 * end for end in each.success_interval))
-        ends = each.total_interval
-        rows.append(
-            (
-                "profile's" if each.rtt_ms is None else f"{each.rtt_ms:g} ms",
-                each.executor,
-                rate,
-                interval,
-                format_number(each.total),
-                f"{format_number(ends[0])} .. {format_number(ends[1])}" if ends else "-",
-                f"{100 * each.means['stale_share']:.1f} %",
-                f"{1e3 * each.means['observation_age']:.0f} ms",
-                format_number(each.means["seam_jump"]) if "seam_jump" in each.means else "-",
-            )
-        )
-    return rows
+def as_text(document: Mapping[str, Any]) -> str:
+    """Return the content of the file for people.
 
-
-def as_text(outcomes: Sequence[EvalOutcome]) -> str:
-    """Return the table of outcomes for people."""
-    return table(cells(outcomes), right=(2, 4, 6, 7, 8))
+    Of the tests, only those that decide by Holm's p are shown, unless another policy was named.
+    """
+    columns, outcomes = dict(COLUMNS), document["outcomes"]
+    if "success" in outcomes[0]:
+        del columns["95 %"]  # to keep the lines short
+    decided = [
+        each
+        for each in document["tests"]
+        if document["versus"]
+        or any(each[name]["p_holm"] < LEVEL for name in ("return", "success") if name in each)
+    ]
+    tables = [cells(outcomes, columns), *([cells(decided, TESTS)] if decided else [])]
+    shown, *more = (table(each, right=range(len(each[0]))) for each in tables)
+    success = f"success: {document['success']}"
+    return "\n".join([shown, "", LEGEND, success, "", *more, *document["notes"]])

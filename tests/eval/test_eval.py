@@ -569,11 +569,15 @@ def test_an_evaluation_has_a_table_a_page_and_rows_and_continues(law, tmp_path, 
     rows = (tmp_path / "e" / "rows.jsonl").read_text().splitlines()
     assert run(*words, "--seeds", 3, "-o", "json") == 0
     more = (tmp_path / "e" / "rows.jsonl").read_text().splitlines()
-    assert (len(rows), len(more), more[:4]) == (4, 6, rows)
+    assert (len(rows), len(more), more[:6]) == (6, 9, rows)
     document = json.loads(capsys.readouterr().out.partition("\n{")[2].join("{}")[:-1])
-    near, far = document["outcomes"]
+    bare, near, far = document["outcomes"]
     assert (near["successes"], near["episodes"], far["successes"]) == (3, 3, 0)
-    assert near["success_interval"] == [pytest.approx(0.292, abs=0.001), 1.0]
+    assert near["success_low"] == pytest.approx(0.292, abs=0.001)
+    assert (bare["executor"], bare["rtt_ms"], bare["success"]) == ("no network", None, 1.0)
+    assert (near["truncated"], far["terminated"], far["limit"]) == (3, 3, 0)
+    assert document["versions"]["gymnasium"] == gymnasium.__version__
+    assert document["command"].startswith("cloudrc eval --env CartPole-v1")
     page = (tmp_path / "e" / "report.html").read_text()
     assert "<svg" in page
     assert "3/3" in page
@@ -584,7 +588,7 @@ def test_rows_of_other_code_are_refused(law, tmp_path, capsys):
     words = ["--policy", law(), "--seeds", 1, "--out", tmp_path / "e"]
     assert run(*words) == 0
     path = tmp_path / "e" / "rows.jsonl"
-    row = json.loads(path.read_text())
+    row = json.loads(path.read_text().splitlines()[0])
     path.write_text(json.dumps({**row, "code": "0" * 16}) + "\n")
     assert run(*words) == 2
     assert "000" in capsys.readouterr().err

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import radians, sin
+from math import isfinite, nan, radians, sin
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,6 +40,7 @@ class Panel:
     title: str
     unit: str
     lines: Mapping[str, Sequence[Point]]
+    baseline: float = nan  # value without a network, a dashed line, any unit
 
 
 def draw(
@@ -95,6 +96,9 @@ def _draw_panel(axes: Axes, content: Panel, *, named: bool) -> None:
             axes.plot(x, middle, ls=dashes, label=name, **look)
         bad = failed > 0
         axes.plot(x[bad], middle[bad], ls="none", mfc="white", zorder=5, **look)
+    if isfinite(content.baseline):
+        look = {"color": style.GREY, "lw": 0.9, "zorder": 1}
+        axes.axhline(content.baseline, ls=(0, (5, 3)), label="no network", **look)
     axes.ticklabel_format(axis="y", useOffset=False)
     if content.unit == "%":
         axes.set_ylim(-5.0, 105.0)

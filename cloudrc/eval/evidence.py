@@ -1,0 +1,199 @@
+"""Judge the rows of an evaluation: what survives, what differs, and what only looks better.
+
+All rows have equal seeds. Those without a network come first, the others by rising round trip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations, pairwise
+from statistics import fmean, median
+from typing import Any, TypeAlias
+
+from cloudrc.eval.setup import BASELINE
+from cloudrc.runs.compare import Pair, adjust, compare_number, compare_success
+from cloudrc.statistics import LEVEL, by_chance, exact_interval, median_interval, tail
+
+Row: TypeAlias = dict[str, Any]
+Groups: TypeAlias = Mapping[str, Mapping[float | None, Sequence[Row]]]
+"""Executor -> round trip [ms] -> the rows of this condition."""
+WEIGHTS = {
+    "stale_share": "steps",
+    "observation_age": "observation_age_of",
+    "action_age": "action_age_of",
+    "late_share": "action_age_of",
+    **dict.fromkeys(("loop_age", "observation_age_p99", "action_age_p99", "seam_jump")),
+    **dict.fromkeys(("delay_measured_uplink", "delay_measured_downlink")),
+    **dict.fromkeys(("loss_uplink", "loss_downlink")),
+}
+"""Number of an episode whose mean a summary has -> steps that it is of; None: episodes count."""
+SURVIVES = (
+    "Survives up to N ms: with 95 % confidence, at each asked round trip up to N ms the policy "
+    "succeeds in more than half of the episodes in which it succeeds without a network. It takes "
+    "at least 5 of 5, 9 of 10, 15 of 20 or 59 of 100 of them. What is not shown may still hold."
+)
+NOTHING = (
+    "survival is unknown: no episode without a network is known to succeed; --success-at says "
+    "what a success is"
+)
+
+
+def group(rows: Sequence[Row]) -> Groups:
+    """Group rows by their condition, in the order in which the conditions first occur."""
+    found = dict[str, dict[float | None, list[Row]]]()
+    for row in rows:
+        at = found.setdefault(row["point"]["executor"], {})
+        at.setdefault(row["point"]["rtt_ms"], []).append(row)
+    return found
+
+
+def summarize(rtt_ms: float | None, executor: str, rows: Sequence[Row]) -> dict[str, Any]:
+    """Summarise a condition, of the mean round trip `rtt_ms` [ms], in plain values.
+
+    Medians and rates have their 95 % interval: `_low` and `_high`. Means of steps are pooled, and
+    `_of` is the number of steps. Ages and delays are in ms. What is not known is left out.
+    """
+    numbers: list[Mapping[str, float]] = [row["numbers"] for row in rows]
+    ends, count = [row["ended"] for row in rows], len(rows)
+    found: dict[str, Any] = {"rtt_ms": rtt_ms, "executor": executor, "episodes": count}
+    for name in ("return", "steps"):
+        values = [each[name] for each in numbers]
+        found |= _estimate(name, median(values), median_interval(values))
+    if all("success" in each for each in numbers):
+        found["successes"] = done = int(sum(each["success"] for each in numbers))
+        found |= _estimate("success", done / count, exact_interval(done, count))
+    found |= {end: ends.count(end) for end in ("terminated", "truncated", "limit")}
+    return {**found, "terminated_share": found["terminated"] / count, **dict(_means(numbers))}
+
+
+def _estimate(name: str, value: float, interval: tuple[float, float] | None) -> dict[str, float]:
+    return {name: value, **dict(zip((f"{name}_low", f"{name}_high"), interval or (), strict=False))}
+
+
+def _means(numbers: Sequence[Mapping[str, float]]) -> Iterator[tuple[str, float]]:
+    for name, weight in WEIGHTS.items():
+        known = [each for each in numbers if name in each]
+        weights = [each[weight] if weight else 1.0 for each in known]
+        if sum(weights):
+            mean = fmean([each[name] for each in known], weights)
+            yield (f"{name}_ms", 1e3 * mean) if "age" in name or "delay" in name else (name, mean)
+            if weight:
+                yield f"{name}_of", sum(weights)
+
+
+def survivals(groups: Groups) -> list[dict[str, Any]]:
+    """Find for each executor up to which round trip the policy survives, also in words.
+
+    From the smallest round trip on, an exact test asks of the seeds with a success without a
+    network whether more than half have a success over the network. The first round trip at which
+    this is not shown ends the sequence. So the probability that a claim is wrong for any of its
+    round trips is at most 5 %, without an adjustment.
+
+    Source: A. C. Tamhane, C. W. Dunnett, J. W. Green, J. D. Wetherington, "Multiple test procedures
+    for identifying the maximum safe dose", 2001.
+    """
+    base, found = _seeds(groups[BASELINE][None]), list[dict[str, Any]]()
+    for executor, conditions in groups.items():
+        each: dict[str, Any] = {"executor": executor, "of": len(base)}
+        text = f"{executor} survives no round trip that was asked"
+        for rtt, rows in conditions.items():
+            kept = len(base & _seeds(rows))
+            each |= {"tried_ms": rtt, "kept": kept, "p": tail(len(base) - kept, len(base))}
+            if each["p"] >= LEVEL:
+                text += f"; at {_place(rtt)} it keeps {kept} of {len(base)} successes"
+                break
+            each["up_to_ms"] = rtt
+            text = f"{executor} survives up to {_place(rtt)}"
+        found.append({**each, "text": text})
+    return found[1:]
+
+
+def _seeds(rows: Sequence[Row]) -> set[int]:
+    return {row["seed"] for row in rows if row["verdict"] == "success"}
+
+
+def _place(rtt_ms: float | None) -> str:
+    return "the profile's round trip" if rtt_ms is None else f"{rtt_ms:g} ms"
+
+
+def compare_conditions(groups: Groups, before: Groups, name: str) -> list[dict[str, Any]]:
+    """Test whether success and return differ between A and B, in pairs of equal seeds.
+
+    A and B are every two executors at the same round trip; and, for each condition, the rows
+    `before`, of an evaluation of this `name`, and those of `groups`. All tests are one family for
+    Holm's p.
+    """
+    sides = [
+        (f"{executor} of {name}", before.get(executor, {}), executor, groups[executor])
+        for executor in groups
+    ]
+    others = list(groups.items())[1:]
+    sides += [(*first, *second) for first, second in combinations(others, 2)]
+    found = [
+        {"rtt_ms": rtt, "a": a, "b": b, **_compare(first[rtt], second[rtt])}
+        for a, first, b, second in sides
+        for rtt in first
+        if rtt in second
+    ]
+    adjust([each[name] for each in found for name in ("success", "return") if name in each])
+    return found
+
+
+def _compare(first: Sequence[Row], second: Sequence[Row]) -> dict[str, Any]:
+    of_seed = {row["seed"]: row for row in first}
+    pairs = [Pair({}, of_seed[row["seed"]], row) for row in second if row["seed"] in of_seed]
+    found = {"return": compare_number(pairs, "return", "")}
+    if all("success" in row["numbers"] for row in (*first, *second)):
+        found["success"] = compare_success(pairs)
+    return found
+
+
+def judge(rows: Sequence[Row], before: Sequence[Row] = (), name: str = "") -> dict[str, Any]:
+    """Return summaries, survival and tests of rows, and notes on them.
+
+    The rows `before` are those of another policy, in the folder `name`.
+    """
+    groups = group(rows)
+    outcomes = [
+        summarize(rtt, executor, some)
+        for executor, at in groups.items()
+        for rtt, some in at.items()
+    ]
+    survival, tests = survivals(groups), compare_conditions(groups, group(before), name)
+    notes = [NOTHING]
+    if outcomes[0].get("successes"):
+        notes = [SURVIVES, *(each["text"] for each in survival)]
+    intervals = [key for each in outcomes for key in each if key.endswith("_low")]
+    count = len(intervals) + sum(len(each.keys() & {"success", "return"}) for each in tests)
+    notes += [*doubts(outcomes), by_chance(count)]
+    return {
+        "versus": name,
+        "outcomes": outcomes,
+        "survival": survival,
+        "tests": tests,
+        "notes": notes,
+    }
+
+
+def doubts(outcomes: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Say for which conditions the return is better in shorter episodes, without more successes.
+
+    A condition is compared with the next smaller round trip and with that without a network.
+    """
+    found = list[str]()
+    for before, each in pairwise(outcomes):
+        others = (outcomes[0], before if before["executor"] == each["executor"] else outcomes[0])
+        if any(_flatters(each, other) for other in others):
+            found.append(f"{each['executor']} at {_place(each['rtt_ms'])}")
+    if found:
+        yield (
+            "the return improves while the episodes get shorter, as if a crash ended the costs: "
+            f"{', '.join(found)}"
+        )
+
+
+def _flatters(each: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Return whether a condition only looks better than another one."""
+    succeeds = each.get("successes") and each["successes"] >= other.get("successes", 0)
+    is_shorter = each.get("steps_high", each["steps"]) < other["steps"]
+    return each["return"] > other["return"] and is_shorter and not succeeds

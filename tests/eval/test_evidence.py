@@ -1,0 +1,160 @@
+"""What rows of an evaluation tell: survival, tests, pooled means, and doubts."""
+
+from math import comb
+from statistics import fmean
+
+import pytest
+
+from cloudrc.eval.evidence import NOTHING, SURVIVES, group, judge, summarize, survivals
+from cloudrc.eval.setup import BASELINE
+
+
+def rows(executor, rtt_ms, outcomes, **numbers):
+    """Make a row per outcome: a truth value, or None if nobody knows the success."""
+    verdicts = {True: "success", False: "failure", None: "done"}
+    return [
+        {
+            "seed": seed,
+            "point": {"rtt_ms": rtt_ms, "executor": executor},
+            "verdict": verdicts[done],
+            "ended": "truncated" if done else "terminated",
+            "numbers": {
+                **{"return": 500.0 if done else 20.0, "steps": 500 if done else 20},
+                **({} if done is None else {"success": int(done)}),
+                **{key: value[seed - 1] for key, value in numbers.items()},
+            },
+        }
+        for seed, done in enumerate(outcomes, start=1)
+    ]
+
+
+def some(done, count=20):
+    return [n < done for n in range(count)]
+
+
+def flight(*kept, baseline=20):
+    """Return rows without a network, and a condition per entry of `kept`: 0, 10, 20, ... ms."""
+    return [
+        *rows(BASELINE, None, some(baseline)),
+        *(row for n, done in enumerate(kept) for row in rows("newest", 10.0 * n, some(done))),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kept", "up_to", "text"),
+    [
+        ((20, 15, 14, 20), 10.0, "survives up to 10 ms; at 20 ms it keeps 14 of 20 successes"),
+        ((20, 20), 10.0, "survives up to 10 ms"),
+        ((3, 20), None, "survives no round trip that was asked; at 0 ms it keeps 3 of 20 "),
+    ],
+)
+def test_a_policy_survives_the_round_trips_before_the_first_that_is_not_shown(kept, up_to, text):
+    """15 of 20 has a p of .0207, 14 of 20 one of .0577."""
+    (found,) = survivals(group(flight(*kept)))
+    assert found.get("up_to_ms") == up_to
+    assert found["text"].startswith(f"newest {text}")
+    few = 20 - found["kept"]
+    assert found["p"] == pytest.approx(sum(comb(20, n) for n in range(few + 1)) / 2**20)
+
+
+@pytest.mark.parametrize(("kept", "count"), [(5, 5), (9, 10), (15, 20), (59, 100)])
+def test_the_definition_names_the_fewest_successes_that_are_enough(kept, count):
+    assert f"{kept} of {count}" in SURVIVES
+    for done, is_enough in ((kept, True), (kept - 1, False)):
+        (found,) = survivals(
+            group(rows(BASELINE, None, [True] * count) + rows("newest", 0.0, some(done, count)))
+        )
+        assert ("up_to_ms" in found) is is_enough
+
+
+def test_successes_that_the_network_gives_do_not_make_up_for_lost_ones():
+    """Ten seeds succeed without a network; the network loses five of them and wins five others."""
+    world = [
+        *rows(BASELINE, None, some(10)),
+        *rows("newest", 0.0, [5 <= n < 15 for n in range(20)]),
+    ]
+    (found,) = survivals(group(world))
+    assert (found["of"], found["kept"], found.get("up_to_ms")) == (10, 5, None)
+
+
+@pytest.mark.parametrize("outcomes", [[False] * 20, [None] * 20])
+def test_without_a_success_without_a_network_nothing_is_said_to_survive(outcomes):
+    notes = judge([*rows(BASELINE, None, outcomes), *rows("newest", 0.0, outcomes)])["notes"]
+    assert notes[0] == NOTHING
+    assert not any("survives" in each for each in notes)
+
+
+def test_four_successes_are_too_few_to_show_anything():
+    found = judge(flight(4, baseline=4))
+    assert "survives no round trip" in found["survival"][0]["text"]
+
+
+def test_means_of_steps_are_those_of_all_steps_and_say_of_how_many():
+    """An episode of 400 steps counts a hundred times as much as one of 4."""
+    ages = {"action_age": (0.1, 0.2), "action_age_of": (400, 4), "action_age_p99": (0.3, 0.5)}
+    ages |= {"late_share": (0.0, 1.0), "loop_age": (0.1, 0.3), "observation_age_of": (0, 0)}
+    found = summarize(50.0, "newest", rows("newest", 50.0, [True, False], **ages))
+    assert found["action_age_ms"] == pytest.approx(1e3 * (400 * 0.1 + 4 * 0.2) / 404)
+    assert (found["action_age_of"], found["late_share"]) == (404, pytest.approx(4 / 404))
+    assert found["action_age_p99_ms"] == pytest.approx(1e3 * fmean((0.3, 0.5)))
+    assert found["loop_age_ms"] == pytest.approx(200.0)
+    assert "observation_age_ms" not in found
+    assert [found[end] for end in ("terminated", "truncated", "limit")] == [1, 1, 0]
+    assert (found["steps"], found["successes"], found["success"]) == (260, 1, 0.5)
+
+
+def test_executors_are_tested_in_pairs_of_equal_seeds():
+    world = flight(20)
+    world += rows("broker", 0.0, some(13))
+    (found,) = judge(world)["tests"]
+    success, change = found["success"], found["return"]
+    assert (found["rtt_ms"], found["a"], found["b"]) == (0.0, "newest", "broker")
+    assert (success["only_a"], success["only_b"]) == (7, 0)
+    assert success["p_mcnemar"] == change["p_wilcoxon"] == pytest.approx(2 / 2**7)
+    assert success["p_holm"] == change["p_holm"] == pytest.approx(4 / 2**7)
+    assert change["count"] == 20
+
+
+def test_another_policy_is_compared_in_each_condition_also_without_a_network():
+    before, now = flight(20, 5), flight(20, 20)[:-5]
+    found = judge(now, before, "runs/a")["tests"]
+    assert [(each["rtt_ms"], each["a"], each["b"]) for each in found] == [
+        (None, f"{BASELINE} of runs/a", BASELINE),
+        (0.0, "newest of runs/a", "newest"),
+        (10.0, "newest of runs/a", "newest"),
+    ]
+    last = found[-1]["success"]
+    assert (last["count"], last["only_a"], last["only_b"]) == (15, 0, 10)
+
+
+def crash(executor, rtt_ms, total, steps):
+    count = 20
+    values = {"return": [total - n for n in range(count)], "steps": [steps] * count}
+    return rows(executor, rtt_ms, [None] * count, **values)
+
+
+def test_a_better_return_of_shorter_episodes_is_told_with_its_condition():
+    """The robot crashes early at 300 ms, so that it has fewer negative rewards."""
+    world = crash(BASELINE, None, -20, 200)
+    world += crash("newest", 0.0, -22, 200) + crash("newest", 50.0, -53, 200)
+    world += crash("newest", 300.0, -48, 31) + crash("broker", 0.0, -21, 200)
+    (told,) = (each for each in judge(world)["notes"] if "return improves" in each)
+    assert told.endswith(": newest at 300 ms")
+
+
+@pytest.mark.parametrize(("total", "steps"), [(-19, 200), (-21, 100)])
+def test_a_better_return_or_shorter_episodes_alone_are_no_doubt(total, steps):
+    world = crash(BASELINE, None, -20, 200) + crash("newest", 0.0, total, steps)
+    assert not any("return improves" in each for each in judge(world)["notes"])
+
+
+def test_a_task_that_is_done_sooner_is_no_doubt():
+    world = rows(BASELINE, None, some(20)) + rows("newest", 0.0, some(20))
+    for row in world[20:]:
+        row["numbers"] |= {"return": 600.0, "steps": 100}
+    assert not any("return improves" in each for each in judge(world)["notes"])
+
+
+def test_the_notes_say_how_many_tests_and_intervals_are_wrong_by_chance():
+    """Three intervals of each of two conditions: success, return and steps."""
+    assert "6 tests and intervals at 95 %: about 0.3 " in judge(flight(20))["notes"][-1]

@@ -1,0 +1,115 @@
+"""What `cloudrc eval` keeps and prints beside success and return."""
+
+import json
+
+import pytest
+
+from cloudrc.eval.episode import play
+from cloudrc.eval.page import draw_outcomes
+from cloudrc.eval.setup import BASELINE, Episode, EvalSetup
+from tests.eval.test_eval import LAW, bare, run, stand
+
+
+@pytest.fixture
+def law(tmp_path):
+    (tmp_path / "law.py").write_text(LAW)
+    return str(tmp_path / "law.py")
+
+
+def test_the_episodes_without_a_network_are_the_policys_own_whatever_link_and_time(law):
+    setup = EvalSetup("CartPole-v1", law, link="lossy", compute=0.3, observation_bytes=90)
+    row = play(Episode(None, BASELINE, 3), setup, {})
+    assert (row["numbers"]["return"], row["records_sha256"]) == bare("CartPole-v1", stand, 3)
+    assert row["point"] == {"rtt_ms": None, "executor": BASELINE}
+    other = EvalSetup("CartPole-v1", setup.policy)
+    for each, kept in ((Episode(None, BASELINE, 3), True), (Episode(None, "newest", 3), False)):
+        assert (each.key(setup.identity()) == each.key(other.identity())) is kept
+
+
+def test_a_limit_for_the_age_makes_other_rows(law):
+    keys = {
+        Episode(0.0, "newest", 1).key(EvalSetup("x", law, deadline=limit).identity())
+        for limit in (None, 0.1, 0.2)
+    }
+    assert len(keys) == 3
+
+
+def test_the_row_says_how_the_episode_ended(law):
+    fell, stood, cut = (
+        play(Episode(rtt, "newest", 1), EvalSetup("CartPole-v1", law, max_steps=most), {})
+        for rtt, most in ((300.0, 600), (0.0, 600), (0.0, 7))
+    )
+    assert [row["ended"] for row in (fell, stood, cut)] == ["terminated", "truncated", "limit"]
+
+
+@pytest.mark.parametrize(
+    ("form", "start"),
+    [("csv", "rtt_ms,executor,episodes,return,steps,"), ("latex", "\\begin{tabular}{lrrr")],
+)
+def test_the_table_is_also_one_of_csv_or_latex_alone(law, tmp_path, capsys, form, start):
+    assert run("--policy", law, "--seeds", 1, "--out", tmp_path / "e", "-o", form) == 0
+    out = capsys.readouterr().out
+    assert out.startswith(start)
+    assert "no network" in out
+
+
+def test_two_policies_are_compared_in_pairs_and_other_conditions_are_refused(law, tmp_path, capsys):
+    words = ["--seeds", 6, "--rtt", 0, "--success-at", 500]
+    (tmp_path / "left.py").write_text("def infer(o):\n    return {'actions': [[0]]}\n")
+    assert run("--policy", tmp_path / "left.py", "--out", tmp_path / "a", *words) == 0
+    versus = ["--policy", law, "--versus", tmp_path / "a"]
+    assert run(*versus, "--out", tmp_path / "b", *words) == 0
+    document = json.loads((tmp_path / "b" / "eval.json").read_text())
+    _, test = document["tests"]
+    assert (test["b"], test["success"]["only_b"]) == ("newest", 6)
+    assert test["a"] == f"newest of {tmp_path}/a"
+    assert test["success"]["p_holm"] == pytest.approx(4 * 2 / 2**6)
+    assert str(tmp_path / "a") in capsys.readouterr().out
+    assert run(*versus, "--out", tmp_path / "c", *words, "--link", "lte") == 2
+    assert "a: differs in link; " in capsys.readouterr().err
+    assert not (tmp_path / "c").exists()
+
+
+def test_the_page_has_figure_tests_notes_and_how_it_was_made(law, tmp_path, capsys):
+    out, words = (
+        tmp_path / "e",
+        ["--policy", law, "--seeds", 2, "--rtt", "200,0", "--deadline", 0.1],
+    )
+    assert run(*words, "--out", out, "--executor", "newest,time-indexed") == 0
+    document, page = (
+        json.loads((out / "eval.json").read_text()),
+        (out / "report.html").read_text(),
+    )
+    for text in (
+        "no network",
+        "<svg",
+        "0/2/0",
+        document["cite"][:20],
+        document["command"],
+        "rate_kbit",
+    ):
+        assert text in page
+    assert [each["rtt_ms"] for each in document["tests"]] == [0.0, 200.0]
+    assert [each["rtt_ms"] for each in document["outcomes"]] == [None, *[0.0, 200.0] * 2]
+
+
+def test_the_figure_has_the_baseline_in_each_panel_and_the_age_of_the_loop_along_x(monkeypatch):
+    kept = []
+    monkeypatch.setattr("cloudrc.report.figures.bands.save", lambda figure, _: kept.append(figure))
+    common = {"return": 1.0, "steps": 9.0, "stale_share": 0.5, "terminated_share": 0.0}
+    conditions = {BASELINE: (None, 0.0), "newest": (50.0, 71.0), "broker": (50.0, 90.0)}
+    draw_outcomes(
+        [
+            {"executor": name, "rtt_ms": rtt, "loop_age_ms": age, "action_age_ms": age, **common}
+            for name, (rtt, age) in conditions.items()
+        ]
+    )
+    assert kept[0].axes[-1].get_xlabel() == "age of the loop (ms)"
+    assert [axes.get_title("left") for axes in kept[0].axes][:2] == [
+        "(a) return",
+        "(b) length of an episode (steps)",
+    ]
+    for axes, value in zip(kept[0].axes, (1.0, 9.0, 0.0, 50.0, 0.0), strict=True):
+        lines = {line.get_label(): line for line in axes.get_lines()}
+        assert set(lines["no network"].get_ydata()) == {value}
+        assert list(lines["broker"].get_xdata()) == [90.0]
