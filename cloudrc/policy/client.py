@@ -9,7 +9,8 @@ from typing import Any, NoReturn
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
 from websockets.frames import CloseCode
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
 
 from cloudrc.errors import BadInputError, CloudrcError, describe_error, to_one_line
 from cloudrc.policy.address import KEY_VARIABLE, check_url
@@ -69,7 +70,7 @@ class PolicyClient:
         except ValueError as error:
             raise BadInputError(str(error)) from None
         self._limit, self._answer_limit = start_limit, answer_limit
-        self._connection: ClientConnection | None = self._connect(key, patience)
+        self._connection: Connection | None = self._connect(key, patience)
         self.metadata = self._receive("metadata")
 
     def __enter__(self) -> PolicyClient:
@@ -120,7 +121,7 @@ class PolicyClient:
         if connection is not None:
             connection.close()
 
-    def _connect(self, key: str, patience: float) -> ClientConnection:
+    def _connect(self, key: str, patience: float) -> Connection:
         headers = {"Authorization": f"Api-Key {key}"} if key else None
         deadline = time.monotonic() + patience
         while True:
@@ -134,7 +135,7 @@ class PolicyClient:
                     close_timeout=CLOSE_LIMIT,
                     ping_interval=None,  # a server that computes answers no ping
                     proxy=None,
-                )
+                ).__enter__()  # else version 17 warns; `close` does what `__exit__` would
             except ConnectionError as error:
                 if time.monotonic() >= deadline:
                     text = f"{self.url}: nobody listens there ({error.strerror or error})"

@@ -81,7 +81,7 @@ def test_health_is_answered_without_a_key_and_a_policy_with_it_only(policy):
 
 def test_a_page_in_a_browser_does_not_reach_a_policy(policy):
     with serving(policy()) as url, pytest.raises(InvalidStatus, match="403"):
-        connect(url, origin="https://example.org").close()
+        connect(url, origin="https://example.org").__enter__()
 
 
 FAILING = """
