@@ -37,10 +37,10 @@ def read_setpoints(path: Path, fence: Fence) -> tuple[TimedPosition, ...]:
     """
     name, fits = f"setpoints {path}", COLUMNS if fence.ground is None else COLUMNS[:3]
     lines = read_lines(path, name, f"give a CSV file: {','.join(fits)}")
-    columns, rows = read_rows(lines, name)
+    columns, rows = read_rows(lines, name, f"the first line must be {','.join(fits)}")
     if columns not in (COLUMNS, fits):
         given = ",".join(columns)[:80] or "missing"
-        raise BadInputError(f"{name}, line 1: the columns are {given}; give {','.join(fits)}")
+        raise BadInputError(f"{name}: the columns are {given}; give {','.join(fits)}")
     with telling_rows(path, lines):
         table = read_columns(lines, name)
         found = None if table is None else _take_all(table, fence)

@@ -36,6 +36,12 @@ from cloudrc.text import parse_number
 SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a second
 START_MAX = 600.0  # if the first row is later, times count from the first row [s]
 LATEST = 1e11  # largest plausible time since 1970 [s]; a larger time has another unit
+NO_HEADER = (
+    "the first line must be time_s,delay_ms; a rate trace of mahimahi has no delays, use "
+    "rate_kbit; of delays [ms], one every 0.1 s, make a trace: "
+    'awk \'BEGIN {print "time_s,delay_ms"} {print (NR-1)*0.1 "," $1}\' FILE'
+)
+"""What to do about a file of numbers without a header."""
 SILENT = 1.0  # time after which a command says that it reads a large file [s]
 _GZIP = b"\x1f\x8b"  # first bytes of a compressed file (RFC 1952)
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
@@ -230,11 +236,13 @@ class Row(NamedTuple):
         return value
 
 
-def read_rows(lines: Iterable[str], name: str) -> tuple[list[str], Iterator[Row]]:
+def read_rows(
+    lines: Iterable[str], name: str, way: str = NO_HEADER
+) -> tuple[list[str], Iterator[Row]]:
     """Read a CSV file with a header; commas, semicolons or tabs separate the cells.
 
     Blank lines and comments are skipped. A file without a header is rejected, and so is a row with
-    more cells than the header.
+    more cells than the header. `way` says what to do about numbers without a header.
 
     Returns:
         Names of the columns in lower case ("RTT (ms)" becomes rtt_ms), and the rows.
@@ -244,12 +252,8 @@ def read_rows(lines: Iterable[str], name: str) -> tuple[list[str], Iterator[Row]
     _, header = next(kept, (1, ""))
     separator = _separator(header)
     columns = [_column(cell) for cell in _cells(header, separator, f"{name}, line 1")]
-    if len(columns) == 1 and _parse(header) is not None:
-        raise BadInputError(
-            f"{name}: has numbers without a header; a rate trace of mahimahi has no delays, use "
-            "rate_kbit; of delays [ms], one every 0.1 s, make a trace: "
-            'awk \'BEGIN {print "time_s,delay_ms"} {print (NR-1)*0.1 "," $1}\' FILE'
-        )
+    if all(_parse(cell) is not None for cell in re.split(r"[,;\s]+", header.strip())):
+        raise BadInputError(f"{name}: has numbers without a header; {way}")
 
     def rows() -> Iterator[Row]:
         for number, line in kept:

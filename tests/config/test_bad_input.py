@@ -243,6 +243,23 @@ def test_an_invalid_file_of_setpoints_is_one_line(tmp_path, rows, said):
 
 
 @pytest.mark.parametrize(
+    "lines",
+    [
+        "#time [ns],x,y,z\n1403636580838555648,0.0,0.0,0.5\n1403636580938555648,0.01,0.0,0.5\n",
+        "# timestamp tx ty tz\n1305031102.17 0.0 0.0 0.5\n1305031102.27 0.01 0.0 0.5\n",
+        "0\t0\t0\t1\n1\t0\t0\t1\n",
+        "0,0;0,0;0,0;1,0\n1,0;0,0;0,0;1,0\n",
+        "0, 0, 0, 1\n1, 0, 0, 1\n",
+        "0.5\n1\n",
+    ],
+)
+def test_a_file_of_setpoints_without_a_header_is_told_so(tmp_path, lines):
+    (tmp_path / "drive.csv").write_text(lines)
+    text = refused("hover", f"mission.setpoints={tmp_path / 'drive.csv'}")
+    assert "has numbers without a header; the first line must be time_s,x_m,y_m,z_m" in text
+
+
+@pytest.mark.parametrize(
     ("key", "name", "own"),
     [
         ("world.robot", "bot2", "bot2/robot.yaml"),
