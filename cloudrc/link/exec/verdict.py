@@ -21,6 +21,8 @@ UNJUDGED = {"distribution"}
 """Quantity that needs no comparison, because the delay of every packet is compared."""
 ASKED_PACKETS = 1000
 """Number of packets in a simulation of what the profile asks for."""
+QUEUED_PACKETS = 10_000
+"""Largest number of packets, from the first on, in that of a profile with a bottleneck."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,8 @@ def judge_packets(log: PacketLog, period: Period) -> list[tuple[float, Judgement
 
     Returns:
         What the profile asks for (NaN if it cannot be known) and the judgement, per quantity. The
-        judgement's `asked` is what the model has computed for these very packets.
+        judgement's `asked` is what the model has computed for these very packets. At a bottleneck
+        the profile asks for what packets of the same times and of one mean size would meet.
     """
     applied, measured = streams(log, period)
     if not len(applied.sent):
@@ -48,13 +51,14 @@ def judge_packets(log: PacketLog, period: Period) -> list[tuple[float, Judgement
     flow = Flow(period.seed, period.uplink, KIND, size)
     plan = Measurement(period.profile, flow, applied.sent)
     limited = any(piece.rate is not None for piece in Timeline(period.profile).pieces)
-    asked = dict[str, float]()
-    if not limited:  # else the delay depends on what the programs send
+    if limited:  # a packet waits for those before it
+        asked = replace(plan, sent=applied.sent[:QUEUED_PACKETS]).asked()
+    else:
         few = applied.sent[:: 1 + len(applied.sent) // ASKED_PACKETS]
         asked = replace(plan, sent=few).asked()
-        del asked["reordered"]  # depends on how close to each other packets are sent
+        asked["reordered"] = nan  # depends on how close to each other packets are sent
     rows = plan.judge_applied(applied, measured)
-    return [(asked.get(row.name, nan), row) for row in rows if row.name not in UNJUDGED]
+    return [(asked.get(row.name, row.asked), row) for row in rows if row.name not in UNJUDGED]
 
 
 def streams(log: PacketLog, period: Period) -> tuple[Stream, Stream]:

@@ -4,7 +4,6 @@ import os
 import socket
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from cloudrc.errors import MissingPrerequisiteError
@@ -14,7 +13,7 @@ from cloudrc.link.exec.relay import LOST, PacketLog, TunRelay, TunWay
 from cloudrc.link.exec.verdict import Period, judge_packets, recording
 from cloudrc.link.library import KIND
 from cloudrc.link.model import LinkDirection
-from tests.link.profiles import profile_of
+from tests.link.profiles import changed, profile_of
 
 MS = 1_000_000
 PACKET = b"\x45" + bytes(99)
@@ -161,10 +160,20 @@ def test_few_packets_give_no_verdict_and_none_give_no_row():
     assert judge_packets(PacketLog(), Period(profile, 7, True, 0, 0)) == []
 
 
-def test_a_limited_rate_has_no_asked_delay_because_the_programs_fill_the_queue():
-    profile = profile_of(0.040, rate=100_000.0)
+@pytest.mark.parametrize(
+    ("rate", "waits"),
+    [
+        (100_000.0, 0.008),  # 100 bytes each 10 ms
+        (64_000.0, 0.0125 + 0.0025 * 999.5),  # more than the rate: each waits 2.5 ms more
+    ],
+)
+def test_a_limited_rate_asks_for_what_these_packets_would_meet(rate, waits):
+    profile = changed(profile_of(0.040, rate=rate), queue_packets=10_000)
     rows = judge_packets(log_of(profile), Period(profile, 7, True, 0, 0))
-    assert all(np.isnan(value) for value, _ in rows)
+    asked = {row.name: value for value, row in rows}
+    assert asked["mean"] == pytest.approx(0.040 + waits, abs=1e-4)
+    assert asked["loss"] == 0.0
+    assert asked["rate"] == rate
 
 
 def test_a_recording_is_a_log_that_link_record_reads(tmp_path, call):
