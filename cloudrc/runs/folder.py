@@ -53,7 +53,7 @@ def new_folder(
             return out
         RUNS.mkdir(exist_ok=True)
         for n in itertools.count(1):
-            folder = RUNS / f"{name}-{n}"
+            folder = RUNS / f"{name.replace(':', '-')}-{n}"  # some systems refuse a colon
             with contextlib.suppress(FileExistsError):  # another process may make it first
                 folder.mkdir()
                 break

@@ -58,3 +58,8 @@ def test_a_process_may_use_its_folder_again_until_something_is_in_it(tmp_path):
         with pytest.raises(BadInputError, match="already exists"):
             new_folder(out, "")
     assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_folder_has_no_colon_in_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert new_folder(None, "eval-my_env:My-v0").name == "eval-my_env-My-v0-1"
