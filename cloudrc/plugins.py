@@ -27,7 +27,7 @@ import re
 import sys
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -481,6 +481,24 @@ def to_numbers(values: Any) -> NDArray[Any]:
         why = f"beyond {LARGEST:g}" if np.isfinite(number) else "not finite"
         raise InvalidResultError(f"its {_name_of(place)} is {number:g}, {why}")
     return array
+
+
+def to_arrays(value: Any) -> Any:
+    """Return a value with arrays of numpy in place of PyTorch's tensors, also in maps and lists.
+
+    A tensor may be on a GPU, have a gradient, or a type that numpy does not know, as bfloat16.
+    """
+    if isinstance(value, Mapping):
+        return {key: to_arrays(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return (tuple if isinstance(value, tuple) else list)(map(to_arrays, value))
+    if not hasattr(value, "detach"):
+        return value
+    tensor = value.detach().cpu()
+    try:
+        return tensor.numpy()
+    except TypeError:
+        return tensor.float().numpy()
 
 
 def _name_of(place: list[int]) -> str:

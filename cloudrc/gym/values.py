@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from cloudrc.errors import BadInputError
-from cloudrc.plugins import LARGEST, InvalidResultError, shorten, to_numbers
+from cloudrc.plugins import LARGEST, InvalidResultError, shorten, to_arrays, to_numbers
 
 _PLAIN = (int, float, bool, str, np.generic, type(None))
 
@@ -26,6 +26,8 @@ def copied(value: Any) -> Any:
         return {key: copied(each) for key, each in value.items()}
     if type(value) is tuple:
         return tuple(copied(each) for each in value)
+    if hasattr(value, "detach"):  # a tensor of PyTorch: none with a gradient can be copied deeply
+        return value.detach().clone()
     return deepcopy(value)
 
 
@@ -37,7 +39,7 @@ def size_of(value: Any) -> int:
         return sum(size_of(each) for each in value)
     if isinstance(value, str):
         return len(value.encode())
-    return int(np.asarray(value).nbytes)
+    return int(np.asarray(to_arrays(value)).nbytes)
 
 
 def neutral(space: spaces.Space[Any]) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.plugins import InvalidResultError, shorten, to_numbers
+from cloudrc.plugins import InvalidResultError, shorten, to_arrays, to_numbers
 
 ACTIONS = "actions"
 """Key of an answer: the chunk of actions, shape (H, A)."""
@@ -34,12 +34,13 @@ def read_actions(
         keys = ", ".join(sorted(map(str, answer))) or "none"
         raise PolicyAnswerError(f"the answer has no key '{ACTIONS}'; its keys: {keys[:200]}")
     try:
-        actions = np.asarray(answer[ACTIONS])
+        given = to_arrays(answer[ACTIONS])
+        actions = np.asarray(given)
         if not (may_switch and actions.dtype.kind == "b"):
-            actions = to_numbers(answer[ACTIONS])
+            actions = to_numbers(given)
     except InvalidResultError as error:
         raise PolicyAnswerError(f"'{ACTIONS}': {error}") from None
-    except (TypeError, ValueError, RuntimeError):  # rows of unequal lengths, a tensor on a GPU
+    except (TypeError, ValueError, RuntimeError):  # rows of unequal lengths
         raise PolicyAnswerError(f"'{ACTIONS}' is {shorten(answer[ACTIONS])}, no array") from None
     wanted = f"(H, {'A' if width is None else width})"
     is_chunk = actions.ndim == 2 and 0 < len(actions) <= HORIZON_MAX and actions.shape[1] > 0

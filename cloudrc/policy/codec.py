@@ -1,7 +1,9 @@
 """Pack maps with numpy arrays as msgpack, in the form of openpi; never as pickle.
 
 An array is a map with the keys `__ndarray__`, `data`, `dtype` and `shape`, which are bytes. A
-scalar of numpy is a map with the keys `__npgeneric__`, `data` and `dtype`.
+scalar of numpy is a map with the keys `__npgeneric__`, `data` and `dtype`. Two other forms are
+read, too: these keys as texts, and the form of the package msgpack-numpy, with the keys `nd`,
+`type`, `kind`, `shape` and `data`.
 """
 
 from __future__ import annotations
@@ -12,9 +14,8 @@ from typing import Any, cast
 
 import msgpack
 import numpy as np
-from numpy.typing import NDArray
 
-from cloudrc.plugins import shorten
+from cloudrc.plugins import shorten, to_arrays
 
 MESSAGE_MAX = 64 << 20
 """Largest message [bytes]; three raw color images of 1920 x 1080 pixels take 19 MB."""
@@ -64,7 +65,7 @@ def _to_map(value: Any) -> dict[bytes, Any]:
         return {SCALAR: True, b"data": value.item(), b"dtype": _name_of(value.dtype)}
     if not hasattr(value, "__array__"):
         raise WireError(f"{shorten(value)} cannot be packed; send numbers, texts and arrays")
-    array = np.asarray(value)
+    array = np.asarray(to_arrays(value))
     name = _name_of(array.dtype)
     return {ARRAY: True, b"data": array.tobytes(), b"dtype": name, b"shape": array.shape}
 
@@ -76,19 +77,26 @@ def _name_of(dtype: np.dtype[Any]) -> str:
 
 
 def _from_map(found: dict[Any, Any]) -> Any:
-    if ARRAY in found:
-        return _to_array(found)
-    if SCALAR in found:
-        dtype = _read_dtype(found.get(b"dtype"))
+    named = {
+        key.decode(errors="replace") if isinstance(key, bytes) else key: value
+        for key, value in found.items()
+    }
+    if "__ndarray__" in named:
+        return _to_array(named.get("dtype"), named.get("shape"), named.get("data"))
+    if "__npgeneric__" in named:
+        dtype, data = _read_dtype(named.get("dtype")), named.get("data")
         try:
-            return dtype.type(found.get(b"data"))
+            return dtype.type(data)
         except (TypeError, ValueError, OverflowError):
-            raise WireError(f"{shorten(found.get(b'data'))} is no {dtype}") from None
+            raise WireError(f"{shorten(data)} is no {dtype}") from None
+    if {"nd", "type", "data"} <= named.keys():
+        array = _to_array(named["type"], named.get("shape", []), named["data"])
+        return array if named["nd"] else array[()]  # a scalar has no shape
     return found
 
 
-def _to_array(found: dict[Any, Any]) -> NDArray[Any]:
-    dtype, shape, data = _read_dtype(found.get(b"dtype")), found.get(b"shape"), found.get(b"data")
+def _to_array(name: Any, shape: Any, data: Any) -> Any:
+    dtype = _read_dtype(name)
     if not isinstance(shape, list) or len(shape) > DIMENSIONS_MAX:
         raise WireError(f"{shorten(shape)} is no shape of an array")
     if not all(type(each) is int and each >= 0 for each in shape):

@@ -6,6 +6,7 @@ import pytest
 
 from cloudrc.policy import codec
 from cloudrc.policy.codec import WireError, pack, unpack
+from tests.tensors import KINDS, Tensor
 
 
 @pytest.mark.parametrize(
@@ -43,13 +44,63 @@ def test_the_bytes_are_those_of_openpi():
     assert found == {b"__ndarray__": True, b"data": data, b"dtype": "<f4", b"shape": [1, 2]}
 
 
-class Tensor:
+class Image:
     def __array__(self, dtype=None, copy=None):
         return np.ones(2)
 
 
-def test_what_numpy_converts_is_sent_as_an_array():
-    assert unpack(pack({"a": Tensor()}))["a"].tolist() == [1.0, 1.0]
+@pytest.mark.parametrize("value", [Image(), *(Tensor([1.0, 1.0], **kind) for kind in KINDS)])
+def test_what_numpy_converts_and_any_tensor_is_sent_as_an_array(value):
+    assert unpack(pack({"a": value}))["a"].tolist() == [1.0, 1.0]
+
+
+def in_texts(array):
+    """Return openpi's form with keys that are texts, as programs in other languages write them."""
+    key = "__npgeneric__" if isinstance(array, np.generic) else "__ndarray__"
+    data = array.item() if isinstance(array, np.generic) else array.tobytes()
+    return {key: True, "data": data, "dtype": array.dtype.str, "shape": array.shape}
+
+
+def in_msgpack_numpy(array):
+    """Return what the package msgpack-numpy 0.4.8 packs."""
+    found = {b"nd": True, b"type": array.dtype.str, b"data": array.tobytes()}
+    if isinstance(array, np.generic):
+        return {**found, b"nd": False}
+    return {**found, b"kind": b"", b"shape": array.shape}
+
+
+def in_msgpack_numpy_texts(array):
+    return {key.decode(): value for key, value in in_msgpack_numpy(array).items()}
+
+
+@pytest.mark.parametrize("write", [in_texts, in_msgpack_numpy, in_msgpack_numpy_texts])
+@pytest.mark.parametrize(
+    "array", [np.arange(6, dtype="<f4").reshape(2, 3), np.array(2.5), np.float32(1.5), np.int64(3)]
+)
+def test_the_other_dialects_of_numpy_are_read(write, array):
+    found = unpack(msgpack.packb({"in": {"a": write(array)}}))["in"]["a"]
+    assert type(found) is type(array)
+    assert found.dtype == array.dtype
+    assert np.array_equal(found, array)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({b"type": "|O", b"kind": b"O"}, "arrays of type object are refused"),
+        ({b"type": [["a", "<f4"]], b"kind": b"V"}, "is no type of an array"),
+        ({b"shape": [3]}, "has 8 bytes, not 12"),
+    ],
+)
+def test_an_array_of_msgpack_numpy_is_checked_as_any(change, words):
+    form = in_msgpack_numpy(np.zeros(2, "<f4")) | change
+    with pytest.raises(WireError, match=words):
+        unpack(msgpack.packb({"a": form}))
+
+
+def test_a_map_of_ones_own_with_some_of_the_keys_stays_a_map():
+    for own in ({"type": "box", "data": [1]}, {"nd": 2, "shape": [3]}, {b"data": b"x"}):
+        assert unpack(msgpack.packb({"a": own}))["a"] == own
 
 
 RECORD = np.zeros(2, [("a", "f4")])
