@@ -101,7 +101,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.cli.progress import CountView, StepView
     from cloudrc.eval import results
     from cloudrc.eval.episode import check_environment, follows_seed
-    from cloudrc.eval.setup import BASELINE, Episode, slow_answers
+    from cloudrc.eval.setup import BASELINE, Episode
 
     setup, episodes = _read(options)
     folder = options.out
@@ -111,11 +111,9 @@ def execute(options: argparse.Namespace) -> int:
     with closing(StepView(sys.stderr, f"makes the environment {setup.env}")):
         checked = check_environment(setup, episodes)
         seeded = follows_seed(setup)
-    if checked.doubt:
-        print_line(f"cloudrc: warning: --dt {setup.dt:g}: {checked.doubt}", sys.stderr)
-    if slow := slow_answers(setup, checked.dt):
-        print_line(f"cloudrc: warning: {slow}", sys.stderr)
-    setup = replace(setup, follows_seed=seeded, env_code=checked.code)
+    for text in checked.step.doubts:
+        print_line(f"cloudrc: warning: --{text}", sys.stderr)
+    setup = replace(setup, follows_seed=seeded, env_code=checked.code, step=checked.step)
     if not seeded:
         print_line(f"cloudrc: warning: --env {setup.env}: {results.SEEDLESS}", sys.stderr)
     episodes = [*(Episode(None, BASELINE, n + 1) for n in range(options.seeds)), *episodes]
@@ -123,7 +121,8 @@ def execute(options: argparse.Namespace) -> int:
     if not goes_on:
         folder = new_folder(folder, f"eval-{Path(setup.env).name}", "latest-eval")
     stream = sys.stdout if options.output == "table" else sys.stderr
-    print_or_drop(escape(f"{setup.env}: {len(episodes)} episodes"), stream)
+    told = f"{setup.env}: {len(episodes)} episodes, step {checked.step}"
+    print_or_drop(escape(told), stream)
     with lock_folder(folder), closing(CountView(stream, len(episodes), "episodes")) as view:
         try:
             rows, stopped = results.play_missing(folder, setup, episodes, options.jobs, view.count)

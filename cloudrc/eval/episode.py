@@ -31,7 +31,7 @@ from cloudrc.eval.setup import (
     read_times,
 )
 from cloudrc.gym import Networked
-from cloudrc.gym.options import doubt_step
+from cloudrc.gym.step import StepTime, find_step
 from cloudrc.gym.values import size_of
 from cloudrc.plugins import InvalidResultError, refuse_failure, shorten, to_boolean, to_number
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
@@ -353,9 +353,8 @@ def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
 class CheckedEnvironment(NamedTuple):
     """What is known about an environment that can be used."""
 
-    dt: float  # time of a step [s]
+    step: StepTime
     code: str  # hash of its code and files
-    doubt: str  # warning about --dt; "" for none
 
 
 def check_environment(setup: EvalSetup, episodes: list[Episode]) -> CheckedEnvironment:
@@ -368,12 +367,12 @@ def check_environment(setup: EvalSetup, episodes: list[Episode]) -> CheckedEnvir
     with make_env(setup, 1) as env:
         width_of(env.action_space)
         code = environment_code(env, setup)
-        doubt = doubt_step(env, setup.dt)
+        step = find_step(env, setup.dt, mean_compute(setup.compute))
         for executor in dict.fromkeys(each.executor for each in episodes):
-            world = _Network(env, dt=setup.dt, chunk=1, executor=executor)
+            _Network(env, dt=setup.dt, chunk=1, executor=executor)
     if not setup.is_remote:
         _load(setup.policy)
-    return CheckedEnvironment(world.dt, code, doubt)
+    return CheckedEnvironment(step, code)
 
 
 def follows_seed(setup: EvalSetup) -> bool:

@@ -86,7 +86,9 @@ def write_page(folder: Path, setup: EvalSetup, document: Mapping[str, Any]) -> P
     made = {key: document[key] for key in ("date", "versions", "compute", "link", "profile")}
     page = TEMPLATE.substitute(
         title=escape(f"{setup.env}: {Path(setup.policy).name} over {setup.link}"),
-        facts=escape(f"{count} episodes per condition; success: {document['success']}."),
+        facts=escape(
+            f"{count} episodes per condition; step {setup.step}; success: {document['success']}."
+        ),
         warning=_paragraphs(_warnings(setup), ' class="warning"'),
         figure=svg[svg.index("<svg") :],
         caption=CAPTION,

@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 from cloudrc.config.document import parse_value, read_document
 from cloudrc.config.reuse import reuse
 from cloudrc.errors import BadInputError
+from cloudrc.gym.step import StepTime
 from cloudrc.link.doubts import describe_heavy_shares
 from cloudrc.link.library import LinkProfile, read_profile
 from cloudrc.link.profile import DirectionProfile
@@ -38,9 +39,6 @@ BARE: dict[str, Any] = {"link": "ideal", "compute": 0.0, "observation_bytes": No
 COMPUTE_MAX = 3600.0
 """Largest time for an answer [s]."""
 
-SLOW_STEPS = 100
-"""Number of steps of an environment after which an answer is slow enough for a warning."""
-
 
 @dataclass(frozen=True)
 class EvalSetup:
@@ -60,6 +58,8 @@ class EvalSetup:
     follows_seed: bool = True  # whether equal seeds give equal episodes
     env_code: str = ""  # hash of the environment's code and files
     deadline: float | None = None  # an action of an older observation is late [s]
+
+    step: StepTime | None = None  # of the environment, and who tells its time
 
     @property
     def is_remote(self) -> bool:
@@ -206,17 +206,6 @@ def heavy_shares(setup: EvalSetup) -> Iterator[str]:
     link = read_profile(setup.link)
     yield from describe_heavy_shares(link.uplink, "uplink")
     yield from describe_heavy_shares(link.downlink, "downlink")
-
-
-def slow_answers(setup: EvalSetup, dt: float) -> str:
-    """Return a warning if an answer takes very many steps of `dt` [s]; else ""."""
-    mean = mean_compute(setup.compute)
-    if mean <= SLOW_STEPS * dt:
-        return ""
-    return (
-        f"--compute: an answer takes {mean:g} s, as long as {mean / dt:,.0f} steps of the "
-        "environment; the unit is s"
-    )
 
 
 def read_times(path: str) -> tuple[float, ...]:

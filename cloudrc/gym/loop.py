@@ -254,6 +254,8 @@ class RemoteLoop:
         `late_share` is the share of steps whose action is older than `deadline` [s].
         """
         ticks, dt = self._tick, self._settings.dt
+        if ticks < 0:
+            raise ResetNeeded("call reset() before summary()")
         actions = np.array(self._action_ages) * dt
         late = nan
         if deadline is not None and len(actions):

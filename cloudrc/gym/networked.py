@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from math import inf
 from typing import Any, Unpack
 
 import gymnasium
@@ -15,10 +17,12 @@ from cloudrc.gym.options import (
     compute_times,
     connect,
     describe_answer,
-    step_time,
-    warn_of_step,
+    refuse_unknown,
+    warn,
 )
+from cloudrc.gym.step import find_step
 from cloudrc.gym.values import checker, copied
+from cloudrc.plugins import to_arrays
 
 
 class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -42,6 +46,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """
 
     _warns = True
+    _left = inf  # steps until a wrapper outside ends the episode
 
     def __init__(
         self,
@@ -86,13 +91,13 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 f"env is {type(env).__name__}: give an environment of gymnasium, as "
                 "gymnasium.make returns it; for a vector there is NetworkedVector"
             )
+        refuse_unknown("Networked", options)
         RecordConstructorArgs.__init__(self, link=link, seed=seed, dt=dt, stream=stream, **options)
         gymnasium.Wrapper.__init__(self, env)
-        self.dt = step_time(env, dt)
-        if self._warns:
-            warn_of_step(env, dt)
+        self.dt, _, doubts = find_step(env, dt, options.get("compute", 0.0))
         both, chunk = (env.observation_space, env.action_space), options.get("chunk")
         (self._loop,) = connect(both, self.dt, link, seed, (stream,), **options)
+        warn(doubts if self._warns else [])
         self.action_space, self._split = answer_space(env.action_space, chunk)
         self._check = checker(self.action_space, describe_answer(chunk))
         self.world_info: dict[str, Any] = {}
@@ -109,7 +114,8 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def summary(self, deadline: float | None = None) -> dict[str, Any]:
         """Return what `info["cloudrc"]["episode"]` has, also before the end of an episode.
 
-        With a `deadline` [s], `late_share` is the share of steps whose action is older.
+        With a `deadline` [s], `late_share` is the share of steps whose action is older. Raise
+        gymnasium's ResetNeeded before the first `reset`.
         """
         return self._loop.summary(deadline)
 
@@ -119,20 +125,37 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Begin an episode; the policy has the first observation at once."""
         observation, self.world_info = self.env.reset(seed=seed, options=options)
         self._loop.begin(seed, observation, self.world_info)
+        self._left = _outer_limit()
         return self._seen()
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Send the policy's answer, and step the world with what the robot executes."""
+        action = to_arrays(action)
         self._check(action)
         loop = self._loop
         executed = loop.act(self._split(action))
         observation, reward, terminated, truncated, self.world_info = self.env.step(executed)
         loop.observe(observation, self.world_info)
         seen, info = self._seen()
-        if terminated or truncated:
+        self._left -= 1
+        if terminated or truncated or self._left <= 0:
             info["cloudrc"]["episode"] = loop.summary()
         return seen, reward, terminated, truncated, info
 
     def _seen(self) -> tuple[Any, dict[str, Any]]:
         observation, info = self._loop.seen
         return copied(observation), {**info, "cloudrc": self._loop.told()}
+
+
+def _outer_limit() -> float:
+    """Return after how many steps a `TimeLimit` outside of an environment ends an episode.
+
+    A wrapper does not know those outside, but they call its `reset`.
+    """
+    least, frame = inf, sys._getframe().f_back
+    while frame is not None:
+        if frame.f_code.co_name == "reset":
+            outer = frame.f_locals.get("self")
+            least = min(least, getattr(outer, "_max_episode_steps", None) or inf)
+        frame = frame.f_back
+    return least

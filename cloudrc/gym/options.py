@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from math import isfinite, nan
+from math import nan
 from pathlib import Path
 from typing import Any, TypeAlias, TypedDict
 
 import gymnasium
-import numpy as np
 from gymnasium.vector.utils import batch_space, iterate
 
 from cloudrc import plugins
@@ -20,13 +19,11 @@ from cloudrc.gym.executors import Executor
 from cloudrc.gym.loop import RemoteLoop, Settings
 from cloudrc.gym.values import checker, copied, neutral, size_of
 from cloudrc.gym.watched import WatchedExecutor
-from cloudrc.link.library import LinkProfile, read_profile
+from cloudrc.link.library import LinkProfile, is_whole, read_profile
 
 Profile: TypeAlias = str | Path | Mapping[str, Any] | LinkProfile
 CHUNK_MAX = 10_000
 """Largest number of actions in an answer."""
-STEP_RATIO = 10.0
-"""Ratio of two times of a step from which on one of them may have another unit."""
 WAIT = 0.05
 """How long a robot waits in a step for an answer, as a share of the step."""
 ANSWER = "answer"
@@ -44,6 +41,21 @@ class Options(TypedDict, total=False):
     start: Any
     observation_bytes: int | None
     action_bytes: int | None
+
+
+ARGUMENTS = ("env", "link", "seed", "dt", "stream", *Options.__annotations__)
+"""Names of the arguments of `Networked` and `NetworkedVector`."""
+
+
+def refuse_unknown(
+    what: str, given: Iterable[str], known: Sequence[str] = ARGUMENTS, more: str = ""
+) -> None:
+    """Raise a BadInputError if one of the `given` names is none of the `known` arguments."""
+    for name in given:
+        if name not in known:
+            near = plugins.suggest_name(name, [*known])
+            there = f"there are {', '.join(known)}{more}{near}"
+            raise BadInputError(f"{what} has no argument {name!r}; {there}")
 
 
 def connect(
@@ -99,63 +111,13 @@ def connect(
 def _refuse_wrong(hold: str, chunk: int | None, sizes: Mapping[str, int | None]) -> None:
     if hold not in ("repeat", "start"):
         raise BadInputError(f"hold {hold!r}: give 'repeat' or 'start'")
-    if chunk is not None and not (_is_whole(chunk) and 1 <= chunk <= CHUNK_MAX):
+    if chunk is not None and not (is_whole(chunk) and 1 <= chunk <= CHUNK_MAX):
         raise BadInputError(
             f"chunk {chunk!r}: give None or the number of actions in an answer, up to {CHUNK_MAX}"
         )
     for name, size in sizes.items():
-        if size is not None and not (_is_whole(size) and size >= 0):
+        if size is not None and not (is_whole(size) and size >= 0):
             raise BadInputError(f"{name}_bytes {size!r}: give a number of bytes, or None")
-
-
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
-
-
-def step_time(env: Any, given: float | None) -> float:
-    """Return the time of a step of an environment [s], unless `given` [s].
-
-    It is the environment's `dt` or `tau`, or that of a frame which it renders.
-    """
-    found: Any = _told_step(env) if given is None else given
-    number = nan
-    with suppress(plugins.InvalidResultError):
-        number = plugins.to_number(found, "time step")
-    if not (isfinite(number) and 0.0 < number <= 3600.0):
-        told = "has no time step" if found is None else f"has the time step {found!r}"
-        raise BadInputError(f"the environment {told}; give dt=, the time of a step in seconds")
-    return number
-
-
-def _told_step(env: Any) -> Any:
-    """Return the time of a step that an environment tells [s], whatever it is; else None."""
-    base = env.unwrapped
-    # The environments of a vector know their step; metadata may have the rate of a film.
-    base = base.envs[0].unwrapped if getattr(base, "envs", ()) else base
-    for name in ("step_dt", "dt", "tau"):
-        if (found := getattr(base, name, None)) is not None:
-            return found
-    with suppress(plugins.InvalidResultError):
-        if rate := (env.metadata or {}).get("render_fps"):
-            return 1.0 / plugins.to_number(rate, "rate")
-    return None
-
-
-def doubt_step(env: Any, given: float | None) -> str:
-    """Return a warning if the `given` time of a step is far from the environment's [s]; else ""."""
-    told = None
-    if given is not None:
-        with suppress(BadInputError):
-            told = step_time(env, None)
-    if given is None or told is None or 1 / STEP_RATIO < given / told < STEP_RATIO:
-        return ""
-    return f"a step of {given:g} s, but the environment says {told:.3g} s; the unit is s"
-
-
-def warn_of_step(env: Any, given: float | None) -> None:
-    """Warn the caller of the caller if the `given` time of a step [s] is doubtful."""
-    if doubt := doubt_step(env, given):
-        warnings.warn(f"dt={given:g}: {doubt}", stacklevel=3)
 
 
 def _read_wait(given: float | None, dt: float) -> float:
@@ -186,6 +148,12 @@ def compute_times(compute: float | tuple[float, float]) -> tuple[float, float]:
             "standard deviation, such as (0.05, 0.02)"
         )
     return mean, deviation
+
+
+def warn(texts: Iterable[str]) -> None:
+    """Warn the caller of the caller."""
+    for text in texts:
+        warnings.warn(text, stacklevel=3)
 
 
 def answer_space(

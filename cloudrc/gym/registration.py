@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import gymnasium
 
 from cloudrc.errors import BadInputError
 from cloudrc.gym.networked import Networked
+from cloudrc.gym.options import refuse_unknown
 from cloudrc.gym.vector import NetworkedVector
 
+NAME = "cloudrc/Networked-v0"
 IDS: dict[str, dict[str, Any]] = {
-    "cloudrc/Networked-v0": {
+    NAME: {
         "entry_point": "cloudrc.gym.registration:make",
         "vector_entry_point": "cloudrc.gym.registration:make_vec",
     },
@@ -36,7 +38,7 @@ def register() -> None:
 
 
 def make(
-    env: str,
+    env: str = "",
     env_args: Mapping[str, Any] | None = None,
     render_mode: str | None = None,
     **networked: Any,
@@ -45,24 +47,28 @@ def make(
 
     `env_args` are arguments of the environment, all others those of `Networked`.
     """
-    with _Told(env):
+    with _Told(env, networked):
         inner = gymnasium.make(env, render_mode=render_mode, **(env_args or {}))
     return Networked(inner, **networked)
 
 
 def make_vec(
-    env: str, num_envs: int = 1, env_args: Mapping[str, Any] | None = None, **networked: Any
+    env: str = "", num_envs: int = 1, env_args: Mapping[str, Any] | None = None, **networked: Any
 ) -> NetworkedVector:
     """Make `num_envs` environments `env`, each behind a link of its own."""
-    with _Told(env):
+    with _Told(env, networked):
         inner = gymnasium.make_vec(env, num_envs, **(env_args or {}))
     return NetworkedVector(inner, **networked)
 
 
 class _Told:
-    """Convert gymnasium's error about an environment to one of cloudrc."""
+    """Refuse arguments that do not exist; convert gymnasium's error about an environment."""
 
-    def __init__(self, env: str) -> None:
+    def __init__(self, env: str, networked: Iterable[str]) -> None:
+        more = "; those of the environment go into env_args, a mapping"
+        refuse_unknown(NAME, networked, more=more)
+        if not env:
+            raise BadInputError(f"{NAME}: give env=, the name of an environment")
         self._env = env
 
     def __enter__(self) -> None:

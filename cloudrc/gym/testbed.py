@@ -26,6 +26,7 @@ from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Link
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.errors import BadInputError
+from cloudrc.gym.options import refuse_unknown
 from cloudrc.messages import Datagram, Odometry, Setpoint
 from cloudrc.plugins import shorten, to_numbers
 from cloudrc.record.columns import Recording, RecordStore
@@ -140,6 +141,7 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         robot: str | None = None,
         settings: Mapping[str, Any] | None = None,
         render_mode: str | None = None,
+        **unknown: Any,
     ) -> None:
         """Load an experiment by name or path.
 
@@ -148,7 +150,9 @@ class RobotEnv(gymnasium.Env[Any, Any]):
             robot: Name of a shipped robot, or path; None: that of the experiment.
             settings: Further changes, as with `--set`: key -> value. The link is always ideal.
             render_mode: None; a flight is drawn by its report.
+            unknown: Is refused, with the nearest name.
         """
+        refuse_unknown("RobotEnv", unknown, ("experiment", "robot", "settings", "render_mode"))
         require("a robot of the testbed as an environment", SIM)
         for key in settings or {}:
             if key.partition(".")[0] == "link":

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 
 from cloudrc.errors import BadInputError
@@ -16,10 +16,12 @@ from cloudrc.gym.options import (
     answer_space,
     connect,
     describe_answer,
-    step_time,
-    warn_of_step,
+    refuse_unknown,
+    warn,
 )
+from cloudrc.gym.step import find_step
 from cloudrc.gym.values import checker, copied
+from cloudrc.plugins import to_arrays
 
 if TYPE_CHECKING:
     _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]
@@ -54,12 +56,14 @@ class NetworkedVector(_Wrapper):
                 f"env is {type(env).__name__}: give a vector environment of gymnasium, as "
                 "gymnasium.make_vec returns it; for a single one there is Networked"
             )
+        refuse_unknown("NetworkedVector", options)
         super().__init__(env)
         space, chunk = env.single_action_space, options.get("chunk")
         names = [f"{stream}/{robot}" for robot in range(env.num_envs)]
         both = env.single_observation_space, space
-        self._loops = connect(both, _step_time(env, dt), link, seed, names, **options)
-        warn_of_step(env, dt)
+        time, _, doubts = find_step(env, dt, options.get("compute", 0.0))
+        self._loops = connect(both, time, link, seed, names, **options)
+        warn(doubts)
         self.single_action_space, self._split = answer_space(space, chunk)
         self.action_space = batch_space(self.single_action_space, env.num_envs)
         words = f"for each of {env.num_envs} robots {describe_answer(chunk)}"
@@ -88,6 +92,7 @@ class NetworkedVector(_Wrapper):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Send each policy's answer, and step the world with what the robots execute."""
+        actions = to_arrays(actions)
         self._check(actions)
         space = self.env.single_action_space
         answers = iterate(self.action_space, actions)
@@ -138,15 +143,6 @@ def _batch(space: Any, values: Sequence[Any]) -> Any:
     """Return the values of all robots, each of `space`, as the vector environment has them."""
     made: Any = create_empty_array(space, len(values))
     return concatenate(space, values, made)
-
-
-def _step_time(env: VectorEnv[Any, Any, Any], given: float | None) -> float:
-    if given is None and isinstance(env.unwrapped, AsyncVectorEnv):
-        raise BadInputError(
-            "environments in other processes do not tell their time step; give dt=, the time of a "
-            "step in seconds"
-        )
-    return step_time(env, given)
 
 
 def _autoreset_mode(env: VectorEnv[Any, Any, Any]) -> AutoresetMode:

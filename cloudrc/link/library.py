@@ -125,7 +125,7 @@ class OneWay:
         self, profile: DirectionProfile, seed: int, uplink: bool, *, stream: str = ""
     ) -> None:
         """Open a direction; `seed` and `stream` are those of `cloudrc.link.open`."""
-        if not _is_whole(seed) or not 0 <= seed <= SEED_MAX:
+        if not is_whole(seed) or not 0 <= seed <= SEED_MAX:
             raise BadInputError(f"seed {seed!r}: give a whole number from 0 to 2^53 - 1")
         if not isinstance(stream, str):
             raise BadInputError(f"stream {stream!r}: give a text, the name of this link")
@@ -278,11 +278,12 @@ class OneWay:
 def _check_whole(**values: int) -> None:
     """Raise a BadInputError for a value that is negative or no whole number."""
     for name, value in values.items():
-        if not _is_whole(value) or value < 0:
+        if not is_whole(value) or value < 0:
             raise BadInputError(f"{name} {value!r}: give a whole number, 0 or more")
 
 
-def _is_whole(value: object) -> bool:
+def is_whole(value: object) -> bool:
+    """Return whether a value is a whole number, and no boolean."""
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 

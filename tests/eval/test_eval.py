@@ -15,7 +15,7 @@ import pytest
 from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.eval import results
-from cloudrc.eval.episode import as_actions, play, width_of
+from cloudrc.eval.episode import as_actions, check_environment, play, width_of
 from cloudrc.eval.setup import (
     Episode,
     EvalSetup,
@@ -26,7 +26,6 @@ from cloudrc.eval.setup import (
     read_env_args,
     read_mapped,
     read_times,
-    slow_answers,
 )
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.observation import Mapped, observe
@@ -510,16 +509,19 @@ def test_a_loss_that_may_be_meant_in_percent_is_a_warning(loss, warned, tmp_path
     ("compute", "warned"),
     [(50.0, True), ((50.0, 1.0), True), (0.5, False), (("measured", ""), False)],
 )
-def test_an_answer_that_takes_very_many_steps_is_a_warning(compute, warned):
-    setup = EvalSetup("CartPole-v1", "law.py", compute=compute)
-    assert ("50 s, as long as 2,500 steps" in slow_answers(setup, 0.02)) is warned
+def test_an_answer_that_takes_very_many_steps_is_a_warning(law, compute, warned):
+    setup = EvalSetup("CartPole-v1", law(), compute=compute)
+    found = check_environment(setup, []).step.doubts
+    assert [text.partition(";")[0] for text in found] == [
+        "compute: an answer takes 50 s, as long as 2,500 steps of the environment"
+    ] * warned
 
 
 def test_a_time_of_a_step_in_another_unit_is_one_warning(law, tmp_path, capsys):
     line = f"eval --env CartPole-v1 --policy {law()} --seeds 2 --jobs 1 --dt 20 --out {tmp_path}/a"
     assert main(line.split()) == 0
     said = [each for each in capsys.readouterr().err.splitlines() if "warning" in each]
-    about = "--dt 20: a step of 20 s, but the environment says 0.02 s; the unit is s"
+    about = "--dt: a step of 20 s, but the environment says 0.02 s; the unit is s"
     assert said == [f"cloudrc: warning: {about}"]
 
 
@@ -554,6 +556,7 @@ def test_a_policy_that_is_none_is_refused(policy):
 
 def test_arguments_of_an_environment_are_yaml():
     assert read_env_args(["b=[1, 2]", "a=x"]) == (("a", "x"), ("b", [1, 2]))
+    assert read_env_args(["seed={seed}", "c={at: [a, b]}"])[1] == ("seed", "{seed}")
     for wrong in ("a", "=1", "a b=1"):
         with pytest.raises(BadInputError, match="--env-arg"):
             read_env_args([wrong])

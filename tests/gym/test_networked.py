@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import SyncVectorEnv
+from gymnasium.wrappers import TimeLimit, TransformReward
 
 from cloudrc.errors import BadInputError
 from cloudrc.gym import Networked, NetworkedVector
 from cloudrc.gym.values import neutral
 from tests.gym.envs import Counter, Mixed, both_ways
+from tests.tensors import KINDS, Tensor
 
 SHAKY = both_ways(70, 50, jitter_ms=40, loss=0.1)
 
@@ -252,18 +255,11 @@ def test_a_bottleneck_sees_the_sizes_of_observations_and_answers():
     assert Networked(Counter(), slow)._loop._up._size == 8
 
 
-def test_the_time_step_is_that_of_the_environment():
-    assert Networked(gymnasium.make("Pendulum-v1")).dt == 0.05  # its film has 30 frames a second
-    assert Networked(gymnasium.make("CartPole-v1")).dt == 0.02
-    assert Networked(gymnasium.make("MountainCar-v0")).dt == 1 / 30
-    assert Networked(Counter(), dt=0.05).dt == 0.05
-
-
 @pytest.mark.parametrize(
     ("dt", "doubtful"), [(20.0, True), (0.2, True), (0.002, True), (0.19, False), (0.003, False)]
 )
 def test_a_time_step_far_from_that_of_the_environment_is_a_warning(dt, doubtful):
-    says = f"dt={dt:g}: a step of {dt:g} s, but the environment says 0.02 s; the unit is s"
+    says = f"dt: a step of {dt:g} s, but the environment says 0.02 s; the unit is s"
     for wrap, env in (
         (Networked, gymnasium.make("CartPole-v1")),
         (NetworkedVector, gymnasium.make_vec("CartPole-v1", 2, "sync")),
@@ -431,17 +427,76 @@ def test_a_copy_within_an_episode_continues_bit_by_bit(make_copy, options):
     assert fly(other, after) == fly(env, after)
 
 
-def test_a_step_before_the_first_reset_is_refused():
+def test_a_step_or_a_summary_before_the_first_reset_is_refused():
     with pytest.raises(gymnasium.error.ResetNeeded):
         Networked(Counter()).step(np.zeros(1, np.float32))
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"reset\(\) before summary"):
+        Networked(Counter()).summary()
 
 
-def test_an_environment_without_a_time_step_asks_for_one():
-    class Timeless(Counter):
-        dt = None
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: gymnasium.make("cloudrc/Networked-v0", env="Pendulum-v1", max_episode_steps=5),
+        lambda: TimeLimit(TimeLimit(Networked(Counter()), 5), 7),
+        lambda: TimeLimit(TransformReward(Networked(Counter()), lambda reward: reward), 5),
+    ],
+)
+def test_a_time_limit_outside_leaves_the_summary_in_the_last_step(make):
+    env = make()
+    for _ in range(2):
+        env.reset(seed=1)
+        steps = [env.step(np.zeros(1, np.float32)) for _ in range(5)]
+        assert steps[-1][3]
+        assert ["episode" in info["cloudrc"] for *_, info in steps] == [False] * 4 + [True]
+        assert steps[-1][4]["cloudrc"]["episode"] == env.get_wrapper_attr("summary")()
 
-    with pytest.raises(BadInputError, match="has no time step; give dt="):
-        Networked(Timeless())
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: Networked(Counter(), chunk_size=8), "^Networked .*'chunk_size'.* mean chunk"),
+        (lambda: Networked(Counter(), delay=40), "^Networked has no argument 'delay'; there are"),
+        (
+            lambda: NetworkedVector(SyncVectorEnv([Counter]), sead=1),
+            "^NetworkedVector .*'sead'.* did you mean seed",
+        ),
+        (
+            lambda: gymnasium.make("cloudrc/Networked-v0", env="Pendulum-v1", g=9.0),
+            "^cloudrc/Networked-v0 has no argument 'g'.* go into env_args",
+        ),
+        (
+            lambda: gymnasium.make_vec("cloudrc/Networked-v0", 2, env="Pendulum-v1", exekutor="x"),
+            "^cloudrc/Networked-v0 .*'exekutor'.* did you mean executor",
+        ),
+        (lambda: gymnasium.make("cloudrc/Networked-v0", link="lte"), "give env="),
+        (lambda: gymnasium.make("cloudrc/Steps-v0", robbot="x2"), "^RobotEnv .* mean robot"),
+    ],
+)
+def test_an_unknown_argument_names_the_class_and_the_nearest(call, words):
+    with pytest.raises(BadInputError, match=words):
+        call()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_tensor_is_an_action_and_may_be_an_observation(kind):
+    class Torch(Counter):
+        def reset(self, **given):
+            observation, info = super().reset(**given)
+            return Tensor(observation, **kind), info
+
+        def step(self, action):
+            observation, *rest = super().step(action)
+            return Tensor(observation.copy(), **kind), *rest
+
+    env = Networked(Torch(), chunk=2)
+    env.reset()
+    assert env.step(Tensor([[0.5], [0.0]], **kind))[0].detach().cpu().float().numpy() == [1.0]
+    assert env.unwrapped.executed[0].tolist() == [0.5]
+    envs = NetworkedVector(SyncVectorEnv([Counter, Counter]))
+    envs.reset()
+    envs.step(Tensor([[0.5], [0.25]], **kind))
+    assert [each.executed[0].tolist() for each in envs.env.envs] == [[0.5], [0.25]]
 
 
 def test_the_neutral_action_is_in_its_space():
