@@ -45,7 +45,7 @@ files have changed."""
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     add = parser.add_argument
-    about = "environment of gymnasium: its id, or MODULE:ID"
+    about = "environment of gymnasium: its id, MODULE:ID or ./FILE.py:ID"
     add("--env", required=True, metavar="ID", help=about)
     about = "argument of the environment; repeatable"
     add("--env-arg", action="append", default=[], metavar="KEY=VALUE", help=about)

@@ -15,10 +15,24 @@ import gymnasium
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.eval.setup import EvalSetup, hash_of
 from cloudrc.plugin_file import OWN, sources
-from cloudrc.plugins import INSTALLED
+from cloudrc.plugins import INSTALLED, is_path
 from cloudrc.runs.grid import everything_of
 from cloudrc.runs.installed import package_code
 from cloudrc.runs.own_files import hash_all, hashes
+
+
+def find_module(setup: EvalSetup) -> str:
+    """Return the name of the environment for gymnasium: with a module, not the path of a file.
+
+    Let Python find modules beside the environment, beside the policy and in the working folder,
+    too. They come last, so that no file there hides a package.
+    """
+    module, colon, name = setup.env.rpartition(":")
+    for file in (module, setup.policy, ""):
+        folder = os.path.dirname(os.path.join(os.getcwd(), file))
+        if folder not in sys.path:
+            sys.path.append(folder)
+    return f"{Path(module).stem}:{name}" if colon and is_path(module) else setup.env
 
 
 def environment_code(env: gymnasium.Env[Any, Any], setup: EvalSetup) -> str:
@@ -50,7 +64,7 @@ def _modules(env: gymnasium.Env[Any, Any], setup: EvalSetup) -> set[str]:
 
     The packages that contain them are also modules.
     """
-    module, colon, _ = setup.env.partition(":")
+    module, colon, _ = find_module(setup).partition(":")
     names = {module} if colon else set[str]()
     entry: Any = getattr(env.spec, "entry_point", None)
     names.add(

@@ -18,7 +18,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.eval.environment import environment_code
+from cloudrc.eval.environment import environment_code, find_module
 from cloudrc.eval.setup import (
     BARE,
     FILE,
@@ -33,7 +33,14 @@ from cloudrc.eval.setup import (
 from cloudrc.gym import Networked
 from cloudrc.gym.step import StepTime, find_step
 from cloudrc.gym.values import size_of
-from cloudrc.plugins import InvalidResultError, refuse_failure, shorten, to_boolean, to_number
+from cloudrc.plugins import (
+    InvalidResultError,
+    refuse_failure,
+    shorten,
+    to_arrays,
+    to_boolean,
+    to_number,
+)
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
 from cloudrc.policy.observation import observe
@@ -97,11 +104,12 @@ class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
             elif isinstance(value, tuple | list):
                 self._note(*value)
             else:
-                self.digest.update(np.asarray(value).tobytes())
+                self.digest.update(np.asarray(to_arrays(value)).tobytes())
 
 
 def _reward_of(given: Any) -> float:
     """Return the reward of a step, which may be a boolean; raise a ValueError for a wrong value."""
+    given = _one(given)
     reward = float(given) if isinstance(given, bool | np.bool_) else to_number(given, "reward")
     if not isfinite(reward):
         raise InvalidResultError(f"its reward is {reward}")
@@ -109,12 +117,14 @@ def _reward_of(given: Any) -> float:
 
 
 def _flag_of(given: Any, name: str) -> bool:
-    """Return a truth value of a step; raise a ValueError for a wrong value.
+    """Return a truth value of a step; raise a ValueError for a wrong value."""
+    return to_boolean(_one(given), name)
 
-    Environments that are made for vectors give an array of one value.
-    """
-    is_one = isinstance(given, np.ndarray) and given.size == 1
-    return to_boolean(given.reshape(()) if is_one else given, name)
+
+def _one(given: Any) -> Any:
+    """Return the value of an array of one, as environments that are made for vectors give it."""
+    given = to_arrays(given)
+    return given.reshape(())[()] if isinstance(given, np.ndarray) and given.size == 1 else given
 
 
 def play(episode: Episode, setup: EvalSetup, identity: Mapping[str, Any]) -> dict[str, Any]:
@@ -166,7 +176,12 @@ def make_env(setup: EvalSetup, seed: int) -> Iterator[gymnasium.Env[Any, Any]]:
     words = {key: seed if value == SEED else value for key, value in setup.env_args}
     what = f"--env {setup.env}"
     with refuse_failure(what, keep=CloudrcError, slow=f"{what} is still being made"):
-        env = gymnasium.make(setup.env, disable_env_checker=True, **words)
+        name = find_module(setup)
+        try:
+            env = gymnasium.make(name, disable_env_checker=True, **words)
+        except gymnasium.error.UnregisteredEnv as error:
+            hint = "" if ":" in name else f"; if a module of your own registers it: MODULE:{name}"
+            raise InvalidResultError(f"{error}{hint}") from None
     with refuse_failure(f"{what}: the episode failed", keep=CloudrcError), closing(env):
         yield env
 

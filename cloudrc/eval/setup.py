@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
@@ -58,7 +59,6 @@ class EvalSetup:
     follows_seed: bool = True  # whether equal seeds give equal episodes
     env_code: str = ""  # hash of the environment's code and files
     deadline: float | None = None  # an action of an older observation is late [s]
-
     step: StepTime | None = None  # of the environment, and who tells its time
 
     @property
@@ -230,12 +230,14 @@ def read_times(path: str) -> tuple[float, ...]:
 
 
 def read_env_args(texts: list[str]) -> tuple[tuple[str, Any], ...]:
-    """Read arguments of an environment, given as KEY=VALUE; a value is YAML."""
+    """Read arguments of an environment, given as KEY=VALUE; a value is YAML, also with None."""
     found = dict[str, Any]()
     for text in texts:
         key, equals, value = text.partition("=")
         if not (equals and key.isidentifier()):
             raise BadInputError(f"--env-arg {text}: give KEY=VALUE, such as env_name=reach-v3")
+        if value == "None" or value.startswith(("[", "{")):
+            value = re.sub(r"(?<!['\"\w])None(?!['\"\w])", "null", value)
         found[key] = value if value == SEED else parse_value(value, f"--env-arg {key}")
     return tuple(sorted(found.items()))
 

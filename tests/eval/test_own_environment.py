@@ -1,0 +1,140 @@
+"""Environments of a user: where they lie, what their arguments are, what they return."""
+
+import json
+import sys
+from pathlib import Path
+from textwrap import dedent
+
+import gymnasium
+import pytest
+
+from cloudrc.cli.main import main
+from cloudrc.errors import BadInputError
+from cloudrc.eval.episode import check_environment, play
+from cloudrc.eval.setup import Episode, EvalSetup, read_env_args
+from tests.tensors import KINDS, Tensor
+
+STILL = "def infer(observation):\n    return {'actions': [[0.0]]}\n"
+
+
+@pytest.fixture
+def law(tmp_path):
+    def write(source=STILL):
+        path = tmp_path / "law.py"
+        path.write_text(source)
+        return str(path)
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("None", None),
+        ("null", None),
+        ("'None'", "None"),
+        ("None of them", "None of them"),
+        ("True", True),
+        ("false", False),
+        ("[None, 1]", [None, 1]),
+        ("{'goal': None, 'is_open': True}", {"goal": None, "is_open": True}),
+        ("{goal: None, is_open: True}", {"goal": None, "is_open": True}),
+        ("[a, None]", ["a", None]),
+        ("1,2", "1,2"),
+        ("1e-3", 1e-3),
+        ("['None', Nones]", ["None", "Nones"]),
+    ],
+)
+def test_arguments_of_an_environment_are_also_what_python_writes(text, value):
+    assert read_env_args([f"a={text}"]) == (("a", value),)
+
+
+MY_ENV = """
+import gymnasium
+import numpy as np
+
+class My(gymnasium.Env):
+    dt, control_hz = 0.05, 20
+    action_space = gymnasium.spaces.Box(-1, 1, (1,))
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        import NAME_sizes  # late, from beside
+        return np.zeros(2, np.float32), 1.0, True, False, {}
+
+gymnasium.register("ID", entry_point=My)
+"""
+
+
+@pytest.mark.parametrize(
+    ("env", "place"),
+    [
+        ("here_env:Here-v0", "."),
+        ("beside_env:Beside-v0", "laws"),
+        ("./path_env.py:Path-v0", "."),
+        ("elsewhere/else_env.py:space/Else-v0", "elsewhere"),
+    ],
+)
+def test_an_environment_may_be_a_file_here_or_beside_the_policy(
+    tmp_path, monkeypatch, capsys, env, place
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    module, name = env.removesuffix("/").split("/", 1)[-1].split(":")
+    module = module.removesuffix(".py")
+    Path("laws").mkdir()
+    Path(place).mkdir(exist_ok=True)
+    Path("laws/law.py").write_text(STILL)
+    source = MY_ENV.replace("NAME", module).replace("ID", name)
+    (Path(place) / f"{module}.py").write_text(source)
+    (Path(place) / f"{module}_sizes.py").touch()
+    line = f"eval --env {env} --policy laws/law.py --seeds 2 --jobs 2"
+    assert main(line.split()) == 0
+    assert "2 episodes, step 0.05 s (control_hz of My)" in capsys.readouterr().out
+    (folder,) = (each for each in Path("runs").iterdir() if not each.is_symlink())
+    assert ":" not in folder.name
+    told = json.loads((folder / "eval.json").read_text())
+    assert told["step"] == {"seconds": 0.05, "source": "control_hz of My", "doubts": []}
+    assert "step 0.05 s (control_hz of My)" in (folder / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("env", "words"),
+    [
+        ("Point-v0", "Point.*if a module of your own registers it: MODULE:Point-v0"),
+        ("./none.py:My-v0", "No module named 'none'"),
+    ],
+)
+def test_an_unknown_environment_is_one_line_with_the_way_to_name_ones_own(law, env, words):
+    with pytest.raises(BadInputError, match=f"--env {env}: .*{words}") as caught:
+        check_environment(EvalSetup(env, law()), [])
+    assert "\n" not in str(caught.value)
+
+
+def test_a_step_that_only_a_film_tells_is_said_to_be_one(law):
+    setup = EvalSetup("MountainCar-v0", law())
+    step = check_environment(setup, []).step
+    assert str(step) == "0.03333 s (render_fps of MountainCarEnv, a film's rate)"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_tensors_of_a_policy_and_an_environment_are_taken(law, monkeypatch, kind):
+    def told(env, action):
+        assert action.tolist() == [0.5]
+        reward, flag = Tensor([1.0], **kind), Tensor(True, **kind)
+        return Tensor(env.state, **kind), reward, flag, Tensor([False]), {"success": flag}
+
+    world = gymnasium.make("MountainCarContinuous-v0").unwrapped
+    monkeypatch.setattr(type(world), "step", told)
+    source = f"""
+        from tests.tensors import Tensor
+        def infer(observation):
+            return {{"actions": [Tensor([0.5], **{kind}), Tensor([0.25], **{kind})]}}
+    """
+    setup = EvalSetup("MountainCarContinuous-v0", law(dedent(source)))
+    row = play(Episode(None, "newest", 1), setup, {})
+    assert (row["verdict"], row["numbers"]["return"]) == ("success", 1.0)
