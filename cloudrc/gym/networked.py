@@ -65,15 +65,12 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             link: Name of a shipped link profile, path of a file, or mapping with its keys.
             seed: Seed of the network. `reset(seed=...)` seeds the environment, and selects the
                 episode of the network, too.
-            compute: Time that the policy needs for an answer [s]; or a pair, mean and standard
-                deviation of a gamma distribution. While it computes, the policy takes no other
-                observation.
-            answer_within: How long the robot waits in a step for an answer [s]; None: 5 % of the
-                step.
+            compute: Time that the policy needs for an answer [s], in which it takes no other
+                observation; or a pair, mean and standard deviation of a gamma distribution.
+            answer_within: Time for which the robot waits in a step for an answer [s]; None: 5 %.
             chunk: Number of actions in an answer, for the ticks from the observation's on; None:
                 an answer is a single action.
-            executor: How the robot executes answers: "newest", "time_indexed", "prefix", "broker",
-                "ensemble", or the path of a file.
+            executor: How the robot executes answers: the name of a plug-in, or the path of a file.
             hold: What the robot executes in a tick without an action: "repeat", the last action, or
                 "start", the action `start`.
             start: Action before the first answer arrives; None: 0, or what is nearest to it;

@@ -76,7 +76,8 @@ def connect(
 ) -> list[RemoteLoop]:
     """Connect a robot of each of the `streams` with its policy.
 
-    `spaces` are those of an observation and of an action; `dt` is the time of a step [s].
+    `spaces` are those of an observation and of an action; `dt` is the time of a step [s],
+    `answer_within` how long a robot waits in it for an answer [s].
     """
     observations, actions = spaces
     _refuse_wrong(hold, chunk, {"observation": observation_bytes, "action": action_bytes})
