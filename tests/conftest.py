@@ -9,6 +9,8 @@ import shutil
 import signal
 import socket
 import time
+import traceback
+import warnings
 from math import isfinite, nan
 from pathlib import Path
 
@@ -71,6 +73,37 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     if skipped and os.environ.get("REQUIRE_ALL"):
         reporter.write_line("REQUIRE_ALL: tests were skipped; see -rs", red=True)
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a test with the mark `child` in a child process of one thread.
+
+    A signal to a process with several threads may arrive late and elsewhere: then its
+    KeyboardInterrupt ends all tests.
+    """
+    if pyfuncitem.get_closest_marker("child") is None:
+        return None
+    arguments = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
+    ours, its = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside threads
+        child = os.fork()
+    if not child:
+        failed = ""
+        try:
+            pyfuncitem.obj(**arguments)
+        except BaseException:
+            failed = traceback.format_exc()
+        os.write(its, failed[-60_000:].encode())
+        os._exit(bool(failed))
+    os.close(its)
+    with open(ours, encoding="utf-8") as file:
+        failed = file.read()
+    status = os.waitpid(child, 0)[1]
+    if failed or status:
+        pytest.fail(failed or f"the child ended with the status {status}", pytrace=False)
+    return True
 
 
 @pytest.fixture(autouse=True)

@@ -369,3 +369,17 @@ def test_only_robots_have_the_words_of_one_robot():
 )
 def test_words_of_one_robot_are_found(text, words):
     assert a_robots_words(ast.parse(text)) == words
+
+
+SIGNALS_ITSELF = re.compile(
+    r"raise_signal|os\.kill\(os\.getpid\(\), (?!signal\.SIGKILL)|default_int_handler"
+)
+
+
+def test_tests_that_signal_their_own_process_do_so_in_a_child():
+    here = Path(__file__).parent
+    files = {path.relative_to(here).as_posix(): path.read_text() for path in here.rglob("test_*.py")}
+    signals = {name: text for name, text in files.items() if SIGNALS_ITSELF.search(text)}
+    signals.pop(Path(__file__).name)
+    assert signals
+    assert [name for name, text in signals.items() if "mark.child" not in text] == []

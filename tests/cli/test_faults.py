@@ -113,6 +113,7 @@ def find(monkeypatch, call):
     return run
 
 
+@pytest.mark.child
 def test_a_search_counts_stores_and_can_continue(find):
     told, _ = find(3)
     assert (told["kind"], told["first"], told["next"], told["count"]) == ("random", 1, 4, 3)

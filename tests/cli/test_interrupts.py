@@ -30,6 +30,7 @@ from cloudrc.runs.workers import isolated_start, map_in_order, take_each
 from tests.runs.conftest import write_sweep
 
 __all__ = ["write_sweep"]
+pytestmark = pytest.mark.child
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 

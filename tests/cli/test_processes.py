@@ -72,6 +72,7 @@ def test_an_address_of_ipv6_is_in_brackets(monkeypatch):
 
 # Here, too, the socket stays open after the command.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.child
 @pytest.mark.parametrize("end", ENDS)
 def test_an_end_stopped_at_its_start_completes_its_recording(end, key, tmp_path, monkeypatch, call):
     """The handlers are set first: as the first process of a container, an end needs them."""
@@ -90,6 +91,7 @@ def test_an_end_stopped_at_its_start_completes_its_recording(end, key, tmp_path,
     assert f"warning: {tmp_path / 'key'} can be read by others: chmod 600" in errors
 
 
+@pytest.mark.child
 def test_cloud_without_a_supervisor_ends_if_its_controller_is_lost(key, monkeypatch, refused):
     """In a pod, Kubernetes starts it again: the next mission gets a new controller."""
     build, bound = assembly.build_cloud, []

@@ -51,15 +51,21 @@ def answers(api):
         return False
 
 
+def beside(folder, monkeypatch):
+    """Let commands find the flight of a session in `folder`, and no other."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
+
+
 @contextmanager
 def session_with_console(tmp_path_factory, *flags):
     """Fly a session of the hover: yield its API, the run's folder, and the console's process.
 
-    `flags` are those of the console, which has to end with the session.
+    `flags` are those of the console, which has to end with the session. Only commands with the
+    environment of `beside` find the flight.
     """
     folder = tmp_path_factory.mktemp("session")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.getbasetemp()))
+        beside(folder, patch)
         session = start(folder, "up", "hover", "--set", "link.profile=wifi")
         wait_until(lambda: under_way() or session.poll() is not None)
         ((run, url),) = under_way().items()
