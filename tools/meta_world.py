@@ -40,7 +40,7 @@ Outcome = dict[str, Any]
 
 
 def evaluate(task: str, seeds: int) -> list[Outcome]:
-    """Evaluate the expert of a task; return an outcome per round trip."""
+    """Evaluate the expert of a task; return its outcomes, the first without a network."""
     folder = FOLDER / code_hash()
     folder.mkdir(parents=True, exist_ok=True)
     policy = folder / f"{task}.py"
@@ -61,11 +61,12 @@ def point(outcome: Outcome) -> Point:
 
 
 def table(found: dict[str, list[Outcome]], seeds: int) -> str:
-    """Return the table of the page: a row per round trip, a column per task."""
+    """Return the table of the page: a row without a network and one per round trip."""
     lines = [
         f"In how many of {seeds} episodes four experts do their tasks within {STEPS} steps of "
         "12.5 ms, with the 95 %\ninterval of the rate:\n",
-        f"![Success of four experts over the round trip, with 95 % intervals]({FIGURE.name})\n",
+        "![Success of four experts over the age of the loop, with 95 % intervals]"
+        f"({FIGURE.name})\n",
         f"| round trip [ms] | {' | '.join(found)} |",
         "|---" * (len(found) + 1) + "|",
     ]
