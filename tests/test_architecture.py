@@ -378,7 +378,9 @@ SIGNALS_ITSELF = re.compile(
 
 def test_tests_that_signal_their_own_process_do_so_in_a_child():
     here = Path(__file__).parent
-    files = {path.relative_to(here).as_posix(): path.read_text() for path in here.rglob("test_*.py")}
+    files = {
+        path.relative_to(here).as_posix(): path.read_text() for path in here.rglob("test_*.py")
+    }
     signals = {name: text for name, text in files.items() if SIGNALS_ITSELF.search(text)}
     signals.pop(Path(__file__).name)
     assert signals
