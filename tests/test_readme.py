@@ -73,7 +73,7 @@ def folder(tmp_path_factory):
     return path
 
 
-PROGRESS = re.compile(r"((writes|flies) .*\n)*")
+PROGRESS = re.compile(r"((reads|writes|flies) .*\n)*")
 """What a quick command says on a busy machine."""
 
 
