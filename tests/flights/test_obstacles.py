@@ -133,8 +133,8 @@ def test_a_report_needs_neither_mujoco_nor_a_scene_that_compiles(flown_into, mon
 @pytest.mark.parametrize(
     "robot",
     [
-        # Without a probe, any part of the robot touches. With drag, nano turns over at the wall.
-        ["world.robot=nano", "world.onboard.drag_s_per_m=0"],
+        # Without a probe, any part of the robot touches.
+        ["world.robot=nano"],
         ["world.robot=pelican"],
     ],
 )

@@ -30,7 +30,7 @@ CLIMB = 2.0
 """Bandwidth of the vertical velocity relative to that of the horizontal velocity [1]. The thrust
 follows at once, the tilt does not."""
 WIND = 2.0
-"""Largest horizontal acceleration of the integral [m/s^2]: what wind and drag can ask for."""
+"""Largest horizontal acceleration of the integral [m/s^2]: what wind can ask for."""
 WEIGHT = 0.5
 """Largest vertical acceleration of the integral, relative to gravity [1]: a payload."""
 SINK, RISE = 0.6, 0.9
@@ -76,14 +76,20 @@ class Multirotor:
 
     stopped: Commands
 
-    def __init__(self, frame: Airframe, allocation: Allocation, gains: Gains, dt: float) -> None:
-        """Set up the loops; `dt` is the time between two updates [s]."""
+    def __init__(
+        self, frame: Airframe, allocation: Allocation, gains: Gains, dt: float, drag: float = 0.0
+    ) -> None:
+        """Set up the loops; `dt` is the time between two updates [s].
+
+        `drag` is the drag of the rotors relative to the thrust and to the velocity [s/m].
+        """
         self.gains = gains
         self.stopped = allocation.stopped
         self.obeys_yaw = gains.yaw > 0.0
         self._allocate = allocation.allocate
         self._dt = dt
         self._gravity = gravity = frame.gravity
+        self._drag = drag * gravity  # deceleration of a hovering robot per velocity [1/s]
         self._thrust_max = min(allocation.acceleration_max, THRUST_MAX * gravity)
         self._slope_max = tan(gains.tilt_max)
         self._ahead_max = gravity * self._slope_max
@@ -138,10 +144,12 @@ class Multirotor:
 
         With the plan u, its bandwidth b, the reference r and the gravity g, in the world frame:
             du/dt = b · (r - u), limited;
-            a = du/dt + b · (u - v) + integral of b^2/4 · (u - v) + g.
+            a = du/dt + d · u + b · (u - v) + integral of b^2/4 · (u - v) + g.
         Both poles of the PI loop are at b/2. The vertical loop has the bandwidth CLIMB · b. The
-        tilt follows with a lag of 2/b of the attitude; so the horizontal velocity is compared with
-        the plan after this lag, else it would overshoot.
+        horizontal drag d · u is that of the rotors in still air: the integral is left for the wind,
+        and a robot that brakes with a constant integral comes to rest. The tilt follows with a lag
+        of 2/b of the attitude; so the horizontal velocity is compared with the plan after this lag,
+        else it would overshoot.
         """
         dt, b, gravity = self._dt, self.gains.velocity, self._gravity
         climb = CLIMB * b
@@ -167,7 +175,9 @@ class Multirotor:
         # The vertical force has priority; the tilt limit and the largest thrust bound the rest.
         wanted_z = planned_z + climb * ez + iz + gravity
         up = min(max(wanted_z, THRUST_MIN * gravity), self._thrust_max)
-        wanted_x, wanted_y = planned_x + b * ex + ix, planned_y + b * ey + iy
+        drag = self._drag
+        wanted_x = planned_x + drag * ux + b * ex + ix
+        wanted_y = planned_y + drag * uy + b * ey + iy
         left = sqrt(self._thrust_max * self._thrust_max - up * up)
         ahead, aside = _shorten(wanted_x, wanted_y, min(up * self._slope_max, left))
 
@@ -241,8 +251,8 @@ def build(
         yaw_bandwidth_radps: Bandwidth of the yaw [rad/s]. Default: 4, or less for a robot that
             turns slowly. 0: leave the yaw alone.
         tilt_max_deg: Largest commanded tilt [deg].
-        drag_s_per_m: Drag of the rotors, which `actuators` simulates and the controller does not
-            know: force relative to the thrust of a rotor and to the velocity of its hub across its
+        drag_s_per_m: Drag of the rotors, which `actuators` simulates and the controller adds to its
+            force: force relative to the thrust of a rotor and to the velocity of its hub across its
             axis [s/m]. Default: no drag. The robots nano and x2 have 0.0258 and 0.0282.
         braking_mps2: Deceleration that the guard expects [m/s^2]; a robot without the thrust to
             stop a descent with it is refused. It comes from `guard` in robot.yaml.
@@ -266,7 +276,7 @@ def build(
     yaw = _checked("yaw", yaw_bandwidth_radps, yaw, attitude) if frame.steers_yaw else 0.0
     _check_ranges(tilt_max_deg, drag_s_per_m)
     gains = Gains(velocity, attitude, yaw, radians(tilt_max_deg))
-    return Multirotor(frame, allocation, gains, model.opt.timestep)
+    return Multirotor(frame, allocation, gains, model.opt.timestep, drag_s_per_m)
 
 
 def actuators(model: Any, dt: float, *, drag_s_per_m: float = 0.0) -> Actuators:
