@@ -127,7 +127,7 @@ class Arrival(NamedTuple):
     cause. Further repeats then get no record, so that they cannot fill the recording. Cloud writes
     the topic /uplink_delay, world the topic /downlink_delay.
 
-    The echo is that in telemetry, for live metrics; a recording has it in the topic /telemetry.
+    The echo is for live metrics; recordings have it in the telemetry that was sent.
     """
 
     stamp_ns: int

@@ -73,7 +73,7 @@ def test_numbers_of_flights_that_failed_are_marked(fly_with, call):
 
 @pytest.mark.parametrize(
     ("form", "start"),
-    [("csv", "number,unit,a_median,"), ("latex", r"\begin{tabular}{lrrrrrrrrll}")],
+    [("csv", "number,unit,a_median,"), ("latex", r"\begin{tabular}{lrrrrrrrrrr}")],
 )
 def test_the_table_is_also_one_of_csv_or_latex_alone(form, start, fly_with, call):
     fly_with(lambda is_a, n: ("success", 0.01 * n + 0.001 * is_a))
