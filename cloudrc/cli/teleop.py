@@ -34,11 +34,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         ("--socket", "DIR", Path, "folder of the two sockets"),
         ("--api", "WHERE", api_address, where),
         ("--tokens", "DIR", Path, "folder of the token files 'operator' and 'reader'"),
-        ("--audit", "FILE", Path, "log all commands and their callers (JSON lines)"),
         ("--api-file", "FILE", Path, "write the API's URL to this file"),
         ("--link", "FILE", Path, "state of the link: its changes go to the mission's log"),
     ):
-        required = flag in ("--socket", "--api", "--audit")
+        required = flag in ("--socket", "--api")
         parser.add_argument(flag, type=kind, metavar=metavar, required=required, help=text)
     missions = parser.add_mutually_exclusive_group()
     journal = "store missions in this file (default: not stored)"

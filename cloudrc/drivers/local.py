@@ -51,7 +51,7 @@ PAUSE = 1.0
 does not count for time limits."""
 SOCKET_NAME = "/cloudrc-12345678/downlink.sock"
 """Longest path of a socket, relative to the folder for temporary files."""
-API_FILE, AUDIT_FILE = "api.json", "audit.jsonl"
+API_FILE = "api.json"
 """Files in a run's folder: the API's address, and the log of the API's commands."""
 LINK_FOLDER, ROUTE_FILE = "link", "route"
 """Folder in a run's folder, during the flight: the link's profile, and a folder per direction with
@@ -310,7 +310,6 @@ class LocalRun:
         start_end("world", "uplink")
         # Only this user can open the socket of the API: no token is needed.
         given: dict[str, object] = {"api": url, "api-file": folder / API_FILE}
-        given |= {"audit": folder / AUDIT_FILE}
         given |= {"link": folder / LINK_FOLDER / "downlink" / STATE_FILE}
         given |= {"journal": folder / JOURNAL_FILE} if session else {}
         start = () if session else ("--start",)

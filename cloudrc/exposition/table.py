@@ -176,7 +176,6 @@ cloudrc_missions_refused_total[reason] = api_order_*: Mission orders that the AP
     reason.
 cloudrc_stream_dropped_events_total = api_events_dropped: Events that slow readers of the event
     stream missed.
-cloudrc_audit_dropped_total = api_audit_dropped: Lines of the audit log that the disk refused.
 cloudrc_journal_repaired_total = journal_repaired: Times that teleop set a damaged journal aside and
     began a new one.
 

@@ -27,7 +27,7 @@ from cloudrc.geometry.scene import Scene
 from cloudrc.processes.ports import open_exporter, warn, warn_if_exposed
 from cloudrc.records import Counted, Fault, Record
 from cloudrc.teleop.api import ApiServer, Bridge, create_app
-from cloudrc.teleop.auth import Audit, Gate, Tokens
+from cloudrc.teleop.auth import Gate, Tokens
 from cloudrc.teleop.models import read_drive, read_goto, read_order
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import MissionStore, Order, StoreLockedError, connect, open_store
@@ -52,7 +52,6 @@ class TeleopSettings:
     config: Path  # experiment file
     socket: Path  # folder of the sockets between teleop and cloud
     api: Address | Path  # where to serve the API
-    audit: Path  # log of all commands and their callers
     tokens: Path | None = None  # folder of the token files
     api_file: Path | None = None  # file for the API's URL
     link: Path | None = None  # state of the link
@@ -117,7 +116,7 @@ def serve_api(settings: TeleopSettings, experiment: ResolvedExperiment, scene: S
     touch = experiment.mission.touch
     goto = partial(read_goto, scene=scene, robot=robot, planar=planar, heading=heading, touch=touch)
     app = create_app(bridge, order, goto, partial(read_drive, grounded=grounded), log_line)
-    server = ApiServer(Gate(app, tokens, Audit(settings.audit, log_line)), bridge, settings.api)
+    server = ApiServer(Gate(app, tokens, log_line), bridge, settings.api)
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     files = FILES_MAX if hard == resource.RLIM_INFINITY else min(FILES_MAX, hard)
     resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))

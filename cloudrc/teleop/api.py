@@ -456,9 +456,9 @@ class ApiServer(uvicorn.Server):
                 ws="none",
                 lifespan="off",
                 log_level="critical",  # a flood does not fill the log
-                access_log=False,  # the audit log has the commands
+                access_log=False,  # the gate's log has the commands
                 server_header=False,
-                proxy_headers=False,  # the audit log has the true address
+                proxy_headers=False,  # the log has the true address
                 # No limit_concurrency: uvicorn would refuse an emergency stop, too.
                 timeout_graceful_shutdown=STOP_LIMIT,
             )
@@ -471,9 +471,8 @@ class ApiServer(uvicorn.Server):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Counts by name: requests with each outcome, and lost lines of the audit log."""
-        counts = {**self.gate.counts, "audit_dropped": self.gate.audit.dropped}
-        return {f"api_{name}": count for name, count in counts.items()}
+        """Counts by name: requests with each outcome."""
+        return {f"api_{name}": count for name, count in self.gate.counts.items()}
 
     def start(self) -> None:
         """Start to serve the API, in a thread of its own."""
@@ -485,7 +484,6 @@ class ApiServer(uvicorn.Server):
         self.should_exit = True
         self._thread.join(STOP_LIMIT)
         self._socket.close()
-        self.gate.audit.stop()
 
 
 def _bind(address: Address) -> tuple[socket.socket, str]:

@@ -8,16 +8,8 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
-import logging
-import os
-import queue
-import sys
 from collections import Counter
 from collections.abc import Callable, Mapping
-from contextlib import suppress
-from datetime import UTC, datetime
-from io import TextIOWrapper
-from logging.handlers import QueueHandler, QueueListener, RotatingFileHandler
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,7 +18,7 @@ from fastapi.security import HTTPBearer
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import read_token, warn_if_readable
 
 OPERATOR, READER = "operator", "reader"
@@ -37,7 +29,7 @@ URGENT = ("/v1/estop", "/v1/hold")
 """Paths of commands that are accepted even if too many requests are open."""
 REPEATED = ("/drive", "/renew")
 """Ends of the paths of requests that a program repeats: to drive, to renew a mission's lease. Of
-these requests, the audit log contains only the refused ones."""
+these requests, the log contains only the refused ones."""
 ORDERS = ("/v1/missions", "/v1/goto")
 """Paths of orders to fly a mission or to a point; refused orders are counted by reason."""
 COUNTED = {409: "order_conflict", 413: "order_invalid", 422: "order_invalid"}
@@ -53,8 +45,6 @@ SEND_LIMIT = 30.0
 """Time for a client to read before its request ends [s]; a client that stalls keeps no slot."""
 IN_FLIGHT_MAX = 32
 """Largest number of requests of one role that are answered at the same time, streams included."""
-AUDIT_MAX = 8 << 20
-"""Largest size of the audit log [bytes]. A full log is renamed to NAME.1, and a new log begins."""
 
 
 class Caller(NamedTuple):
@@ -113,63 +103,15 @@ def _read_token(path: Path) -> str:
         raise BadInputError(f"--tokens: {path}: {error}; make one: {make}") from None
 
 
-class Audit(RotatingFileHandler):
-    """Log file of the commands to the API, as lines of JSON that a separate thread writes.
-
-    Only the owner can read the file.
-    """
-
-    def __init__(self, path: Path, complain: Callable[[str], None]) -> None:
-        """Start the thread that writes the log to the file `path`.
-
-        `complain` receives one line of text if the file cannot be written.
-        """
-        super().__init__(path, maxBytes=AUDIT_MAX, backupCount=1, encoding="utf-8", delay=True)
-        self.dropped, self._complain = 0, complain  # `dropped`: lines that could not be written
-        waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._queue, self._listener = QueueHandler(waiting), QueueListener(waiting, self)
-        self._listener.start()
-
-    def note(self, caller: Caller, scope: Mapping[str, Any], answer: Mapping[str, Any]) -> None:
-        """Queue a log line: who sent a command, the request (`scope`), and the `answer` to it."""
-        said = json.loads(answer.get("body") or b"{}")
-        line = {
-            "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
-            "role": caller.role,
-            "token": caller.name,
-            "client": ":".join(map(str, scope.get("client") or ("local",))),
-            "action": f"{scope['method']} {scope['path']}"[:200],
-            "mission": said.get("id"),
-            "status": answer["status"],
-            "outcome": said.get("detail") or said.get("state") or "",
-        }
-        text = json.dumps(line, separators=(",", ":"))
-        self._queue.handle(logging.makeLogRecord({"msg": text}))
-
-    def stop(self) -> None:
-        """Write the queued log lines, end the thread and close the file."""
-        self._listener.stop()
-        with suppress(OSError):
-            self.close()
-
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
-        """Count a log line that could not be written; report the first such line."""
-        if not self.dropped:
-            reason = sys.exception()
-            self._complain(f"the audit log {self.baseFilename} cannot be written: {reason}")
-        self.dropped += 1
-
-    def _open(self) -> TextIOWrapper:
-        private = lambda path, flags: os.open(path, flags, 0o600)  # noqa: E731
-        return open(self.baseFilename, "a", encoding="utf-8", opener=private)
-
-
 class Gate:
     """Check token and role of every request before the application gets the request."""
 
-    def __init__(self, app: ASGIApp, tokens: Tokens | None, audit: Audit) -> None:
-        """Set application and audit log; without `tokens`, all who can connect may command."""
-        self._app, self.tokens, self.audit = app, tokens, audit
+    def __init__(self, app: ASGIApp, tokens: Tokens | None, log: Callable[[str], None]) -> None:
+        """Set the application; without `tokens`, all who can connect may command.
+
+        `log` receives a line for each command: who sent it, from where, what, and the answer.
+        """
+        self._app, self.tokens, self._log = app, tokens, log
         self._in_flight: Counter[str] = Counter()
         self.counts: Counter[str] = Counter()  # requests by outcome; "served": answered by `app`
 
@@ -202,7 +144,7 @@ class Gate:
                 self.counts[COUNTED[answer["status"]]] += 1
             repeats = path.endswith(REPEATED) and answer["status"] == 200
             if scope["method"] not in READS and not repeats:
-                self.audit.note(caller, scope, answer)
+                self._log(_describe(caller, scope, answer))
 
     async def caller(self, scope: Scope) -> Caller | None:
         """Return the caller of a request; None without a valid token."""
@@ -220,3 +162,12 @@ class Gate:
             return 403
         is_urgent = is_command and scope["path"] in URGENT
         return 429 if self._in_flight[caller.role] >= IN_FLIGHT_MAX and not is_urgent else 0
+
+
+def _describe(caller: Caller, scope: Mapping[str, Any], answer: Mapping[str, Any]) -> str:
+    """Return the line of the log about a command and the `answer` to it."""
+    said = json.loads(answer.get("body") or b"{}")
+    where = ":".join(map(str, scope.get("client") or ("local",)))
+    outcome = said.get("detail") or said.get("state") or ""
+    line = f"{caller.name} {where} {scope['method']} {scope['path'][:200]}: {answer['status']}"
+    return to_one_line(f"{line} {said.get('id') or ''} {outcome}")

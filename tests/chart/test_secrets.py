@@ -123,5 +123,4 @@ def test_a_container_mounts_only_what_it_needs(mode):
         assert folder(containers(found[end])[end], "key") == "secret"
     cloud, teleop = (containers(found["cloud"])[name] for name in ("cloud", "teleop"))
     assert folder(teleop, "tokens") == "tokens"
-    assert folder(teleop, "audit") == "journal"
     assert folder(cloud, "teleop") == folder(teleop, "socket") == "teleop"

@@ -130,7 +130,7 @@ class Release:
             "world": ["--listen", world, "--route", "world.route", "--key", "key"],
             "cloud": ["--listen", cloud, "--route", "cloud.route", "--key", "key", "--teleop", "."],
             "teleop": ["--socket", ".", "--api", "0", "--api-file", "api.json", "--tokens", ".",
-                       "--audit", "audit.jsonl", "--journal", "journal/missions"],
+                       "--journal", "journal/missions"],
         }  # fmt: skip
         for end in ("world", "cloud"):
             self.flags[end] += ["--record", f"{end}.mcap"]

@@ -40,7 +40,7 @@ def test_idle_connections_do_not_lock_a_stop_out(tmp_path):
     (tmp_path / "operator").write_text(TOKEN)
     (tmp_path / "operator").chmod(0o644)
     words = "-m cloudrc teleop --config config.yaml --socket . --tokens . --api-file api.json"
-    command = [sys.executable, *words.split(), "--api", "[::1]:0", "--audit", "audit.jsonl"]
+    command = [sys.executable, *words.split(), "--api", "[::1]:0"]
     shell = ["bash", "-c", f'ulimit -Sn {FILES}; exec "$@"', "bash", *command]
     process = subprocess.Popen(shell, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
     wait_until((tmp_path / "api.json").exists, LIMIT)

@@ -73,6 +73,6 @@ def test_a_flight_exposes_no_secret(tmp_path):
     for path in tmp_path.rglob("*"):
         if path.is_file() and path.name not in SECRET_FILES:
             shown[str(path.relative_to(tmp_path))] = content_of(path)
-    assert {"world.mcap", "cloud.mcap", "audit.jsonl", "journal/missions"} <= shown.keys()
+    assert {"world.mcap", "cloud.mcap", "journal/missions"} <= shown.keys()
     assert b"position" in shown["world.mcap"], "it is decompressed"
     assert {place: found_in(data) for place, data in shown.items() if found_in(data)} == {}

@@ -22,7 +22,7 @@ from cloudrc.messages import UPRIGHT, Cause, GuardState, OperatorRequest, Reques
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
 from cloudrc.teleop.api import STARTING, ApiServer, Bridge, create_app
-from cloudrc.teleop.auth import Audit, Gate, Tokens
+from cloudrc.teleop.auth import Gate, Tokens
 from cloudrc.teleop.carrot import setpoint_at
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.models import read_drive, read_goto, read_order
@@ -322,11 +322,11 @@ class Running:
         for role, token in (("operator", OPERATOR), ("reader", READER)):
             (folder / role).write_text(token + "\n")
             (folder / role).chmod(0o600)
-        self.token_file, self.audit_file = folder / "operator", folder / "audit.jsonl"
+        self.token_file = folder / "operator"
         self.scene, self.bridge = load_scene("pipes"), Bridge()
         self.flight = ServiceFlight(self.scene)
         self.flight.uplink = uplink
-        self.alarms, self.complaints = [], []
+        self.alarms, self.complaints, self.log = [], [], []
         self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
         how = {"plan": partial(assembly.mission_plan, fence=FENCE)}
         where = {"scene": self.scene, "robot": PELICAN.dense}
@@ -334,7 +334,7 @@ class Running:
         order = partial(order, **how)
         app = create_app(self.bridge, order, goto, read_drive, self.complaints.append)
         tokens = None if unix else Tokens(folder, self.complaints.append)
-        self.gate = Gate(app, tokens, Audit(self.audit_file, self.complaints.append))
+        self.gate = Gate(app, tokens, self.log.append)
         self.address = folder / "api.sock" if unix else (host, 0)
         self.server = ApiServer(self.gate, self.bridge, self.address)
         self.url = self.server.url
@@ -351,7 +351,7 @@ class Running:
         vars(self.bridge).pop("make_calls", None)
         self.bridge.overtakings = 0
         self.until(lambda: not self.gate._in_flight.total())
-        for kept in (self.alarms, self.complaints, self.gate.counts):
+        for kept in (self.alarms, self.complaints, self.log, self.gate.counts):
             kept.clear()
         self.flight = ServiceFlight(self.scene)
         self.bridge.open(self.flight.teleop)
@@ -397,11 +397,11 @@ class Running:
         with answer:
             return answer.status, json.loads(answer.read() or "null")
 
-    def audited(self):
-        """Stop the server, and return the lines of the audit log."""
+    def logged(self):
+        """Stop the server, and return the lines of its log."""
         self.server.stop()
         self.server.stop = lambda: None
-        return [json.loads(line) for line in self.audit_file.read_text().splitlines()]
+        return self.log
 
     def until(self, condition):
         wait_until(condition, LIMIT)
