@@ -16,8 +16,6 @@ ROUNDING = 1e-9
 NOISE = 1e-12
 """Two numbers are equal if they differ by less than this [any SI unit]: a number that is 0 but for
 rounding has no size of its own."""
-DECIMALS = 2, 15
-"""Smallest and largest number of decimals of `format_beside`."""
 
 
 def differences(a: ArrayLike, b: ArrayLike) -> NDArray[Any]:
@@ -32,15 +30,6 @@ def exceeds(value: float, limit: float) -> bool:
     """Return whether `value` is above `limit`, both in any unit, by more than rounding."""
     above = value - limit  # in plain floats: teleop asks for each telemetry
     return above >= max(NOISE, ROUNDING * max(abs(value), abs(limit)))
-
-
-def format_beside(value: float, limit: float) -> str:
-    """Format `value` with two decimals, or with as many as show its side of `limit` [any unit]."""
-    first, last = DECIMALS
-    side = np.sign(differences(limit, value))
-    texts = [f"{value:.{digits}f}" for digits in range(first, last + 1)]
-    seen = (text for text in texts if np.sign(differences(limit, float(text))) == side)
-    return next(seen, texts[0])
 
 
 def format_limit(limit: float) -> str:

@@ -23,7 +23,7 @@ from cloudrc.metrics.flight import (
     yaw_of,
 )
 from cloudrc.record.merge import machine_time_ns
-from cloudrc.rounding import differences, exceeds, format_beside, format_limit
+from cloudrc.rounding import differences, exceeds, format_limit
 
 IMPACT_NS = 100_000_000
 """Time from the first touch over which the impulse is summed [ns]: the impact and its bounces."""
@@ -189,13 +189,13 @@ class _Visit:
         if not self._near[since:].all():
             row = since + int(np.argmax(self._distance[since:]))
             limit = self._waypoint.tolerance_m
-            text = f"{format_beside(self._distance[row], limit)} m from it"
+            text = f"{self._distance[row]:.4g} m from it"
             text += f"{self._measured(row)}, above tolerance_m {format_limit(limit)}"
             return f"{text}, {self._at(row)}"
         row = since + int(np.argmax(self._turn[since:]))
         limit = degrees(self._yaw_allowed)
-        turn = format_beside(degrees(self._turn[row]), limit)
-        text = f"turned {turn} deg away, above yaw_tolerance_deg {format_limit(limit)}"
+        text = f"turned {degrees(self._turn[row]):.4g} deg away, above yaw_tolerance_deg "
+        text += format_limit(limit)
         return f"{text}, {self._at(row)}"
 
     def _at(self, row: int) -> str:

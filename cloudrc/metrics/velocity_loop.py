@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
-from cloudrc.rounding import format_beside
 
 Array: TypeAlias = NDArray[np.float64]
 INPUT, OUTPUT = "/reference", "/ground_truth"
@@ -62,11 +61,11 @@ def series(recording: Recording, name: str) -> tuple[Array, Array]:
     start_ns, end_ns = begins_ns[longest] + int(TAKE_OFF * 1e9), ends_ns[longest]
     end_ns = end_ns if tracks[longest] else start_ns
     if end_ns - start_ns < DURATION_MIN * 1e9:
-        flown = format_beside(max(0, end_ns - start_ns) * 1e-9, DURATION_MIN)
+        flown = max(0, end_ns - start_ns) * 1e-9
         where = " without lost messages" if recording.holes else ""
         raise BadInputError(
-            f"{name}: {flown} s of flight under commands after the take-off{where}, and the fit "
-            f"needs {DURATION_MIN:g} s; record a longer flight"
+            f"{name}: {flown:.4g} s of flight under commands after the take-off{where}, and the "
+            f"fit needs {DURATION_MIN:g} s; record a longer flight"
         )
     at_ns = np.arange(start_ns, end_ns, int(DT * 1e9))
     held = source["stamp_ns"].searchsorted(at_ns, "right") - 1

@@ -42,7 +42,7 @@ from cloudrc.metrics.response import responses
 from cloudrc.record.columns import Recording
 from cloudrc.record.holes import describe
 from cloudrc.records import CONTROLLER_LOST, REAL_TIME_FACTOR_MIN
-from cloudrc.rounding import exceeds, format_beside, format_limit
+from cloudrc.rounding import exceeds, format_limit
 
 SLIP_MAX = 0.25
 """Largest time that world's clock may lose in a valid flight [s]: the guard's default limit on the
@@ -171,7 +171,7 @@ def _too_fast(evidence: Evidence) -> Iterator[FlightFailure]:
     speed, moment = touch
     limit = wanted.speed_max_mps
     text = (
-        f"the robot met {wanted.body} at {format_beside(speed, limit)} m/s, above "
+        f"the robot met {wanted.body} at {speed:.4g} m/s, above "
         f"mission.touch.speed_max_mps {format_limit(limit)}"
     )
     yield FlightFailure("contact_too_fast", text, *moment)
@@ -192,7 +192,7 @@ def _unmet_goals(evidence: Evidence) -> Iterator[FlightFailure]:
         yield FlightFailure("not_touched", text)
     if end.time is not None and exceeds(end.time, evidence.time_limit):
         key = f"criteria.time_limit_s {format_limit(evidence.time_limit)}"
-        text = f"the mission took {format_beside(end.time, evidence.time_limit)} s, more than {key}"
+        text = f"the mission took {end.time:.4g} s, more than {key}"
         yield FlightFailure("time_limit_exceeded", text, *end)
 
 
@@ -204,8 +204,7 @@ def _obstacle_touched(name: str, count: int, moment: Moment = UNKNOWN) -> Flight
 def _too_slow(factor: float) -> str:
     if not exceeds(REAL_TIME_FACTOR_MIN, factor):
         return ""
-    found = format_beside(factor, REAL_TIME_FACTOR_MIN)
-    return f"real-time factor {found} is below {REAL_TIME_FACTOR_MIN}: {ADVICE}"
+    return f"real-time factor {factor:.4g} is below {REAL_TIME_FACTOR_MIN}: {ADVICE}"
 
 
 def flight_evidence(
@@ -342,7 +341,7 @@ def plugin_failures(
         if share > PLUGIN_FAILURES_MAX:
             first = faults["text"][faults["code"] == f"{kind}_failed"]
             why = f": {first[0]}" if len(first) else ""
-            shown = format_beside(min(share, 1.0) * 100, PLUGIN_FAILURES_MAX * 100)
+            shown = f"{min(share, 1.0) * 100:.4g}"
             limit = f"{PLUGIN_FAILURES_MAX:.0%}"
             text = f"cloud.{kind} failed in {shown}% of its periods, above {limit}{why}"
             yield FlightFailure("plugin_failed", text)
@@ -368,10 +367,9 @@ def _responses(flight: Flight, settle: float) -> Iterator[FlightFailure]:
     far = [step for step in whole if exceeds(step.last_error, settle)]
     if far and flight.mission.steps:
         first = far[0]
-        error = format_beside(first.last_error, settle)
         text = (
             f"{len(far)} of {len(whole)} steps did not settle: in step {first.waypoint + 1} the "
-            f"robot was {error} m from the setpoint in the last 0.5 s, above "
+            f"robot was {first.last_error:.4g} m from the setpoint in the last 0.5 s, above "
             f"criteria.settle_m {format_limit(settle)} m"
         )
         yield FlightFailure("not_settled", text, first.start)
@@ -390,7 +388,7 @@ def _missed_end(flight: Flight, settle: float) -> Iterator[FlightFailure]:
     if away is None or ending is None:
         return
     text = (
-        f"setpoints flown to their end, but the robot was {format_beside(away, settle)} m from the "
+        f"setpoints flown to their end, but the robot was {away:.4g} m from the "
         f"last one, above criteria.settle_m {format_limit(settle)} m; give the robot time there: "
         "repeat the last row with a later time_s"
     )
@@ -404,8 +402,7 @@ def _not_real_time(numbers: Mapping[str, Number]) -> str:
     if slow := _too_slow(factor.value):
         return slow
     if exceeds(slip.value, SLIP_MAX):
-        lost = format_beside(slip.value, SLIP_MAX)
-        return f"world's clock lost {lost} s, more than {SLIP_MAX} s: {ADVICE}"
+        return f"world's clock lost {slip.value:.4g} s, more than {SLIP_MAX} s: {ADVICE}"
     return ""
 
 

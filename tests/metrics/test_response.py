@@ -130,7 +130,7 @@ def test_random_steps_must_settle_and_null_switches_it_off():
     far = second_order(0.5), lambda t: (1.3, 0.0, 1.0)
     mission = MissionConfig(steps=Steps(count=1))
     text = judged(flight(*far, mission=mission))["not_settled"]
-    assert "in step 1 the robot was 0.30 m from the setpoint" in text
+    assert "in step 1 the robot was 0.3 m from the setpoint" in text
     assert "criteria.settle_m 0.15 m" in text
     assert "not_settled" not in judged(flight(*far, mission=mission, settle_m=None))
 
