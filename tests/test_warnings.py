@@ -65,13 +65,9 @@ def test_what_does_not_fit_is_named_and_the_named_value_fits(settings, words):
         (["link.uplink.changes=[{at_s: 3, loss: 1}]"], "100 % of its packets at times: "),
         (["link.uplink.loss={bad_start: 1, bad_end: 0.5}"], "the uplink loses 66.7 % of"),
         (["link.uplink.loss=0.4", "link.uplink.blackouts=[{start_s: 2, duration_s: 1}]"], ""),
-        (["link.uplink.corrupt=1"], "the uplink damages 100 % of its packets: its corrupt is a"),
-        (["link.downlink.duplicate=1"], "duplicates 100 % of its packets: its duplicate is a"),
-        (["link.uplink.reorder=1"], "reorders 100 % of its packets: its reorder is a share"),
-        (["link.uplink={corrupt: 0.1, duplicate: 0.1, reorder: 0.1}"], ""),
     ],
 )
-def test_a_share_that_may_be_meant_in_percent_is_named(settings, words):
+def test_a_loss_that_may_be_meant_in_percent_is_named(settings, words):
     told = [text for text in advise(load_experiment("paper", settings)) if "1 % is 0.01" in text]
     assert bool(told) == bool(words)
     assert all(words in text for text in told)
@@ -82,7 +78,6 @@ def test_a_share_that_may_be_meant_in_percent_is_named(settings, words):
     [
         (both(45_000, 0), "uplink.delay_ms is 45000 (45 s) and link.downlink.delay_ms is 45000"),
         (["link.uplink.delay_ms=45000"], "link.uplink.delay_ms is 45000 (45 s): no command"),
-        (["link.uplink.jitter_ms=45000"], "link.uplink.jitter_ms is 45000 (45 s), and a delay"),
         (["link.uplink.rate_kbit=0.05"], "rate_kbit 0.05 is below the 185.6 kbit/s that telemetry"),
         (["link.downlink.rate_kbit=0.05"], "below the 92.8 kbit/s that the stream of commands"),
         (
@@ -102,13 +97,12 @@ def test_a_link_that_no_setting_fits_is_named_without_one(settings, words):
 @pytest.mark.parametrize(
     ("times", "words"),
     [
-        (range(0, 30_000, 10), "t.csv: one packet in 10 s, if time_s is in the unit that its"),
         ([300 + 0.01 * step for step in range(3000)], "t.csv: begins at 300 s, and its first row"),
         (range(0, 90, 10), ""),  # nine rows may be typed by hand
         (range(3000), ""),
     ],
 )
-def test_a_trace_with_unusual_times_is_named(times, words, tmp_path):
+def test_a_trace_that_begins_late_is_named(times, words, tmp_path):
     rows = [f"{time},{30 + round(time) % 7}" for time in times]
     (tmp_path / "t.csv").write_text("\n".join(["time_s,delay_ms", *rows]))
     flown = load_experiment("steps", [f"link.uplink.trace={tmp_path / 't.csv'}"])
@@ -117,20 +111,14 @@ def test_a_trace_with_unusual_times_is_named(times, words, tmp_path):
     assert all(words in text for text in told)
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        (["criteria.time_limit_s=60"], "last 9,900 s, longer than criteria.time_limit_s 60;"),
-        (["criteria.time_limit_s=null"], "last 9,900 s: this is 2.75 hours;"),
-        (["criteria.time_limit_s=20000"], "last 9,900 s: this is 2.75 hours;"),
-    ],
-)
-def test_setpoints_with_times_in_milliseconds_are_named(settings, words, tmp_path):
+def test_setpoints_with_times_in_milliseconds_are_named(tmp_path):
     rows = [f"{time},0,0,1" for time in (0, 5000, 9900)]
     (tmp_path / "d.csv").write_text("\n".join(["time_s,x_m,y_m,z_m", *rows]))
-    flown = load_experiment("hover", [f"mission.setpoints={tmp_path / 'd.csv'}", *settings])
+    flown = load_experiment(
+        "hover", [f"mission.setpoints={tmp_path / 'd.csv'}", "criteria.time_limit_s=60"]
+    )
     (text,) = [text for text in advise(flown) if "mission.setpoints" in text]
-    assert words in text
+    assert "last 9,900 s, longer than criteria.time_limit_s 60;" in text
 
 
 @pytest.mark.parametrize(
@@ -175,10 +163,6 @@ def test_what_a_flight_never_reaches_on_the_time_line_of_the_link_is_named(setti
         ("paper", ["world.sensors.position_noise_m=0.05"], "within 0.1 m of waypoint 3 for 0.5 s"),
         ("paper", ["world.sensors.position_noise_m=0.02"], ""),
         ("pillars", ["world.sensors.position_noise_m=0.05"], ""),
-        ("steps", ["world.sensors.position_noise_m=5"], "noise_m is 5: cloud cannot bring"),
-        ("steps", ["world.sensors.position_noise_m=0.2"], ""),
-        ("paper", ["world.sensors.velocity_noise_mps=10"], "velocity_noise_mps is 10, and"),
-        ("paper", ["world.sensors.velocity_noise_mps=0.5"], ""),
         ("paper", ["guard.speed_max_mps=0.01"], "guard.speed_max_mps is 0.01 m/s, too slow for"),
         ("paper", ["cloud.controller.speed_max=0.0005"], "controller.speed_max is 0.0005 m/s"),
         ("pillars", ["guard.speed_max_mps=0.01"], ""),
@@ -194,14 +178,6 @@ def test_noise_and_speeds_with_which_no_mission_succeeds_are_named(name, setting
     for key, value in re.findall(r"--set ([\w.]+)=(\S+)", " ".join(told)):
         fitting = advise(load_experiment(name, [f"{key}={value}"]))
         assert not [text for text in fitting if text.startswith(key)]
-
-
-@pytest.mark.parametrize(("tolerance", "count"), [(10, 1), (0.5, 0)])
-def test_a_tolerance_that_may_be_meant_in_centimetres_is_named(tolerance, count):
-    settings = [f"mission.waypoints.0.tolerance_m={tolerance}"]
-    told = [text for text in advise(load_experiment("hover", settings)) if "waypoint 1" in text]
-    assert len(told) == count
-    assert all("10 m away; give mission.waypoints.0.tolerance_m in metres" in text for text in told)
 
 
 @pytest.mark.parametrize("profile", shipped.names("profile"))

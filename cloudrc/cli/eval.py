@@ -165,7 +165,7 @@ def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
         Episode,
         EvalSetup,
         check_setup,
-        heavy_shares,
+        heavy_loss,
         link_at,
         read_compute,
         read_env_args,
@@ -188,7 +188,7 @@ def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
         deadline=options.deadline,
     )
     check_setup(setup)
-    for text in heavy_shares(setup):
+    for text in heavy_loss(setup):
         print_line(f"cloudrc: warning: --link {setup.link}: {text}", sys.stderr)
     for rtt in options.rtt:
         link_at(setup.link, rtt)

@@ -56,7 +56,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import NO_SIZE
 from cloudrc.geometry.obstacles import fence_of, known
 from cloudrc.geometry.scene import Scene
-from cloudrc.link.doubts import describe_heavy_shares
+from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.traces import read_table, read_trace
 from cloudrc.rounding import format_limit
 
@@ -652,7 +652,7 @@ def edit_profile(
     overrides.apply_overrides(document, changes)
     new_profile = check_profile(document, command)
     for way in DIRECTIONS:
-        notes += describe_heavy_shares(getattr(new_profile, way), way)
+        notes += describe_heavy_loss(getattr(new_profile, way), way)
     values = new_profile.model_dump(mode="json", exclude_defaults=True)
     words = [f"profile {profile}"] if profile else []
     return Edit(values, ", ".join([*words, *settings]), restart, notes)

@@ -17,7 +17,7 @@ from cloudrc.config.document import parse_value, read_document
 from cloudrc.config.reuse import reuse
 from cloudrc.errors import BadInputError
 from cloudrc.gym.step import StepTime
-from cloudrc.link.doubts import describe_heavy_shares
+from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.library import LinkProfile, read_profile
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.traces import read_lines
@@ -201,11 +201,11 @@ def mean_compute(compute: Compute) -> float:
     return 0.0 if kind == MEASURED else float(kind)
 
 
-def heavy_shares(setup: EvalSetup) -> Iterator[str]:
-    """Warn of each share of packets of the link of which 100 times less may be meant."""
+def heavy_loss(setup: EvalSetup) -> Iterator[str]:
+    """Warn of a loss of the link of which 100 times less may be meant."""
     link = read_profile(setup.link)
-    yield from describe_heavy_shares(link.uplink, "uplink")
-    yield from describe_heavy_shares(link.downlink, "downlink")
+    yield from describe_heavy_loss(link.uplink, "uplink")
+    yield from describe_heavy_loss(link.downlink, "downlink")
 
 
 def read_times(path: str) -> tuple[float, ...]:

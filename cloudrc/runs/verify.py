@@ -24,7 +24,7 @@ from cloudrc.config.robot import known_robot
 from cloudrc.config.schema import Experiment, Profile
 from cloudrc.drivers.programs import run_tool
 from cloudrc.errors import BadInputError, TimedOutError
-from cloudrc.link.doubts import describe_heavy_shares
+from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.netem import check, find_netems
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import link_profile
@@ -111,7 +111,7 @@ def verify(
             break
     report = make_report(target, found)
     for way in found:
-        report["notes"] += describe_heavy_shares(link_profile(getattr(experiment, way)), way)
+        report["notes"] += describe_heavy_loss(link_profile(getattr(experiment, way)), way)
     return report
 
 

@@ -20,7 +20,7 @@ from cloudrc.eval.setup import (
     Episode,
     EvalSetup,
     check_setup,
-    heavy_shares,
+    heavy_loss,
     link_at,
     read_compute,
     read_env_args,
@@ -501,7 +501,7 @@ def test_a_wrong_time_for_an_answer_is_refused_with_all_that_fits(text):
 def test_a_loss_that_may_be_meant_in_percent_is_a_warning(loss, warned, tmp_path):
     (tmp_path / "lab.yaml").write_text(f"uplink: {{delay_ms: 40, loss: {loss}}}\n")
     setup = EvalSetup("CartPole-v1", "law.py", link=str(tmp_path / "lab.yaml"))
-    said = [text for text in heavy_shares(setup) if "the uplink loses 100 %" in text]
+    said = [text for text in heavy_loss(setup) if "the uplink loses 100 %" in text]
     assert bool(said) is warned
 
 

@@ -13,7 +13,7 @@ from typing import TypeAlias
 from cloudrc.config.load import load_profile
 from cloudrc.config.schema import DirectionConfig, Profile
 from cloudrc.errors import BadInputError
-from cloudrc.link.doubts import describe_heavy_shares, describe_trace
+from cloudrc.link.doubts import describe_heavy_loss, describe_trace
 from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers, sample
 from cloudrc.link.profile import DirectionProfile, Timeline, Trace
 from cloudrc.link.traces import link_profile, read_lines, read_trace
@@ -104,7 +104,7 @@ def _way(
         many = send(range(0, settings.packets * period_ns, period_ns))
     if doubt := describe_trace(profile.rows):
         tell(f"warning: {asked.trace}: {doubt}")
-    for doubt in describe_heavy_shares(profile, name):
+    for doubt in describe_heavy_loss(profile, name):
         tell(f"warning: {doubt}")
     return DirectionSample(asked, shown.sent, shown.delays, many.delays), numbers(many)
 
