@@ -37,16 +37,15 @@ def known_hull(name: str) -> Hull | None:
 
 
 def doubts(name: str) -> Iterator[str]:
-    """Say what in the model of a robot, given as for `find_robot`, cannot be right.
+    """Say that the size of a robot, given as for `find_robot`, cannot be right.
 
     Raises:
         BadInputError: If the model does not compile.
         MissingPrerequisiteError: If MuJoCo is missing.
     """
-    from cloudrc.geometry.compiled import odd_inertias, reach_of
+    from cloudrc.geometry.compiled import reach_of
 
     robot = known_robot(name)
-    yield from odd_inertias(robot.model)
     if robot.hull is None or robot.hull_points is not None:
         return
     if robot.hull < (reach := reach_of(robot.model)) - TOLERANCE:

@@ -38,7 +38,6 @@ from cloudrc.geometry.obstacles import (
 from cloudrc.geometry.placement import (
     CLEARANCE_MIN,
     find_crossed,
-    find_nearest_legal,
     find_overlapped,
     outside_fence,
 )
@@ -228,13 +227,6 @@ def _check_waypoints(
             reason = (
                 f"the robot would be within {CLEARANCE_MIN:g} m of {surface(known[hit[index]])}"
             )
-        before = mission.waypoints[index - 1].position_m if index else start
-        legal = None if index - 1 in wrong else before
-        near = None
-        if not planar:
-            near = find_nearest_legal(fence, known, robot, position, float(yaws[index + 1]), legal)
-        if near is not None:
-            reason += f"; nearest legal point found: {_point(np.array(near))}"
         yield _at_point(index, positions[index], reason)
     if not len(wrong):
         yield from _check_ways(np.vstack([start or positions[0], positions]), yaws, place)

@@ -62,10 +62,6 @@ _SHAPES: dict[Any, Shape] = {
     _GEOM.mjGEOM_MESH: "hull",
 }
 """Type of a geom -> shape of its solid; all other types become an outline."""
-INERTIAS = 0.005, 10.0
-"""Smallest and largest plausible moment of inertia of a body, relative to its mass times the square
-of the distance of its farthest geom [1]. The small one is a ball of a ninth of this radius. The
-large one leaves room for a model that draws only a part of the body."""
 ROBOT_BITS = 1
 """Value of contype and conaffinity of the robot's geoms, as far as a scene is concerned: a flight
 whose robot meets other geoms is refused."""
@@ -253,35 +249,6 @@ def _compile_alone(robot: Path) -> tuple[Any, Any]:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     return model, data
-
-
-def odd_inertias(robot: Path) -> Iterator[str]:
-    """Say of each body of a robot that its inertia does not fit its mass and its geoms.
-
-    Raise a BadInputError if the robot does not compile.
-    """
-    model, data = _compile_alone(robot)
-    bodies = model.geom_bodyid
-    for body in np.flatnonzero(model.body_mass).tolist():
-        fixed = np.flatnonzero(model.body_weldid[bodies] == model.body_weldid[body]).tolist()
-        own = [geom for geom in fixed if bodies[geom] == body] or fixed
-        if not own:
-            continue
-        mass, found = float(model.body_mass[body]), float(model.body_inertia[body].max())
-        near, far = (
-            max(_reach(model, data, geom, data.xipos[body]) for geom in geoms)
-            for geoms in (own, fixed)
-        )
-        # What an actuator moves has mass, and in many models it is a site without a geom.
-        sites = model.body_weldid[model.site_bodyid] == model.body_weldid[body]
-        places = np.linalg.norm(data.site_xpos[sites] - data.xipos[body], axis=1)
-        far = max(far, places.max(initial=0.0))
-        least, most = INERTIAS[0] * mass * near**2, INERTIAS[1] * mass * far**2
-        if not least <= found <= most:
-            yield (
-                f"{robot}: body {model.body(body).name or body}: an inertia of {found:.2g} kg m^2 "
-                f"does not fit {mass:.3g} kg and its geoms, which have {least:.2g} to {most:.2g}"
-            )
 
 
 def reach_of(robot: Path) -> float:

@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from cloudrc.geometry.clearance import Array, Spheres, clearance_per_obstacle
 from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.obstacles import Obstacle
-from cloudrc.geometry.scene import Tube
-from cloudrc.messages import Vector
 
 CLEARANCE_MIN = 0.04
 """Smallest distance of the whole robot from an obstacle, at a waypoint and on the way to it [m].
@@ -22,8 +20,6 @@ The value is above 32 mm, the steady error of a hover with the published gains."
 STEP_MIN = 0.02
 """Shortest step in which a straight way is checked [m]. Near a wall, a check without a
 shortest step would not end."""
-_SEARCH = 1.5  # [m] largest distance of a suggested legal point
-_AT_ONCE = 50  # number of candidates whose ways are checked together
 _FAR = 1e3  # [m] limit of coordinates, so that no square overflows
 
 
@@ -100,48 +96,6 @@ def find_crossed(
         flying = flying[going]
         flown[flying] = np.minimum(flown[flying] + step, length[flying])
     return result
-
-
-def find_nearest_legal(
-    fence: Fence,
-    obstacles: Sequence[Obstacle],
-    robot: Spheres,
-    position: Vector,
-    yaw: float,
-    before: Vector | None = None,
-) -> Vector | None:
-    """Find a point that the guard allows and that is clear of obstacles; None if none is near.
-
-    The search begins at `position` (of the base, [m], world frame), moved into the guard's limits.
-    It goes up to 1.5 m along x, y and z, and towards and away from the axes of the tubes.
-    The coordinates of the point are whole centimetres, so that a message can show them exactly.
-
-    `yaw` is the heading of the level robot [rad]. If `before` [m] is given, the straight way from
-    there to the point is also clear of obstacles.
-    """
-    start = np.clip(position, fence.inner_low, fence.inner_high)
-    directions = [*np.eye(3), *-np.eye(3)]
-    for tube in (each for each in obstacles if isinstance(each, Tube)):
-        relative = start - np.asarray(tube.centre)
-        radial = relative - (relative @ np.asarray(tube.axis)) * np.asarray(tube.axis)
-        norm = float(np.linalg.norm(radial))
-        if 0 < norm < tube.outer + _SEARCH:
-            directions += [radial / norm, -radial / norm]
-    steps = np.arange(0, _SEARCH, 0.02)
-    around = start + steps[:, None, None] * np.array(directions)
-    candidates = np.round(around.reshape(-1, 3), 2)
-    legal = ~outside_fence(fence, candidates)
-    legal &= find_overlapped(obstacles, robot, candidates, np.full(len(candidates), yaw)) < 0
-    candidates = candidates[legal]
-    candidates = candidates[np.linalg.norm(candidates - start, axis=1).argsort(kind="stable")]
-    for part in np.array_split(candidates, max(1, len(candidates) // _AT_ONCE)):
-        if before is not None:
-            starts = np.tile(before, (len(part), 1))
-            part = part[find_crossed(obstacles, robot, starts, part, yaw) < 0]
-        if len(part):
-            x, y, z = part[0].tolist()
-            return x, y, z
-    return None
 
 
 def _distances(

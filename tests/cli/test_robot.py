@@ -10,7 +10,6 @@ import pytest
 from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
 from cloudrc.config.shipped import FOLDERS
-from cloudrc.geometry.compiled import odd_inertias
 from cloudrc.warnings import advise
 
 
@@ -44,31 +43,6 @@ def test_a_run_and_the_check_say_that_a_robot_is_larger_than_its_hull(mine, caps
     (told,) = json.loads(capsys.readouterr().out)["changes"]
     assert told == f"{mine}/robot.yaml: hull_m is 0.1, but the geoms reach 0.333 m from the base"
     assert told in advise(load_experiment("hover", [f"world.robot={mine}"]))
-
-
-@pytest.mark.parametrize(
-    ("value", "shown"),
-    [
-        (".000022 .000018 .000038", "an inertia of 3.8e-05 kg m^2 does not fit 1.22 kg"),
-        (".000022 .000018 .00003", "base: an inertia of 3e-05 kg m^2"),
-        (".22 .18 .38", None),  # ten times too large may be a model without its arms
-    ],
-)
-def test_a_run_and_the_check_doubt_an_inertia_in_another_unit(mine, capsys, value, shown):
-    replace(mine / "robot.xml", ".022 .018 .038", value)
-    main(["robot", "check", str(mine), "-o", "json"])
-    found = json.loads(capsys.readouterr().out or '{"changes": []}')["changes"]
-    told = list(advise(load_experiment("hover", [f"world.robot={mine}"])))
-    for texts in (found, told):
-        assert [shown in text for text in texts if "inertia" in text] == [True] * bool(shown)
-
-
-def test_the_wheel_of_a_robot_with_a_wrong_inertia_is_named(mine):
-    wheel = '<body name="wheel"><joint axis="0 1 0"/><geom size=".05"/>'
-    text = wheel + '<inertial pos="0 0 0" mass=".1" diaginertia=".1 .1 .1"/></body>'
-    replace(mine / "robot.xml", '<body name="back_right"', text + '<body name="back_right"')
-    (told,) = odd_inertias(mine / "robot.xml")
-    assert "body wheel: an inertia of 0.1 kg m^2 does not fit 0.1 kg" in told
 
 
 @pytest.fixture

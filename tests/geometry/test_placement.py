@@ -15,12 +15,9 @@ from cloudrc.geometry.obstacles import obstacles
 from cloudrc.geometry.placement import (
     CLEARANCE_MIN,
     find_crossed,
-    find_nearest_legal,
     find_overlapped,
-    outside_fence,
 )
 from cloudrc.geometry.scene import SCENES, load_scene
-from tests.fences import FENCE
 
 PIPES = load_scene("pipes")
 KNOWN = obstacles(PIPES, touch="board")
@@ -85,25 +82,6 @@ def test_a_way_touches_a_wall_if_one_of_its_points_does(start, end):
     distance = clearance(KNOWN, points, np.tile([1.0, 0, 0, 0], (len(points), 1)), FEW).min()
     if abs(distance - CLEARANCE_MIN) > 0.02:
         assert (crossed(start, end) >= 0) is bool(distance < CLEARANCE_MIN)
-
-
-@settings(max_examples=30, deadline=None)
-@given(
-    st.tuples(st.floats(-4, 10), st.floats(-9, 6), st.floats(-1, 3)), st.floats(-math.pi, math.pi)
-)
-def test_the_nearest_legal_point_is_legal(position, yaw):
-    found = find_nearest_legal(FENCE, KNOWN, DENSE, position, yaw)
-    assert found is not None
-    assert hit(found, yaw) == -1
-    assert not outside_fence(FENCE, np.array([found]))[0]
-    assert find_nearest_legal(FENCE, KNOWN, DENSE, found, yaw) == found
-
-
-def test_a_straight_way_leads_to_the_offered_point():
-    said = refusals((0.0, 0.0, 0.8))
-    x, y, z = (float(word) for word in said.rpartition("[")[2].rstrip("]").split(","))
-    assert math.dist((x, y, z), (0.0, 0.0, 0.8)) < 0.15
-    assert refusals((x, y, z)) == ""
 
 
 @pytest.mark.parametrize(

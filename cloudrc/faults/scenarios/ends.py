@@ -230,8 +230,6 @@ def _impossible(outcome: Outcome, seed: int) -> None:
             values = (f"{value:g}" in problems[0] for value in points[name])
             told = "waypoints.1" in problems[0] and all(values)
             outcome.true(f"{name}: names the waypoint's index and value", told)
-            offered = "nearest legal point found: [" in problems[0]
-            outcome.true(f"{name}: offers another point", offered)
 
 
 def _wall_of(tube: Tube) -> Vector:

@@ -2,42 +2,27 @@
 
 from __future__ import annotations
 
-from functools import cache
-from math import inf
-from typing import Any, TypeAlias
+from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike
-
-from cloudrc.config.robot import find_robot
-from cloudrc.config.shipped import file_of
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.compiled import mujoco
-from cloudrc.robots.pelican.low_level import GRAVITY, THRUST_MAX
-from cloudrc.world.scene import ROBOT_PREFIX, compile_model, rotation
+from cloudrc.robots.pelican.low_level import GRAVITY, ROBOT_MASS
+from cloudrc.world.scene import ROBOT_PREFIX
 
 ROTORS = ("rotor_front", "rotor_left", "rotor_back", "rotor_right")
 """Names of the actuators. Every tuple of four rotor values has the same order."""
-Facts: TypeAlias = dict[str, tuple[ArrayLike, ArrayLike]]
-"""Name of a quantity, with its unit -> its value and the largest difference that is accepted."""
+MASS_SLACK = 0.1
+"""Largest difference of the mass [kg]: the velocity loop compensates for a weight of 1 N."""
+GRAVITY_SLACK = 0.2
+"""Largest difference of the gravity from that which the controller assumes [m/s^2]."""
 
 
 def check_fit(model: Any) -> None:
-    """Raise a BadInputError that lists how a compiled model differs too much from the Pelican."""
-    _check_parts(model)
-    wanted = _wanted()
-    differs = [
-        f"{name} is {_words(have)}, not {_words(wanted[name][0])}"
-        + (f" +- {_words(slack)}" if np.any(slack := wanted[name][1]) else "")
-        for name, (have, _) in _facts(model).items()
-        if not np.all(np.abs(np.subtract(have, wanted[name][0])) <= np.add(wanted[name][1], 1e-9))
-    ]
-    if differs:
-        raise BadInputError(f"the onboard controller is not made for it: {'; '.join(differs)}")
+    """Raise a BadInputError if a compiled `MjModel` differs too much from the Pelican.
 
-
-def _check_parts(model: Any) -> None:
-    """Raise a BadInputError if the model has other parts than the Pelican, or drag of the air."""
+    Its parts, mass and gravity decide; there may be no air, whose drag the rotors would count
+    twice.
+    """
     for option in ("density", "viscosity"):
         if value := getattr(model.opt, option):
             raise BadInputError(
@@ -56,51 +41,10 @@ def _check_parts(model: Any) -> None:
             raise BadInputError(f"needs a {kind} named tip") from None
     if (model.nq, model.nv) != (7, 6):
         raise BadInputError("nothing but the robot's base may move")
-
-
-@cache
-def _wanted() -> Facts:
-    """Return the facts of the Pelican; its gravity is that which the controller assumes."""
-    facts = _facts(compile_model(find_robot("pelican").model, file_of("empty")))
-    return facts | {"gravity [m/s^2]": ((0.0, 0.0, -GRAVITY), 0.2)}
-
-
-def _words(numbers: ArrayLike) -> str:
-    return " ".join(f"{number:.4g}" for number in np.round(np.atleast_1d(numbers), 6) + 0.0)
-
-
-def _facts(model: Any) -> Facts:
-    """Return the quantities in which a robot must match the Pelican: name -> value, tolerance.
-
-    Within the tolerances the Pelican's controller works: its velocity loop compensates for a
-    weight that differs by 1 N, and its attitude gains work for an inertia that differs by 50 %.
-    """
-    base = model.jnt_bodyid[0]
-    turned = rotation(model.body_iquat[base])
-    inertia = np.diag(turned @ np.diag(model.body_inertia[base]) @ turned.T)
-    facts: Facts = {
-        "gravity [m/s^2]": (model.opt.gravity, 0.2),
-        "mass [kg]": (model.body_mass[base], 0.1),
-        "centre of mass [m]": (model.body_ipos[base], (0.01, 0.01, 0.03)),
-        "inertia [kg m^2]": (inertia, 0.5 * inertia),
-        "damping of the base": (model.dof_damping, 0.0),
-        "tip [m]": (model.site(f"{ROBOT_PREFIX}tip").pos, 0.01),
-    }
-    for number, name in enumerate(ROTORS):
-        site, gear = model.actuator_trnid[number, 0], model.actuator_gear[number]
-        axes, low, high = rotation(model.site_quat[site]), -inf, inf
-        for kind in ("ctrl", "force"):
-            if getattr(model, f"actuator_{kind}limited")[number]:
-                limits = getattr(model, f"actuator_{kind}range")[number]
-                low, high = max(low, limits[0]), min(high, limits[1])
-        facts |= {
-            f"{name} place [m]": (model.site_pos[site], 0.01),
-            f"{name} gear, thrust": (axes @ gear[:3], 0.01),
-            f"{name} gear, torque [m]": (axes @ gear[3:], 0.001),
-            f"{name} gain": (model.actuator_gainprm[number, 0], 0.01),
-            f"{name} biastype": (model.actuator_biastype[number], 0.0),
-            f"{name} dyntype": (model.actuator_dyntype[number], 0.0),
-            # A wider range than needed makes no difference.
-            f"{name} range [N]": (np.clip((low, high), (0.0, -inf), (inf, THRUST_MAX)), 0.0),
-        }
-    return facts
+    mass, gravity = model.body_mass[model.jnt_bodyid[0]], -model.opt.gravity[2]
+    if abs(mass - ROBOT_MASS) > MASS_SLACK or abs(gravity - GRAVITY) > GRAVITY_SLACK:
+        raise BadInputError(
+            f"the onboard controller is made for a mass of {ROBOT_MASS:g} +- {MASS_SLACK:g} kg and "
+            f"a gravity of {GRAVITY:g} +- {GRAVITY_SLACK:g} m/s^2, not {mass:g} and {gravity:g}; "
+            "fly the model with the onboard controller multirotor"
+        )
