@@ -92,7 +92,7 @@ def test_only_the_flight_under_commands_counts():
     ("recording", "text"),
     [
         ([], "m: has no /reference; name the recording of a whole flight"),
-        (records(track_s=(1.0, 15.0)), "m: 12.00 s of flight under commands after.*needs 20 s"),
+        (records(track_s=(1.0, 15.0)), "m: 12 s of flight under commands after.*needs 20 s"),
         (records(track_s=(1.0, 22.97)), "m: 19.97 s of flight under commands"),
     ],
 )

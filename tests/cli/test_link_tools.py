@@ -155,12 +155,12 @@ def test_a_trace_is_shown_row_by_row_whatever_its_span(folder, call):
     assert "downlink" not in trace
 
 
-def test_a_trace_with_times_in_milliseconds_is_shown_with_a_warning(folder, call):
-    rows = [f"{n * 10},{30 + n % 5}" for n in range(100)]
+def test_a_trace_that_begins_late_is_shown_with_a_warning(folder, call):
+    rows = [f"{300 + 0.1 * n:g},{30 + n % 5}" for n in range(100)]
     (folder / "t.csv").write_text("\n".join(["time_s,delay_ms", *rows]))
     (folder / "mine.yaml").write_text("downlink: {trace: t.csv}\n")
     for name in ("t.csv", "./mine.yaml"):
-        assert "t.csv: one packet in 10 s, if time_s is in" in call(f"link show {name}").err
+        assert "t.csv: begins at 300 s, and its first row holds" in call(f"link show {name}").err
 
 
 @pytest.mark.parametrize("name", ["Verizon.up", "./Verizon.up", "delays.csv"])
