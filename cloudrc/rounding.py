@@ -28,8 +28,12 @@ def differences(a: ArrayLike, b: ArrayLike) -> NDArray[Any]:
 
 def exceeds(value: float, limit: float) -> bool:
     """Return whether `value` is above `limit`, both in any unit, by more than rounding."""
-    above = value - limit  # in plain floats: teleop asks for each telemetry
-    return above >= max(NOISE, ROUNDING * max(abs(value), abs(limit)))
+    # Without a call of a function: teleop asks for each telemetry.
+    above = value - limit
+    if not above > 0.0:
+        return False
+    least = ROUNDING * (value if value > -limit else -limit)
+    return above >= least if least > NOISE else above >= NOISE
 
 
 def format_limit(limit: float) -> str:

@@ -175,7 +175,7 @@ class CloudEndpoint(TunnelEnd):
         if now_ns < self.next_deadline_ns():
             return
         if self._unsent is not None:
-            self._queue([self._unsent[1]])
+            self._queue(self._unsent[1])
             self._unsent = None
             if now_ns < self._tick_ns:
                 return
@@ -282,7 +282,7 @@ class CloudEndpoint(TunnelEnd):
         return self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS
 
     def _greet(self, hello: bytes, key: Key) -> None:
-        self._queue([self._session.greet(Kind.HELLO, hello, key)])
+        self._queue(self._session.greet(Kind.HELLO, hello, key))
 
     def _receive_accept(self, epoch: int, accept: Accept, now_ns: int) -> None:
         asks = self._wants_session(now_ns)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections import deque
+from functools import lru_cache
+from math import sqrt
 
 import numpy as np
 
 from cloudrc.messages import FRESH_ECHO_PERIODS, NEVER_NS, GuardState
 from cloudrc.metrics.definitions import (
-    PredictionJudge,
+    GAP_MAX_NS,
     age,
     delay_error,
+    prediction_error,
     real_time_factor,
     target_ns,
     tracking_error,
@@ -30,6 +32,7 @@ from cloudrc.record.columns import Table
 from cloudrc.rounding import differences
 
 
+@lru_cache(maxsize=1)  # four metrics and the figures ask for the same flight
 def _echoes(flight: Flight) -> Columns:
     """Measure the loop with each telemetry that cloud used, in order of arrival.
 
@@ -137,7 +140,7 @@ def _age_violation(flight: Flight) -> float | None:
 
 def compare_with_truth(
     flight: Flight, at_ns: Array, predicted: Array
-) -> tuple[PredictionJudge, Array, Array]:
+) -> tuple[float | None, Array, Array]:
     """Compare predicted positions with the true position at the same instants.
 
     Args:
@@ -146,30 +149,30 @@ def compare_with_truth(
         predicted: Predicted positions [m], shape (n, 3).
 
     Returns:
-        The judge with the sum of all errors. Then, of the predictions that it compared, the
-        instants [ns], shape (m,), and the errors [m], shape (m, 3).
+        The root mean square length of all errors [m], None without one. Then, of the predictions
+        that could be compared, the instants [ns], shape (m,), and the errors [m], shape (m, 3).
     """
-    truth, judge, found = flight.recording["/ground_truth"], PredictionJudge(), []
+    truth = flight.recording["/ground_truth"]
+    stamps_ns, positions = truth["stamp_ns"], truth["position"]
     known = np.isfinite(predicted).all(axis=1)  # a plug-in's model may have predicted NaN
     at_ns, predicted = at_ns[known], predicted[known]
-    order = np.argsort(at_ns, kind="stable")
-    waiting = deque(zip(at_ns[order].tolist(), predicted[order].tolist(), strict=True))
-    # The rows of the true position around these instants; an instant that has the stamp of a row
-    # is judged with the row before.
-    ends_ns = at_ns[order[[0, -1]]] if len(order) else np.zeros(2, np.int64)
-    first, last = truth["stamp_ns"].searchsorted(ends_ns, "right").tolist()
-    rows = slice(max(first - 2, 0), last + 1)
-    stamps, positions = truth["stamp_ns"][rows].tolist(), truth["position"][rows].tolist()
-    for stamp_ns, position in zip(stamps, positions, strict=True):
-        while waiting and waiting[0][0] <= stamp_ns:
-            judge.predict(*waiting.popleft())
-        found += judge.know(stamp_ns, position)
-    instants = np.array([at for at, _ in found], dtype=np.int64)
-    errors = np.array([error for _, error in found], dtype=float).reshape(-1, 3)
-    return judge, instants, errors
+    order = np.lexsort((*predicted.T[::-1], at_ns))
+    at_ns, predicted = at_ns[order], predicted[order]
+    # An instant that has the stamp of a row is judged with the row before.
+    after = stamps_ns.searchsorted(at_ns)
+    inside = (after > 0) & (after < len(stamps_ns))
+    inside[inside] = np.diff(stamps_ns)[after[inside] - 1] <= GAP_MAX_NS
+    at_ns, predicted, after = at_ns[inside], predicted[inside], after[inside]
+    before = after - 1
+    share = (at_ns - stamps_ns[before]) / (stamps_ns[after] - stamps_ns[before])
+    error = prediction_error(predicted.T, positions[before].T, positions[after].T, share)
+    errors = np.stack(error, axis=1)
+    squares = sum(axis * axis for axis in error)
+    rms = sqrt(np.cumsum(squares)[-1] / len(at_ns)) if len(at_ns) else None  # in the order of time
+    return rms, at_ns, errors
 
 
-def prediction_errors(flight: Flight) -> tuple[PredictionJudge, Array, Array]:
+def prediction_errors(flight: Flight) -> tuple[float | None, Array, Array]:
     """Compare each predicted position with the true position when the command was applied.
 
     So an error of the estimated delay adds to the result, which is that of `compare_with_truth`.
@@ -183,13 +186,13 @@ def prediction_errors(flight: Flight) -> tuple[PredictionJudge, Array, Array]:
 
 
 def _prediction_error(flight: Flight) -> float | None:
-    return finite(prediction_errors(flight)[0].rms)
+    return prediction_errors(flight)[0]
 
 
-def estimate_errors(flight: Flight) -> tuple[PredictionJudge, Array, Array]:
+def estimate_errors(flight: Flight) -> tuple[float | None, Array, Array]:
     """Compare each predicted position with the true position at the instant of the prediction.
 
-    Live metrics show these errors, too, but against the measured position (`PredictionJudge.take`).
+    Live metrics show these errors, too, but against the measured position (`PredictionJudge`).
     The result is that of `compare_with_truth`.
     """
     control = flight.control
@@ -199,7 +202,7 @@ def estimate_errors(flight: Flight) -> tuple[PredictionJudge, Array, Array]:
 
 
 def _estimate_error(flight: Flight) -> float | None:
-    return finite(estimate_errors(flight)[0].rms)
+    return estimate_errors(flight)[0]
 
 
 def _delay_error(flight: Flight) -> float | None:

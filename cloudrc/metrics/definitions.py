@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from heapq import heappop, heappush
-from math import nan, sqrt
+from math import nan
 from typing import Any
 
 from cloudrc.messages import Cause, GuardState, Vector
@@ -72,6 +72,21 @@ def tracking_error(setpoint: Iterable[Any], position: Iterable[Any]) -> tuple[An
     return sx - x, sy - y, sz - z
 
 
+def prediction_error(
+    predicted: Iterable[Any], before: Iterable[Any], after: Iterable[Any], share: Any
+) -> tuple[Any, Any, Any]:
+    """Return a predicted position minus the position between two known ones [m].
+
+    Each position has x, y and z, each a number or an array. `share` [1] of the way from `before` to
+    `after` is flown.
+    """
+    (px, py, pz), (ax, ay, az), (bx, by, bz) = predicted, before, after
+    x = px - ax - share * (bx - ax)
+    y = py - ay - share * (by - ay)
+    z = pz - az - share * (bz - az)
+    return x, y, z
+
+
 GAP_MAX_NS = 50_000_000
 """Longest time between two known positions between which positions are interpolated [ns]."""
 WAITING_MAX = 256
@@ -83,8 +98,9 @@ LONG_AGO_NS = -(1 << 62)
 class PredictionJudge:
     """Compares predicted positions with the position that was known later for the same instant.
 
-    Live metrics and the console know the measured positions, the report knows the true positions.
-    Between two known positions, the position is interpolated linearly.
+    Live metrics and the console do so with measured positions, the report with true positions
+    (`cloudrc.metrics.control.compare_with_truth`). Between two known positions, the position is
+    interpolated linearly.
 
     Attributes:
         error: Newest error: predicted minus known position [m]; NaN before the first.
@@ -97,11 +113,6 @@ class PredictionJudge:
         self.square = 0.0
         self.judged = 0
         self.reset()
-
-    @property
-    def rms(self) -> float:
-        """Root mean square length of all errors [m]; NaN without a compared prediction."""
-        return sqrt(self.square / self.judged) if self.judged else nan
 
     def reset(self) -> None:
         """Drop all predictions and positions, because a new session has started."""
@@ -120,31 +131,19 @@ class PredictionJudge:
         if len(self._waiting) < WAITING_MAX:
             heappush(self._waiting, (at_ns, position))
 
-    def know(self, stamp_ns: int, position: Vector) -> list[tuple[int, Vector]]:
-        """Judge the predictions for instants up to `stamp_ns` [ns], with its known position [m].
-
-        Return instant [ns] and error [m] of each judged prediction.
-        """
-        waiting, before_ns, found = self._waiting, self._known_ns, list[tuple[int, Vector]]()
+    def know(self, stamp_ns: int, position: Vector) -> None:
+        """Judge the predictions for instants up to `stamp_ns` [ns], with its known position [m]."""
+        waiting, before_ns = self._waiting, self._known_ns
         if stamp_ns <= before_ns:
-            return found
+            return
         before, self._known_ns, self._known = self._known, stamp_ns, position
         while waiting and waiting[0][0] <= stamp_ns:
             at_ns, predicted = heappop(waiting)
             if before_ns <= at_ns and stamp_ns - before_ns <= GAP_MAX_NS:
                 share = (at_ns - before_ns) / (stamp_ns - before_ns)
-                self._judge(predicted, before, position, share)
-                found.append((at_ns, self.error))
-        return found
-
-    def _judge(self, predicted: Vector, before: Vector, after: Vector, share: float) -> None:
-        (px, py, pz), (ax, ay, az), (bx, by, bz) = predicted, before, after
-        x = px - ax - share * (bx - ax)
-        y = py - ay - share * (by - ay)
-        z = pz - az - share * (bz - az)
-        self.error = (x, y, z)
-        self.square += x * x + y * y + z * z
-        self.judged += 1
+                self.error = x, y, z = prediction_error(predicted, before, position, share)
+                self.square += x * x + y * y + z * z
+                self.judged += 1
 
 
 class DelayJudge:

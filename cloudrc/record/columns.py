@@ -147,8 +147,8 @@ class Recording(Content):
             for name in table.names:
                 column = table[name][rows]
                 if column.dtype == object:
-                    texts = [text.encode("utf-8", "replace") for text in column]
-                    total.update(repr(texts).encode())
+                    known = {text: text.encode("utf-8", "replace") for text in {*column}}
+                    total.update(repr([known[text] for text in column]).encode())
                 elif (topic.ros_type, name) != ROTATED:
                     total.update(column.data)
         return total.hexdigest()
@@ -207,9 +207,12 @@ class RecordStore:
 
     def _convert(self, kind: type[Record]) -> None:
         """Convert the waiting records of one class to a block for each of their topics."""
-        records = self._waiting.pop(kind, [])
+        records: list[Any] = self._waiting.pop(kind, [])
         for topic in BY_SOURCE[kind]:
-            chosen = filter(topic.contains, records) if kind is Arrival else records
+            chosen = records
+            if kind is Arrival:
+                is_uplink = topic.end == "cloud"
+                chosen = [record for record in records if record.uplink == is_uplink]
             columns = zip(*map(topic.row, chosen), strict=True)
             self._blocks[topic.name].append(Table(topic, columns))
 

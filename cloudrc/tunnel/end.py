@@ -84,16 +84,16 @@ class TunnelEnd:
             self._tell("key", KEY_TEXT, now_ns)
 
     def _send(self, kind: int, body: bytes) -> None:
-        self._queue([self._session.seal(kind, body)])
+        self._queue(self._session.seal(kind, body))
 
     def _send_message(self, kind: int, message: Telemetry | Command) -> None:
-        self._queue([self._make_datagram(kind, message)])
+        self._queue(self._make_datagram(kind, message))
 
     def _encode(self, kind: int, message: Telemetry | Command) -> bytes:
         encode: Any = encode_command if isinstance(message, Command) else encode_telemetry
         return self._session.seal(kind, encode(message))
 
-    def _queue(self, datagrams: list[Datagram]) -> None:
-        self._datagrams += datagrams
-        self.counts["sent"] += len(datagrams)
-        self.counts["sent_bytes"] += sum(map(datagram_size, datagrams))
+    def _queue(self, datagram: Datagram) -> None:
+        self._datagrams.append(datagram)
+        self.counts["sent"] += 1
+        self.counts["sent_bytes"] += datagram_size(datagram)

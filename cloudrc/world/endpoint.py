@@ -276,7 +276,8 @@ class WorldEndpoint(TunnelEnd):
             self._clock_is_shared = hello.clock == self._identity.clock_id
             self._number = 0
             self._begin_epoch("cloud said hello")
-        self._queue(answer.datagrams)
+        for datagram in answer.datagrams:
+            self._queue(datagram)
 
     def _begin_epoch(self, cause: str) -> None:
         self._channel.reset()
@@ -346,7 +347,7 @@ class WorldEndpoint(TunnelEnd):
             case Request.START:
                 if request.start is Start.SPAWN:
                     self.robot.put_on_ground(tick_ns, "mission starts from spawn")
-                    self._queue([self._door.begin_next_epoch(now_ns)])
+                    self._queue(self._door.begin_next_epoch(now_ns))
                     self._begin_epoch("mission starts from spawn")
                 guard.start_mission(tick_ns)
         for observer in self.robot.observers:

@@ -480,6 +480,6 @@ def test_a_prediction_for_the_stamp_of_a_true_position_counts(row):
     truth = flight.recording["/ground_truth"]
     at_ns = truth["stamp_ns"][[row, row + 2]]
     predicted = truth["position"][[row, row + 2]] + (0.003, 0.004, 0.0)
-    judge, instants, _ = compare_with_truth(flight, at_ns, predicted)
+    error, instants, _ = compare_with_truth(flight, at_ns, predicted)
     assert instants.tolist() == at_ns.tolist()
-    assert judge.rms == approx(0.005)
+    assert error == approx(0.005)
