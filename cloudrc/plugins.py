@@ -25,7 +25,6 @@ import os
 import pkgutil
 import re
 import sys
-import sysconfig
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
@@ -49,7 +48,7 @@ from cloudrc.errors import (
     to_one_line,
 )
 from cloudrc.patience import telling_if_slow
-from cloudrc.plugin_file import PREFIX, load_file
+from cloudrc.plugin_file import INSTALLED, PREFIX, load_file
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -74,11 +73,6 @@ Metrics square numbers, and the page of the report stores some with single preci
 number overflows there."""
 STACK_MAX = 4000
 """Largest length of a failure's stack in the recording [characters]."""
-INSTALLED = (
-    *(sysconfig.get_path(name) + os.sep for name in ("stdlib", "platstdlib", "purelib", "platlib")),
-    os.path.dirname(__file__) + os.sep,
-)
-"""Folders of Python, of installed packages, and of cloudrc: files elsewhere are those of users."""
 METHODS = {
     **{"estimators": "horizon", "predictors": "predict", "controllers": "update"},
     **{"onboard": "update", "motion": "__call__", "executors": "action"},
@@ -112,7 +106,7 @@ class Found:
         """Whether it is a module of cloudrc, and not code of a user."""
         name = str(getattr(self._target, "__name__", ""))
         is_module = isinstance(self._target, ModuleType)
-        return is_module and name.startswith("cloudrc.") and not name.startswith(PREFIX)
+        return is_module and name.startswith("cloudrc.")
 
     @property
     def builder(self) -> Any:
@@ -151,7 +145,7 @@ class Found:
         try:
             with apart():
                 yield
-        except BaseException as error:
+        except FAILURES as error:
             what = f"{self._place(error, function)}: {name} {verb}"
             check_failure(error, what)
             raise BadInputError(f"{what}: {_explain(error)}") from error
@@ -306,14 +300,18 @@ def find(kind: str, name: str, *, look: bool = True) -> Found:
     raise BadInputError(unknown_name_text(one(kind), name, names(kind)))
 
 
+FAILURES = Exception, SystemExit
+"""What counts as a failure of a user's code; Ctrl-C, which is the user's, does not."""
+
+
 def check_failure(error: BaseException, what: str) -> None:
     """Return if `error`, which a plug-in raised, is the plug-in's failure; else raise.
 
-    Everything is, also SystemExit, except Ctrl-C, which is the user's, and a lack of memory, which
-    is the machine's: no result may depend on it; and except the loss of a program outside, which
-    ends a flight. `what` names the plug-in in the error's text.
+    All `FAILURES` are, except a lack of memory, which is the machine's: no result may depend on it;
+    and except the loss of a program outside, which ends a flight. `what` names the plug-in in the
+    error's text.
     """
-    if isinstance(error, KeyboardInterrupt | OutOfMemoryError | ControllerLostError):
+    if isinstance(error, OutOfMemoryError | ControllerLostError):
         raise error
     if isinstance(error, MemoryError):
         text = f"{what}: memory ran out ({describe_error(error)})"
@@ -350,7 +348,7 @@ def refuse_failure(
             yield
     except keep:
         raise
-    except BaseException as error:
+    except FAILURES as error:
         check_failure(error, what)
         raise BadInputError(f"{what}: {place_of(error)}{_explain(error)}") from error
 

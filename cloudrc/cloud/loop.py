@@ -41,6 +41,7 @@ from cloudrc.messages import (
     plan_length,
 )
 from cloudrc.plugins import (
+    FAILURES,
     InvalidResultError,
     check_failure,
     locate,
@@ -131,7 +132,7 @@ class ControlLoop:
         self._now_ns = now_ns
         try:
             estimator = self._build_estimator()
-        except BaseException as error:
+        except FAILURES as error:
             self._note("estimator", error)
             estimator = Estimator()  # it has no estimate, so the horizon stays 0
         self._call("predictor", self._predictor.reset)
@@ -271,7 +272,7 @@ class ControlLoop:
         assert basis is not None, "check `ready` first"
         try:
             self._horizon = self._estimate_horizon((now_ns - basis.stamp_ns) * 1e-9)
-        except BaseException as error:
+        except FAILURES as error:
             self._note("estimator", error)
         horizon = self._horizon
         estimate = self._predict(basis, horizon)
@@ -310,7 +311,7 @@ class ControlLoop:
         try:
             estimate = self._predictor.predict(basis, horizon)
             return estimate if self._trusts_predictor else check_estimate(estimate)
-        except BaseException as error:
+        except FAILURES as error:
             self._note("predictor", error)
             return basis
 
@@ -322,7 +323,7 @@ class ControlLoop:
             self.lost = error
             self.faults.append(Fault(self._now_ns, error.code, str(error)))
             return STAND_STILL
-        except BaseException as error:
+        except FAILURES as error:
             self._note("controller", error)
             return STAND_STILL
 
@@ -365,7 +366,7 @@ class ControlLoop:
                     break
                 plan.append(as_planned(velocity))
                 positions.append(state.position)
-        except BaseException as error:
+        except FAILURES as error:
             self._note(plug_in, error, "cloud sends this command without a plan")
             return [], []
         return plan, positions
@@ -382,7 +383,7 @@ class ControlLoop:
         """Call a plug-in's method that has no result; count and report an exception."""
         try:
             call(*arguments)
-        except BaseException as error:
+        except FAILURES as error:
             self._note(kind, error, "cloud goes on using it")
 
     def _note(self, kind: str, error: BaseException, instead: str = "") -> None:

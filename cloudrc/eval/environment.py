@@ -14,8 +14,8 @@ import gymnasium
 
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.eval.setup import EvalSetup, hash_of
-from cloudrc.plugin_file import OWN, sources
-from cloudrc.plugins import INSTALLED, is_path
+from cloudrc.plugin_file import INSTALLED, OWN, sources
+from cloudrc.plugins import is_path
 from cloudrc.runs.grid import everything_of
 from cloudrc.runs.installed import package_code
 from cloudrc.runs.own_files import hash_all, hashes

@@ -150,7 +150,7 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> Measured:
             else:
                 beyond = f", beyond {plugins.LARGEST:g}" if isfinite(number) else ""
                 notes.append(f"{METRIC_NOTE}{name} gave {number}{beyond}: left out")
-        except BaseException as error:
+        except plugins.FAILURES as error:
             plugins.check_failure(error, f"{METRIC_NOTE}{name}")
             why = f"{plugins.place_of(error)}{describe_error(error)}"
             notes.append(f"{METRIC_NOTE}{name} failed: {why}")

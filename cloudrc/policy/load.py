@@ -7,7 +7,15 @@ from functools import partial
 from typing import Any
 
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.plugins import check_failure, find, is_path, locate, refuse_failure, stack_of
+from cloudrc.plugins import (
+    FAILURES,
+    check_failure,
+    find,
+    is_path,
+    locate,
+    refuse_failure,
+    stack_of,
+)
 
 
 class PolicyFailedError(CloudrcError):
@@ -66,7 +74,7 @@ class LoadedPolicy:
         what = f"policy '{self.name}': {name}() failed"
         try:
             return function(*arguments)
-        except BaseException as error:
+        except FAILURES as error:
             check_failure(error, what)
             stack = stack_of(error)
             last = stack.rpartition("\n")[2]

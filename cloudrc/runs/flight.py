@@ -32,7 +32,7 @@ def fly_point(experiment: ResolvedExperiment) -> Row:
     """
     try:
         return measure(experiment)
-    except BaseException as error:  # one point that cannot fly must not stop the others
+    except plugins.FAILURES as error:  # one point that cannot fly must not stop the others
         if failure := plugins.machine_failure(error) or _lost_file(experiment):
             raise failure from error
         plugins.check_failure(error, "the flight")

@@ -83,7 +83,7 @@ def fly_step(experiment: ResolvedExperiment, size: float = SMALL) -> Answer:
     """
     try:
         return _fly_step(experiment, size)
-    except BaseException as error:  # a value that cannot fly must not stop the search
+    except plugins.FAILURES as error:  # a value that cannot fly must not stop the search
         if failure := plugins.machine_failure(error):
             raise failure from error
         plugins.check_failure(error, "the flight")

@@ -7,7 +7,7 @@ from math import isfinite
 from typing import Any
 
 from cloudrc.geometry.compiled import mujoco
-from cloudrc.plugins import shorten
+from cloudrc.plugins import FAILURES, shorten
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.onboard import Onboard
 from cloudrc.world.robot import STEP_NS, Robot
@@ -60,7 +60,7 @@ class AcceleratedRobot(Robot):
         self._has_failed = False
         try:
             self._faster.put_on_ground(now_ns, cause)
-        except BaseException as error:
+        except FAILURES as error:
             super().put_on_ground(now_ns, cause)
             self._stop(self._faster.put_on_ground, error, now_ns)
 
@@ -72,7 +72,7 @@ class AcceleratedRobot(Robot):
         try:
             ended_ns = self._faster.run(tick_ns, until_ns)
             self._check(ended_ns, until_ns, before)
-        except BaseException as error:
+        except FAILURES as error:
             self._stop(self._faster.run, error, tick_ns)
             return super().run(tick_ns, until_ns)
         # Its Python part has told of a failure of its own.

@@ -7,7 +7,6 @@ is an `OnboardFailedError`, on which the guard stops the robot.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Set
-from contextlib import suppress
 from math import hypot
 from pathlib import Path
 from types import CodeType
@@ -16,6 +15,7 @@ from typing import Any
 from cloudrc.errors import describe_error
 from cloudrc.messages import NEVER_NS, Vector
 from cloudrc.plugins import (
+    FAILURES,
     LARGEST,
     InvalidResultError,
     check_failure,
@@ -56,36 +56,21 @@ class WatchedOnboard:
         """Watch `onboard`, whose `stopped` are finite numbers."""
         self.stopped: Commands = tuple([float(value) for value in onboard.stopped])
         self._size = len(self.stopped)
-        self._onboard = onboard
-        self._update, self._brake = onboard.update, onboard.brake
+        self._reset, self._update, self._brake = onboard.reset, onboard.update, onboard.brake
 
     def reset(self) -> None:
         """Forget everything; the robot is stopped."""
-        reset = self._onboard.reset
-        try:
-            reset()
-        except BaseException as error:
-            raise failure_of(WHAT, reset, error) from error
+        _call(WHAT, self._reset)
 
     def update(self, readings: Readings, velocity: Vector, yaw_rate: float) -> Commands:
         """Return the commands that make the robot follow a velocity [m/s] and yaw rate [rad/s]."""
-        try:
-            commands = self._update(readings, velocity, yaw_rate)
-            if _are_floats(commands, self._size):
-                return commands
-        except BaseException as error:
-            raise failure_of(WHAT, self._update, error) from error
-        return _numbers(commands, self._size, WHAT, self._update)
+        commands = _call(WHAT, self._update, readings, velocity, yaw_rate)
+        return _floats(commands, self._size, WHAT, self._update)
 
     def brake(self, readings: Readings, velocity: Vector) -> Commands:
         """Return commands as `update` does, while the guard brakes to a velocity [m/s]."""
-        try:
-            commands = self._brake(readings, velocity)
-            if _are_floats(commands, self._size):
-                return commands
-        except BaseException as error:
-            raise failure_of(WHAT, self._brake, error) from error
-        return _numbers(commands, self._size, WHAT, self._brake)
+        commands = _call(WHAT, self._brake, readings, velocity)
+        return _floats(commands, self._size, WHAT, self._brake)
 
 
 class WatchedActuators:
@@ -100,59 +85,56 @@ class WatchedActuators:
         self._actuators = actuators
         self._size = inputs + 6
         self._rest: Inputs = (0.0,) * self._size
-        self._step = actuators.step
         self._has_failed = False
 
     @property
     def speeds(self) -> Commands:
         """What the actuators do at present."""
-        try:
-            return self._actuators.speeds
-        except BaseException as error:
-            raise failure_of(PHYSICS, self._step, error) from error
+        return self._actuators.speeds
 
     @speeds.setter
     def speeds(self, speeds: Commands) -> None:
-        try:
-            self._actuators.speeds = speeds
-        except BaseException as error:
-            raise failure_of(PHYSICS, self._step, error) from error
+        self._actuators.speeds = speeds
 
     def reset(self) -> None:
         """Stand still."""
+        self._has_failed = True  # as long as the reset does not succeed
+        _call(PHYSICS, self._actuators.reset)
         self._has_failed = False
-        try:
-            self._actuators.reset()
-        except BaseException as error:
-            self._has_failed = True
-            raise failure_of(PHYSICS, self._actuators.reset, error) from error
 
     def step(self, commands: Commands, readings: Readings) -> Inputs:
         """Advance by one physics step towards `commands`; return the input to MuJoCo."""
         if self._has_failed:
             return self._rest
-        try:
-            inputs = self._step(commands, readings)
-            if _are_floats(inputs, self._size):
-                return inputs
-        except BaseException as error:
-            self._has_failed = True
-            raise failure_of(PHYSICS, self._step, error) from error
-        try:
-            return _numbers(inputs, self._size, PHYSICS, self._step)
-        except OnboardFailedError:
-            self._has_failed = True
-            raise
+        self._has_failed = True  # as long as the step does not succeed
+        step = self._actuators.step
+        inputs = _floats(_call(PHYSICS, step, commands, readings), self._size, PHYSICS, step)
+        self._has_failed = False
+        return inputs
 
 
-def _are_floats(values: Any, size: int) -> bool:
-    """Return whether `values` need no `_numbers`, which takes some microseconds."""
-    return (
-        type(values) is tuple
-        and len(values) == size
-        and {*map(type, values)} == {float}
-        and hypot(*values) <= LARGEST  # False for NaN
-    )
+def _call(what: str, function: Callable[..., Any], *given: Any) -> Any:
+    """Call a function of the user; its failure is an OnboardFailedError."""
+    try:
+        return function(*given)
+    except FAILURES as error:
+        raise failure_of(what, function, error) from error
+
+
+def _floats(values: Any, size: int, what: str, call: Callable[..., Any]) -> tuple[float, ...]:
+    """Return the values of a `call` as floats; refuse another number of values, and wrong ones."""
+    if type(values) is tuple and len(values) == size and {*map(type, values)} == {float}:
+        if hypot(*values) <= LARGEST:  # the usual case; False for NaN
+            return values
+    try:
+        numbers = to_commands(values)
+    except FAILURES:  # the values are the user's, and so may be what iterates them
+        numbers = ()
+    if len(numbers) == size:
+        return numbers
+    name = getattr(call, "__name__", "it")
+    text = f"{name}() returned {shorten(values)}, not {size} finite numbers up to {LARGEST:g}"
+    raise OnboardFailedError(f"{what} failed ({text}, {where(call)})")
 
 
 def to_commands(values: Any) -> tuple[float, ...]:
@@ -163,17 +145,6 @@ def to_commands(values: Any) -> tuple[float, ...]:
     if not hypot(*numbers) <= LARGEST:
         raise InvalidResultError(f"{shorten(values)} is not finite, or beyond {LARGEST:g}")
     return numbers
-
-
-def _numbers(values: Any, size: int, what: str, call: Callable[..., Any]) -> tuple[float, ...]:
-    """Return the values of a call as floats; refuse another number of values, and wrong ones."""
-    with suppress(Exception):  # the values are the user's, and so may be what iterates them
-        numbers = to_commands(values)
-        if len(numbers) == size:
-            return numbers
-    name = getattr(call, "__name__", "it")
-    text = f"{name}() returned {shorten(values)}, not {size} finite numbers up to {LARGEST:g}"
-    raise OnboardFailedError(f"{what} failed ({text}, {where(call)})")
 
 
 def failure_of(what: str, call: Callable[..., Any], error: BaseException) -> OnboardFailedError:

@@ -1,7 +1,6 @@
 """The control loop: delays, when it freezes, and that it goes on whatever a plug-in does."""
 
 import re
-from asyncio import CancelledError
 from functools import partial
 from math import inf, nan
 
@@ -135,14 +134,14 @@ def returns(horizon=0.0, output=None, **changes):
     return Odd
 
 
-class NoText(BaseException):
+class NoTextError(Exception):
     def __str__(self):
         raise SystemExit(0)
 
 
 ERRORS = (
-    *(RuntimeError("out of\nluck"), StopIteration, SystemExit("enough"), GeneratorExit),
-    *(CancelledError, RecursionError, NoText()),
+    *(RuntimeError("out of\nluck"), StopIteration, SystemExit("enough")),
+    *(RecursionError, NoTextError()),
 )
 LONG = ValueError("no caf\udce9 " + "x" * 100_000)
 ANY = ControlOutput((0.1, 0.2, 0.3), 0.4, ZERO, ZERO, ZERO)

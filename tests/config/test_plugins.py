@@ -114,8 +114,6 @@ def build(share: Annotated[float, AfterValidator(check)] = 1.0): ...
         ("import sys\nsys.exit(0)", "imported: share.py:2: SystemExit: 0 (sys.exit() was called)"),
         ("import argparse\nargparse.ArgumentParser().parse_args(['-h'])", "SystemExit: 0"),
         ("def build():\n    raise StopIteration", "cannot be built: share.py:2: StopIteration"),
-        ("from asyncio import CancelledError\ndef build():\n    raise CancelledError",
-         "cannot be built: share.py:3: CancelledError"),
         ("def build():\n    return build()", "cannot be built: share.py:2: RecursionError: "),
         ("from dataclasses import dataclass, field\n@dataclass\nclass build:\n"
          "    gain: float = field(default_factory=lambda: {}['tau'], init=False)\n",
@@ -209,7 +207,7 @@ def test_a_method_may_come_from_the_object_or_from_a_class_above(share):
 
 
 @pytest.mark.parametrize(
-    "error", [ValueError("no"), SystemExit(0), GeneratorExit(), StopIteration(), ExitingTextError()]
+    "error", [ValueError("no"), SystemExit(0), StopIteration(), ExitingTextError()]
 )
 def test_every_exception_of_a_plug_in_becomes_one_error(error):
     with pytest.raises(BadInputError, match=r"^it failed: "), plugins.refuse_failure("it failed"):

@@ -10,8 +10,6 @@ from cloudrc.messages import GuardState
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.runs.fly import fly as fly_into_folder
 from cloudrc.runs.folder import run_folder
-from cloudrc.world.onboard import Direct
-from cloudrc.world.watched import OnboardFailedError, WatchedActuators
 
 HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
 FAILS = """
@@ -160,16 +158,6 @@ def test_physics_of_actuators_that_fails_in_flight_is_onboard_failed_too(fly, wh
     flight = fly(FAILS.replace("{what}", "pass") + ACTUATORS.replace("{what}", late))
     assert flight.failures[0].code == "onboard_failed"
     assert "own.py:" in flight.failures[0].text
-
-
-def test_speeds_of_actuators_are_read_as_their_steps_are():
-    class Push(Direct):
-        speeds = property(lambda self: self.gone, lambda self, value: None)
-
-    watched = WatchedActuators(Push(1), 1)
-    watched.speeds = (1.0,)
-    with pytest.raises(OnboardFailedError, match="no attribute 'gone'"):
-        watched.speeds  # noqa: B018
 
 
 @pytest.mark.parametrize(
