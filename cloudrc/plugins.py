@@ -182,24 +182,10 @@ def names(kind: str) -> list[str]:
     return sorted({*_shipped(kind), *_installed(kind)})
 
 
-def packages_of(kind: str) -> dict[str, tuple[str, ...]]:
-    """Return name -> top-level packages and modules, for each installed plug-in of a kind.
-
-    The first one contains the plug-in, the others are installed with it.
-    """
+def installed(kind: str) -> dict[str, EntryPoint]:
+    """Return name -> entry point of each installed plug-in of a kind; shipped names win."""
     shipped = _shipped(kind)
-    entries = {name: entry for name, entry in _installed(kind).items() if name not in shipped}
-    return {name: tuple(dict.fromkeys(_packages(entry))) for name, entry in entries.items()}
-
-
-def _packages(entry: EntryPoint) -> Iterator[str]:
-    """Yield the top-level packages and modules of the distribution of an entry point."""
-    yield entry.module.partition(".")[0]
-    listed = (entry.dist and entry.dist.read_text("top_level.txt")) or ""
-    yield from listed.split()
-    for file in (entry.dist and entry.dist.files) or ():
-        if file.suffix == ".py" and file.parts[0] != "..":
-            yield file.parts[0].removesuffix(".py")
+    return {name: entry for name, entry in _installed(kind).items() if name not in shipped}
 
 
 def describe(kind: str, name: str) -> str:

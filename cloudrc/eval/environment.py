@@ -13,12 +13,12 @@ from typing import Any
 import gymnasium
 
 from cloudrc.config.load import ResolvedExperiment
-from cloudrc.eval.setup import EvalSetup, hash_of
-from cloudrc.plugin_file import INSTALLED, OWN, sources
+from cloudrc.eval.setup import EvalSetup
+from cloudrc.plugin_file import OWN
 from cloudrc.plugins import is_path
 from cloudrc.runs.grid import everything_of
-from cloudrc.runs.installed import package_code
-from cloudrc.runs.own_files import hash_all, hashes
+from cloudrc.runs.installed import module_code
+from cloudrc.runs.own_files import hash_all, hash_of_module, hashes, is_installed
 
 
 def find_module(setup: EvalSetup) -> str:
@@ -47,10 +47,10 @@ def environment_code(env: gymnasium.Env[Any, Any], setup: EvalSetup) -> str:
         file = getattr(sys.modules.get(name), "__file__", None)
         if file is None or top == OWN or top in sys.stdlib_module_names:
             continue
-        if not _is_installed(file):
-            found[name] = _local_code(name, Path(file))
+        if not is_installed(file):
+            found[name] = hash_of_module(name, Path(file))
         elif top not in found:
-            found[top] = package_code(top)
+            found[top] = module_code(top)
     for path in _files_in(dict(setup.env_args)):
         found[path] = hashes(path)
     experiment = getattr(env.unwrapped, "experiment", None)
@@ -77,19 +77,6 @@ def _modules(env: gymnasium.Env[Any, Any], setup: EvalSetup) -> set[str]:
     names |= {each.__module__ for each in type(layer).__mro__}
     parts = [name.split(".") for name in names]
     return {".".join(each[:count]) for each in parts for count in range(1, len(each) + 1)}
-
-
-def _local_code(name: str, file: Path) -> str:
-    """Return the hash of the `file` of a module and of the local modules that it imports."""
-    depth = name.count(".") + (file.stem == "__init__")
-    others = [each for each in sys.path if os.path.isdir(each) and not _is_installed(each)]
-    root = [*file.parents][: depth + 1][-1]  # of the top-level package
-    return hash_of(sources(file, [str(root), *others]))
-
-
-def _is_installed(path: str) -> bool:
-    inside = f"{path}{os.sep}".startswith(INSTALLED)
-    return inside or not {"site-packages", "dist-packages"}.isdisjoint(Path(path).parts)
 
 
 def _files_in(value: Any) -> Iterator[str]:

@@ -26,6 +26,7 @@ from cloudrc.plugins import is_path
 from cloudrc.policy.address import check_url
 from cloudrc.policy.observation import Mapped
 from cloudrc.runs.installed import plugin_code
+from cloudrc.runs.own_files import hash_of
 from cloudrc.text import parse_number
 
 Compute: TypeAlias = float | tuple[float, float] | tuple[str, str]
@@ -117,14 +118,6 @@ class Episode:
         if is_path(self.executor):
             return hash_of(sources(Path(self.executor)))
         return plugin_code("executors", "newest" if self.is_baseline else self.executor)
-
-
-def hash_of(files: list[Path]) -> str:
-    """Return the hash of names and contents of files."""
-    total = sha256()
-    for path in sorted(files):
-        total.update(f"{path.name}\n{sha256(path.read_bytes()).hexdigest()}\n".encode())
-    return total.hexdigest()
 
 
 def _code_of_link(link: LinkProfile) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from hashlib import file_digest, sha256
 from pathlib import Path
 
@@ -42,6 +44,28 @@ def hash_all(experiment: ResolvedExperiment) -> dict[str, str]:
     named = [*local_files(values).values()] if '"/' in json.dumps(values) else []
     named += map(str, files_of(experiment.world.robot))
     return {file: each for path in named for file, each in hashes(path)}
+
+
+def hash_of(files: list[Path]) -> str:
+    """Return the hash of names and contents of files."""
+    total = sha256()
+    for path in sorted(files):
+        total.update(f"{path.name}\n{sha256(path.read_bytes()).hexdigest()}\n".encode())
+    return total.hexdigest()
+
+
+def hash_of_module(name: str, file: Path) -> str:
+    """Return the hash of the `file` of a module and of the local modules that it imports."""
+    depth = name.count(".") + (file.stem == "__init__")
+    others = [each for each in sys.path if os.path.isdir(each) and not is_installed(each)]
+    root = [*file.parents][: depth + 1][-1]  # of the top-level package
+    return hash_of(plugin_file.sources(file, [str(root), *others]))
+
+
+def is_installed(path: str) -> bool:
+    """Return whether a path is one of Python or of installed packages."""
+    inside = f"{path}{os.sep}".startswith(plugin_file.INSTALLED)
+    return inside or not {"site-packages", "dist-packages"}.isdisjoint(Path(path).parts)
 
 
 def hash_files(experiment: ResolvedExperiment) -> dict[str, str]:

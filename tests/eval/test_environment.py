@@ -10,7 +10,6 @@ from cloudrc.cli.main import main
 from cloudrc.eval.environment import environment_code
 from cloudrc.eval.episode import make_env
 from cloudrc.eval.setup import Episode, EvalSetup
-from cloudrc.runs import installed
 
 FILES = {
     "law.py": "from gains import GAIN\ndef infer(observation):\n    return {'actions': [[GAIN]]}\n",
@@ -26,7 +25,6 @@ FILES = {
     "scene.txt": "a",
     "other.txt": "a",
     "site-packages/parts/__init__.py": "from gymnasium import Env\nclass Part(Env):\n  dt = 0.1\n",
-    "site-packages/parts/arm.xml": "<mujoco/>",
     "libs/rewards.py": "REWARD = 0.1\n",
     "tools/makes_arms.py": "import gymnasium\ngymnasium.register('Arm-v0', 'arms.arm:make')\n",
     "tools/arms/__init__.py": "",
@@ -90,21 +88,14 @@ def test_an_episode_of_a_changed_file_is_another(folder):
     before, unseen = key_of_all(), []
     (folder / "unused.py").touch()
     for name, text in FILES.items():
+        if "site-packages" in name:  # the version of an installed package counts
+            continue
         (folder / name).write_text(text + CHANGES.get(Path(name).suffix, "\n"))
         if key_of_all() == before:
             unseen.append(name)
         (folder / name).write_text(text)
     assert unseen == []
     assert key_of_all() == before
-
-
-def test_a_package_too_large_to_read_is_known_by_the_sizes_of_its_files(folder, monkeypatch):
-    before = key_of_all()
-    monkeypatch.setattr(installed, "FILES_MAX", 1)
-    large = key_of_all()
-    assert large != before
-    (folder / "site-packages/parts/arm.xml").write_text("<mujoco></mujoco>")
-    assert key_of_all() != large
 
 
 @pytest.mark.parametrize("name", ["mine.yaml", "point.yaml", "turns.py"])
