@@ -40,11 +40,9 @@ from cloudrc.errors import (
     BadInputError,
     CloudrcError,
     ControllerLostError,
-    MissingPrerequisiteError,
     OutOfMemoryError,
     PlacedError,
     describe_error,
-    machine_error,
     to_one_line,
 )
 from cloudrc.patience import telling_if_slow
@@ -349,26 +347,6 @@ def place_of(error: BaseException) -> str:
         return ""
     frame, line = own[-1]
     return f"{Path(frame.f_code.co_filename).name}:{line}: "
-
-
-def stray_error(error: BaseException) -> BadInputError | None:
-    """Return the error to report if a user's code raised `error` outside of a guard; else None.
-
-    A signal handler of a plug-in may do so at any line of cloudrc. A full disk, say, is always the
-    machine's.
-    """
-    if isinstance(error, CloudrcError | KeyboardInterrupt):
-        return None
-    is_of_system = not isinstance(error, OSError) or error.errno  # not a plug-in's TimeoutError
-    if machine_error(error) and is_of_system:
-        return None
-    place = place_of(error)
-    return BadInputError(f"{place}{describe_error(error)}") if place else None
-
-
-def machine_failure(error: BaseException) -> MissingPrerequisiteError | None:
-    """Return what `machine_error` does; None if a user's code raised `error`, such as a timeout."""
-    return machine_error(error) if stray_error(error) is None else None
 
 
 def locate(error: BaseException) -> str:

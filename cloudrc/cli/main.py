@@ -19,6 +19,7 @@ from cloudrc.errors import (
     machine_error,
 )
 from cloudrc.files import naming
+from cloudrc.runs.interrupts import is_interrupted
 from cloudrc.runs.requirements import name_extra
 from cloudrc.text import escape
 
@@ -48,6 +49,8 @@ def _run(given: list[str]) -> int:
     except Exception as error:
         if "--debug" in given:
             raise
+        if is_interrupted():  # a library has turned the interrupt into an error of its own
+            return InterruptedRunError.exit_code
         message, code = _explain(error)
         # Escape text from files, but keep the line breaks of our messages: two blanks follow them.
         shown = "\n  ".join(map(escape, message.split("\n  ")))
@@ -74,9 +77,6 @@ def _dispatch(given: Sequence[str]) -> int:
 
 
 def _explain(error: Exception) -> tuple[str, int]:
-    from cloudrc.plugins import stray_error
-
-    error = stray_error(error) or error
     if isinstance(error, CloudrcError):
         return str(error).rstrip(), error.exit_code  # one line, or one per wrong key
     if isinstance(error, OSError) and error.errno not in (*DISK_FULL, *TOO_MANY_FILES):

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 from cloudrc import assembly, metrics, plugins
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.config.load import ResolvedExperiment, absolute_paths
-from cloudrc.errors import MissingPrerequisiteError, describe_error
+from cloudrc.errors import MissingPrerequisiteError, describe_error, machine_error
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Assessment, Run
 from cloudrc.report.write import assess
@@ -33,7 +33,7 @@ def fly_point(experiment: ResolvedExperiment) -> Row:
     try:
         return measure(experiment)
     except plugins.FAILURES as error:  # one point that cannot fly must not stop the others
-        if failure := plugins.machine_failure(error) or _lost_file(experiment):
+        if failure := machine_error(error) or _lost_file(experiment):
             raise failure from error
         plugins.check_failure(error, "the flight")
         text = f"{plugins.place_of(error)}{describe_error(error)}"

@@ -14,7 +14,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from cloudrc import assembly, plugins
+from cloudrc import assembly
 from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.config.overrides import OUTSIDE, REMOTE
 from cloudrc.drivers.companion import companion
@@ -79,8 +79,6 @@ def fly(
             run = replace(run, files=files)
             return write_report(folder, recording, resolved, run, own=own, page=page)
     except OSError as error:
-        if plugins.stray_error(error):  # a timeout that a plug-in's signal handler raised
-            raise
         error.filename = str(error.filename or folder)
         raise machine_error(error) or error from error
 

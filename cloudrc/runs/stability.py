@@ -22,7 +22,7 @@ from cloudrc.ages import simulate_ages
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
-from cloudrc.errors import describe_error
+from cloudrc.errors import describe_error, machine_error
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
 from cloudrc.metrics.counters import growth
@@ -84,7 +84,7 @@ def fly_step(experiment: ResolvedExperiment, size: float = SMALL) -> Answer:
     try:
         return _fly_step(experiment, size)
     except plugins.FAILURES as error:  # a value that cannot fly must not stop the search
-        if failure := plugins.machine_failure(error):
+        if failure := machine_error(error):
             raise failure from error
         plugins.check_failure(error, "the flight")
         text = f"{plugins.place_of(error)}{describe_error(error)}"

@@ -17,9 +17,8 @@ from queue import Empty, SimpleQueue
 from types import ModuleType
 from typing import Any, TypeVar
 
-from cloudrc import plugins
 from cloudrc.drivers.machine import usable_cores
-from cloudrc.errors import CloudrcError, InterruptedRunError, InvalidRunError
+from cloudrc.errors import CloudrcError, InterruptedRunError, InvalidRunError, machine_error
 from cloudrc.runs.interrupts import is_interrupted, noted_interrupts, raise_if_interrupted
 
 Work = TypeVar("Work")
@@ -94,17 +93,6 @@ def map_in_order(
         yield from _map_in_workers(function, chunk, rest, workers, in_order)
 
 
-def _call(function: Callable[[Work], Result], work: Work) -> Result:
-    """Call a function in a worker; name file and line of a user's code that fails here.
-
-    The parent process gets an exception without its traceback.
-    """
-    try:
-        return function(work)
-    except BaseException as error:
-        raise plugins.stray_error(error) or error from error
-
-
 def _map_in_workers(
     function: Callable[[Work], Result],
     chunk: list[Work],
@@ -120,7 +108,7 @@ def _map_in_workers(
     try:
         while chunk:
             with isolated_start():  # submit() starts the workers
-                futures = [pool.submit(_call, function, each) for each in chunk]
+                futures = [pool.submit(function, each) for each in chunk]
             started = multiprocessing.active_children()
             for future in _ended(futures, in_order):
                 result = future.result()
@@ -193,7 +181,7 @@ def take_each(
     except Exception as error:
         if is_interrupted():  # the signal also killed a worker, or a library converted the error
             return InterruptedRunError("interrupted")
-        failure = error if isinstance(error, WorkerDiedError) else plugins.machine_failure(error)
+        failure = error if isinstance(error, WorkerDiedError) else machine_error(error)
         if failure is None or isinstance(error, BrokenPipeError):
             raise
         return failure

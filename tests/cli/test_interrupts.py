@@ -4,19 +4,14 @@ MuJoCo turns every exception in its import into an ImportError, so that a sweep 
 verdict `error` and ended as if it was done.
 """
 
-import importlib
 import json
 import os
 import signal
-import sys
-import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
 from unittest.mock import Mock
 
 import pytest
-from pydantic import Discriminator, Tag, create_model
 
 from cloudrc.cli import run
 from cloudrc.config.load import load_experiment
@@ -39,64 +34,6 @@ def one_core_and_a_terminal(monkeypatch):
     monkeypatch.setattr("cloudrc.runs.workers.usable_cores", lambda: 1)
     for number in SIGNALS:  # tests/conftest.py restores them
         signal.signal(number, signal.SIG_DFL)
-    yield
-    signal.setitimer(signal.ITIMER_REAL, 0.0)
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
-
-
-@pytest.fixture
-def make_module(tmp_path, monkeypatch):
-    """Return a function that writes a module whose import gets a signal, and returns its name."""
-    monkeypatch.syspath_prepend(tmp_path)
-
-    def make(number, rest=""):
-        name = f"gets_{int(number)}"
-        lines = ["import os, signal", "ended = False", f"os.kill(os.getpid(), {int(number)})", rest]
-        text = "\n".join([*lines, "ended = True"])
-        (tmp_path / f"{name}.py").write_text(text)
-        monkeypatch.delitem(sys.modules, name, raising=False)
-        return name
-
-    return make
-
-
-@pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_during_an_import_interrupts_after_the_import(number, make_module):
-    interrupt_on_signals()
-    module = importlib.import_module(make_module(number))
-    assert module.ended
-    assert is_interrupted()
-    with pytest.raises(KeyboardInterrupt):
-        time.sleep(60.0)
-
-
-def test_a_signal_in_a_function_that_pydantic_calls_interrupts_after_the_call():
-    """Pydantic turns an exception of a discriminator into a warning."""
-
-    def kind(value):
-        os.kill(os.getpid(), signal.SIGTERM)
-        return "whole"
-
-    either = Annotated[int, Tag("whole")] | Annotated[float, Tag("part")]
-    model = create_model("Sample", value=(Annotated[either, Discriminator(kind)], 0))
-    interrupt_on_signals()
-    assert model().model_dump() == {"value": 0}
-    with pytest.raises(KeyboardInterrupt):
-        time.sleep(60.0)
-
-
-def test_an_import_that_never_ends_is_interrupted(make_module, monkeypatch):
-    monkeypatch.setattr(interrupts, "LOOKS_MAX", 2)
-    interrupt_on_signals()
-    with pytest.raises(KeyboardInterrupt):
-        importlib.import_module(make_module(signal.SIGTERM, "while True: pass"))
-
-
-def test_a_second_signal_interrupts_an_import_at_once(make_module):
-    interrupt_on_signals()
-    with pytest.raises(KeyboardInterrupt):
-        importlib.import_module(make_module(signal.SIGTERM, "os.kill(os.getpid(), signal.SIGINT)"))
-    time.sleep(2 * interrupts.PERIOD)  # no further interrupt arrives
 
 
 def test_only_the_first_hang_up_interrupts():

@@ -6,7 +6,6 @@ from unittest.mock import Mock
 
 import pytest
 
-from cloudrc import plugins
 from cloudrc.cli.faults import SEED_MAX
 from cloudrc.cli.link import VERBS
 from cloudrc.cli.main import INTERNAL, main
@@ -92,13 +91,10 @@ def test_an_error_prints_one_line_and_sets_its_exit_code(error, code, words, mon
         main(["list", "--debug"])
 
 
-def test_an_exception_of_a_signal_handler_of_a_plug_in_is_at_its_line(
-    tmp_path, monkeypatch, refused
-):
-    (tmp_path / "late.py").write_text("def build(*signal):\n    raise TimeoutError('too slow')\n")
-    handler = plugins.builder("predictors", str(tmp_path / "late.py"))
-    monkeypatch.setattr("cloudrc.cli.list.execute", lambda options: handler())
-    assert "late.py:2: TimeoutError: too slow" in refused("list", code=2)
+def test_an_error_after_an_interrupt_is_the_interrupt(monkeypatch, call):
+    monkeypatch.setattr("cloudrc.cli.list.execute", Mock(side_effect=ImportError))
+    monkeypatch.setattr("cloudrc.cli.main.is_interrupted", lambda: True)
+    assert call("list", code=130).err == ""
 
 
 def test_an_interrupt_ends_with_130_in_silence(monkeypatch, call):

@@ -1,7 +1,6 @@
 """Plug-ins are found by name, entry point or path; an error lists the known names."""
 
 import logging
-import re
 import sys
 import traceback
 from importlib.metadata import EntryPoint
@@ -13,7 +12,6 @@ from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.schema import PlugIn
 from cloudrc.errors import BadInputError, OutOfMemoryError
-from cloudrc.runs import flight
 from tests.config.conftest import refused
 
 SOURCE = '''"""Looks ahead by a share of the horizon.
@@ -220,14 +218,6 @@ def test_a_failure_is_at_the_line_of_the_plug_in_not_of_a_library(share):
     with pytest.raises(ValueError, match="mean requires") as caught:
         fail()
     assert plugins.locate(caught.value) == f"share.py:{len(share.read_text().splitlines())} in fail"
-
-
-def test_a_timeout_of_a_plug_in_is_no_failure_of_the_machine(share, monkeypatch):
-    share.write_text(f"{SOURCE}\ndef late(*signal): raise TimeoutError('too slow')\n")
-    late = plugins.find("predictors", str(share)).get("late")
-    monkeypatch.setattr(flight, "measure", late)
-    row = flight.fly_point(load_experiment("steps"))
-    assert re.fullmatch(r"share.py:\d+: TimeoutError: too slow", row["text"])
 
 
 def test_a_plug_in_is_not_blamed_for_ctrl_c_and_for_a_lack_of_memory(share):
