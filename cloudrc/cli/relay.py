@@ -23,14 +23,15 @@ example:
   cloudrc link set downlink.delay_ms=120      (meanwhile, in another terminal)
 
 A client connects to --listen instead of the server. The uplink leads to the
-server. The relay hands bytes on as a TCP over the link would: one round trip
-to open, slow start, repair of losses, one bottleneck for all connections. A
+server. The relay hands bytes on with the link's delay and rate: one round trip
+to open, one more for a lost segment, one bottleneck for all connections. A
 change by 'cloudrc link set' acts on open connections, too. Ctrl-C ends the
 relay, and prints the turns: the times from the last byte of a request to the
 first byte of its answer.
 
-It needs no privileges. 'cloudrc link exec' passes every IP packet through the
-link instead, also UDP: use it where it works."""
+It needs no privileges, and is not a congestion control. 'cloudrc link exec'
+passes every IP packet through the link instead, with the TCP of the kernel:
+use it where it works."""
 
 
 ROS_EPILOG = """\

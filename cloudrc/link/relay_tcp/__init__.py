@@ -2,6 +2,7 @@
 
     client > TCP > StreamRelay > TCP > server
 
-The relay ends both connections, and hands bytes on as a TCP over the link would: `medium.py` is the
-link, `stream.py` one direction of a connection over it, `relay.py` has the sockets.
+The relay ends both connections, and hands their bytes on with the delay, the rate and the repaired
+losses of the link: `medium.py` is the link, `stream.py` one direction of a connection over it,
+`relay.py` has the sockets. It is no model of a congestion control.
 """

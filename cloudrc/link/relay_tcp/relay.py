@@ -14,9 +14,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 
-from cloudrc.link.relay_tcp.agenda import Agenda
+from cloudrc.link.queue import PacketQueue
 from cloudrc.link.relay_tcp.medium import Medium
-from cloudrc.link.relay_tcp.stream import LinkStream
+from cloudrc.link.relay_tcp.stream import LinkStream, run_due
 
 CHUNK = 64 << 10  # most bytes that one call reads [bytes]
 BUFFER = 128 << 10  # of the kernel, for each socket and direction [bytes]
@@ -24,7 +24,7 @@ ACCEPTED_MAX = 64  # connections that one turn of the loop accepts
 TURNS_KEPT = 100_000  # newest turns of which the times are kept
 FIRST_RETRY_NS = 1_000_000_000  # time until the first packet of a connection is sent again [ns]
 GREETINGS = 7  # times that the first packet of a connection is sent
-SYN = 0  # place of the draws of the first packets; the bytes of a connection have other epochs
+SYN = 0  # epoch of the draws of all first packets; that of a connection's bytes is its number
 _RESET = b"\x01\0\0\0\0\0\0\0"  # struct linger: on, 0 s: close sends RST
 
 Ways = tuple[Medium, Medium]
@@ -57,7 +57,7 @@ class RelayedConnection:
             for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
                 # Larger ones would hide from a sender that the receiver has stopped.
                 side.socket.setsockopt(socket.SOL_SOCKET, option, BUFFER)
-        self.trip_ns = 0  # of the first packets of the connection [ns]; 0 before they are back
+        self.greeted = False  # whether the first packets of the connection have crossed
         self.server.socket.connect_ex(relay.to)
         relay.watch(self, self.server, selectors.EVENT_WRITE)
         self._greet(1, time.monotonic_ns())
@@ -76,28 +76,24 @@ class RelayedConnection:
         self.update()
 
     def _greet(self, attempt: int, now_ns: int) -> None:
-        """Send the first packet of the connection, again and again until it is answered."""
-        if self.dead or self.trip_ns:
+        """Send the first packet of the connection; again later if it is lost."""
+        if self.dead:
             return
         if attempt > GREETINGS:
             self._end(now_ns)
             return
-        arrival_ns = self.relay.ways[0].cross(SYN, self.number, attempt, 0, now_ns)
-        if arrival_ns is not None:
-            self.relay.agenda.at(arrival_ns, self._welcome, attempt, now_ns)
-        again_ns = now_ns + (FIRST_RETRY_NS << (attempt - 1))
-        self.relay.agenda.at(again_ns, self._greet, attempt + 1)
+        up, down = self.relay.ways
+        arrival_ns = up.cross(SYN, self.number, attempt, 0, now_ns)
+        if arrival_ns is None:
+            again_ns = now_ns + (FIRST_RETRY_NS << (attempt - 1))
+            self.relay.agenda.put(self._greet, (again_ns,), (attempt + 1,))
+        else:
+            answer_ns = arrival_ns + down.delay_ns(arrival_ns)
+            self.relay.agenda.put(self._greeted, (answer_ns,), ())
 
-    def _welcome(self, attempt: int, sent_ns: int, now_ns: int) -> None:
-        """Answer the first packet, which was sent at `sent_ns` [ns]."""
-        arrival_ns = self.relay.ways[1].cross(SYN, self.number, attempt, 0, now_ns)
-        if arrival_ns is not None and not self.dead:
-            self.relay.agenda.at(arrival_ns, self._welcomed, sent_ns)
-
-    def _welcomed(self, sent_ns: int, now_ns: int) -> None:
-        if not self.trip_ns:
-            self.trip_ns = max(1, now_ns - sent_ns)
-            self._begin(now_ns)
+    def _greeted(self, now_ns: int) -> None:
+        self.greeted = True
+        self._begin(now_ns)
 
     def _connected(self, now_ns: int) -> None:
         """Take what the client sends, or note that the server refuses it."""
@@ -120,13 +116,13 @@ class RelayedConnection:
 
     def _begin(self, now_ns: int) -> None:
         """Open the streams, or refuse the client, once the server and the link have answered."""
-        if self.dead or self.connecting or not self.trip_ns:
+        if self.dead or self.connecting or not self.greeted:
             return
         if self.client.source is None or self.server.source is None:
             self._end(now_ns)
             return
-        self.client.source.open(now_ns, self.trip_ns)
-        self.server.source.open(self.relay.ways[0].arrival_ns(now_ns), self.trip_ns)
+        self.client.source.open(now_ns)
+        self.server.source.open(now_ns + self.relay.ways[0].delay_ns(now_ns))
 
     def update(self) -> None:
         """Watch the sockets for what the streams can take and give."""
@@ -193,7 +189,7 @@ class RelayedConnection:
         side.reads = False
         up, down = self.relay.ways
         way = up if side is self.client else down
-        self.relay.agenda.at(way.arrival_ns(now_ns), self._end)
+        self.relay.agenda.put(self._end, (now_ns + way.delay_ns(now_ns),), ())
 
     def _end(self, now_ns: int, *, reset: bool = True) -> None:
         """Close both sockets, by RST with `reset`."""
@@ -234,7 +230,7 @@ class StreamRelay:
     ) -> None:
         """Accept connections at the socket `listening`, to a server at the address `to`."""
         self.to, self.family, self.ways = to, family, ways
-        self.agenda, self.connections = Agenda(), set[RelayedConnection]()
+        self.agenda, self.connections = PacketQueue(), set[RelayedConnection]()
         self.connected = self.refused = self.up_bytes = self.down_bytes = 0
         self.turns = deque[int](maxlen=TURNS_KEPT)
         self.changes = deque[Callable[[], None]]()
@@ -252,14 +248,14 @@ class StreamRelay:
             select.select([self._selector.fileno()], (), (), wait)
             wait = 0.0
         ready = self._selector.select(wait)
-        self.agenda.run(time.monotonic_ns())
+        run_due(self.agenda, time.monotonic_ns())
         for key, mask in ready:
             if key.data is None:
                 self._accept()
             else:
                 connection, side = key.data
                 now_ns = time.monotonic_ns()
-                self.agenda.run(now_ns)
+                run_due(self.agenda, now_ns)
                 connection.handle(side, mask, now_ns)
 
     def watch(self, connection: RelayedConnection, side: Side, mask: int) -> None:
