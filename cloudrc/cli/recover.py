@@ -1,30 +1,25 @@
-"""`cloudrc recover FILE`: copy what is readable of a damaged recording into a valid file."""
+"""`cloudrc recover FILE`: copy a torn or damaged recording, up to the damage, into a valid file."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import sys
+from collections import Counter
 from contextlib import closing
-from dataclasses import asdict
 from pathlib import Path
-from shlex import quote
 
 from cloudrc.cli.output import output_argument, print_result
 from cloudrc.errors import BadInputError
 from cloudrc.runs.requirements import require
 from cloudrc.text import escape
 
-LOSSY = 1
-"""Exit code if the copy lacks data of the recording."""
-READ_BY_REPORT = ("mission.mcap", "world.mcap", "cloud.mcap")
-"""Files of a run that `cloudrc report` reads."""
 EPILOG = """\
 examples:
   cloudrc recover runs/latest/world.mcap
   cloudrc recover torn.mcap --to clean.mcap -o json
 
-exit codes: 0 complete, 1 some data is lost (printed), 2 nothing readable, or
+exit codes: 0 copied, and what is missing is printed, 2 nothing readable, or
   still in flight"""
 
 
@@ -37,11 +32,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Copy a damaged recording; print which share of the data was kept, and the known losses."""
+    """Copy a recording; print what is in the copy, and what is missing."""
     require("a recovery", ("record",))
     from cloudrc.cli.progress import StepView
-    from cloudrc.record.recovery import recover
-    from cloudrc.report.attached import attached_views
+    from cloudrc.record.columns import Recording
     from cloudrc.runs.session import refuse_under_way
 
     source: Path = options.file
@@ -50,19 +44,29 @@ def execute(options: argparse.Namespace) -> int:
     if os.path.lexists(target):
         raise BadInputError(f"{target}: already there; name another file with --to")
     with closing(StepView(sys.stderr, f"copies what is readable of {source}")):
-        recovery = recover(source, target, attached_views)
-    lines = [*recovery.as_lines(), str(target), *_next_steps(source, target)]
-    text = "\n".join(map(escape, lines))
-    print_result(options.output, {"file": str(target), **asdict(recovery)}, text)
-    return 0 if recovery.complete else LOSSY
-
-
-def _next_steps(source: Path, target: Path) -> list[str]:
-    """Return the line that puts the copy in place of a run's damaged file; none for other files."""
-    run = source.parent
-    if source.name not in READ_BY_REPORT or not (run / "config.yaml").is_file():
-        return []
-    old, aside, new = (quote(str(path)) for path in (source, f"{source}.damaged", target))
-    return [
-        f"to report on it: mv {old} {aside} && mv {new} {old} && cloudrc report {quote(str(run))}"
-    ]
+        recording = Recording.read(source)
+        if not recording.messages:
+            reason = "; ".join([*recording.remarks, recording.note]).strip("; ") or "none is in it"
+            raise BadInputError(
+                f"{source}: holds no readable message: {reason}; nothing is written"
+            )
+        recording.write(target)
+    topics = Counter(topic for topic, _, _ in [*recording.messages, *recording.views])
+    kept = {"messages": topics.total(), "attachments": len(recording.attachments)}
+    found = {
+        "file": str(target),
+        "complete": not recording.note,
+        "size": source.stat().st_size,
+        "bytes_lost": recording.unread,
+        "kept": {**kept, "topics": len(topics)},
+        "topics": dict(sorted(topics.items())),
+        "notes": [recording.note] if recording.note else [],
+        "remarks": list(recording.remarks),
+    }
+    lines = ["kept " + ", ".join(f"{count} {kind}" for kind, count in kept.items() if count)]
+    lines.append("topics: " + ", ".join(f"{name} {n}" for name, n in sorted(topics.items())))
+    if recording.note:
+        lines.append(f"missing: {recording.note}")
+    lines += [f"the recording {remark}" for remark in recording.remarks]
+    print_result(options.output, found, "\n".join(map(escape, [*lines, str(target)])))
+    return 0

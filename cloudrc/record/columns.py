@@ -164,7 +164,7 @@ class Recording(Content):
         ]
         holes = tuple(hole for hole in self.holes if hole.meets(first_ns, last_ns))
         if self.holes and not holes:  # what is lost is not in this time
-            self.torn = self.told = ""
+            self.lacking = self.told = ""
         self.holes = holes
         self._tables.clear()
 

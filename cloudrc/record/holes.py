@@ -1,6 +1,7 @@
 """Know the holes of a recording: the times in which its messages are lost.
 
-The reader finds them in a damaged file, and the metadata of a copy keep them. What is computed over
+The recorder notes them, the reader finds the lost end of a torn file, and the metadata of a copy
+keep them. What is computed over
 time, such as an age or a loss, is computed outside of the holes, or not at all.
 """
 
@@ -54,17 +55,6 @@ def describe(holes: Iterable[Hole], seconds: Callable[[int], float]) -> str:
 def goes_on(holes: Iterable[Hole]) -> bool:
     """Return whether the recording goes on behind one of its holes."""
     return any(hole.end_ns < END_NS or hole == SOMEWHERE for hole in holes)
-
-
-def between(spans: Iterable[tuple[int, int, int]], position: int) -> Hole:
-    """Return the hole that damage at a position of a file has left.
-
-    `spans`: position of each intact part, and the first and the last log time in it [ns].
-    """
-    spans = list(spans)
-    begin_ns = max((last for at, _, last in spans if at < position), default=0)
-    end_ns = min((first for at, first, _ in spans if at > position), default=END_NS)
-    return Hole(begin_ns, end_ns) if begin_ns <= end_ns else SOMEWHERE  # a file without order
 
 
 def union(holes: Iterable[Hole]) -> tuple[Hole, ...]:

@@ -142,11 +142,11 @@ def merge(world: Path, cloud: Path) -> Recording:
     if not found:
         raise failures[0]
     mission = next(iter(found.values())) if failures else _join(found["world"], found["cloud"])
-    torn, lacking, told = (
+    lacking, told = (
         [f"{end}: {text}" for end, one in found.items() if (text := getattr(one, name))]
-        for name in ("torn", "lacking", "told")
+        for name in ("lacking", "told")
     )
-    mission.torn, mission.lacking = "; ".join(torn), "; ".join(lacking)
+    mission.lacking = "; ".join(lacking)
     mission.told = "; ".join([*told, *map(str, failures)])
     if failures:
         mission.holes = (SOMEWHERE,)
@@ -210,7 +210,7 @@ def cut_to_last_mission(mission: Recording, *, being_written: bool = False) -> b
     if any(hole.begin_ns <= ended and hole.end_ns >= END_NS for hole in mission.holes):
         return False  # of one end, the file is cut short before the mission's end
     if being_written:
-        mission.torn = ""
+        mission.lacking = ""
         mission.holes = tuple(hole for hole in mission.holes if hole.begin_ns < ended)
     return True
 

@@ -6,11 +6,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from cloudrc.config.load import ResolvedExperiment, read_experiment
-from cloudrc.errors import BadInputError, describe_error
+from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
-from cloudrc.record.content import Message
 from cloudrc.report.folder import read_run
-from cloudrc.report.views import views
 
 NAME = "config.yaml"
 
@@ -26,14 +24,6 @@ def read_attached(recording: Recording) -> ResolvedExperiment:
             return read_experiment(config, flown=True)
         except BadInputError as error:
             raise BadInputError(str(error).replace(str(config), "its config.yaml")) from error
-
-
-def attached_views(recording: Recording) -> list[Message]:
-    """Make the topics for viewers from a recording and the experiment that is attached to it."""
-    try:
-        return views(recording, read_attached(recording))
-    except (ValueError, OSError) as error:  # impossible values
-        raise BadInputError(describe_error(error)) from error
 
 
 def read_flight(run: Path) -> tuple[Recording, ResolvedExperiment]:

@@ -48,11 +48,7 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     recording = before or merge(folder / "world.mcap", folder / "cloud.mcap")
     whole = _is_of_whole_recording(folder / "report.json")
     for lack in _lacking(recording, config, whole=whole):
-        text = f"{merged}: {lack}; no report is written"
-        if lack == recording.lacking:
-            damaged = merged if before else folder / f"{lack.partition(':')[0]}.mcap"
-            text += recording.remedy(damaged)
-        raise BadInputError(text)
+        raise BadInputError(f"{merged}: {lack}; no report is written")
     run = _read_facts(recording)
     if before is None:
         run = replace(run, interrupted=True)  # the command was killed before it wrote mission.mcap
@@ -76,8 +72,7 @@ def _read_merged(folder: Path) -> Recording | None:
             return None
         raise
     # A mission.mcap that is whole has the facts about the run, even if the file of an end was torn.
-    torn = recording.torn and not recording.lacking
-    return None if torn and all(ends) else recording
+    return None if recording.unread and all(ends) else recording
 
 
 def _lacking(recording: Recording, config: Path, *, whole: bool) -> Iterator[str]:
@@ -88,8 +83,6 @@ def _lacking(recording: Recording, config: Path, *, whole: bool) -> Iterator[str
     """
     if not sum(len(recording[topic]) for topic in TOPICS):  # all topics: each must be readable
         yield "; ".join(["holds no message of cloudrc", *recording.remarks])
-    if recording.lacking:
-        yield recording.lacking
     if recording.note and whole:
         yield (
             f"{recording.note}, but report.json describes the whole recording: to report on what"

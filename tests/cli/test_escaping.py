@@ -45,7 +45,7 @@ def test_the_note_of_a_recording(folder, call):
         writer.write(world_records(5))
         writer.note({MISSING: EVIL})
     note = SHOWN.replace(r"\r", " ").replace(r"\n", " ")
-    assert f"lossy: {note}\n" in call("recover a.mcap", code=1).out
+    assert f"missing: {note}\n" in call("recover a.mcap").out
 
 
 def test_what_is_printed_of_a_flight(printed):

@@ -238,7 +238,7 @@ def test_a_recording_cut_short_is_measured_up_to_its_end():
     for records in (log.world, log.cloud):
         records[:] = [each for each in records if each.stamp_ns <= at(6)]
     flight = log.flight()
-    flight.recording.holes, flight.recording.torn = (Hole(at(6), END_NS),), "cut short"
+    flight.recording.holes, flight.recording.lacking = (Hole(at(6), END_NS),), "cut short"
     assert "age_at_actuator_max" in measure_all(flight)[0]
     flight = replace(flight, scene=OPEN_AIR)
     flight.recording.holes = (SOMEWHERE,)

@@ -88,12 +88,12 @@ def test_the_same_clock_is_left_as_it_is(tmp_path):
     for end, records in ends.items():
         with McapWriter(tmp_path / f"{end}.mcap", clock=end, clock_id="boot") as writer:
             writer.write(records)
-            writer.note({"changed": "once"})
-            writer.note({"changed": f"by {end}"})
+            writer.note({"missing": "once"})
+            writer.note({"missing": f"by {end}"})
             writer.attach(f"{end}.txt", end.encode())
             writer.attach("config.yaml", end.encode())
     mission = merge(tmp_path / "world.mcap", tmp_path / "cloud.mcap")
-    assert mission.lacking == "world: by world; cloud: by cloud"
+    assert mission.told == "world: by world; cloud: by cloud"
     assert mission.metadata["clock_offset_method"] == "same clock"
     mission.write(tmp_path / "mission.mcap", {"report.json": b"{}"})
     merged = Recording.read(tmp_path / "mission.mcap")

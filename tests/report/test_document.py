@@ -32,7 +32,7 @@ def test_names_and_values():
     assert all(set(number) == {"value", "unit"} for number in report["numbers"].values())
     # What is unknown is absent.
     assert "real_time_factor" not in report["numbers"]
-    torn = assess(replace(paper()[1], torn="cut short"), paper()[0], RUN).document
+    torn = assess(replace(paper()[1], lacking="cut short"), paper()[0], RUN).document
     assert set(torn) == NAMES - {"records_sha256"}
 
 

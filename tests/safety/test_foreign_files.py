@@ -18,7 +18,6 @@ from cloudrc.files import atomic_file, write_atomically
 from cloudrc.link.traces import read_trace
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
-from cloudrc.record.recovery import recover
 from cloudrc.record.writer import COUNTS
 from cloudrc.report.document import clock_offset_document, write_json
 from cloudrc.report.figures import FIGURES
@@ -160,7 +159,7 @@ def records(path, name="theirs.mcap"):
 WRITERS = [
     lambda path: write_atomically(path, b"new"),
     lambda path: write_json(path, {}),
-    lambda path: recover(records(path), path),
+    lambda path: Recording.read(records(path)).write(path),
     lambda path: merge(records(path), records(path, "other.mcap")).write(path),
 ]
 
