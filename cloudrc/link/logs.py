@@ -23,7 +23,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.model import Array, Stream
+from cloudrc.link.model import Stream
 from cloudrc.link.profile import Trace
 from cloudrc.link.traces import Row, read_rows
 
@@ -31,9 +31,7 @@ Direction: TypeAlias = Literal["uplink", "downlink"]
 Entry: TypeAlias = tuple[float, float]
 """Time of sending [s] and delay [s]; the delay is NaN if the packet was lost."""
 REPEATED_MAX = 0.01  # largest share of packets with the time of an earlier one, in [0, 1]
-GAP, GAP_MIN, BACK_MAX = 5, 0.1, 1.0
-"""A pause is reported if it is longer than GAP_MIN [s] and than GAP times the median time between
-packets. A log whose times go back by BACK_MAX [s] is refused."""
+BACK_MAX = 1.0  # a log whose times go back by this time is refused [s]
 HALVE = (
     "a trace is one way; if both directions are alike, use half of each round trip with "
     "--halve-rtt; otherwise measure one way with irtt between synchronised clocks"
@@ -58,8 +56,6 @@ class Log:
     halved: bool = False  # whether the delays are halves of round trips
     unmeasured: set[float] = field(default_factory=set)
     """Times of sending [s] of packets that arrived with an unknown delay, NaN in `entries`."""
-    elsewhere: list[float] = field(default_factory=list)
-    """Times [s] at which a packet is missing: the other direction or the recording has lost it."""
 
     def packets(self) -> Packets:
         """Check the packets, sort them by time of sending, and add a note on each correction.
@@ -71,39 +67,24 @@ class Log:
         if np.isnan(delays).all():
             raise self.error("no packet has a delay; give a log with at least one reply")
         self.refuse_early(float(np.nanmin(delays)))
-        self._refuse_steps(times, delays)
-        unique = dict(reversed(self.entries))  # of packets with the same time, the first is kept
-        repeated = len(times) - len(unique)
-        if repeated > REPEATED_MAX * len(times):
-            same = f"{repeated} of {len(times)} packets have the same time as another one"
-            raise self.error(f"{same}; give times with more digits")
-        self.counts["out of order, sorted"] += int(np.sum(times < np.maximum.accumulate(times)))
-        self.counts["left out, at the time of another one"] += repeated
-        notes = [f"{count} {what}" for what, count in self.counts.items() if count]
-        sent, delays = np.array(sorted(unique.items())).T
-        gaps = np.diff(np.sort([*sent, *self.elsewhere]))
-        far = max(GAP_MIN, GAP * float(np.median(np.diff(sent)))) if len(sent) > 1 else 0.0
-        if gaps.max(initial=0.0) > far:
-            notes.append(
-                f"nothing sent for {gaps.max():.4g} s after packet {gaps.argmax() + 1}: a pause, "
-                "two sessions in one log, or a step of the clock"
-            )
-        copies = (np.isfinite(delays) | np.isin(sent, [*self.unmeasured])).astype(int)
-        return Packets(sent, delays, copies, tuple(notes), self.halved)
-
-    def _refuse_steps(self, times: Array, delays: Array) -> None:
-        """Raise a BadInputError if the times go far back: sorting would mix two sessions.
-
-        The rows of a log may be in the order of sending or of arrival.
-        """
-        arrivals = times + np.nan_to_num(delays) * (2 if self.halved else 1)
-        back = np.minimum(*(np.maximum.accumulate(each) - each for each in (times, arrivals)))
-        if back.max() >= BACK_MAX:
+        back = np.maximum.accumulate(times) - times
+        if back.max() >= BACK_MAX:  # sorting would mix two sessions
             raise self.error(
                 f"at packet {back.argmax() + 1} the times go back by {back.max():.4g} s: several "
                 "sessions in one log, or a step of the clock; give the rows of one session, "
                 "sorted by time"
             )
+        unique = dict(reversed(self.entries))  # of packets with the same time, the first is kept
+        repeated = len(times) - len(unique)
+        if repeated > REPEATED_MAX * len(times):
+            same = f"{repeated} of {len(times)} packets have the same time as another one"
+            raise self.error(f"{same}; give times with more digits")
+        self.counts["out of order, sorted"] += int(np.sum(back > 0.0))
+        self.counts["left out, at the time of another one"] += repeated
+        notes = tuple(f"{count} {what}" for what, count in self.counts.items() if count)
+        sent, delays = np.array(sorted(unique.items())).T
+        copies = (np.isfinite(delays) | np.isin(sent, [*self.unmeasured])).astype(int)
+        return Packets(sent, delays, copies, notes, self.halved)
 
     def error(self, text: str) -> BadInputError:
         """Make an error that begins with the name of the log."""
@@ -136,6 +117,8 @@ def trace_of(packets: Packets) -> Trace:
 
 _MISSHAPEN = ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError
 """Errors that reading JSON with an unexpected layout can raise."""
+_IRTT_KEYS = {None: "rtt", "uplink": "send", "downlink": "receive"}
+"""Direction, None for round trips -> irtt's key of the delay."""
 
 
 def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool) -> Packets:
@@ -155,17 +138,13 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
     """
     log = Log(name, halved=halve)
     try:
-        document = json.loads(text)
-        trips = document["round_trips"]
+        trips = json.loads(text)["round_trips"]
         if direction is None and not halve:
             raise log.error(
                 "irtt measures both directions; choose --direction uplink (sent by its client) or "
                 "downlink"
             )
-        arrived = [trip for trip in trips if _arrived(trip)]
-        if not halve:
-            _check_clocks(arrived, log)
-        _read_trips(trips, "halves" if halve or not direction else direction, log)
+        _read_trips(trips, None if halve else direction, log)
     except _MISSHAPEN as error:
         raise log.error(
             f"not a log of irtt ({type(error).__name__}: {error}); give the file that 'irtt client "
@@ -174,59 +153,35 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
     return log.packets()
 
 
-def _arrived(trip: dict[str, Any]) -> bool:
-    return str(trip["lost"]).lower() == "false"
-
-
-def _check_clocks(arrived: list[dict[str, Any]], log: Log) -> None:
-    """Raise an error if irtt's one-way delays are missing or wrong.
-
-    They are wrong if the clocks of client and server differ, or if one of the clocks steps.
-    """
-    if any(not {"send", "receive"} <= trip["delay"].keys() for trip in arrived):
-        raise BadInputError(f"{log.name} (irtt's server sent no stamps): has round trips; {HALVE}")
-    both = [int(trip["delay"][key]) for trip in arrived for key in ("send", "receive")]
-    log.refuse_early(min(both, default=0) * 1e-9)
-    for end, event in (("client", "send"), ("server", "receive")):
-        stamps = [trip["timestamps"][end][event] for trip in arrived]
-        passed, wall = (
-            np.diff([int(stamp.get(clock, 0)) for stamp in stamps if "monotonic" in stamp])
-            for clock in ("monotonic", "wall")
-        )
-        # 1 ms, plus 0.1 % for a clock that NTP adjusts.
-        far = np.flatnonzero(np.abs(wall - passed) > 1_000_000 + passed // 1000)
-        if len(far):
-            raise log.error(
-                f"the clock of irtt's {end} made a step of {(wall - passed)[far[0]] * 1e-6:.4g} "
-                "ms; measure again, or take half of each round trip (--halve-rtt)"
-            )
-
-
-_IRTT_KEYS = {"halves": "rtt", "uplink": "send", "downlink": "receive"}
-"""Delays to read -> irtt's key of the delay."""
-
-
-def _read_trips(trips: list[dict[str, Any]], what: str, log: Log) -> None:
+def _read_trips(trips: list[dict[str, Any]], direction: Direction | None, log: Log) -> None:
     """Read the time of sending and the delay of each packet [s] into `log`; the first time is 0.
 
-    `what` is "uplink", "downlink", or "halves" for half of each round trip. On the downlink,
-    packets lost on the uplink are left out. The time is always that of the client, even for the
-    downlink: a lost packet has no time of the server.
+    On the downlink, packets lost on the uplink are left out. The time is always that of the client,
+    even for the downlink: a lost packet has no time of the server.
     """
-    part = 0.5e-9 if what == "halves" else 1e-9
+    arrived = [trip["delay"] for trip in trips if _fate(trip) == "false"]
+    if direction:
+        if any(not {"send", "receive"} <= delay.keys() for delay in arrived):
+            raise log.error(f"irtt's server sent no stamps: has round trips; {HALVE}")
+        both = [int(delay[key]) for delay in arrived for key in ("send", "receive")]
+        log.refuse_early(min(both, default=0) * 1e-9)  # of the other direction, too
     stamps = [trip["timestamps"]["client"]["send"] for trip in trips]
     sent_ns = [int(stamp.get("monotonic", stamp.get("wall"))) for stamp in stamps]
-    start = min(sent_ns, default=0)
     for trip, stamp_ns in zip(trips, sent_ns, strict=True):
-        sent, lost = (stamp_ns - start) * 1e-9, str(trip["lost"]).lower()
-        if (what, lost) == ("downlink", "true_up"):
-            log.elsewhere.append(sent)
+        sent, fate, delay = (stamp_ns - sent_ns[0]) * 1e-9, _fate(trip), nan
+        if (direction, fate) == ("downlink", "true_up"):
             continue
-        delay = int(trip["delay"][_IRTT_KEYS[what]]) * part if _arrived(trip) else nan
+        if fate == "false":
+            delay = int(trip["delay"][_IRTT_KEYS[direction]]) * (1e-9 if direction else 0.5e-9)
         log.entries.append((sent, delay))
-        if (what, lost) == ("uplink", "true_down"):
+        if (direction, fate) == ("uplink", "true_down"):
             log.unmeasured.add(sent)
             log.counts["lost on the way back, delay unknown"] += 1
+
+
+def _fate(trip: dict[str, Any]) -> str:
+    """Return whether a packet was lost: "false", "true", "true_up" or "true_down"."""
+    return str(trip["lost"]).lower()
 
 
 SCALES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -252,7 +207,11 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool) -> Packets:
     log = Log(name, halved=delay.startswith("rtt"))
     if log.halved and not halve:
         raise BadInputError(f"{name}, column {delay}: has round trips; {HALVE}")
-    loss = _find_loss(columns, log)
+    # A share of losses must not be passed over in silence.
+    losses = [column for column in columns if any(word in column for word in LOSSES)]
+    loss = next((column for column in losses if column in LOSSES), None)
+    if losses and not loss:
+        raise log.error(f"column {losses[0]} is not read; call it loss, 0 or 1, or remove it")
     raw = [(_csv_time(row, time, time_unit), _csv_delay(row, delay, loss)) for row in rows]
     # For nanoseconds since 1970 a float has a resolution of 256 ns, which is enough here.
     start = min((sent for sent, _ in raw), default=0.0)
@@ -267,30 +226,15 @@ def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, s
     Return the column's name and its unit; "" without unit. Raise an error if there is none, or more
     than one; `name` is the log's name, for the error.
     """
-    known = {f"{kind}_{unit}": unit for kind in kinds for unit in SCALES}
-    found = [column for column in columns if column in known]
-    found = found or [column for column in columns if column in kinds]
+    pattern = re.compile(f"(?:{'|'.join(kinds)})(?:_({'|'.join(SCALES)}))?")
+    found = [(column, it[1] or "") for column in columns if (it := pattern.fullmatch(column))]
     if len(found) == 1:
-        return found[0], known.get(found[0], "")
+        return found[0]
     if found:
-        raise BadInputError(f"{name}: has {' and '.join(found)}; keep only one of them")
+        names = " and ".join(column for column, _ in found)
+        raise BadInputError(f"{name}: has {names}; keep only one of them")
     shown = ",".join(columns)[:200] or "nothing"
     raise BadInputError(f"{name}: no column {kinds[0]}, found {shown}; name them {COLUMNS}")
-
-
-def _find_loss(columns: list[str], log: Log) -> str | None:
-    """Return the column that marks lost packets; None without one.
-
-    Raise an error if the only such column has another name, such as loss_percent.
-    """
-    found = [column for column in columns if any(word in column for word in LOSSES)]
-    known = [column for column in found if column in LOSSES]
-    if found and not known:
-        raise log.error(
-            f"column {found[0]} is not read; call it loss and give 0 or 1 for a packet, or remove "
-            "it"
-        )
-    return known[0] if known else None
 
 
 def _no_unit(column: str) -> str:
@@ -315,23 +259,22 @@ def _csv_delay(row: Row, column: str, loss: str | None) -> float:
 
     `loss` is the column that marks lost packets; None if the file has no such column.
     """
-    is_lost = row.text(column).lower() in ("", "nan")
-    if loss is not None:
-        remedy = "0 or 1 for a packet; a profile can use a trace with other shares directly"
+    if loss:
         flag = {"false": 0.0, "true": 1.0}.get(row.text(loss).lower())
-        if flag is None:
-            flag = row.number(loss, wanted=remedy)
+        flag = row.number(loss) if flag is None else flag
         if flag not in (0.0, 1.0):
-            raise BadInputError(f"{row.where}: {loss} is {row.text(loss)[:40]!r}; give {remedy}")
-        is_lost = is_lost or flag == 1.0
-    wanted = "a number that is not negative, or nothing for a lost packet"
-    return nan if is_lost else row.number(column, wanted=wanted)
+            raise BadInputError(f"{row.where}: {loss} is {flag:g}; give 0 or 1 for a packet")
+        if flag:
+            return nan
+    if row.text(column).lower() in ("", "nan"):
+        return nan
+    return row.number(column, wanted="a number that is not negative, or nothing for a lost packet")
 
 
-_WRAP = 1 << 16
+_WRAP = 1 << 16  # after 65535 ping goes on with 0
 _PACKET = re.compile(r"(?:\[(\d+\.\d+)\] )?.*icmp_seq=(\d{1,5})\b(?: .*time=(\d+(?:\.\d+)?) ms)?")
 """Line of `ping -D` about a packet: time stamp [s], sequence number, round trip [ms]."""
-_SUMMARY = re.compile(r"(\d+) packets transmitted, (\d+) received")
+_SUMMARY = re.compile(r"(\d+) packets transmitted, \d+ received")
 _NO_LINUX = (
     "is not what Linux' ping -D prints in English; measure with: LC_ALL=C ping -D -O HOST; Apple's "
     "ping and others have no such lines, so measure with irtt there"
@@ -353,26 +296,29 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
     ignored.
 
     Raises:
-        BadInputError: If `halve` is false; if the log `name` has another form, no replies or
-            several sessions; or if it contradicts its summary.
+        BadInputError: If `halve` is false; or if the log `name` has another form, no replies or
+            several sessions.
     """
     log = Log(name, halved=True)
     if not halve:
         raise log.error(f"ping measures round trips; {HALVE}")
+    totals = [int(found[1]) for line in lines if (found := _SUMMARY.search(line))]
+    is_twice = max(len(totals), sum(line.startswith("PING ") for line in lines)) > 1
     sent, trips, numbers = dict[int, float](), dict[int, float](), set[int]()
     for number, stamp, trip, line in _ping_packets(lines, log):
         numbers.add(number)
         if trip is not None:
-            if number in trips:
-                raise _sessions(f"number {number} comes twice", log)
+            is_twice |= number in trips
             sent[number], trips[number] = stamp - trip, trip
         elif stamp and "no answer yet" in line:  # said just before ping sends the next packet
             sent.setdefault(number + 1, stamp)
+    if is_twice:
+        raise log.error("has more than one session of ping; give the lines of one session")
     if not trips:
         raise log.error(f"has no replies, or {_NO_LINUX}")
     order = np.array(list(trips))
     log.counts["out of order, sorted"] += int(np.sum(order < np.maximum.accumulate(order)))
-    first, last = _ping_range(lines, numbers, len(trips), log)
+    first, last = (1, max(*totals, *numbers)) if totals else (min(numbers), max(numbers))
     n, at = np.array(sorted(sent.items())).T
     period = max(float(np.median(np.diff(at) / np.diff(n))), 1e-6) if len(n) > 1 else 1.0
     # Without a reply, the time of sending is interpolated between its neighbours.
@@ -400,33 +346,8 @@ def _ping_packets(lines: list[str], log: Log) -> Iterator[tuple[int, float, floa
         if "DUP!" in line:
             log.counts["duplicates left out"] += 1
             continue
+        # A late reply may have a number from before the wrap.
         number = int(found[2])
-        # After 65535 ping goes on with 0. A late reply may have a number from before that.
         number += _WRAP * max(0, round((newest - number) / _WRAP))
         newest = max(newest, number)
         yield number, float(found[1] or 0.0), float(found[3]) * 1e-3 if found[3] else None, line
-
-
-def _ping_range(lines: list[str], numbers: set[int], replies: int, log: Log) -> tuple[int, int]:
-    """Return the first and last sequence number: those of ping's summary, or else in the lines.
-
-    Raise a BadInputError if the log has several sessions of ping, or if the summary does not match
-    the number of `replies`.
-    """
-    totals = [found for line in lines if (found := _SUMMARY.search(line))]
-    begun = max(len(totals), sum(line.startswith("PING ") for line in lines))
-    if begun > 1:
-        raise _sessions(f"{begun} beginnings or ends", log)
-    if not totals:
-        return min(numbers), max(numbers)
-    sent, received = map(int, totals[0].groups())
-    if received != replies or sent < max(numbers):
-        raise log.error(
-            f"its summary counts {sent} sent and {received} received, but it has {replies} "
-            f"replies up to number {max(numbers)}; give the whole log"
-        )
-    return 1, sent
-
-
-def _sessions(sign: str, log: Log) -> BadInputError:
-    return log.error(f"has more than one session of ping ({sign}); give the lines of one session")

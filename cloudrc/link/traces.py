@@ -37,9 +37,7 @@ SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a
 START_MAX = 600.0  # if the first row is later, times count from the first row [s]
 LATEST = 1e11  # largest plausible time since 1970 [s]; a larger time has another unit
 NO_HEADER = (
-    "the first line must be time_s,delay_ms; a rate trace of mahimahi has no delays, use "
-    "rate_kbit; of delays [ms], one every 0.1 s, make a trace: "
-    'awk \'BEGIN {print "time_s,delay_ms"} {print (NR-1)*0.1 "," $1}\' FILE'
+    "the first line must be time_s,delay_ms; a rate trace of mahimahi has no delays, use rate_kbit"
 )
 """What to do about a file of numbers without a header."""
 SILENT = 1.0  # time after which a command says that it reads a large file [s]

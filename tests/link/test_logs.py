@@ -95,24 +95,16 @@ def test_round_trips_are_halved_only_on_request():
         ("", "no column time, found nothing"),
         ("time_s,delay_ms,rtt_ms\n0,45,90", "has delay_ms and rtt_ms; keep only one"),
         ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms is 'fast'; give a number that is n"),
-        ("time_s,delay_ms\n0,45\n1,timeout", "or nothing for a lost packet"),
         ("time_s,delay_ms\n0,45\n5", "line 3: delay_ms is nothing; give a number"),
         ("time_s,delay_ms\n,45", "line 2: time_s is nothing; give a finite number"),
-        ("time_s,delay_ms,loss\n0,45,0.5", "line 2: loss is '0.5'; give 0 or 1"),
+        ("time_s,delay_ms,loss\n0,45,0.5", "line 2: loss is 0.5; give 0 or 1"),
         ("time_s,delay_ms,loss\n0,45,maybe", "line 2: loss is 'maybe'"),
         ("time_s,delay_ms\n0,45\n1,-3", "arrived 3 ms before it was sent: the two clocks differ;"),
-        ("time_s,delay_ms\n0,45\n1,-1", "; leave the delay of a lost packet empty"),
         (
             "time,delay_ms\n20.01.2024 10:00:00.000,45",
             "time is '20.01.2024 10:00:00.000'; give date",
         ),
-        ("time,delay_ms\n01/20/2024 10:00,45", "line 2: time is '01/20/2024 10:00'; give date and"),
-        (
-            "time,delay_ms\n,45",
-            "line 2: time is ''; give date and time as 2024-01-20T10:00:00",
-        ),
         ("time_s,delay_ms,loss_percent\n0,45,2", "column loss_percent is not read; call it loss"),
-        ("time_s,delay_ms,Packet loss\n0,45,2", "column packet_loss is not read; call it loss"),
         ("time_s,delay_ms", "no packet has a delay"),
         ("sent_ms,delay_ms\n" + "1.7212E+12,20\n" * 50, "49 of 50 packets have the same time"),
         ("time_s,delay_ms\n98,4\n99,4\n100,4\n0,4\n1,4", "at packet 4 the times go back by 100 s"),
@@ -127,45 +119,13 @@ def test_an_unusable_csv_log_is_refused(text, says):
 
 
 def test_what_is_sorted_or_left_out_is_counted():
-    """Of 200 rows, one is out of order, one repeats a time; a pause follows."""
+    """Of 200 rows, one is out of order, and one repeats a time."""
     rows = [f"{n / 10:g},{40 + n % 5}" for n in range(200)]
     rows[20:22], rows[60] = [rows[21], rows[20]], rows[59]
-    packets = read("\n".join(["time_s,delay_ms", *rows, "919.9,40"]))
-    assert packets.notes[:2] == (
-        "1 out of order, sorted",
-        "1 left out, at the time of another one",
-    )
-    pause = "a pause, two sessions in one log, or a step of the clock"
-    assert packets.notes[2:] == (f"nothing sent for 900 s after packet 199: {pause}",)
-    assert len(packets.sent) == 200
+    packets = read("\n".join(["time_s,delay_ms", *rows]))
+    assert packets.notes == ("1 out of order, sorted", "1 left out, at the time of another one")
+    assert len(packets.sent) == 199
     assert packets.sent.tolist() == sorted(packets.sent)
-
-
-def rows(*times):
-    """Make a log of rows with delays of 40 to 44 ms at these times [s]."""
-    lines = [f"{time:.9g},{40 + n % 5}" for n, time in enumerate(times)]
-    return "\n".join(["time_s,delay_ms", *lines])
-
-
-def test_appended_sessions_are_never_sorted_into_one_another():
-    """Sessions of 0.5 s may be packets out of order, so they are only counted."""
-    long = [n / 10 + session / 100 for session in range(5) for n in range(60)]
-    with pytest.raises(BadInputError, match=r"at packet 61 the times go back by 5\.89 s"):
-        read(rows(*long))
-    short = [n / 100 + session / 1000 for session in range(5) for n in range(50)]
-    assert read(rows(*short)).notes == ("196 out of order, sorted",)
-
-
-def test_rows_in_the_order_of_arrival_are_no_step_of_a_clock():
-    late = [(n, (900 - 10 * n if 30 < n < 60 else 20) + n % 5) for n in range(200)]
-    late.sort(key=lambda packet: packet[0] * 10 + packet[1])
-    text = "\n".join(["time_ms,delay_ms", *(f"{n * 10},{delay}" for n, delay in late)])
-    assert len(read(text).notes) == 1
-
-
-def test_a_pause_that_may_be_a_step_of_the_clock_is_named():
-    packets = read(rows(*(1.0 + n / 10 + 0.9 * (n >= 150) for n in range(300))))
-    assert packets.notes[-1].startswith("nothing sent for 1 s after packet 150: a pause, ")
 
 
 def trip(number, lost=False, send=30, receive=20):
@@ -207,7 +167,7 @@ def test_irtt_gives_the_delays_of_each_direction(direction, sent, delays):
     assert lost == {"uplink": [1, 3], "downlink": [1, 2], None: [1, 2, 3]}[direction]
 
 
-def test_losses_on_the_way_back_are_no_losses_and_no_pause_of_the_uplink():
+def test_losses_on_the_way_back_are_no_losses_of_the_uplink():
     fates = ["false"] * 100 + ["true_down"] * 40 + ["true_up"] * 10 + ["false"] * 50
     trips = [trip(n, fate if fate != "false" else False) for n, fate in enumerate(fates)]
     up, down = irtt(trips, "uplink"), irtt(trips, "downlink")
@@ -219,22 +179,6 @@ def test_losses_on_the_way_back_are_no_losses_and_no_pause_of_the_uplink():
     assert sum(trace_of(up).losses) == 10
 
 
-def test_a_burst_of_losses_on_the_uplink_is_no_pause_of_the_downlink():
-    trips = [trip(n, "true_up" if 20 <= n < 60 else False) for n in range(80)]
-    assert irtt(trips, "downlink").notes == ()
-
-
-def test_irtt_without_a_monotonic_clock_is_read():
-    trips = [trip(0), trip(1)]
-    for one in trips:
-        del one["timestamps"]["client"]["send"]["monotonic"]
-    assert irtt(trips, "uplink").sent == pytest.approx((0.0, 0.010))
-
-
-STEPPED = [trip(0), trip(1), trip(2)]
-STEPPED[2]["timestamps"]["server"]["receive"]["monotonic"] -= 30_000_000
-CLIENT_STEPPED = [trip(0), trip(1)]
-CLIENT_STEPPED[1]["timestamps"]["client"]["send"]["wall"] += 9_000_000
 NO_STAMPS = [trip(0)]
 del NO_STAMPS[0]["delay"]["send"]
 
@@ -245,8 +189,6 @@ del NO_STAMPS[0]["delay"]["send"]
     [
         ([trip(0, send=-5, receive=60)], "arrived 5 ms before it was sent: the two clocks dif"),
         ([trip(0, send=60, receive=-5)], "arrived 5 ms before it was sent: the two clocks dif"),
-        (STEPPED, "the clock of irtt's server made a step of 30 ms"),
-        (CLIENT_STEPPED, "the clock of irtt's client made a step of 9 ms"),
         (NO_STAMPS, r"server sent no stamps.*--halve-rtt"),
         ([], "no packet has a delay"),
     ],
@@ -328,10 +270,8 @@ FIVE = [reply(number, number / 5) for number in range(1, 6)]
     ("lines", "says"),
     [
         ([HEAD], "has no replies"),
-        ([*FIVE, summary(5, 4)], "summary counts 5 sent and 4 received, but it has 5 replies"),
-        ([*FIVE[:2], summary(5, 5)], "summary counts 5 sent and 5 received, but it has 2 replies"),
-        ([HEAD, *FIVE, HEAD], "more than one session of ping .2 beginnings"),
-        ([*FIVE, reply(1, 900.0)], "more than one session of ping .number 1 comes twice"),
+        ([HEAD, *FIVE, HEAD], "more than one session of ping"),
+        ([*FIVE, reply(1, 900.0)], "more than one session of ping"),
         (
             [reply(n, 50.0 + n - 10.0 * (n > 5)) for n in range(1, 12)],
             "at packet 6 the times go back by 9 s: .* a step of the clock",

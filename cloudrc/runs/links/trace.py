@@ -12,12 +12,9 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from cloudrc.errors import BadInputError
 from cloudrc.files import naming
 from cloudrc.link.logs import (
-    GAP_MIN,
     Direction,
     Log,
     Packets,
@@ -141,19 +138,14 @@ def _outside_holes(
     """Leave out the datagrams whose arrival may be lost in a hole of the recording.
 
     `rows` begin with the stamp of sending [ns], and `longest_ns` is the longest time to the arrival
-    [ns]. `log` notes what is left out, and when nothing is known.
+    [ns]. `log` notes what is left out.
     """
-    from cloudrc.record.holes import END_NS, describe
+    from cloudrc.record.holes import describe
 
     def seconds(stamp_ns: float) -> float:
         return (stamp_ns - rows[0][0]) * 1e-9
 
     lost = [row for row in rows if any(h.meets(row[0], row[0] + longest_ns) for h in holes)]
-    log.elsewhere = [seconds(row[0]) for row in lost]
-    for hole in holes:
-        if hole.end_ns < END_NS:
-            span = seconds(hole.begin_ns), seconds(hole.end_ns)
-            log.elsewhere += np.arange(*span, GAP_MIN / 2).tolist()
     if lost:
         why = f"their arrivals may be lost: {describe(holes, seconds)}"
         log.counts[f"left out, because {why}"] += len(lost)
