@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -10,14 +10,7 @@ import numpy as np
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import Fence
-from cloudrc.link.traces import (
-    Row,
-    is_rising,
-    read_columns,
-    read_lines,
-    read_rows,
-    telling_rows,
-)
+from cloudrc.link.traces import Row, read_lines, read_rows, telling_rows
 from cloudrc.messages import Vector
 
 COLUMNS = ["time_s", "x_m", "y_m", "z_m"]
@@ -42,29 +35,10 @@ def read_setpoints(path: Path, fence: Fence) -> tuple[TimedPosition, ...]:
         given = ",".join(columns)[:80] or "missing"
         raise BadInputError(f"{name}: the columns are {given}; give {','.join(fits)}")
     with telling_rows(path, lines):
-        table = read_columns(lines, name)
-        found = None if table is None else _take_all(table, fence)
-        found = found or _take_each(rows, columns, fence)  # names the wrong row
+        found = _take_each(rows, columns, fence)
     if len(found) < 2:
         raise BadInputError(f"{name}: has {len(found)} rows; give at least two")
     return tuple((time - found[0][0], position) for time, position in found)
-
-
-def _take_all(table: Mapping[str, Sequence[float]], fence: Fence) -> list[TimedPosition] | None:
-    """Return all setpoints of a table of finite numbers; None if a row does not fit."""
-    times = table[COLUMNS[0]]
-    low, high = fence.inner_low, fence.inner_high
-    heights = table.get(COLUMNS[3], (low[2],) * len(times))
-    if fence.ground is not None and max(abs(z - fence.ground) for z in heights) > ROUNDING:
-        return None
-    places = (table[COLUMNS[1]], table[COLUMNS[2]], heights)
-    inside = all(
-        least - ROUNDING <= min(each) and max(each) <= most + ROUNDING
-        for least, each, most in zip(low, places, high, strict=True)
-    )
-    if not inside or not is_rising(times):
-        return None
-    return list(zip(times, zip(*places, strict=True), strict=True))
 
 
 def _take_each(rows: Iterable[Row], columns: Sequence[str], fence: Fence) -> list[TimedPosition]:

@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import fields
 from functools import lru_cache
-from itertools import islice
-from math import fsum, inf, isfinite, sqrt
-from operator import lt
+from math import fsum, inf, sqrt
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -146,7 +144,6 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
     If the first row's time is above `START_MAX` [s], subtract this time from all times.
     """
     place = f"trace {name}"
-    lines = list(lines)
     columns, rows = read_rows(lines, place)
     delay = next((column for column in columns if column in _SCALES), "delay_ms")
     if sorted(columns) not in (sorted(["time_s", delay]), sorted(["time_s", delay, "loss"])):
@@ -155,29 +152,15 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
             "is time_s,delay_ms or time_s,delay_us, and may end in ,loss"
         )
     wanted = ["time_s", delay, "loss"][: len(columns)]
-    table = read_columns(lines, place)
-    if table is None or not _is_trace(table):
-        found = _rising(rows, wanted)  # names the wrong row
-        if not found:
-            raise BadInputError(f"{place}: no rows; give at least one, for example: 0,45")
-        table = dict(zip(wanted, zip(*found, strict=True), strict=True))
-    times, delays, *losses = (table[column] for column in wanted)
+    found = _rising(rows, wanted)
+    if not found:
+        raise BadInputError(f"{place}: no rows; give at least one, for example: 0,45")
+    times, delays, *losses = zip(*found, strict=True)
     if times[0] > LATEST:
         raise BadInputError(f"{place}: time_s begins at {times[0]:.15g}, which is not in seconds")
     start = times[0] if times[0] > START_MAX else 0.0
     scaled = tuple(one * _SCALES[delay] for one in delays)
     return Trace(tuple(time - start for time in times), scaled, losses[0] if losses else None)
-
-
-def _is_trace(table: Mapping[str, Sequence[float]]) -> bool:
-    """Return whether columns of finite numbers have the values of a trace."""
-    least = min(map(min, table.values()))
-    return is_rising(table["time_s"]) and least >= 0.0 and max(table.get("loss", (0.0,))) <= 1.0
-
-
-def is_rising(times: Sequence[float]) -> bool:
-    """Return whether each time comes after the one before it."""
-    return all(map(lt, times, islice(times, 1, None)))
 
 
 def _rising(rows: Iterable[Row], columns: Sequence[str]) -> list[list[float]]:
@@ -266,32 +249,6 @@ def read_rows(
             yield Row(where, named, "." if separator == "," else ",")
 
     return columns, rows()
-
-
-def read_columns(lines: Iterable[str], name: str) -> dict[str, tuple[float, ...]] | None:
-    """Read the numbers of a CSV file as `read_rows` does, but fast: column -> its values.
-
-    Return None if there is no row, or one that is not finite numbers alone, in as many cells as the
-    header has. Then only `read_rows` can say which row is wrong, or read it in another form.
-    """
-    kept = [line for line in lines if _has_data(line) and not line.startswith("sep=")]
-    if len(kept) < 2:
-        return None
-    header, *data = kept
-    separator = _separator(header)
-    if separator != ",":
-        data = [line.replace(",", ".") for line in data]
-    rows = [line.split(separator) for line in data]
-    columns = [_column(cell) for cell in _cells(header, separator, f"{name}, line 1")]
-    try:
-        values = [tuple(map(float, cells)) for cells in zip(*rows, strict=True)]
-    except ValueError:
-        return None
-    if any("_" in line for line in data):  # see `parse_number`, which is slower
-        return None
-    if len(values) != len(columns) or not all(all(map(isfinite, each)) for each in values):
-        return None
-    return dict(zip(columns, values, strict=True))
 
 
 def _has_data(line: str) -> bool:

@@ -2,7 +2,6 @@
 
 import pytest
 
-from cloudrc.config import setpoints
 from cloudrc.config.setpoints import read_setpoints, write_setpoints
 from cloudrc.errors import BadInputError
 from tests.fences import FENCE
@@ -20,13 +19,6 @@ def test_setpoints_that_follow_closely_can_be_read_again(gap, tmp_path):
 
 
 HEAD = "time_s,x_m,y_m,z_m"
-
-
-def test_good_setpoints_are_read_without_an_object_for_each_row(tmp_path, monkeypatch):
-    path = tmp_path / "drive.csv"
-    path.write_text(f"{HEAD}\n5,0,0,1\n\n6.5,0.5,0,1.2\n")
-    monkeypatch.setattr(setpoints, "_take_each", None)
-    assert read_setpoints(path, FENCE) == ((0.0, HERE), (1.5, THERE))
 
 
 @pytest.mark.parametrize(

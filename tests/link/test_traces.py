@@ -84,55 +84,6 @@ def test_a_table_is_the_arrived_delays_with_mean_0_deviation_1(tmp_path):
         read_table(path)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        f"{HEAD}\n0,45\n1, 46.5 \n2,47\n",
-        "# measured\ndelay_us;time_s\n45000,5;0\n46000;0,25\n\n",
-        f"sep=,\n{HEAD},loss\n0,45,0\n1,0,1\n",
-    ],
-)
-def test_a_good_file_is_read_without_an_object_for_each_row(monkeypatch, text):
-    slow = traces.read_columns
-    with monkeypatch.context() as patch:
-        patch.setattr(traces, "read_columns", lambda *given: None)
-        expected = parse_trace(text.splitlines(), "x")
-    assert slow(text.splitlines(), "x") is not None
-    monkeypatch.setattr(traces, "Row", None)
-    assert parse_trace(text.splitlines(), "x") == expected
-
-
-@pytest.mark.parametrize(
-    "row",
-    [
-        "9,45,1",
-        "9",
-        "8,45",
-        "9,x",
-        '9,"46"',
-        "9,nan",
-        "9,inf",
-        "-1,45",
-        "9,-1",
-        "",
-        "9,4_5",
-        "9_0,4",
-    ],
-)
-def test_the_fast_reader_takes_no_row_that_the_other_one_refuses(monkeypatch, row):
-    lines = [HEAD, *(f"{n},45" for n in range(9)), row, "10,45"]
-
-    def result():
-        try:
-            return parse_trace(lines, "x")
-        except BadInputError as error:
-            return str(error)
-
-    fast = result()
-    monkeypatch.setattr(traces, "read_columns", lambda *given: None)
-    assert fast == result()
-
-
 def test_an_unchanged_file_is_read_once_and_a_changed_one_anew(tmp_path, monkeypatch):
     path, reads = tmp_path / "trace.csv", []
     path.write_text(f"{HEAD}\n0,45\n")
