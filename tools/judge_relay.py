@@ -1,13 +1,12 @@
 """Compare `cloudrc relay tcp` with `cloudrc link exec`: how long turns take, on the same link.
 
-    python -m tools.judge_relay [--only lte] [--rounds 6]
+    python -m tools.judge_relay [--rounds 6]
 
 A turn sends a number of bytes, and gets eight back: on a new connection (cold) or on a used one
 (warm). A round measures both at the same time, because other load on the machine changes; each
 round has a seed of its own. The table has median and 95 % quantile [ms] of both. Over the link with
 loss, 16 connections measure at once, because their times differ much; it has no rate, so that they
-do not meet. Over `ideal` both are measured one after the other, and a connection without a link,
-too: `link exec` spends CPU time on each packet. Needs root, and what `link exec` needs.
+do not meet. Needs root, and what `link exec` needs.
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from statistics import quantiles
 
-from cloudrc.cli.main import main as run_command
 from cloudrc.drivers.realtime import free_ports
 
 TURNS = {200: 30, 300_000: 15, 1_400_000: 5}
@@ -64,6 +62,7 @@ def serve(port: int) -> None:
                 one.sendall(bytes(8))
 
     listening = socket.create_server(("0.0.0.0", port), backlog=64)
+    print("listening", flush=True)
     while True:
         one, _ = listening.accept()
         threading.Thread(target=answer, args=(one,), daemon=True).start()
@@ -112,90 +111,60 @@ def through_exec(link: str, seed: int, crowd: int) -> str:
     asking = words("--ask", "{server}:9000", "--crowd", crowd)
     command += ["--client", " ".join(asking)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return done.stdout.replace("[client] ", "")
+    lines = done.stdout.splitlines()
+    return "\n".join(line.removeprefix("[client] ") for line in lines if "[client]" in line)
 
 
 def through_relay(link: str, seed: int, crowd: int) -> str:
-    """Measure over `relay tcp`, or without it if `link` is ""; return what `ask` prints."""
+    """Measure over `relay tcp`; return what `ask` prints."""
     port, entry = free_ports(2)
-    server = subprocess.Popen(words("--serve", port))
-    relay = None
-    try:
-        wait_until_listening(port)
-        if link:
-            relay = subprocess.Popen(
-                words("--relay", link, seed, entry, port), stderr=subprocess.PIPE
-            )
-            assert relay.stderr is not None
-            relay.stderr.readline()
-        where = f"127.0.0.1:{entry if link else port}"
-        asking = words("--ask", where, "--crowd", crowd)
-        return subprocess.run(asking, capture_output=True, text=True, check=True).stdout
-    finally:
-        for process in filter(None, (relay, server)):
-            process.kill()
-            process.wait()
+    command = [PYTHON, "-m", "cloudrc", "relay", "tcp", "--link", link, "--seed", str(seed)]
+    command += ["--listen", f"127.0.0.1:{entry}", "--to", f"127.0.0.1:{port}"]
+    with (
+        subprocess.Popen(words("--serve", port), stdout=subprocess.PIPE) as server,
+        subprocess.Popen(command, stderr=subprocess.PIPE) as relay,
+    ):
+        assert server.stdout is not None
+        assert relay.stderr is not None
+        server.stdout.readline()  # they listen
+        relay.stderr.readline()
+        asking = words("--ask", f"127.0.0.1:{entry}", "--crowd", crowd)
+        done = subprocess.run(asking, capture_output=True, text=True, check=True)
+        relay.kill()
+        server.kill()
+    return done.stdout
 
 
-def wait_until_listening(port: int) -> None:
-    """Wait until a program of this machine listens."""
-    while True:
-        with contextlib.suppress(ConnectionRefusedError):
-            socket.create_connection(("127.0.0.1", port)).close()
-            return
-        time.sleep(0.05)
-
-
-def relay(link: str, seed: str, entry: str, port: str) -> None:
-    """Run `cloudrc relay tcp`."""
-    sockets = ("--listen", f"127.0.0.1:{entry}", "--to", f"127.0.0.1:{port}")
-    run_command(["relay", "tcp", "--link", link, "--seed", seed, *sockets])
+WAYS = {"exec": through_exec, "relay": through_relay}
 
 
 def measure(way: str, link: str, seed: int, crowd: int, times: Times) -> None:
     """Measure a round, and add it to `times`."""
-    if way == "exec":
-        text = through_exec(link, seed, crowd)
-    else:
-        text = through_relay(link if way == "relay" else "", seed, crowd)
-    for line in text.splitlines():
+    for line in WAYS[way](link, seed, crowd).splitlines():
         size, kind, taken = line.split()
         times[int(size), kind].append(float(taken))
 
 
-def compare(names: Sequence[str], rounds: int) -> None:
+def compare(rounds: int) -> None:
     """Print a row of the table for each link, number of bytes, and kind of connection."""
-    print(f"{rounds} rounds\n")
     print(f"{'link':6}{'bytes':>9} {'':5}{'turns':>6}", end="")
     print(f"{'exec p50':>10}{'relay':>9}{'exec p95':>10}{'relay':>9}")
-    with tempfile.TemporaryDirectory() as folder:
-        for name in names:
-            path = Path(folder, "link.yaml")
-            path.write_text(LINKS[name], encoding="utf-8")
-            link = str(path) if ":" in LINKS[name] else LINKS[name]
-            ways = ("exec", "relay", "direct") if name == "ideal" else ("exec", "relay")
-            found: dict[str, Times] = {way: defaultdict(list) for way in ways}
-            with ThreadPoolExecutor(1 if name == "ideal" else len(ways)) as pool:
-                for seed in range(1, rounds + 1):
-                    crowd = CROWDS.get(name, 1)
-                    doing = [
-                        pool.submit(measure, way, link, seed, crowd, found[way]) for way in ways
-                    ]
-                    for one in doing:
-                        one.result()
-            print_rows(name, found)
-
-
-def print_rows(name: str, found: dict[str, Times]) -> None:
-    """Print the rows of a link."""
-    for (size, kind), exact in found["exec"].items():
-        row = f"{name:6}{size:>9} {kind:5}{len(exact):>6}"
-        for percent in (50, 95):
-            row += f"{quantile(exact, percent):>10.1f}"
-            row += f"{quantile(found['relay'][size, kind], percent):>9.1f}"
-        if "direct" in found:
-            row += f"  without a link: {quantile(found['direct'][size, kind], 50):.1f}"
-        print(row, flush=True)
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(len(WAYS)) as pool:
+        for name, text in LINKS.items():
+            (path := Path(folder, "link.yaml")).write_text(text, encoding="utf-8")
+            link = str(path) if ":" in text else text
+            found: dict[str, Times] = {way: defaultdict(list) for way in WAYS}
+            for seed in range(1, rounds + 1):
+                crowd = CROWDS.get(name, 1)
+                doing = [pool.submit(measure, way, link, seed, crowd, found[way]) for way in WAYS]
+                for one in doing:
+                    one.result()
+            for (size, kind), exact in found["exec"].items():
+                row = f"{name:6}{size:>9} {kind:5}{len(exact):>6}"
+                for percent in (50, 95):
+                    row += f"{quantile(exact, percent):>10.1f}"
+                    row += f"{quantile(found['relay'][size, kind], percent):>9.1f}"
+                print(row, flush=True)
 
 
 def quantile(times: Sequence[float], percent: int) -> float:
@@ -206,12 +175,10 @@ def quantile(times: Sequence[float], percent: int) -> float:
 def main() -> int:
     """Compare, or be one of the two programs."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=LINKS, help="measure one link")
     parser.add_argument("--rounds", type=int, default=6, help="rounds of each (default: 6)")
     parser.add_argument("--serve", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--ask", help=argparse.SUPPRESS)
     parser.add_argument("--crowd", type=int, help=argparse.SUPPRESS)
-    parser.add_argument("--relay", nargs=4, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.serve:
         serve(options.serve)
@@ -222,13 +189,9 @@ def main() -> int:
             for one in doing:
                 one.result()
         return 0
-    if options.relay:
-        link, seed, entry, port = options.relay
-        relay(link, seed, entry, port)
-        return 0
     # Other programs of this machine would delay the packets of `link exec`, each one a little.
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-    compare([options.only] if options.only else list(LINKS), options.rounds)
+    compare(options.rounds)
     return 0
 
 

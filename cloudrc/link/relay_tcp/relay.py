@@ -80,7 +80,7 @@ class RelayedConnection:
         if self.dead:
             return
         if attempt > GREETINGS:
-            self._end(now_ns)
+            self.end(now_ns)
             return
         up, down = self.relay.ways
         arrival_ns = up.cross(SYN, self.number, attempt, 0, now_ns)
@@ -119,7 +119,7 @@ class RelayedConnection:
         if self.dead or self.connecting or not self.greeted:
             return
         if self.client.source is None or self.server.source is None:
-            self._end(now_ns)
+            self.end(now_ns)
             return
         self.client.source.open(now_ns)
         self.server.source.open(now_ns + self.relay.ways[0].delay_ns(now_ns))
@@ -134,7 +134,7 @@ class RelayedConnection:
             mask |= selectors.EVENT_WRITE if side.unsent else 0
             self.relay.watch(self, side, mask)
         if self.client.closed and self.server.closed:
-            self._end(0, reset=False)
+            self.end(0, reset=False)
 
     def _read(self, side: Side, now_ns: int) -> None:
         assert side.source is not None
@@ -189,9 +189,9 @@ class RelayedConnection:
         side.reads = False
         up, down = self.relay.ways
         way = up if side is self.client else down
-        self.relay.agenda.put(self._end, (now_ns + way.delay_ns(now_ns),), ())
+        self.relay.agenda.put(self.end, (now_ns + way.delay_ns(now_ns),), ())
 
-    def _end(self, now_ns: int, *, reset: bool = True) -> None:
+    def end(self, now_ns: int, *, reset: bool = True) -> None:
         """Close both sockets, by RST with `reset`."""
         if self.dead:
             return
@@ -203,14 +203,6 @@ class RelayedConnection:
                     side.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
             side.socket.close()
         self.relay.connections.discard(self)
-
-    def close(self) -> None:
-        """Reset both sides at once; the relay does not watch them any more."""
-        self.dead = True
-        for side in (self.client, self.server):
-            with suppress(OSError):  # closed already
-                side.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
-            side.socket.close()
 
 
 class StreamRelay:
@@ -263,7 +255,8 @@ class StreamRelay:
         if mask == side.mask:
             return
         if not mask:
-            self._selector.unregister(side.socket)
+            with suppress(KeyError):  # a signal has ended a change in its middle
+                self._selector.unregister(side.socket)
         elif not side.mask:
             self._selector.register(side.socket, mask, (connection, side))
         else:
@@ -279,8 +272,7 @@ class StreamRelay:
 
     def close(self) -> None:
         """Reset all connections, and accept no more."""
-        # A signal may have ended the loop in the middle of a change of what it watches.
+        for connection in list(self.connections):
+            connection.end(0)
         self._selector.close()
-        for connection in self.connections:
-            connection.close()
         self._listening.close()

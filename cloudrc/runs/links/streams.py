@@ -8,7 +8,7 @@ import socket
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from ipaddress import IPv4Address, IPv6Address, ip_address
+from ipaddress import ip_address
 from statistics import quantiles
 from typing import Any
 
@@ -110,22 +110,7 @@ def _find(to: Address) -> tuple[int, tuple[str, int]]:
 def _is_same(listen: tuple[Any, ...], to: tuple[str, int]) -> bool:
     """Return whether a connection to `to` reaches the socket that listens at `listen`."""
     here, there = ip_address(listen[0]), ip_address(to[0])
-    there = getattr(there, "ipv4_mapped", None) or there
-    if (listen[1], here.version) != (to[1], there.version):
-        return False
-    if there.is_unspecified:  # the kernel connects to this machine
-        there = ip_address("127.0.0.1" if there.version == 4 else "::1")
-    return here == there or (here.is_unspecified and _is_of_machine(there))
-
-
-def _is_of_machine(address: IPv4Address | IPv6Address) -> bool:
-    family = socket.AF_INET if address.version == 4 else socket.AF_INET6
-    with socket.socket(family, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind((str(address), 0))
-        except OSError:
-            return False
-    return True
+    return listen[1] == to[1] and (here == there or (here.is_unspecified and there.is_loopback))
 
 
 def _summary(relay: StreamRelay) -> dict[str, Any]:

@@ -14,9 +14,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
-from websockets.exceptions import ConnectionClosed
-from websockets.sync import client as websocket_client
-from websockets.sync.server import serve as serve_websocket
 
 from cloudrc import link
 from cloudrc.drivers.realtime import free_ports
@@ -126,42 +123,15 @@ def test_bytes_turns_and_a_half_close_cross_the_link(relayed):
     assert report["turns"]["max"] >= 0.08 - 0.001
 
 
-@pytest.mark.parametrize("flags", [(), (*SHORT, "--set", "uplink.loss=0.01")])
+@pytest.mark.parametrize("flags", [(), ("--link", "lte"), (*SHORT, "--set", "uplink.loss=0.01")])
 def test_what_arrives_is_what_was_sent(relayed, flags):
-    data = os.urandom(3_000_000)
+    data = os.urandom(2_000_000)
     with server(echo) as port:
         relay = relayed(port, *flags)
         with relay.connect() as client:
             threading.Thread(target=lambda: (client.sendall(data), client.shutdown(1))).start()
             found = b"".join(iter(lambda: client.recv(1 << 16), b""))
     assert hashlib.sha256(found).digest() == hashlib.sha256(data + b"end").digest()
-
-
-def test_a_stock_websocket_client_meets_its_server_over_lte(relayed):
-    closed = []
-
-    def handle(one):
-        try:
-            while True:
-                one.send(one.recv())
-        except ConnectionClosed as error:
-            closed.append((error.rcvd.code, error.rcvd.reason))
-
-    with serve_websocket(handle, "127.0.0.1", 0) as web:
-        threading.Thread(target=web.serve_forever).start()
-        relay = relayed(web.socket.getsockname()[1], "--link", "lte")
-        data = os.urandom(1_000_000)
-        with websocket_client.connect(f"ws://127.0.0.1:{relay.port}") as client:
-            for message in ("vélo", data):
-                client.send(message)
-                assert client.recv(timeout=20.0) == message
-            began = time.monotonic()
-            client.close(4001, "landed")
-            round_trip = time.monotonic() - began
-        assert (client.close_code, client.close_reason) == (4001, "landed")
-        assert relay.end()["turns"]["count"] >= 2
-    assert closed == [(4001, "landed")]
-    assert round_trip >= 0.03  # the answer to the close crossed the link, too
 
 
 def test_a_refused_port_refuses_the_client_after_a_round_trip(relayed):
@@ -280,15 +250,6 @@ def test_a_port_in_use_is_named(refused):
         port = taken.getsockname()[1]
         text = refused(f"relay tcp --listen 127.0.0.1:{port} --to 127.0.0.1:1")
     assert f"--listen 127.0.0.1:{port}: Address already in use" in text
-
-
-def test_nothing_is_left_behind(relayed):
-    with server(echo) as port:
-        relay = relayed(port)
-        relay.connect().close()
-        relay.process.terminate()
-        out, _ = relay.process.communicate(timeout=20)
-    assert json.loads(out)["connections"] >= 0
 
 
 def test_a_signal_in_the_middle_of_a_change_does_not_spoil_the_end():
