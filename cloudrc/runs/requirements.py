@@ -9,7 +9,7 @@ from cloudrc.errors import MissingPrerequisiteError
 
 EXTRAS: dict[str, tuple[str, ...]] = {
     "world": ("mujoco",),
-    "record": ("lz4", "mcap", "rosbags", "zstandard"),
+    "record": ("mcap", "rosbags"),
     "report": ("matplotlib",),
     "kube": ("kubernetes",),
     "api": ("fastapi", "uvicorn"),
