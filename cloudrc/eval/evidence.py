@@ -165,7 +165,9 @@ def judge(rows: Sequence[Row], before: Sequence[Row] = (), name: str = "") -> di
         notes = [SURVIVES, *(each["text"] for each in survival)]
     intervals = [key for each in outcomes for key in each if key.endswith("_low")]
     count = len(intervals) + sum(len(each.keys() & {"success", "return"}) for each in tests)
-    notes += [*doubts(outcomes), by_chance(count)]
+    notes += doubts(outcomes)
+    if count > 1:
+        notes.append(by_chance(count))
     return {
         "versus": name,
         "outcomes": outcomes,
