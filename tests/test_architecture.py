@@ -22,7 +22,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "messages": set(),
     "records": set(),
-    "renamed": set(),
     "rounding": set(),
     "source": set(),
     "text": set(),
@@ -102,7 +101,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "__init__": {"api"},
 }
 ALWAYS = {
-    *("errors", "messages", "patience", "records", "renamed", "rounding", "source", "text"),
+    *("errors", "messages", "patience", "records", "rounding", "source", "text"),
     "version",
 }
 
@@ -323,7 +322,6 @@ A_ROBOTS_WORDS = {"pelican", "rotor", "pipe", "board", "tip"}
 # Words of one robot and its scene, as singular and plural; only `robots/` may use them. File -> its
 # words, and why it has them.
 MAY_SAY = {
-    "renamed.py": ({"board", "pipe", "tip"}, "it is the table of old names"),
     "config/schema.py": ({"pelican", "pipe"}, "shipped robot, scene and mission are defaults"),
     "cli/mission.py": ({"pipe"}, "a shipped mission is an example"),
     "gym/registration.py": ({"pipe"}, "an environment has the name of a shipped mission"),

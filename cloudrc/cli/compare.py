@@ -17,7 +17,6 @@ from cloudrc.cli.output import (
 )
 from cloudrc.cli.parser import read_count
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.renamed import new_name
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.text import csv_table, latex_table
@@ -48,7 +47,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     flight_arguments(parser, seeds=10)
     add("--in", type=Path, dest="sweep", metavar="DIR", help="compare flights of this sweep")
     about = "compare this metric instead of the default ones; repeatable"
-    add("--number", action="append", type=new_name, default=[], metavar="NAME", help=about)
+    add("--number", action="append", default=[], metavar="NAME", help=about)
     output_argument(parser, forms=TABLES)
 
 

@@ -16,7 +16,6 @@ from cloudrc.cli.parser import (
     read_count,
     whole_number,
 )
-from cloudrc.renamed import new_name
 from cloudrc.runs.interrupts import interrupt_on_signals
 
 VERBS = {
@@ -71,7 +70,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     output_argument(status)
     add = figure.add_argument
     about = "metric to draw; repeatable (default: three that matter first)"
-    add("--number", action="append", type=new_name, default=[], metavar="NAME", help=about)
+    add("--number", action="append", default=[], metavar="NAME", help=about)
     about = "axis of the sweep along x (default: the first one with numbers)"
     add("--x", metavar="AXIS", help=about)
     about = "axis with one line per value (default: the first with names, else the next one)"

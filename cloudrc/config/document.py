@@ -18,7 +18,6 @@ import yaml
 from cloudrc import files
 from cloudrc.config.reuse import reuse
 from cloudrc.errors import BadInputError
-from cloudrc.renamed import NEW_KEYS, new_key
 
 KeyPath = tuple[str, ...]
 """The keys that lead from the top of a document to a value. The index of a list entry is text."""
@@ -199,24 +198,6 @@ class Document:
             parent[path[-1]] = value
         below = {key: place for key, place in self.sources.items() if key[: len(path)] != path}
         self.sources = below | {path: source}
-
-    def rename_keys(self) -> None:
-        """Give the keys of an experiment that have an old name their present one."""
-        for old, new in NEW_KEYS.items():
-            path, to = tuple(old.split(".")), tuple(new.split("."))
-            above = self.get(*path[:-1])  # the section of both
-            if not (isinstance(above, dict) and path[-1] in above):
-                continue
-            new_key(old)
-            value = above.pop(path[-1])
-            if to[-1] in above:
-                both = f"{new} is given twice, also as {old}"
-                raise BadInputError(f"{self.source(path).label}: {both}; keep one of them")
-            above[to[-1]] = value
-            self.sources = {
-                (*to, *key[len(path) :]) if key[: len(path)] == path else key: source
-                for key, source in self.sources.items()
-            }
 
 
 def child(node: Any, key: str) -> Any:

@@ -23,7 +23,7 @@ from pydantic import (
     field_validator,
 )
 
-from cloudrc import plugins, renamed
+from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
 from cloudrc.config.document import Document, KeyPath, read_document, write_yaml
 from cloudrc.config.ground import ABOVE, put_on_ground
@@ -199,7 +199,6 @@ def load_experiment(
         _remove_derived(document, new_profile=bool(changes.keys() & _PROFILE_KEYS))
     outer = {path: value for path, value in changes.items() if path not in inner}
     overrides.apply_overrides(document, outer, build=build)
-    document.rename_keys()  # in a mapping that a setting gives
     for key in ("world", "guard", "link", "cloud", "report"):
         _default(document, (key,), {})
     found: list[ConfigProblem] = []
@@ -207,7 +206,6 @@ def load_experiment(
         _inline_mission(document)
     with _collect(found, ("link", "profile")):
         _inline_profile(document)
-    _renew_touch(document)
     overrides.apply_overrides(document, inner)
     _default(document, ("guard", "plan_max_s"), _plan_max(document))
     for key in overrides.KINDS:
@@ -418,24 +416,6 @@ def _keep_setpoints(document: Document, changes: Settings) -> None:
     has_touch = any(path[:2] == ("mission", "touch") for path in changes)
     for key in ("waypoints", "steps", "carrot", *([] if has_touch else ["touch"])):
         document.tree["mission"].pop(key, None)
-
-
-def _renew_touch(document: Document) -> None:
-    """Turn what older files say in their criteria about a touch into the mission's `touch`."""
-    criteria, mission = document.get("criteria"), document.get("mission")
-    if not isinstance(criteria, dict) or not isinstance(mission, dict):
-        return
-    users = not _has_all_values(document)  # else cloudrc has written the file
-    for key in ("contact", "contact_speed_max_mps"):
-        if (given := criteria.pop(key, None)) is None:
-            continue
-        path, value = renamed.touch(key, given, told=users)
-        if path[-1] == "speed_max_mps" and not mission.get("touch"):
-            continue
-        source = document.source(("criteria", key))
-        if len(path) > 2 and not mission.get("touch"):
-            document.set_value(path[:2], {}, source)
-        document.set_value(path, value, source)
 
 
 def _inline_profile(document: Document) -> None:

@@ -34,7 +34,6 @@ from cloudrc.config.robot import RobotFacts, facts, find_robot, known_robot, par
 from cloudrc.config.schema import Cloud, Experiment, PlanTime, PlugIn, Steps, World
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
-from cloudrc.renamed import new_key
 
 REMOTE, ROS2 = "remote", "ros2"
 OUTSIDE = (REMOTE, ROS2)
@@ -69,7 +68,7 @@ def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
     """
     found: Settings = {}
     for key, value, source in given:
-        path = tuple(new_key(".".join(part.strip() for part in key.split("."))).split("."))
+        path = tuple(part.strip() for part in key.split("."))
         if not all(path):
             raise BadInputError(f"{source.label}: {key!r}: is no key; one is cloud.predictor")
         for each in _directions(path):

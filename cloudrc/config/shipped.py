@@ -54,10 +54,7 @@ def read(kind: str, name: str, folder: Path) -> Document:
     path = folder / os.path.expanduser(name)
     if not os.path.exists(path):  # unlike Path.exists, no exception for an invalid name
         raise _no_file("no such file", kind, path)
-    document = read_document(path, name)
-    if kind == "experiment":
-        document.rename_keys()
-    return document
+    return read_document(path, name)
 
 
 def check_name(kind: str, name: str, folder: Path | None = None) -> None:

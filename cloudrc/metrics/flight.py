@@ -26,7 +26,6 @@ from cloudrc.metrics.counters import growth
 from cloudrc.record.columns import Recording, Table
 from cloudrc.record.holes import Hole
 from cloudrc.records import UNDER_WAY
-from cloudrc.renamed import new_column
 
 Array: TypeAlias = NDArray[Any]
 Columns: TypeAlias = dict[str, Array]
@@ -293,22 +292,13 @@ def turn_between(start: Array, end: Array | float) -> Array:
     return turns
 
 
-class _Columns(Columns):
-    """Columns by name; the old name of a column finds it, too."""
-
-    def __missing__(self, name: str) -> Array:
-        if (new := new_column(name)) == name:
-            raise KeyError(name)
-        return self[new]
-
-
 def _columns(table: Table) -> Columns:
-    return _Columns((name, table[name]) for name in table.names)
+    return {name: table[name] for name in table.names}
 
 
 def select(columns: Columns, rows: Array) -> Columns:
     """Select rows of all columns by `rows` [1]: an index, indices, or a truth value per row."""
-    return _Columns((name, column[rows]) for name, column in columns.items())
+    return {name: column[rows] for name, column in columns.items()}
 
 
 Measure: TypeAlias = Callable[[Flight], float | None]

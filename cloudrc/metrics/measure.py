@@ -15,7 +15,6 @@ from cloudrc.metrics import control, link, mission, response
 from cloudrc.metrics.flight import SHIPPED, Flight, Metric
 from cloudrc.patience import telling_if_slow
 from cloudrc.record.holes import goes_on
-from cloudrc.renamed import new_name
 
 # The imported modules add the metrics of cloudrc to SHIPPED.
 __all__ = ["SHIPPED", "Flight", "Metric", "control", "link", "mission", "response"]
@@ -66,7 +65,6 @@ def find(choice: str, *, look: bool = False) -> Metric:
     Raises:
         BadInputError: If the metric does not exist, or if the file defines no metric.
     """
-    choice = new_name(choice)
     if choice in SHIPPED:
         return SHIPPED[choice]
     known = [*SHIPPED, *plugins.names("metrics")]

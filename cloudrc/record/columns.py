@@ -25,7 +25,6 @@ from cloudrc.record.content import Content
 from cloudrc.record.content import Message as Message  # callers take it from here, too
 from cloudrc.record.topics import ADDED, BY_SOURCE, TOPICS, Kind, Topic
 from cloudrc.records import Arrival, Record
-from cloudrc.renamed import new_column
 
 Column: TypeAlias = NDArray[Any]
 
@@ -72,7 +71,7 @@ class Table:
 
     def __getitem__(self, name: str) -> Column:
         try:
-            return self._columns[name if name in self._columns else new_column(name)]
+            return self._columns[name]
         except KeyError:
             known = ", ".join(self.names)
             raise KeyError(f"no column {name!r} in {self.topic.name}; it has: {known}") from None

@@ -30,7 +30,6 @@ from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, of_metadata, union
 from cloudrc.record.ros import converter
 from cloudrc.record.topics import TOPICS, VIEWS
 from cloudrc.record.writer import CLOCK, COUNTS, MISSING
-from cloudrc.renamed import with_new_columns
 
 LISTED_MAX = 3
 """Largest number of topics that a text lists."""
@@ -167,7 +166,7 @@ class _Reader:
         ros_type = topic.ros_type if topic else VIEWS.get(channel.topic)
         if schema is None or ros_type is None or schema.name != ros_type:
             return None
-        return converter(ros_type, with_new_columns(schema.data.decode("utf-8", "replace")))
+        return converter(ros_type, schema.data.decode("utf-8", "replace"))
 
     def _sort(self) -> None:
         messages = self.content.messages

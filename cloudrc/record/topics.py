@@ -155,7 +155,7 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 """Name -> topic, for every topic of a recording."""
 
 ADDED = ("/plan", "/sensor")
-"""Topics that recordings of version 0.1.0 lack; without rows they do not change a hash."""
+"""Topics that came later than the others; without rows they do not change a hash."""
 
 VIEWS: dict[str, str] = {
     "/tf": "tf2_msgs/msg/TFMessage",

@@ -14,7 +14,6 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.metrics import SHIPPED
 from cloudrc.plugins import unknown_name_text
-from cloudrc.renamed import new_key
 from cloudrc.rounding import differences
 from cloudrc.runs import flight, store
 from cloudrc.runs.experiment import load, refuse_seed
@@ -212,12 +211,6 @@ def _flight(row: Row, names: Sequence[str]) -> dict[str, Any]:
     return {"verdict": row["verdict"], "numbers": numbers}
 
 
-def _with_new_key(text: str) -> str:
-    """Return VALUE or AXIS=VALUE with the present name of the axis."""
-    axis, equals, value = text.partition("=")
-    return f"{new_key(axis)}={value}" if equals else text
-
-
 def of_sweep(folder: Path, a: str, b: str) -> Pairs:
     """Pair the rows of a sweep that differ only in one axis: one has the value `a`, the other `b`.
 
@@ -228,7 +221,7 @@ def of_sweep(folder: Path, a: str, b: str) -> Pairs:
     """
     rows, units, missing = store.read_flights(folder)
     axes = store.values_of(rows)
-    axis, first, second = _sides(folder, axes, _with_new_key(a), _with_new_key(b))
+    axis, first, second = _sides(folder, axes, a, b)
     what = f"{axis} in {folder}" + (f", of which {missing}" if missing else "")
     if pooled := ", ".join(name for name, each in axes.items() if name != axis and len(each) > 1):
         what += f", over all values of {pooled}; flights with equal seeds depend on each other, "

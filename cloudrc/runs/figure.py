@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 from cloudrc.errors import BadInputError
 from cloudrc.metrics import scale
 from cloudrc.plugins import unknown_name_text
-from cloudrc.renamed import new_key
 from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.report.figures.style import Look
 from cloudrc.runs.compare import NUMBERS, check_names
@@ -126,12 +125,9 @@ def _with(rows: Sequence[Row], axis: str, value: Any) -> list[Row]:
     return [row for row in rows if row["point"][axis] == value]
 
 
-def _known_axis(given: str | None, known: Iterable[str]) -> str | None:
-    """Return the present name of the axis that the user gave; raise an error if there is none."""
-    if given is None:
-        return None
-    axis = new_key(given)
-    if axis not in known:
+def _known_axis(axis: str | None, known: Iterable[str]) -> str | None:
+    """Return the axis that the user gave; raise an error if there is none of this name."""
+    if axis is not None and axis not in known:
         raise BadInputError(unknown_name_text("axis", axis, sorted(known)))
     return axis
 

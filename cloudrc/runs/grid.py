@@ -27,7 +27,6 @@ from cloudrc.config.problems import ConfigProblem, ProblemsError, validate
 from cloudrc.config.reuse import reuse, reuse_results
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError
-from cloudrc.renamed import new_key
 from cloudrc.runs.experiment import check_world
 from cloudrc.runs.flight import Row, units
 from cloudrc.runs.installed import installed_code
@@ -272,10 +271,8 @@ def _entries(
         return []
 
     axes: dict[str, list[tuple[Any, list[_Entry]]]] = {}
-    for name, given in file.grid.items():
-        above, axis = ("grid", name), new_key(name)
-        if axis in axes:
-            found.append(ConfigProblem(above, "", f"{axis} is given twice; keep one of them"))
+    for axis, given in file.grid.items():
+        above = "grid", axis
         axes[axis] = choices_of(axis, given, *above)
         if not axes[axis]:
             text = "must be a list of values, or names, each with a mapping of keys to values"

@@ -25,7 +25,6 @@ from cloudrc import files
 from cloudrc.config.document import read_document, write_yaml
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file, write_atomically
-from cloudrc.renamed import NEW_NAMES, new_key
 from cloudrc.runs.flight import Row
 from cloudrc.runs.grid import Grid, read_grid
 from cloudrc.runs.lock import LOCK
@@ -101,21 +100,8 @@ def _lines(path: Path) -> Iterator[bytes]:
 def parse_row(line: bytes | str) -> Row | None:
     """Parse a line of JSON as a row; return None if it is not a row."""
     with suppress(ValidationError):
-        row: Row = dict(_RowDocument.model_validate_json(line))
-        row["failures"] = [NEW_NAMES.get(code, code) for code in row["failures"]]
-        row["numbers"] = _with_new_names(row["numbers"])
-        row["point"] = _with_new_keys(row["point"])
-        return row
+        return dict(_RowDocument.model_validate_json(line))
     return None
-
-
-def _with_new_names(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {NEW_NAMES.get(name, name): value for name, value in values.items()}
-
-
-def _with_new_keys(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return axis -> value with the present names of the axes that are keys of an experiment."""
-    return {new_key(axis): value for axis, value in values.items()}
 
 
 @contextmanager
@@ -272,8 +258,7 @@ class _SummaryDocument(_Document):
 def read_summary(folder: Path) -> dict[str, Any]:
     """Read the description of a sweep; raise a BadInputError if `folder` is not that of a sweep."""
     with suppress(OSError, ValueError):
-        found = _SummaryDocument.model_validate_json(files.read(folder / SUMMARY, SUMMARY_MAX))
-        return {**dict(found), "axes": _with_new_keys(found.axes)}
+        return dict(_SummaryDocument.model_validate_json(files.read(folder / SUMMARY, SUMMARY_MAX)))
     raise BadInputError(f"{folder}: is not a folder of 'cloudrc sweep run'; name one")
 
 
@@ -350,7 +335,7 @@ def read_flights(folder: Path) -> tuple[list[Row], dict[str, str], str]:
     unknown = dict.fromkeys((name for row in rows for name in row["numbers"]), "")
     return (
         rows,
-        {**unknown, **_with_new_names(summary["units"])},
+        {**unknown, **summary["units"]},
         f"{missing} flights are not done" if missing else "",
     )
 

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.errors import BadInputError
-from cloudrc.renamed import new_key
 from cloudrc.runs import flight, stability
 from cloudrc.runs.experiment import check_world, load, refuse_seed
 from cloudrc.runs.margin import (
@@ -63,7 +62,7 @@ class Trials:
 
     def __init__(self, asked: Asked) -> None:
         """Read the present value and the range of the search; refuse a key that has no range."""
-        self.asked = asked = asked._replace(key=new_key(asked.key))
+        self.asked = asked
         key = asked.key
         refuse_seed([*asked.settings, f"{key}=0"])
         self.step_depends = not key.startswith(NOT_IN_STEP)

@@ -22,7 +22,6 @@ from pydantic import TypeAdapter
 from cloudrc.config.schema import Touch
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.metrics.verdict import Observations
-from cloudrc.renamed import with_new_names, with_touch
 from cloudrc.teleop.wire import ENDED, QUEUED, STATES, Plan
 
 Event: TypeAlias = dict[str, Any]
@@ -327,12 +326,7 @@ class MissionStore:
     def _read(self) -> None:
         for row, ordered, status in self._db.execute("SELECT * FROM missions ORDER BY n"):
             number, order = json.loads(ordered)
-            known = {
-                "id": f"m{row}",
-                "number": number,
-                "order": with_touch(order),
-                **json.loads(with_new_names(status)),
-            }
+            known = {"id": f"m{row}", "number": number, "order": order, **json.loads(status)}
             mission = _MISSION.validate_python(known)
             mission.events = deque(mission.events, SHOWN)
             self._events = max(self._events, *(event["id"] for event in mission.events), 0)

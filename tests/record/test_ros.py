@@ -67,7 +67,7 @@ def test_another_layout_is_noticed(old, new, known):
 def test_fields_that_only_the_type_in_a_file_has_are_left_out():
     fault = TOPICS["/fault"]
     text = definition(fault.ros_type)
-    longer = text.replace("string code", "float64 tip_force\nstring code")
+    longer = text.replace("string code", "float64 force\nstring code")
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg(longer, fault.ros_type))
     row = (7, "late", "slow", "")

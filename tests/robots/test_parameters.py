@@ -197,26 +197,6 @@ def test_what_the_robot_cannot_do_is_refused_before_the_first_flight_of_a_sweep(
         read_grid(sweep)
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("world.low_level.integral_limit_xy=0.3", "world.onboard.integral_limit_xy=0.3"),
-        ("world.low_level.gain_p.0=5", "world.onboard.gain_p.0=5"),
-        ("world.low_level={integral_limit_z: 1}", "world.onboard={integral_limit_z: 1}"),
-        (
-            "world={scene: empty, low_level: {integral_limit_z: 1}}",
-            "world={scene: empty, onboard: {integral_limit_z: 1}}",
-        ),
-        ("world.plant.thrust_factor=0.9", "world.plant.actuator_factor=0.9"),
-        ("world.plant.thrust_factor=[1,1,1,.9]", "world.plant.actuator_factor=[1,1,1,.9]"),
-        ("world.plant.thrust_factor=[1,1,1,1]", "world.plant.actuator_factor=1"),
-        ("world.plant={thrust_factor: 0.9}", "world.plant={actuator_factor: 0.9}"),
-    ],
-)
-def test_an_old_key_means_the_new_one(old, new):
-    assert load("hover", [old]) == load("hover", [new])
-
-
 def test_a_machine_without_mujoco_leaves_the_check_and_the_advice_to_world():
     program = (
         "import sys; sys.modules['mujoco'] = None\n"

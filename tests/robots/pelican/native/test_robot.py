@@ -219,7 +219,7 @@ def test_in_air_that_acts_on_geoms_c_uses_the_whole_model(setting):
     ("name", "settings"),
     [
         ("paper", ()),
-        ("steps", ("world.low_level.integral_limit_xy=0.3", "guard.speed_max_mps=0.5")),
+        ("steps", ("world.onboard.integral_limit_xy=0.3", "guard.speed_max_mps=0.5")),
         ("fast", ("link.profile=lossy",)),
         ("paper-verbatim", ()),
         ("hover", ("link.uplink.blackouts=[{start_s: 8, duration_s: 3}]",)),
