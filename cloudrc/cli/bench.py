@@ -9,7 +9,6 @@ measurement and prints the shortest processor time.
 from __future__ import annotations
 
 import argparse
-import sys
 from contextlib import closing
 
 from cloudrc.cli.output import output_argument, print_result
@@ -32,10 +31,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Run all measurements; print for each the processor time per physics step [us]."""
     require("the bench", ("world",))
-    from cloudrc.cli.progress import StepView
+    from cloudrc.cli.progress import Progress
     from cloudrc.runs.bench import as_text, bench
 
-    with closing(StepView(sys.stderr, f"measures each part {options.repeats} times")):
+    with closing(Progress(f"measures each part {options.repeats} times")):
         document = bench(options.repeats)
     print_result(options.output, document, as_text(document))
     return 0

@@ -65,7 +65,7 @@ def flight_arguments(parser: argparse.ArgumentParser, seeds: int) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Compare A and B, print the result, and return the exit code: 0 if all flights were flown."""
     interrupt_on_signals()
-    from cloudrc.cli.progress import StepView
+    from cloudrc.cli.progress import Progress
     from cloudrc.runs.compare import compare, of_sweep
     from cloudrc.runs.compare_text import as_text, cells
 
@@ -73,7 +73,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.set and options.sweep:
         raise BadInputError(f"--set {options.set[0]}: these flights are finished; leave it out")
     if options.sweep:
-        with closing(StepView(sys.stderr, f"reads {options.sweep}")):
+        with closing(Progress(f"reads {options.sweep}")):
             found = of_sweep(options.sweep, options.a, options.b)
     else:
         found, stopped = _fly_both(options)
@@ -81,7 +81,7 @@ def execute(options: argparse.Namespace) -> int:
         print_or_drop(f"cloudrc: {stopped}: {len(found.pairs)} pairs are finished", sys.stderr)
         if not found.pairs:
             return stopped.exit_code
-    with closing(StepView(sys.stderr, f"compares {len(found.pairs):,} pairs of flights")):
+    with closing(Progress(f"compares {len(found.pairs):,} pairs of flights")):
         compared = compare(found.pairs, found.units, options.number)
     document = {
         **{"a": options.a, "b": options.b, "of": found.what},
@@ -114,8 +114,7 @@ def _fly_both(options: argparse.Namespace) -> tuple[Pairs, CloudrcError | None]:
     sides, unit_of = load_sides(options.experiment, options.set, a, b, options.number)
     warn(*sides)
     head = f"{sides[0].name}: A and B, each with seeds 1 to {options.seeds}"
-    stream = sys.stdout if options.output == "table" else sys.stderr
     flights = 2 * options.seeds
-    with closing(SweepView(stream, f"{head}, {flights} flights", flights)) as view:
+    with closing(SweepView(f"{head}, {flights} flights", flights)) as view:
         pairs, stopped = fly_pairs(sides, options.seeds, flights, view.see)
     return Pairs(pairs, unit_of, f"experiment {options.experiment}"), stopped

@@ -14,7 +14,6 @@ from cloudrc.cli.output import (
     TABLES,
     output_argument,
     print_line,
-    print_or_drop,
     print_result,
 )
 from cloudrc.cli.parser import COUNT_MAX, number, read_count
@@ -98,7 +97,7 @@ def execute(options: argparse.Namespace) -> int:
     interrupt_on_signals()
     needed = ["gym", "report", *(["policy"] if "://" in options.policy else [])]
     require("an evaluation", needed)
-    from cloudrc.cli.progress import CountView, StepView
+    from cloudrc.cli.progress import Progress
     from cloudrc.eval import results
     from cloudrc.eval.episode import check_environment, follows_seed
     from cloudrc.eval.setup import BASELINE, Episode
@@ -108,7 +107,7 @@ def execute(options: argparse.Namespace) -> int:
     goes_on = folder is not None and results.is_begun(folder)
     if goes_on:
         results.refuse_other(folder, setup)
-    with closing(StepView(sys.stderr, f"makes the environment {setup.env}")):
+    with closing(Progress(f"makes the environment {setup.env}")):
         checked = check_environment(setup, episodes)
         seeded = follows_seed(setup)
     for text in checked.step.doubts:
@@ -120,10 +119,8 @@ def execute(options: argparse.Namespace) -> int:
     before = results.read_versus(options.versus, setup, episodes) if options.versus else []
     if not goes_on:
         folder = new_folder(folder, f"eval-{Path(setup.env).name}", "latest-eval")
-    stream = sys.stdout if options.output == "table" else sys.stderr
-    told = f"{setup.env}: {len(episodes)} episodes, step {checked.step}"
-    print_or_drop(escape(told), stream)
-    with lock_folder(folder), closing(CountView(stream, len(episodes), "episodes")) as view:
+    with lock_folder(folder), closing(Progress("plays episodes", len(episodes))) as view:
+        view.say(escape(f"{setup.env}: {len(episodes)} episodes, step {checked.step}"))
         try:
             rows, stopped = results.play_missing(folder, setup, episodes, options.jobs, view.count)
         except Exception:

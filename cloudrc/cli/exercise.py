@@ -8,7 +8,6 @@ the user.
 from __future__ import annotations
 
 import argparse
-import sys
 from contextlib import closing
 from pathlib import Path
 from shlex import quote
@@ -53,12 +52,12 @@ def execute(options: argparse.Namespace) -> int:
     check_folder(folder, may_be_empty=for_gradescope)
     require("a check", ("world",))
     interrupt_on_signals()
-    from cloudrc.cli.progress import StepView
+    from cloudrc.cli.progress import Progress
     from cloudrc.exercise import score
     from cloudrc.exercise.scoring import check
 
     rows = []
-    with closing(StepView(sys.stderr, f"scores {folder}")) as view:
+    with closing(Progress(f"scores {folder}")) as view:
         view.say(escape(f"scores {folder}"))
         for row in check(folder.resolve()):
             rows.append(row)

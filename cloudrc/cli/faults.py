@@ -115,7 +115,7 @@ def print_faults(options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Run one fault, all faults, or the schedule of faults in a file; return the exit code."""
-    from cloudrc.cli.progress import StepView
+    from cloudrc.cli.progress import Progress
     from cloudrc.faults.scenarios import SCENARIOS, find
     from cloudrc.faults.search import run_fault
 
@@ -133,7 +133,7 @@ def run(options: argparse.Namespace) -> int:
 
     run_seed = partial(run_fault, seed=options.seed)
     flown = map_in_order(run_seed, [each.name for each in chosen], options.jobs)
-    with closing(StepView(sys.stderr, "flies with the faults")):
+    with closing(Progress("flies with the faults")):
         stopped = take_each(flown, take)
     done, failed = len(faults), sum(each["result"] == "failed" for each in faults)
     document = {"seed": options.seed, "passed": not failed, "faults": faults}
@@ -148,12 +148,12 @@ def run(options: argparse.Namespace) -> int:
 
 def run_file(options: argparse.Namespace) -> int:
     """Fly the schedule of faults in a file; return 1 if the flight breaks a safety invariant."""
-    from cloudrc.cli.progress import StepView
+    from cloudrc.cli.progress import Progress
     from cloudrc.faults.trial import fly_file
 
     if options.seed != 1:
         raise BadInputError("--seed belongs to named faults, not to a schedule's file")
-    with closing(StepView(sys.stderr, f"flies {options.name}")):
+    with closing(Progress(f"flies {options.name}")):
         finding = fly_file(options.name)
     breaches = [breach._asdict() for breach in finding.breaches]
     document = {"records_sha256": finding.sha256, "breaches": breaches}
@@ -163,7 +163,7 @@ def run_file(options: argparse.Namespace) -> int:
 
 def search(options: argparse.Namespace) -> int:
     """Fly random schedules of faults; print the failures, and how to continue the search."""
-    from cloudrc.cli.progress import StepView
+    from cloudrc.cli.progress import Progress
     from cloudrc.config.schema import World
     from cloudrc.faults.search import SearchSettings, search, search_rows, search_summary
 
@@ -182,7 +182,7 @@ def search(options: argparse.Namespace) -> int:
             print_line(f"FAILED seed {failure['seed']}: {failure['breaches'][0]['text']}")
             print_line(f"  again: cloudrc faults run {failure['file']}")
 
-    with closing(StepView(sys.stderr, "flies schedules")):
+    with closing(Progress("flies schedules")):
         found, stopped = search(settings, see)
     again = f"cloudrc faults search{' --adversarial' if options.adversarial else ''}"
     again += f" --robot {quote(options.robot)}" if options.robot else ""

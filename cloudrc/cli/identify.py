@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -33,13 +32,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Fit the model, write it to a file, and print it."""
     require("identify", ("record",))
-    from cloudrc.cli.progress import StepView
+    from cloudrc.cli.progress import Progress
     from cloudrc.runs.identify import as_text, describe, identify
 
     out = options.out
     if os.path.lexists(out):
         raise BadInputError(f"{out}: already there; name another file with --out")
-    with closing(StepView(sys.stderr, f"reads {options.run} and fits the model")):
+    with closing(Progress(f"reads {options.run} and fits the model")):
         found = identify(options.run)
     document = describe(*found)
     write_atomically(out, f"{format_document(document, 'yaml')}\n".encode())

@@ -147,9 +147,9 @@ def show(options: argparse.Namespace) -> int:
     if output.suffix[1:] not in PICTURES:
         raise BadInputError(f"-o {output}: not a picture; end its name in .png, .svg or .pdf")
     refuse_other_file(output, PICTURES[output.suffix[1:]])
-    from cloudrc.cli.progress import StepView
+    from cloudrc.cli.progress import Progress
 
-    with closing(StepView(sys.stderr, f"reads {options.profile}")) as view:
+    with closing(Progress(f"reads {options.profile}")) as view:
         title, text, picture = _drawn(options, output.suffix[1:], view.tell)
     with naming(output):
         output.write_bytes(picture)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from contextlib import closing
 
 from cloudrc.cli.cluster_flags import flown_release
 from cloudrc.cli.output import paint, print_result
-from cloudrc.cli.progress import StepView
+from cloudrc.cli.progress import Progress
 from cloudrc.errors import BadInputError
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.verify import (
@@ -30,7 +29,7 @@ AWAITED = "waits for the verdicts of both pods"
 def execute(options: argparse.Namespace) -> int:
     """Measure the link and print the verdict; return 0 if the link matches its profile, else 1."""
     interrupt_on_signals()  # on a signal, remove namespaces and processes
-    with closing(StepView(sys.stderr, "starts")) as view:
+    with closing(Progress("starts")) as view:
         report = _verify(options, view.tell)
     print_result(options.output, report, as_text(report, paint))
     return 0 if report["verdict"] == "believed" else 1

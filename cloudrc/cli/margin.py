@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from contextlib import closing
 from typing import TYPE_CHECKING
@@ -49,11 +48,10 @@ def execute(options: argparse.Namespace) -> int:
     """Print both answers; return 0, or 1 if no value is stable (or, without that, none settles)."""
     interrupt_on_signals()
     require("margin", MODES["virtual"])
-    from cloudrc.cli.progress import StepView
+    from cloudrc.cli.progress import Progress
     from cloudrc.runs.margin_text import as_text
     from cloudrc.runs.trials import QUESTIONS, Asked, Trials, describe, questions
 
-    stream = sys.stdout if options.output == "table" else sys.stderr
     trials = Trials(
         Asked(
             options.key,
@@ -66,7 +64,7 @@ def execute(options: argparse.Namespace) -> int:
     )
     asked = questions(trials)
     found: dict[str, ValueRange | None] = {}
-    with closing(StepView(stream, "flies")) as view:
+    with closing(Progress("flies")) as view:
         for name in QUESTIONS:
             found[name] = _search(options, trials, name, view.say) if name in asked else None
         document = describe(trials, found)

@@ -1,17 +1,25 @@
-"""Show what a long command does: on a terminal in a moving line, else in a line every 10 s."""
+"""Show on stderr what a long command does: a moving line on a terminal, else a line every 10 s."""
 
 from __future__ import annotations
 
 import math
 import sys
 from collections.abc import Callable, Iterable
-from threading import Event, Lock, Thread
+from threading import Event, Thread
 from time import monotonic
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.live import Live
-from rich.spinner import Spinner
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    ProgressColumn,
+    SpinnerColumn,
+    Task,
+    TimeRemainingColumn,
+)
+from rich.progress import Progress as Bars
+from rich.table import Column
 from rich.text import Text
 
 from cloudrc.cli.output import is_live, print_or_drop
@@ -33,107 +41,102 @@ if TYPE_CHECKING:
     from cloudrc.runs.flight import Row
 
 ENDINGS = ("done", "cancelled", "timed_out")
-FIRST_WAIT, PERIOD = 3.0, 10.0
-"""Time to the first line on a stream that is no terminal, and from one line to the next [s]."""
-STEP_WAIT = 1.0
-"""Time after which a terminal shows the step of a command, or the check of a sweep [s]."""
+PERIOD = 10.0
+"""Time from one line to the next on a stream that is no terminal [s]."""
 
 
-class StatusLine:
-    """Shows one line about a work until it is closed: a terminal or a log is never silent.
+class _Line(ProgressColumn):
+    """The line of a `Progress`, cropped to the terminal."""
 
-    On a terminal the line moves. On another stream it is printed `FIRST_WAIT` after the beginning,
-    and then whenever nothing was printed for `PERIOD`.
-    """
+    def __init__(self, line: Callable[[], Text]) -> None:
+        super().__init__(Column(no_wrap=True, overflow="crop"))
+        self._line = line
+
+    def render(self, task: Task) -> Text:
+        return self._line()
+
+
+class Progress:
+    """Shows the present step of a command until it is closed, and how much of it is done."""
 
     def __init__(
-        self,
-        stream: TextIO,
-        line: Callable[[], str | Text],
-        wait: float = 0.0,
-        *,
-        in_logs: bool = True,
+        self, step: str = "", total: int | None = None, *, says_on_stdout: bool = False
     ) -> None:
-        """Set the stream and the function that returns the line.
+        """Set the first step, such as "reads the recording", and the number of its pieces of work.
 
-        A terminal shows the line after `wait` [s]. Without `in_logs`, other streams
-        get it after `begin_log`.
+        `say` prints on stderr, or with `says_on_stdout` on stdout.
         """
-        self._stream, self._line, self._wait = stream, line, wait
-        self._began, self._quiet_since = monotonic(), monotonic() - PERIOD
-        self._closed, self._printing = Event(), Lock()
-        self._live: Live | None = None
-        self._thread: Thread | None = None
-        if is_live(stream):
-            self._spinner = Spinner("dots")
-            terminal = Console(file=stream)
-            self._live = Live(
-                console=terminal,
-                transient=True,
-                get_renderable=self._moving,
-                # What goes elsewhere must not appear on this terminal.
-                redirect_stdout=is_live(sys.stdout),
-                redirect_stderr=is_live(sys.stderr),
-            )
-            self._live.start(refresh=True)  # now: the work may begin with a long import
-        elif in_logs:
-            self.begin_log()
-
-    def begin_log(self) -> None:
-        """Print the line from now on, if the stream is no terminal."""
-        if not self._live and not self._thread:
-            self._thread = Thread(target=self._print, daemon=True)
+        self._step = step
+        is_moving = is_live(sys.stderr)
+        bar = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()) if total else ()
+        self._bars = Bars(
+            SpinnerColumn(),
+            _Line(self.line),
+            *bar,
+            console=Console(stderr=True),
+            transient=True,
+            disable=not is_moving,
+            # What goes elsewhere must not appear on this terminal.
+            redirect_stdout=is_live(sys.stdout),
+            redirect_stderr=is_moving,
+            speed_estimate_period=600.0,  # a piece of work may take minutes
+        )
+        self._bars.add_task("", total=total)
+        (self._work,) = self._bars.tasks
+        self._closed, self._thread = Event(), Thread(target=self._log, daemon=True)
+        self._bars.start()
+        # Now: while plug-ins run, sys.stdout is stderr.
+        self._out = sys.stdout if says_on_stdout else sys.stderr
+        if not is_moving:
             self._thread.start()
 
-    @property
-    def elapsed(self) -> str:
-        """The time since the beginning, for people."""
-        return f"{monotonic() - self._began:.0f} s"
+    def line(self) -> Text:
+        """Return the present step, and how long it takes."""
+        return Text(f"{escape(self._step)} ({self._work.elapsed or 0:.0f} s)")
 
-    def _moving(self) -> Text:
-        line = Text(no_wrap=True, overflow="crop")
-        if monotonic() - self._began >= self._wait:
-            line.append(str(self._spinner.render(monotonic()))).append(" ").append(self._line())
-        return line
+    def _log(self) -> None:
+        while not self._closed.wait(PERIOD):
+            if line := self.log_line():
+                print_or_drop(line, sys.stderr)
 
-    def _print(self) -> None:
-        wait = FIRST_WAIT
-        while not self._closed.wait(wait):
-            wait = PERIOD - (monotonic() - self._quiet_since)
-            if wait <= 0.0:
-                wait = PERIOD
-                self.say(str(self._line()))
+    def log_line(self) -> str:
+        """Return the line for a stream that is no terminal; "": none."""
+        line, left = str(self.line()), self._work.time_remaining
+        if self._work.total:
+            line = f"{line}  {self._work.completed:.0f}/{self._work.total:.0f}"
+        return line if left is None else f"{line}, {left:.0f} s left"
+
+    def tell(self, step: str) -> None:
+        """Set the next step."""
+        self._step = step
+        self._bars.reset(self._work.id, total=self._work.total)
+
+    def count(self, done: int) -> None:
+        """Show that `done` pieces of work are done."""
+        self._bars.update(self._work.id, completed=done)
 
     def say(self, line: str) -> None:
         """Print a line for good; on a terminal, above the moving one."""
-        self._quiet_since = monotonic()
-        if self._live:
-            self._live.console.print(Text(line))
-            return
-        with self._printing:
-            print_or_drop(line, self._stream)
+        print_or_drop(line, self._out)
 
     def close(self) -> None:
         """Erase the moving line."""
         self._closed.set()
-        if self._thread:
+        self._bars.stop()
+        if self._thread.is_alive():
             self._thread.join()
-        if self._live:
-            self._live.stop()
 
 
-class FlightView(StatusLine):
-    """Prints the events of a flight to a stream, and shows its state.
+class FlightView(Progress):
+    """Prints the events of a flight, and shows its state.
 
     All times are those of the report: since the mission's start, on world's clock.
     """
 
-    def __init__(
-        self, stream: TextIO, waypoints: int, unit: str = "waypoint", *, events: bool = True
-    ) -> None:
-        """Set the stream and the number of waypoints (0: unknown); show a status line at once.
+    def __init__(self, waypoints: int, unit: str = "waypoint", *, events: bool = True) -> None:
+        """Set the number of waypoints (0: a session); show a status line at once.
 
-        `unit` is what the mission counts; "": nothing. Without `events`, print no events.
+        `unit` is what the mission counts; "": nothing. With `events`, print them on stdout.
         """
         self._waypoints, self._unit, self._events = waypoints, unit, events
         self._first_ns = self._now_ns = self._start_ns = NEVER_NS
@@ -142,9 +145,7 @@ class FlightView(StatusLine):
         self._position: Vector = (math.nan, math.nan, math.nan)
         self._delay, self._waypoint = math.nan, -1
         self._guard, self._ended = GuardState.GROUND, False
-        self._step = ""  # what the command does after the flight
-        # A session, which has no waypoints, may wait for its next mission for days.
-        super().__init__(stream, self.line, in_logs=bool(waypoints))
+        super().__init__(says_on_stdout=events)
 
     def see(self, records: Iterable[Record]) -> None:
         """Show new records of world or cloud, in the order of time."""
@@ -186,7 +187,7 @@ class FlightView(StatusLine):
     def line(self) -> Text:
         """Return the status line; it ends with the least important part, which may be cropped."""
         if self._step:
-            return Text(f"{self._step} ({self.elapsed})")
+            return super().line()
         elapsed, flown = self._seen - self._moved_at, (self._now_ns - self._first_ns) * 1e-9
         since = self._now_ns - self._start_ns if self._start_ns != NEVER_NS else 0
         cells = (
@@ -197,10 +198,14 @@ class FlightView(StatusLine):
             "" if math.isnan(self._delay) else f"delay {self._delay * 1e3:3.0f} ms",
             f"x{flown / elapsed:.2f}" if elapsed > 0 and flown > 0 else "",
         )
-        line = Text(_joined(cells), no_wrap=True, overflow="crop")
+        line = Text(_joined(cells))
         colour = "green" if self._guard == GuardState.TRACK else "yellow"
         line.highlight_words([self._guard.name], colour)
         return line
+
+    def log_line(self) -> str:
+        """Return the line for a log; a session may wait for its next mission for days."""
+        return super().log_line() if self._waypoints or self._step else ""
 
     def _leg(self) -> str:
         number = self._waypoint + 1
@@ -220,117 +225,46 @@ class FlightView(StatusLine):
         time = " " * 9 if self._start_ns == NEVER_NS else f"{since:7.2f} s"
         self.say(_joined((time, f"{escape(text):<44}", self._place())))
 
-    def tell(self, step: str) -> None:
-        """Show what the command does after the flight."""
-        self._step, self._began = step, monotonic()
-        self.begin_log()
-
 
 def _joined(cells: Iterable[str]) -> str:
     return "  ".join(cell for cell in cells if cell).rstrip()
 
 
-class CountView(StatusLine):
-    """Shows how much of a long work is done, and how long the rest takes."""
+class SweepView(Progress):
+    """Counts flights; prints the first failure of each verdict."""
 
-    def __init__(self, stream: TextIO, total: int, unit: str) -> None:
-        """Set the amount of work `total` and its `unit`, such as "flights"."""
-        self._total, self._unit, self._done, self._more = total, unit, 0, ""
-        self._first, self._at_first = math.nan, 0
-        super().__init__(stream, self.line)
-
-    def count(self, done: int, more: str = "") -> None:
-        """Show that `done` pieces of work are done; `more` ends the line."""
-        if math.isnan(self._first):
-            self._first, self._at_first = monotonic(), done
-        self._done, self._more = done, more
-
-    def line(self) -> str:
-        """Return the line. The rate counts from the first result: workers take seconds to start."""
-        line = f"{self._done}/{self._total} {self._unit}"
-        more = self._done - self._at_first
-        if not more:
-            return f"{line}  {self.elapsed}{self._more}"
-        rate = more / max(monotonic() - self._first, 1e-3)
-        left = (self._total - self._done) / rate
-        time = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
-        return f"{line}  {rate:.1f}/s, {time} left{self._more}"
-
-
-class PlanView:
-    """Shows how many points of a sweep are checked, if that takes longer than a second."""
-
-    def __init__(self, stream: TextIO) -> None:
-        """Print nothing yet."""
-        self._stream, self._began = stream, monotonic()
-        self._view: CountView | None = None
-
-    def see(self, done: int, points: int, work: str) -> None:
-        """Show that `done` of the points are checked; `work` has their number in words."""
-        if monotonic() - self._began < STEP_WAIT or done == points:
-            return
-        if self._view is None:
-            print_or_drop(f"checks {work}", self._stream)
-            self._view = CountView(self._stream, points, "points")
-        self._view.count(done)
-
-    def close(self) -> None:
-        """Erase the status line on a terminal."""
-        if self._view:
-            self._view.close()
-
-
-class StepView(StatusLine):
-    """Shows the present step of a command, if the command takes longer than a second."""
-
-    def __init__(self, stream: TextIO, step: str) -> None:
-        """Set the stream and the first step, such as "reads the recording"."""
-        self._step = step
-        super().__init__(stream, self.line, STEP_WAIT)
-
-    def line(self) -> str:
-        """Return the step, and how long the command has taken."""
-        return f"{escape(self._step)} ({self.elapsed})"
-
-    def tell(self, step: str) -> None:
-        """Set the next step."""
-        self._step = step
-
-
-class SweepView(CountView):
-    """Shows how many flights are done."""
-
-    def __init__(self, stream: TextIO, head: str, total: int) -> None:
+    def __init__(self, head: str, total: int) -> None:
         """Print the headline `head`; set `total`, the number of flights to fly."""
-        print_or_drop(escape(head), stream)
-        super().__init__(stream, total, "flights")
-        self._failed, self._told = 0, set[str]()
+        super().__init__("flies", total)
+        self.say(escape(head))
+        self._done = self._failed = 0
+        self._told = set[str]()
 
     def see(self, row: Row) -> None:
-        """Count a finished flight; print its failure if it is the first of its verdict.
-
-        Print why a metric has no value once per text.
-        """
+        """Count a finished flight; print why a metric has no value once per text."""
+        self._done += 1
         self._failed += row["verdict"] != "success"
         kind = row["verdict"] if row["failures"] else row["text"]
         if row["text"] and kind not in self._told:
             self._told.add(kind)
             self.say(escape(f"{row['key']}: {row['verdict']}: {row['text']}"))
-        self.count(self._done + 1, f", {self._failed} failed" if self._failed else "")
+        self._step = f"flies, {self._failed} failed" if self._failed else "flies"
+        self.count(self._done)
 
 
-class SeedsView(CountView):
-    """Prints a line per flight with its seed, its verdict and why it failed."""
+class SeedsView(Progress):
+    """Prints a line per flight on stdout, with its seed, its verdict and why it failed."""
 
-    def __init__(self, stream: TextIO, head: str, total: int) -> None:
+    def __init__(self, head: str, total: int) -> None:
         """Print the headline `head`; set `total`, the number of flights to fly."""
-        print_or_drop(escape(head), stream)
-        super().__init__(stream, total, "flights")
-        self._told = set[str]()
+        super().__init__("flies", total, says_on_stdout=True)
+        self.say(escape(head))
+        self._total, self._done, self._told = total, 0, set[str]()
 
     def see(self, row: Row) -> None:
         """Print the line of a finished flight; say why a metric has no value once per text."""
-        self.count(self._done + 1)
+        self._done += 1
+        self.count(self._done)
         count = f"{self._done}/{self._total}"
         line = f"{count:>7}  seed {row['seed']}  {row['verdict']}"
         if row["failures"] or row["text"] not in ("", *self._told):

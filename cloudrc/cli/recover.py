@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
@@ -34,7 +33,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Copy a recording; print what is in the copy, and what is missing."""
     require("a recovery", ("record",))
-    from cloudrc.cli.progress import StepView
+    from cloudrc.cli.progress import Progress
     from cloudrc.record.columns import Recording
     from cloudrc.runs.session import refuse_under_way
 
@@ -43,7 +42,7 @@ def execute(options: argparse.Namespace) -> int:
     target = options.to or source.parent / f"{source.stem}.recovered{source.suffix}"
     if os.path.lexists(target):
         raise BadInputError(f"{target}: already there; name another file with --to")
-    with closing(StepView(sys.stderr, f"copies what is readable of {source}")):
+    with closing(Progress(f"copies what is readable of {source}")):
         recording = Recording.read(source)
         if not recording.messages:
             reason = "; ".join([*recording.remarks, recording.note]).strip("; ") or "none is in it"

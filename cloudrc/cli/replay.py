@@ -27,10 +27,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Write the page, open it in the browser, and print its path."""
     require("a replay", ("world", "record", "console"))
-    from cloudrc.cli.progress import StepView
+    from cloudrc.cli.progress import Progress
     from cloudrc.runs.replay import write_replay
 
-    with closing(StepView(sys.stderr, f"reads the recording of {options.run}")):
+    with closing(Progress(f"reads the recording of {options.run}")):
         out = write_replay(options.run, options.out)
     if not options.no_open and not open_page(out.absolute().as_uri()):
         print_line("cloudrc: found no browser here; open the page yourself", sys.stderr)

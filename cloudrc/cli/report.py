@@ -46,7 +46,7 @@ def execute(options: argparse.Namespace) -> int:
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
     from cloudrc import metrics
-    from cloudrc.cli.progress import StepView
+    from cloudrc.cli.progress import Progress
     from cloudrc.metrics.verdict import exit_code
     from cloudrc.record.topics import TOPICS
     from cloudrc.report.figures.style import Look
@@ -56,7 +56,7 @@ def execute(options: argparse.Namespace) -> int:
 
     metrics.check(options.metric)
     look = Look(options.width, options.font_size)
-    with closing(StepView(sys.stderr, f"reads the recording of {options.run}")) as view:
+    with closing(Progress(f"reads the recording of {options.run}")) as view:
         refuse_under_way(options.run)
         restore_mission(options.run)
         recording, experiment, run = read_run(options.run)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -38,10 +37,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Check the robot; return 0, or 2 if something must change."""
     require("a check", ("world",))
-    from cloudrc.cli.progress import StepView
+    from cloudrc.cli.progress import Progress
     from cloudrc.runs.robot_check import as_text, check_robot
 
-    with closing(StepView(sys.stderr, f"flies {options.robot}")):
+    with closing(Progress(f"flies {options.robot}")):
         document, note = check_robot(options.robot, options.picture)
     print_result(options.output, document, as_text(document, note))
     return BadInputError.exit_code if document["changes"] else 0

@@ -18,7 +18,6 @@ from cloudrc.cli.cluster_flags import (
     timeout_argument,
 )
 from cloudrc.cli.output import (
-    is_live,
     output_argument,
     print_line,
     print_or_drop,
@@ -148,13 +147,12 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
     if changes := describe_changes(options.experiment, experiment):
         print_line(f"cloudrc: warning: {changes}", sys.stderr)
     in_cluster, for_programs = mode == "cluster", options.output != "table"
-    stream = sys.stderr if for_programs else sys.stdout
     # First prepare the flight: if that fails, no folder must be left.
     if in_cluster:
-        flight = _cluster_flight(experiment, options, stream)
+        flight = _cluster_flight(experiment, options, sys.stderr if for_programs else sys.stdout)
     else:
         beside = getattr(options, "beside", "")
-        flight = _local_flight(experiment, mode, stream, ready, beside)
+        flight = _local_flight(experiment, mode, ready, beside, events=not for_programs)
     folder = run_folder(experiment, "session" if ready else mode, options.out)
     if not for_programs:
         facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
@@ -185,12 +183,13 @@ def _place_of_recording(folder: Path) -> Iterator[None]:
 
 
 def _local_flight(
-    experiment: ResolvedExperiment, mode: str, stream: TextIO, ready: Ready | None, beside: str
+    experiment: ResolvedExperiment, mode: str, ready: Ready | None, beside: str, *, events: bool
 ) -> Flight:
-    """Return a function that flies on this machine and shows the progress on `stream`.
+    """Return a function that flies on this machine and shows the progress.
 
-    With `ready`, the function flies a session, in which teleop waits for missions. It calls `ready`
-    when all processes are ready. `beside` is the command of a program that runs with the flight.
+    With `events`, the function prints what happens. With `ready`, it flies a session, in which
+    teleop waits for missions, and calls `ready` when all processes are ready. `beside` is the
+    command of a program that runs with the flight.
     """
     from cloudrc.cli.progress import FlightView
     from cloudrc.runs.fly import fly
@@ -199,9 +198,7 @@ def _local_flight(
         with contextlib.ExitStack() as stack:
             mission = experiment.mission
             counted = (0, "waypoint") if ready else (mission.count, mission.unit)
-            # Programs that read the document may also read what a log of stderr has.
-            events = stream is sys.stdout or is_live(stream)
-            view = FlightView(stream, *counted, events=events)
+            view = FlightView(*counted, events=events)
             stack.enter_context(contextlib.closing(view))
 
             def landed() -> None:

@@ -9,7 +9,6 @@ from collections.abc import Generator, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from shlex import quote
-from typing import TextIO
 
 from cloudrc import metrics
 from cloudrc.cli.cluster_flags import release_from_flags
@@ -21,7 +20,7 @@ from cloudrc.cli.output import (
     warn,
 )
 from cloudrc.cli.parser import FLIGHTS_MAX
-from cloudrc.cli.progress import PlanView, SeedsView, StepView, SweepView
+from cloudrc.cli.progress import Progress, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.cluster.pods import refuse_local_files
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
@@ -59,7 +58,7 @@ def _run_locked(
     points = len(grid.point_of) // len(grid.seeds)
     head = f"{points} points x {len(grid.seeds)} seeds{part}: {len(mine)} flights"
     head += f", {len(mine) - len(missing)} done before" if len(missing) < len(mine) else ""
-    view = SweepView(_stream(options), f"{grid.name}: {head}", len(missing))
+    view = SweepView(f"{grid.name}: {head}", len(missing))
     with closing(view):
         if options.on:
             flown = _fly_in_pods(options, grid, missing)
@@ -100,8 +99,9 @@ def _check_flags(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace) -> Grid:
     """Check all points; print warnings."""
-    with closing(PlanView(_stream(options))) as view:
-        grid = check(read_unchecked(options.file, options.max_flights), view.see)
+    unchecked = read_unchecked(options.file, options.max_flights)
+    with closing(Progress(f"checks {unchecked.size}")):
+        grid = check(unchecked)
     if options.on:
         for point in grid.points:
             refuse_local_files(point.model_dump(mode="json"), "or fly without --on")
@@ -109,17 +109,12 @@ def _check(options: argparse.Namespace) -> Grid:
     return grid
 
 
-def _stream(options: argparse.Namespace) -> TextIO:
-    """Return the stream for progress: stdout, or stderr if stdout has a document for programs."""
-    return sys.stdout if options.output == "table" else sys.stderr
-
-
 def fly_again(options: argparse.Namespace) -> int:
     """Repeat a flight of a sweep with recording and report; exit with 6 if its records changed."""
     require("a report", MODES["virtual"])
     row, flight = sweep.find_flight(options.folder, options.key)
     key = flight.key
-    with closing(StepView(sys.stderr, f"flies {key} again")):
+    with closing(Progress(f"flies {key} again")):
         report = sweep.fly_into(options.folder / key, flight, page=True)
     print_traceback(options, report)
     print_or_drop(summary(report, options.folder / key))
@@ -130,7 +125,7 @@ def fly_again(options: argparse.Namespace) -> int:
 
 def print_status(options: argparse.Namespace) -> int:
     """Print how many flights of a sweep are done, and how many succeeded per value of an axis."""
-    with closing(StepView(sys.stderr, f"reads {options.folder}")):
+    with closing(Progress(f"reads {options.folder}")):
         flights, rows, values = sweep.count_successes(options.folder)
     document = {"flights": flights, "rows": len(rows), "axes": values}
     print_result(options.output, document, sweep.status_text(flights, rows, values))
@@ -144,7 +139,7 @@ def draw_figure(options: argparse.Namespace) -> int:
     from cloudrc.runs.figure import draw_sweep
 
     look = Look(options.width, options.font_size)
-    with closing(StepView(sys.stderr, f"draws {options.folder}")):
+    with closing(Progress(f"draws {options.folder}")):
         rows, units, missing = store.read_flights(options.folder)
         files, caption = draw_sweep(rows, units, options.number, options.x, options.by, look)
     out = options.out or options.folder / "figure"
@@ -225,8 +220,7 @@ def fly_seeds(options: argparse.Namespace) -> int:
     grid = seeds.write_grid(folder, options.experiment, options.set, options.seeds)
     seen, count = list[Row](), len(grid.flights)
     head = f"{name}: mode virtual, seeds 1 to {options.seeds}, link {experiment.link.profile}"
-    for_people = options.output == "table"
-    make, stream = (SeedsView, sys.stdout) if for_people else (SweepView, sys.stderr)
+    make = SeedsView if options.output == "table" else SweepView
 
     def see(row: Row) -> None:
         seen.append(row)
@@ -234,7 +228,7 @@ def fly_seeds(options: argparse.Namespace) -> int:
         if not any("traceback" in earlier for earlier in seen[:-1]):
             print_traceback(options, row)
 
-    with closing(make(stream, head, count)) as view:
+    with closing(make(head, count)) as view:
         _, stopped = sweep.keep(
             seeds.fly_seeds(grid), folder, grid, None, store.begin(folder, grid), see
         )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import gzip
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from itertools import chain, product
@@ -36,8 +36,6 @@ SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
 """Largest seed, and largest number of seeds."""
 COLUMNS = ("key", "seed", "verdict", "failures", "code", "physics_steps")
 """Columns of the table besides the axes and the numbers."""
-See: TypeAlias = Callable[[int, int, str], None]
-"""Function that shows how far a check is: points checked, points to check, and these in words."""
 _Entry: TypeAlias = tuple[str, Any, Source]
 """A setting's key and value, and their place in the file."""
 _Point: TypeAlias = tuple[dict[str, Any], tuple[tuple[Any, list[_Entry]], ...]]
@@ -140,16 +138,8 @@ def read_grid(given: Path | Mapping[str, Any]) -> Grid:
     return check(grid)
 
 
-def check(
-    grid: UncheckedGrid,
-    see: See = lambda done, points, work: None,
-) -> Grid:
-    """Check the points of a sweep; raise a BadInputError.
-
-    Call `see` once before the first point, and after each.
-    """
-    count = grid.flights // len(grid.seeds)
-    see(0, count, grid.size)
+def check(grid: UncheckedGrid) -> Grid:
+    """Check the points of a sweep; raise a BadInputError."""
     points, flights = list[ResolvedExperiment](), dict[str, SweepPoint]()
     files = dict[str, str]()
     with reuse_results():
@@ -164,7 +154,6 @@ def check(
                     same = f"{point} is the same as {flights[key].point}; remove one of them"
                     raise BadInputError(f"{grid.name}: {same}")
                 flights[key] = SweepPoint(key, point, seed, points[-1])
-            see(len(points), count, grid.size)
     return Grid(
         file=grid.file,
         axes={axis: [label for label, _ in choices] for axis, choices in grid.axes.items()},

@@ -138,7 +138,7 @@ def test_a_signal_that_a_library_turned_into_an_error_of_the_report_interrupts(m
             os.kill(os.getpid(), signal.SIGTERM)
         raise BadInputError("the recorded values cannot be drawn")
 
-    monkeypatch.setattr(run, "_local_flight", lambda *words: fly)
+    monkeypatch.setattr(run, "_local_flight", lambda *words, **flags: fly)
     error = call("run hover --mode virtual --out r", code=130).err
     assert error == "the recording is in r; to write its report: cloudrc report r\n"
 
@@ -148,7 +148,7 @@ def test_a_flight_that_failed_before_its_recording_names_none(monkeypatch, call)
         (folder / "with.log").touch()
         raise CloudrcError("the program of --with has ended")
 
-    monkeypatch.setattr(run, "_local_flight", lambda *words: fly)
+    monkeypatch.setattr(run, "_local_flight", lambda *words, **flags: fly)
     error = call("run hover --mode virtual --out r", code=CloudrcError.exit_code).err
     assert error == "cloudrc: error: the program of --with has ended\n"
 

@@ -136,7 +136,6 @@ def test_show_warns_of_a_loss_that_may_be_meant_in_percent(folder, call):
 
 
 def test_a_picture_of_many_packets_says_what_it_does(folder, call, monkeypatch):
-    monkeypatch.setattr("cloudrc.cli.progress.FIRST_WAIT", 0.02)
     monkeypatch.setattr("cloudrc.cli.progress.PERIOD", 0.02)
     said = call("link show lossy --packets 30000").err
     assert "sends 30000 packets through the uplink (" in said

@@ -4,14 +4,14 @@ import io
 import json
 import subprocess
 import sys
-from contextlib import closing
+from contextlib import closing, redirect_stderr, redirect_stdout
 
 import pytest
 import yaml
 
 from cloudrc.cli import progress
 from cloudrc.cli.output import is_live, paint
-from cloudrc.cli.progress import CountView, FlightView, StepView
+from cloudrc.cli.progress import FlightView, Progress
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import Fault, GuardChange, MissionEvent, TelemetrySent
 from cloudrc.text import format_number, table
@@ -59,29 +59,17 @@ def test_yaml_has_the_content_of_json(line, call):
     assert document["schemaVersion"] == 1
 
 
-def test_the_rate_counts_from_the_first_result_and_before_it_the_time_runs(monkeypatch):
-    """Workers take seconds to start."""
-    now = [0.0]
-    monkeypatch.setattr(progress, "monotonic", lambda: now[0])
-    with closing(CountView(io.StringIO(), 200, "flights")) as view:
-        now[0] = 50.0
-        assert view.line() == "0/200 flights  50 s"
-        for done in range(1, 41):
-            now[0] = 50.0 + done
-            view.count(done)
-        assert view.line() == "40/200 flights  1.0/s, 3 min left"
-
-
-def test_a_log_gets_a_line_soon_and_then_whenever_nothing_was_said(monkeypatch):
-    monkeypatch.setattr(progress, "FIRST_WAIT", 0.0)
+def test_a_log_gets_a_line_again_and_again(monkeypatch):
     monkeypatch.setattr(progress, "PERIOD", 0.05)
-    file = io.StringIO()
-    with closing(CountView(file, 9, "flights")):
-        wait_until(lambda: file.getvalue().count("0/9 flights") >= 2, 5.0)
+    with redirect_stderr(io.StringIO()) as stderr, closing(Progress("flies", 9)) as view:
+        wait_until(lambda: stderr.getvalue().count("flies (0 s)  0/9\n") >= 2, 5.0)
+        for done in (1, 2, 3):
+            view.count(done)
+        wait_until(lambda: "  3/9, 1 s left\n" in stderr.getvalue(), 5.0)
 
 
-def test_events_are_plain_lines_or_wrapped_on_a_terminal():
-    file, terminal = io.StringIO(), Terminal()
+def test_events_are_plain_lines_or_wrapped_on_a_terminal(monkeypatch):
+    streams = io.StringIO(), Terminal()
     odometry = Odometry(0, (-1.0, 2.5, -0.0004), UPRIGHT, ZERO, ZERO)
     before = Telemetry(0, odometry, (), -1, 0, 0, 0, GuardState.TRACK)
     seen = TelemetrySent(1_000_000_000, 1, 1, before._replace(mission_id=7))
@@ -91,61 +79,51 @@ def test_events_are_plain_lines_or_wrapped_on_a_terminal():
     late = Fault(6_100_000_000, "late", "plug-in " * 20)
     done = MissionEvent(7_000_000_000, "done", 6, "mission done")
     early = MissionEvent(0, "held", 0, "held")
-    for stream in (file, terminal):
-        view = FlightView(stream, 7)
+    for stream in streams:
+        monkeypatch.setattr("sys.stdout", stream)
+        monkeypatch.setattr("sys.stderr", stream)
+        view = FlightView(7)
         view.see([early, TelemetrySent(0, 1, 0, before), seen, reached, hold, track, late, done])
         view.see([hold, TelemetrySent(7_100_000_000, 1, 2, before._replace(mission_id=7))])
         assert str(view.line()).lstrip().startswith("6.1 s")
         view.close()
+    shown, wrapped = (stream.getvalue() for stream in streams)
     place = " (-1.00, 2.50, 0.00) m"
-    assert [" ".join(line.split()) for line in file.getvalue().splitlines()] == [
+    assert [" ".join(line.split()) for line in shown.splitlines()] == [
         "held",  # before the mission's start there is no time
         f"4.85 s waypoint 2 of 7 reached{place}",
         f"5.00 s HOLD: command age 0.252 s above 0.250 s{place}",
         f"5.10 s {late.text.strip()}{place}",
         f"6.00 s mission done{place}",  # then the robot always holds
     ]
-    assert max(map(len, terminal.getvalue().splitlines())) <= 90
-    assert terminal.getvalue().endswith("\x1b[2K"), "the status line is erased"
+    assert max(map(len, wrapped.splitlines())) <= 90
+    assert wrapped.endswith("\x1b[2K"), "the status line is erased"
 
 
 @pytest.mark.parametrize("kind", [io.StringIO, Terminal])
 def test_a_flight_shows_what_happens_before_it_and_after_it(kind, monkeypatch):
     """MuJoCo loads for a second, and the report takes several."""
-    monkeypatch.setattr(progress, "FIRST_WAIT", 0.0)
-    stream = kind()
-    with closing(FlightView(stream, 7)) as view:
-        wait_until(lambda: "GROUND" in stream.getvalue(), 5.0)
-        view.tell("writes the report")
-        assert str(view.line()) == "writes the report (0 s)"
+    monkeypatch.setattr(progress, "PERIOD", 0.01)
+    with redirect_stderr(kind()) as stderr, closing(FlightView(7)) as view:
+        wait_until(lambda: "GROUND" in stderr.getvalue(), 5.0)
+        view.tell("writes [it]")
+        wait_until(lambda: "writes [it] (0 s)" in stderr.getvalue(), 5.0)
 
 
 def test_a_session_that_waits_writes_no_log_but_tells_of_its_report(monkeypatch):
-    monkeypatch.setattr(progress, "FIRST_WAIT", 0.0)
-    file = io.StringIO()
-    with closing(FlightView(file, 0)) as view:
+    monkeypatch.setattr(progress, "PERIOD", 0.01)
+    with redirect_stderr(io.StringIO()) as stderr, closing(FlightView(0)) as view:
+        assert view.log_line() == ""
         view.tell("writes the report")
-        wait_until(lambda: file.getvalue() == "writes the report (0 s)\n", 5.0)
+        wait_until(lambda: stderr.getvalue().startswith("writes the report (0 s)\n"), 5.0)
 
 
-@pytest.mark.parametrize("kind", [io.StringIO, Terminal])
-def test_a_long_report_shows_its_step_and_a_short_one_nothing(kind, monkeypatch):
-    stream = kind()
-    with closing(StepView(stream, "reads [it]")) as view:
-        view.tell("draws")
-    assert "draws" not in stream.getvalue()
-    monkeypatch.setattr(progress, "STEP_WAIT", 0.0)
-    monkeypatch.setattr(progress, "FIRST_WAIT", 0.0)
-    with closing(StepView(stream, "reads [it]")):
-        wait_until(lambda: "reads [it]" in stream.getvalue(), 5.0)
-
-
-def test_a_moving_line_on_stderr_leaves_stdout_alone(monkeypatch):
-    document = io.StringIO()
-    monkeypatch.setattr("sys.stdout", document)
-    with closing(StepView(Terminal(), "reads")):
+def test_a_moving_line_leaves_stdout_alone():
+    document, stderr = io.StringIO(), Terminal()
+    with redirect_stdout(document), redirect_stderr(stderr), closing(Progress("reads")):
         print("{}")
     assert document.getvalue() == "{}\n"
+    assert "reads" in stderr.getvalue()
 
 
 PRINTS = """\

@@ -14,7 +14,7 @@ from cloudrc.assembly import build_links
 from cloudrc.config import document, load, overrides, scene
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import SCENES
-from cloudrc.runs.grid import check, pack, read_flight, read_grid, read_unchecked, unpack
+from cloudrc.runs.grid import pack, read_flight, read_grid, unpack
 from cloudrc.source import code_hash
 from tests.runs.conftest import SHORT
 
@@ -236,13 +236,6 @@ def test_one_flight_is_read_without_the_others(write_sweep):
     point = next(iter(flights.values())).point
     for other, seed in ((point, 3), ({}, 1), (point | {"cloud.predictor": "kalman"}, 1)):
         assert read_flight(path, other, seed) is None
-
-
-def test_the_progress_is_told_for_each_point(write_sweep):
-    seen = []
-    grid = read_unchecked(write_sweep(seeds=3))
-    check(grid, see=lambda *counts: seen.append(counts))
-    assert seen == [(done, 4, "4 points x 3 seeds: 12 flights") for done in range(5)]
 
 
 def test_the_key_takes_in_the_code(write_sweep, monkeypatch):
