@@ -23,7 +23,6 @@ from cloudrc.cluster.client import (
     program,
     run,
 )
-from cloudrc.cluster.incidents import explain_refusal
 from cloudrc.cluster.jobs import JobGoneError, delete_job, failure_of, follow, job_key, run_job
 from cloudrc.cluster.missions import release_api, settle_mission
 from cloudrc.cluster.own_files import find_own_files, give_to_release, send_own_files
@@ -128,7 +127,7 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
     spec = deployment.spec.template.spec
     for condition in deployment.status.conditions or []:  # for example Pod Security or a quota
         if condition.type == "ReplicaFailure" and condition.status == "True":
-            return explain_refusal(str(condition.message), spec), True
+            return str(condition.message), True
     found = pods.list_pods(release, component)
     for pod in found:
         if why := pods.pod_failure(pod):

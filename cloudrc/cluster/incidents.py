@@ -1,9 +1,8 @@
-"""Say what happened to pods: evictions, ended containers, refusals by a LimitRange or a quota."""
+"""Say what happened to pods: evictions and ended containers."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 from cloudrc.cluster.client import COMPONENTS, Release
@@ -12,73 +11,16 @@ from cloudrc.cluster.pods import (
     describe_end,
     list_pods,
     pod_failure,
-    value_key,
 )
 from cloudrc.errors import to_one_line
-
-EVICTIONS = {
-    "EvictionByEvictionAPI": "evicted: node drained, or another request to evict",
-    "PreemptionByScheduler": "evicted: a pod with a higher priority takes its place",
-    "DeletionByTaintManager": "evicted: its node has a taint, for example because it is lost",
-    "TerminationByKubelet": "evicted: its node lacks resources or shuts down",
-    "DeletionByPodGC": "lost with its node",
-}
-"""Reason of the condition DisruptionTarget of a pod -> text."""
-_RANGE = re.compile(
-    r"(minimum|maximum) (\S+) usage per (?:Container|Pod) is ([^,\s]+), "
-    r"but (request|limit) is ([^,\]\s]+)"
-)
-"""Part of the refusal by a LimitRange."""
-_QUOTA = re.compile(r"exceeded quota: .*?requested: (?P<requested>.*?), used: ")
-"""Part of the refusal by a ResourceQuota."""
 
 
 def eviction(pod: Any) -> str:
     """Return why Kubernetes has evicted a pod; "" if it has not."""
     for condition in pod.status.conditions or []:
         if condition.type == "DisruptionTarget" and condition.status == "True":
-            return EVICTIONS.get(condition.reason, f"evicted: {to_one_line(condition.message)}")
+            return to_one_line(f"evicted: {condition.reason}: {condition.message}")
     return ""
-
-
-def explain_refusal(message: str, pod: Any) -> str:
-    """Add to the API server's refusal of a pod which of its containers asks for how much.
-
-    The server names the limit of a LimitRange or of a quota, but not the container. `pod` is the
-    pod's spec.
-    """
-    from kubernetes import utils
-
-    quantity: Any = utils.parse_quantity  # not annotated
-    asks, found = [*_container_resources(pod)], list[str]()
-    for bound, resource, limit, field, asked in _RANGE.findall(message):
-        order = "at least" if bound == "minimum" else "at most"
-        own = [
-            f"container '{name}' has the {field} {value} of {resource}, {order} {limit} is "
-            f"allowed: set {value_key(name)}.{field}s.{resource}"
-            for name, kind, key, value in asks
-            if (kind, key) == (f"{field}s", resource) and quantity(value) == quantity(asked)
-        ]
-        found += own or _sum_of(asks, f"{field}s", resource)  # or the sum of a pod's containers
-    if quota := _QUOTA.search(message):
-        for term in quota["requested"].split(","):
-            kind, _, resource = term.partition("=")[0].strip().rpartition(".")
-            found += _sum_of(asks, kind or "requests", resource)
-    return "; ".join([message, *found])
-
-
-def _sum_of(asks: Iterable[tuple[str, str, str, str]], kind: str, resource: str) -> list[str]:
-    """Return a sentence on what each container asks for of a resource; none if none asks for it."""
-    parts = [f"{name} {value}" for name, k, r, value in asks if (k, r) == (kind, resource)]
-    return [f"{kind}.{resource} of the pod: {' + '.join(parts)}"] if parts else []
-
-
-def _container_resources(pod: Any) -> Iterator[tuple[str, str, str, str]]:
-    """Yield container, "requests" or "limits", resource and quantity of each resource of a pod."""
-    for container in [*(pod.init_containers or []), *pod.containers]:
-        for kind in ("requests", "limits"):
-            amounts = getattr(container.resources, kind, None) or {}
-            yield from ((container.name, kind, key, str(value)) for key, value in amounts.items())
 
 
 def troubles(release: Release) -> list[str]:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from cloudrc.cluster.client import ClusterError, NotFoundError, Release, chart_folder
-from cloudrc.cluster.incidents import ReleaseWatch, eviction, explain_refusal
+from cloudrc.cluster.incidents import ReleaseWatch, eviction
 from cloudrc.cluster.pods import (
     UNSCHEDULED,
     container_statuses,
@@ -364,5 +364,4 @@ def _refusals(release: Release, job: Any) -> list[str]:
     """Return why the cluster has refused to make pods of a Job."""
     selector = f"involvedObject.uid={job.metadata.uid}"
     events = release.request("list", "events", field_selector=selector)
-    messages = (event.message for event in events if event.reason == "FailedCreate")
-    return [explain_refusal(message, job.spec.template.spec) for message in messages]
+    return [event.message for event in events if event.reason == "FailedCreate"]

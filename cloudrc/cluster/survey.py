@@ -2,7 +2,7 @@
 
 The pods of the chart are sent to the API server as a dry run, so that Pod Security, LimitRanges and
 quotas judge them themselves. A small pod on each node, which is deleted again, shows whether the
-images are there and whether the kernel has netem.
+images are there.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple
 
 import yaml
@@ -26,8 +25,7 @@ from cloudrc.cluster.client import (
     explain_errors,
     run,
 )
-from cloudrc.cluster.incidents import explain_refusal
-from cloudrc.cluster.pods import container_statuses, pod_failure, pod_log
+from cloudrc.cluster.pods import pod_failure
 from cloudrc.cluster.releases import as_files, is_of_experiment
 from cloudrc.errors import CloudrcError, to_one_line
 
@@ -50,14 +48,18 @@ PROBE_LIMIT = 60.0
 """Time limit for the probe of all nodes [s], in which a node may pull both images."""
 LOOK_PERIOD = 0.5
 """Time between two looks at the probes [s]."""
-NETEM = "tc qdisc add dev lo root netem delay 1ms && echo has sch_netem || true"
-"""Program of a probe: it tries netem in the pod's own network."""
-HAS_NETEM = "has sch_netem"
 RESOURCES = {
     "requests": {"cpu": "30m", "memory": "40Mi"},
     "limits": {"cpu": "500m", "memory": "96Mi"},
 }
 """Resources of each container of a probe."""
+RESTRICTED = {
+    "allowPrivilegeEscalation": False,
+    "capabilities": {"drop": ["ALL"]},
+    "runAsNonRoot": True,
+    "seccompProfile": {"type": "RuntimeDefault"},
+}
+"""Rights of each container of a probe: every level of Pod Security admits them."""
 
 
 class Finding(NamedTuple):
@@ -185,21 +187,8 @@ def admission(release: Release, component: str, spec: dict[str, Any]) -> Finding
         fix = "set these values at install"
         if "PodSecurity" in text:
             fix = "--set link.mode=relay, which Pod Security 'restricted' admits"
-        return Finding(name, "missing", explain_refusal(text, _as_object(spec)), fix)
+        return Finding(name, "missing", text, fix)
     return Finding(name, "ok", "is admitted: Pod Security, LimitRanges and quota agree")
-
-
-def _as_object(spec: dict[str, Any]) -> SimpleNamespace:
-    """Convert a pod's spec to the attributes that `explain_refusal` reads."""
-
-    def convert(containers: list[dict[str, Any]]) -> list[SimpleNamespace]:
-        return [
-            SimpleNamespace(name=one["name"], resources=SimpleNamespace(**one.get("resources", {})))
-            for one in containers
-        ]
-
-    first = convert(spec.get("initContainers", []))
-    return SimpleNamespace(init_containers=first, containers=convert(spec["containers"]))
 
 
 def create_pod(release: Release, name: str, spec: dict[str, Any], **how: Any) -> str:
@@ -258,17 +247,17 @@ def nodes(release: Release, pods: dict[str, dict[str, Any]]) -> Iterator[Finding
     names = schedulable_nodes(release)
     if names is None:
         yield Finding("nodes", "warn", "you may not list nodes: one probe on any node", "")
-    probes = dict[str, tuple[str, bool]]()
+    probes = dict[str, str]()
     try:
         for node in names if names is not None else [""]:
             probes[node] = start_probe(release, node, pods)
         until = time.monotonic() + PROBE_LIMIT
-        for node, (pod, netem) in probes.items():
-            yield _finding(release, node or "any", pod, netem, until)
+        for node, pod in probes.items():
+            yield _finding(release, node or "any", pod, until)
     except ClusterError as error:
         yield Finding("nodes", "warn", f"no probe: {error}", "solve the problems above")
     finally:
-        for pod, _ in probes.values():
+        for pod in probes.values():
             with suppress(ClusterError):
                 release.request("delete", "pods", name=pod, grace_period_seconds=0)
 
@@ -291,73 +280,39 @@ def schedulable_nodes(release: Release) -> list[str] | None:
     ]
 
 
-def start_probe(release: Release, node: str, pods: dict[str, dict[str, Any]]) -> tuple[str, bool]:
-    """Create a probe with the images of `pods`: component -> spec.
-
-    Returns:
-        Its name, and whether it may try netem, which needs NET_ADMIN.
-    """
-    restricted = {
-        "allowPrivilegeEscalation": False,
-        "capabilities": {"drop": ["ALL"]},
-        "runAsNonRoot": True,
-        "seccompProfile": {"type": "RuntimeDefault"},
-    }
-    privileged = {"runAsUser": 0, "capabilities": {"drop": ["ALL"], "add": ["NET_ADMIN"]}}
-    for netem in (True, False):
-        containers = [
-            {
-                "name": component,
-                "image": pod["containers"][0]["image"],
-                "imagePullPolicy": "IfNotPresent",
-                "command": ["sh", "-c", NETEM],
-                "resources": RESOURCES,
-                "securityContext": privileged if netem else restricted,
-            }
-            for component, pod in pods.items()
-        ]
-        spec = {
-            "restartPolicy": "Never",
-            "automountServiceAccountToken": False,
-            "containers": containers,
-            "imagePullSecrets": pods["cloud"].get("imagePullSecrets", []),
-            **({"nodeName": node} if node else {}),
+def start_probe(release: Release, node: str, pods: dict[str, dict[str, Any]]) -> str:
+    """Create a probe with the images of `pods`: component -> spec; return its name."""
+    containers = [
+        {
+            "name": component,
+            "image": pod["containers"][0]["image"],
+            "imagePullPolicy": "IfNotPresent",
+            "command": ["true"],
+            "resources": RESOURCES,
+            "securityContext": RESTRICTED,
         }
-        try:
-            return create_pod(release, "node", spec), netem
-        except ClusterError as error:
-            if not netem or "PodSecurity" not in str(error):
-                raise
-    raise AssertionError("unreachable")
+        for component, pod in pods.items()
+    ]
+    spec = {
+        "restartPolicy": "Never",
+        "automountServiceAccountToken": False,
+        "containers": containers,
+        "imagePullSecrets": pods["cloud"].get("imagePullSecrets", []),
+        **({"nodeName": node} if node else {}),
+    }
+    return create_pod(release, "node", spec)
 
 
-def _finding(release: Release, node: str, pod: str, netem: bool, until: float) -> Finding:
+def _finding(release: Release, node: str, pod: str, until: float) -> Finding:
     """Wait for a probe until the time `until` [s, monotonic]; say what it shows about its node."""
-    name, why = f"node {node}", "its probe has not ended"
+    name, why = f"node {node}", ""
     while time.monotonic() < until:
         found = release.request("get", "pods", name=pod)
-        if found.status.phase in ("Succeeded", "Failed"):
-            break
+        if found.status.phase == "Succeeded":
+            return Finding(name, "ok", "has the images")
+        if found.status.phase == "Failed":
+            return Finding(name, "missing", "its probe failed", f"kubectl describe pod {pod}")
         if why := pod_failure(found):
             return Finding(name, "missing", why, "make kind-load, or --set image.registry=...")
         time.sleep(LOOK_PERIOD)
-    else:
-        return Finding(name, "warn", why or "its probe has not ended", "kubectl get events")
-    bad = [
-        f"{status.name}: {to_one_line(status.state.terminated.message or 'failed')}"
-        for status in container_statuses(found)
-        if status.state.terminated and status.state.terminated.exit_code
-    ]
-    if bad:
-        return Finding(name, "missing", "; ".join(bad), f"kubectl describe pod {pod}")
-    if not netem:
-        return Finding(name, "ok", "has the images; Pod Security allows link.mode relay alone")
-    component = container_statuses(found)[0].name
-    if HAS_NETEM in pod_log(release, pod, component):
-        return Finding(name, "ok", "has the images, and the kernel has sch_netem")
-    return Finding(
-        name,
-        "warn",
-        "has the images, but the kernel has no sch_netem",
-        "link.mode auto and relay work; for netem, load the module: modprobe sch_netem",
-    )
+    return Finding(name, "warn", why or "its probe has not ended", "kubectl get events")

@@ -3,7 +3,6 @@
 import pytest
 
 from cloudrc.cluster import survey
-from cloudrc.cluster.survey import HAS_NETEM
 
 CHART = """\
 apiVersion: apps/v1
@@ -28,20 +27,12 @@ def cluster(api, pretend, monkeypatch):
     pretend("helm", f"cat <<'END'\n{rendered}END")
     monkeypatch.setattr(survey, "LOOK_PERIOD", 0.01)
     put = api.put
-    api.log = HAS_NETEM
+    api.ended = {"phase": "Succeeded"}
 
     def run_at_once(plural, body):
         made = put(plural, body)
         if plural == "pods":
-            ended = {"terminated": {"exitCode": 0}}
-            made["status"] = {
-                "phase": "Succeeded",
-                "containerStatuses": [
-                    {"name": "world", "image": "i", "imageID": "", "ready": False}
-                    | {"restartCount": 0, "state": ended}
-                ],
-            }
-            api.logs[made["metadata"]["name"]] = api.log
+            made["status"] = api.ended
         return made
 
     monkeypatch.setattr(api, "put", run_at_once)
@@ -58,15 +49,17 @@ def test_a_cluster_that_is_fit_has_no_problem_and_keeps_no_pod(cluster, release)
     checks = ["permissions", "experiment", "world pod", "cloud pod", "node one", "node two"]
     assert list(seen) == checks
     assert {one.state for one in seen.values()} == {"ok"}
-    assert "has sch_netem" in seen["node two"].found
+    assert seen["node two"].found == "has the images"
     assert not [name for kind, name in cluster.objects if kind == "pods"]
 
 
-def test_a_kernel_without_netem_is_told_for_each_node(cluster, release):
-    cluster.log = "Error: Specified qdisc kind is unknown."
+def test_a_node_without_an_image_is_told(cluster, release):
+    waits = {"waiting": {"reason": "ErrImagePull", "message": "no such image"}}
+    status = {"name": "world", "image": "i", "imageID": "", "ready": False, "restartCount": 0}
+    cluster.ended = {"phase": "Pending", "containerStatuses": [{**status, "state": waits}]}
     seen = found(release)["node one"]
-    assert seen.state == "warn"
-    assert "no sch_netem" in seen.found
+    assert seen.state == "missing"
+    assert "the image i of container 'world' is not on the node" in seen.found
 
 
 def test_the_charts_values_go_to_helm_and_its_pull_secrets_to_the_probes(
@@ -132,11 +125,11 @@ def test_missing_permissions_end_the_survey(cluster, release):
     assert "pods" not in only.found
 
 
-def test_a_limit_range_names_container_and_value(cluster, release):
+def test_a_refusal_of_a_pod_is_shown_as_it_is(cluster, release):
     cluster.refuse["POST", "pods"] = (403, CPU)
     seen = found(release)["world pod"]
     assert seen.state == "missing"
-    assert "link.resources.requests.cpu" in seen.found
+    assert CPU in seen.found
     assert "can-i" not in seen.found, "the user's permission is not the problem"
 
 
