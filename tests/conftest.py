@@ -197,10 +197,10 @@ def refused(call):
 def no_page(monkeypatch):
     """Leave out the figures of a report, which take longer than a flight."""
 
-    def write_page(folder, *assessment):
+    def draw(folder, *assessment, **wanted):
         (folder / "report.html").write_text("drawn elsewhere")
 
-    monkeypatch.setattr("cloudrc.report.write._write_page", write_page)
+    monkeypatch.setattr("cloudrc.report.write._draw", draw)
 
 
 @pytest.fixture(scope="session")

@@ -26,7 +26,7 @@ def result():
 
 
 def test_a_flight_equals_that_of_the_command(result, tmp_path, call, monkeypatch):
-    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *given: None)
+    monkeypatch.setattr("cloudrc.report.write._draw", lambda *given, **wanted: None)
     sets = [f"--set={key}={value}" for key, value in SHORT.items()]
     out = call("run steps --mode=virtual --seed=3 -o=json", *sets, "--out", tmp_path / "run").out
     report = json.loads(out)
@@ -78,7 +78,7 @@ def test_every_function_can_be_called_after_every_module_is_imported():
 
 
 def test_a_flight_with_a_folder_equals_one_without(result, tmp_path, monkeypatch):
-    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *given: None)
+    monkeypatch.setattr("cloudrc.report.write._draw", lambda *given, **wanted: None)
     kept = cloudrc.fly("steps", SHORT, seed=3, out=tmp_path / "run")
     assert (kept.numbers, kept.records_sha256) == (result.numbers, result.records_sha256)
     assert (tmp_path / "run/report.json").is_file()
@@ -253,7 +253,7 @@ def test_the_examples_with_many_flights_run(tmp_path):
 
 
 def test_the_velocity_loop_of_a_recording_is_identified(tmp_path, monkeypatch):
-    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *given: None)
+    monkeypatch.setattr("cloudrc.report.write._draw", lambda *given, **wanted: None)
     cloudrc.fly("steps", {"link.profile": "paper-p1"}, seed=1, out=tmp_path / "run")
     model = cloudrc.identify(tmp_path / "run")
     assert all(0.05 < each < 0.3 for each in model["time_constant"])

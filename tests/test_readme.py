@@ -107,7 +107,7 @@ def test_a_slow_command_works(command, folder):
 def numbers_only(folder, monkeypatch):
     """Fly in this process and without figures, which is fast."""
     monkeypatch.chdir(folder)
-    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
+    monkeypatch.setattr("cloudrc.report.write._draw", lambda *given, **wanted: None)
 
 
 @pytest.mark.parametrize(("command", "printed"), REFUSED)

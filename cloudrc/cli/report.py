@@ -21,7 +21,7 @@ EPILOG = """\
 examples:
   cloudrc report runs/latest
   cloudrc report runs/latest --metric ./overshoot.py
-  cloudrc report runs/latest --width 3.5 --font-size 8
+  cloudrc report runs/latest --figures --width 3.5 --font-size 8
   cloudrc report runs/paper-local-seed1-1 -o json"""
 
 
@@ -36,8 +36,22 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="also evaluate the metric in this Python file; repeatable. Files named by the run's"
         " configuration are never executed",
     )
+    files_argument(parser)
     figure_arguments(parser, 7.16)
     output_argument(parser)
+
+
+def report_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments that say which files a flight's report has."""
+    about = "page: write report.html (default); none: the recording and report.json alone"
+    parser.add_argument("--report", choices=["page", "none"], default="page", help=about)
+    files_argument(parser)
+
+
+def files_argument(parser: argparse.ArgumentParser) -> None:
+    """Declare the argument for the files of the figures."""
+    about = "also write each figure as PDF, PNG and SVG into the run's folder figures/"
+    parser.add_argument("--figures", action="store_true", help=about)
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -66,22 +80,25 @@ def execute(options: argparse.Namespace) -> int:
         count = sum(len(recording[topic]) for topic in TOPICS)
         view.tell(f"measures {count:,} messages and draws the figures")
         document = write_report(
-            options.run, recording, experiment, run, own=options.metric, look=look
+            *(options.run, recording, experiment, run),
+            own=options.metric,
+            figures=options.figures,
+            look=look,
         )
     print_traceback(options, document)
     print_result(options.output, document, summary(document, options.run))
     return exit_code(document)
 
 
-def summary(report: Mapping[str, Any], folder: Path) -> str:
-    """Summarize a report as text, and say where the replay and the page are."""
+def summary(report: Mapping[str, Any], folder: Path, last: str = "report.html") -> str:
+    """Summarize a report as text, and say where the replay and the file `last` are."""
     from cloudrc.report.summary import summarize
 
     command = f"cloudrc replay {quote(str(folder))}"
     how = f"pip install 'cloudrc[console]', then {command}"
     replay = f"replay in 3-D: {how if missing('console') else command}"
-    page = str(folder / "report.html")
-    return "\n".join(["", summarize(report, paint), "", escape(replay), escape(page)])
+    path = str(folder / last)
+    return "\n".join(["", summarize(report, paint), "", escape(replay), escape(path)])
 
 
 def print_traceback(options: argparse.Namespace, report: Mapping[str, Any]) -> None:

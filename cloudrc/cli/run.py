@@ -25,7 +25,7 @@ from cloudrc.cli.output import (
     warn,
 )
 from cloudrc.cli.parser import read_count, whole_number
-from cloudrc.cli.report import print_traceback, summary
+from cloudrc.cli.report import print_traceback, report_arguments, summary
 from cloudrc.errors import BadInputError, CloudrcError, NothingFlownError
 from cloudrc.runs.folder import point_to, run_folder
 from cloudrc.runs.interrupts import interrupt_on_signals, is_interrupted
@@ -51,6 +51,7 @@ examples:
   cloudrc run
   cloudrc run paper --mode virtual --set link.profile=satellite
   cloudrc run steps --seeds 10 --set cloud.predictor=last_sample
+  cloudrc run pillars --mode virtual --report none       recording and report.json alone
   cloudrc run my.yaml --mode virtual --set cloud.predictor=./my_predictor.py
   cloudrc run --set cloud.controller=remote --with "node controller.js"
   cloudrc run --mode cluster --context kind-cloudrc -n demo --release demo
@@ -70,6 +71,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     many.add_argument("--seeds", type=read_count, metavar="N", help=about)
     about = "start this program with the flight, and end it with it: a remote controller"
     parser.add_argument("--with", dest="beside", default="", metavar="CMD", help=about)
+    report_arguments(parser)
     output_argument(parser, "json, yaml: print only the report")
     release_arguments(parser, DEFAULT_RELEASE)
     timeout_argument(parser)
@@ -95,7 +97,10 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"--seeds flies in virtual time; leave out --mode {mode}")
     if options.beside:
         _check_beside(options, mode)
-    require(f"mode {mode}", MODES[mode])
+    if options.seeds and options.figures:
+        raise BadInputError("--figures draws one flight; leave out --seeds")
+    is_drawn = any(_files(options))
+    require(f"mode {mode}", [each for each in MODES[mode] if is_drawn or each != "report"])
     if options.seeds:
         from cloudrc.cli.sweep_run import fly_seeds
 
@@ -151,8 +156,7 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
     if in_cluster:
         flight = _cluster_flight(experiment, options, sys.stderr if for_programs else sys.stdout)
     else:
-        beside = getattr(options, "beside", "")
-        flight = _local_flight(experiment, mode, ready, beside, events=not for_programs)
+        flight = _local_flight(experiment, mode, ready, options)
     folder = run_folder(experiment, "session" if ready else mode, options.out)
     if not for_programs:
         facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
@@ -161,7 +165,8 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
     with _place_of_recording(folder):
         report = flight(folder)
     print_traceback(options, report)
-    print_result(options.output, report, summary(report, folder))
+    last = "report.html" if options.report == "page" else "report.json"
+    print_result(options.output, report, summary(report, folder, last))
     return 0 if ready else exit_code(report)
 
 
@@ -183,13 +188,15 @@ def _place_of_recording(folder: Path) -> Iterator[None]:
 
 
 def _local_flight(
-    experiment: ResolvedExperiment, mode: str, ready: Ready | None, beside: str, *, events: bool
+    experiment: ResolvedExperiment,
+    mode: str,
+    ready: Ready | None,
+    options: argparse.Namespace,
 ) -> Flight:
     """Return a function that flies on this machine and shows the progress.
 
-    With `events`, the function prints what happens. With `ready`, it flies a session, in which
-    teleop waits for missions, and calls `ready` when all processes are ready. `beside` is the
-    command of a program that runs with the flight.
+    With `ready`, the function flies a session, in which teleop waits for missions. It calls `ready`
+    when all processes are ready.
     """
     from cloudrc.cli.progress import FlightView
     from cloudrc.runs.fly import fly
@@ -198,7 +205,7 @@ def _local_flight(
         with contextlib.ExitStack() as stack:
             mission = experiment.mission
             counted = (0, "waypoint") if ready else (mission.count, mission.unit)
-            view = FlightView(*counted, events=events)
+            view = FlightView(*counted, events=options.output == "table")
             stack.enter_context(contextlib.closing(view))
 
             def landed() -> None:
@@ -210,11 +217,25 @@ def _local_flight(
                 view.tell("writes the report")
 
             session = partial(ready, folder, view.say, stack) if ready else None
+            page, figures = _files(options)
             return fly(
-                experiment, mode, folder, view.see, session=session, beside=beside, landed=landed
+                experiment,
+                mode,
+                folder,
+                view.see,
+                page=page,
+                figures=figures,
+                session=session,
+                beside=options.beside,
+                landed=landed,
             )
 
     return flight
+
+
+def _files(options: argparse.Namespace) -> tuple[bool, bool]:
+    """Return whether the page is wanted, and whether the files in figures/ are."""
+    return options.report == "page", options.figures
 
 
 def _cluster_flight(
@@ -231,7 +252,11 @@ def _cluster_flight(
 
     def flight(folder: Path) -> dict[str, Any]:
         try:
-            return fly_in_cluster(experiment, folder, release, options.timeout, tell)
+            page, figures = _files(options)
+            limit = options.timeout
+            return fly_in_cluster(
+                experiment, folder, release, limit, tell, page=page, figures=figures
+            )
         finally:
             if options.out is None and folder.exists():
                 point_to(folder, "latest")

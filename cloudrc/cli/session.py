@@ -21,6 +21,7 @@ from cloudrc.cli.find_run import run_argument
 from cloudrc.cli.output import print_line
 from cloudrc.cli.parser import whole_number
 from cloudrc.cli.processes import CliCommand
+from cloudrc.cli.report import report_arguments
 from cloudrc.cli.run import experiment_arguments, fly_once
 from cloudrc.errors import BadInputError, CloudrcError, NothingFlownError
 from cloudrc.runs.interrupts import interrupt_on_signals
@@ -65,7 +66,8 @@ def _up_arguments(parser: argparse.ArgumentParser) -> None:
     about = "serve the flight to Foxglove at this port of 127.0.0.1 (default: 8765)"
     port = whole_number(1, 65535)
     parser.add_argument("--foxglove", type=port, nargs="?", const=8765, metavar="PORT", help=about)
-    parser.set_defaults(output="table")
+    report_arguments(parser)
+    parser.set_defaults(output="table", beside="")
 
 
 def _up(options: argparse.Namespace) -> int:
@@ -163,8 +165,9 @@ def _down(options: argparse.Namespace) -> int:
         print_line(f"cloudrc: {note}", sys.stderr)
     end_session(run, DOWN_LIMIT)
     name = short(run)
-    if (run / "report.json").exists():
-        print_line(short(run / "report.html"))
+    page, report = run / "report.html", run / "report.json"
+    if report.exists():
+        print_line(short(page if page.exists() else report))
     elif last := last_mission(run):
         text = f"ended; mission {last.id} flew, but has no report"
         raise CloudrcError(f"{name}: {text}; to write it: cloudrc report {quote(str(name))}")

@@ -243,6 +243,9 @@ def fly_in_cluster(
     release: Release,
     timeout: float,
     tell: Tell = lambda text: None,
+    *,
+    page: bool = True,
+    figures: bool = False,
 ) -> dict[str, Any]:
     """Fly one experiment in a cluster, fill its run folder, and return the report.
 
@@ -254,6 +257,8 @@ def fly_in_cluster(
         release: The Helm release to use; it is installed if it is missing, and stays afterwards.
         timeout: Time limit for the release to become ready [s].
         tell: Receives the progress, one line per call.
+        page: Whether to write report.html.
+        figures: Whether to write the files in figures/.
     """
     from cloudrc.config.load import dump
 
@@ -270,7 +275,7 @@ def fly_in_cluster(
         raise
     (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
     mission = fetch_all(release, folder, tell, want_end=not interrupted)
-    return _report(experiment, folder, mission, interrupted)
+    return _report(experiment, folder, mission, interrupted, page=page, figures=figures)
 
 
 def chart_values(
@@ -382,7 +387,13 @@ def _fetch_previous(release: Release, component: str, path: Path, tell: Tell) ->
 
 
 def _report(
-    experiment: ResolvedExperiment, folder: Path, mission: Recording, interrupted: bool
+    experiment: ResolvedExperiment,
+    folder: Path,
+    mission: Recording,
+    interrupted: bool,
+    *,
+    page: bool,
+    figures: bool,
 ) -> dict[str, Any]:
     from cloudrc.report.document import Run
     from cloudrc.report.views import views
@@ -394,6 +405,6 @@ def _report(
         mission.metadata |= run.metadata
         mission.views = views(mission, experiment)
         own = experiment.report.metrics  # evaluated here, so the pods do not need the file
-        return write_report(folder, mission, experiment, run, own=own)
+        return write_report(folder, mission, experiment, run, own=own, page=page, figures=figures)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))

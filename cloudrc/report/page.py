@@ -15,12 +15,13 @@ from string import Template
 from typing import Any
 
 from cloudrc.config.load import ResolvedExperiment, dump
-from cloudrc.metrics import SHIPPED, Flight, Number, scale
+from cloudrc.metrics import SHIPPED, Flight, Number
 from cloudrc.metrics.verdict import FlightFailure
 from cloudrc.record import wall_time
 from cloudrc.report.document import Assessment, Run
 from cloudrc.report.figures import Picture
 from cloudrc.report.figures.style import PAGE
+from cloudrc.report.summary import main_numbers, readable
 from cloudrc.version import __version__
 
 HEADLINES = {
@@ -37,30 +38,6 @@ REPEAT = {
     "not identical:",
 }
 """Whether the run was in virtual time -> text above the command that repeats the run."""
-MAIN = {
-    "waypoints_reached": "waypoints reached",
-    "final_error": "from the last setpoint, at the end",
-    "duration": "mission took",
-    "contact_time": "first touch at",
-    "touch_speed": "speed at the first touch",
-    "steady_contact_force": "steady contact force",
-    "min_clearance": "least clearance",
-    "rtt_mean": "round trip, mean",
-    "prediction_error_rms": "prediction error, RMS",
-    "hold_count": "times in HOLD",
-    "real_time_factor": "real-time factor",
-}
-"""Numbers that a summary shows, and their labels."""
-SHARES = ("loss_", "late_", "overshoot_")
-"""Prefixes of the names of metrics that the page shows in per cent."""
-
-
-def main_numbers(numbers: Mapping[str, Number]) -> list[tuple[str, str, str]]:
-    """Return label, digits and unit of each number in `MAIN` that was measured."""
-    # A mission with a last setpoint has no waypoints.
-    hidden = "waypoints_reached" if "final_error" in numbers else None
-    names = [name for name in MAIN if name in numbers and name != hidden]
-    return [(MAIN[name], *readable(name, numbers[name])) for name in names]
 
 
 def render(
@@ -165,24 +142,6 @@ def _table_rows(numbers: Mapping[str, Number]) -> str:
             head = f'<tr><th scope="rowgroup" colspan="4">{escape(title)}</th></tr>'
             bodies.append("\n".join(["<tbody>", head, *rows, "</tbody>"]))
     return "\n".join(bodies)
-
-
-def readable(name: str, number: Number) -> tuple[str, str]:
-    """Convert a value to a readable unit; return the digits and the unit as text."""
-    value, (factor, unit) = number.value, scale(number.unit, abs(number.value))
-    if value == 0:
-        return "0", unit
-    if unit:
-        return _digits(value * factor), unit
-    if name.startswith(SHARES):
-        return f"{value * 100:.2f}", "%"
-    return (f"{value:.0f}" if value.is_integer() else f"{value:.4g}"), ""
-
-
-def _digits(value: float) -> str:
-    """Format with four significant digits, but at most three decimals: 27.60, 0.237, 16.99."""
-    places = 3 if abs(value) < 1 else 4 - len(str(int(abs(value))))
-    return f"{value:.{max(places, 0)}f}"
 
 
 def _row(name: str, number: Number) -> str:

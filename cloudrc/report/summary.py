@@ -5,11 +5,26 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from cloudrc.metrics import METRIC_NOTE, Number
+from cloudrc.metrics import METRIC_NOTE, Number, scale
 from cloudrc.report.document import INCOMPLETE
-from cloudrc.report.page import main_numbers
 from cloudrc.text import Paint, escape, plain, table
 
+MAIN = {
+    "waypoints_reached": "waypoints reached",
+    "final_error": "from the last setpoint, at the end",
+    "duration": "mission took",
+    "contact_time": "first touch at",
+    "touch_speed": "speed at the first touch",
+    "steady_contact_force": "steady contact force",
+    "min_clearance": "least clearance",
+    "rtt_mean": "round trip, mean",
+    "prediction_error_rms": "prediction error, RMS",
+    "hold_count": "times in HOLD",
+    "real_time_factor": "real-time factor",
+}
+"""Numbers that a summary shows, and their labels."""
+SHARES = ("loss_", "late_", "overshoot_")
+"""Prefixes of the names of metrics that readers see in per cent."""
 NO_NUMBERS = {
     True: "  no numbers: nothing was flown",
     False: "  no numbers: the recording has lost the end of the flight",
@@ -52,3 +67,29 @@ def _warnings(report: Mapping[str, Any], paint: Paint) -> Iterable[str]:
     faults = report["numbers"].get("fault_count", {"value": 0})["value"]
     if faults:
         yield paint(f"  faults noted in flight: {faults:.0f}, see the report", "yellow")
+
+
+def main_numbers(numbers: Mapping[str, Number]) -> list[tuple[str, str, str]]:
+    """Return label, digits and unit of each number in `MAIN` that was measured."""
+    # A mission with a last setpoint has no waypoints.
+    hidden = "waypoints_reached" if "final_error" in numbers else None
+    names = [name for name in MAIN if name in numbers and name != hidden]
+    return [(MAIN[name], *readable(name, numbers[name])) for name in names]
+
+
+def readable(name: str, number: Number) -> tuple[str, str]:
+    """Convert a value to a readable unit; return the digits and the unit as text."""
+    value, (factor, unit) = number.value, scale(number.unit, abs(number.value))
+    if value == 0:
+        return "0", unit
+    if unit:
+        return _digits(value * factor), unit
+    if name.startswith(SHARES):
+        return f"{value * 100:.2f}", "%"
+    return (f"{value:.0f}" if value.is_integer() else f"{value:.4g}"), ""
+
+
+def _digits(value: float) -> str:
+    """Format with four significant digits, but at most three decimals: 27.60, 0.237, 16.99."""
+    places = 3 if abs(value) < 1 else 4 - len(str(int(abs(value))))
+    return f"{value:.{max(places, 0)}f}"

@@ -1,4 +1,4 @@
-"""Write the report of a run: report.json, environment.json, report.html and figures."""
+"""Write the report of a run: report.json, environment.json and, if wanted, page and figures."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ from cloudrc.report.document import (
 from cloudrc.report.flown import flight_of, flown_shapes, flown_world
 
 if TYPE_CHECKING:
+    from cloudrc.report.figures import Picture
     from cloudrc.report.figures.style import Look
 
 
@@ -138,9 +139,10 @@ def write_report(
     *,
     own: Iterable[str] = (),
     page: bool = True,
+    figures: bool = False,
     look: Look | None = None,
 ) -> dict[str, Any]:
-    """Write report.json and, if `page`, report.html with its figures.
+    """Write report.json; if `page`, report.html; if `figures`, the files in figures/.
 
     Also write environment.json, if the flight has left none.
 
@@ -154,8 +156,8 @@ def write_report(
     environment = _environment(folder / ENVIRONMENT_FILE, assessment)
     if driven := _driven(assessment):
         write_atomically(folder / DRIVE_FILE, driven.encode())
-    if page:
-        _write_page(folder, assessment, environment, look)
+    if page or figures:
+        _draw(folder, assessment, environment, look, page=page, figures=figures)
     return document
 
 
@@ -187,10 +189,17 @@ def _driven(assessment: Assessment) -> str:
     return write_setpoints(setpoints, fence)
 
 
-def _write_page(
-    folder: Path, assessment: Assessment, environment: dict[str, Any], look: Look | None
+def _draw(
+    folder: Path,
+    assessment: Assessment,
+    environment: dict[str, Any],
+    look: Look | None,
+    *,
+    page: bool,
+    figures: bool,
 ) -> None:
-    from cloudrc.report.figures import draw_all
+    """Draw a run; write report.html, the files in figures/, or both."""
+    from cloudrc.report.figures import PAGE_KINDS, PRINT_KINDS, draw_all
     from cloudrc.report.figures.style import Look, Subject
     from cloudrc.report.page import render
 
@@ -198,21 +207,26 @@ def _write_page(
     shapes = flown_shapes(assessment.flight.recording, flown)
     subject = Subject(assessment.flight, flown.uplink, flown.downlink, look or Look(), shapes)
     try:
-        pictures = draw_all(subject)
+        pictures = draw_all(subject, PRINT_KINDS if figures else PAGE_KINDS)
     except ValueError as error:  # matplotlib cannot draw impossible values
         raise BadInputError(
             f"{folder}: the recorded values cannot be drawn ({describe_error(error)}); "
             "report.json is written, check the recording"
         ) from error
-    figures = folder / "figures"
-    if figures.is_symlink():  # in a run from somebody else, the link may point anywhere
-        raise BadInputError(f"{figures}: is a symbolic link; remove it")
-    figures.mkdir(exist_ok=True)
+    if figures:
+        _write_figures(folder / "figures", pictures)
+    if page:
+        text = render(assessment, pictures, environment, _replay(assessment))
+        write_atomically(folder / "report.html", text.encode("utf-8"))
+
+
+def _write_figures(folder: Path, pictures: Iterable[Picture]) -> None:
+    if folder.is_symlink():  # in a run from somebody else, the link may point anywhere
+        raise BadInputError(f"{folder}: is a symbolic link; remove it")
+    folder.mkdir(exist_ok=True)
     for picture in pictures:
         for kind, content in picture.files.items():
-            write_atomically(figures / f"{picture.name}.{kind}", content)
-    text = render(assessment, pictures, environment, _replay(assessment))
-    write_atomically(folder / "report.html", text.encode("utf-8"))
+            write_atomically(folder / f"{picture.name}.{kind}", content)
 
 
 def _replay(assessment: Assessment) -> str:

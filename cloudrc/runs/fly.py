@@ -47,6 +47,7 @@ def fly(
     see: See = lambda records: None,
     *,
     page: bool = True,
+    figures: bool = False,
     session: Session | None = None,
     beside: str = "",
     landed: Callable[[], None] = lambda: None,
@@ -55,7 +56,7 @@ def fly(
 
     During the flight `see` is called with new records; in local mode some are left out. An
     interrupted flight also gets a report, but not one whose controller outside never gave a
-    command. Without `page`, write no report.html.
+    command. With `page`, write report.html; with `figures`, write the files in figures/.
 
     With `session`, teleop waits for missions, and the report is that of the last one. When all
     processes are ready, `session` gets the API's address and process -> HOST:PORT of its metrics.
@@ -77,7 +78,9 @@ def fly(
             if _is_refused(recording):
                 return {}  # the end of the block raises the error
             run = replace(run, files=files)
-            return write_report(folder, recording, resolved, run, own=own, page=page)
+            return write_report(
+                folder, recording, resolved, run, own=own, page=page, figures=figures
+            )
     except OSError as error:
         error.filename = str(error.filename or folder)
         raise machine_error(error) or error from error

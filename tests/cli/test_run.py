@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -10,6 +12,7 @@ import pytest
 from cloudrc.cli.main import main
 from cloudrc.cli.report import summary
 from cloudrc.errors import BadInputError
+from cloudrc.report.figures import FIGURES
 from cloudrc.runs import requirements
 from cloudrc.runs.folder import new_folder
 from tests.cli.conftest import FLY, SHORT
@@ -20,6 +23,7 @@ from tests.cli.conftest import FLY, SHORT
     [
         ("--mode local --seeds 3", "virtual time"),
         ("--seed 1 --seeds 2", "not allowed with"),
+        ("--seeds 2 --figures", "one flight"),
         ("papper", "paper"),
         ("--set cloud.predictr=last_sample", "predictor"),
         ("--set report.metrics=./no.py", "no.py': there is no such file"),
@@ -44,6 +48,32 @@ def test_the_last_line_is_the_report_and_the_folder_is_complete(folder, call):
     wanted = "report.html report.json mission.mcap config.yaml environment.json"
     assert set(wanted.split()) <= left
     assert (folder / "runs/latest/report.html").samefile(page)
+
+
+WITHOUT_MATPLOTLIB = """
+import sys
+sys.modules["matplotlib"] = None
+from cloudrc.cli.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_run_without_a_page_leaves_recording_and_numbers_and_needs_no_matplotlib(folder):
+    command = [sys.executable, "-c", WITHOUT_MATPLOTLIB, *FLY, "--out", "a", "--report", "none"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "a/report.json"
+    names = {path.name for path in (folder / "a").iterdir()}
+    assert names == {"report.json", "mission.mcap", "config.yaml", "environment.json"}
+
+
+@pytest.mark.parametrize("line", ["run --report none", "report"])
+def test_figures_are_files_if_they_are_asked_for(line, folder, monkeypatch, call):
+    monkeypatch.setattr("cloudrc.report.figures.FIGURES", {"error": FIGURES["error"]})
+    call(*FLY, "--out", "a", "--report", "none", *["--figures"] * line.startswith("run"))
+    if line == "report":
+        call("report a --figures --width 3.5")
+    names = {path.name for path in (folder / "a/figures").iterdir()}
+    assert names == {"error.pdf", "error.png", "error.svg"}
 
 
 @pytest.mark.usefixtures("no_page")

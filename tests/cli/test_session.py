@@ -32,7 +32,7 @@ from cloudrc.teleop.client import Api, ApiError
 from cloudrc.teleop.store import Order, open_store
 from cloudrc.teleop.wire import Leg, Plan
 from tests.conftest import wait_until
-from tests.drivers.conftest import FAST, processes_of
+from tests.drivers.conftest import COMMAND, processes_of
 from tests.fences import FENCE
 from tests.record.conftest import cloud_records, world_records, write
 
@@ -159,7 +159,9 @@ def up(folder, *words):
     """Start a session in the folder `s`; yield its process once the robot waits for missions."""
     with (folder / "said").open("w") as said:
         process = subprocess.Popen(
-            [*FAST, "up", "hover", "--out", "s", *words], stdout=said, stderr=said
+            [*COMMAND, "up", "hover", "--out", "s", "--report", "none", *words],
+            stdout=said,
+            stderr=said,
         )
     try:
         wait_until(lambda: "to end: Ctrl-C here, or cloudrc down" in (folder / "said").read_text())
@@ -209,10 +211,10 @@ def test_a_session_flies_missions_and_reports_the_last_one(folder, command, figu
         wait_until(lambda: "done" in command("mission list --run s").splitlines()[-1])
         assert "s: in force after" in command("link set downlink.delay_ms=60")
         wait_until(lambda: "link: downlink 60 " in (folder / "said").read_text())
-        assert command("down") == f"s/report.html\n{USING}"
+        assert command("down") == f"s/report.json\n{USING}"
         assert process.wait(10) == 0
     said = (folder / "said").read_text()
-    assert said.splitlines()[-1] == "s/report.html"
+    assert said.splitlines()[-1] == "s/report.json"
     document = json.loads((folder / "s/report.json").read_text())
     assert document["verdict"] == "success"
     assert document["numbers"]["waypoints_reached"]["value"] == 1
@@ -260,7 +262,7 @@ def test_a_session_that_ends_with_a_drive_has_its_report(folder, command, ended)
         if ended:
             command("mission resume --run s")
             wait_until(lambda: "SUCCESS" in command("mission list --run s"))
-        assert command("down") == f"s/report.html\n{USING}"
+        assert command("down") == f"s/report.json\n{USING}"
         assert process.wait(10) == 0
     document = json.loads((folder / "s/report.json").read_text())
     assert document["verdict"] == ("success" if ended else "interrupted")

@@ -56,7 +56,7 @@ BEFORE = {"metrics": {"allowFrom": ["x"]}, "mission": {"enabled": True, "queue":
 def ready(running, teleop, pretend, tmp_path, monkeypatch):
     """A release whose pods have recorded a flight."""
     monkeypatch.setattr(flight, "FLUSH", 0.0)
-    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
+    monkeypatch.setattr("cloudrc.report.write._draw", lambda *given, **wanted: None)
     monkeypatch.chdir(tmp_path)
     world, _ = flown()
     record(tmp_path, flown(), (later(world[-300:], SECOND), []), torn=True)

@@ -62,26 +62,17 @@ def ages_at_hold(recording):
     return ages
 
 
-WITHOUT_PAGE = """
-import sys
-from cloudrc.cli.main import main
-from cloudrc.report import write
-whole = write.write_report
-write.write_report = lambda *given, **more: whole(*given, **(more | {"page": False}))
-sys.exit(main(sys.argv[1:]))
-"""
-FAST = [sys.executable, "-c", WITHOUT_PAGE]
-"""`cloudrc` that writes no page with figures, which takes longer than a short flight."""
+COMMAND = [sys.executable, "-m", "cloudrc"]
 
 
-def start(folder, *settings, dwell=20.0, command=FAST):
+def start(folder, *settings, dwell=20.0, report="none"):
     """Start a local run of `hover`."""
-    words = ["run", "hover", "--mode", "local", "--out", str(folder)]
+    words = ["run", "hover", "--mode", "local", "--out", str(folder), "--report", report]
     for setting in (f"mission.waypoints.0.dwell_s={dwell}", *settings):
         words += ["--set", setting]
     pipe = subprocess.PIPE
     return subprocess.Popen(
-        [*command, *words], stdout=pipe, stderr=pipe, text=True, start_new_session=True
+        [*COMMAND, *words], stdout=pipe, stderr=pipe, text=True, start_new_session=True
     )
 
 

@@ -5,7 +5,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from contextlib import suppress
 from itertools import pairwise
@@ -17,12 +16,11 @@ import pytest
 from cloudrc.drivers import local
 from cloudrc.record.columns import Recording
 from tests.conftest import nightly, wait_until
-from tests.drivers.conftest import start, wait_until_flying
+from tests.drivers.conftest import COMMAND, start, wait_until_flying
 
 pytestmark = pytest.mark.process
 
 ENDS = ("world", "cloud")
-COMMAND = [sys.executable, "-m", "cloudrc"]
 
 
 def report(folder):
@@ -45,7 +43,7 @@ def wait_until_ended(pids, limit):
 @pytest.mark.alone
 @pytest.mark.parametrize("how", [signal.SIGINT, *nightly(signal.SIGTERM, signal.SIGHUP)])
 def test_ctrl_c_ends_all_processes_in_2_s_and_leaves_a_report(tmp_path, how):
-    run = start(tmp_path / "run", command=COMMAND)
+    run = start(tmp_path / "run", report="page")
     pids = wait_until_flying(run)
     assert set(pids) == {"world", "teleop", "cloud", "uplink", "downlink"}
     words = Path(f"/proc/{pids['world']}/cmdline").read_text().split("\0")
@@ -114,7 +112,7 @@ CAUSE = "downlink.delay_ms=120, downlink.jitter_ms=0"
 @pytest.mark.alone
 def test_an_operator_sets_the_link_of_a_run_and_cancels_it(tmp_path, figure):
     folder, took = tmp_path / "run", []
-    run = start(folder, dwell=30.0, command=COMMAND)
+    run = start(folder, dwell=30.0, report="page")
     wait_until_flying(run)
     assert json.loads((folder / "api.json").read_text())["url"] == local.under_way()[folder]
     time.sleep(1.0)

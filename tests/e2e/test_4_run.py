@@ -83,7 +83,7 @@ def test_a_run_in_a_cluster_is_that_of_virtual_time(
     found = {check["name"]: check["state"] for check in json.loads(done.stdout)["checks"]}
     assert (done.returncode, found["kubeconfig"], found["cluster"]) == (0, "ok", "ok")
     report = tmp_path / name
-    line = ["run", name, "--set", setting, "--mode", "cluster"]
+    line = ["run", name, "--set", setting, "--mode", "cluster", "--figures"]
     said = in_release(*line, "--out", str(report))
     assert said.splitlines()[-1] == str(report / "report.html")
     wanted = ["report.html", "report.json", "mission.mcap", "config.yaml", "environment.json"]

@@ -72,7 +72,7 @@ def test_a_later_report_measures_a_file_only_if_named(folder, monkeypatch):
     assert "flies past the setpoint along x" in (run / "report.html").read_text()
     assert str(folder / "mine" / "overshoot.py") in (run / "config.yaml").read_text()
 
-    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
+    monkeypatch.setattr("cloudrc.report.write._draw", lambda *given, **wanted: None)
     assert main(["report", "run"]) == 0
     again = report_of(run)
     assert again["numbers"] == {k: v for k, v in first["numbers"].items() if k != "overshoot"}

@@ -13,7 +13,7 @@ from cloudrc.config.schema import DirectionConfig
 from cloudrc.geometry.shapes import Shapes, box, terrain
 from cloudrc.record.holes import Hole
 from cloudrc.records import Control
-from cloudrc.report.figures import FIGURES, draw_all, own_settings
+from cloudrc.report.figures import FIGURES, PRINT_KINDS, draw_all, own_settings
 from cloudrc.report.figures.labels import FREE, place_labels
 from cloudrc.report.figures.projection import View, glass, simplified
 from cloudrc.report.figures.style import RC, Look, Subject, sampled
@@ -148,7 +148,7 @@ def test_the_inset_of_a_step_has_a_place_without_curves(every):
 def test_text_stays_text_and_a_flight_in_real_time_has_a_date(monkeypatch):
     monkeypatch.setattr("cloudrc.report.figures.FIGURES", {"error": FIGURES["error"]})
     subject = replace(subject_of(flown()), look=Look(3.5, 8.0))
-    (picture,) = draw_all(subject)
+    (picture,) = draw_all(subject, PRINT_KINDS)
     assert b"<text" in picture.files["svg"]
     assert b"8px" in picture.files["svg"], "the size of the font"
     assert b'width="252pt"' in picture.files["svg"], "3.5 in"
@@ -156,7 +156,7 @@ def test_text_stays_text_and_a_flight_in_real_time_has_a_date(monkeypatch):
     assert b"/Type3" not in picture.files["pdf"]
     assert not [kind for kind, data in picture.files.items() if b"1970-01-0" in data]
     subject.flight.recording.metadata = {"wall_clock_offset_ns": "86400000000000"}
-    (picture,) = draw_all(subject)
+    (picture,) = draw_all(subject, PRINT_KINDS)
     assert b"1970-01-02" in picture.files["svg"]
     assert b"1970-01-02" in picture.files["png"]
     assert b"D:19700102" in picture.files["pdf"]

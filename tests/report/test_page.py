@@ -10,7 +10,8 @@ from cloudrc.metrics import Number
 from cloudrc.metrics.verdict import FlightFailure, FlightVerdict
 from cloudrc.report.document import Run, environment_document
 from cloudrc.report.figures import FIGURES, Picture
-from cloudrc.report.page import readable, render
+from cloudrc.report.page import render
+from cloudrc.report.summary import readable
 from cloudrc.report.write import assess, write_report
 from tests.metrics.conftest import paper
 
@@ -20,7 +21,7 @@ def folder(tmp_path_factory):
     """Folder with the complete report of the shipped experiment."""
     path = tmp_path_factory.mktemp("run")
     experiment, recording = paper()
-    write_report(path, recording, experiment, Run("virtual", "virtual"))
+    write_report(path, recording, experiment, Run("virtual", "virtual"), figures=True)
     return path
 
 

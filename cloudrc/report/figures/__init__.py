@@ -1,8 +1,8 @@
-"""Draw the figures of a report as PDF, PNG and SVG, without a display, OpenGL or pyplot."""
+"""Draw the figures of a report, without a display, OpenGL or pyplot."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -29,6 +29,8 @@ FIGURES: dict[str, tuple[Draw, Write, str]] = {
 }
 """Name of a figure -> function that draws the figure, function that returns the caption, text for
 readers who cannot see the figure. The figures of the paper are delay, odom and error."""
+PAGE_KINDS, PRINT_KINDS = ("svg",), ("pdf", "png", "svg")
+"""Kinds of files: what the page contains, and what the folder figures/ has of each figure."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +38,7 @@ class Picture:
     """A drawn figure."""
 
     name: str  # name of the files, without suffix
-    files: dict[str, bytes]  # "pdf", "png", "svg" -> content
+    files: dict[str, bytes]  # kind, such as "svg" -> content
     caption: str
     width: float  # in print [in]
     alt: str  # for readers who cannot see the figure
@@ -44,8 +46,8 @@ class Picture:
     over_time: tuple[tuple[float, float, float, float], ...] = ()
 
 
-def draw_all(subject: Subject) -> list[Picture]:
-    """Draw all figures.
+def draw_all(subject: Subject, kinds: Iterable[str] = PAGE_KINDS) -> list[Picture]:
+    """Draw all figures, each as files of `kinds`.
 
     Only one thread at a time may draw, because matplotlib's settings are global in a process.
     """
@@ -55,7 +57,7 @@ def draw_all(subject: Subject) -> list[Picture]:
         for name, (draw, caption, alt) in FIGURES.items():
             figure = draw(subject)
             place_labels(figure)
-            files = {kind: save(figure, kind, flown) for kind in ("pdf", "png", "svg")}
+            files = {kind: save(figure, kind, flown) for kind in kinds}
             width, panels = subject.look.width, _over_time(figure)
             pictures.append(Picture(name, files, caption(subject), width, alt, panels))
     return pictures

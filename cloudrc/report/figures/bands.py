@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
-from cloudrc.report.figures import own_settings, save, style
+from cloudrc.report.figures import PRINT_KINDS, own_settings, save, style
 from cloudrc.report.figures.style import Look, new_figure, panel
 
 UNITS = {"ms": "ms", "s": "s", "m": "m", "mps": "m/s", "kbit": "kbit/s", "deg": "deg"}
@@ -67,7 +67,7 @@ def draw(
             lines = column[0].get_legend_handles_labels()
             shape = {"ncols": 2, "alignment": "left", "title_fontsize": look.font_size - 1.0}
             figure.legend(*lines, loc="outside upper left", title=_label(by), **shape)
-        return {kind: save(figure, kind) for kind in ("pdf", "png", "svg")}
+        return {kind: save(figure, kind) for kind in PRINT_KINDS}
 
 
 def _slant(names: Sequence[str], look: Look) -> tuple[float, float]:
