@@ -235,13 +235,8 @@ bench-link: $(VENV)/all ## compare the relay with its profiles and with a C prog
 
 # The end-to-end tests draw the dashboards, with the data of their Prometheus.
 # The film needs Chromium and flies in real time.
-pictures: $(VENV)/dev ## film the console for the README, draw two robots, and take the dashboards from 'make e2e'
+pictures: $(VENV)/dev ## film the console for the README, and take the dashboards from 'make e2e'
 	$(bin)/python -m tools.console_picture
-	rm -rf build/pictures
-	$(bin)/cloudrc run paper --mode virtual --figures --report none --out build/pictures/paper
-	cp build/pictures/paper/figures/overview.png docs/overview.png
-	$(bin)/cloudrc run pillars --mode virtual --figures --report none --out build/pictures/pillars
-	cp build/pictures/pillars/figures/overview.png docs/pillars.png
 	@if [ -f build/e2e/dashboards.webp ]; then cp build/e2e/dashboards.webp docs/; \
 		else echo "no build/e2e/dashboards.webp: 'make e2e' draws it"; fi
 

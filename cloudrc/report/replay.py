@@ -90,5 +90,6 @@ def _record(server: viser.ViserServer, flight: Flight, experiment: ResolvedExper
         pose = applied["position"], applied["orientation_wxyz"]
         scene.move("ghost", *(column[ghost] if fresh else None for column in pose))
         scene.move("setpoint", control["setpoint"][asked[frame]] if asked[frame] >= 0 else None)
-        scene.set_waypoints(points, int(reached[frame]))
+        if not frame or reached[frame] != reached[frame - 1]:
+            scene.set_waypoints(points, int(reached[frame]))
     return recorded.as_html()

@@ -13,6 +13,7 @@ from PIL import Image
 
 from cloudrc.report import replay
 from cloudrc.report.document import Run
+from cloudrc.report.figures import FIGURES
 from cloudrc.report.write import assess, write_report
 from tests.metrics.conftest import OPEN_AIR, Log, paper
 
@@ -90,7 +91,7 @@ def test_without_replay_a_line_says_why(lack, words, tmp_path, monkeypatch):
     (line,) = re.findall(r'<p class="note" id="replay">(.*?)</p>', page)
     assert line.startswith("No replay in 3-D: ")
     assert words in line
-    assert page.count("<img ") == 5
+    assert page.count("<img ") == len(FIGURES)
 
 
 @pytest.mark.process
@@ -126,5 +127,5 @@ def test_without_webgl_the_figures_remain(browse, page):
     assert "WebGL is off" in shown.locator("#no3d").inner_text()
     assert shown.locator("#replay .room").is_hidden()
     assert shown.locator("iframe").count() == 0
-    assert shown.locator("figure img").count() == 5
+    assert shown.locator("figure img").count() == len(FIGURES)
     assert shown.evaluate("[...document.images].every(one => one.naturalWidth > 0)")

@@ -14,8 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cloudrc.record import wall_time
-from cloudrc.report.figures import curves, flight, marks, overview
-from cloudrc.report.figures.labels import place_labels
+from cloudrc.report.figures import curves, flight, marks
 from cloudrc.report.figures.style import Look, Subject
 
 Draw = Callable[[Subject], Figure]
@@ -25,7 +24,6 @@ FIGURES: dict[str, tuple[Draw, Write, str]] = {
     "delay": (curves.draw_delay, lambda s: curves.DELAY + marks.legend(s), curves.DELAY_ALT),
     "odom": (curves.draw_odom, lambda s: curves.ODOM + marks.legend(s), curves.ODOM_ALT),
     "error": (curves.draw_error, lambda s: curves.ERROR + marks.legend(s), curves.ERROR_ALT),
-    "overview": (overview.draw, overview.caption, overview.ALT),
 }
 """Name of a figure -> function that draws the figure, function that returns the caption, text for
 readers who cannot see the figure. The figures of the paper are delay, odom and error."""
@@ -56,11 +54,18 @@ def draw_all(subject: Subject, kinds: Iterable[str] = PAGE_KINDS) -> list[Pictur
     with own_settings(subject.look):
         for name, (draw, caption, alt) in FIGURES.items():
             figure = draw(subject)
-            place_labels(figure)
+            _lay_out(figure)
             files = {kind: save(figure, kind, flown) for kind in kinds}
             width, panels = subject.look.width, _over_time(figure)
             pictures.append(Picture(name, files, caption(subject), width, alt, panels))
     return pictures
+
+
+def _lay_out(figure: Figure) -> None:
+    """Place the panels once; else each `save` would draw the figure twice to place them."""
+    if engine := figure.get_layout_engine():
+        engine.execute(figure)
+    figure.set_layout_engine(None)
 
 
 def _over_time(figure: Figure) -> tuple[tuple[float, float, float, float], ...]:

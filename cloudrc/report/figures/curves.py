@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from itertools import product
 from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.transforms import Bbox
 
 from cloudrc.metrics.control import prediction_errors, round_trips, tracking_errors
 from cloudrc.metrics.flight import Array, rms
 from cloudrc.report.figures import style
-from cloudrc.report.figures.labels import is_free
 from cloudrc.report.figures.marks import bounds, mark_events
 from cloudrc.report.figures.style import Subject, broken, dots, legend_above, new_figure, panel
 
@@ -123,14 +120,12 @@ ODOM_ALT = "Line plots of the position per axis over time: reference, measured, 
 ODOM = (
     "Position per axis, as cloud knew it. Reference: the setpoint that the controller tracks. "
     "Measured: the newest odometry that had arrived. Estimated: the prediction from which the "
-    "command was computed. The inset enlarges the part in the grey box: one step."
+    "command was computed. At the right, the largest step of the reference is enlarged."
 )
 ZOOM, BEFORE = 1.2, 0.1
-"""Duration that the inset shows enlarged, and how long before the step it begins [s]."""
+"""Duration of the part that is enlarged, and how long before the step it begins [s]."""
 STEP_MIN = 0.2
-"""Smallest step of the setpoint that the inset enlarges [m]."""
-HEIGHTS = (0.85, 0.7, 0.55)
-"""Heights of the inset, as shares of a panel; the first that fits is used."""
+"""Smallest step of the reference that is enlarged, and least height of that panel [m]."""
 LINES: dict[str, dict[str, Any]] = {
     "setpoint": {
         **{"label": "reference", "color": style.REFERENCE},
@@ -143,78 +138,64 @@ LINES: dict[str, dict[str, Any]] = {
 
 
 def draw_odom(subject: Subject) -> Figure:
-    """Draw reference, measured and estimated position, one panel per axis."""
+    """Draw reference, measured and estimated position, one panel per axis.
+
+    In a wide figure, a second column enlarges the largest step of the reference.
+    """
     names = "xy" if subject.shapes.planar else "xyz"
-    figure, control = new_figure(1.4 * len(names), subject.look.width), subject.flight.control
-    time, behind = _times(subject)
-    rows = figure.subplots(len(names), 1, sharex=True)
+    begin = _largest_step(subject, len(names)) if subject.look.width >= style.NARROW else None
+    ratios = (1.0,) if begin is None else (4.0, 1.0)
+    figure = new_figure(1.4 * len(names), subject.look.width)
+    columns = figure.subplots(
+        len(names), len(ratios), sharex="col", squeeze=False, width_ratios=ratios
+    ).T
+    rows = columns[0]
     for index, (axes, name) in enumerate(zip(rows, names, strict=True)):
         panel(axes, "abc"[index])
-        for column, look in LINES.items():
-            axes.plot(time, broken(control[column][:, index], behind), **look)
+        _draw_position(axes, subject, index)
         mark_events(axes, subject)
         axes.set_ylabel(f"${name}$ (m)")
         axes.margins(y=0.12)
+        if begin is not None:
+            _draw_step(columns[1][index], subject, index, begin)
     _time_axis(rows[-1], subject)
+    if begin is not None:
+        columns[1][0].set_title("largest step", loc="left")
+        columns[1][-1].set_xlabel("time (s)")
     legend_above(rows[0], 3)
     figure.align_ylabels(rows)
-    _draw_inset(rows, subject)
     return figure
 
 
-def _draw_inset(rows: Any, subject: Subject) -> None:
-    """Draw an inset that enlarges a large step of the setpoint, in a free place of its panel."""
+def _draw_position(axes: Axes, subject: Subject, index: int) -> None:
+    """Draw the position along one axis of the world, 0 to 2."""
+    time, behind = _times(subject)
+    for column, look in LINES.items():
+        axes.plot(time, broken(subject.flight.control[column][:, index], behind), **look)
+
+
+def _largest_step(subject: Subject, count: int) -> float | None:
+    """Return when the part that is enlarged begins [s]; None if the reference has no step.
+
+    `count` is the number of axes that are drawn.
+    """
+    control = subject.flight.control
+    jumps = np.abs(np.diff(control["setpoint"][:, :count], axis=0)).max(axis=1, initial=0.0)
+    if jumps.max(initial=0.0) <= STEP_MIN:
+        return None
+    return float(subject.flight.seconds(control["stamp_ns"][jumps.argmax() + 1])) - BEFORE
+
+
+def _draw_step(axes: Axes, subject: Subject, index: int, begin: float) -> None:
+    """Enlarge the measured and the estimated position of an axis from `begin` [s] on."""
+    _draw_position(axes, subject, index)
     control = subject.flight.control
     time = subject.flight.seconds(control["stamp_ns"])
-    jumps = np.diff(control["setpoint"][:, : len(rows)], axis=0)
-    largest = np.argsort(-np.abs(jumps), axis=None)[:9]
-    steps = np.transpose(np.unravel_index(largest, jumps.shape)).tolist()
-    steps = [(row, axis) for row, axis in steps if abs(jumps[row, axis]) > STEP_MIN]
-    if not steps:
-        return
-    width = 0.34 if subject.look.width < style.NARROW else 0.24
-    for height, (row, axis) in product(HEIGHTS, steps):
-        box = _free_box(rows[axis], time[row], width, height)
-        if box is not None:
-            break
-    else:
-        row, axis = steps[0]
-        low, high = rows[axis].get_ylim()
-        rows[axis].set_ylim(low, high + 1.2 * (high - low))
-        box = Bbox.from_bounds(0.3, 0.48, width, 0.5)
-    begin = time[row] - BEFORE
     inside = (time >= begin) & (time <= begin + ZOOM)
-    shown = np.concatenate([control[name][inside, axis] for name in ("measured", "position")])
-    room = 0.1 * np.ptp(shown) + 1e-3
-    # The numbers of the inset are inside the box, too.
-    left, low = box.x0 + 0.2 * width, box.y0 + 0.14
-    inset = rows[axis].inset_axes((left, low, box.x1 - left, box.y1 - low))
-    times, behind = _times(subject)
-    for name, look in LINES.items():
-        inset.plot(times, broken(control[name][:, axis], behind), **look)
-    inset.set(xlim=(begin, begin + ZOOM), ylim=(shown.min() - room, shown.max() + room))
-    inset.locator_params(nbins=3)
-    inset.tick_params(labelsize="x-small", pad=1.5, length=2.0)
-    inset.spines[:].set_visible(True)
-    mark = rows[axis].indicate_inset_zoom(inset, edgecolor=style.GREY, lw=0.8)
-    for connector in mark.connectors:  # they would cross the curves
-        connector.set_visible(False)
-
-
-def _free_box(axes: Axes, time: float, width: float, height: float) -> Bbox | None:
-    """Find a place near `time` [s] for a box that no curve crosses; return None if there is none.
-
-    `width` and `height` of the box are shares of the panel.
-    """
-    to_axes = axes.transData - axes.transAxes
-    paths = [to_axes.transform_path(line.get_path()) for line in axes.lines]
-    at = to_axes.transform((time, 0.0))[0]
-    lefts = sorted(np.linspace(0.01, 0.99 - width, 60), key=lambda x: abs(x + width / 2 - at))
-    for x, y in product(lefts, np.linspace(0.98 - height, 0.02, 6)):
-        box = Bbox.from_bounds(x, y, width, height)
-        if is_free(box, paths, np.zeros((0, 2))):
-            return box
-    return None
+    shown = np.concatenate([control[name][inside, index] for name in ("measured", "position")])
+    middle, half = (shown.max() + shown.min()) / 2, max(np.ptp(shown), STEP_MIN) * 0.6
+    axes.set(xlim=(begin, begin + ZOOM), ylim=(middle - half, middle + half))
+    axes.locator_params(nbins=4)
 
 
 ERROR_ALT = "Two line plots over time: distance to the setpoint, and the error of the estimate."

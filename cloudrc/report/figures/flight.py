@@ -1,6 +1,6 @@
-"""Draw the figure of the flight: the path from above, and z and clearance along the path.
+"""Draw the figure of the flight: the path from above and from the side, and its clearance.
 
-A robot that stays on the ground has no panel with z.
+A robot that stays on the ground has no panel from the side.
 """
 
 from __future__ import annotations
@@ -10,18 +10,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from cloudrc.geometry.clearance import CLEARANCE_SHOWN, tube_index
+from cloudrc.geometry.clearance import CLEARANCE_SHOWN
 from cloudrc.geometry.scene import Tube
 from cloudrc.geometry.shapes import rotation
-from cloudrc.geometry.tubes import cut_open
+from cloudrc.geometry.tubes import rims
 from cloudrc.metrics.flight import Array
-from cloudrc.report.figures.labels import free_label
-from cloudrc.report.figures.projection import POLYGONS_MAX, outline
 from cloudrc.report.figures.style import (
     BLACK,
     BORE,
@@ -32,28 +30,27 @@ from cloudrc.report.figures.style import (
     VERMILION,
     Subject,
     broken,
-    distance_moved,
+    legend_above,
     new_figure,
-    own_bodies,
     panel,
     sampled,
 )
 
-UP = np.array([0.0, 0.0, 1.0])
-BORE_RGBA, WALL_RGBA = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 1.0)
-"""Marks of the two faces of a cut tube."""
-
 CEILING = 2 * CLEARANCE_SHOWN
 """Upper end of the clearance axis [m]."""
+SHADES = 40
+"""Number of colours of the path."""
 NEAR = 1.0
-"""Distance from the path up to which obstacles widen the view from above [m]."""
-TITLES = {
-    "top": "from above",
-    "side": "height along the path",
-    "margin": "clearance along the path",
-}
+"""Distance from the path up to which obstacles widen a view [m]."""
+ALT = "The path from above and from the side, with outlines of obstacles, and its clearance."
+TITLES = {"top": "from above", "side": "from the side", "margin": "clearance"}
 """Panel -> its title."""
-ALT = "The path from above, with obstacles, and height and clearance along the path."
+TEXTS = {
+    "top": "path from above",
+    "side": "path from the side",
+    "margin": "clearance, the distance from the robot to the nearest obstacle",
+}
+"""Panel -> its part of the caption."""
 
 
 def _panels(subject: Subject) -> list[str]:
@@ -64,41 +61,34 @@ def _panels(subject: Subject) -> list[str]:
 
 def caption(subject: Subject) -> str:
     """Return the figure's caption; it describes only what the flight has."""
-    tubes, panels = subject.flight.scene.tubes, _panels(subject)
-    above = "path from above, waypoints numbered, the robot at its last pose in blue"
-    above += ", tubes cut open" if tubes else ""
-    above += ", obstacles above the robot dashed" if own_bodies(subject) else ""
-    texts = {
-        "top": above,
-        "side": "height along the path" + (", with the bore of each tube" if tubes else ""),
-        "margin": "clearance, the distance from the robot to the nearest obstacle",
-    }
-    words = [f"({letter}) {texts[name]}" for letter, name in zip("abc", panels, strict=False)]
+    panels = _panels(subject)
+    words = [f"({letter}) {TEXTS[name]}" for letter, name in zip("abc", panels, strict=False)]
     text = f"Flight: {'; '.join(words)}."
+    flight = subject.flight
+    text += " Circles: waypoints." if flight.mission.waypoints else ""
+    if flight.scene.tubes or subject.shapes.scene:
+        text += " Grey: outlines of obstacles, dashed if they are above the robot."
+    text += " Blue: the robot at its last pose." if subject.shapes.robot else ""
     if "margin" in panels:
         text += f" The colour is the clearance in all panels; its axis ends at {CEILING:.1f} m."
     return text
 
 
 def draw(subject: Subject) -> Figure:
-    """Draw the path from above, and z and clearance over the distance moved."""
+    """Draw the path from above, from the side, and its clearance over the distance moved."""
     figure, axes = _arrange(subject)
     for letter, (name, each) in zip("abc", axes.items(), strict=False):
         panel(each, letter, TITLES[name])
-    position = subject.flight.truth["position"]
-    way = distance_moved(position)
-    coloured = _draw_top(axes["top"], subject, position)
+    coloured = _draw_view(axes["top"], subject, (0, 1))
+    axes["top"].set_aspect("equal", adjustable="datalim")
     if side := axes.get("side"):
-        _draw_side(side, subject, way, position)
+        extent = np.ptp(_shown(subject), axis=0)
+        _draw_view(side, subject, (int(extent[1] > extent[0]), 2))
+        side.axhline(subject.flight.scene.floor, color=BLACK, lw=0.8)
     if margin := axes.get("margin"):
-        _draw_clearance(margin, subject, way, position)
-    right = [each for name, each in axes.items() if name != "top"]
-    if right:
-        right[-1].set_xlabel("distance moved (m)")
-    for each in right[:-1]:
-        each.tick_params(labelbottom=False)
-        each.sharex(right[-1])
+        _draw_clearance(margin, subject)
     if coloured is not None:
+        right = [each for name, each in axes.items() if name != "top"]
         bar = figure.colorbar(coloured, ax=right, extend="max", aspect=20 * len(right), pad=0.01)
         bar.set_label("clearance (m)")
         bar.outline.set_linewidth(0.5)
@@ -122,132 +112,140 @@ def _arrange(subject: Subject) -> tuple[Figure, dict[str, Axes]]:
     return figure, figure.subplot_mosaic(mosaic, **ratios)
 
 
-def _draw_path(axes: Axes, subject: Subject, x: Array, y: Array) -> LineCollection | None:
-    clearance, points = subject.flight.clearance, np.stack([x, y], axis=1)
-    behind = subject.flight.rows_behind_holes(subject.flight.truth["stamp_ns"])
-    if len(clearance) != len(x) or len(x) < 2:
+def _shown(subject: Subject) -> Array:
+    """Return the points that each view shows [m], shape (n, 3): spawn, waypoints and path."""
+    flight = subject.flight
+    waypoints = [waypoint.position_m for waypoint in flight.mission.waypoints]
+    return np.array([flight.scene.spawn, *waypoints, *flight.truth["position"]])
+
+
+def _draw_view(axes: Axes, subject: Subject, sides: tuple[int, int]) -> LineCollection | None:
+    """Draw path, obstacles and robot over two axes of the world, 0 to 2; return the path."""
+    _draw_waypoints(axes, subject, sides)
+    _draw_obstacles(axes, subject, sides)
+    _draw_robot(axes, subject, sides)
+    coloured = _draw_path(axes, subject, subject.flight.truth["position"][:, sides])
+    axes.margins(0.08)
+    axes.autoscale_view()
+    axes.set_xlabel(f"${'xyz'[sides[0]]}$ (m)")
+    axes.set_ylabel(f"${'xyz'[sides[1]]}$ (m)")
+    return coloured
+
+
+def _draw_waypoints(axes: Axes, subject: Subject, sides: tuple[int, int]) -> None:
+    """Draw the waypoints; their numbers stand in the view from above, where few hide each other."""
+    numbered = sides == (0, 1)
+    look: dict[str, Any] = {"ms": 8 if numbered else 4, "mfc": "white", "mec": BLACK, "mew": 0.8}
+    for number, waypoint in enumerate(subject.flight.mission.waypoints, start=1):
+        x, y = (waypoint.position_m[side] for side in sides)
+        axes.plot(x, y, "o", zorder=5, **look)
+        if numbered:
+            text = axes.text(x, y, str(number), size="x-small", ha="center", zorder=6)
+            text.set_verticalalignment("center_baseline")
+
+
+def _draw_path(axes: Axes, subject: Subject, points: Array) -> LineCollection | None:
+    """Draw a line through `points`, any unit, shape (n, 2), one for each row of the true states.
+
+    Its colour is the clearance. Return the line; None if the clearance is unknown.
+    """
+    flight = subject.flight
+    behind = flight.rows_behind_holes(flight.truth["stamp_ns"])
+    if len(flight.clearance) != len(points) or len(points) < 2:
         axes.plot(*broken(points, behind).T, color=BLACK, lw=1.4)
         return None
-    ends, is_line = sampled(len(x), behind)
-    points = points[ends]
-    around = broken(points, np.searchsorted(ends, behind))
-    axes.plot(*around.T, color=BLACK, lw=3.0, solid_capstyle="round", zorder=3)
+    rows = sampled(len(points), behind)
+    points, holes = points[rows], np.searchsorted(rows, behind)
+    axes.plot(*broken(points, holes).T, color=BLACK, lw=3.0, solid_capstyle="round", zorder=3)
+    shade = np.minimum(flight.clearance / CLEARANCE_SHOWN, 1.0) * SHADES
+    shade = np.rint(np.minimum.reduceat(shade, rows))
+    begins = np.union1d(np.flatnonzero(np.diff(shade)) + 1, holes).astype(int)
+    # Each part goes on to the first point of the next one, but not across a hole.
+    spans = pairwise([0, *begins, len(points)])
+    parts = [points[first : last + (last not in holes)] for first, last in spans]
     lines = LineCollection(
-        list(np.stack([points[:-1], points[1:]], axis=1)[is_line]),
+        parts,
         cmap="viridis",
         norm=Normalize(0.0, CLEARANCE_SHOWN),
         lw=1.8,
         capstyle="round",
         zorder=4,
     )
-    lines.set_array(np.minimum.reduceat(clearance, ends[:-1])[is_line])
+    lines.set_array(shade[[0, *begins]] * CLEARANCE_SHOWN / SHADES)
     axes.add_collection(lines)
-    axes.autoscale_view()
     return lines
 
 
-def _draw_top(axes: Axes, subject: Subject, position: Array) -> LineCollection | None:
-    for tube in subject.flight.scene.tubes:
-        _draw_tube(axes, tube)
-    coloured = _draw_path(axes, subject, position[:, 0], position[:, 1])
-    for number, waypoint in enumerate(subject.flight.mission.waypoints, start=1):
-        place = waypoint.position_m[:2]
-        axes.plot(*place, "o", ms=4, mfc="white", mec=BLACK, mew=0.8, zorder=5)
-        free_label(axes, str(number), place)
-    _draw_obstacles(axes, subject, position)
-    _draw_robot(axes, subject)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.autoscale_view()
-    axes.set_xlabel("$x$ (m)")
-    axes.set_ylabel("$y$ (m)")
-    return coloured
-
-
-def _draw_tube(axes: Axes, tube: Tube) -> None:
-    """Draw a tube from above, cut open along its axis: the bore, and the wall around it."""
-    for surface in cut_open(tube, UP, BORE_RGBA, WALL_RGBA, station=tube.length):
-        colour, zorder = (BORE, 1) if surface.rgba == BORE_RGBA else (GREY, 2)
-        polygons = [corners[:, :2] for faces in surface.faces for corners in surface.corners[faces]]
-        axes.add_collection(
-            PolyCollection(polygons, fc=colour, ec=colour, linewidths=0.2, zorder=zorder)
-        )
-
-
-def _draw_obstacles(axes: Axes, subject: Subject, position: Array) -> None:
-    """Draw what the scene has besides tubes; what is near the path widens the view."""
-    around = np.concatenate([[subject.flight.scene.spawn], position])
-    low, high = around.min(axis=0) - NEAR, around.max(axis=0) + NEAR
+def _draw_obstacles(axes: Axes, subject: Subject, sides: tuple[int, int]) -> None:
+    """Draw outlines of tubes and other bodies; what is near the path widens the view."""
+    shown = _shown(subject)
+    low, high = shown.min(axis=0) - NEAR, shown.max(axis=0) + NEAR
     top = high[2] - NEAR + subject.shapes.size / 2
-    for surface in own_bodies(subject):
-        corners = surface.corners
+    tubes = subject.flight.scene.tubes
+    bodies = [(tube.name, _corners(tube), BORE) for tube in tubes]
+    known = {tube.name for tube in tubes}
+    others = [each for each in subject.shapes.scene if each.body not in known]
+    bodies += [(each.body, each.corners, LIGHT) for each in others]
+    for name, corners, colour in bodies:
         if (corners.min(axis=0) <= high).all() and (corners.max(axis=0) >= low).all():
-            axes.update_datalim(np.clip(corners, low, high)[:, :2])
-        is_above = corners[:, 2].min() > top
-        colour = BLACK if surface.body == subject.touch else LIGHT
-        if is_above or surface.convex:
-            look = {"fc": "none", "ls": "--"} if is_above else {"fc": colour}
-            hull = outline(corners[:, :2])
-            axes.add_patch(Polygon(hull, closed=True, ec=GREY, lw=0.6, zorder=1.5, **look))
-            continue
-        polygons = corners[surface.triangles][:, :, :2]
-        axes.add_collection(
-            PolyCollection(
-                list(polygons),
-                fc=colour,
-                ec=colour,
-                linewidths=0.2,
-                rasterized=len(polygons) > POLYGONS_MAX,
-                zorder=1.2,
-            ),
-            autolim=False,
-        )
+            axes.update_datalim(np.clip(corners, low, high)[:, sides])
+        is_above = sides == (0, 1) and corners[:, 2].min() > top
+        look: dict[str, Any] = {"fc": "none" if is_above else colour, "alpha": 0.7}
+        look |= {"ls": "--" if is_above else "-", "ec": BLACK if name == subject.touch else GREY}
+        axes.add_patch(Polygon(outline(corners[:, sides]), lw=0.8, zorder=1.5, **look))
 
 
-def _draw_robot(axes: Axes, subject: Subject) -> None:
-    """Draw the robot from above at its last pose."""
+def _corners(tube: Tube) -> Array:
+    """Return points on both ends of a tube [m], world frame, shape (n, 3)."""
+    return np.concatenate([rim.corners for rim in rims(tube, (0.0, 0.0, 0.0, 1.0))])
+
+
+def _draw_robot(axes: Axes, subject: Subject, sides: tuple[int, int]) -> None:
+    """Draw the robot at its last pose."""
     truth = subject.flight.truth
     if not len(truth["stamp_ns"]):
         return
     position, axes_of = truth["position"][-1], rotation(truth["orientation_wxyz"][-1])
     for surface in subject.shapes.robot:
-        hull = outline(surface.placed(position, axes_of).corners[:, :2])
-        axes.add_patch(Polygon(hull, closed=True, fc=SKY, ec="none", alpha=0.5, zorder=2.5))
+        hull = outline(surface.placed(position, axes_of).corners[:, sides])
+        axes.add_patch(Polygon(hull, fc=SKY, ec="none", alpha=0.5, zorder=2.5))
 
 
-def _draw_side(axes: Axes, subject: Subject, flown: Array, position: Array) -> None:
-    for tube, begin, end in _passages(subject, flown, position):
-        low, high = tube.centre[2] - tube.inner, tube.centre[2] + tube.inner
-        axes.fill_between([begin, end], low, high, color=BORE, lw=0, zorder=1)
-        axes.hlines([low, high], begin, end, color=GREY, lw=1.5, zorder=2)
-    axes.axhline(subject.flight.scene.floor, color=BLACK, lw=0.8)
-    _draw_path(axes, subject, flown, position[:, 2])
-    axes.margins(y=0.12)
-    axes.set_ylabel("$z$ (m)")
-
-
-def _passages(subject: Subject, flown: Array, position: Array) -> list[tuple[Tube, float, float]]:
-    """List each flight through a tube: the tube, and the distance flown to entry and exit [m]."""
-    inside = tube_index(subject.flight.scene, position)
-    changes = np.flatnonzero(np.diff(inside, prepend=-1, append=-1))
-    return [
-        (subject.flight.scene.tubes[inside[first]], float(flown[first]), float(flown[last - 1]))
-        for first, last in pairwise(changes)
-        if inside[first] >= 0
-    ]
-
-
-def _draw_clearance(axes: Axes, subject: Subject, flown: Array, position: Array) -> None:
-    axes.set_ylabel("clearance (m)")
+def _draw_clearance(axes: Axes, subject: Subject) -> None:
+    """Draw the clearance over the distance moved, and mark the least one that counts."""
     flight, clearance = subject.flight, subject.flight.clearance
-    for _, begin, end in _passages(subject, flown, position):
-        axes.axvspan(begin, end, color=BORE, lw=0, zorder=0)
-    _draw_path(axes, subject, flown, clearance)
+    steps = np.linalg.norm(np.diff(flight.truth["position"], axis=0), axis=1)
+    moved = np.concatenate([[0.0], np.cumsum(steps)])
+    _draw_path(axes, subject, np.stack([moved, clearance], axis=1))
     axes.set_ylim(min(0.0, float(clearance.min())), CEILING)
-    axes.set_xlim(0.0, max(float(flown[-1]), 1e-3))
-    rows = flight.inside if flight.scene.tubes else np.ones(len(clearance), dtype=bool)
-    if rows.any():
-        row = np.where(rows, clearance, np.inf).argmin()
-        lowest = flown[row], clearance[row]
-        if lowest[1] < CEILING:
-            axes.plot(*lowest, "o", ms=4, mfc="none", mec=VERMILION, zorder=6)
-            free_label(axes, f"{lowest[1]:.3f} m", lowest, color=VERMILION)
+    axes.set_xlim(0.0, max(float(moved[-1]), 1e-3))
+    axes.set_xlabel("distance moved (m)")
+    axes.set_ylabel("clearance (m)")
+    counts = flight.inside if flight.scene.tubes else np.ones(len(clearance), dtype=bool)
+    if counts.any():
+        row = np.where(counts, clearance, np.inf).argmin()
+        look: dict[str, Any] = {"ms": 4, "mfc": "none", "mec": VERMILION, "ls": "none", "zorder": 6}
+        place = moved[row], clearance[row]
+        axes.plot(*place, "o", label=f"least: {clearance[row]:.3f} m", **look)
+        legend_above(axes, 1)
+
+
+def outline(points: Array) -> Array:
+    """Return the convex hull of `points` [m] in a plane, shape (n, 2), counter-clockwise."""
+    ordered = np.unique(points, axis=0).tolist()
+    if len(ordered) < 3:
+        return np.array(ordered).reshape(-1, 2)
+    halves = []
+    for line in (ordered, ordered[::-1]):
+        hull: list[list[float]] = []
+        for point in line:
+            while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0.0:
+                hull.pop()
+            hull.append(point)
+        halves.append(hull[:-1])
+    return np.array(halves[0] + halves[1])
+
+
+def _turn(a: list[float], b: list[float], c: list[float]) -> float:
+    """Return twice the area of a triangle, positive if counter-clockwise."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cloudrc.config.schema import DirectionConfig
-from cloudrc.geometry.shapes import Shapes, Surface
+from cloudrc.geometry.shapes import Shapes
 from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Array
 
@@ -128,25 +128,11 @@ def broken(values: Array, behind: Array) -> Array:
     return np.insert(values, behind, np.nan, axis=0)
 
 
-def sampled(count: int, behind: Array) -> tuple[Array, Array]:
+def sampled(count: int, behind: Array) -> Array:
     """Choose 20 of the 100 points per second of a path: it looks smooth, and the file is smaller.
 
     `count` is the number of points. `behind` are the rows behind holes [row numbers], shape (m,).
-    Return the chosen rows, and for each pair of neighbours whether a line joins them: not across a
-    hole.
+    Return the chosen rows, among them both sides of each hole.
     """
     every = [*range(0, count, 5), *range(count)[-1:]]
-    rows = np.unique(np.array([*every, *(behind - 1), *behind], dtype=int))
-    return rows, ~np.isin(rows[1:], behind)
-
-
-def own_bodies(subject: Subject) -> list[Surface]:
-    """Return the surfaces of a scene that are not those of tubes: the file gives their shape."""
-    tubes = {tube.name for tube in subject.flight.scene.tubes}
-    return [surface for surface in subject.shapes.scene if surface.body not in tubes]
-
-
-def distance_moved(path: Array) -> Array:
-    """Return the distance along a path [m], shape (n, 3), up to each of its points [m]."""
-    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    return np.concatenate([np.zeros(min(len(path), 1)), np.cumsum(steps)])
+    return np.unique(np.array([*every, *(behind - 1), *behind], dtype=int))
