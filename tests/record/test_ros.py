@@ -39,6 +39,21 @@ def test_rows_are_converted_to_the_conventions_of_ros():
     assert (xyz(twist.linear), xyz(twist.angular)) == ((1.0, 2.0, 3.0), (0.0, 0.0, 0.4))
 
 
+EXAMPLES = {
+    **{"int": -(2**40), "float": 0.1, "bool": True, "string": "é", "vector": (0.1, -2.0, 3.0)},
+    "quaternion": (1.0, 0.0, 0.0, 0.0),
+}
+
+
+@pytest.mark.parametrize("topic", TOPICS.values(), ids=lambda topic: topic.name)
+def test_a_message_has_the_bytes_that_rosbags_writes(topic):
+    row = (2_500_000_001, *[EXAMPLES[field.kind] for field in topic.fields])
+    data = encode(topic, row)
+    message = STORE.deserialize_cdr(data, topic.ros_type)
+    assert bytes(STORE.serialize_cdr(message, topic.ros_type)) == data
+    assert decode(topic, data) == row
+
+
 @pytest.mark.parametrize("ros_type", sorted({topic.ros_type for topic in TOPICS.values()}))
 def test_a_definition_stands_on_its_own(ros_type):
     text = definition(ros_type)
