@@ -73,7 +73,7 @@ def folder(tmp_path_factory):
     return path
 
 
-PROGRESS = re.compile(r"((reads|writes|flies) .*\n)*")
+PROGRESS = re.compile(r"([a-z]+s .*\n)*")
 """What a quick command says on a busy machine."""
 
 
