@@ -72,7 +72,9 @@ MAY_IMPORT: dict[str, set[str]] = {
         *("assembly", "record", "metrics", "config", "geometry", "link", "files", "console"),
         "world",
     },
-    "console": {"config", "exposition", "geometry", "metrics.definitions", "teleop", "world"},
+    "console": {
+        *("config", "drivers", "exposition", "geometry", "metrics.definitions", "teleop", "world"),
+    },
     "cluster": {"config", "geometry", "link", "record", "report", "teleop"},
     "statistics": set(),
     "runs": {
@@ -124,7 +126,9 @@ RESERVED: dict[str, tuple[str, ...]] = {
         *("config/", "link/", "cli/", "teleop/", "runs/", "report/folder"),
         *("drivers/process", "faults/schedule"),
     ),
-    **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("teleop/api", "teleop/auth")),
+    "fastapi": ("teleop/api", "teleop/auth"),
+    "starlette": ("console/access", "console/door", "teleop/api", "teleop/auth"),
+    "uvicorn": ("console/door", "teleop/api", "teleop/auth"),
     "fcntl": (
         "drivers/local",
         "console/serve",
@@ -151,7 +155,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "multiprocessing": ("drivers/", "runs/workers"),
     "concurrent": ("cli/", "runs/workers", "cluster/", "teleop/", "policy/serve"),
     **dict.fromkeys(("secrets", "uuid"), ("console/", "drivers/", "cluster/", "cli/")),
-    "websockets": ("console/handed", "policy/"),
+    "websockets": ("console/door", "policy/"),
     "msgpack": ("policy/codec",),
     **dict.fromkeys(ROS, ("bridges/ros2/",)),
     **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),
@@ -160,7 +164,6 @@ RESERVED: dict[str, tuple[str, ...]] = {
 ASKED_AS = {
     "yaml": "pyyaml",
     **dict.fromkeys(("pydantic_core", "annotated_types"), "pydantic"),
-    "starlette": "fastapi",
     "urllib3": "kubernetes",
     "foxglove": "foxglove_sdk",
 }

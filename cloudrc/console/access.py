@@ -11,8 +11,11 @@ from __future__ import annotations
 import hmac
 import re
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
 from hashlib import sha256
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from starlette.requests import HTTPConnection
 
 LOCAL_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]{1,5})?")
 """The console's own address. The port is free: a tunnel may forward another one."""
@@ -20,48 +23,6 @@ ORIGIN = re.compile(r"https?://([a-z0-9.-]+|\[[0-9a-f:.]+\])(:[0-9]{1,5})?")
 """An origin as browsers write it: lower case, no path, no slash at the end."""
 PARAMETER = "token"
 """Parameter of the address that has the token."""
-_NAME = re.compile(r"[!#$%&'*+.^_`|~0-9A-Za-z-]+")
-_FIRST_LINE = re.compile(rf"({_NAME.pattern}) (/[!->@-~]*)(?:\?([!-~]*))? HTTP/1\.1")
-_LINE = re.compile(r"[\t -~\x80-\xff]*")
-
-
-@dataclass(frozen=True)
-class PageRequest:
-    """The head of an HTTP request."""
-
-    method: str
-    path: str
-    query: str  # of the address, without "?"
-    headers: tuple[tuple[str, str], ...]  # name in lower case, value
-
-    def values(self, name: str) -> list[str]:
-        """Return the values of all headers with this name, in lower case."""
-        return [value for key, value in self.headers if key == name]
-
-    @property
-    def is_websocket(self) -> bool:
-        """Whether the client asks for a WebSocket."""
-        return [value.lower() for value in self.values("upgrade")] == ["websocket"]
-
-
-def parse_head(head: bytes) -> PageRequest:
-    """Parse the head of an HTTP request, without the empty line at its end.
-
-    Raises:
-        ValueError: If it is not valid, or older than HTTP/1.1.
-    """
-    first, *lines = head.decode("latin-1").split("\r\n")
-    found = _FIRST_LINE.fullmatch(first)
-    if found is None:
-        raise ValueError("no request")
-    method, path, query = found.groups(default="")
-    headers = []
-    for line in lines:
-        name, colon, value = line.partition(":")
-        if not (colon and _NAME.fullmatch(name) and _LINE.fullmatch(value)):
-            raise ValueError("no request: a line is not a header")
-        headers.append((name.lower(), value.strip("\t ")))
-    return PageRequest(method, path, query, tuple(headers))
 
 
 class Access:
@@ -76,9 +37,9 @@ class Access:
         self.token, self.origins = token, frozenset(origins)
         self._hosts = {origin.partition("://")[2] for origin in origins}
 
-    def is_own_page(self, request: PageRequest) -> bool:
+    def is_own_page(self, request: HTTPConnection) -> bool:
         """Return whether the request comes from the console's page or from no page at all."""
-        hosts, origins = request.values("host"), request.values("origin")
+        hosts, origins = (request.headers.getlist(name) for name in ("host", "origin"))
         if len(hosts) != 1 or len(origins) > 1:
             return False
         host = hosts[0]
@@ -88,31 +49,28 @@ class Access:
         own = {f"http://{host}"} if is_local else set()
         return not origins or origins[0] in own | self.origins
 
-    def has_token(self, request: PageRequest) -> bool:
+    def has_token(self, request: HTTPConnection) -> bool:
         """Return whether the address has the token, or has none and the cookie has it."""
-        given = self.given_tokens(request) or self._cookies(request)
+        query = request.scope["query_string"].decode("latin-1").split("&")
+        given = _values(query, PARAMETER)
+        if not given:
+            cookies = ";".join(request.headers.getlist("cookie")).split(";")
+            given = _values([each.strip(" ") for each in cookies], self.cookie)
         return bool(given) and all(self._is_token(each) for each in given)
-
-    def given_tokens(self, request: PageRequest) -> list[str]:
-        """Return the tokens in the request's address, as they are written there."""
-        pairs = (part.partition("=") for part in request.query.split("&"))
-        return [value for name, _, value in pairs if name == PARAMETER]
 
     @property
     def cookie(self) -> str:
         """The name of the cookie. It differs between consoles: cookies ignore the port."""
         return f"cloudrc-{sha256(self.token().encode()).hexdigest()[:12]}"
 
-    def _cookies(self, request: PageRequest) -> list[str]:
-        pairs = (
-            part.strip(" ").partition("=")
-            for line in request.values("cookie")
-            for part in line.split(";")
-        )
-        return [value for name, _, value in pairs if name == self.cookie]
-
     def _is_token(self, given: str) -> bool:
         return hmac.compare_digest(given.encode(), self.token().encode())
+
+
+def _values(pairs: list[str], name: str) -> list[str]:
+    """Return the values with this name of all pairs NAME=VALUE, as they are written."""
+    parts = (pair.partition("=") for pair in pairs)
+    return [value for key, _, value in parts if key == name]
 
 
 def page_token(secret: str) -> str:

@@ -12,14 +12,25 @@ import html
 import json
 import socket
 import threading
-from collections.abc import Callable, Mapping
-from contextlib import suppress
-from http import HTTPStatus
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from cloudrc.console.access import PARAMETER, Access, PageRequest, parse_head
-from cloudrc.console.handed import HandedSockets
+import uvicorn
+import websockets.asyncio.server
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
+from starlette.types import Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from cloudrc.console.access import PARAMETER, Access
+from cloudrc.drivers.local import socket_folder
 from cloudrc.errors import BadInputError, CloudrcError
 
 PAGES_MAX = 50
@@ -27,11 +38,13 @@ PAGES_MAX = 50
 HEAD_MAX = 16_384
 """Size limit of a request's head [bytes]."""
 HEAD_TIME = 10.0
-"""Time limit for a browser to send a request and to take the answer [s]."""
-LOOK_PERIOD = 0.02
-"""Time between two looks at a request that has arrived in part [s]."""
-WAITING_MAX = 512
-"""Largest number of connections that wait for the door."""
+"""Time limit for a browser to send its first request [s]."""
+MESSAGE_MAX = 1 << 20
+"""Size limit of a message from a browser [bytes]."""
+COPIED_MAX = 1 << 16
+"""Largest number of bytes that are copied at once."""
+STOP_LIMIT = 1
+"""Time limit for open pages to end with the door [s]."""
 NO_TOKEN = (
     "This address lacks the console's token, or has an old one. "
     "Open the address that 'cloudrc console' has printed."
@@ -40,32 +53,15 @@ FOREIGN = (
     "This address is not the console's own. If a proxy of yours serves it, "
     "start the console with --allow-origin and this origin."
 )
+HEADERS = [
+    ("Cache-Control", "no-store"),
+    ("Referrer-Policy", "no-referrer"),
+    ("X-Content-Type-Options", "nosniff"),
+    ("X-Frame-Options", "SAMEORIGIN"),
+]
+"""Headers of every answer."""
 WEB = Path(__file__).parent / "web"
 """Folder of the pages' parts."""
-
-
-class PageAnswer(NamedTuple):
-    """An HTTP answer."""
-
-    status: HTTPStatus
-    body: bytes = b""
-    kind: str = "text/plain; charset=utf-8"
-    headers: tuple[tuple[str, str], ...] = ()
-
-    def encode(self) -> bytes:
-        """Return the bytes to send."""
-        lines = [f"HTTP/1.1 {self.status.value} {self.status.phrase}"]
-        lines += [f"{name}: {value}" for name, value in self.headers]
-        lines += [
-            f"Content-Type: {self.kind}",
-            f"Content-Length: {len(self.body)}",
-            "Connection: close",
-            "Cache-Control: no-store",
-            "Referrer-Policy: no-referrer",
-            "X-Content-Type-Options: nosniff",
-            "X-Frame-Options: SAMEORIGIN",
-        ]
-        return "\r\n".join([*lines, "", ""]).encode("latin-1") + self.body
 
 
 class Desk(NamedTuple):
@@ -77,11 +73,38 @@ class Desk(NamedTuple):
     has_pilot: Callable[[], bool]  # whether a page with the scene steers
 
 
-class Door:
+class _Protocol(H11Protocol):
+    """HTTP of a browser, which has to send its first request within `HEAD_TIME`."""
+
+    def __init__(self, door: Door, **settings: Any) -> None:
+        super().__init__(**settings)
+        self._door = door
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self.loop.call_later(HEAD_TIME, self._end_if_silent)
+
+    def _end_if_silent(self) -> None:
+        request: object = self.cycle
+        if request is None and self.transport.get_protocol() is self:
+            self.transport.abort()
+
+    def _should_upgrade(self) -> bool:
+        return self._door.gives_scene_to(HTTPConnection(dict(self.scope)))
+
+    def handle_websocket_upgrade(self, event: Any) -> None:
+        """Pass the connection on to viser, with the head of its request."""
+        self.connections.discard(self)
+        lines = [b"%b %b HTTP/1.1" % (event.method, event.target)]
+        lines += [b"%b: %b" % header for header in event.headers]
+        self._passing = self._door.pass_on(self.transport, b"\r\n".join([*lines, b"", b""]))
+
+
+class Door(uvicorn.Server):
     """The console's server at 127.0.0.1."""
 
     def __init__(self, port: int, access: Access, desk: Desk, scene: str) -> None:
-        """Open the port (0: any free one); answer after `start`.
+        """Open the port (0: any free one); answer after `open`.
 
         Args:
             port: TCP port.
@@ -93,156 +116,91 @@ class Door:
             BadInputError: If the port cannot be opened.
         """
         try:
-            self._socket = socket.create_server(("127.0.0.1", port), backlog=WAITING_MAX)
+            opened = socket.create_server(("127.0.0.1", port), backlog=512)
         except OSError as error:
             why = "is in use" if error.errno == errno.EADDRINUSE else str(error.strerror)
             raise BadInputError(f"--port {port}: {why}; name another port, or none") from None
-        self._socket.setblocking(False)
-        self.address: tuple[str, int] = self._socket.getsockname()
-        self.pages = HandedSockets(self.address)
-        self._access, self._desk = access, desk
-        self._scene = scene
-        self._open = 0  # connections that viser serves
-        self._counting = threading.Lock()
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._run, name="door", daemon=True)
+        # The new socket names its protocol: only then does asyncio disable Nagle's algorithm.
+        self._socket = socket.socket(fileno=opened.detach())
+        self.port: int = self._socket.getsockname()[1]
+        self._folder = TemporaryDirectory(prefix="cloudrc-", dir=socket_folder())
+        self.viser = f"{self._folder.name}/viser.sock"  # only this user may enter its folder
+        self._access, self._desk, self._scene = access, desk, scene
+        self._open = 0  # pages that have the scene
+        self._routes = Starlette(
+            routes=[
+                Route("/{name:path}", self._show, methods=["GET"]),
+                Route("/{name:path}", self._act, methods=["POST"]),
+            ]
+        )
+        super().__init__(
+            uvicorn.Config(
+                self._check,
+                http=partial(_Protocol, self),  # type: ignore[arg-type]
+                ws="none",
+                interface="asgi3",
+                lifespan="off",
+                log_level="critical",
+                access_log=False,
+                headers=HEADERS,
+                server_header=False,
+                proxy_headers=False,
+                h11_max_incomplete_event_size=HEAD_MAX,
+                timeout_graceful_shutdown=STOP_LIMIT,
+            )
+        )
+        self._thread = threading.Thread(target=self.run, args=([self._socket],), daemon=True)
 
-    def start(self) -> None:
+    def open(self) -> None:
         """Begin to answer."""
         self._thread.start()
 
     def close(self) -> None:
         """Stop to answer."""
+        self.should_exit = True
         if self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._work.cancel)
             self._thread.join()
-        self._loop.close()
         self._socket.close()
+        self._folder.cleanup()
 
-    def count_out(self) -> None:
-        """Count a page as ended that viser has served."""
-        with self._counting:
-            self._open -= 1
+    async def _check(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request of the own page with the token; refuse all others unread."""
+        answer = self._refusal(HTTPConnection(scope)) or self._routes
+        await answer(scope, receive, send)
 
-    def _count_in(self) -> bool:
-        with self._counting:
-            if self._open >= PAGES_MAX:
-                return False
-            self._open += 1
-            return True
-
-    def _run(self) -> None:
-        self._work = self._loop.create_task(self._accept())
-        with suppress(asyncio.CancelledError):
-            self._loop.run_until_complete(self._work)
-        for task in asyncio.all_tasks(self._loop):
-            task.cancel()
-        self._loop.run_until_complete(self._loop.shutdown_default_executor())
-
-    async def _accept(self) -> None:
-        tasks = set()
-        while True:
-            try:
-                connection, _ = await self._loop.sock_accept(self._socket)
-            except OSError:  # this process has no free file descriptor now
-                await asyncio.sleep(LOOK_PERIOD)
-                continue
-            task = self._loop.create_task(self._serve(connection))
-            tasks.add(task)
-            task.add_done_callback(tasks.discard)
-
-    async def _serve(self, connection: socket.socket) -> None:
-        """Answer one request, or pass its connection on to viser."""
+    def _refusal(self, request: HTTPConnection) -> Response | None:
+        """Return the answer to a request that is refused; None if it is admitted."""
         try:
-            async with asyncio.timeout(HEAD_TIME):
-                head = await self._look(connection)
-                answer = await self._answer(head)
-                if answer is None:
-                    self.pages.hand(connection)
-                    return
-                await self._loop.sock_recv(connection, len(head) + 4)
-                await self._loop.sock_sendall(connection, answer.encode())
-                connection.shutdown(socket.SHUT_WR)
-                while await self._loop.sock_recv(connection, HEAD_MAX):
-                    pass  # what the browser still sends would reset the connection
-        except (OSError, TimeoutError, asyncio.CancelledError):
-            pass
-        connection.close()
-
-    async def _look(self, connection: socket.socket) -> bytes:
-        """Return the head of the request (b"" if too long), and leave it in the socket, for viser.
-
-        Raise a ConnectionError if the browser goes away before its end.
-        """
-        connection.setblocking(False)
-        while True:
-            await self._until_readable(connection)
-            seen = connection.recv(HEAD_MAX, socket.MSG_PEEK)
-            head, end, _ = seen.partition(b"\r\n\r\n")
-            if end or len(seen) == HEAD_MAX:
-                return head if end else b""
-            if not seen:
-                raise ConnectionResetError
-            await asyncio.sleep(LOOK_PERIOD)  # the part of the request is readable all the time
-
-    async def _until_readable(self, connection: socket.socket) -> None:
-        readable = asyncio.Event()
-        self._loop.add_reader(connection, readable.set)
-        try:
-            await readable.wait()
-        finally:
-            self._loop.remove_reader(connection)
-
-    async def _answer(self, head: bytes) -> PageAnswer | None:
-        """Answer a request; return None if viser shall."""
-        try:
-            request = parse_head(head)
-        except ValueError:
-            return PageAnswer(HTTPStatus.BAD_REQUEST)
-        if not self._access.is_own_page(request):
-            return PageAnswer(HTTPStatus.FORBIDDEN, FOREIGN.encode())
-        try:
-            if not self._access.has_token(request):
-                return PageAnswer(HTTPStatus.FORBIDDEN, NO_TOKEN.encode())
+            if not self._access.is_own_page(request):
+                return PlainTextResponse(FOREIGN, 403)
+            return None if self._access.has_token(request) else PlainTextResponse(NO_TOKEN, 403)
         except CloudrcError as error:  # the file with the token cannot be read now
-            return PageAnswer(HTTPStatus.SERVICE_UNAVAILABLE, str(error).encode())
-        return await self._admit(request)
+            return PlainTextResponse(str(error), 503)
 
-    async def _admit(self, request: PageRequest) -> PageAnswer | None:
-        """Answer a checked request; return None if viser shall."""
-        if request.method == "POST":
-            return await self._act(request.path.removeprefix("/"))
-        if request.method != "GET":
-            return PageAnswer(HTTPStatus.METHOD_NOT_ALLOWED)
-        if request.is_websocket:
-            is_free = self._count_in()
-            return None if is_free else PageAnswer(HTTPStatus.SERVICE_UNAVAILABLE)
-        if self._access.given_tokens(request):
+    async def _show(self, request: Request) -> Response:
+        name = request.path_params["name"]
+        if "upgrade" in request.headers:
+            return Response(status_code=503)  # no place for one more scene
+        if PARAMETER in request.query_params:
             return self._keep_token(request)
-        return self._page(request.path)
+        if name == "state":
+            return JSONResponse(self._state())
+        if name == "plain" or (name == "" and self._open >= PAGES_MAX):
+            return HTMLResponse(plain_page(self._state()["lines"]))
+        return HTMLResponse(self._scene) if name == "" else Response(status_code=404)
 
-    def _keep_token(self, request: PageRequest) -> PageAnswer:
+    def _keep_token(self, request: Request) -> Response:
         """Move the token from the address to a cookie.
 
         The cookie has no path: the browser takes that of the page, also behind a proxy.
         """
-        parts = [p for p in request.query.split("&") if p.partition("=")[0] != PARAMETER]
-        name = request.path.rpartition("/")[2]
-        target = f"./{name}" + (f"?{'&'.join(parts)}" if parts else "")
-        cookie = f"{self._access.cookie}={self._access.token()}; HttpOnly; SameSite=Lax"
-        headers = (("Location", target), ("Set-Cookie", cookie))
-        return PageAnswer(HTTPStatus.SEE_OTHER, headers=headers)
-
-    def _page(self, path: str) -> PageAnswer:
-        if path == "/state":
-            return PageAnswer(HTTPStatus.OK, json.dumps(self._state()).encode(), "application/json")
-        if path == "/plain" or (path == "/" and self._open >= PAGES_MAX):
-            text = plain_page(self._state()["lines"])
-        elif path == "/":
-            text = self._scene
-        else:
-            return PageAnswer(HTTPStatus.NOT_FOUND)
-        return PageAnswer(HTTPStatus.OK, text.encode(), "text/html; charset=utf-8")
+        target = request.url.remove_query_params(PARAMETER)
+        name = target.path.rpartition("/")[2]
+        location = f"./{name}" + (f"?{target.query}" if target.query else "")
+        answer = Response(status_code=303, headers={"Location": location})
+        token = self._access.token()
+        answer.set_cookie(self._access.cookie, token, path=None, httponly=True, samesite="lax")
+        return answer
 
     def _state(self) -> dict[str, Any]:
         """Return the state, the buttons of the plain page, and whether all scenes are taken."""
@@ -252,17 +210,84 @@ class Door:
         lines += self._desk.describe()
         return {"lines": lines, "acts": acts, "is_full": self._open >= PAGES_MAX}
 
-    async def _act(self, name: str) -> PageAnswer:
+    async def _act(self, request: Request) -> Response:
         """Carry out what a page asks for."""
+        name = request.path_params["name"]
         if name == "stop":
             if self._desk.stop():
-                return PageAnswer(HTTPStatus.ACCEPTED, b"switching the robot off")
-            return PageAnswer(HTTPStatus.SERVICE_UNAVAILABLE, b"the console starts; ask again")
+                return PlainTextResponse("switching the robot off", 202)
+            return PlainTextResponse("the console starts; ask again", 503)
         if (act := self._desk.acts.get(name)) is None:
-            return PageAnswer(HTTPStatus.NOT_FOUND)
+            return Response(status_code=404)
         if self._desk.has_pilot():
-            return PageAnswer(HTTPStatus.CONFLICT, b"another browser steers")
-        return PageAnswer(HTTPStatus.OK, (await asyncio.to_thread(act)).encode())
+            return PlainTextResponse("another browser steers", 409)
+        return PlainTextResponse(await run_in_threadpool(act))
+
+    def gives_scene_to(self, request: HTTPConnection) -> bool:
+        """Return whether viser may serve a request: an admitted page opens its WebSocket."""
+        asked = request.scope["method"], request.headers.get("upgrade", "").lower()
+        is_free = self._open < PAGES_MAX
+        return asked == ("GET", "websocket") and is_free and self._refusal(request) is None
+
+    def pass_on(self, page: asyncio.Transport, head: bytes) -> asyncio.Task[None]:
+        """Let viser serve the connection of a page from now on; `head` begins its request."""
+        loop = asyncio.get_running_loop()
+        reader = asyncio.StreamReader()
+        protocol = asyncio.StreamReaderProtocol(reader)
+        protocol.connection_made(page)
+        page.set_protocol(protocol)
+        self._open += 1
+        return loop.create_task(
+            self._pass_on(reader, asyncio.StreamWriter(page, protocol, reader, loop), head)
+        )
+
+    async def _pass_on(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, head: bytes
+    ) -> None:
+        with suppress(OSError), closing(writer):
+            from_viser, to_viser = await asyncio.open_unix_connection(self.viser)
+            with closing(to_viser):
+                to_viser.write(head)
+                ways = _copy(reader, to_viser), _copy(from_viser, writer)
+                tasks = [asyncio.create_task(way) for way in ways]
+                await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+                for task in tasks:
+                    task.cancel()
+        self._open -= 1
+
+
+async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """Copy what a connection sends until it ends, or until nobody takes it any more."""
+    with suppress(OSError):
+        while data := await reader.read(COPIED_MAX):
+            writer.write(data)
+            await writer.drain()
+
+
+@contextmanager
+def viser_at(path: str) -> Iterator[None]:
+    """Let a viser server that starts in the `with` block listen on the Unix socket `path`.
+
+    viser 1.1.1 opens a TCP port that answers everybody on this machine, and has no setting for
+    this. Therefore the function with which viser opens its port is replaced.
+
+    Raises:
+        RuntimeError: If viser has not used the replaced function.
+    """
+    module, used = websockets.asyncio.server, list[str]()
+    serve = module.serve
+
+    def listen(handler: Any, _host: str, _port: int, **settings: Any) -> Any:
+        used.append(path)
+        return serve(handler, unix=True, path=path, **{**settings, "max_size": MESSAGE_MAX})
+
+    module.serve = listen  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        module.serve = serve  # type: ignore[misc]
+    if not used:
+        raise RuntimeError("viser opens its port in another way: see cloudrc/console/door.py")
 
 
 def scene_page(viser: str, keys: Mapping[str, str]) -> str:

@@ -24,9 +24,8 @@ import viser
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.scene import scene_of
 from cloudrc.console.access import PARAMETER, Access
-from cloudrc.console.door import Desk, Door, scene_page
+from cloudrc.console.door import Desk, Door, scene_page, viser_at
 from cloudrc.console.feed import STALE, FlightFeed
-from cloudrc.console.handed import viser_behind
 from cloudrc.console.steering import SLIDERS, Steering, is_drive
 from cloudrc.geometry.clearance import Array
 from cloudrc.geometry.obstacles import fence_of
@@ -95,8 +94,8 @@ class Page:
         scene = scene_page(viser_page.read_text(encoding="utf-8"), labels)
         self._door = Door(port, self._access, desk, scene)
         rich.get_console().quiet = True  # viser prints about itself
-        with viser_behind(self._door.pages, self._door.count_out):
-            self._server = viser.ViserServer("127.0.0.1", 0, label="cloudrc", verbose=False)
+        with viser_at(self._door.viser):
+            self._server = viser.ViserServer(label="cloudrc", verbose=False)
         self._server.gui.configure_theme(show_share_button=False, show_logo=False)
         self._lock = threading.Lock()
         self._pilot: int | None = None  # the client that has the controls
@@ -105,12 +104,12 @@ class Page:
         self._sliders: dict[str, Any] = {}
         self._target: tuple[Any, Any] | None = None  # gizmo and its numbers, until somebody moves
         self._drawn = 0  # number of drawn points of the trail
-        self._door.start()
+        self._door.open()
 
     @property
     def port(self) -> int:
         """The TCP port of the page."""
-        return self._door.address[1]
+        return self._door.port
 
     @property
     def url(self) -> str:

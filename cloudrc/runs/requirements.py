@@ -13,7 +13,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "report": ("matplotlib",),
     "kube": ("kubernetes",),
     "api": ("fastapi", "uvicorn"),
-    "console": ("viser",),
+    "console": ("starlette", "uvicorn", "viser"),
     "policy": ("msgpack", "websockets"),
     "gym": ("gymnasium",),
     "foxglove": ("foxglove",),

@@ -26,6 +26,8 @@ CAMERA = msgspec.msgpack.encode(
 )
 """What viser's page sends first: from then on it is a client."""
 
+CLOSE = "Connection: close"
+
 
 async def watch_scene(address, opened):
     """Read what viser sends to a page."""
@@ -44,15 +46,17 @@ async def watch_state(address, opened, delay):
     """Ask for the state once a second; the token stands in the cookie."""
     parts = urlsplit(address)
     reader, writer = await asyncio.open_connection(parts.hostname, parts.port)
-    writer.write(f"GET /?{parts.query} HTTP/1.1\r\nHost: {parts.netloc}\r\n\r\n".encode())
+    writer.write(
+        f"GET /?{parts.query} HTTP/1.1\r\nHost: {parts.netloc}\r\n{CLOSE}\r\n\r\n".encode()
+    )
     head = (await reader.read()).decode()
-    cookie = head.partition("Set-Cookie: ")[2].partition(";")[0]
+    cookie = head.partition("set-cookie: ")[2].partition(";")[0]
     writer.close()
     opened()
     await asyncio.sleep(delay)
     while True:
         reader, writer = await asyncio.open_connection(parts.hostname, parts.port)
-        lines = ["GET /state HTTP/1.1", f"Host: {parts.netloc}", f"Cookie: {cookie}", "", ""]
+        lines = ["GET /state HTTP/1.1", f"Host: {parts.netloc}", f"Cookie: {cookie}", CLOSE, "", ""]
         writer.write("\r\n".join(lines).encode())
         await reader.read()
         writer.close()

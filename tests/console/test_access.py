@@ -7,7 +7,7 @@ import pytest
 
 from cloudrc.cli import console
 from cloudrc.config.load import load_experiment
-from cloudrc.console.access import ORIGIN, Access, page_token, parse_head
+from cloudrc.console.access import ORIGIN, Access, page_token
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import Page
 from cloudrc.console.steering import Steering
@@ -191,24 +191,10 @@ def test_the_token_moves_from_the_address_to_a_cookie_of_this_console(served):
     host = f"Host: 127.0.0.1:{page.port}"
     status, head = ask(page, [host], f"/?fixedDpr=0.25&token={TOKEN}")
     assert status == 303
-    assert "Location: ./?fixedDpr=0.25\r\n" in head
-    assert f"Set-Cookie: {page._access.cookie}={TOKEN}; HttpOnly; SameSite=Lax\r\n" in head
-    assert "Path=" not in head, "behind a proxy, the browser takes the path of the page"
+    assert "location: ./?fixedDpr=0.25\r\n" in head
+    assert f"set-cookie: {page._access.cookie}={TOKEN}; HttpOnly; SameSite=lax" in head
+    assert "path=" not in head.lower(), "behind a proxy, the browser takes the path of the page"
     assert Access(lambda: TOKEN[::-1]).cookie != page._access.cookie
-
-
-@pytest.mark.parametrize(
-    "head",
-    [
-        *("", "GET /", "GET / HTTP/1.0", "GET / HTTP/2", "GET  / HTTP/1.1", "GET x HTTP/1.1"),
-        *("GET / HTTP/1.1\r\nHost", "GET / HTTP/1.1\r\n a: b", "GET / HTTP/1.1\r\na\nb: c"),
-        *("GET / HTTP/1.1\r\na: b\nHost: c", "GET / HTTP/1.1\r\na: b\x00", "GET /\xe9 HTTP/1.1"),
-        "G(T / HTTP/1.1",
-    ],
-)
-def test_a_request_that_is_not_valid_is_refused(head):
-    with pytest.raises(ValueError, match="no request"):
-        parse_head(head.encode("latin-1"))
 
 
 @pytest.mark.parametrize(
