@@ -120,12 +120,12 @@ ODOM_ALT = "Line plots of the position per axis over time: reference, measured, 
 ODOM = (
     "Position per axis, as cloud knew it. Reference: the setpoint that the controller tracks. "
     "Measured: the newest odometry that had arrived. Estimated: the prediction from which the "
-    "command was computed. At the right, the largest step of the reference is enlarged."
+    "command was computed. The panel at the right enlarges the largest step of the reference."
 )
 ZOOM, BEFORE = 1.2, 0.1
 """Duration of the part that is enlarged, and how long before the step it begins [s]."""
 STEP_MIN = 0.2
-"""Smallest step of the reference that is enlarged, and least height of that panel [m]."""
+"""Smallest step of the reference that is enlarged [m]."""
 LINES: dict[str, dict[str, Any]] = {
     "setpoint": {
         **{"label": "reference", "color": style.REFERENCE},
@@ -140,30 +140,30 @@ LINES: dict[str, dict[str, Any]] = {
 def draw_odom(subject: Subject) -> Figure:
     """Draw reference, measured and estimated position, one panel per axis.
 
-    In a wide figure, a second column enlarges the largest step of the reference.
+    In a wide figure, a panel at the right enlarges the largest step of the reference.
     """
     names = "xy" if subject.shapes.planar else "xyz"
-    begin = _largest_step(subject, len(names)) if subject.look.width >= style.NARROW else None
-    ratios = (1.0,) if begin is None else (4.0, 1.0)
+    step = _largest_step(subject, len(names)) if subject.look.width >= style.NARROW else None
     figure = new_figure(1.4 * len(names), subject.look.width)
-    columns = figure.subplots(
-        len(names), len(ratios), sharex="col", squeeze=False, width_ratios=ratios
-    ).T
-    rows = columns[0]
+    mosaic: list[Any] = [[name, "step"] if step else [name] for name in names]
+    panels = figure.subplot_mosaic(mosaic, width_ratios=(4.0, 1.2) if step else None)
+    rows = [panels[name] for name in names]
     for index, (axes, name) in enumerate(zip(rows, names, strict=True)):
         panel(axes, "abc"[index])
         _draw_position(axes, subject, index)
         mark_events(axes, subject)
         axes.set_ylabel(f"${name}$ (m)")
         axes.margins(y=0.12)
-        if begin is not None:
-            _draw_step(columns[1][index], subject, index, begin)
+    for axes in rows[:-1]:
+        axes.sharex(rows[-1])
+        axes.tick_params(labelbottom=False)
     _time_axis(rows[-1], subject)
-    if begin is not None:
-        columns[1][0].set_title("largest step", loc="left")
-        columns[1][-1].set_xlabel("time (s)")
     legend_above(rows[0], 3)
     figure.align_ylabels(rows)
+    if step:
+        index, begin = step
+        panel(panels["step"], "abcd"[len(names)], f"step of ${names[index]}$ (m)")
+        _draw_step(panels["step"], subject, index, begin)
     return figure
 
 
@@ -174,16 +174,17 @@ def _draw_position(axes: Axes, subject: Subject, index: int) -> None:
         axes.plot(time, broken(subject.flight.control[column][:, index], behind), **look)
 
 
-def _largest_step(subject: Subject, count: int) -> float | None:
-    """Return when the part that is enlarged begins [s]; None if the reference has no step.
+def _largest_step(subject: Subject, count: int) -> tuple[int, float] | None:
+    """Find the largest step of the reference along the first `count` axes of the world.
 
-    `count` is the number of axes that are drawn.
+    Return its axis, and when the part that is enlarged begins [s]; None if there is no step.
     """
     control = subject.flight.control
-    jumps = np.abs(np.diff(control["setpoint"][:, :count], axis=0)).max(axis=1, initial=0.0)
+    jumps = np.abs(np.diff(control["setpoint"][:, :count], axis=0))
     if jumps.max(initial=0.0) <= STEP_MIN:
         return None
-    return float(subject.flight.seconds(control["stamp_ns"][jumps.argmax() + 1])) - BEFORE
+    row, index = divmod(int(jumps.argmax()), count)
+    return index, float(subject.flight.seconds(control["stamp_ns"][row + 1])) - BEFORE
 
 
 def _draw_step(axes: Axes, subject: Subject, index: int, begin: float) -> None:
@@ -193,9 +194,10 @@ def _draw_step(axes: Axes, subject: Subject, index: int, begin: float) -> None:
     time = subject.flight.seconds(control["stamp_ns"])
     inside = (time >= begin) & (time <= begin + ZOOM)
     shown = np.concatenate([control[name][inside, index] for name in ("measured", "position")])
-    middle, half = (shown.max() + shown.min()) / 2, max(np.ptp(shown), STEP_MIN) * 0.6
-    axes.set(xlim=(begin, begin + ZOOM), ylim=(middle - half, middle + half))
-    axes.locator_params(nbins=4)
+    room = 0.1 * np.ptp(shown) + 1e-3
+    axes.set(xlim=(begin, begin + ZOOM), ylim=(shown.min() - room, shown.max() + room))
+    axes.locator_params(nbins=4, axis="x")
+    axes.set_xlabel("time (s)")
 
 
 ERROR_ALT = "Two line plots over time: distance to the setpoint, and the error of the estimate."
