@@ -285,15 +285,19 @@ def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask:
     world = _connect(witness, episode, setup, len(chunk), policy)
     witness.digest = sha256()
     observation, info = world.reset(seed=episode.seed)
-    times, dt = _times(setup), world.dt
+    is_measured = isinstance(setup.compute, tuple) and setup.compute[0] == MEASURED
+    if isinstance(setup.compute, tuple) and setup.compute[0] == FILE:
+        times = read_times(str(setup.compute[1]))
+        world.compute = lambda tick: times[(episode.seed + tick) % len(times)]
+    dt = world.dt
     total, steps, stale, ended = 0.0, 0, 0, "limit"
     jumps, before, basis, success = list[float](), None, -1.0, None
     while steps < setup.max_steps and ended == "limit":
         about = info["cloudrc"]
         if about["asked"] and steps:
             chunk = policy(observation, about.get("prefix", []))
-        seen = steps - round(about["observation_age"] / dt)
-        world.compute = times(episode.seed + seen, policy.duration)
+        if is_measured:
+            world.compute = policy.duration
         observation, reward, terminated, truncated, info = world.step(chunk)
         steps, total = steps + 1, total + reward
         about = info["cloudrc"]
@@ -342,16 +346,6 @@ def _connect(
     )
 
 
-def _times(setup: EvalSetup) -> Callable[[int, float], float | None]:
-    """Return a function that returns the time for an answer [s], by its number and duration [s]."""
-    if isinstance(setup.compute, tuple) and setup.compute[0] == MEASURED:
-        return lambda number, duration: duration
-    if isinstance(setup.compute, tuple) and setup.compute[0] == FILE:
-        times = read_times(str(setup.compute[1]))
-        return lambda number, duration: times[number % len(times)]
-    return lambda number, duration: None
-
-
 def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
     """Return whether the task was done in any step so far; None if the info never told."""
     for key in SUCCESS:
@@ -384,7 +378,8 @@ def check_environment(setup: EvalSetup, episodes: list[Episode]) -> CheckedEnvir
         code = environment_code(env, setup)
         step = find_step(env, setup.dt, mean_compute(setup.compute))
         for executor in dict.fromkeys(each.executor for each in episodes):
-            _Network(env, dt=setup.dt, chunk=1, executor=executor)
+            wait = setup.answer_within
+            _Network(env, dt=setup.dt, chunk=1, executor=executor, answer_within=wait)
     if not setup.is_remote:
         _load(setup.policy)
     return CheckedEnvironment(step, code)

@@ -93,9 +93,12 @@ def survivals(groups: Groups) -> list[dict[str, Any]]:
     for identifying the maximum safe dose", 2001.
     """
     base, found = _seeds(groups[BASELINE][None]), list[dict[str, Any]]()
+    too_few = tail(0, len(base)) >= LEVEL
     for executor, conditions in groups.items():
         each: dict[str, Any] = {"executor": executor, "of": len(base)}
-        text = f"{executor} survives no round trip that was asked"
+        text = f"{executor} is not shown to survive a round trip that was asked"
+        if too_few:
+            text += f": {len(base)} successes without a network are too few to show it"
         for rtt, rows in conditions.items():
             kept = len(base & _seeds(rows))
             each |= {"tried_ms": rtt, "kept": kept, "p": tail(len(base) - kept, len(base))}
@@ -159,9 +162,10 @@ def judge(rows: Sequence[Row], before: Sequence[Row] = (), name: str = "") -> di
         for executor, at in groups.items()
         for rtt, some in at.items()
     ]
-    survival, tests = survivals(groups), compare_conditions(groups, group(before), name)
+    tests, survival = compare_conditions(groups, group(before), name), []
     notes = [NOTHING]
     if outcomes[0].get("successes"):
+        survival = survivals(groups)
         notes = [SURVIVES, *(each["text"] for each in survival)]
     intervals = [key for each in outcomes for key in each if key.endswith("_low")]
     count = len(intervals) + sum(len(each.keys() & {"success", "return"}) for each in tests)

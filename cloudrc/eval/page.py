@@ -24,7 +24,8 @@ CAPTION = (
     "action. Dashed: without a network. Success: share, with the 95 % interval of Clopper and "
     "Pearson. Return and length: median, with its 95 % interval from 6 episodes on. Age: mean over "
     "the steps, up to the mean of the episodes' p99. All conditions have the same seeds, so that "
-    "they meet the same environments and networks."
+    "they meet the same environments and networks. A condition without any answer has no age: "
+    "it is in the table alone."
 )
 PANELS = (
     ("success", "%", "success", "success_low", "success_high"),

@@ -29,7 +29,10 @@ SEEDLESS = (
     "if it takes a seed, add --env-arg 'seed={seed}'"
 )
 """Warning about an environment that does not follow the seed of its reset."""
-PAIRED = ("env", "env_args", "env_code", "link", "success_at", "dt", "max_steps", "code")
+PAIRED = (
+    *("env", "env_args", "env_code", "link", "success_at", "dt", "max_steps", "code"),
+    *("answer_within", "observation_bytes"),
+)
 """What two evaluations must share for a comparison of their policies."""
 LEGEND = (
     "loop: time from an observation to its action; ended: terminated/truncated/by --max-steps; "

@@ -18,7 +18,7 @@ one answer: of the questions that begin in one tick, the newest counts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from math import ceil, inf, nan
@@ -110,7 +110,8 @@ class RemoteLoop:
 
     Attributes:
         seen: The newest observation that the policy has taken, and the environment's info about it.
-        compute: Time for the next answers [s], in place of that of the settings; None: the latter.
+        compute: Time for the next answers [s], or a function that returns it for the tick of an
+            observation; None: that of the settings.
     """
 
     def __init__(self, settings: Settings, executor: Executor, stream: str = "") -> None:
@@ -123,7 +124,7 @@ class RemoteLoop:
         self._stream, self._episode = stream, -1
         self._within_ns = round(settings.answer_within * 1e9)
         self._late: int | None = None
-        self.compute: float | None = None
+        self.compute: float | Callable[[int], float] | None = None
         self.seen: list[Any] = [None, {}]
 
     def begin(self, seed: int | None, observation: Any, info: Mapping[str, Any]) -> None:
@@ -223,7 +224,8 @@ class RemoteLoop:
     def _time_to_compute(self) -> int:
         """Return how long the policy computes the answer to its newest observation [ns]."""
         if self.compute is not None:
-            return round(self.compute * 1e9)
+            time = self.compute(self._seen_tick) if callable(self.compute) else self.compute
+            return round(time * 1e9)
         mean, deviation = self._settings.compute
         if not deviation:
             return round(mean * 1e9)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from math import inf
 from typing import Any, Unpack
 
@@ -100,13 +101,18 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.world_info: dict[str, Any] = {}
 
     @property
-    def compute(self) -> float | None:
-        """Time for the next answers [s], for whoever measures it; None: as the argument says."""
+    def compute(self) -> float | Callable[[int], float] | None:
+        """Time for the next answers [s], for whoever measures it; None: as the argument says.
+
+        It may be a function that returns the time for the observation of a tick.
+        """
         return self._loop.compute
 
     @compute.setter
-    def compute(self, time: float | None) -> None:
-        self._loop.compute = None if time is None else compute_times((time, 0.0))[0]
+    def compute(self, time: float | Callable[[int], float] | None) -> None:
+        if time is not None and not callable(time):
+            time, _ = compute_times((time, 0.0))
+        self._loop.compute = time
 
     def summary(self, deadline: float | None = None) -> dict[str, Any]:
         """Return what `info["cloudrc"]["episode"]` has, also before the end of an episode.

@@ -6,6 +6,7 @@ import dis
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from math import isnan, log10, nan, remainder
+from types import CodeType
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -132,13 +133,17 @@ def _repeats(wrapper: Any) -> bool:
     It does so once if it names a number of repetitions or skipped frames that is 1.
     """
     named = [each for name, each in vars(wrapper).items() if "skip" in name or "repeat" in name]
-    return 1 not in named and any(map(_loops, type(wrapper).__mro__))
+    if any(type(each) is int and each == 1 for each in named):
+        return False
+    steps = [getattr(vars(kind).get("step"), "__code__", None) for kind in type(wrapper).__mro__]
+    return any(_loops(code) for code in steps if code)
 
 
-def _loops(kind: type) -> bool:
-    """Return whether the function `step` of a class calls a `step` in a loop."""
-    code = getattr(vars(kind).get("step"), "__code__", None)
-    found = [*dis.get_instructions(code)] if code else []
+def _loops(code: CodeType) -> bool:
+    """Return whether code, or a comprehension in it, calls a `step` in a loop."""
+    if any(_loops(each) for each in code.co_consts if isinstance(each, CodeType)):
+        return True
+    found = [*dis.get_instructions(code)]
     calls = [each.offset for each in found if each.argval == "step"]
     jumps = [each for each in found if "JUMP" in each.opname]
     return any(jump.argval <= call <= jump.offset for jump in jumps for call in calls)

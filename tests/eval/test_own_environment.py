@@ -94,7 +94,7 @@ def test_an_environment_may_be_a_file_here_or_beside_the_policy(
     (Path(place) / f"{module}_sizes.py").touch()
     line = f"eval --env {env} --policy laws/law.py --seeds 2 --jobs 2"
     assert main(line.split()) == 0
-    assert "4 episodes, step 0.05 s (control_hz of My)" in capsys.readouterr().out
+    assert "4 episodes, step 0.05 s (control_hz of My)" in capsys.readouterr().err
     (folder,) = (each for each in Path("runs").iterdir() if not each.is_symlink())
     assert ":" not in folder.name
     told = json.loads((folder / "eval.json").read_text())

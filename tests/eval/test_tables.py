@@ -67,6 +67,8 @@ def test_two_policies_are_compared_in_pairs_and_other_conditions_are_refused(law
     assert str(tmp_path / "a") in capsys.readouterr().out
     assert run(*versus, "--out", tmp_path / "c", *words, "--link", "lte") == 2
     assert "a: differs in link; " in capsys.readouterr().err
+    assert run(*versus, "--out", tmp_path / "c", *words, "--answer-within", 0.02) == 2
+    assert "a: differs in answer_within; " in capsys.readouterr().err
     assert not (tmp_path / "c").exists()
 
 

@@ -47,6 +47,10 @@ class Setup(NamedTuple):
     wait: float | None = None  # None: 5 % of a step
     start: Any = "answer"
     uses_prefix: bool = False
+    times: tuple[float, ...] = ()  # of computing, by the tick of the observation, in turn
+
+    def compute_ns(self, tick):
+        return round((self.times[tick % len(self.times)] if self.times else self.compute) * 1e9)
 
     @property
     def dt(self):
@@ -115,7 +119,7 @@ def simulate(env, setup, seed, answer, neutral, exact=False):
     """Play an episode by the rule; `exact`: all questions of a tick are answered."""
     ways = links(setup.link)
     up, down = (OneWay(way, SEED, is_up) for way, is_up in zip(ways, (True, False), strict=True))
-    number, compute_ns, late = (seed + 1) * EPISODES, round(setup.compute * 1e9), ticks_late(setup)
+    number, late = (seed + 1) * EPISODES, ticks_late(setup)
     observations, executed = [env.reset(seed=seed)[0]], neutral
     at_policy, taken, free = {0: 0}, -1, 0  # arrivals [ns] of observations not yet taken
     flying, got, sent, asked, basis = [], [], {}, 0, None
@@ -142,7 +146,7 @@ def simulate(env, setup, seed, answer, neutral, exact=False):
             begin = max(min(at_policy.values()), free)
             taken = max(each for each, arrival in at_policy.items() if arrival <= begin)
             at_policy = {each: at for each, at in at_policy.items() if each > taken}
-            free = begin + compute_ns
+            free = begin + setup.compute_ns(taken)
             questions.append((taken, free))
         rows.append([taken, bool(questions), None, None])
         if is_over:
@@ -270,7 +274,7 @@ def make(setup, steps):
 
 def networked(setup, steps):
     """Return the environment behind the link."""
-    return Networked(
+    env = Networked(
         make(setup, steps)[0],
         LINKS[setup.link],
         SEED,
@@ -281,6 +285,9 @@ def networked(setup, steps):
         **({} if setup.wait is None else {"answer_within": setup.wait}),
         **BYTES,
     )
+    if setup.times:
+        env.compute = lambda tick: setup.times[tick % len(setup.times)]
+    return env
 
 
 def measure(env, setup, seed, answer, idle):
@@ -382,6 +389,18 @@ def averages(episodes):
         ),
         np.mean([each["loop_age"] for each in means]),
     ]
+
+
+@pytest.mark.parametrize("link", ["uniform, loss", "lte"])
+@pytest.mark.parametrize("times", [(0.02, 0.15), (0.0, 0.06, 0.03, 0.2)])
+def test_each_answer_takes_its_own_time(link, times):
+    """The time of the last answer once decided which observation the policy took next."""
+    setup = Setup("Pendulum-v1", link, "newest", None, times=times)
+    bare, neutral = make(setup, 100)
+    env, answer = networked(setup, 100), policy(setup)
+    for seed in range(5):
+        expected = simulate(bare, setup, seed, answer, neutral)
+        assert_equal(measure(env, setup, seed, answer, neutral), expected)
 
 
 OFTEN = ("one action", 0.0), ("prefix, used", 0.008)

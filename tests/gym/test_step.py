@@ -92,6 +92,19 @@ class Heir(Repeat):
         return super().step(-action)
 
 
+class Listing(gymnasium.Wrapper):
+    """Repeats in a comprehension, and says something else."""
+
+    skip_noops = True
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.skip_noops = True
+
+    def step(self, action):
+        return [self.env.step(action) for _ in range(4)][-1]
+
+
 class Once(Repeat):
     """Repeats once, and says so."""
 
@@ -107,6 +120,7 @@ class Once(Repeat):
         lambda env: TimeLimit(MaxAndSkipObservation(env, 2), 10),
         lambda env: Repeat(env, 3),
         lambda env: Heir(env, 3),
+        Listing,
     ],
 )
 def test_a_wrapper_that_makes_several_steps_of_one_is_refused_and_dt_decides(repeat):
