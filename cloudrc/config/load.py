@@ -206,6 +206,7 @@ def load_experiment(
         _inline_mission(document)
     with _collect(found, ("link", "profile")):
         _inline_profile(document)
+    _take_contact(document)
     overrides.apply_overrides(document, inner)
     _default(document, ("guard", "plan_max_s"), _plan_max(document))
     for key in overrides.KINDS:
@@ -416,6 +417,18 @@ def _keep_setpoints(document: Document, changes: Settings) -> None:
     has_touch = any(path[:2] == ("mission", "touch") for path in changes)
     for key in ("waypoints", "steps", "carrot", *([] if has_touch else ["touch"])):
         document.tree["mission"].pop(key, None)
+
+
+def _take_contact(document: Document) -> None:
+    """Let `contact: false` of the criteria mean that the mission touches nothing.
+
+    Experiments of before the first release have it.
+    """
+    criteria, mission = document.get("criteria"), document.get("mission")
+    if isinstance(criteria, dict) and criteria.get("contact") is False:
+        del criteria["contact"]
+        if isinstance(mission, dict):
+            mission["touch"] = None
 
 
 def _inline_profile(document: Document) -> None:

@@ -95,6 +95,11 @@ def test_a_profile_sets_and_another_resets_the_limits_of_cloud(tmp_path):
     [
         ("paper", [], BOARD),
         ("paper", ["mission=hover"], None),
+        (
+            "paper",
+            ["criteria.contact=false", "mission.waypoints=[{position_m: [0.5, 0, 0.7]}]"],
+            None,
+        ),
         ("hover", ["world.scene=pillars", "mission.touch.body=pillar_1"], ("pillar_1", 0.25)),
         ("paper", ["mission.setpoints=drive.csv"], None),
     ],
