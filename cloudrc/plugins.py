@@ -29,7 +29,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, entry_points, packages_distributions, version
 from importlib.util import find_spec
 from numbers import Real
 from pathlib import Path
@@ -47,6 +47,7 @@ from cloudrc.errors import (
 )
 from cloudrc.patience import telling_if_slow
 from cloudrc.plugin_file import INSTALLED, PREFIX, load_file
+from cloudrc.text import unknown_name_text
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -514,18 +515,6 @@ def _suggest_file(path: Path) -> str:
     return ""
 
 
-def unknown_name_text(what: str, name: str, available: list[str]) -> str:
-    """Return an error text for an unknown name: all known names, and the most similar name."""
-    known = ", ".join(available) or "none"
-    return f"no {what} named {name!r}; available: {known}{suggest_name(name, available)}"
-
-
-def suggest_name(name: str, available: list[str]) -> str:
-    """Return a suggestion of the most similar name, to append to an error text; or "" if none."""
-    near = difflib.get_close_matches(name, available, n=1)
-    return f"; did you mean {near[0]}?" if near else ""
-
-
 def builder(kind: str, name: str, *, look: bool = True) -> Callable[..., Any]:
     """Return the function `build` of a plug-in, to `look` at it or to call it.
 
@@ -558,6 +547,16 @@ def _module_of(path: Path) -> str | None:
 
 def _installed(kind: str) -> dict[str, EntryPoint]:
     return _entries(kind, tuple(sys.path))
+
+
+def versions_of(top: str) -> list[str]:
+    """Return names and versions of the packages that have installed a top-level package."""
+    return [f"{name} {version(name)}" for name in sorted({*_distributions().get(top, ())})]
+
+
+@cache
+def _distributions() -> Mapping[str, list[str]]:
+    return packages_distributions()
 
 
 @cache  # the search takes milliseconds, which every flight of a sweep would pay

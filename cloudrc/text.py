@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import io
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -121,3 +122,15 @@ def csv_table(rows: Sequence[Mapping[str, Any]]) -> str:
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue().rstrip("\n")
+
+
+def unknown_name_text(what: str, name: str, available: list[str]) -> str:
+    """Return an error text for an unknown name: all known names, and the most similar name."""
+    known = ", ".join(available) or "none"
+    return f"no {what} named {name!r}; available: {known}{suggest_name(name, available)}"
+
+
+def suggest_name(name: str, available: list[str]) -> str:
+    """Return a suggestion of the most similar name, to append to an error text; or "" if none."""
+    near = difflib.get_close_matches(name, available, n=1)
+    return f"; did you mean {near[0]}?" if near else ""

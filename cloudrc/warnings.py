@@ -100,7 +100,7 @@ def _low_rates(experiment: ResolvedExperiment) -> Iterator[str]:
 def _late(ways: Mapping[str, DirectionProfile]) -> Iterator[str]:
     """Yield a warning if delays are the reason why no command arrives in the simulated time."""
     from cloudrc.ages import DURATION_NS
-    from cloudrc.config.schema import COMMAND_AGE_MS
+    from cloudrc.config.profile import COMMAND_AGE_MS
     from cloudrc.link.profile import Timeline
 
     parts, total = list[str](), 0.0
@@ -298,7 +298,7 @@ def _long_link(
     which cloud computed the command that the robot follows. `echoes` has the age of the newest
     command that telemetry has confirmed.
     """
-    from cloudrc.config.schema import CLOUD_TIME_MAX, COMMAND_AGE_MS
+    from cloudrc.config.profile import CLOUD_TIME_MAX, COMMAND_AGE_MS
 
     age_max, cloud = experiment.guard.command_age_max_ms * 1e-3, experiment.cloud
     mean, longest = sum(ages) / len(ages), max(ages)

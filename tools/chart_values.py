@@ -16,7 +16,8 @@ import yaml
 from pydantic import TypeAdapter
 from pydantic.json_schema import models_json_schema
 
-from cloudrc.config.schema import Experiment, MissionConfig, Profile, RosNamespace
+from cloudrc.config.profile import Profile
+from cloudrc.config.schema import Experiment, MissionConfig, RosNamespace
 
 Schema: TypeAlias = dict[str, Any]
 Path: TypeAlias = tuple[str, ...]

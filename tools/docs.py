@@ -25,8 +25,9 @@ from pydantic import BaseModel
 from cloudrc import plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.overrides import KINDS, default_parameters
+from cloudrc.config.profile import DirectionConfig, Profile
 from cloudrc.config.robot import find_robot
-from cloudrc.config.schema import DirectionConfig, Experiment, MissionConfig, Profile
+from cloudrc.config.schema import Experiment, MissionConfig
 from cloudrc.exposition.table import METRICS, ROLES
 from cloudrc.record.topics import TOPICS
 from tools.chart_values import make_schema, table_rows

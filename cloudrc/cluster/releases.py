@@ -99,7 +99,8 @@ def _link(files: dict[str, str]) -> str:
 
     `files` are those of the release's ConfigMaps with the experiment and the link.
     """
-    from cloudrc.config.load import DIRECTIONS, load_link
+    from cloudrc.config.load import load_link
+    from cloudrc.config.profile import DIRECTIONS
 
     with as_files(files) as folder:
         try:

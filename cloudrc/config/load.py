@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from math import inf, sqrt
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,23 +32,30 @@ from cloudrc.config.hull import hull_of
 from cloudrc.config.mission_check import UNREACHED, check_mission, check_reach, check_scene
 from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import ConfigProblem
+from cloudrc.config.profile import (
+    DIRECTIONS,
+    ChangeConfig,
+    CloudTime,
+    CommandAge,
+    DirectionConfig,
+    Profile,
+    check_file,
+    check_profile,
+    load_profile,
+    resolve_files,
+)
 from cloudrc.config.reuse import reuse, reuse_results
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, known_robot, parameters
 from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import (
     SPEED_MPS,
     Acceleration,
-    ChangeConfig,
     Cloud,
-    CloudTime,
-    CommandAge,
-    DirectionConfig,
     Experiment,
     GuardConfig,
     MissionConfig,
     PlanMax,
     PlugIn,
-    Profile,
     Speed,
     World,
 )
@@ -57,7 +64,7 @@ from cloudrc.geometry.clearance import NO_SIZE
 from cloudrc.geometry.obstacles import fence_of, known
 from cloudrc.geometry.scene import Scene
 from cloudrc.link.doubts import describe_heavy_loss
-from cloudrc.link.traces import read_table, read_trace
+from cloudrc.link.traces import read_trace
 from cloudrc.rounding import format_limit
 
 HORIZON_MAX_S = 1.0
@@ -70,11 +77,8 @@ Source: docs/reference/plant.md, "Command age"."""
 PLAN_MAX_S = 0.8
 """Default of guard.plan_max_s if cloud sends plans [s].
 Source: docs/reference/plant.md, "Plan"."""
-DIRECTIONS = ("uplink", "downlink")
 _PROFILE_KEYS = {("link",), ("link", "profile")}
 """If a setting gives one of these keys, it replaces the whole link profile."""
-FILE_READERS: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
-"""Key whose value is the path of a data file -> function that reads and checks the file."""
 
 
 class Bounds(NamedTuple):
@@ -202,9 +206,9 @@ def load_experiment(
     for key in ("world", "guard", "link", "cloud", "report"):
         _default(document, (key,), {})
     found: list[ConfigProblem] = []
-    with _collect(found, ("mission",)):
+    with problems.collect(found, ("mission",)):
         _inline_mission(document)
-    with _collect(found, ("link", "profile")):
+    with problems.collect(found, ("link", "profile")):
         _inline_profile(document)
     _take_contact(document)
     overrides.apply_overrides(document, inner)
@@ -235,7 +239,7 @@ def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> Res
     mission = experiment.mission
     scene = scene_of(experiment.world)
     robot, found = known_robot(experiment.world.robot), list[ConfigProblem]()
-    with _collect(found, ("world", "tuning")):
+    with problems.collect(found, ("world", "tuning")):
         parameters(robot, experiment.world)
     found += _without_effect(document, experiment)
     mission = put_on_ground(mission, scene) if robot.planar else mission
@@ -312,11 +316,6 @@ def read_experiment(
     return load_experiment(name, settings, build=False, flown=flown)
 
 
-def load_profile(name: str | Path) -> Profile:
-    """Load a link profile by name or path; raises BadInputError."""
-    return check_profile(shipped.read("profile", str(name), Path()), str(name))
-
-
 def load_link(file: Path, experiment: Path) -> Profile:
     """Load the link that a `file` of the chart asks for; raises BadInputError.
 
@@ -336,16 +335,11 @@ def _link_of(document: Document, name: str) -> Profile:
     """Return the link of an experiment, whose other parts are not looked at."""
     document.tree = {"link": document.get("link") or {}}
     found: list[ConfigProblem] = []
-    with _collect(found, ("link", "profile")):
+    with problems.collect(found, ("link", "profile")):
         _inline_profile(document)
     found += _resolve_paths(document)
     link = problems.validate(document, Experiment, name, found).link
     return Profile(uplink=link.uplink, downlink=link.downlink)
-
-
-def check_profile(document: Document, name: str) -> Profile:
-    """Convert a document to a link profile; raises BadInputError about all its problems."""
-    return problems.validate(document, Profile, name, _resolve_paths(document))
 
 
 def dump(experiment: ResolvedExperiment) -> str:
@@ -388,15 +382,6 @@ def _is_inside_name(path: KeyPath) -> bool:
 def _default(document: Document, path: KeyPath, value: Any) -> None:
     if document.get(*path) is None and isinstance(document.get(*path[:-1]), dict):
         document.set_value(path, value, document.source(path))
-
-
-@contextmanager
-def _collect(found: list[ConfigProblem], path: KeyPath) -> Iterator[None]:
-    """Turn a BadInputError of the `with` block into a problem at `path`, and add it to `found`."""
-    try:
-        yield
-    except BadInputError as error:
-        found.append(ConfigProblem(path, "", str(error)))
 
 
 def _inline_mission(document: Document) -> None:
@@ -532,7 +517,7 @@ def _bounds(document: Document, found: list[ConfigProblem]) -> Bounds:
         with suppress(BadInputError):
             limits = known_robot(world.robot).guard
         if ("world", "scene") not in [problem.path for problem in found]:
-            with _collect(found, ("world", "scene")):
+            with problems.collect(found, ("world", "scene")):
                 scene = scene_of(world)
                 if scene.own_fence or known(scene) or not document.get("guard", "speed_max_mps"):
                     room = fence_of(scene).room(scene.spawn)
@@ -563,11 +548,11 @@ def _remove_derived(document: Document, *, new_profile: bool) -> None:
 
 
 def _resolve_paths(document: Document) -> list[ConfigProblem]:
-    """Make all paths in an experiment or profile absolute, and check the files; return problems."""
-    found: list[ConfigProblem] = []
+    """Make all paths in an experiment absolute, and check the files; return problems."""
+    found = resolve_files(document, ("link",))
     for path in _places_of_files(document):
         name, key, source = document.get(*path), path[-1], document.source(path)
-        with _collect(found, path):
+        with problems.collect(found, path):
             if not isinstance(name, str) or (key.isdecimal() and not plugins.is_path(name)):
                 continue
             if key in ("robot", "scene"):
@@ -576,24 +561,17 @@ def _resolve_paths(document: Document) -> list[ConfigProblem]:
                     known_robot(name)
             else:
                 name = str(source.absolute(name))
-                _check_file(key, name)
+                check_file(key, name)
             document.set_value(path, name, source)
     return found
 
 
 def _places_of_files(document: Document) -> list[KeyPath]:
-    """Return the paths of all keys that may name a file."""
-    ways = [(*above, way) for above in ((), ("link",)) for way in DIRECTIONS]
-    paths: list[KeyPath] = [(*way, key) for way in ways for key in ("trace", "table")]
-    paths += [("mission", "setpoints"), ("world", "robot"), ("world", "scene")]
+    """Return the paths of all keys that may name a file, but those of the link."""
+    paths: list[KeyPath] = [("mission", "setpoints"), ("world", "robot"), ("world", "scene")]
     metrics = document.get("report", "metrics")
     count = len(metrics) if isinstance(metrics, list) else 0
     return paths + [("report", "metrics", str(index)) for index in range(count)]
-
-
-def _check_file(key: str, path: str) -> None:
-    """Read a data file, or raise an error; a large trace takes long, so read it once a sweep."""
-    reuse(("file", key, path), lambda: bool(FILE_READERS.get(key, Path)(Path(path))))
 
 
 CHANGEABLE_KEYS = ChangeConfig.model_fields.keys() - {"at_s"}

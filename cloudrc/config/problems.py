@@ -9,6 +9,7 @@ import difflib
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import is_dataclass
 from pathlib import Path
 from types import NoneType
@@ -37,6 +38,15 @@ INVALID = "is not valid"
 """Expectation at a key that is not in the schema, or whose type has no words here."""
 _LISTED = 50
 """Largest number of problems in one error message."""
+
+
+@contextmanager
+def collect(found: list[ConfigProblem], path: KeyPath) -> Iterator[None]:
+    """Turn a BadInputError of the `with` block into a problem at `path`, and add it to `found`."""
+    try:
+        yield
+    except BadInputError as error:
+        found.append(ConfigProblem(path, "", str(error)))
 
 
 def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPath, FieldInfo]]:

@@ -27,13 +27,14 @@ from cloudrc.config.schema import (
     NotNegatives,
     Parameters,
     PlugIn,
-    Section,
     Speed,
     World,
 )
+from cloudrc.config.section import Section
 from cloudrc.errors import BadInputError
 from cloudrc.messages import SENSORS_MAX
-from cloudrc.plugins import is_path, unknown_name_text
+from cloudrc.plugins import is_path
+from cloudrc.text import unknown_name_text
 
 Braking = Annotated[float, Field(ge=0.1, le=10)]
 Hull = Annotated[float, Field(gt=0, le=10)]

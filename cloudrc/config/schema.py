@@ -1,4 +1,4 @@
-"""Define every key of experiments, missions and link profiles, with its unit, range and default.
+"""Define every key of experiments and missions, with its unit, range and default.
 
 The name of a key ends with its unit (`delay_ms`); `cloudrc/assembly.py` and `cloudrc/link/` convert
 the values to SI units. Unknown keys are refused. The defaults are the control scheme and the gains
@@ -8,16 +8,11 @@ loading the file.
 
 from __future__ import annotations
 
-import ast
-import inspect
-from dataclasses import is_dataclass
-from itertools import pairwise
 from pathlib import PurePath
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
     ConfigDict,
     Discriminator,
@@ -27,14 +22,9 @@ from pydantic import (
     model_validator,
 )
 
+from cloudrc.config.profile import CloudTime, CommandAge, DirectionConfig
+from cloudrc.config.section import Section
 from cloudrc.geometry.fence import Corners, order_of
-from cloudrc.link.profile import (
-    Blackout,
-    Change,
-    DirectionKeys,
-    GilbertElliott,
-    Probability,
-)
 from cloudrc.link.profile import NotNegative as NotNegative
 from cloudrc.link.profile import Positive as Positive
 from cloudrc.messages import TOUCH_NAME_MAX
@@ -71,16 +61,10 @@ milliseconds."""
 Gain = Annotated[float, Field(gt=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
 # Every limit of the guard has a smallest and a largest value, so that nobody can switch it off.
-COMMAND_AGE_MS = 1, 10_000
-"""Smallest and largest value of guard.command_age_max_ms [ms]."""
-CommandAge = Annotated[float, Field(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1])]
 SPEED_MPS = 0.01, 10.0
 """Smallest and largest value of guard.speed_max_mps [m/s]."""
 Speed = Annotated[float, Field(ge=SPEED_MPS[0], le=SPEED_MPS[1])]
 Acceleration = Annotated[float, Field(ge=0.1, le=100)]
-CLOUD_TIME_MAX = 10
-"""Largest value of cloud.horizon_max_s and of cloud.freeze_after_s [s]."""
-CloudTime = Annotated[float, Field(gt=0, le=CLOUD_TIME_MAX)]
 PlanTime = Annotated[float, Field(ge=0, le=0.8)]
 PlanMax = Annotated[float, Field(ge=0, le=2)]
 HoldTime = Annotated[float, Field(ge=0.1, le=3600)]
@@ -103,117 +87,6 @@ ActuatorFactor = Annotated[
 Offset = Annotated[float, Field(ge=-1, le=1)]
 WindSpeed = Annotated[float, Field(ge=-20, le=20)]
 Bias = Annotated[float, Field(ge=-90, le=90)]
-
-
-def attribute_docstrings(owner: type) -> dict[str, str]:
-    """Return the text below each attribute of a class: name -> text."""
-    body = ast.parse(inspect.getsource(owner)).body[0]
-    assert isinstance(body, ast.ClassDef)
-    return {
-        name.target.id: inspect.cleandoc(text.value.value)
-        for name, text in pairwise(body.body)
-        if isinstance(name, ast.AnnAssign)
-        and isinstance(name.target, ast.Name)
-        and isinstance(text, ast.Expr)
-        and isinstance(text.value, ast.Constant)
-        and isinstance(text.value.value, str)
-    }
-
-
-class Section(BaseModel):
-    """A section of a file: immutable, strictly typed, without unknown keys or infinite numbers."""
-
-    model_config = ConfigDict(
-        extra="forbid",
-        frozen=True,
-        strict=True,
-        allow_inf_nan=False,
-        use_attribute_docstrings=True,
-    )
-
-    @classmethod
-    def __pydantic_init_subclass__(cls, **_: Any) -> None:
-        """Take the texts of keys that the class has from a plain class."""
-        texts: dict[str, str] = {}
-        for base in cls.__mro__:
-            if is_dataclass(base):
-                texts = attribute_docstrings(base) | texts
-        for key, info in cls.model_fields.items():
-            info.description = info.description or texts.get(key)
-        if texts:
-            cls.model_rebuild(force=True)
-
-
-class BurstsConfig(Section, GilbertElliott):
-    """Loss in bursts: a two-state Markov chain that takes one step per packet."""
-
-    @model_validator(mode="after")
-    def _ends(self) -> BurstsConfig:
-        if self.bad_start > 0 and self.bad_end == 0:
-            raise ValueError("bad_end must be above 0 if bad_start is: else a burst never ends")
-        return self
-
-
-def _loss_tag(value: Any) -> str:
-    return "<bursts>" if isinstance(value, dict | GilbertElliott) else "<chance>"
-
-
-LossConfig = Annotated[
-    Annotated[Probability, Tag("<chance>")] | Annotated[BurstsConfig, Tag("<bursts>")],
-    Discriminator(_loss_tag),
-]
-
-
-class BlackoutConfig(Section, Blackout):
-    """An interval in which every packet is lost."""
-
-
-class ChangeConfig(Section, Change):
-    """A change of one direction of the link; a key that is not given keeps its value."""
-
-    loss: LossConfig | None = None
-
-
-class DirectionConfig(Section, DirectionKeys):
-    """Network conditions of one direction. All delays are ONE WAY."""
-
-    loss: LossConfig = 0.0
-    changes: tuple[ChangeConfig, ...] = ()
-    blackouts: tuple[BlackoutConfig, ...] = ()
-
-    @model_validator(mode="after")
-    def _check_table(self) -> DirectionConfig:
-        if self.distribution == "table" and self.table is None:
-            raise ValueError("distribution: table needs the key table: a CSV file of delays")
-        return self
-
-    @field_validator("changes")
-    @classmethod
-    def _check_times_rise(cls, changes: tuple[ChangeConfig, ...]) -> tuple[ChangeConfig, ...]:
-        for index, (before, after) in enumerate(pairwise(changes), start=1):
-            if after.at_s <= before.at_s:
-                raise ValueError(
-                    f"at_s must rise: entry {index} is at {after.at_s:g} s, "
-                    f"the one before at {before.at_s:g} s"
-                )
-        return changes
-
-
-class Profile(Section):
-    """A link profile, such as the files under link/profiles."""
-
-    description: str = ""
-    """One line about the profile, for lists"""
-    uplink: DirectionConfig = DirectionConfig()
-    """Conditions from world to cloud"""
-    downlink: DirectionConfig = DirectionConfig()
-    """Conditions from cloud to world"""
-    command_age_max_ms: CommandAge | None = None
-    """Default of guard.command_age_max_ms with this profile [ms]; null: 250"""
-    horizon_max_s: CloudTime | None = None
-    """Default of cloud.horizon_max_s with this profile [s]; null: 1"""
-    freeze_after_s: CloudTime | None = None
-    """Default of cloud.freeze_after_s with this profile [s]; null: 0.4"""
 
 
 MAX_WAYPOINTS = 10_000

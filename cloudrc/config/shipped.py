@@ -8,7 +8,7 @@ from pathlib import Path
 from cloudrc.config.document import Document, read_document
 from cloudrc.config.reuse import reuse
 from cloudrc.errors import BadInputError
-from cloudrc.plugins import suggest_name, unknown_name_text
+from cloudrc.text import suggest_name, unknown_name_text
 
 _PACKAGE = Path(__file__).parents[1]
 FOLDERS = {

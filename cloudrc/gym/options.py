@@ -20,6 +20,7 @@ from cloudrc.gym.loop import RemoteLoop, Settings
 from cloudrc.gym.values import checker, copied, neutral, size_of
 from cloudrc.gym.watched import WatchedExecutor
 from cloudrc.link.library import LinkProfile, is_whole, read_profile
+from cloudrc.text import suggest_name
 
 Profile: TypeAlias = str | Path | Mapping[str, Any] | LinkProfile
 CHUNK_MAX = 10_000
@@ -53,7 +54,7 @@ def refuse_unknown(
     """Raise a BadInputError if one of the `given` names is none of the `known` arguments."""
     for name in given:
         if name not in known:
-            near = plugins.suggest_name(name, [*known])
+            near = suggest_name(name, [*known])
             there = f"there are {', '.join(known)}{more}{near}"
             raise BadInputError(f"{what} has no argument {name!r}; {there}")
 

@@ -57,7 +57,7 @@ def read_profile(profile: str | Path | Mapping[str, Any] | LinkProfile) -> LinkP
         return profile
     # Here, because a program that makes its profile itself needs neither pydantic nor YAML.
     from cloudrc.config.document import Document, Source
-    from cloudrc.config.load import check_profile, load_profile
+    from cloudrc.config.profile import check_profile, load_profile
     from cloudrc.link.traces import link_profile
 
     if isinstance(profile, Mapping):

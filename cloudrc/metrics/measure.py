@@ -15,6 +15,7 @@ from cloudrc.metrics import control, link, mission, response
 from cloudrc.metrics.flight import SHIPPED, Flight, Metric
 from cloudrc.patience import telling_if_slow
 from cloudrc.record.holes import goes_on
+from cloudrc.text import unknown_name_text
 
 # The imported modules add the metrics of cloudrc to SHIPPED.
 __all__ = ["SHIPPED", "Flight", "Metric", "control", "link", "mission", "response"]
@@ -70,7 +71,7 @@ def find(choice: str, *, look: bool = False) -> Metric:
     known = [*SHIPPED, *plugins.names("metrics")]
     name, is_path = name_of(choice), plugins.is_path(choice)
     if not is_path and name not in known:
-        raise BadInputError(plugins.unknown_name_text("metric", choice, sorted(known)))
+        raise BadInputError(unknown_name_text("metric", choice, sorted(known)))
     if is_path and name in known:
         raise BadInputError(f"metric {choice!r}: {name} is a metric already; rename the file")
     found = plugins.find("metrics", choice, look=look)

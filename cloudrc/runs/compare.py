@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.metrics import SHIPPED
-from cloudrc.plugins import unknown_name_text
 from cloudrc.rounding import differences
 from cloudrc.runs import flight, store
 from cloudrc.runs.experiment import load, refuse_seed
 from cloudrc.runs.flight import Row, counts
 from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.statistics import LEVEL, exact_interval, holm, paired, sign_test
+from cloudrc.text import unknown_name_text
 
 NUMBERS = (
     *("prediction_error_rms", "tracking_error_p95", "iae_mean", "settling_time_mean"),

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 from cloudrc.errors import BadInputError
 from cloudrc.metrics import scale
-from cloudrc.plugins import unknown_name_text
 from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.report.figures.style import Look
 from cloudrc.runs.compare import NUMBERS, check_names
 from cloudrc.runs.flight import Row, counts
 from cloudrc.runs.store import values_of
 from cloudrc.statistics import exact_interval, median_interval
+from cloudrc.text import unknown_name_text
 
 COLUMN = Look(width=3.5)
 """Look of a figure in one column of a page. Source: IEEE conference template."""

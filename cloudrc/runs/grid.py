@@ -25,7 +25,7 @@ from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.config.overrides import Settings, collect_settings
 from cloudrc.config.problems import ConfigProblem, ProblemsError, validate
 from cloudrc.config.reuse import reuse, reuse_results
-from cloudrc.config.schema import Section
+from cloudrc.config.section import Section
 from cloudrc.errors import BadInputError
 from cloudrc.runs.experiment import check_world
 from cloudrc.runs.flight import Row, units

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache, partial
-from importlib.metadata import packages_distributions, version
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -40,15 +39,8 @@ def module_code(module: str) -> str:
     An editable package, whose version stays while its code changes, also has the hash of the
     module's file and of the modules that this file imports.
     """
-    top = module.partition(".")[0]
-    versions = [f"{name} {version(name)}" for name in sorted(_distributions().get(top, ()))]
+    versions = plugins.versions_of(module.partition(".")[0])
     spec = find_spec(module)
     if spec is not None and spec.origin is not None and not is_installed(spec.origin):
         versions.append(hash_of_module(module, Path(spec.origin)))
     return ", ".join(versions)
-
-
-@cache
-def _distributions() -> dict[str, list[str]]:
-    """Return top-level package or module -> the packages that have installed it."""
-    return {top: [*{*names}] for top, names in packages_distributions().items()}

@@ -15,7 +15,8 @@ from cloudrc.ages import simulate_ages
 from cloudrc.config.document import child
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.problems import exceeds, expectation
-from cloudrc.config.schema import COMMAND_AGE_MS, Experiment
+from cloudrc.config.profile import COMMAND_AGE_MS
+from cloudrc.config.schema import Experiment
 from cloudrc.errors import BadInputError
 from cloudrc.robots.build import onboard_values
 

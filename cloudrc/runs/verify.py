@@ -20,8 +20,9 @@ from cloudrc.cluster.client import Release
 from cloudrc.cluster.pods import METRICS, NO_PROXY, find_pod, forwarded
 from cloudrc.config import shipped
 from cloudrc.config.load import ResolvedExperiment, read_experiment
+from cloudrc.config.profile import Profile
 from cloudrc.config.robot import known_robot
-from cloudrc.config.schema import Experiment, Profile
+from cloudrc.config.schema import Experiment
 from cloudrc.drivers.programs import run_tool
 from cloudrc.errors import BadInputError, TimedOutError
 from cloudrc.link.doubts import describe_heavy_loss

@@ -23,7 +23,7 @@ from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
-from cloudrc.config.schema import Section
+from cloudrc.config.section import Section
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.messages import Vector
 from cloudrc.teleop import models

@@ -23,12 +23,12 @@ from cloudrc.config.schema import (
     JudgedBy,
     MissionConfig,
     Place,
-    Section,
     TimeLimit,
     Touch,
     Waypoint,
     Yaw,
 )
+from cloudrc.config.section import Section
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import Spheres
 from cloudrc.geometry.scene import Scene

@@ -10,7 +10,7 @@ import numpy as np
 from cloudrc.config.robot import SensorConfig
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.compiled import mujoco
-from cloudrc.plugins import unknown_name_text
+from cloudrc.text import unknown_name_text
 from cloudrc.world.scene import ROBOT_PREFIX
 
 

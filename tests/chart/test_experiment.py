@@ -3,7 +3,8 @@
 import pytest
 import yaml
 
-from cloudrc.config.load import dump, load_experiment, load_link, load_profile
+from cloudrc.config.load import dump, load_experiment, load_link
+from cloudrc.config.profile import load_profile
 from cloudrc.config.shipped import names
 from tests.chart.conftest import of_kind, render
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.config import shipped
-from cloudrc.config.load import load_profile
+from cloudrc.config.profile import load_profile
 from cloudrc.errors import BadInputError
 from tests.config.conftest import refused
 

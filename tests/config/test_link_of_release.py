@@ -2,7 +2,8 @@
 
 import pytest
 
-from cloudrc.config.load import dump, load_experiment, load_link, load_profile
+from cloudrc.config.load import dump, load_experiment, load_link
+from cloudrc.config.profile import load_profile
 from cloudrc.errors import BadInputError
 
 

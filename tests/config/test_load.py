@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from cloudrc.config import document, shipped
 from cloudrc.config.document import parse_value
-from cloudrc.config.load import dump, fingerprint, load_experiment, load_profile, read_experiment
+from cloudrc.config.load import dump, fingerprint, load_experiment, read_experiment
+from cloudrc.config.profile import load_profile
 from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.obstacles import intangible, without_file

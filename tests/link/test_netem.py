@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloudrc.config.load import load_profile
+from cloudrc.config.profile import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.draws import Purpose, shape, stream_key

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from cloudrc.config.load import load_profile
+from cloudrc.config.profile import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.drivers.programs import Programs
 from cloudrc.errors import MissingPrerequisiteError

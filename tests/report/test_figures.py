@@ -8,7 +8,7 @@ import pytest
 from matplotlib.collections import LineCollection
 
 from cloudrc.config.load import load_experiment
-from cloudrc.config.schema import DirectionConfig
+from cloudrc.config.profile import DirectionConfig
 from cloudrc.geometry.shapes import Shapes, box
 from cloudrc.record.holes import Hole
 from cloudrc.records import Control

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from cloudrc.config.schema import BlackoutConfig, ChangeConfig, DirectionConfig
+from cloudrc.config.profile import BlackoutConfig, ChangeConfig, DirectionConfig
 from cloudrc.messages import GuardState
 from cloudrc.records import GuardChange, LinkChanged
 from cloudrc.report.figures.marks import HELD, bounds, legend, mark_events

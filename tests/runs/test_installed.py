@@ -6,7 +6,6 @@ import pytest
 
 from cloudrc import plugins
 from cloudrc.errors import BadInputError
-from cloudrc.runs import installed
 from cloudrc.runs.grid import pack, read_grid, unpack
 
 PLUG = """from cloudrc.cloud.predictors.last_sample import LastSample
@@ -34,7 +33,7 @@ def install(tmp_path, monkeypatch):
             path = site / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(content)
-        for cached in (plugins._entries, installed._distributions):
+        for cached in (plugins._entries, plugins._distributions):
             cached.cache_clear()  # as in the next command
 
     yield make

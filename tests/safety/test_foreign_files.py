@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from cloudrc import files
-from cloudrc.config.load import load_profile, read_experiment
+from cloudrc.config.load import read_experiment
+from cloudrc.config.profile import load_profile
 from cloudrc.errors import BadInputError
 from cloudrc.files import atomic_file, write_atomically
 from cloudrc.link.traces import read_trace

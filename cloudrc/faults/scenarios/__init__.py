@@ -5,7 +5,7 @@ from __future__ import annotations
 from cloudrc.errors import BadInputError
 from cloudrc.faults.measures import Scenario
 from cloudrc.faults.scenarios import ends, intruder, links
-from cloudrc.plugins import suggest_name
+from cloudrc.text import suggest_name
 
 MODULES = (ends, intruder, links)
 _FOUND = [each for part in MODULES for each in vars(part).values() if isinstance(each, Scenario)]

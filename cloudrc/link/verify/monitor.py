@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from cloudrc.config.schema import Profile
+from cloudrc.config.profile import Profile
 from cloudrc.errors import BadInputError, describe_error
 from cloudrc.link.model import Stream
 from cloudrc.link.profile import DirectionProfile, Timeline, settled

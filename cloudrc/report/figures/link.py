@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cloudrc.config.schema import DirectionConfig
+from cloudrc.config.profile import DirectionConfig
 from cloudrc.metrics.flight import Array
 from cloudrc.report.figures import marks, own_settings, save, style
 from cloudrc.report.figures.style import Look, dots, legend_above, new_figure, panel

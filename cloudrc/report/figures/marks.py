@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
-from cloudrc.config.schema import DirectionConfig
+from cloudrc.config.profile import DirectionConfig
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import Timeline
 from cloudrc.link.traces import link_profile

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cloudrc.config.schema import DirectionConfig
+from cloudrc.config.profile import DirectionConfig
 from cloudrc.geometry.shapes import Shapes
 from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Array

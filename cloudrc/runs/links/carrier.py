@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 
-from cloudrc.config.load import DIRECTIONS
+from cloudrc.config.profile import DIRECTIONS
 from cloudrc.link.exec.relay import TunRelay, TunWay
 from cloudrc.link.exec.verdict import Period
 from cloudrc.link.follow import Loaded

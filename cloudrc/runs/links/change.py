@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.config.document import Document, write_yaml
-from cloudrc.config.load import DIRECTIONS, Edit, edit_profile
+from cloudrc.config.load import Edit, edit_profile
+from cloudrc.config.profile import DIRECTIONS
 from cloudrc.drivers.link_control import ask
 from cloudrc.drivers.local import link_socket
 from cloudrc.errors import BadInputError, TimedOutError

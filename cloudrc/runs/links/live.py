@@ -13,7 +13,8 @@ from functools import partial
 from pathlib import Path
 
 from cloudrc.config.document import write_yaml
-from cloudrc.config.load import DIRECTIONS, Edit, load_profile
+from cloudrc.config.load import Edit
+from cloudrc.config.profile import DIRECTIONS, load_profile
 from cloudrc.drivers.link_control import ControlServer
 from cloudrc.drivers.local import LINK_FOLDER, link_socket
 from cloudrc.files import write_atomically

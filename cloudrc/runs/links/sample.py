@@ -10,8 +10,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import TypeAlias
 
-from cloudrc.config.load import load_profile
-from cloudrc.config.schema import DirectionConfig, Profile
+from cloudrc.config.profile import DirectionConfig, Profile, load_profile
 from cloudrc.errors import BadInputError
 from cloudrc.link.doubts import describe_heavy_loss, describe_trace
 from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers, sample

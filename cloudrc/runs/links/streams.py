@@ -13,7 +13,8 @@ from statistics import quantiles
 from typing import Any
 
 from cloudrc.config.document import Document
-from cloudrc.config.load import DIRECTIONS, edit_profile
+from cloudrc.config.load import edit_profile
+from cloudrc.config.profile import DIRECTIONS
 from cloudrc.drivers.realtime import Address, show_address
 from cloudrc.errors import BadInputError
 from cloudrc.link.follow import Loaded

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from math import copysign, inf, sqrt
 
-from cloudrc.config.schema import COMMAND_AGE_MS
+from cloudrc.config.profile import COMMAND_AGE_MS
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Vector
 

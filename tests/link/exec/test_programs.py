@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloudrc.config.load import load_profile
+from cloudrc.config.profile import load_profile
 from cloudrc.drivers.namespaces import ProgramEnd
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import MissingPrerequisiteError

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cloudrc.config.load import load_profile
+from cloudrc.config.profile import load_profile
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.causes import Findings
