@@ -51,7 +51,7 @@ examples:
   cloudrc run
   cloudrc run paper --mode virtual --set link.profile=satellite
   cloudrc run steps --seeds 10 --set cloud.predictor=last_sample
-  cloudrc run pillars --mode virtual --report none       recording and report.json alone
+  cloudrc run pillars --mode virtual --report none        no report.html
   cloudrc run my.yaml --mode virtual --set cloud.predictor=./my_predictor.py
   cloudrc run --set cloud.controller=remote --with "node controller.js"
   cloudrc run --mode cluster --context kind-cloudrc -n demo --release demo
