@@ -137,14 +137,16 @@ class Release:
     def run(self, *words):
         environ = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
         how = {"cwd": self.folder, "env": environ, "text": True}
-        how |= dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
-        self.all.append(subprocess.Popen([sys.executable, "-m", "cloudrc", *words], **how))
+        command = [sys.executable, "-m", "cloudrc", *words]
+        # A file: teleop logs each command, and nobody reads while it flies.
+        with open(self.folder / f"{len(self.all)}.log", "w") as log:
+            self.all.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, **how))
         return self.all[-1]
 
     def kill(self, *names):
         for name in names:
             self.running[name].kill()
-            self.running[name].communicate()
+            self.running[name].communicate(timeout=10)
 
     def freeze(self, name, duration):
         """Let a process stand still for `duration` [s]."""
