@@ -242,6 +242,7 @@ class Passed(NamedTuple):
     epoch: int
     counter: int  # of the datagram
     message: Any  # the object itself, not a copy
+    size: int  # of the datagram that it would be [bytes]
 
 
 Datagram: TypeAlias = Any

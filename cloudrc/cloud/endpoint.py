@@ -400,7 +400,7 @@ class CloudEndpoint(TunnelEnd):
             compute.begin()
         command, control = self._loop.command(setpoint, now_ns, elapsed_ns * 1e-9, epoch, counter)
         if compute is None:
-            self._send_message(COMMAND, command)
+            self._queue(self._make_datagram(COMMAND, command))
         else:
             self._unsent = now_ns + compute.end(), self._make_datagram(COMMAND, command)
         self._records.append(control)

@@ -78,6 +78,12 @@ Source: docs/reference/faults.md, "F23"."""
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
+def _does_nothing(predictor: Predictor, name: str) -> bool:
+    """Return whether a method is that of the base class, which need not be called."""
+    method = getattr(predictor, name, None)
+    return getattr(method, "__func__", None) is getattr(Predictor, name)
+
+
 class ControlLoop:
     """Runs estimator, predictor and controller in the sessions of one cloud.
 
@@ -111,6 +117,10 @@ class ControlLoop:
         self._build_estimator, self._predictor = build_estimator, predictor
         self._controller = controller
         self._trusts_predictor, self._trusts_controller = is_ours(predictor), is_ours(controller)
+        self._observe, self._commanded, self._applied = (
+            None if _does_nothing(predictor, name) else getattr(predictor, name)
+            for name in ("observe", "commanded", "applied")
+        )
         self._horizon_max, self._freeze_after_ns = horizon_max, freeze_after * 1e9
         self.period_ns = period_ns
         self._planned = plan_length(plan)
@@ -186,7 +196,8 @@ class ControlLoop:
         self._basis, self._basis_arrival_ns = telemetry.odometry, now_ns
         self._now_ns = now_ns
         self._call("estimator", self._observe_delay, telemetry, now_ns)
-        self._call("predictor", self._predictor.observe, telemetry.odometry)
+        if self._observe is not None:
+            self._call("predictor", self._observe, telemetry.odometry)
 
     def expect(self, round_trip: float) -> None:
         """Use `round_trip` [s] as the horizon until telemetry echoes the first command."""
@@ -233,7 +244,8 @@ class ControlLoop:
             return
         self._echoes.append(echo_ns)
         applied_ns = telemetry.stamp_ns - telemetry.echo_hold_ns
-        self._call("predictor", self._predictor.applied, echo_ns, applied_ns)
+        if self._applied is not None:
+            self._call("predictor", self._applied, echo_ns, applied_ns)
         self._estimator.add_applied((applied_ns - echo_ns) * 1e-9)
 
     def _estimate_horizon(self, age: float) -> float:
@@ -244,7 +256,9 @@ class ControlLoop:
         Raises:
             InvalidResultError: If the estimator's horizon is not a finite number.
         """
-        horizon = to_number(self._estimator.horizon(age), "horizon")
+        horizon = self._estimator.horizon(age)
+        if type(horizon) is not float:
+            horizon = to_number(horizon, "horizon")
         if horizon == 0.0 and self._newest_echo_ns == NEVER_NS:
             horizon = self._expected
         if 0.0 <= horizon <= self._horizon_max:
@@ -291,7 +305,8 @@ class ControlLoop:
         command = _new(Command, fields)
         if plan:
             self.plans.add(command, [estimate.position, *positions])
-        self._call("predictor", self._predictor.commanded, command)
+        if self._commanded is not None:
+            self._call("predictor", self._commanded, command)
         _, position, orientation, predicted_velocity, _ = estimate
         # fmt: off
         control = _new(Control, (

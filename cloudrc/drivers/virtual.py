@@ -17,7 +17,7 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.queue import PacketQueue
 from cloudrc.messages import Datagram, Passed
 from cloudrc.records import Record
-from cloudrc.tunnel.codec import datagram_size, peek
+from cloudrc.tunnel.codec import peek
 
 Sink = Callable[[list[Record], list[Record]], None]
 """Function that is called with the new records of world and the new records of cloud."""
@@ -128,5 +128,8 @@ class VirtualRun:
 
     def _send(self, datagrams: list[Datagram], link: LinkDirection) -> None:
         for data in datagrams:
-            header = data[:3] if type(data) is Passed else peek(data)
-            self._in_flight.send(link, header, datagram_size(data), data, self.now_ns)
+            if type(data) is Passed:
+                header, size = data[:3], data.size
+            else:
+                header, size = peek(data), len(data)
+            self._in_flight.send(link, header, size, data, self.now_ns)

@@ -122,19 +122,7 @@ _sizes_of: dict[int, Container[int]] = {
     int(Kind.OPERATOR): range(SIZES[Kind.OPERATOR], SIZES[Kind.OPERATOR] + TOUCH_NAME_MAX + 1),
 }
 """Kind -> valid sizes of its datagrams [bytes]."""
-# Looking up a member of an enum is slow.
-_COMMAND_KIND, _TELEMETRY_KIND = int(Kind.COMMAND), int(Kind.TELEMETRY)
 _unpack_header: Callable[[bytes], Header] = _HEADER.unpack_from
-
-
-def datagram_size(data: Datagram) -> int:
-    """Return the size of a datagram [bytes]; a passed message has the size that it would have."""
-    if type(data) is not Passed:
-        return len(data)
-    kind, _, _, message = data
-    if kind == _COMMAND_KIND:
-        return COMMAND_SIZES[len(message.plan)]
-    return TELEMETRY_SIZES[len(message.sensors)] if kind == _TELEMETRY_KIND else SIZES[kind]
 
 
 def encode_header(kind: int, direction: int, epoch: int, counter: int) -> bytes:

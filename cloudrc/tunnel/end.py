@@ -6,11 +6,11 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
-from cloudrc.messages import Command, Datagram, Telemetry
+from cloudrc.messages import Command, Datagram, Passed, Telemetry
 from cloudrc.records import Fault, Record
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import Channel
-from cloudrc.tunnel.codec import Direction, datagram_size, encode_command, encode_telemetry
+from cloudrc.tunnel.codec import Direction, encode_command, encode_telemetry
 from cloudrc.tunnel.handshake import KEY_TEXT, VERSION_TEXT
 from cloudrc.tunnel.keys import KeyRing
 from cloudrc.tunnel.session import Session
@@ -86,9 +86,6 @@ class TunnelEnd:
     def _send(self, kind: int, body: bytes) -> None:
         self._queue(self._session.seal(kind, body))
 
-    def _send_message(self, kind: int, message: Telemetry | Command) -> None:
-        self._queue(self._make_datagram(kind, message))
-
     def _encode(self, kind: int, message: Telemetry | Command) -> bytes:
         encode: Any = encode_command if isinstance(message, Command) else encode_telemetry
         return self._session.seal(kind, encode(message))
@@ -96,4 +93,5 @@ class TunnelEnd:
     def _queue(self, datagram: Datagram) -> None:
         self._datagrams.append(datagram)
         self.counts["sent"] += 1
-        self.counts["sent_bytes"] += datagram_size(datagram)
+        is_passed = type(datagram) is Passed
+        self.counts["sent_bytes"] += datagram.size if is_passed else len(datagram)

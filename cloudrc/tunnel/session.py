@@ -12,11 +12,13 @@ from typing import Any
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-from cloudrc.messages import Command, Datagram, Passed, Telemetry
+from cloudrc.messages import Datagram, Passed
 from cloudrc.tunnel.codec import (
+    COMMAND_SIZES,
     HEADER_SIZE,
     LAST_GREETING,
     TAG_SIZE,
+    TELEMETRY_SIZES,
     DecodeError,
     Direction,
     Kind,
@@ -25,6 +27,7 @@ from cloudrc.tunnel.codec import (
 )
 from cloudrc.tunnel.keys import Key, KeyRing
 
+COMMAND = int(Kind.COMMAND)  # looked up for each message
 NO_EPOCH = 0  # epoch of an end without a session, and of every HELLO, CHALLENGE and BUSY datagram
 TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}  # kinds without a session
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
@@ -68,8 +71,8 @@ class Session:
         header = encode_header(kind, self._sends, self.epoch, counter)
         return header + self._sealing.encrypt(header[4:], body, header)
 
-    def pass_on(self, kind: int, message: Telemetry | Command) -> Passed:
-        """Give `message` the counter of the next datagram of this kind, without encryption.
+    def pass_on(self, kind: int, message: Any) -> Passed:
+        """Give telemetry or a command the counter of its next datagram, without encryption.
 
         Use this method in place of `seal` only if the receiver is in the same process: the result
         is a Python object, not bytes.
@@ -77,7 +80,11 @@ class Session:
         counters = self._counters
         counter = counters[kind]
         counters[kind] = counter + 1
-        return _new(Passed, (kind, self.epoch, counter, message))
+        if kind == COMMAND:
+            size = COMMAND_SIZES[len(message.plan)]
+        else:
+            size = TELEMETRY_SIZES[len(message.sensors)]
+        return _new(Passed, (kind, self.epoch, counter, message, size))
 
     def greet(self, kind: int, body: bytes, key: Key | None = None) -> bytes:
         """Make a handshake datagram with a tag made with `key`, by default the session's key."""
@@ -99,7 +106,7 @@ class Session:
         if type(data) is Passed:
             if data[1] != self.epoch or not data[1]:
                 raise DecodeError("old_epoch")
-            return data
+            return data[:4]
         _, direction, epoch, kind, counter = check(data)
         if direction != self._opens:
             raise DecodeError("direction")

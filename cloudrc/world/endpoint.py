@@ -253,7 +253,7 @@ class WorldEndpoint(TunnelEnd):
         )
         telemetry = _new(Telemetry, known)
         counter = self._session.next_counter(TELEMETRY)
-        self._send_message(TELEMETRY, telemetry)
+        self._queue(self._make_datagram(TELEMETRY, telemetry))
         self._records.append(_new(TelemetrySent, (now_ns, epoch, counter, telemetry)))
 
     def _record_counts(self, now_ns: int) -> None:

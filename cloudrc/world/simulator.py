@@ -174,8 +174,7 @@ class Simulator:
 
     def read_sensors(self) -> tuple[float, ...]:
         """Return what the robot's own sensors show, each in its unit, in the order of `sensors`."""
-        values = self._sensordata
-        return tuple([values[address] for address in self._addresses])
+        return tuple(map(self._sensordata.__getitem__, self._addresses))
 
     def take_contact_force(self) -> tuple[float, float, float] | None:
         """Return the normal force on the probe, its peak and its impulse; None without a sensor.

@@ -45,7 +45,7 @@ def test_a_message_arrives_the_same_with_and_without_bytes(kind, message, decode
         peer = make_end(Identity(CLOCK, bytes(16), keys), Direction.DOWNLINK)
         for each in (end, peer):
             each._session.begin(1, bytes(32))
-        end._send_message(kind, message)
+        end._queue(end._make_datagram(kind, message))
         (data,) = end.take_datagrams()
         assert isinstance(data, Passed) is passes
         body = peer._session.open(data)[3]
