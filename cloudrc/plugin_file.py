@@ -99,8 +99,14 @@ def _importing_beside(folder: str) -> Iterator[None]:
         sys.path += others
         for name in {*sys.modules} - known:
             file = str(getattr(sys.modules[name], "__file__", None))
-            if file.startswith(folder + os.sep) and not file.startswith(INSTALLED):
+            if file.startswith(folder + os.sep) and not is_installed(file):
                 _beside.add(name)
+
+
+def is_installed(path: str) -> bool:
+    """Return whether a path is one of Python or of installed packages."""
+    inside = f"{path}{os.sep}".startswith(INSTALLED)
+    return inside or not {"site-packages", "dist-packages"}.isdisjoint(Path(path).parts)
 
 
 def sources(path: Path, folders: list[str] | None = None) -> list[Path]:

@@ -46,7 +46,7 @@ from cloudrc.errors import (
     to_one_line,
 )
 from cloudrc.patience import telling_if_slow
-from cloudrc.plugin_file import INSTALLED, PREFIX, load_file
+from cloudrc.plugin_file import PREFIX, is_installed, load_file
 from cloudrc.text import unknown_name_text
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def _own_frames(error: BaseException, file: str = "") -> list[tuple[FrameType, i
         name, own = (str(frame.f_globals.get(key)) for key in ("__name__", "__file__"))
         if frame.f_code.co_filename[:1] == "<":
             return False
-        return name.startswith(PREFIX) or own == file or not own.startswith(INSTALLED)
+        return name.startswith(PREFIX) or own == file or not is_installed(own)
 
     return [each for each in traceback.walk_tb(error.__traceback__) if is_own(each[0])]
 

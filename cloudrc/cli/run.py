@@ -99,7 +99,7 @@ def execute(options: argparse.Namespace) -> int:
         _check_beside(options, mode)
     if options.seeds and options.figures:
         raise BadInputError("--figures draws one flight; leave out --seeds")
-    is_drawn = any(_files(options))
+    is_drawn = options.report == "page" or options.figures
     require(f"mode {mode}", [each for each in MODES[mode] if is_drawn or each != "report"])
     if options.seeds:
         from cloudrc.cli.sweep_run import fly_seeds
@@ -217,25 +217,19 @@ def _local_flight(
                 view.tell("writes the report")
 
             session = partial(ready, folder, view.say, stack) if ready else None
-            page, figures = _files(options)
             return fly(
                 experiment,
                 mode,
                 folder,
                 view.see,
-                page=page,
-                figures=figures,
+                page=options.report == "page",
+                figures=options.figures,
                 session=session,
                 beside=options.beside,
                 landed=landed,
             )
 
     return flight
-
-
-def _files(options: argparse.Namespace) -> tuple[bool, bool]:
-    """Return whether the page is wanted, and whether the files in figures/ are."""
-    return options.report == "page", options.figures
 
 
 def _cluster_flight(
@@ -252,10 +246,14 @@ def _cluster_flight(
 
     def flight(folder: Path) -> dict[str, Any]:
         try:
-            page, figures = _files(options)
-            limit = options.timeout
             return fly_in_cluster(
-                experiment, folder, release, limit, tell, page=page, figures=figures
+                experiment,
+                folder,
+                release,
+                options.timeout,
+                tell,
+                page=options.report == "page",
+                figures=options.figures,
             )
         finally:
             if options.out is None and folder.exists():

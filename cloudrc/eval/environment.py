@@ -14,11 +14,11 @@ import gymnasium
 
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.eval.setup import EvalSetup
-from cloudrc.plugin_file import OWN
+from cloudrc.plugin_file import OWN, is_installed
 from cloudrc.plugins import is_path
 from cloudrc.runs.grid import everything_of
 from cloudrc.runs.installed import module_code
-from cloudrc.runs.own_files import hash_all, hash_of_module, hashes, is_installed
+from cloudrc.runs.own_files import hash_all, hash_of_module, hashes
 
 
 def find_module(setup: EvalSetup) -> str:

@@ -1,8 +1,8 @@
 """Know the holes of a recording: the times in which its messages are lost.
 
 The recorder notes them, the reader finds the lost end of a torn file, and the metadata of a copy
-keep them. What is computed over
-time, such as an age or a loss, is computed outside of the holes, or not at all.
+keep them. What is computed over time, such as an age or a loss, is computed outside of the holes,
+or not at all.
 """
 
 from __future__ import annotations

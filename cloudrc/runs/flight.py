@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 from cloudrc import assembly, metrics, plugins
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.config.load import ResolvedExperiment, absolute_paths
+from cloudrc.config.reuse import reuse_results
 from cloudrc.errors import MissingPrerequisiteError, describe_error, machine_error
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Assessment, Run
@@ -84,6 +85,7 @@ def units(own: Iterable[str]) -> dict[str, str]:
     return {metric.name: metric.unit for metric in map(metrics.find, names)}
 
 
+@reuse_results()  # a flight looks ten times at the file of its robot
 def fly_in_memory(
     experiment: ResolvedExperiment, make_loop: Callable[..., ControlLoop] = ControlLoop
 ) -> Assessment:

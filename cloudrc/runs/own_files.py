@@ -57,15 +57,11 @@ def hash_of(files: list[Path]) -> str:
 def hash_of_module(name: str, file: Path) -> str:
     """Return the hash of the `file` of a module and of the local modules that it imports."""
     depth = name.count(".") + (file.stem == "__init__")
-    others = [each for each in sys.path if os.path.isdir(each) and not is_installed(each)]
+    others = [
+        each for each in sys.path if os.path.isdir(each) and not plugin_file.is_installed(each)
+    ]
     root = [*file.parents][: depth + 1][-1]  # of the top-level package
     return hash_of(plugin_file.sources(file, [str(root), *others]))
-
-
-def is_installed(path: str) -> bool:
-    """Return whether a path is one of Python or of installed packages."""
-    inside = f"{path}{os.sep}".startswith(plugin_file.INSTALLED)
-    return inside or not {"site-packages", "dist-packages"}.isdisjoint(Path(path).parts)
 
 
 def hash_files(experiment: ResolvedExperiment) -> dict[str, str]:
