@@ -14,9 +14,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from operator import index
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -30,6 +28,8 @@ from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Columns
 from cloudrc.metrics.response import Step, steps
 from cloudrc.metrics.verdict import FlightFailure
+from cloudrc.outside.refusal import naming
+from cloudrc.outside.values import Quantity, to_plain
 from cloudrc.record.columns import Recording, Table
 from cloudrc.runs.experiment import advice_on, check_mode, load
 from cloudrc.runs.flight import fly_in_memory
@@ -39,6 +39,10 @@ from cloudrc.runs.requirements import MODES, require
 if TYPE_CHECKING:
     from cloudrc.report.document import Assessment
     from cloudrc.runs.grid import Grid
+
+
+COUNT = Quantity(ge=1, whole=True)
+"""Number of seeds or processes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +162,8 @@ def fly(
     if mode not in MODES:
         raise BadInputError(f"mode {mode!r}: give 'virtual', 'local' or 'cluster'")
     require(f"mode {mode}", MODES[mode])
-    resolved = load(str(experiment), _texts(settings or {}), seed)
+    seeds = {} if seed is None else {"seed": seed}
+    resolved = load(str(experiment), [*_texts(settings or {}), *_texts(seeds)])
     check_mode(resolved, mode)
     for text in advice_on(resolved):
         warnings.warn(text, stacklevel=3)
@@ -246,7 +251,9 @@ def sweep(
 
     jobs = _count(jobs, "jobs")
     if isinstance(grid, Mapping):
-        read = read_grid(json.loads(json.dumps(dict(grid), default=_plain)))
+        with naming("the grid"):
+            plain = to_plain(grid)
+        read = read_grid(plain)
     else:
         read = read_grid(Path(grid))
     for text in advice_on(*read.points):
@@ -422,20 +429,14 @@ def _as_exception(stopped: CloudrcError) -> BaseException:
 
 def _count(value: Any, name: str) -> int:
     """Return the argument `name` as a number of seeds or processes; raise a BadInputError."""
-    with suppress(TypeError):
-        if not isinstance(value, bool) and (count := index(value)) >= 1:
-            return count
-    raise BadInputError(f"{name}={value!r}: give a whole number, 1 or more")
+    with naming(name):
+        return COUNT.of(value)  # type: ignore[no-any-return]
 
 
 def _texts(settings: Mapping[str, Any]) -> list[str]:
     """Return settings as texts KEY=VALUE."""
-    return [
-        f"{key}={json.dumps(value, default=_plain, ensure_ascii=False)}"
-        for key, value in settings.items()
-    ]
-
-
-def _plain(value: Any) -> Any:
-    """Convert a number or an array of numpy to Python values, and a path to a text."""
-    return value.tolist() if hasattr(value, "tolist") else str(value)
+    found = list[str]()
+    for key, value in settings.items():
+        with naming(key):
+            found.append(f"{key}={json.dumps(to_plain(value), ensure_ascii=False)}")
+    return found

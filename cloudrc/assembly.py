@@ -31,7 +31,7 @@ from cloudrc.geometry.fence import Fence
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
 from cloudrc.messages import Start
-from cloudrc.plugins import apart
+from cloudrc.outside.code import apart
 from cloudrc.records import CONTROLLER_LOST, Fault
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.wire import Leg, Plan

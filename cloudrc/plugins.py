@@ -6,51 +6,29 @@ places:
 
 1. the package of the kind in cloudrc, without files whose name begins with an underscore;
 2. installed packages with an entry point in the group `cloudrc.<kind>`;
-3. a file, if the name is a path or ends in `.py`; `plugin_file` loads it.
-
-Plug-ins are code of the user, which may raise anything and may call `sys.exit()`. `check_failure`
-decides what is a failure of a plug-in; all parts of cloudrc that call plug-ins use it. `apart`
-keeps the working folder and the standard streams of the command. `find` returns a `Found`, through
-which alone a caller reaches what the file of a plug-in defines.
+3. a file, if the name is a path or ends in `.py`; `outside.code` loads it.
 """
 
 from __future__ import annotations
 
 import ast
-import difflib
 import importlib
 import inspect
-import operator
-import os
 import pkgutil
-import re
 import sys
-import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points, packages_distributions, version
 from importlib.util import find_spec
-from numbers import Real
 from pathlib import Path
-from types import CodeType, FrameType, ModuleType
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import Any
 
-from cloudrc.errors import (
-    BadInputError,
-    CloudrcError,
-    ControllerLostError,
-    OutOfMemoryError,
-    PlacedError,
-    describe_error,
-    to_one_line,
-)
-from cloudrc.patience import telling_if_slow
-from cloudrc.plugin_file import PREFIX, is_installed, load_file
-from cloudrc.text import unknown_name_text
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.outside.code import calling, load_file
+from cloudrc.outside.patience import telling_if_slow
+from cloudrc.text import suggest_name, unknown_name_text
 
 PACKAGES = {
     "estimators": "cloudrc.cloud.estimators",
@@ -64,14 +42,6 @@ PACKAGES = {
 }
 """Kind of plug-in -> package that contains cloudrc's plug-ins of this kind; "" if there is none:
 cloudrc's metrics are functions, models of motion are files of robots, policies those of users."""
-SHOWN_MAX = 60
-"""Largest length of a wrong value's representation in a message [characters]."""
-LARGEST = 1e30
-"""Largest size of a number that a plug-in returns, and largest length of several [any unit].
-Metrics square numbers, and the page of the report stores some with single precision: a much larger
-number overflows there."""
-STACK_MAX = 4000
-"""Largest length of a failure's stack in the recording [characters]."""
 METHODS = {
     **{"estimators": "horizon", "predictors": "predict", "controllers": "update"},
     **{"onboard": "update", "motion": "__call__", "executors": "action"},
@@ -86,13 +56,10 @@ INHERITED = {
 
 
 class Found:
-    """The file of a plug-in, or the object of an entry point: the guarded way to what it defines.
-
-    A file may define anything, also a `__getattr__` that fails, so no caller reads it directly.
-    """
+    """The file of a plug-in, or the object of an entry point."""
 
     def __init__(self, target: Any) -> None:
-        """Guard `target`, a module or the object of an entry point."""
+        """Give `target`, a module or the object of an entry point."""
         self._target = target
 
     @property
@@ -103,9 +70,8 @@ class Found:
     @property
     def is_shipped(self) -> bool:
         """Whether it is a module of cloudrc, and not code of a user."""
-        name = str(getattr(self._target, "__name__", ""))
         is_module = isinstance(self._target, ModuleType)
-        return is_module and name.startswith("cloudrc.")
+        return is_module and self._target.__name__.startswith("cloudrc.")
 
     @property
     def builder(self) -> Any:
@@ -115,13 +81,8 @@ class Found:
         return self._target if build is None and not is_module else build
 
     def get(self, name: str) -> Any:
-        """Return what is called `name`, to look at it or to call it in a guard; None if missing.
-
-        Raises:
-            BadInputError: If it cannot be read.
-        """
-        with self._refusing(name, None, "cannot be read"):
-            return getattr(self._target, name, None)
+        """Return what is called `name`; None if missing."""
+        return getattr(self._target, name, None)
 
     @contextmanager
     def calling(self, name: str) -> Iterator[Callable[..., Any]]:
@@ -131,49 +92,11 @@ class Found:
         """
         function = self.get(name)
         file = getattr(self._target, "__file__", None) or type(self._target).__name__
-        with (
-            self._refusing(f"{name}()", function, "failed"),
-            telling_if_slow(f"{name}() of {file} is still running"),
-        ):
-            if function is None:
-                raise ValueError("there is no such function; write one")
+        if function is None:
+            raise BadInputError(f"{file}: has no function {name}(); write one")
+        slow = "" if self.is_shipped else f"{name}() of {file} is still running"
+        with calling(f"{file}: {name}() failed", slow=slow):
             yield function
-
-    @contextmanager
-    def _refusing(self, name: str, function: Any, verb: str) -> Iterator[None]:
-        try:
-            with apart():
-                yield
-        except FAILURES as error:
-            what = f"{self._place(error, function)}: {name} {verb}"
-            check_failure(error, what)
-            raise BadInputError(f"{what}: {_explain(error)}") from error
-
-    def _place(self, error: BaseException, function: Any) -> str:
-        """Return file and line: where a plug-in's own code failed, else where `function` begins."""
-        file = getattr(self._target, "__file__", None) or type(self._target).__name__
-        own = [(frame.f_code.co_filename, line) for frame, line in _own_frames(error, file)]
-        code = getattr(function, "__code__", None)
-        if not own and isinstance(code, CodeType):
-            own = [(code.co_filename, code.co_firstlineno)]
-        return f"{own[-1][0]}:{own[-1][1]}" if own else str(file)
-
-
-def _own_frames(error: BaseException, file: str = "") -> list[tuple[FrameType, int]]:
-    """Return frame and line of each call in a user's files that `error` left, innermost last.
-
-    They are the files of plug-ins, those beside them, `file`, and all others that are not
-    installed, such as the module of an environment. A frame without a file, such as in a method
-    that a dataclass generates, has no line that a user could look at.
-    """
-
-    def is_own(frame: FrameType) -> bool:
-        name, own = (str(frame.f_globals.get(key)) for key in ("__name__", "__file__"))
-        if frame.f_code.co_filename[:1] == "<":
-            return False
-        return name.startswith(PREFIX) or own == file or not is_installed(own)
-
-    return [each for each in traceback.walk_tb(error.__traceback__) if is_own(each[0])]
 
 
 def names(kind: str) -> list[str]:
@@ -206,7 +129,7 @@ def describe(kind: str, name: str) -> str:
 def signature(kind: str, name: str) -> inspect.Signature:
     """Return the parameters of a plug-in's `build`; their annotations are types, not strings."""
     build = builder(kind, name)
-    with refuse_failure(f"{one(kind)} {name!r} has a build() with annotations that cannot be read"):
+    with calling(f"{one(kind)} {name!r} has a build() with annotations that cannot be read"):
         found = inspect.signature(build, eval_str=True)
     if "name" in found.parameters:
         raise BadInputError(
@@ -219,8 +142,8 @@ def signature(kind: str, name: str) -> inspect.Signature:
 def load(kind: str, name: str, /, **parameters: Any) -> Any:
     """Find a plug-in and build it; raise a BadInputError if it is missing or its `build` fails."""
     build = builder(kind, name, look=False)
-    what = f"{one(kind)} {name!r} cannot be built"
-    with refuse_failure(what, slow=f"{name} is still being built"):
+    slow = "" if name in _shipped(kind) else f"{name} is still being built"
+    with calling(f"{one(kind)} {name!r} cannot be built", slow=slow):
         plugin = build(**parameters)
         _check_methods(kind, plugin)
     return plugin
@@ -232,35 +155,21 @@ def _check_methods(kind: str, plugin: Any) -> None:
     base = getattr(importlib.import_module(PACKAGES[kind] or "cloudrc"), name, None)
     for method in (METHODS[kind], *INHERITED.get(kind, ())):
         found = getattr(plugin, method, None)
-        if callable(found) and not _is_described(found, getattr(base, METHODS[kind], None)):
+        # The base class raises a NotImplementedError in the method that each plug-in defines.
+        is_described = (
+            method == METHODS[kind]
+            and found is not None
+            and (getattr(found, "__func__", None) is getattr(base, method, found))
+        )
+        if callable(found) and not is_described:
             continue
-        near = _suggest_method(type(plugin), base, method)
-        if not near and method in INHERITED.get(kind, ()):
-            near = f"; derive its class from {PACKAGES[kind]}.{name}"
-        raise _no_method(type(plugin), f"no method {method}(){near}")
-
-
-def _is_described(found: Any, method: Any) -> bool:
-    """Return whether `found` is a `method` that the base class of a kind describes only.
-
-    The base class raises a NotImplementedError there.
-    """
-    return method is not None and getattr(found, "__func__", found) is method
-
-
-def _suggest_method(own: type, base: Any, method: str) -> str:
-    """Return a suggestion of the method that a user may have misspelt as `method`; or ""."""
-    added = [name for name in dir(own) if not hasattr(base, name) and name != method]
-    near = difflib.get_close_matches(method, added, n=1)
-    return f"; it has {near[0]}()" if near else ""
-
-
-def _no_method(own: type, lacking: str) -> ValueError:
-    """Return the error about the class of what `build` returned; it names the file of a user."""
-    file = getattr(sys.modules.get(own.__module__), "__file__", None)
-    if own.__module__.startswith(PREFIX) and file:
-        return PlacedError(f"{Path(file).name}: {own.__name__} has {lacking}")
-    return ValueError(f"build() returned {own.__name__}, which has {lacking}")
+        own = [each for each in dir(plugin) if not hasattr(base, each)]
+        hint = suggest_name(method, own)
+        if not hint and method in INHERITED.get(kind, ()):
+            hint = f"; derive its class from {PACKAGES[kind]}.{name}"
+        raise ValueError(
+            f"build() returned {type(plugin).__name__}, which has no method {method}(){hint}"
+        )
 
 
 def find(kind: str, name: str, *, look: bool = True) -> Found:
@@ -269,9 +178,9 @@ def find(kind: str, name: str, *, look: bool = True) -> Found:
     With `look`, the caller only looks at what the file defines; it neither builds nor measures.
     """
     if is_path(name) and not Path(name).is_file():
-        near = _suggest_file(Path(name))
+        near = suggest_name(Path(name).name, _files_beside(Path(name)))
         raise BadInputError(f"{one(kind)} {name!r}: there is no such file{near}")
-    with refuse_failure(f"{one(kind)} {name!r} cannot be imported"):
+    with calling(f"{one(kind)} {name!r} cannot be imported"):
         if is_path(name):
             if (module := _module_of(Path(name))) is not None:
                 return Found(importlib.import_module(module))
@@ -285,234 +194,14 @@ def find(kind: str, name: str, *, look: bool = True) -> Found:
     raise BadInputError(unknown_name_text(one(kind), name, names(kind)))
 
 
-FAILURES = Exception, SystemExit
-"""What counts as a failure of a user's code; Ctrl-C, which is the user's, does not."""
-
-
-def check_failure(error: BaseException, what: str) -> None:
-    """Return if `error`, which a plug-in raised, is the plug-in's failure; else raise.
-
-    All `FAILURES` are, except a lack of memory, which is the machine's: no result may depend on it;
-    and except the loss of a program outside, which ends a flight. `what` names the plug-in in the
-    error's text.
-    """
-    if isinstance(error, OutOfMemoryError | ControllerLostError):
-        raise error
-    if isinstance(error, MemoryError):
-        text = f"{what}: memory ran out ({describe_error(error)})"
-        raise OutOfMemoryError(f"{text}; let it use less memory, or free some") from error
-
-
-@contextmanager
-def apart() -> Iterator[None]:
-    """Call plug-ins inside the block: what they print goes to stderr, as stdout has the result.
-
-    Afterwards, working folder and standard streams are again those before the block.
-    """
-    folder, out, err = os.getcwd(), sys.stdout, sys.stderr
-    sys.stdout = err
-    try:
-        yield
-    finally:
-        sys.stdout, sys.stderr = out, err
-        os.chdir(folder)
-
-
-@contextmanager
-def refuse_failure(
-    what: str, *, keep: type[CloudrcError] | tuple[()] = (), slow: str = ""
-) -> Iterator[None]:
-    """Convert the failure of a plug-in to a BadInputError; `what` says which one failed to do what.
-
-    Use it before a flight and between flights; in flight, cloud goes on. Errors of the kind `keep`,
-    which the block's other code raises, stay as they are. `slow` is the text to log if the block
-    takes long; "" for none.
-    """
-    try:
-        with apart(), telling_if_slow(slow) if slow else nullcontext():
-            yield
-    except keep:
-        raise
-    except FAILURES as error:
-        check_failure(error, what)
-        raise BadInputError(f"{what}: {place_of(error)}{_explain(error)}") from error
-
-
-def place_of(error: BaseException) -> str:
-    """Return file and line where a user's own code failed, to put before the error's text.
-
-    Return "" if the user's code did not fail, or if Python's text names the place already.
-    """
-    own = _own_frames(error)
-    if not own or isinstance(error, SyntaxError | PlacedError):
-        return ""
-    frame, line = own[-1]
-    return f"{Path(frame.f_code.co_filename).name}:{line}: "
-
-
-def locate(error: BaseException) -> str:
-    """Return file, line and function where a plug-in failed.
-
-    Prefer the last line of a plug-in's own file to that of a library that it calls.
-    """
-    frames = [*traceback.walk_tb(error.__traceback__)]
-    frame, line = (_own_frames(error) or frames)[-1]
-    return f"{Path(frame.f_code.co_filename).name}:{line} in {frame.f_code.co_name}"
-
-
-def stack_of(error: BaseException) -> str:
-    """Return the stack of a plug-in's failure as Python prints it, shortened from the front."""
-    frames = "".join(traceback.format_tb(error.__traceback__))[-STACK_MAX:]
-    return frames.encode(errors="replace").decode() + describe_error(error)
-
-
-class InvalidResultError(ValueError):
-    """A plug-in returned a value of a wrong type or shape, or a number that is not finite."""
-
-
-def to_number(value: Any, name: str) -> float:
-    """Convert a number that a plug-in returned to a float; `name` names it in the error's text.
-
-    A scalar or an array without dimensions of numpy, PyTorch or JAX is a number. A boolean, a text,
-    a Decimal, a masked value, a time of numpy, and an integer that no float can hold are none: they
-    raise an InvalidResultError.
-    """
-    if type(value) is float:
-        return value
-    plain = _plain(value)
-    if not isinstance(plain, bool) and isinstance(plain, Real):
-        with suppress(OverflowError):
-            return float(plain)
-    raise InvalidResultError(f"its {name} is {shorten(value)}, which is no number")
-
-
-def to_integer(value: Any, name: str) -> int:
-    """Convert an integer that a plug-in returned as `to_number` does; a float is none, also 3.0.
-
-    A float holds no stamp exactly that is above 104 days in ns.
-    """
-    to_number(value, name)
-    with suppress(TypeError):
-        return operator.index(value)
-    raise InvalidResultError(f"its {name} is {shorten(value)}, which is no integer")
-
-
-def to_boolean(value: Any, name: str) -> bool:
-    """Convert a truth value that a user's code returned as `to_number` does.
-
-    The numbers 0 and 1 are truth values, too. A text is none: "False" would be true.
-    """
-    plain = _plain(value)
-    if isinstance(plain, bool | Real) and plain in (0, 1):
-        return bool(plain)
-    raise InvalidResultError(f"its {name} is {shorten(value)}, which is no boolean")
-
-
-def _plain(value: Any) -> Any:
-    """Return the item of a scalar of numpy, PyTorch or JAX, and any other value as it is.
-
-    Return None for a scalar whose item looks like a number but is none: the item of a masked value
-    of numpy is 0, and that of a time is a count of its unit, such as ns.
-    """
-    plain = value.item() if getattr(value, "shape", None) == () else value
-    kinds = (getattr(getattr(each, "dtype", None), "kind", "") for each in (value, plain))
-    is_masked = value is not plain and bool(getattr(value, "mask", False))
-    return None if is_masked or not {"m", "M"}.isdisjoint(kinds) else plain
-
-
-def to_numbers(values: Any) -> NDArray[Any]:
-    """Return the numbers that a user gave in an array or in nested lists as an array.
-
-    Each of them is judged as by `to_number`. An array of numbers keeps its type.
-
-    Raises:
-        InvalidResultError: If one is no number, not finite or beyond `LARGEST`; the text has its
-            place.
-    """
-    import numpy as np
-
-    if type(values) is not np.ndarray or values.dtype.kind not in "iuf":
-        for place, value in _leaves_of(values):
-            to_number(value, _name_of(place))
-    array = np.asarray(values)
-    if array.dtype.kind not in "iuf":
-        array = array.astype(float)
-    fits = np.abs(array) <= LARGEST  # False for NaN
-    if not fits.all():
-        place = np.argwhere(~fits)[0].tolist()
-        number = array[tuple(place)]
-        why = f"beyond {LARGEST:g}" if np.isfinite(number) else "not finite"
-        raise InvalidResultError(f"its {_name_of(place)} is {number:g}, {why}")
-    return array
-
-
-def to_arrays(value: Any) -> Any:
-    """Return a value with arrays of numpy in place of PyTorch's tensors, also in maps and lists.
-
-    A tensor may be on a GPU, have a gradient, or a type that numpy does not know, as bfloat16.
-    """
-    if isinstance(value, Mapping):
-        return {key: to_arrays(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return (tuple if isinstance(value, tuple) else list)(map(to_arrays, value))
-    if not hasattr(value, "detach"):
-        return value
-    tensor = value.detach().cpu()
-    try:
-        return tensor.numpy()
-    except TypeError:
-        return tensor.float().numpy()
-
-
-def _name_of(place: list[int]) -> str:
-    return f"value at {place}" if place else "value"
-
-
-def _leaves_of(values: Any, place: tuple[int, ...] = ()) -> Iterator[tuple[list[int], Any]]:
-    """Yield place and value of what may be no number in nested lists and arrays."""
-    import numpy as np
-
-    if isinstance(values, np.ma.MaskedArray):
-        values = values.tolist()  # in which a masked value is None
-    if isinstance(values, Sequence) and not isinstance(values, str | bytes):
-        if {*map(type, values)} == {float}:  # the usual case, which must be fast
-            return
-        for number, each in enumerate(values):
-            yield from _leaves_of(each, (*place, number))
-    elif not hasattr(values, "__array__"):
-        yield [*place], values
-    elif (array := np.asarray(values)).dtype.kind not in "iuf":
-        for inside, each in np.ndenumerate(array):
-            yield [*place, *inside], each
-
-
-def shorten(value: Any) -> str:
-    """Describe a value in a short text: its type and, as far as it has one, its representation."""
-    shown = ""
-    with suppress(Exception):  # a user's __repr__ may raise, and so does that of a huge integer
-        shown = to_one_line(re.sub(rf"{PREFIX}\w+\.", "", repr(value)))[:SHOWN_MAX]
-    return f"{type(value).__name__} {shown}".strip()
+def _files_beside(path: Path) -> list[str]:
+    folder = path.parent
+    return [each.name for each in folder.iterdir()] if folder.is_dir() else []
 
 
 def is_path(name: str) -> bool:
     """Check whether the name of a plug-in is the path of a file."""
     return name.endswith(".py") or "/" in name or "\\" in name
-
-
-def _suggest_file(path: Path) -> str:
-    """Return a suggestion of a file beside a missing one, to append to an error text; or "".
-
-    It has the same name in other letters, or with another suffix, such as `.py.txt`.
-    """
-
-    def plain(name: str) -> str:
-        return name.casefold().partition(".")[0].replace("-", "_").replace(" ", "_")
-
-    with suppress(OSError):
-        files = sorted(each.name for each in path.parent.iterdir() if each.is_file())
-        near = [name for name in files if plain(name) == plain(path.name)]
-        return f"; did you mean {near[0]}?" if near else ""
-    return ""
 
 
 def builder(kind: str, name: str, *, look: bool = True) -> Callable[..., Any]:
@@ -528,6 +217,7 @@ def builder(kind: str, name: str, *, look: bool = True) -> Callable[..., Any]:
     return build  # type: ignore[no-any-return]
 
 
+@cache
 def _shipped(kind: str) -> list[str]:
     if kind not in PACKAGES:
         raise BadInputError(unknown_name_text("kind of plug-in", kind, list(PACKAGES)))
@@ -568,11 +258,3 @@ def _entries(kind: str, path: tuple[str, ...]) -> dict[str, EntryPoint]:
 def one(kind: str) -> str:
     """Return the word for one plug-in of a kind, such as "predictor"."""
     return "policy" if kind == "policies" else kind.removesuffix("s")
-
-
-def _explain(error: BaseException) -> str:
-    """Describe an exception in one line, without its type if it was raised to inform the user."""
-    described = describe_error(error)
-    if isinstance(error, ValueError | CloudrcError):
-        return described.partition(": ")[2] or described
-    return described

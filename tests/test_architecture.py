@@ -30,9 +30,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "files": set(),
     "geometry": set(),
     "geometry.vectors": set(),
-    "plugins": {"plugin_file"},
-    "patience": set(),
-    "plugin_file": set(),
+    "outside": set(),
+    "plugins": set(),
     "tunnel": {"endpoint"},
     "link": {"config", "files", "exposition", "metrics.definitions", "tunnel"},
     "config": {"plugins", "geometry", "link", "files", "policy.address"},
@@ -80,7 +79,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "runs": {
         *("ages", "assembly", "bridges", "cloud", "cluster", "config", "drivers", "files"),
         *("geometry", "link"),
-        *("metrics", "plugin_file", "plugins", "record", "report", "robots", "statistics"),
+        *("metrics", "plugins", "record", "report", "robots", "statistics"),
         *("teleop", "tunnel", "warnings", "world"),
     },
     "gym": {
@@ -88,7 +87,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         *("record", "report", "runs"),
     },
     "eval": {
-        *("config", "files", "gym", "link", "plugin_file", "plugins", "policy"),
+        *("config", "files", "gym", "link", "plugins", "policy"),
         *("policy.address", "report", "runs", "statistics"),
     },
     "assembly": EVERYTHING,
@@ -103,7 +102,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "__init__": {"api"},
 }
 ALWAYS = {
-    *("errors", "messages", "patience", "records", "rounding", "source", "text"),
+    *("errors", "messages", "outside", "records", "rounding", "source", "text"),
     "version",
 }
 

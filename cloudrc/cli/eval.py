@@ -84,7 +84,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _bytes(text: str) -> int:
-    return round(number(0, 1_000_000_000, "bytes")(text))
+    return int(number(0, 1_000_000_000, "bytes")(text))
 
 
 def _round_trips(text: str) -> tuple[float, ...]:

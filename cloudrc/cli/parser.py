@@ -7,13 +7,12 @@ import difflib
 import importlib
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields
-from math import nan
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from cloudrc.errors import BadInputError
-from cloudrc.text import parse_number
+from cloudrc.outside.values import InvalidValueError, Quantity
 from cloudrc.version import __version__
 
 GROUPS: dict[str, dict[str, str]] = {
@@ -118,36 +117,32 @@ class Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, f"no '{value}'; {hint}")
 
 
-def whole_number(low: int, high: int) -> Callable[[str], int]:
-    """Return a type for argparse: a function that parses a whole number from `low` to `high`."""
+@dataclass(frozen=True)
+class NumberFlag:
+    """A type for argparse: a number, which the first letter of its unit may follow, as in 300s."""
 
-    def read(text: str) -> int:
-        if not text.isdecimal() or not low <= int(text) <= high:
-            raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from {low} to {high}")
-        return int(text)
+    quantity: Quantity
 
-    return read
+    def __call__(self, text: str) -> Any:
+        """Read a number; raise argparse's error for anything else."""
+        unit = self.quantity.unit[:1]
+        try:
+            return self.quantity.read(text.removesuffix(unit) if unit.isalpha() else text)
+        except InvalidValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def whole_number(low: int, high: int) -> NumberFlag:
+    """Return a type for argparse: a whole number from `low` to `high`."""
+    return NumberFlag(Quantity(ge=low, le=high, whole=True))
 
 
 read_count = whole_number(1, COUNT_MAX)
 
 
-def number(low: float, high: float, unit: str) -> Callable[[str], float]:
-    """Return a type for argparse: a function that parses a number from `low` to `high` [`unit`].
-
-    `unit` is the name of the unit; its first letter may follow the number, as in "300s".
-    """
-
-    def parse(text: str) -> float:
-        try:
-            value = parse_number(text.removesuffix(unit[0]))
-        except ValueError:
-            value = nan
-        if not low <= value <= high:  # or it is NaN
-            raise argparse.ArgumentTypeError(f"'{text}' is not a number of {unit}, {low} to {high}")
-        return value
-
-    return parse
+def number(low: float, high: float, unit: str) -> NumberFlag:
+    """Return a type for argparse: a number from `low` to `high` [`unit`], such as "seconds"."""
+    return NumberFlag(Quantity(unit, low, high))
 
 
 def figure_arguments(parser: argparse.ArgumentParser, width: float) -> None:

@@ -26,7 +26,7 @@ from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.plan_log import PlanLog
 from cloudrc.cloud.predictors import Predictor
-from cloudrc.cloud.results import check_estimate, check_output, is_ours, refuse, to_vector
+from cloudrc.cloud.results import check_estimate, check_output, is_ours, to_vector
 from cloudrc.errors import ControllerLostError, describe_error
 from cloudrc.messages import (
     FRESH_ECHO_PERIODS,
@@ -40,15 +40,8 @@ from cloudrc.messages import (
     Vector,
     plan_length,
 )
-from cloudrc.plugins import (
-    FAILURES,
-    InvalidResultError,
-    check_failure,
-    locate,
-    refuse_failure,
-    stack_of,
-    to_number,
-)
+from cloudrc.outside.code import FAILURES, calling, check_failure, locate, stack_of
+from cloudrc.outside.values import RESULT, InvalidValueError
 from cloudrc.records import Control, Fault
 from cloudrc.teleop.carrot import path_of, setpoint_at
 from cloudrc.tunnel.codec import as_planned
@@ -133,7 +126,7 @@ class ControlLoop:
         estimator = build_estimator()
         for kind, plug_in in (("predictor", predictor), ("controller", controller)):
             what = f"cloud.{kind}: its reset() failed"
-            with refuse_failure(what, slow=f"reset() of cloud.{kind} is still running"):
+            with calling(what, slow=f"reset() of cloud.{kind} is still running"):
                 plug_in.reset()
         self._begin(estimator)
 
@@ -254,18 +247,15 @@ class ControlLoop:
         `age` is cloud's time minus the stamp of the newest odometry on world's clock [s].
 
         Raises:
-            InvalidResultError: If the estimator's horizon is not a finite number.
+            InvalidValueError: If the estimator's horizon is not a finite number.
         """
-        horizon = self._estimator.horizon(age)
-        if type(horizon) is not float:
-            horizon = to_number(horizon, "horizon")
+        horizon = RESULT.of(self._estimator.horizon(age), "horizon")
         if horizon == 0.0 and self._newest_echo_ns == NEVER_NS:
             horizon = self._expected
         if 0.0 <= horizon <= self._horizon_max:
-            return horizon
-        refuse("horizon", horizon)
+            return horizon  # type: ignore[no-any-return]
         self.counts["horizon_clamped"] += 1
-        return min(max(horizon, 0.0), self._horizon_max)
+        return float(min(max(horizon, 0.0), self._horizon_max))
 
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
@@ -377,7 +367,7 @@ class ControlLoop:
                     velocity = to_vector(velocity, "planned velocity")
                 x, y, z = velocity
                 if not (abs(x) <= most and abs(y) <= most and abs(z) <= most):
-                    refuse("planned velocity", *velocity)
+                    RESULT.row(velocity, 3, "planned velocity")
                     break
                 plan.append(as_planned(velocity))
                 positions.append(state.position)
@@ -414,7 +404,7 @@ class ControlLoop:
         self.counts[code] += 1
         if code not in self._reported:
             self._reported.add(code)
-            where = "" if isinstance(error, InvalidResultError) else f", {locate(error)}"
+            where = "" if isinstance(error, InvalidValueError) else f", {locate(error)}"
             what = f"the {kind} failed ({describe_error(error)}{where})"
             text = f"{what}; {instead or INSTEAD[kind]}; fix cloud.{kind} or choose another"
             self.faults.append(Fault(self._now_ns, code, text, stack_of(error)))

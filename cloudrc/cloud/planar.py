@@ -7,7 +7,7 @@ from cloudrc.cloud.controllers.remote import STAND_STILL, OutsideController
 from cloudrc.cloud.results import check_output
 from cloudrc.errors import ControllerLostError
 from cloudrc.messages import Odometry, Setpoint
-from cloudrc.plugins import InvalidResultError
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.records import CONTROLLER_LOST
 
 ROUNDING = 1e-9
@@ -33,7 +33,7 @@ class Planar(Controller):
         one that steers by the error of the position commands no vertical velocity.
 
         Raises:
-            InvalidResultError: If the controller commands a vertical velocity.
+            InvalidValueError: If the controller commands a vertical velocity.
             ControllerLostError: Once, if a program outside does so.
         """
         if self._lost:
@@ -57,4 +57,4 @@ class Planar(Controller):
             _, invalid = CONTROLLER_LOST
             place = self._controller.place or self._name  # ROS without a namespace has no place
             raise ControllerLostError(invalid, f"{place}: {text}")
-        raise InvalidResultError(f"{self._name}: {text}")
+        raise InvalidValueError(f"{self._name}: {text}")

@@ -13,6 +13,7 @@ from cloudrc.config.robot import RobotFiles, known_robot
 from cloudrc.config.shipped import ROBOT_FILE
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry.clearance import Hull, Spheres, ball
+from cloudrc.outside.values import RESULT
 
 TOLERANCE = 1e-3
 """Length by which geoms may reach out of the hull [m]: hull_m is rounded."""
@@ -72,7 +73,7 @@ def _read_hull(name: str, robot: RobotFiles) -> Hull:
 def _spheres(file: plugins.Found, part: str) -> Spheres:
     """Return the spheres of one function of a file."""
     with file.calling(part) as function:
-        numbers = plugins.to_numbers(function()).astype(np.float64)
+        numbers = RESULT.array(function()).astype(np.float64)
         if numbers.ndim != 2 or numbers.shape[1] != 4:
             raise ValueError(
                 f"it returned shape {numbers.shape}, not rows of x, y, z, radius [m]: shape (n, 4)"

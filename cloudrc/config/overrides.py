@@ -34,6 +34,7 @@ from cloudrc.config.robot import RobotFacts, facts, find_robot, known_robot, par
 from cloudrc.config.schema import Cloud, Experiment, PlanTime, PlugIn, Steps, World
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
+from cloudrc.outside import code
 
 REMOTE, ROS2 = "remote", "ros2"
 OUTSIDE = (REMOTE, ROS2)
@@ -324,14 +325,14 @@ def _complete(
             file = document.source(place).absolute(parameters[parameter])
             parameters[parameter] = str(file)
     checked = _check(kind, name, parameters)
-    with plugins.refuse_failure(f"{path[-1]} {name!r} has a default that YAML cannot contain"):
+    with code.calling(f"{path[-1]} {name!r} has a default that YAML cannot contain"):
         values: dict[str, Any] = checked.model_dump(mode="json")
     checked = _check(kind, name, values)  # as `build_plugin` will do
     more = {"robot": robot} if _takes_robot(kind, name) else {}
     plugin = plugins.load(kind, name, **dict(checked), **more)
     if kind != "estimators":
         what = f"{path[-1]} {name!r}: its reset() failed"
-        with plugins.refuse_failure(what, slow=f"reset() of {name} is still running"):
+        with code.calling(what, slow=f"reset() of {name} is still running"):
             plugin.reset()
     if _plans_ahead(document):
         if kind == "predictors":
@@ -355,7 +356,7 @@ def _parameters_of(kind: str, name: str) -> type[BaseModel]:
 def _check_model(predictor: Any, name: str) -> None:
     """Raise a BadInputError if the predictor has no robot model, which `cloud.plan_s` needs."""
     what = f"predictor {name!r} cannot predict"
-    with plugins.refuse_failure(what, slow=f"predict() of {name} is still running"):
+    with code.calling(what, slow=f"predict() of {name} is still running"):
         predictor.predict(Odometry(0, ZERO, UPRIGHT, ZERO, ZERO), 0.0)
         model = predictor.model()
     if model is None:
@@ -425,7 +426,7 @@ def _model_of(kind: str, name: str, build: Callable[..., Any]) -> type[BaseModel
         extra="allow" if is_open else "forbid", strict=True, arbitrary_types_allowed=True,
         allow_inf_nan=False, protected_namespaces=(),
     )  # fmt: skip
-    with plugins.refuse_failure(f"{plugins.one(kind)} {name!r} has a type that cannot be read"):
+    with code.calling(f"{plugins.one(kind)} {name!r} has a type that cannot be read"):
         model: type[BaseModel] = create_model("parameters", __config__=config, **fields)
     return model
 
@@ -437,7 +438,7 @@ def _check(kind: str, name: str, parameters: dict[str, Any]) -> BaseModel:
     """
     model, text = _parameters_of(kind, name), json.dumps(parameters)
     what = f"{plugins.one(kind)} {name!r}: a check of a parameter failed"
-    with plugins.refuse_failure(what, slow=f"{name} still checks its parameters"):
+    with code.calling(what, slow=f"{name} still checks its parameters"):
         try:
             return model.model_validate_json(text)
         except ValidationError as error:

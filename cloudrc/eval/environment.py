@@ -14,7 +14,7 @@ import gymnasium
 
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.eval.setup import EvalSetup
-from cloudrc.plugin_file import OWN, is_installed
+from cloudrc.outside.code import OWN, is_installed
 from cloudrc.plugins import is_path
 from cloudrc.runs.grid import everything_of
 from cloudrc.runs.installed import module_code

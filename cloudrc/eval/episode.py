@@ -33,14 +33,8 @@ from cloudrc.eval.setup import (
 from cloudrc.gym import Networked
 from cloudrc.gym.step import StepTime, find_step
 from cloudrc.gym.values import size_of
-from cloudrc.plugins import (
-    InvalidResultError,
-    refuse_failure,
-    shorten,
-    to_arrays,
-    to_boolean,
-    to_number,
-)
+from cloudrc.outside.code import calling
+from cloudrc.outside.values import RESULT, InvalidValueError, shorten, to_arrays, to_boolean
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
 from cloudrc.policy.observation import observe
@@ -93,7 +87,7 @@ class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
         reward = _reward_of(given)
         ends = _flag_of(terminated, "terminated"), _flag_of(truncated, "truncated")
         if not isinstance(info, Mapping):
-            raise InvalidResultError(f"its info is {shorten(info)}, which is no mapping")
+            raise InvalidValueError(f"its info is {shorten(info)}, which is no mapping")
         self._note(action, observation, reward)
         return observation, reward, *ends, dict(info)
 
@@ -110,9 +104,9 @@ class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
 def _reward_of(given: Any) -> float:
     """Return the reward of a step, which may be a boolean; raise a ValueError for a wrong value."""
     given = _one(given)
-    reward = float(given) if isinstance(given, bool | np.bool_) else to_number(given, "reward")
+    reward = float(given) if isinstance(given, bool | np.bool_) else RESULT.of(given, "reward")
     if not isfinite(reward):
-        raise InvalidResultError(f"its reward is {reward}")
+        raise InvalidValueError(f"its reward is {reward}")
     return reward
 
 
@@ -175,14 +169,14 @@ def make_env(setup: EvalSetup, seed: int) -> Iterator[gymnasium.Env[Any, Any]]:
     """Make the environment of an episode; raise a BadInputError if it fails, also in the block."""
     words = {key: seed if value == SEED else value for key, value in setup.env_args}
     what = f"--env {setup.env}"
-    with refuse_failure(what, keep=CloudrcError, slow=f"{what} is still being made"):
+    with calling(what, keep=CloudrcError, slow=f"{what} is still being made"):
         name = find_module(setup)
         try:
             env = gymnasium.make(name, disable_env_checker=True, **words)
         except gymnasium.error.UnregisteredEnv as error:
             hint = "" if ":" in name else f"; if a module of your own registers it: MODULE:{name}"
-            raise InvalidResultError(f"{error}{hint}") from None
-    with refuse_failure(f"{what}: the episode failed", keep=CloudrcError), closing(env):
+            raise InvalidValueError(f"{error}{hint}") from None
+    with calling(f"{what}: the episode failed", keep=CloudrcError), closing(env):
         yield env
 
 
@@ -353,9 +347,9 @@ def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
             continue
         try:
             known = _flag_of(info[key], f"info['{key}']") or bool(known)
-        except InvalidResultError as error:
+        except InvalidValueError as error:
             text = f"{error}; say with --success-at which return is a success"
-            raise InvalidResultError(text) from None
+            raise InvalidValueError(text) from None
     return known
 
 

@@ -21,7 +21,7 @@ from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.library import LinkProfile, read_profile
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.traces import read_lines
-from cloudrc.plugin_file import sources
+from cloudrc.outside.code import sources
 from cloudrc.plugins import is_path
 from cloudrc.policy.address import check_url
 from cloudrc.policy.observation import Mapped

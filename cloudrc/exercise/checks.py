@@ -23,7 +23,7 @@ from cloudrc.errors import describe_error, machine_error, to_one_line
 from cloudrc.exercise.hand_in import FILES, find_method
 from cloudrc.exercise.remote import HandInError, Remote
 from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
-from cloudrc.plugins import InvalidResultError
+from cloudrc.outside.values import WHOLE, InvalidValueError
 from cloudrc.runs.flight import fly_in_memory
 
 REFERENCES = {"estimator": "running_mean", "predictor": "constant_velocity", "controller": "pid"}
@@ -55,7 +55,7 @@ def _predict(build: Callable[[], Any], select: Callable[[Odometry], Any]) -> Any
 
 def _velocity_and_stamp(odometry: Odometry) -> list[float]:
     """Return velocity [m/s] and stamp [s]; the control loop takes no float as a stamp, either."""
-    return [*odometry.velocity, plugins.to_integer(odometry.stamp_ns, "stamp") * 1e-9]
+    return [*odometry.velocity, WHOLE.of(odometry.stamp_ns, "stamp") * 1e-9]
 
 
 def _command(
@@ -87,7 +87,7 @@ class Formula(NamedTuple):
     def score(self, parts: Sequence[str], hand_in: Remote) -> tuple[float, str]:
         """Return 1.0 and "right" if the student's results agree with those of the reference.
 
-        Otherwise raise an InvalidResultError. `parts` has one entry.
+        Otherwise raise an InvalidValueError. `parts` has one entry.
         """
         (part,) = parts
         reference = partial(plugins.load, f"{part}s", REFERENCES[part])
@@ -99,7 +99,7 @@ class Formula(NamedTuple):
                 return 1.0, "right"
             first = int(np.argwhere(wrong)[0, 0]) if wrong.ndim > 1 else slice(None)
             seen, wanted = seen[first], wanted[first]
-        raise InvalidResultError(f"gives {seen.round(3).tolist()}, not {wanted.round(3).tolist()}")
+        raise InvalidValueError(f"gives {seen.round(3).tolist()}, not {wanted.round(3).tolist()}")
 
 
 class Exam(NamedTuple):
@@ -180,7 +180,7 @@ def run(part: str, hand_in: Remote, folder: Path) -> Iterator[dict[str, Any]]:
         except Exception as error:  # the answers may be anything
             if failure := machine_error(error):
                 raise failure from error
-            text = str(error) if isinstance(error, InvalidResultError) else describe_error(error)
+            text = str(error) if isinstance(error, InvalidValueError) else describe_error(error)
             share, seen = 0.0, f"{find_method(folder, parts[0])}: {text}"
         yield {
             "part": part,

@@ -25,6 +25,7 @@ from cloudrc import plugins
 from cloudrc.cloud.estimators import DelaySample
 from cloudrc.errors import CloudrcError, PlacedError, describe_error
 from cloudrc.messages import Command, Odometry, Setpoint
+from cloudrc.outside.values import RESULT, WHOLE, InvalidValueError
 
 FILES = {
     "estimator": "delay_estimator.py",
@@ -114,7 +115,7 @@ def find_method(folder: Path, part: str) -> str:
 
 
 def to_plain(value: Any) -> Any:
-    """Convert a plug-in's result to numbers and lists; raise an InvalidResultError if it is none.
+    """Convert a plug-in's result to numbers and lists; raise an InvalidValueError if it is none.
 
     The check decides whether numbers and shapes are right.
     """
@@ -123,9 +124,9 @@ def to_plain(value: Any) -> Any:
     is_list = isinstance(value, Iterable) and not isinstance(value, str | bytes | Set | Mapping)
     if is_list and getattr(value, "shape", None) != ():
         return [to_plain(each) for each in islice(value, PARTS_MAX)]
-    with suppress(plugins.InvalidResultError):
-        return plugins.to_integer(value, "result")
-    return plugins.to_number(value, "result")
+    with suppress(InvalidValueError):
+        return WHOLE.of(value, "result")
+    return RESULT.of(value, "result")
 
 
 def to_tuple(value: Any) -> Any:

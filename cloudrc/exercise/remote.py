@@ -12,10 +12,10 @@ from cloudrc.cloud.predictors import Predictor
 from cloudrc.errors import to_one_line
 from cloudrc.exercise.hand_in import Call
 from cloudrc.messages import Command, Odometry, Setpoint
-from cloudrc.plugins import InvalidResultError
+from cloudrc.outside.values import InvalidValueError
 
 
-class HandInError(InvalidResultError):
+class HandInError(InvalidValueError):
     """A student's file failed; the text says where and why."""
 
 
@@ -117,5 +117,5 @@ _PLUGINS: dict[str, Callable[[Remote, str], Any]] = {
 def _parts(answer: Any, kind: Any) -> list[Any]:
     """Return the parts of a named tuple in an answer; the control loop checks their numbers."""
     if not isinstance(answer, list) or len(answer) != len(kind._fields):
-        raise InvalidResultError(f"its result is no {kind.__name__}")
+        raise InvalidValueError(f"its result is no {kind.__name__}")
     return [tuple(each) if isinstance(each, list) else each for each in answer]

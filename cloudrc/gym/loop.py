@@ -33,6 +33,7 @@ from cloudrc.link.draws import Floats, stream_key
 from cloudrc.link.library import LinkProfile, OneWay
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.queue import PacketQueue
+from cloudrc.outside.values import Quantity
 
 EPISODES = 1 << 20
 """Number of episodes that belong to a seed of the environment."""
@@ -114,9 +115,19 @@ class RemoteLoop:
             observation; None: that of the settings.
     """
 
-    def __init__(self, settings: Settings, executor: Executor, stream: str = "") -> None:
-        """Connect; `stream` is the name of the robot. Call `begin` for each episode."""
-        self._settings, self._executor = settings, executor
+    def __init__(
+        self,
+        settings: Settings,
+        executor: Executor,
+        stream: str = "",
+        *,
+        judge: Callable[[Any], None] | None = None,
+    ) -> None:
+        """Connect; `stream` is the name of the robot. Call `begin` for each episode.
+
+        `judge` raises an exception for a value of the executor that is no action.
+        """
+        self._settings, self._executor, self._judge = settings, executor, judge
         link, seed = settings.link, settings.seed
         self._tick = -1  # before the first episode
         self._up = Lane(OneWay(link.uplink, seed, True, stream=stream), settings.observation_bytes)
@@ -169,6 +180,9 @@ class RemoteLoop:
         action = executor.action(tick)
         self._is_held = action is None
         if action is not None:
+            if self._judge is not None:
+                self._judge(action)
+                Quantity(ge=0, le=tick).of(executor.basis, "basis")
             self._last, self._basis = action, executor.basis
         else:
             self._held += 1

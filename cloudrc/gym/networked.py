@@ -18,12 +18,12 @@ from cloudrc.gym.options import (
     compute_times,
     connect,
     describe_answer,
-    refuse_unknown,
+    read_options,
     warn,
 )
 from cloudrc.gym.step import find_step
 from cloudrc.gym.values import checker, copied
-from cloudrc.plugins import to_arrays
+from cloudrc.outside.values import to_arrays
 
 
 class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -89,7 +89,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 f"env is {type(env).__name__}: give an environment of gymnasium, as "
                 "gymnasium.make returns it; for a vector there is NetworkedVector"
             )
-        refuse_unknown("Networked", options)
+        options = read_options("Networked", options)
         RecordConstructorArgs.__init__(self, link=link, seed=seed, dt=dt, stream=stream, **options)
         gymnasium.Wrapper.__init__(self, env)
         self.dt, _, doubts = find_step(env, dt, options.get("compute", 0.0))

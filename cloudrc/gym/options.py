@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from functools import partial
-from math import nan
 from pathlib import Path
-from typing import Any, TypeAlias, TypedDict
+from typing import Any, TypeAlias, TypedDict, cast
 
 import gymnasium
 from gymnasium.vector.utils import batch_space, iterate
@@ -18,13 +16,22 @@ from cloudrc.errors import BadInputError
 from cloudrc.gym.executors import Executor
 from cloudrc.gym.loop import RemoteLoop, Settings
 from cloudrc.gym.values import checker, copied, neutral, size_of
-from cloudrc.gym.watched import WatchedExecutor
-from cloudrc.link.library import LinkProfile, is_whole, read_profile
+from cloudrc.link.library import LinkProfile, read_profile
+from cloudrc.outside.refusal import naming
+from cloudrc.outside.values import InvalidValueError, Quantity
 from cloudrc.text import suggest_name
 
 Profile: TypeAlias = str | Path | Mapping[str, Any] | LinkProfile
-CHUNK_MAX = 10_000
-"""Largest number of actions in an answer."""
+SIZE = Quantity("bytes", 0, 1_000_000_000, whole=True)
+"""Size of a packet."""
+COUNTS = {
+    "chunk": (Quantity(ge=1, le=10_000, whole=True), "the number of actions in an answer"),
+    "observation_bytes": (SIZE, "a number of bytes"),
+    "action_bytes": (SIZE, "a number of bytes"),
+}
+"""Option -> which whole numbers it takes, and what they mean."""
+COMPUTE = Quantity("s", 0.0, 3600.0)
+"""Time for an answer."""
 WAIT = 0.05
 """How long a robot waits in a step for an answer, as a share of the step."""
 ANSWER = "answer"
@@ -59,6 +66,19 @@ def refuse_unknown(
             raise BadInputError(f"{what} has no argument {name!r}; {there}")
 
 
+def read_options(what: str, given: Options) -> Options:
+    """Read the options of an environment; raise a BadInputError that says what is wrong."""
+    refuse_unknown(what, given)
+    if (hold := given.get("hold", "repeat")) not in ("repeat", "start"):
+        raise BadInputError(f"hold {hold!r}: give 'repeat' or 'start'")
+    read = dict(given)
+    for name, (quantity, wanted) in COUNTS.items():
+        if read.get(name) is not None:
+            with naming(name, f"None, or {wanted}"):
+                read[name] = quantity.of(read[name])
+    return cast(Options, read)
+
+
 def connect(
     spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]],
     dt: float,
@@ -81,7 +101,6 @@ def connect(
     `answer_within` how long a robot waits in it for an answer [s].
     """
     observations, actions = spaces
-    _refuse_wrong(hold, chunk, {"observation": observation_bytes, "action": action_bytes})
     waits = isinstance(start, str) and start == ANSWER
     if start is None or waits:
         start = neutral(actions)
@@ -103,52 +122,28 @@ def connect(
         observation_bytes=observation_bytes,
         action_bytes=action_bytes,
     )
-    check = checker(actions, "one action, or None")
-    return [
-        RemoteLoop(settings, find_executor(executor, check, chunked=chunk is not None), stream)
-        for stream in streams
-    ]
-
-
-def _refuse_wrong(hold: str, chunk: int | None, sizes: Mapping[str, int | None]) -> None:
-    if hold not in ("repeat", "start"):
-        raise BadInputError(f"hold {hold!r}: give 'repeat' or 'start'")
-    if chunk is not None and not (is_whole(chunk) and 1 <= chunk <= CHUNK_MAX):
-        raise BadInputError(
-            f"chunk {chunk!r}: give None or the number of actions in an answer, up to {CHUNK_MAX}"
-        )
-    for name, size in sizes.items():
-        if size is not None and not (is_whole(size) and size >= 0):
-            raise BadInputError(f"{name}_bytes {size!r}: give a number of bytes, or None")
+    check, loops = checker(actions, "one action, or None"), list[RemoteLoop]()
+    for stream in streams:
+        own, is_ours = find_executor(executor, chunked=chunk is not None)
+        loops.append(RemoteLoop(settings, own, stream, judge=None if is_ours else check))
+    return loops
 
 
 def _read_wait(given: float | None, dt: float) -> float:
     """Return how long the robot waits in a step of `dt` [s] for an answer [s]."""
     if given is None:
         return WAIT * dt
-    wait = nan
-    with suppress(plugins.InvalidResultError):
-        wait = plugins.to_number(given, "time")
-    if not 0.0 <= wait <= dt:
-        raise BadInputError(
-            f"answer_within {given!r}: give how long the robot waits in a step for an answer, in "
-            f"seconds, from 0 to the step, {dt:g}"
-        )
-    return wait
+    with naming("answer_within", "how long the robot waits in a step for an answer"):
+        return Quantity("s", 0.0, dt).of(given)  # type: ignore[no-any-return]
 
 
 def compute_times(compute: float | tuple[float, float]) -> tuple[float, float]:
     """Return mean and standard deviation of a compute time [s], given as a number or as both."""
     both = compute if isinstance(compute, tuple | list) else (compute, 0.0)
-    try:
-        mean, deviation = (plugins.to_number(each, "time") for each in both)
-    except ValueError:  # also for another number of values
-        mean = deviation = nan
-    if not (0.0 <= mean <= 3600.0 and 0.0 <= deviation <= 3600.0) or (deviation and not mean):
-        raise BadInputError(
-            f"compute {compute!r}: give the time for an answer in seconds, or its mean and its "
-            "standard deviation, such as (0.05, 0.02)"
-        )
+    with naming("compute", "the time for an answer, or its mean and its standard deviation"):
+        mean, deviation = COMPUTE.row(both, 2)
+        if deviation and not mean:
+            raise InvalidValueError(f"{both}: the mean is 0")
     return mean, deviation
 
 
@@ -181,10 +176,10 @@ def describe_answer(chunk: int | None) -> str:
     return "one action" if chunk is None else f"a chunk of {chunk} actions"
 
 
-def find_executor(name: str | Path, check: Callable[[Any], None], *, chunked: bool) -> Executor:
+def find_executor(name: str | Path, *, chunked: bool) -> tuple[Executor, bool]:
     """Build an executor by name or path; raise a BadInputError if it does not fit.
 
-    `check` raises an exception for a value that is no action.
+    Also return whether cloudrc ships it, so that its actions need no judge.
     """
     found = str(name)
     if not plugins.is_path(found):
@@ -200,6 +195,4 @@ def find_executor(name: str | Path, check: Callable[[Any], None], *, chunked: bo
             f"executor {found!r} plays chunks of actions: give chunk=, the number of actions in "
             "an answer"
         )
-    if plugins.find("executors", found).is_shipped:
-        return executor
-    return WatchedExecutor(found, executor, check)
+    return executor, plugins.find("executors", found).is_shipped

@@ -14,7 +14,7 @@ from gymnasium.vector import AsyncVectorEnv, VectorWrapper
 
 from cloudrc.errors import BadInputError
 from cloudrc.gym.options import compute_times
-from cloudrc.plugins import InvalidResultError, to_number
+from cloudrc.outside.values import ANY, InvalidValueError
 
 CONTROL = ("step_dt", "control_hz", "control_freq", "policy_frequency")
 """Names that tell how often an environment takes an action, as in Isaac Lab, gym-pusht, robosuite,
@@ -120,8 +120,8 @@ def _told(env: Any) -> dict[str, float]:
 
 def _seconds(name: str, value: Any) -> float:
     """Return the time [s] that a value means; NaN if it means none."""
-    with suppress(InvalidResultError, ZeroDivisionError):
-        number = to_number(value, name)
+    with suppress(InvalidValueError, ZeroDivisionError):
+        number = ANY.of(value)
         number = number if name in TIMES else 1.0 / number
         return number if 0.0 < number <= 3600.0 else nan
     return nan

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping
-from contextlib import suppress
 from math import dist
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +27,7 @@ from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.errors import BadInputError
 from cloudrc.gym.options import refuse_unknown
 from cloudrc.messages import Datagram, Odometry, Setpoint
-from cloudrc.plugins import shorten, to_numbers
+from cloudrc.outside.values import RESULT, InvalidValueError
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
@@ -207,14 +206,11 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         info = self._judge(flight) if ended or late else {}
         return observation, -distance, ended, late, info
 
-    def _numbers_of(self, action: Any) -> list[float]:
-        count = len(self._parts)
-        with suppress(TypeError, ValueError):
-            values = to_numbers(action)
-            if values.shape == (count,):
-                return [*map(float, values)]
-        parts = ", ".join(self._parts)
-        raise BadInputError(f"action {shorten(action)}: give {count} finite numbers: {parts}")
+    def _numbers_of(self, action: Any) -> tuple[float, ...]:
+        try:
+            return RESULT.row(action, len(self._parts))
+        except InvalidValueError as error:
+            raise BadInputError(f"action {error}: {', '.join(self._parts)}") from None
 
     def __getstate__(self) -> object:
         """Return the state for a copy; refuse it in flight, whose tunnel has keys in C objects."""

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from cloudrc.errors import BadInputError
-from cloudrc.plugins import LARGEST, InvalidResultError, shorten, to_arrays, to_numbers
+from cloudrc.outside.values import RESULT, shorten, to_arrays
 
 _PLAIN = (int, float, bool, str, np.generic, type(None))
 
@@ -68,65 +68,34 @@ def checker(space: spaces.Space[Any], what: str) -> Callable[[Any], None]:
     It does not look at the bounds of a `Box`: the environment decides about them, and many clip.
     `what` says in words what an action is.
     """
-    return partial(_check, _judge_of(space), space, what)
+    return partial(_check, space, what)
 
 
-# Functions of this module and no closures: an environment that has them can be pickled.
-def _check(judge: Callable[[Any], None], space: spaces.Space[Any], what: str, action: Any) -> None:
+# A function of this module and no closure: an environment that has it can be pickled.
+def _check(space: spaces.Space[Any], what: str, action: Any) -> None:
     try:
-        judge(action)
-    except (InvalidResultError, TypeError, ValueError) as error:
+        _judge(space, action)
+    except (TypeError, ValueError) as error:
         shape = getattr(action, "shape", None)
         given = shorten(action) + (f" of shape {shape}" if shape is not None else "")
-        why = f" ({error})" if isinstance(error, InvalidResultError) else ""
+        why = f" ({error})" if str(error) else ""
         raise BadInputError(f"the action is {given}{why}; give {what}, in {space}") from None
 
 
-def _judge_of(space: spaces.Space[Any]) -> Callable[[Any], None]:
-    """Return a function that raises a ValueError if an action does not have the form of a space."""
+def _judge(space: spaces.Space[Any], action: Any) -> None:
+    """Raise a ValueError if an action does not have the form of a space."""
     if isinstance(space, spaces.Box):
-        return partial(_judge_array, space.shape)
-    if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary):
-        return partial(_judge_choices, space)
-    if isinstance(space, spaces.Discrete):
-        return partial(_judge_choice, int(space.start), int(space.start + space.n))
-    if isinstance(space, spaces.Dict):
-        return partial(_judge_map, {key: _judge_of(each) for key, each in space.spaces.items()})
-    return _judge_given
-
-
-def _judge_array(shape: tuple[int, ...], action: Any, *, may_switch: bool = False) -> None:
-    if type(action) is np.ndarray and action.shape == shape:
-        if action.dtype.kind == "f" and float(np.vdot(action, action)) <= LARGEST:
-            return  # the usual case: `to_numbers` takes microseconds
-    elif not isinstance(action, list | tuple | np.generic) or np.shape(action) != shape:
-        raise ValueError
-    if not (may_switch and np.asarray(action).dtype.kind == "b"):
-        to_numbers(action)
-
-
-def _judge_choices(space: spaces.MultiDiscrete | spaces.MultiBinary, action: Any) -> None:
-    _judge_array(space.shape, action, may_switch=True)
-    if not space.contains(np.asarray(action)):
-        raise ValueError
-
-
-def _judge_choice(first: int, end: int, action: Any) -> None:
-    if type(action) is not int and (
-        np.shape(action) != () or np.asarray(action).dtype.kind not in "biu"
-    ):
-        raise ValueError
-    if not first <= int(action) < end:
-        raise ValueError
-
-
-def _judge_map(judges: Mapping[str, Callable[[Any], None]], action: Any) -> None:
-    if not isinstance(action, Mapping) or action.keys() != judges.keys():
-        raise ValueError
-    for key, judge in judges.items():
-        judge(action[key])
-
-
-def _judge_given(action: Any) -> None:
-    if action is None:
+        if np.shape(action) != space.shape:
+            raise ValueError
+        RESULT.array(action)
+    elif isinstance(space, spaces.Dict):
+        if not isinstance(action, Mapping) or action.keys() != space.keys():
+            raise ValueError
+        for key, part in space.items():
+            _judge(part, action[key])
+    elif isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+        given = np.asarray(action)
+        if not space.contains((given.astype(int) if given.dtype == bool else given)[()]):
+            raise ValueError
+    elif action is None:
         raise ValueError

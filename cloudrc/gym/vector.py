@@ -16,12 +16,12 @@ from cloudrc.gym.options import (
     answer_space,
     connect,
     describe_answer,
-    refuse_unknown,
+    read_options,
     warn,
 )
 from cloudrc.gym.step import find_step
 from cloudrc.gym.values import checker, copied
-from cloudrc.plugins import to_arrays
+from cloudrc.outside.values import to_arrays
 
 if TYPE_CHECKING:
     _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]
@@ -56,7 +56,7 @@ class NetworkedVector(_Wrapper):
                 f"env is {type(env).__name__}: give a vector environment of gymnasium, as "
                 "gymnasium.make_vec returns it; for a single one there is Networked"
             )
-        refuse_unknown("NetworkedVector", options)
+        options = read_options("NetworkedVector", options)
         super().__init__(env)
         space, chunk = env.single_action_space, options.get("chunk")
         names = [f"{stream}/{robot}" for robot in range(env.num_envs)]

@@ -27,7 +27,7 @@ from cloudrc.link.profile import (
     GilbertElliott,
     Trace,
 )
-from cloudrc.patience import telling_if_slow
+from cloudrc.outside.patience import telling_if_slow
 from cloudrc.rounding import differences
 from cloudrc.text import parse_number
 

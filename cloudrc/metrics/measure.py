@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +12,9 @@ from cloudrc import plugins
 from cloudrc.errors import BadInputError, describe_error
 from cloudrc.metrics import control, link, mission, response
 from cloudrc.metrics.flight import SHIPPED, Flight, Metric
-from cloudrc.patience import telling_if_slow
+from cloudrc.outside import code
+from cloudrc.outside.patience import telling_if_slow
+from cloudrc.outside.values import RESULT
 from cloudrc.record.holes import goes_on
 from cloudrc.text import unknown_name_text
 
@@ -139,21 +140,17 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> Measured:
             else:
                 # A user's metric may change what it is given: it gets tables of its own.
                 own_flight = replace(flight)
-                with plugins.apart(), telling_if_slow(f"metric {choice} is still being computed"):
+                with code.apart(), telling_if_slow(f"metric {choice} is still being computed"):
                     value = metric.measure(own_flight)
             if value is None:
                 continue
-            number = plugins.to_number(value, "value")
-            if abs(number) <= plugins.LARGEST:  # False for NaN
-                numbers[name] = Number(number, metric.unit, metric.meaning)
-            else:
-                beyond = f", beyond {plugins.LARGEST:g}" if isfinite(number) else ""
-                notes.append(f"{METRIC_NOTE}{name} gave {number}{beyond}: left out")
-        except plugins.FAILURES as error:
-            plugins.check_failure(error, f"{METRIC_NOTE}{name}")
-            why = f"{plugins.place_of(error)}{describe_error(error)}"
+            number = RESULT.of(value, "value")
+            numbers[name] = Number(number, metric.unit, metric.meaning)
+        except code.FAILURES as error:
+            code.check_failure(error, f"{METRIC_NOTE}{name}")
+            why = f"{code.place_of(error)}{describe_error(error)}"
             notes.append(f"{METRIC_NOTE}{name} failed: {why}")
-            traceback = traceback or plugins.stack_of(error)
+            traceback = traceback or code.stack_of(error)
     return Measured(numbers, notes, traceback)
 
 

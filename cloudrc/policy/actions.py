@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.plugins import InvalidResultError, shorten, to_arrays, to_numbers
+from cloudrc.outside.values import RESULT, InvalidValueError, shorten, to_arrays
 
 ACTIONS = "actions"
 """Key of an answer: the chunk of actions, shape (H, A)."""
@@ -33,15 +33,12 @@ def read_actions(
     if ACTIONS not in answer:
         keys = ", ".join(sorted(map(str, answer))) or "none"
         raise PolicyAnswerError(f"the answer has no key '{ACTIONS}'; its keys: {keys[:200]}")
+    given = to_arrays(answer[ACTIONS])
     try:
-        given = to_arrays(answer[ACTIONS])
-        actions = np.asarray(given)
-        if not (may_switch and actions.dtype.kind == "b"):
-            actions = to_numbers(given)
-    except InvalidResultError as error:
+        is_switch = may_switch and isinstance(given, np.ndarray) and given.dtype.kind == "b"
+        actions = given if is_switch else RESULT.array(given)
+    except InvalidValueError as error:
         raise PolicyAnswerError(f"'{ACTIONS}': {error}") from None
-    except (TypeError, ValueError, RuntimeError):  # rows of unequal lengths
-        raise PolicyAnswerError(f"'{ACTIONS}' is {shorten(answer[ACTIONS])}, no array") from None
     wanted = f"(H, {'A' if width is None else width})"
     is_chunk = actions.ndim == 2 and 0 < len(actions) <= HORIZON_MAX and actions.shape[1] > 0
     if not is_chunk or width not in (None, actions.shape[1]):

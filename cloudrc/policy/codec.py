@@ -15,7 +15,7 @@ from typing import Any, cast
 import msgpack
 import numpy as np
 
-from cloudrc.plugins import shorten, to_arrays
+from cloudrc.outside.values import shorten, to_arrays
 
 MESSAGE_MAX = 64 << 20
 """Largest message [bytes]; three raw color images of 1920 x 1080 pixels take 19 MB."""

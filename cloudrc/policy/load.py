@@ -7,15 +7,8 @@ from functools import partial
 from typing import Any
 
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.plugins import (
-    FAILURES,
-    check_failure,
-    find,
-    is_path,
-    locate,
-    refuse_failure,
-    stack_of,
-)
+from cloudrc.outside.code import FAILURES, calling, check_failure, locate, stack_of
+from cloudrc.plugins import find, is_path
 
 
 class PolicyFailedError(CloudrcError):
@@ -43,7 +36,7 @@ class LoadedPolicy:
         policy = find("policies", name, look=False)
         build, infer = policy.get("build"), policy.get("infer")
         what = f"policy '{name}' cannot be built"
-        with refuse_failure(what, slow=f"{name} is still being built"):
+        with calling(what, slow=f"{name} is still being built"):
             is_built = build is not None and infer is None
             read = partial(_attribute, build()) if is_built else policy.get
             infer, reset, metadata = read("infer"), read("reset"), read("metadata")

@@ -18,7 +18,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from cloudrc.errors import BadInputError, describe_error
-from cloudrc.plugins import apart
+from cloudrc.outside.code import apart
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.codec import MESSAGE_MAX, WireError, pack, unpack
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError

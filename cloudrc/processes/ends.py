@@ -28,7 +28,7 @@ from cloudrc.link.traces import SIZE_MAX, link_profile
 from cloudrc.link.verify.judge import Flow
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.messages import GuardState, plan_length
-from cloudrc.plugins import apart
+from cloudrc.outside.code import apart
 from cloudrc.processes.ports import listening, open_exporter, warn
 from cloudrc.records import Fault
 from cloudrc.runs.requirements import require

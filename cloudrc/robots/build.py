@@ -19,6 +19,8 @@ from cloudrc.config.shipped import ROBOT_FILE, file_of
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import ZERO, Vector
+from cloudrc.outside import code
+from cloudrc.outside.values import RESULT, shorten
 from cloudrc.robots.onboard._airframe import thrust_to_weight
 from cloudrc.world.accelerated import AcceleratedRobot
 from cloudrc.world.guard.state import Guard
@@ -28,7 +30,7 @@ from cloudrc.world.plant import Wind
 from cloudrc.world.robot import STEP, Robot
 from cloudrc.world.scene import compile_model, compile_true
 from cloudrc.world.simulator import Simulator, find_site
-from cloudrc.world.watched import WatchedActuators, WatchedOnboard, to_commands
+from cloudrc.world.watched import WatchedActuators, WatchedOnboard
 
 KIND = "onboard"
 """Kind of plug-in."""
@@ -134,7 +136,7 @@ def _advise(plugin: plugins.Found, world: World, gains: Vector) -> tuple[str, ..
         advice = function(world, values, gains)
         texts = () if isinstance(advice, str) else tuple(advice)
         if isinstance(advice, str) or not all(isinstance(text, str) for text in texts):
-            raise ValueError(f"it returned {plugins.shorten(advice)}, not texts; yield each text")
+            raise ValueError(f"it returned {shorten(advice)}, not texts; yield each text")
         return texts
 
 
@@ -157,7 +159,7 @@ def _accelerator(world: World, plugin: plugins.Found) -> Accelerator | None:
     with plugin.calling("accelerator") as function:
         faster = function()
         if not isinstance(faster, Accelerator | None):
-            raise ValueError(f"it returned {plugins.shorten(faster)}, no Accelerator")
+            raise ValueError(f"it returned {shorten(faster)}, no Accelerator")
         return faster
 
 
@@ -307,18 +309,13 @@ def _check_onboard(name: str, onboard: Onboard, size: int | None) -> None:
 
     `size` is the number of commands, None if unknown.
     """
-    wanted = "finite numbers" if size is None else f"{size} finite numbers, one per actuator"
     what = f"the onboard controller {name!r} does not hold the contract"
-    with plugins.refuse_failure(what, slow=f"reset() of {name} is still running"):
+    with code.calling(what, slow=f"reset() of {name} is still running"):
         for method in ("reset", "update", "brake"):
             if not callable(getattr(onboard, method, None)):
                 raise ValueError(f"{type(onboard).__name__} has no method {method}()")
-        stopped = getattr(onboard, "stopped", None)
-        count = 0
-        with suppress(plugins.InvalidResultError):
-            count = len(to_commands(stopped))
-        if not count or count != (size or count):
-            raise ValueError(f"its stopped is {plugins.shorten(stopped)}, not {wanted}")
+        stopped = getattr(onboard, "stopped", None) or ()
+        RESULT.row(stopped, len(stopped) if size is None else size, "stopped")
         onboard.reset()
 
 

@@ -11,6 +11,7 @@ from cloudrc.cloud.loop import ControlLoop
 from cloudrc.config.load import ResolvedExperiment, absolute_paths
 from cloudrc.config.reuse import reuse_results
 from cloudrc.errors import MissingPrerequisiteError, describe_error, machine_error
+from cloudrc.outside import code
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Assessment, Run
 from cloudrc.report.write import assess
@@ -33,11 +34,11 @@ def fly_point(experiment: ResolvedExperiment) -> Row:
     """
     try:
         return measure(experiment)
-    except plugins.FAILURES as error:  # one point that cannot fly must not stop the others
+    except code.FAILURES as error:  # one point that cannot fly must not stop the others
         if failure := machine_error(error) or _lost_file(experiment):
             raise failure from error
-        plugins.check_failure(error, "the flight")
-        text = f"{plugins.place_of(error)}{describe_error(error)}"
+        code.check_failure(error, "the flight")
+        text = f"{code.place_of(error)}{describe_error(error)}"
         none: Row = {"numbers": {}, "records_sha256": ""}
         return {"verdict": ERROR, "failures": [ERROR], "text": text, **none, "physics_steps": ""}
 

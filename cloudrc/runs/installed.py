@@ -11,7 +11,7 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.overrides import KINDS
 from cloudrc.config.reuse import reuse
 from cloudrc.config.robot import known_robot
-from cloudrc.plugin_file import is_installed
+from cloudrc.outside.code import is_installed
 from cloudrc.runs.own_files import hash_of_module
 
 

@@ -8,13 +8,13 @@ import sys
 from hashlib import file_digest, sha256
 from pathlib import Path
 
-from cloudrc import plugin_file
 from cloudrc.config.load import ResolvedExperiment, absolute_paths, local_files, read_experiment
 from cloudrc.config.reuse import reuse
 from cloudrc.config.robot import files_of
 from cloudrc.errors import BadInputError
 from cloudrc.files import read
 from cloudrc.geometry.model_files import model_files
+from cloudrc.outside import code
 from cloudrc.report.document import ENVIRONMENT_FILE, FILES
 
 DIGITS = 12
@@ -26,7 +26,7 @@ def hashes(path: str) -> list[tuple[str, str]]:
 
     A plug-in needs the modules that it imports. A robot or scene needs the files that it names.
     """
-    needs = model_files if path.endswith(".xml") else plugin_file.sources
+    needs = model_files if path.endswith(".xml") else code.sources
     return reuse(
         ("hashes", path),
         lambda: [(str(file), _hash_of(file)) for file in needs(Path(path))],
@@ -57,11 +57,9 @@ def hash_of(files: list[Path]) -> str:
 def hash_of_module(name: str, file: Path) -> str:
     """Return the hash of the `file` of a module and of the local modules that it imports."""
     depth = name.count(".") + (file.stem == "__init__")
-    others = [
-        each for each in sys.path if os.path.isdir(each) and not plugin_file.is_installed(each)
-    ]
+    others = [each for each in sys.path if os.path.isdir(each) and not code.is_installed(each)]
     root = [*file.parents][: depth + 1][-1]  # of the top-level package
-    return hash_of(plugin_file.sources(file, [str(root), *others]))
+    return hash_of(code.sources(file, [str(root), *others]))
 
 
 def hash_files(experiment: ResolvedExperiment) -> dict[str, str]:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc import assembly, plugins
+from cloudrc import assembly
 from cloudrc.ages import simulate_ages
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.robot import is_planar
@@ -27,6 +27,7 @@ from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
 from cloudrc.metrics.counters import growth
 from cloudrc.metrics.verdict import NOT_STARTED, plugin_failures
+from cloudrc.outside import code
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.record.holes import END_NS
 from cloudrc.records import Control, Counted, Fault, GroundTruth, GuardChange, MissionEvent, Record
@@ -83,11 +84,11 @@ def fly_step(experiment: ResolvedExperiment, size: float = SMALL) -> Answer:
     """
     try:
         return _fly_step(experiment, size)
-    except plugins.FAILURES as error:  # a value that cannot fly must not stop the search
+    except code.FAILURES as error:  # a value that cannot fly must not stop the search
         if failure := machine_error(error):
             raise failure from error
-        plugins.check_failure(error, "the flight")
-        text = f"{plugins.place_of(error)}{describe_error(error)}"
+        code.check_failure(error, "the flight")
+        text = f"{code.place_of(error)}{describe_error(error)}"
         return {"stable": False, "code": "error", "text": text}
 
 

@@ -7,7 +7,8 @@ from math import isfinite
 from typing import Any
 
 from cloudrc.geometry.compiled import mujoco
-from cloudrc.plugins import FAILURES, shorten
+from cloudrc.outside.code import FAILURES
+from cloudrc.outside.values import shorten
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.onboard import Onboard
 from cloudrc.world.robot import STEP_NS, Robot

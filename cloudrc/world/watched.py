@@ -6,24 +6,15 @@ is an `OnboardFailedError`, on which the guard stops the robot.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Set
-from math import hypot
+from collections.abc import Callable
 from pathlib import Path
 from types import CodeType
 from typing import Any
 
 from cloudrc.errors import describe_error
 from cloudrc.messages import NEVER_NS, Vector
-from cloudrc.plugins import (
-    FAILURES,
-    LARGEST,
-    InvalidResultError,
-    check_failure,
-    locate,
-    shorten,
-    stack_of,
-    to_number,
-)
+from cloudrc.outside.code import FAILURES, check_failure, locate, stack_of
+from cloudrc.outside.values import RESULT, InvalidValueError
 from cloudrc.world.onboard import Actuators, Commands, Inputs, Onboard
 from cloudrc.world.readings import Readings
 
@@ -123,28 +114,10 @@ def _call(what: str, function: Callable[..., Any], *given: Any) -> Any:
 
 def _floats(values: Any, size: int, what: str, call: Callable[..., Any]) -> tuple[float, ...]:
     """Return the values of a `call` as floats; refuse another number of values, and wrong ones."""
-    if type(values) is tuple and len(values) == size and {*map(type, values)} == {float}:
-        if hypot(*values) <= LARGEST:  # the usual case; False for NaN
-            return values
     try:
-        numbers = to_commands(values)
-    except FAILURES:  # the values are the user's, and so may be what iterates them
-        numbers = ()
-    if len(numbers) == size:
-        return numbers
-    name = getattr(call, "__name__", "it")
-    text = f"{name}() returned {shorten(values)}, not {size} finite numbers up to {LARGEST:g}"
-    raise OnboardFailedError(f"{what} failed ({text}, {where(call)})")
-
-
-def to_commands(values: Any) -> tuple[float, ...]:
-    """Return a user's values as floats, in order; raise an InvalidResultError for a wrong value."""
-    if not isinstance(values, Iterable) or isinstance(values, str | bytes | Set | Mapping):
-        raise InvalidResultError(f"{shorten(values)} is no row of numbers")
-    numbers = tuple([to_number(value, "value") for value in values])
-    if not hypot(*numbers) <= LARGEST:
-        raise InvalidResultError(f"{shorten(values)} is not finite, or beyond {LARGEST:g}")
-    return numbers
+        return RESULT.row(values, size, "result")
+    except InvalidValueError as error:
+        raise OnboardFailedError(f"{what} failed ({error}, {where(call)})") from None
 
 
 def failure_of(what: str, call: Callable[..., Any], error: BaseException) -> OnboardFailedError:

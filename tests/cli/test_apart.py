@@ -2,51 +2,24 @@
 
 import json
 import os
-import sys
 
 import pytest
 
-from cloudrc import plugins
 from cloudrc.runs.workers import map_in_order, take_each
 from tests.cli.conftest import FLY
-
-METRIC = """
-import os, sys, threading, time
-UNIT = "1"
-def measure(flight):
-    return 1.0
-def spoil():
-    print("text of the user")
-    os.chdir("/")
-    sys.stdout = None
-"""
-
-
-def _spoil():
-    print("text of the user")
-    os.chdir("/")
-    sys.stdout = None
-
-
-def test_a_plugin_keeps_folder_and_streams_of_the_command(folder, capsys):
-    out = sys.stdout
-    with plugins.apart():
-        _spoil()
-    print("result")
-    assert (os.getcwd(), sys.stdout) == (str(folder), out)
-    assert capsys.readouterr() == ("result\n", "text of the user\n")
 
 
 def test_what_plugins_print_is_not_part_of_the_result(folder, capsys):
     from cloudrc.cli.main import main
 
-    body = METRIC.replace("return 1.0", "spoil()\n    return 1.0") + "spoil()\n"
-    (folder / "metric.py").write_text(body)
+    (folder / "metric.py").write_text(
+        'UNIT = "1"\ndef measure(flight):\n    print("text of the user")\n    return 1.0\n'
+    )
     asked = "--set=report.metrics=[./metric.py]"
     assert main([*FLY, asked, "--out", "run", "-o", "json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert report["numbers"]["metric"]["value"] == 1.0
-    assert (folder / "run" / "report.json").is_file()
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["numbers"]["metric"]["value"] == 1.0
+    assert "text of the user" in printed.err
 
 
 def _exit_at_once(number):

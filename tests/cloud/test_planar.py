@@ -8,7 +8,7 @@ from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.cloud.planar import Planar
 from cloudrc.errors import ControllerLostError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
-from cloudrc.plugins import InvalidResultError
+from cloudrc.outside.values import InvalidValueError
 
 SEEN = Odometry(0, (0.0, 0.0, 0.0993), UPRIGHT, (0.2, 0.0, 0.004), ZERO)
 GOAL = Setpoint((1.0, 2.0, 0.1), velocity=(0.5, 0.0, 1e-5))
@@ -46,7 +46,7 @@ def test_the_pid_plans_in_the_plane_and_its_limits_count_there():
 @pytest.mark.parametrize("z", [0.3, -0.3, 1e-6])
 def test_a_vertical_velocity_is_refused_with_file_value_and_robot(z):
     said = f"^/mine/climb.py: its velocity in z is {z:g} m/s, but the robot rover stays on the"
-    with pytest.raises(InvalidResultError, match=said):
+    with pytest.raises(InvalidValueError, match=said):
         steer(Climbing(z))
 
 

@@ -314,32 +314,14 @@ def test_importing_the_wrapper_takes_no_heavy_package_along():
     ("options", "words"),
     [
         ({"link": "let"}, "no profile named 'let'.*did you mean lte"),
-        ({"seed": -1}, "seed -1"),
-        ({"compute": -0.1}, "compute -0.1: give the time"),
-        ({"compute": "fast"}, "compute 'fast'"),
-        ({"compute": (0.0, 0.1)}, "compute"),
-        ({"compute": (0.1, 0.1, 0.1)}, "compute"),
-        ({"answer_within": -0.001}, "answer_within -0.001: give how long the robot waits"),
-        ({"answer_within": 0.02}, "from 0 to the step, 0.01"),
-        ({"answer_within": "1 ms"}, "answer_within '1 ms'"),
-        ({"chunk": 0}, "chunk 0: give None or the number"),
-        ({"chunk": 2.5}, "chunk 2.5"),
-        ({"chunk": True}, "chunk True"),
+        ({"compute": (0.0, 0.1)}, "the mean is 0"),
+        ({"compute": (0.1, 0.1, 0.1)}, "not 2 numbers"),
+        ({"answer_within": 0.02}, r"0.02, not a number >= 0 and <= 0.01 \[s\]; give how long"),
         ({"executor": "newst"}, "no executor named 'newst'.*did you mean newest"),
         ({"executor": "prefix"}, "executor 'prefix' plays chunks of actions: give chunk="),
-        ({"executor": "./none.py"}, "there is no such file"),
         ({"hold": "zero"}, "hold 'zero': give 'repeat' or 'start'"),
         ({"start": np.zeros(3)}, r"of shape \(3,\); give as start= an action"),
-        ({"start": "answr"}, "start= an action, or 'answer'"),
-        ({"observation_bytes": -1}, "observation_bytes -1"),
-        ({"action_bytes": 2.0}, "action_bytes 2.0"),
         ({"dt": 0.0}, "the time step 0.0; give dt="),
-        ({"dt": "10 ms"}, "give dt="),
-        ({"dt": True}, "time step True; give dt="),
-        ({"compute": True}, "compute True"),
-        ({"compute": (0.05, "0.02")}, "compute"),
-        ({"seed": True}, "seed True"),
-        ({"start": [np.nan]}, r"value at \[0\] is nan"),
         ({"stream": 3}, "stream 3"),
     ],
 )
@@ -349,50 +331,39 @@ def test_an_argument_that_cannot_be_used_is_refused_in_one_line(options, words):
     assert "\n" not in str(caught.value)
 
 
+BOX, TWO = spaces.Box(-1, 1, (1,)), spaces.Discrete(2)
+
+
 @pytest.mark.parametrize(
-    ("space", "chunk", "action", "words"),
+    ("space", "chunk", "action", "is_one"),
     [
-        (None, None, None, "the action is NoneType None; give one action"),
-        (None, None, {"move": 1}, "the action is dict"),
-        (None, None, np.zeros(2), r"of shape \(2,\); give one action, in Box"),
-        (None, None, np.array([np.nan]), r"value at \[0\] is nan, not finite"),
-        (None, None, np.array([1e31]), "beyond 1e"),
-        (None, None, np.array([True]), r"value at \[0\] is bool"),
-        (None, None, [True], r"value at \[0\] is bool True"),
-        (None, None, ["0.5"], r"value at \[0\] is str '0.5'"),
-        (None, None, np.array([0.5], object), None),
-        (spaces.MultiBinary(2), None, np.array([True, False]), None),
-        (spaces.MultiBinary(2), None, [1, np.nan], r"value at \[1\] is nan"),
-        (spaces.Discrete(2), None, np.True_, None),
-        (spaces.Discrete(2), None, 0.5, "float 0.5"),
-        (spaces.Discrete(2), None, 2, "the action is int 2; give one action, in Discrete"),
-        (spaces.Discrete(2, start=3), None, np.int64(2), "the action is"),
-        (spaces.Discrete(2), 2, [0, 2], "the action is list"),
-        (spaces.MultiDiscrete([2, 3]), None, np.array([1, 3]), "the action is"),
-        (spaces.MultiBinary(2), None, [0, 2], "the action is list"),
-        (spaces.Discrete(2), None, "1", "str '1'"),
-        (spaces.Dict(a=spaces.Box(-1, 1, (1,))), None, {"a": [np.nan]}, r"\[0\] is nan"),
-        (None, 4, np.zeros(1), "give a chunk of 4 actions"),
-        (None, 4, np.zeros((3, 1)), r"of shape \(3, 1\)"),
-        (None, 4, [[1.0], [1.0, 2.0], [1.0], [1.0]], "the action is list"),
-        (spaces.Discrete(2), None, None, "NoneType"),
-        (spaces.Discrete(2), None, np.zeros(1, int), r"of shape \(1,\)"),
-        (spaces.Discrete(2), 4, 1, "the action is int 1; give a chunk of 4"),
-        (spaces.Dict(a=spaces.Discrete(2)), None, {"b": 1}, "the action is dict"),
-        (spaces.Dict(a=spaces.Discrete(2)), None, 1, "the action is int"),
-        (spaces.Dict(a=spaces.Discrete(2)), 3, None, "the action is NoneType"),
-        (spaces.Tuple((spaces.Discrete(2),)), None, None, "NoneType"),
+        (BOX, None, np.array([5.0]), True),
+        (BOX, None, np.array([0.5], object), True),
+        (BOX, None, None, False),
+        (BOX, None, np.zeros(2), False),
+        (BOX, None, np.array([np.nan]), False),
+        (BOX, None, [True], False),
+        (BOX, 4, np.zeros((3, 1)), False),
+        (BOX, 4, [[1.0], [1.0, 2.0], [1.0], [1.0]], False),
+        (TWO, None, np.True_, True),
+        (TWO, None, 2, False),
+        (TWO, None, 0.5, False),
+        (TWO, 2, [0, 2], False),
+        (spaces.MultiBinary(2), None, np.array([True, False]), True),
+        (spaces.MultiBinary(2), None, [0, 2], False),
+        (spaces.MultiDiscrete([2, 3]), None, np.array([1, 3]), False),
+        (spaces.Dict(a=BOX), None, {"a": [np.nan]}, False),
+        (spaces.Dict(a=TWO), None, {"b": 1}, False),
+        (spaces.Tuple((TWO,)), None, None, False),
     ],
 )
-def test_an_action_of_another_form_or_a_wrong_value_is_refused_in_one_line(
-    space, chunk, action, words
-):
+def test_only_an_action_of_the_space_reaches_the_world(space, chunk, action, is_one):
     env = Networked(Counter(space), chunk=chunk)
     env.reset()
-    if words is None:
+    if is_one:
         env.step(action)
         return
-    with pytest.raises(BadInputError, match=words) as caught:
+    with pytest.raises(BadInputError, match="the action is") as caught:
         env.step(action)
     assert "\n" not in str(caught.value)
     assert env.unwrapped.executed == []

@@ -109,10 +109,10 @@ def after(count, last):
 @pytest.mark.parametrize(
     ("last", "code", "text"),
     [
-        (actions(np.nan), "controller_invalid", "not finite"),
-        (actions(np.inf), "controller_invalid", "not finite"),
+        (actions(np.nan), "controller_invalid", "not a finite number"),
+        (actions(np.inf), "controller_invalid", "not a finite number"),
         (actions(True), "controller_invalid", r"value at \[0, 0\] is bool np.True_"),
-        (pack({"actions": [[0.1, 0.2, True, 0]]}), "controller_invalid", "bool True"),
+        (pack({"actions": [[0.1, 0.2, True, 0]]}), "controller_invalid", "is True, not a finite"),
         (actions(0.0, (4,)), "controller_invalid", r"shape \(4,\), not \(H, 4\)"),
         (actions(0.0, (1, 3)), "controller_invalid", r"shape \(1, 3\), not \(H, 4\)"),
         (actions(0.0, (0, 4)), "controller_invalid", "shape"),

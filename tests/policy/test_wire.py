@@ -106,10 +106,10 @@ def infer(observation):
         ("shape", r"shape \(1,\)"),
         ("key", "no key 'actions'; its keys: action"),
         ("none", "not a map"),
-        ("nan", "not finite"),
+        ("nan", "not a finite number"),
         ("object", "cannot be packed"),
-        ("text", r"value at \[0, 0\] is str '1'"),
-        ("mixed", r"value at \[0, 1\] is bool True"),
+        ("text", r"value at \[0, 0\] is '1'"),
+        ("mixed", r"value at \[0, 1\] is True"),
         ("empty", "shape"),
     ],
 )

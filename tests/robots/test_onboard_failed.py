@@ -105,15 +105,10 @@ def fly(own, tmp_path):
 @pytest.mark.parametrize(
     ("what", "shown"),
     [
-        ("return (float('nan'), *commands[1:])", "tuple (nan, "),
-        ("return commands[1:]", "not 4 finite numbers up to 1e+30, own.py:15 in update"),
-        ("return [*commands, float('inf')]", "list ["),
-        ("return None", "NoneType None, not 4 finite numbers"),
-        ("return 'stop'", "str 'stop'"),
-        ("return (True, *commands[1:])", "tuple (True, "),
-        ("return (1e300, *commands[1:])", "not 4 finite numbers up to 1e+30"),
-        ("return {1.0, 2.0, 3.0, 4.0}", "set {1.0, "),
-        ("import numpy; return numpy.ones(4) > 0", "array([ True, "),
+        ("return (float('nan'), *commands[1:])", "its result at [0] is nan, not a finite number"),
+        ("return commands[1:]", "not 4 numbers, own.py:15 in update"),
+        ("return None", "its result is None"),
+        ("return (1e300, *commands[1:])", "its result at [0] is 1e+300"),
         ("raise KeyError('gyro')", "KeyError: 'gyro', own.py:19 in update"),
         ("raise SystemExit(0)", "sys.exit() was called"),
         ("assert False", "AssertionError"),
@@ -165,7 +160,7 @@ def test_physics_of_actuators_that_fails_in_flight_is_onboard_failed_too(fly, wh
     [
         ("1 / 0", "ZeroDivisionError: division by zero, own.py:14 in run"),
         ("raise SystemExit(0)", "sys.exit() was called"),
-        ("return None", "run() returned NoneType None, not the time of the next step, own.py:"),
+        ("return None", "run() returned None, not the time of the next step, own.py:"),
         ("return ended_ns - 10_000_000", "not the time of the next step"),
         ("data.qvel[0] = float('nan')", "its values are not finite, own.py:"),
         ("self.simulator.step((float('nan'),) * 4)", "its values are not finite"),
@@ -208,11 +203,11 @@ def test_a_reset_that_fails_is_told_once(fly):
 @pytest.mark.parametrize(
     ("old", "new", "shown"),
     [
-        ("law.stopped", "(0.0,) * 3", "stopped is tuple (0.0, 0.0, 0.0), not 4 finite numbers"),
-        ("law.stopped", "None", "stopped is NoneType None"),
+        ("law.stopped", "(0.0,) * 3", "stopped is tuple (0.0, 0.0, 0.0), not 4 numbers"),
+        ("law.stopped", "None", "stopped is tuple (), not 4 numbers"),
         ("law.stopped", "{0.0, 0.1, 0.2, 0.3}", "stopped is set {"),
-        ("law.stopped", "[float('nan')] * 4", "not 4 finite numbers, one per actuator"),
-        ("law.stopped", "(False,) * 4", "stopped is tuple (False, False, False, False), not 4"),
+        ("law.stopped", "[float('nan')] * 4", "stopped at [0] is nan"),
+        ("law.stopped", "(False,) * 4", "stopped at [0] is False"),
         ("def brake", "def halt", "Fails has no method brake()"),
         ("def update", "def go", "no method update()"),
         ("self.law.reset()", "raise OSError('no bus')", "no bus"),
@@ -227,7 +222,7 @@ def test_a_controller_without_its_parts_is_refused_before_the_flight(fly, old, n
 
 
 def test_actuators_that_cannot_be_made_are_refused_before_the_flight(fly):
-    with pytest.raises(BadInputError, match=r"\.py:\d+: actuators\(\) failed: ZeroDivisionError"):
+    with pytest.raises(BadInputError, match=r"failed: own\.py:\d+: ZeroDivisionError"):
         fly(FAILS.replace("{what}", "pass") + "\ndef actuators(model, dt):\n    return 1 / 0\n")
 
 
@@ -248,7 +243,7 @@ def test_actuators_that_cannot_work_are_refused_before_the_flight(fly, old, new,
 
 @pytest.mark.parametrize("make", ["3", "lambda *given: 3", "lambda *given: given[9]"])
 def test_an_accelerator_that_makes_no_robot_is_refused_before_the_flight(fly, make):
-    with pytest.raises(BadInputError, match=r"own\.py:\d+: accelerator\(\) failed: "):
+    with pytest.raises(BadInputError, match=r"own\.py: accelerator\(\) failed: "):
         fly(FASTER.replace("{what}", "pass").replace("(Faster", f"({make}"))
 
 

