@@ -21,6 +21,7 @@ EVERYTHING = {"*"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "messages": set(),
+    "outside": {"files"},
     "records": set(),
     "rounding": set(),
     "source": set(),
@@ -120,7 +121,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
         *("tunnel/codec", "record/", "world/simulator", "robots/pelican/native/robot"),
         "link/exec/namespace",
     ),
-    "yaml": ("config/", "link/", "record/", "report/", "cli/", "cluster/"),
+    "yaml": ("outside/", "config/", "record/", "report/", "cli/", "cluster/"),
     "pydantic": (
         *("config/", "link/", "cli/", "teleop/", "runs/", "report/folder"),
         *("drivers/process", "faults/schedule"),

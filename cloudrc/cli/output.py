@@ -41,7 +41,7 @@ def format_document(document: object, form: str) -> str:
     text = json.dumps(document, indent=2, ensure_ascii=False)
     if form == "json":  # escaped: a terminal must not obey control characters
         return re.sub("[\x7f-\x9f]", lambda found: f"\\u{ord(found[0]):04x}", text)
-    from cloudrc.config.document import write_yaml
+    from cloudrc.outside.document import write_yaml
 
     return write_yaml(json.loads(text)).rstrip("\n")
 

@@ -22,13 +22,13 @@ from typing import Any, NamedTuple
 
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, run
 from cloudrc.cluster.releases import INSTANCE, several_releases
-from cloudrc.config.document import Document, write_yaml
 from cloudrc.config.load import Edit, edit_profile, load_link
 from cloudrc.config.profile import DIRECTIONS, FILE_READERS
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 from cloudrc.link.control import APPLY_LIMIT, SOCKET, put_request, read_answer
 from cloudrc.link.follow import PROFILE
 from cloudrc.link.state import CHANGE_FILE, ChangeFacts, LinkState, write_change
+from cloudrc.outside.document import Document, write_yaml
 
 FOLDER = "/run/cloudrc"
 """Folder in a link container with the files of the link: route, state, socket."""

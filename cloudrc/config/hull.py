@@ -8,11 +8,11 @@ from importlib.util import find_spec
 import numpy as np
 
 from cloudrc import plugins
-from cloudrc.config.reuse import reuse
 from cloudrc.config.robot import RobotFiles, known_robot
 from cloudrc.config.shipped import ROBOT_FILE
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry.clearance import Hull, Spheres, ball
+from cloudrc.outside.reuse import reuse
 from cloudrc.outside.values import RESULT
 
 TOLERANCE = 1e-3

@@ -25,7 +25,6 @@ from pydantic import (
 
 from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
-from cloudrc.config.document import Document, KeyPath, read_document, write_yaml
 from cloudrc.config.ground import ABOVE, put_on_ground
 from cloudrc.config.heading import without_held_yaws
 from cloudrc.config.hull import hull_of
@@ -44,7 +43,6 @@ from cloudrc.config.profile import (
     load_profile,
     resolve_files,
 )
-from cloudrc.config.reuse import reuse, reuse_results
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, known_robot, parameters
 from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import (
@@ -65,6 +63,8 @@ from cloudrc.geometry.obstacles import fence_of, known
 from cloudrc.geometry.scene import Scene
 from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.traces import read_trace
+from cloudrc.outside.document import Document, KeyPath, read_document, write_yaml
+from cloudrc.outside.reuse import reuse, reuse_results
 from cloudrc.rounding import format_limit
 
 HORIZON_MAX_S = 1.0

@@ -27,14 +27,14 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 
 from cloudrc import plugins
 from cloudrc.config import problems, shipped
-from cloudrc.config.document import Document, KeyPath, Source, child, parse_value
 from cloudrc.config.problems import ConfigProblem, ProblemsError
-from cloudrc.config.reuse import reuse
 from cloudrc.config.robot import RobotFacts, facts, find_robot, known_robot, parameters
 from cloudrc.config.schema import Cloud, Experiment, PlanTime, PlugIn, Steps, World
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.outside import code
+from cloudrc.outside.document import Document, KeyPath, Source, child, parse_value
+from cloudrc.outside.reuse import reuse
 
 REMOTE, ROS2 = "remote", "ros2"
 OUTSIDE = (REMOTE, ROS2)

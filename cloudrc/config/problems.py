@@ -20,9 +20,9 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from cloudrc.config.document import Document, KeyPath
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import Range
+from cloudrc.outside.document import Document, KeyPath
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _TYPES = {

@@ -13,12 +13,12 @@ from typing import Annotated, Any
 from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from cloudrc.config import problems, shipped
-from cloudrc.config.document import Document, KeyPath
 from cloudrc.config.problems import ConfigProblem
-from cloudrc.config.reuse import reuse
 from cloudrc.config.section import Section
 from cloudrc.link.profile import Blackout, Change, DirectionKeys, GilbertElliott, Probability
 from cloudrc.link.traces import read_table, read_trace
+from cloudrc.outside.document import Document, KeyPath
+from cloudrc.outside.reuse import reuse
 
 DIRECTIONS = ("uplink", "downlink")
 FILE_READERS: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}

@@ -15,10 +15,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from cloudrc.config import shipped
-from cloudrc.config.document import read_document
 from cloudrc.config.heading import Heading
 from cloudrc.config.problems import ConfigProblem, raise_problems, validate
-from cloudrc.config.reuse import reuse
 from cloudrc.config.schema import (
     Acceleration,
     Constants,
@@ -33,6 +31,8 @@ from cloudrc.config.schema import (
 from cloudrc.config.section import Section
 from cloudrc.errors import BadInputError
 from cloudrc.messages import SENSORS_MAX
+from cloudrc.outside.document import read_document
+from cloudrc.outside.reuse import reuse
 from cloudrc.plugins import is_path
 from cloudrc.text import unknown_name_text
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from cloudrc.config.reuse import reuse
 from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import World
 from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.geometry.scene import Scene, load_scene
+from cloudrc.outside.reuse import reuse
 
 
 def scene_of(world: World) -> Scene:

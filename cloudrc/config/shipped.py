@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from cloudrc.config.document import Document, read_document
-from cloudrc.config.reuse import reuse
 from cloudrc.errors import BadInputError
+from cloudrc.outside.document import Document, read_document
+from cloudrc.outside.reuse import reuse
 from cloudrc.text import suggest_name, unknown_name_text
 
 _PACKAGE = Path(__file__).parents[1]

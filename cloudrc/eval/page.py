@@ -9,10 +9,10 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from cloudrc.config.document import write_yaml
 from cloudrc.eval.results import COLUMNS, LEGEND, SEEDLESS, TESTS
 from cloudrc.eval.setup import BASELINE, EvalSetup
 from cloudrc.files import write_atomically
+from cloudrc.outside.document import write_yaml
 from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.report.figures.style import Look
 from cloudrc.text import cells

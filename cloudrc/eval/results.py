@@ -9,12 +9,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cloudrc.config.reuse import reuse_results
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.eval.episode import play
 from cloudrc.eval.evidence import Row
 from cloudrc.eval.setup import Episode, EvalSetup
 from cloudrc.files import read, write_atomically
+from cloudrc.outside.reuse import reuse_results
 from cloudrc.rounding import format_limit
 from cloudrc.runs.store import append_rows, read_rows
 from cloudrc.runs.workers import map_in_order, take_each

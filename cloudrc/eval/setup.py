@@ -13,8 +13,6 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, TypeAlias
 
-from cloudrc.config.document import parse_value, read_document
-from cloudrc.config.reuse import reuse
 from cloudrc.errors import BadInputError
 from cloudrc.gym.step import StepTime
 from cloudrc.link.doubts import describe_heavy_loss
@@ -22,6 +20,9 @@ from cloudrc.link.library import LinkProfile, read_profile
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.traces import read_lines
 from cloudrc.outside.code import sources
+from cloudrc.outside.document import parse_value, read_document
+from cloudrc.outside.reuse import reuse
+from cloudrc.plugin_file import sources
 from cloudrc.plugins import is_path
 from cloudrc.policy.address import check_url
 from cloudrc.policy.observation import Mapped

@@ -9,9 +9,9 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
-from cloudrc.config.document import read_document, write_yaml
 from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
+from cloudrc.outside.document import read_document, write_yaml
 
 
 def generator(seed: int, use: int) -> np.random.Generator:

@@ -47,8 +47,8 @@ Load = Callable[[Path], Loaded]
 
 def prepare_link(folder: Path, link: ResolvedExperiment) -> None:
     """Make the folder of a link on this machine, with its profile and a folder per direction."""
-    from cloudrc.config.document import write_yaml
     from cloudrc.config.profile import DIRECTIONS, Profile
+    from cloudrc.outside.document import write_yaml
 
     for way in DIRECTIONS:
         (folder / way).mkdir(parents=True)

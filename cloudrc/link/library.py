@@ -56,9 +56,9 @@ def read_profile(profile: str | Path | Mapping[str, Any] | LinkProfile) -> LinkP
     if isinstance(profile, LinkProfile):
         return profile
     # Here, because a program that makes its profile itself needs neither pydantic nor YAML.
-    from cloudrc.config.document import Document, Source
     from cloudrc.config.profile import check_profile, load_profile
     from cloudrc.link.traces import link_profile
+    from cloudrc.outside.document import Document, Source
 
     if isinstance(profile, Mapping):
         tree = _plain(profile)

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from cloudrc.config.document import parse_yaml
 from cloudrc.config.load import ResolvedExperiment, read_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.files import read
 from cloudrc.metrics.flight import CONTROL_TOPICS
+from cloudrc.outside.document import parse_yaml
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
 from cloudrc.record.reader import NothingReadableError

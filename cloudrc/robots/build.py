@@ -8,7 +8,6 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 from cloudrc import plugins
-from cloudrc.config.document import KeyPath
 from cloudrc.config.load import ResolvedGuard
 from cloudrc.config.overrides import BRAKING, build_plugin, check_plugin, default_parameters
 from cloudrc.config.problems import ConfigProblem, ProblemsError
@@ -20,6 +19,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import ZERO, Vector
 from cloudrc.outside import code
+from cloudrc.outside.document import KeyPath
 from cloudrc.outside.values import RESULT, shorten
 from cloudrc.robots.onboard._airframe import thrust_to_weight
 from cloudrc.world.accelerated import AcceleratedRobot

@@ -8,9 +8,9 @@ from contextlib import suppress
 from cloudrc import metrics
 from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.config.overrides import OUTSIDE, ROS2, parse_settings
-from cloudrc.config.reuse import reuse
 from cloudrc.config.schema import Parameters, World
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.outside.reuse import reuse
 from cloudrc.runs.requirements import require
 from cloudrc.warnings import advise
 

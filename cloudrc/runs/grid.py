@@ -20,13 +20,13 @@ from pydantic import Field
 
 from cloudrc import files, metrics, source
 from cloudrc.config import problems, shipped
-from cloudrc.config.document import Document, Source, parse_yaml, read_document, write_yaml
 from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.config.overrides import Settings, collect_settings
 from cloudrc.config.problems import ConfigProblem, ProblemsError, validate
-from cloudrc.config.reuse import reuse, reuse_results
 from cloudrc.config.section import Section
 from cloudrc.errors import BadInputError
+from cloudrc.outside.document import Document, Source, parse_yaml, read_document, write_yaml
+from cloudrc.outside.reuse import reuse, reuse_results
 from cloudrc.runs.experiment import check_world
 from cloudrc.runs.flight import Row, units
 from cloudrc.runs.installed import installed_code

@@ -9,9 +9,10 @@ from pathlib import Path
 from cloudrc import plugins
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.overrides import KINDS
-from cloudrc.config.reuse import reuse
 from cloudrc.config.robot import known_robot
 from cloudrc.outside.code import is_installed
+from cloudrc.outside.reuse import reuse
+from cloudrc.plugin_file import is_installed
 from cloudrc.runs.own_files import hash_of_module
 
 

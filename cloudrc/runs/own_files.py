@@ -9,12 +9,12 @@ from hashlib import file_digest, sha256
 from pathlib import Path
 
 from cloudrc.config.load import ResolvedExperiment, absolute_paths, local_files, read_experiment
-from cloudrc.config.reuse import reuse
 from cloudrc.config.robot import files_of
 from cloudrc.errors import BadInputError
 from cloudrc.files import read
 from cloudrc.geometry.model_files import model_files
 from cloudrc.outside import code
+from cloudrc.outside.reuse import reuse
 from cloudrc.report.document import ENVIRONMENT_FILE, FILES
 
 DIGITS = 12

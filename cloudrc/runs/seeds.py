@@ -7,8 +7,8 @@ from collections.abc import Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cloudrc.config.document import write_yaml
 from cloudrc.config.overrides import parse_settings
+from cloudrc.outside.document import write_yaml
 from cloudrc.runs import store
 from cloudrc.runs.flight import Row, counts, measure
 from cloudrc.runs.grid import Grid, SweepPoint, read_grid

@@ -22,9 +22,9 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError
 
 from cloudrc import files
-from cloudrc.config.document import read_document, write_yaml
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file, write_atomically
+from cloudrc.outside.document import read_document, write_yaml
 from cloudrc.runs.flight import Row
 from cloudrc.runs.grid import Grid, read_grid
 from cloudrc.runs.lock import LOCK

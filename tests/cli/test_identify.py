@@ -7,12 +7,12 @@ from math import exp
 import numpy as np
 import pytest
 
-from cloudrc.config.document import parse_yaml
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers import local
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
 from cloudrc.metrics.velocity_loop import DT, identify, series
+from cloudrc.outside.document import parse_yaml
 from cloudrc.record.columns import Recording
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import GroundTruth, GuardChange

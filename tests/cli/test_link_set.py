@@ -9,7 +9,6 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
-from cloudrc.config.document import Document
 from cloudrc.config.load import edit_profile
 from cloudrc.drivers import local
 from cloudrc.drivers.link_control import ControlServer, ask
@@ -20,6 +19,7 @@ from cloudrc.link.control import put_request
 from cloudrc.link.follow import Profiles
 from cloudrc.link.profile import summary
 from cloudrc.link.state import LinkState, to_text
+from cloudrc.outside.document import Document
 from cloudrc.processes.link import make_profile_loader
 
 CHANGES = [{"at_s": 9.0, "delay_ms": 50.0, "jitter_ms": 20.0}, {"at_s": 12.0, "loss": 0.1}]

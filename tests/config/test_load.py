@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config import document, shipped
-from cloudrc.config.document import parse_value
+from cloudrc.config import shipped
 from cloudrc.config.load import dump, fingerprint, load_experiment, read_experiment
 from cloudrc.config.profile import load_profile
 from cloudrc.config.robot import find_robot
@@ -18,6 +17,8 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry.obstacles import intangible, without_file
 from cloudrc.geometry.scene import SCENES, load_scene
 from cloudrc.link.traces import link_profile
+from cloudrc.outside import document
+from cloudrc.outside.document import parse_value
 
 PROFILES = shipped.names("profile")
 BOARD = "board", 0.25

@@ -13,9 +13,9 @@ import pytest
 
 from cloudrc.config import problems
 from cloudrc.config.load import dump, load_experiment
-from cloudrc.config.reuse import reuse_results
 from cloudrc.config.schema import Experiment
 from cloudrc.errors import BadInputError
+from cloudrc.outside.reuse import reuse_results
 from tests.conftest import nightly
 
 OWN = """\

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cloudrc.config.document import write_yaml
+from cloudrc.outside.document import write_yaml
 
 SHORT = {
     "mission.steps.count": 1,

@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 
 from cloudrc.assembly import build_links
-from cloudrc.config import document, load, overrides, scene
+from cloudrc.config import load, overrides, scene
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import SCENES
+from cloudrc.outside import document
 from cloudrc.runs.grid import pack, read_flight, read_grid, unpack
 from cloudrc.source import code_hash
 from tests.runs.conftest import SHORT

@@ -14,12 +14,12 @@ from typing import Any, TypeAlias
 
 from cloudrc.cloud.motion import Body
 from cloudrc.cloud.predictors._history import COUNT, PERIOD_NS, Replay
-from cloudrc.config.document import read_document
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotFacts
 from cloudrc.config.schema import Constants, DeadTimes, NotNegatives, Positive
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Command, Odometry, Vector
+from cloudrc.outside.document import read_document
 
 Axes: TypeAlias = tuple[Vector, ...]
 """Time constant [s], dead time [s] and gain [1] of x, y and z."""

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cloudrc.config.document import Document, write_yaml
 from cloudrc.config.load import Edit, edit_profile
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.drivers.link_control import ask
@@ -23,6 +22,7 @@ from cloudrc.link.state import (
     from_text,
     write_change,
 )
+from cloudrc.outside.document import Document, write_yaml
 from cloudrc.text import table
 
 COLUMNS = ("delay_ms", "jitter_ms", "distribution", "loss", "rate_kbit")

@@ -12,7 +12,6 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from cloudrc.config.document import write_yaml
 from cloudrc.config.load import Edit
 from cloudrc.config.profile import DIRECTIONS, load_profile
 from cloudrc.drivers.link_control import ControlServer
@@ -22,6 +21,7 @@ from cloudrc.link.follow import PROFILE, Loaded, Profiles
 from cloudrc.link.profile import DirectionProfile, summary
 from cloudrc.link.state import STATE_FILE, LinkState, to_text
 from cloudrc.link.traces import link_profile
+from cloudrc.outside.document import write_yaml
 
 Apply = Callable[[str, Loaded, int], None]
 """Function that lets a direction follow a profile, at a time on the monotonic clock [ns]."""

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.config.document import Document
 from cloudrc.config.load import edit_profile
 from cloudrc.drivers.local import LINK, announced, socket_folder
 from cloudrc.drivers.namespaces import Forwarder, ProgramEnd, ProgramState, print_lines
@@ -26,6 +25,7 @@ from cloudrc.errors import (
 )
 from cloudrc.link.exec.listening import is_loopback
 from cloudrc.link.exec.namespace import ADDRESSES
+from cloudrc.outside.document import Document
 from cloudrc.records import Counted
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.links.carrier import FLOWS, ExecLink

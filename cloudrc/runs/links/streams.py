@@ -12,7 +12,6 @@ from ipaddress import ip_address
 from statistics import quantiles
 from typing import Any
 
-from cloudrc.config.document import Document
 from cloudrc.config.load import edit_profile
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.drivers.realtime import Address, show_address
@@ -22,6 +21,7 @@ from cloudrc.link.relay import settle, tighten_slack
 from cloudrc.link.relay_tcp.medium import Medium, refuse_unsupported
 from cloudrc.link.relay_tcp.relay import StreamRelay
 from cloudrc.link.state import LinkState
+from cloudrc.outside.document import Document
 from cloudrc.runs.links.live import LiveLink
 from cloudrc.runs.links.programs import link_folder
 

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.bridges.ros2 import require_ros
-from cloudrc.config.document import Document
 from cloudrc.config.load import edit_profile
 from cloudrc.link.exec.verdict import Period
 from cloudrc.link.follow import Loaded
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.relay import ask_for_fifo, settle, tighten_slack
 from cloudrc.link.state import LinkState
+from cloudrc.outside.document import Document
 from cloudrc.runs.links.live import LiveLink
 from cloudrc.runs.links.programs import link_folder
 from cloudrc.runs.links.programs_report import Carried, make_link_report, write_report

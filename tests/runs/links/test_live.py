@@ -4,8 +4,8 @@ import contextlib
 
 import pytest
 
-from cloudrc.config.document import Document
 from cloudrc.config.load import edit_profile
+from cloudrc.outside.document import Document
 from cloudrc.runs.links.change import set_here
 from cloudrc.runs.links.live import LiveLink
 from cloudrc.runs.links.programs import link_folder

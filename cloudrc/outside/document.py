@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import yaml
 
 from cloudrc import files
-from cloudrc.config.reuse import reuse
 from cloudrc.errors import BadInputError
+from cloudrc.outside.reuse import reuse
 
 KeyPath = tuple[str, ...]
 """The keys that lead from the top of a document to a value. The index of a list entry is text."""
