@@ -34,7 +34,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "outside": set(),
     "plugins": set(),
     "tunnel": {"endpoint"},
-    "link": {"config", "files", "exposition", "metrics.definitions", "tunnel"},
+    "link": {"files", "tunnel"},
     "config": {"plugins", "geometry", "link", "files", "policy.address"},
     "world": {
         "endpoint",
@@ -59,7 +59,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "exposition": {"metrics.definitions"},
     "drivers": {
         *("endpoint", "tunnel", "link", "exposition", "files", "policy", "policy.address"),
-        *("record", "teleop"),
+        *("metrics.definitions", "record", "teleop"),
     },
     "bridges": {
         *("config", "console", "drivers", "geometry.vectors", "link", "metrics.definitions"),

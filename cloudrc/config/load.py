@@ -178,6 +178,11 @@ class ResolvedExperiment(Experiment):
         """Conditions of the link from cloud to world."""
         return self.link.downlink
 
+    @property
+    def link_values(self) -> dict[str, Any]:
+        """Content of a profile of this link, without defaults."""
+        return self.link.model_dump(mode="json", include={*DIRECTIONS}, exclude_defaults=True)
+
 
 @reuse_results()
 def load_experiment(

@@ -6,39 +6,49 @@ The name of a key ends with its unit (`delay_ms`). Unknown keys are refused.
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
-from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import Discriminator, Tag, model_validator
 
 from cloudrc.config import problems, shipped
 from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.section import Section
-from cloudrc.link.profile import Blackout, Change, DirectionKeys, GilbertElliott, Probability
+from cloudrc.link.profile import CLOUD_TIME_MAX as CLOUD_TIME_MAX
+from cloudrc.link.profile import COMMAND_AGE_MS as COMMAND_AGE_MS
+from cloudrc.link.profile import DIRECTIONS as DIRECTIONS
+from cloudrc.link.profile import (
+    Blackout,
+    Change,
+    DirectionKeys,
+    GilbertElliott,
+    Probability,
+    ProfileKeys,
+)
+from cloudrc.link.profile import CloudTime as CloudTime
+from cloudrc.link.profile import CommandAge as CommandAge
 from cloudrc.link.traces import read_table, read_trace
 from cloudrc.outside.document import Document, KeyPath
 from cloudrc.outside.reuse import reuse
 
-DIRECTIONS = ("uplink", "downlink")
 FILE_READERS: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
 """Key whose value is the path of a data file -> function that reads and checks the file."""
-COMMAND_AGE_MS = 1, 10_000
-"""Smallest and largest value of guard.command_age_max_ms [ms]."""
-CommandAge = Annotated[float, Field(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1])]
-CLOUD_TIME_MAX = 10
-"""Largest value of cloud.horizon_max_s and of cloud.freeze_after_s [s]."""
-CloudTime = Annotated[float, Field(gt=0, le=CLOUD_TIME_MAX)]
+
+
+_Keys = TypeVar("_Keys", GilbertElliott, DirectionKeys)
+
+
+def _refuse_conflict(keys: _Keys) -> _Keys:
+    """Raise a ValueError if keys of a section do not agree with each other."""
+    if text := keys.conflict():
+        raise ValueError(text)
+    return keys
 
 
 class BurstsConfig(Section, GilbertElliott):
     """Loss in bursts: a two-state Markov chain that takes one step per packet."""
 
-    @model_validator(mode="after")
-    def _ends(self) -> BurstsConfig:
-        if self.bad_start > 0 and self.bad_end == 0:
-            raise ValueError("bad_end must be above 0 if bad_start is: else a burst never ends")
-        return self
+    _agree = model_validator(mode="after")(_refuse_conflict)
 
 
 def _loss_tag(value: Any) -> str:
@@ -68,39 +78,14 @@ class DirectionConfig(Section, DirectionKeys):
     changes: tuple[ChangeConfig, ...] = ()
     blackouts: tuple[BlackoutConfig, ...] = ()
 
-    @model_validator(mode="after")
-    def _check_table(self) -> DirectionConfig:
-        if self.distribution == "table" and self.table is None:
-            raise ValueError("distribution: table needs the key table: a CSV file of delays")
-        return self
-
-    @field_validator("changes")
-    @classmethod
-    def _check_times_rise(cls, changes: tuple[ChangeConfig, ...]) -> tuple[ChangeConfig, ...]:
-        for index, (before, after) in enumerate(pairwise(changes), start=1):
-            if after.at_s <= before.at_s:
-                raise ValueError(
-                    f"at_s must rise: entry {index} is at {after.at_s:g} s, "
-                    f"the one before at {before.at_s:g} s"
-                )
-        return changes
+    _agree = model_validator(mode="after")(_refuse_conflict)
 
 
-class Profile(Section):
+class Profile(Section, ProfileKeys):
     """A link profile, such as the files under link/profiles."""
 
-    description: str = ""
-    """One line about the profile, for lists"""
     uplink: DirectionConfig = DirectionConfig()
-    """Conditions from world to cloud"""
     downlink: DirectionConfig = DirectionConfig()
-    """Conditions from cloud to world"""
-    command_age_max_ms: CommandAge | None = None
-    """Default of guard.command_age_max_ms with this profile [ms]; null: 250"""
-    horizon_max_s: CloudTime | None = None
-    """Default of cloud.horizon_max_s with this profile [s]; null: 1"""
-    freeze_after_s: CloudTime | None = None
-    """Default of cloud.freeze_after_s with this profile [s]; null: 0.4"""
 
 
 def load_profile(name: str | Path) -> Profile:

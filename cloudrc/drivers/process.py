@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
     from cloudrc.drivers.exporter import Exporter
+    from cloudrc.drivers.link_monitor import LinkMonitor
     from cloudrc.drivers.readers import RecordSender
-    from cloudrc.link.verify.monitor import LinkMonitor
 
 PARENT = "CLOUDRC_PARENT"
 """Environment variable with the process id of the supervisor."""

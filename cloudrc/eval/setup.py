@@ -22,7 +22,6 @@ from cloudrc.link.traces import read_lines
 from cloudrc.outside.code import sources
 from cloudrc.outside.document import parse_value, read_document
 from cloudrc.outside.reuse import reuse
-from cloudrc.plugin_file import sources
 from cloudrc.plugins import is_path
 from cloudrc.policy.address import check_url
 from cloudrc.policy.observation import Mapped

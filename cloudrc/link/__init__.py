@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cloudrc.link.library import LinkProfile, OneWay, open, read_profile
-    from cloudrc.link.model import Numbers
     from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Trace
     from cloudrc.link.queue import PacketQueue
+    from cloudrc.link.streams import Numbers
 
 _HOMES = {
     **dict.fromkeys(("LinkProfile", "OneWay", "open", "read_profile"), "library"),
-    "Numbers": "model",
+    "Numbers": "streams",
     **dict.fromkeys(
         ("Blackout", "Change", "DirectionProfile", "GilbertElliott", "Trace"), "profile"
     ),

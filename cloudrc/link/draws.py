@@ -17,9 +17,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 from functools import lru_cache
-from hashlib import blake2b
 from math import erf, erfc, sqrt
-from statistics import NormalDist
 from typing import TypeAlias
 
 import numpy as np
@@ -35,7 +33,6 @@ PARETO_CUT = 1e-3  # probability of the tail that is cut off the Pareto distribu
 _CACHED = 256
 _PAGE = 4  # number of blocks whose uniform variates are drawn by one generator: making one is slow
 _OUTPUTS_PER_COUNT = 4
-_NORMAL_QUANTILE = NormalDist().inv_cdf
 _HALF_ROOT = sqrt(0.5)
 # Moments of s^(-1/3) for s uniform in (cut, 1).
 _PARETO_MEAN = 1.5 * (1.0 - PARETO_CUT ** (2 / 3)) / (1.0 - PARETO_CUT)
@@ -65,6 +62,8 @@ def stream_key(seed: int, uplink: bool, epoch: int, kind: int, stream: str = "")
 
     Links with one seed and different names, `stream`, have different random numbers.
     """
+    from hashlib import blake2b  # takes milliseconds to import, as does `statistics`
+
     name = f"cloudrc link {seed} {'up' if uplink else 'down'} {epoch} {kind}"
     if stream:
         name += f" {stream}"
@@ -110,7 +109,9 @@ def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) ->
 
     Deviation: tc-netem mixes (1 - c) · new + c · old, which narrows the distribution.
     """
-    fresh = map(_NORMAL_QUANTILE, uniforms(key, purpose, block).tolist())
+    from statistics import NormalDist
+
+    fresh = map(NormalDist().inv_cdf, uniforms(key, purpose, block).tolist())
     if not correlation:
         return tuple(fresh)
     values = []

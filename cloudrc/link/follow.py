@@ -9,7 +9,7 @@ arrives first and ignores the other.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc.errors import BadInputError
 from cloudrc.files import version
+from cloudrc.link.profile import DIRECTIONS
 from cloudrc.link.state import CHANGE_FILE, ChangeFacts, parse, read_change
+from cloudrc.outside.document import write_yaml
 
 if TYPE_CHECKING:
-    from cloudrc.config.load import ResolvedExperiment
     from cloudrc.link.profile import DirectionProfile
     from cloudrc.link.relay import Address
 
@@ -45,16 +46,16 @@ Load = Callable[[Path], Loaded]
 """Function that reads and checks a profile's file; raises a BadInputError if it is invalid."""
 
 
-def prepare_link(folder: Path, link: ResolvedExperiment) -> None:
-    """Make the folder of a link on this machine, with its profile and a folder per direction."""
-    from cloudrc.config.profile import DIRECTIONS, Profile
-    from cloudrc.outside.document import write_yaml
+def make_folder(folder: Path, values: Mapping[str, Any]) -> Path:
+    """Make the folder of a link on this machine, with a folder per direction; return its profile.
 
+    `values` are the content of the profile.
+    """
     for way in DIRECTIONS:
         (folder / way).mkdir(parents=True)
-    profile = Profile(uplink=link.uplink, downlink=link.downlink)
-    text = write_yaml(profile.model_dump(mode="json", exclude_defaults=True))
-    (folder / PROFILE).write_text(text, encoding="utf-8")
+    profile = folder / PROFILE
+    profile.write_text(write_yaml(values), encoding="utf-8")
+    return profile
 
 
 def read_handed(text: bytes | str) -> dict[str, str]:

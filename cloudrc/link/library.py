@@ -6,12 +6,11 @@ direction, stream, episode and number of the packet alone, so two policies meet 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,8 +25,11 @@ from cloudrc.link.draws import (
     stream_key,
     uniforms_of,
 )
-from cloudrc.link.model import LinkDirection, Numbers, numbers, sample
+from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Conditions, DirectionProfile
+
+if TYPE_CHECKING:
+    from cloudrc.link.streams import Numbers
 
 KIND = 128
 """Kind of the packets of other programs; smaller numbers are those of the testbed's datagrams."""
@@ -55,38 +57,11 @@ def read_profile(profile: str | Path | Mapping[str, Any] | LinkProfile) -> LinkP
     """
     if isinstance(profile, LinkProfile):
         return profile
-    # Here, because a program that makes its profile itself needs neither pydantic nor YAML.
-    from cloudrc.config.profile import check_profile, load_profile
-    from cloudrc.link.traces import link_profile
-    from cloudrc.outside.document import Document, Source
+    # Here, because a program that makes its profile itself needs no YAML.
+    from cloudrc.link.profile_file import read_keys, with_files
 
-    if isinstance(profile, Mapping):
-        tree = _plain(profile)
-        keys = check_profile(Document(tree, {(): Source("profile", Path())}), "profile")
-    elif isinstance(profile, str | Path):
-        keys = load_profile(profile)
-    else:
-        raise BadInputError(
-            f"a link is the name or path of a profile, or a mapping; not {type(profile).__name__}"
-        )
-    return LinkProfile(link_profile(keys.uplink), link_profile(keys.downlink))
-
-
-def _plain(profile: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a mapping with plain lists and numbers, also in place of those of numpy."""
-
-    def item(value: Any) -> Any:
-        if isinstance(value, np.generic | np.ndarray):
-            return value.tolist()
-        raise TypeError(type(value).__name__)
-
-    try:
-        tree: dict[str, Any] = json.loads(json.dumps(dict(profile), default=item))
-    except (TypeError, ValueError) as error:
-        raise BadInputError(
-            f"the mapping of a link profile holds texts, numbers, lists and mappings, not {error}"
-        ) from None
-    return tree
+    keys = read_keys(profile)
+    return LinkProfile(with_files(keys.uplink), with_files(keys.downlink))
 
 
 def open(
@@ -213,6 +188,8 @@ class OneWay:
         The random numbers are not those of the episodes. The packets leave once per `period` [s]
         from the start of the time line on and have `size` bytes.
         """
+        from cloudrc.link.streams import numbers, sample
+
         _check_whole(size=size)
         link = LinkDirection(
             self.profile, self._seed, self._uplink, stream=f"{self._stream} expected"

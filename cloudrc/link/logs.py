@@ -23,8 +23,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.model import Stream
 from cloudrc.link.profile import Trace
+from cloudrc.link.streams import Stream
 from cloudrc.link.traces import Row, read_rows
 
 Direction: TypeAlias = Literal["uplink", "downlink"]

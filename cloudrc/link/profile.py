@@ -1,8 +1,8 @@
 """Define the keys of a link profile, and compute the conditions of a direction over time from them.
 
-The classes of the keys are plain; the models in `config/schema.py` inherit keys, ranges and texts
-from them. All delays are ONE WAY. `config` and `link/traces.py` check the values; this module does
-not.
+The classes of the keys are plain; the models in `config/profile.py` inherit keys, ranges and texts
+from them. All delays are ONE WAY. `link/profile_file.py`, `config` and `link/traces.py` check the
+values; this module does not.
 """
 
 from __future__ import annotations
@@ -11,17 +11,19 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 from math import inf
 from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
 
-@dataclass(frozen=True)
 class Range:
-    """The values that a key may have; config checks them."""
+    """The values that a key may have."""
 
-    ge: float | None = None  # smallest value, [unit of the key]
-    gt: float | None = None  # every value is larger, [unit of the key]
-    le: float | None = None  # largest value, [unit of the key]
+    def __init__(
+        self, *, ge: float | None = None, gt: float | None = None, le: float | None = None
+    ) -> None:
+        """Set least and largest value, `ge` and `le`, and what all are above, `gt` [their unit]."""
+        self.ge, self.gt, self.le = ge, gt, le
 
     # Pydantic accepts a class with these two members in place of the ranges of annotated_types,
     # whose import takes longer than that of the whole link.
@@ -36,10 +38,27 @@ class Range:
             if (limit := getattr(self, name)) is not None:
                 yield getattr(annotated_types, name.capitalize())(limit)
 
+    def allows(self, value: float) -> bool:
+        """Return whether a `value` [any unit] is in the range."""
+        over = self.gt is None or value > self.gt
+        at_least = self.ge is None or value >= self.ge
+        return over and at_least and (self.le is None or value <= self.le)
+
+    def __str__(self) -> str:
+        limits = ((">", self.gt), (">=", self.ge), ("<=", self.le))
+        return " and ".join(f"{sign} {limit}" for sign, limit in limits if limit is not None)
+
 
 NotNegative = Annotated[float, Range(ge=0)]
 Positive = Annotated[float, Range(gt=0)]
 Probability = Annotated[float, Range(ge=0, le=1)]
+COMMAND_AGE_MS = 1, 10_000
+"""Smallest and largest value of guard.command_age_max_ms [ms]."""
+CommandAge = Annotated[float, Range(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1])]
+CLOUD_TIME_MAX = 10
+"""Largest value of cloud.horizon_max_s and of cloud.freeze_after_s [s]."""
+CloudTime = Annotated[float, Range(gt=0, le=CLOUD_TIME_MAX)]
+DIRECTIONS = ("uplink", "downlink")
 
 
 @dataclass(frozen=True)
@@ -58,8 +77,14 @@ class GilbertElliott:
     delay_bad_ms: NotNegative = 0.0
     """Extra one-way delay in the bad state [ms]; netem refuses a value above 0"""
 
+    def conflict(self) -> str:
+        """Say which keys do not agree with each other; "" if all do."""
+        if self.bad_start > 0 and self.bad_end == 0:
+            return "bad_end must be above 0 if bad_start is: else a burst never ends"
+        return ""
 
-Loss: TypeAlias = float | GilbertElliott
+
+Loss: TypeAlias = Probability | GilbertElliott
 
 
 @dataclass(frozen=True)
@@ -130,6 +155,33 @@ class DirectionKeys:
     true"""
     blackouts: tuple[Blackout, ...] = ()
     """Intervals in which every packet is lost; they may overlap"""
+
+    def conflict(self) -> str:
+        """Say which keys do not agree with each other; "" if all do."""
+        if self.distribution == "table" and self.table is None:
+            return "distribution: table needs the key table: a CSV file of delays"
+        for before, after in pairwise(self.changes):
+            if after.at_s <= before.at_s:
+                return f"at_s of changes must rise: {after.at_s:g} s is after {before.at_s:g} s"
+        return ""
+
+
+@dataclass(frozen=True)
+class ProfileKeys:
+    """A link profile, such as the files under link/profiles."""
+
+    description: str = ""
+    """One line about the profile, for lists"""
+    uplink: DirectionKeys = DirectionKeys()
+    """Conditions from world to cloud"""
+    downlink: DirectionKeys = DirectionKeys()
+    """Conditions from cloud to world"""
+    command_age_max_ms: CommandAge | None = None
+    """Default of guard.command_age_max_ms with this profile [ms]; null: 250"""
+    horizon_max_s: CloudTime | None = None
+    """Default of cloud.horizon_max_s with this profile [s]; null: 1"""
+    freeze_after_s: CloudTime | None = None
+    """Default of cloud.freeze_after_s with this profile [s]; null: 0.4"""
 
 
 def mean_loss(loss: Loss) -> float:

@@ -16,6 +16,7 @@ from cloudrc.cloud.controllers.ros2 import RosController
 from cloudrc.config.load import ResolvedExperiment, load_experiment, read_experiment
 from cloudrc.config.robot import known_robot
 from cloudrc.drivers.keyfile import KeyFile
+from cloudrc.drivers.link_monitor import LinkMonitor
 from cloudrc.drivers.machine import clock_id
 from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
 from cloudrc.drivers.readers import RecordSender
@@ -26,7 +27,6 @@ from cloudrc.files import warn_if_readable
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import SIZE_MAX, link_profile
 from cloudrc.link.verify.judge import Flow
-from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.messages import GuardState, plan_length
 from cloudrc.outside.code import apart
 from cloudrc.processes.ports import listening, open_exporter, warn

@@ -20,7 +20,7 @@ from cloudrc.config.overrides import OUTSIDE, REMOTE
 from cloudrc.drivers.companion import companion
 from cloudrc.drivers.local import LINK_FOLDER, LocalRun
 from cloudrc.errors import CloudrcError, ControllerLostError, InterruptedRunError, machine_error
-from cloudrc.link.follow import prepare_link
+from cloudrc.link.follow import make_folder
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.record.merge import merge
 from cloudrc.record.writer import CODE, McapWriter
@@ -191,7 +191,7 @@ def _record_local(
     """
     from cloudrc.robots.build import describe_steps
 
-    prepare_link(folder / LINK_FOLDER, experiment)
+    make_folder(folder / LINK_FOLDER, experiment.link_values)
     see, remote = _interruptible(see), experiment.cloud.controller.name in OUTSIDE
     local = LocalRun(folder, see, session, remote=remote, lost=_raise_if_lost, gone=gone)
     broken, interrupted = None, True

@@ -12,7 +12,6 @@ from cloudrc.config.overrides import KINDS
 from cloudrc.config.robot import known_robot
 from cloudrc.outside.code import is_installed
 from cloudrc.outside.reuse import reuse
-from cloudrc.plugin_file import is_installed
 from cloudrc.runs.own_files import hash_of_module
 
 

@@ -12,9 +12,9 @@ from cloudrc import assembly
 from cloudrc.cli.processes import read_address, read_size
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers import realtime
+from cloudrc.drivers.link_monitor import LinkMonitor
 from cloudrc.drivers.realtime import free_ports, show_address
 from cloudrc.errors import ControllerLostError
-from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.processes import ends
 from cloudrc.processes.ports import ipv4_addresses
 from cloudrc.record.columns import Recording

@@ -208,7 +208,7 @@ def test_an_invalid_setting_is_refused(text, reason):
         ("uplink: {loss: {bad_start: .1}}", "uplink.loss.bad_end: is missing; must be a number"),
         ("uplink: {jitter_ms: 3, distribution: gauss}", "'normal', 'pareto' or 'table'"),
         ("uplink: {distribution: table}", "uplink: distribution: table needs the key table"),
-        ("uplink: {changes: [{at_s: 5}, {at_s: 5}]}", "uplink.changes: at_s must rise: entry 1"),
+        ("uplink: {changes: [{at_s: 5}, {at_s: 5}]}", "uplink: at_s of changes must rise"),
         ("uplink: {trace: falling.csv}", "falling.csv, line 3"),
         ("command_age_max_ms: 1e-9", "command_age_max_ms: 1e-09: must be a number >= 1 and <= 1"),
         ('uplink: {"<chance>": 3}', "uplink.<chance>: unknown key; "),

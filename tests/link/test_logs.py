@@ -15,7 +15,7 @@ from cloudrc.link.logs import (
     read_ping,
     trace_of,
 )
-from cloudrc.link.model import numbers
+from cloudrc.link.streams import numbers
 
 
 def read(text, *, halve=False):

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.link.draws import BLOCK, Purpose, bad_states, normals, stream_key, uniforms
-from cloudrc.link.model import LinkDirection, Stream, loss_runs, numbers, sample
+from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Trace
+from cloudrc.link.streams import Stream, loss_runs, numbers, sample
 from tests.link.profiles import blackout, change, changed, in_bursts, profile_of
 
 MS, SECOND = 1_000_000, 1_000_000_000

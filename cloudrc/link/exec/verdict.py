@@ -10,8 +10,9 @@ import numpy as np
 
 from cloudrc.link.exec.relay import LOST, PacketLog
 from cloudrc.link.library import KIND
-from cloudrc.link.model import HEADER_BYTES, Stream
+from cloudrc.link.model import HEADER_BYTES
 from cloudrc.link.profile import DirectionProfile, Timeline
+from cloudrc.link.streams import Stream
 from cloudrc.link.verify.judge import Flow, Judgement, Measurement
 
 HEAD = "time_s,delay_ms,applied_ms,bytes"

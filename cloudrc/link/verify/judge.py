@@ -20,8 +20,9 @@ from typing import NamedTuple
 import numpy as np
 
 from cloudrc.link.draws import Floats
-from cloudrc.link.model import HEADER_BYTES, LinkDirection, Stream, numbers, sample
+from cloudrc.link.model import HEADER_BYTES, LinkDirection
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mean_loss
+from cloudrc.link.streams import Stream, numbers, sample
 
 RUNS, RUN_LENGTH = 200, 1000
 """Number of simulated links for a band, and number of datagrams on each simulated link. The band is

@@ -17,11 +17,10 @@ from cloudrc.config.profile import DIRECTIONS, load_profile
 from cloudrc.drivers.link_control import ControlServer
 from cloudrc.drivers.local import LINK_FOLDER, link_socket
 from cloudrc.files import write_atomically
-from cloudrc.link.follow import PROFILE, Loaded, Profiles
+from cloudrc.link.follow import Loaded, Profiles, make_folder
 from cloudrc.link.profile import DirectionProfile, summary
 from cloudrc.link.state import STATE_FILE, LinkState, to_text
 from cloudrc.link.traces import link_profile
-from cloudrc.outside.document import write_yaml
 
 Apply = Callable[[str, Loaded, int], None]
 """Function that lets a direction follow a profile, at a time on the monotonic clock [ns]."""
@@ -56,10 +55,7 @@ class LiveLink:
         """
         self.cause, self._reason, self._check = edit.cause, reason, check
         self._folder, self._url = folder / LINK_FOLDER, url
-        for way in DIRECTIONS:
-            (self._folder / way).mkdir(parents=True)
-        file = self._folder / PROFILE
-        file.write_text(write_yaml(edit.values), encoding="utf-8")
+        file = make_folder(self._folder, edit.values)
         self._files = {
             way: Profiles(file, partial(self._load, way), lambda _: None) for way in DIRECTIONS
         }

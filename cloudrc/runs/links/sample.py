@@ -13,8 +13,9 @@ from typing import TypeAlias
 from cloudrc.config.profile import DirectionConfig, Profile, load_profile
 from cloudrc.errors import BadInputError
 from cloudrc.link.doubts import describe_heavy_loss, describe_trace
-from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers, sample
+from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile, Timeline, Trace
+from cloudrc.link.streams import Numbers, Stream, numbers, sample
 from cloudrc.link.traces import link_profile, read_lines, read_trace
 from cloudrc.report.figures.link import DirectionSample
 from cloudrc.text import table

@@ -24,7 +24,7 @@ from cloudrc.link.logs import (
     read_ping,
     trace_of,
 )
-from cloudrc.link.model import numbers
+from cloudrc.link.streams import numbers
 from cloudrc.link.traces import read_lines, telling_rows, write_trace
 from cloudrc.runs.requirements import require
 

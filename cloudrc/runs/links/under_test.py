@@ -28,9 +28,9 @@ from cloudrc.errors import (
     MissingPrerequisiteError,
     TimedOutError,
 )
-from cloudrc.link.follow import prepare_link
-from cloudrc.link.model import Stream
+from cloudrc.link.follow import make_folder
 from cloudrc.link.state import STATE_FILE, from_text
+from cloudrc.link.streams import Stream
 from cloudrc.link.verify.judge import Measurement
 from cloudrc.link.verify.probe import ProbeEnd, send_probes
 from cloudrc.tunnel.codec import Kind
@@ -80,7 +80,7 @@ def run_link(experiment: ResolvedExperiment, shaper: str) -> Iterator[dict[str, 
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cloudrc-verify-")))
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
-        prepare_link(folder, experiment)
+        make_folder(folder, experiment.link_values)
         names, hosts = dict.fromkeys(WAYS, ""), dict.fromkeys(WAYS, LOOPBACK)
         if shaper == "netem":
             names, hosts = stack.enter_context(_namespaces()), HOSTS

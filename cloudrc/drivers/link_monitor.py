@@ -6,7 +6,6 @@ trips. A separate thread does the work, so that the control loop is not delayed.
 
 from __future__ import annotations
 
-import json
 import queue
 import threading
 import time
@@ -18,10 +17,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from cloudrc.config.profile import Profile
 from cloudrc.errors import BadInputError, describe_error
-from cloudrc.link.model import Stream
 from cloudrc.link.profile import DirectionProfile, Timeline, settled
+from cloudrc.link.profile_file import read_keys
+from cloudrc.link.streams import Stream
 from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.causes import describe
 from cloudrc.link.verify.judge import (
@@ -105,10 +104,11 @@ class LinkMonitor:
     def _load(self, values: dict[str, Any] | None) -> Asked | None:
         if values is None:
             return None
-        profile = Profile.model_validate_json(json.dumps(values))
-        ways = profile.uplink, profile.downlink
+        keys = read_keys(values)
         try:
-            uplink, downlink = (link_profile(way, self._file_max) for way in ways)
+            uplink, downlink = (
+                link_profile(k, self._file_max) for k in (keys.uplink, keys.downlink)
+            )
         except BadInputError:  # a file is too large, or deleted since
             return None
         return uplink, downlink

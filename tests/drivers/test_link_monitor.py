@@ -7,8 +7,8 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.config.shipped import names
+from cloudrc.drivers.link_monitor import LinkMonitor
 from cloudrc.link.verify.judge import netem_makes
-from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.records import Arrival, Fault, Lateness, LinkChecked, Record
 from tests.console.conftest import control
 from tests.link.profiles import changed, profile_of

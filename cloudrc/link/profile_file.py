@@ -1,0 +1,162 @@
+"""Read a link profile: a shipped one by its name, a file by its path, or a mapping with its keys.
+
+The classes in `link/profile.py` say which keys there are, and which values each may have.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from math import isfinite
+from pathlib import Path
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from cloudrc.errors import BadInputError
+from cloudrc.link.profile import DIRECTIONS, DirectionKeys, DirectionProfile, ProfileKeys
+from cloudrc.outside.document import Document, KeyPath, Source, read_document
+
+FOLDER = Path(__file__).with_name("profiles")
+FILE_KEYS = ("trace", "table")
+"""Keys of a direction whose values are paths of files."""
+_WORDS = {int: "a whole number", float: "a number", str: "text", bool: "true or false"}
+
+
+def read_keys(profile: str | Path | Mapping[str, Any]) -> ProfileKeys:
+    """Read the keys of a profile; paths in it become absolute.
+
+    Raises:
+        BadInputError: If there is no such profile, or if a value is wrong; the text says where.
+    """
+    document = _document(profile)
+    for path in [(way, key) for way in DIRECTIONS for key in FILE_KEYS]:
+        if isinstance(file := document.get(*path), str):
+            source = document.source(path)
+            document.set_value(path, str(source.absolute(file)), source)
+    try:
+        keys: ProfileKeys = _section(ProfileKeys, document.tree, ())
+    except _WrongValueError as error:
+        path, text = error.args
+        where = ": ".join(filter(None, (document.source(path).label, ".".join(path))))
+        raise BadInputError(f"{where}: {text}") from None
+    return keys
+
+
+def with_files(direction: DirectionKeys) -> DirectionProfile:
+    """Read the files that a direction names; raise a BadInputError if one cannot be used."""
+    if direction.trace is None and direction.table is None:
+        return DirectionProfile(**vars(direction))
+    from cloudrc.link.traces import link_profile
+
+    return link_profile(direction)
+
+
+def _document(profile: str | Path | Mapping[str, Any]) -> Document:
+    if isinstance(profile, Mapping):
+        return Document(_plain(profile), {(): Source("profile", Path())})
+    if not isinstance(profile, str | Path):
+        raise BadInputError(
+            f"a link is the name or path of a profile, or a mapping; not {type(profile).__name__}"
+        )
+    name = str(profile)
+    if (file := FOLDER / f"{name}.yaml").parent == FOLDER and file.is_file():
+        return read_document(file, file.name)
+    path = Path(os.path.expanduser(name))
+    if not path.is_file():
+        from cloudrc.text import unknown_name_text
+
+        names = sorted(shipped.stem for shipped in FOLDER.glob("*.yaml"))
+        raise BadInputError(f"{unknown_name_text('profile', name, names)}; no such file: {path}")
+    return read_document(path, name)
+
+
+def _plain(profile: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a mapping with plain lists and numbers, also in place of those of numpy."""
+    import json
+
+    def item(value: Any) -> Any:
+        if hasattr(value, "tolist"):
+            return value.tolist()
+        raise TypeError(type(value).__name__)
+
+    try:
+        tree: dict[str, Any] = json.loads(json.dumps(dict(profile), default=item))
+    except (TypeError, ValueError) as error:
+        raise BadInputError(
+            f"the mapping of a link profile holds texts, numbers, lists and mappings, not {error}"
+        ) from None
+    return tree
+
+
+class _WrongValueError(Exception):
+    """A value of a profile is wrong; the arguments are the keys that lead to it, and the reason."""
+
+
+def _section(kind: Any, values: Mapping[str, Any], path: KeyPath) -> Any:
+    """Convert a mapping to a class of keys."""
+    hints, made = get_type_hints(kind, include_extras=True), {}
+    for key, value in values.items():
+        if key not in hints:
+            raise _WrongValueError((*path, key), f"unknown key; {_nearest(key, hints)}")
+        made[key] = _value(hints[key], value, (*path, key))
+    for field in fields(kind):
+        if field.default is MISSING and field.name not in values:
+            raise _WrongValueError((*path, field.name), "is missing")
+    keys = kind(**made)
+    if hasattr(keys, "conflict") and (text := keys.conflict()):
+        raise _WrongValueError(path, text)
+    return keys
+
+
+def _value(kind: Any, value: Any, path: KeyPath) -> Any:
+    """Convert the value of a key that may be of `kind`."""
+    options = list(_options(kind))
+    for option in options:
+        if is_dataclass(option) and isinstance(value, dict):
+            return _section(option, value, path)
+        if get_origin(option) is tuple and isinstance(value, list):
+            one = get_args(option)[0]
+            return tuple(_value(one, each, (*path, str(n))) for n, each in enumerate(value))
+        if _fits(option, value):
+            return float(value) if get_args(option)[:1] == (float,) else value
+    shown = f"{value!r:.60}" if isinstance(value, str | int | float) else type(value).__name__
+    raise _WrongValueError(path, f"{shown}: must be {' or '.join(map(_words, options))}")
+
+
+def _options(kind: Any) -> Iterator[Any]:
+    """Yield the types of a union, or the only type."""
+    if get_origin(kind) in (Literal, tuple) or hasattr(kind, "__metadata__") or not get_args(kind):
+        yield kind
+        return
+    for one in get_args(kind):
+        yield from _options(one)
+
+
+def _fits(kind: Any, value: Any) -> bool:
+    if get_origin(kind) is Literal:
+        return value in get_args(kind)
+    if not hasattr(kind, "__metadata__"):
+        return type(value) is kind
+    number, limits = get_args(kind)
+    is_number = type(value) is int or (type(value) is number and isfinite(value))
+    return is_number and limits.allows(value)
+
+
+def _words(kind: Any) -> str:
+    if get_origin(kind) is Literal:
+        return f"one of {', '.join(get_args(kind))}"
+    if hasattr(kind, "__metadata__"):
+        return f"{_WORDS[get_args(kind)[0]]} {get_args(kind)[1]}"
+    if get_origin(kind) is tuple:
+        return "a list"
+    return "null" if kind is NoneType else _WORDS.get(kind, "a mapping of keys")
+
+
+def _nearest(key: str, known: Iterable[str]) -> str:
+    import difflib
+
+    # `delay` is nearest to `delay_ms`: a forgotten unit is more likely than a typo.
+    without_unit = [name for name in known if name.startswith(f"{key}_")]
+    near = without_unit or difflib.get_close_matches(key, list(known), n=1)
+    return f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
