@@ -73,7 +73,7 @@ def execute(options: argparse.Namespace) -> int:
 
     settings = settings_from(options, ExecSettings)
     outcome, link = run_programs(settings, tell)
-    if link.relay is not None:
+    if link.engine is not None:
         report = make_exec_report(settings, outcome, link)
         print_line("", sys.stderr)
         for line in as_text(report).splitlines():

@@ -41,7 +41,7 @@ MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cance
 """States of a mission; the value of `cloudrc_mission_state` is the index of the state."""
 MISSION_OUTCOMES = ("done", "cancelled", *FAILURES, "other")
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
-"""Outcomes of a datagram at the relay; `cloudrc.link.relay.Relay.counts` explains them."""
+"""Outcomes of a datagram at the relay; `cloudrc.link.carry.udp.Relay.counts` explains them."""
 RELEASE_PERCENTILES = ("50", "99", "99.9")
 """Percentiles of the relay's release error; the count for "99.9" is `release_error_p999_ns`."""
 

@@ -22,8 +22,8 @@ from cloudrc.link.state import CHANGE_FILE, ChangeFacts, parse, read_change
 from cloudrc.outside.document import write_yaml
 
 if TYPE_CHECKING:
+    from cloudrc.link.carry.udp import Address
     from cloudrc.link.profile import DirectionProfile
-    from cloudrc.link.relay import Address
 
 PROFILE_PERIOD = 0.05  # time between two checks whether the profile's file has changed [s]
 PEER_PAUSE = (0.5, 1.0)

@@ -30,9 +30,9 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
+from cloudrc.link.carry.udp import Address
 from cloudrc.link.draws import PARETO_CUT, Floats
 from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline
-from cloudrc.link.relay import Address
 
 USE_RELAY = "use the relay (link.mode=relay, or --shaper relay)"
 ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"  # root qdisc, band of the tunnel, its netem

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 from cloudrc.errors import CloudrcError
 from cloudrc.files import write_atomically
+from cloudrc.link.carry.udp import Address, Relay
 from cloudrc.link.follow import Loaded
 from cloudrc.link.profile import DirectionProfile, summary
-from cloudrc.link.relay import Address, Relay
 from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, to_text
 
 if TYPE_CHECKING:

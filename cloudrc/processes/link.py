@@ -23,6 +23,8 @@ from cloudrc.drivers.link_control import ControlServer
 from cloudrc.drivers.process import Feed, StopSignal
 from cloudrc.drivers.programs import Programs, run_tool
 from cloudrc.drivers.realtime import Address
+from cloudrc.link.carry.punctual import ask_for_fifo, settle
+from cloudrc.link.carry.udp import Relay
 from cloudrc.link.follow import (
     PEER_PAUSE,
     PROFILE_PERIOD,
@@ -34,7 +36,6 @@ from cloudrc.link.follow import (
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.netem import Netem, find_netems
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.relay import Relay, ask_for_fifo, settle
 from cloudrc.link.sidecar import Machine, Sidecar
 from cloudrc.link.state import LinkState
 from cloudrc.link.traces import link_profile

@@ -21,7 +21,7 @@ from cloudrc.exposition.table import (
     MetricKind,
     of_role,
 )
-from cloudrc.link.relay import ReleaseErrors
+from cloudrc.link.carry.log import ReleaseErrors
 from cloudrc.messages import ZERO
 from cloudrc.records import (
     Contact,

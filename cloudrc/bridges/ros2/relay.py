@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -17,16 +17,11 @@ from rclpy.type_support import check_for_type_support
 
 from cloudrc.bridges.ros2.own_node import LINGERS, OwnNode, clash, in_words, known, name_of
 from cloudrc.errors import BadInputError, MissingPrerequisiteError, to_one_line
-from cloudrc.link.exec.relay import PacketLog
+from cloudrc.link.carry.engine import BATCH, Engine, LinkWay, Packet
 from cloudrc.link.library import KIND
-from cloudrc.link.model import HEADER_BYTES, LinkDirection
-from cloudrc.link.queue import PacketQueue
-from cloudrc.link.relay import SPIN_NS, ReleaseErrors
 
 DEPTH = 100
 """Number of messages that ROS keeps until they are read: a burst is no loss of the link."""
-BATCH = 32
-"""Number of messages that the relay reads before it publishes, and the other way round."""
 CAPACITY = 10_000
 """Largest number of messages on the link; a message beyond that is dropped and counted."""
 LOOK_PERIOD = 0.1
@@ -47,13 +42,8 @@ class TopicRelay(OwnNode):
     Attributes:
         source: Full name of the topic that the relay hears.
         target: Full name of the topic that it publishes.
-        kind: Type of the messages, such as "nav_msgs/msg/Odometry"; "" before `wait`.
-        log: What happened to the messages.
-        received: Number of messages heard.
-        forwarded: Number of messages published, copies included.
-        waited: Number of messages in full batches: how long they waited is not known.
-        errors: How late messages were published.
-        queue: The messages on the link.
+        kind: Type of the messages, such as "nav_msgs/msg/Odometry"; "" before
+            `wait_for_publisher`.
     """
 
     def __init__(self, source: str, target: str) -> None:
@@ -63,8 +53,6 @@ class TopicRelay(OwnNode):
         if self.source == self.target:
             raise BadInputError(f"--from and --to are both {self.source}: give --to another name")
         self.kind = ""
-        self.log, self.queue, self.errors = PacketLog(), PacketQueue(CAPACITY), ReleaseErrors()
-        self.received = self.forwarded = self.waited = 0
         self._waiting = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, self.context.handle)
 
     def _full(self, flag: str, name: str) -> str:
@@ -74,7 +62,7 @@ class TopicRelay(OwnNode):
             text = to_one_line(str(error)).partition(", at ")[0].rpartition(": ")[2]
             raise BadInputError(f"{flag} {name}: {text or 'no name of a topic'}") from None
 
-    def wait(self, tell: Callable[[str], None]) -> None:
+    def wait_for_publisher(self, tell: Callable[[str], None]) -> None:
         """Wait until a node publishes the source; `tell` gets a word if that takes time.
 
         Raises:
@@ -92,10 +80,10 @@ class TopicRelay(OwnNode):
             first = f"node {name_of(infos[0])} publishes {self.source} as {self.kind}"
             raise BadInputError(f"{first}, but {texts[0]}; {LINGERS}")
 
-    def open(self, link: LinkDirection, *, reliable: bool) -> str:
-        """Begin to hear, with the QoS of the publishers; return the QoS of both topics in words.
+    def open(self, way: LinkWay, *, reliable: bool) -> tuple[Engine, str]:
+        """Begin to hear, with the QoS of the publishers; the output is RELIABLE if `reliable`.
 
-        The output is BEST_EFFORT, or RELIABLE if `reliable`.
+        Return the engine that carries the messages, and the QoS of both topics in words.
 
         Raises:
             MissingPrerequisiteError: If this ROS does not have the type.
@@ -104,12 +92,13 @@ class TopicRelay(OwnNode):
         is_reliable = all(i.qos_profile.reliability == ReliabilityPolicy.RELIABLE for i in infos)
         is_kept = all(i.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for i in infos)
         heard, sent = (_qos(reliable=one, kept=is_kept) for one in (is_reliable, reliable))
-        self.link, self._type = link, kind
+        way.checked = True  # as the checksum of UDP lets no damaged message pass
+        self._way, self._type = way, kind
         self._messages = self.node.create_subscription(
             kind, self.source, lambda data: None, heard, raw=True
         )
         self._publisher = self.node.create_publisher(kind, self.target, sent)
-        return f"{in_words(heard)} in, {in_words(sent)} out"
+        return Engine(self, (way,), CAPACITY), f"{in_words(heard)} in, {in_words(sent)} out"
 
     def _load(self) -> Any:
         package, _, name = self.kind.partition("/msg/")
@@ -156,48 +145,30 @@ class TopicRelay(OwnNode):
     def _subscribers(self) -> list[Any]:
         return known(self.node.get_subscriptions_info_by_topic(self.target))
 
-    def step(self, timeout: float) -> None:
-        """Wait at most `timeout` [s] until messages arrive or are due; hear and publish them."""
-        due_ns = self.queue.next_ns
-        limit_ns = min(round(timeout * 1e9), due_ns - SPIN_NS - time.monotonic_ns())
+    def wait(self, until_ns: int) -> bool:
+        """Wait until messages have come, or until a time [ns]; True, as nobody knows which."""
         self._waiting.clear_entities()
         self._waiting.add_subscription(self._messages.handle)
-        self._waiting.wait(max(0, limit_ns))
-        if due_ns - time.monotonic_ns() <= SPIN_NS:
-            while time.monotonic_ns() < due_ns:
-                pass
-            self._release()
-        self._take_in()
-        self._release()  # messages without delay
+        self._waiting.wait(max(0, until_ns - time.monotonic_ns()))
+        return True
 
-    def _take_in(self) -> None:
-        """Read up to `BATCH` messages, and compute when each is due."""
-        link, handle = self.link, self._messages.handle
+    def take(self) -> Iterator[Packet]:
+        """Read up to `BATCH` messages."""
+        way, handle = self._way, self._messages.handle
         for _ in range(BATCH):
             with handle:
                 taken = handle.take_message(self._type, True)
             if taken is None:
                 return
-            data, number, now_ns = taken[0], self.received, time.monotonic_ns()
-            arrivals = link.send(1, KIND, number, len(data), now_ns)
-            if link.corrupts and link.corrupted(1, KIND, number, data) != data:
-                arrivals = ()  # the checksum of UDP does not let it pass
-            self.received += 1
-            self.log.enter(now_ns, len(data) + HEADER_BYTES, arrivals)
-            self.queue.put(number, arrivals, data)
-        self.waited += BATCH
+            data = taken[0]
+            header = (KIND, 1, way.received)
+            yield Packet(way, header, len(data), data, time.monotonic_ns())
+        way.waited += BATCH
 
-    def _release(self) -> None:
-        """Publish up to `BATCH` messages that are due."""
-        for _ in range(BATCH):
-            now_ns = time.monotonic_ns()
-            if self.queue.next_ns > now_ns:
-                return
-            due_ns, number, data = self.queue.pop()
-            self._publisher.publish(data)
-            self.forwarded += 1
-            self.errors.observe(now_ns - due_ns)
-            self.log.leave(number, now_ns)
+    def publish(self, data: bytes) -> bool:
+        """Publish a message."""
+        self._publisher.publish(data)
+        return True
 
 
 def _qos(*, reliable: bool, kept: bool) -> QoSProfile:

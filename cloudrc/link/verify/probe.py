@@ -17,9 +17,9 @@ from math import ceil, inf
 
 import numpy as np
 
+from cloudrc.link.carry.udp import ANCILLARY_SIZE, DATAGRAM_MAX, Stamps, ask_for_stamps
 from cloudrc.link.model import HEADER_BYTES
 from cloudrc.link.profile import DirectionProfile, Timeline
-from cloudrc.link.relay import ANCILLARY_SIZE, DATAGRAM_MAX, Stamps, ask_for_stamps
 from cloudrc.link.streams import Stream
 from cloudrc.link.verify.judge import Flow, Measurement
 from cloudrc.tunnel.codec import Direction, encode_header, peek

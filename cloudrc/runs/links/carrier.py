@@ -1,45 +1,142 @@
-"""The link between two programs while they run: the relay and its thread."""
+"""A link that a command runs between programs, connections or topics, and judges at the end."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+import tempfile
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
 
-from cloudrc.config.profile import DIRECTIONS
-from cloudrc.link.exec.relay import TunRelay, TunWay
-from cloudrc.link.exec.verdict import Period
+from cloudrc.config.load import edit_profile
+from cloudrc.drivers.local import LINK, announced, socket_folder
+from cloudrc.link.carry.engine import Engine, LinkWay
+from cloudrc.link.carry.punctual import ask_for_fifo, settle
+from cloudrc.link.carry.tun import IN_FLIGHT_MAX, TunPort, write_packet
 from cloudrc.link.follow import Loaded
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.relay import ask_for_fifo, settle, tighten_slack
-from cloudrc.runs.links.live import Changed, LiveLink
+from cloudrc.link.profile import DIRECTIONS
+from cloudrc.link.queue import NOTHING_NS
+from cloudrc.link.verify.packets import Period
+from cloudrc.outside.document import Document
+from cloudrc.runs.folder import new_folder
+from cloudrc.runs.links.live import Changed, Check, LiveLink
 
-STEP = 0.05  # longest time until the relay reacts to a change [s]
+STEP = 0.05  # longest time until the engine reacts to a change or a signal [s]
 DRAIN_LIMIT = 1.0  # for the packets in flight at the end [s]
 FLOWS = {"uplink": ("client", "server"), "downlink": ("server", "client")}
 """Direction -> the end that sends, and the end that receives."""
+Tell = Callable[[str], None]
+"""Function that shows a line to the user."""
 
 
-class ExecLink:
-    """The link between two programs. A thread of its own carries the packets.
+@dataclass(frozen=True)
+class CarrySettings:
+    """What a command asks of its link; a field is the flag of this name."""
+
+    link: str  # name or file of a profile
+    settings: Sequence[str]  # changes of the profile: KEY=VALUE
+    seed: int
+
+
+def open_live(
+    asked: CarrySettings,
+    command: str,
+    tell: Tell,
+    stack: contextlib.ExitStack,
+    *,
+    output: Path | None = None,
+    flag: str = "-o",
+    check: Check = lambda profile, name: None,
+) -> LiveLink:
+    """Read the profile of a command's link, and make the folder of its state.
+
+    `output` is a new folder for the link's state, given by `flag`; without it, the state is in a
+    temporary folder. `check` is that of `LiveLink`.
+
+    Raises:
+        BadInputError: If the profile or a setting cannot be used.
+    """
+    edit = edit_profile(Document({}), asked.link, asked.settings, command)
+    for note in edit.notes:
+        tell(f"note: {note}")
+    base = tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder())
+    sockets = Path(stack.enter_context(base))
+    folder = sockets if output is None else new_folder(output, "", flag=flag)
+    url = f"unix:{sockets}/api.sock"  # as of a run, though nothing listens there
+    stack.enter_context(announced(folder, url, LINK))
+    live = LiveLink(edit, folder, url, f"cloudrc {command}", check)
+    stack.callback(live.close)
+    return live
+
+
+class CarriedLink:
+    """A link whose packets an engine carries.
 
     Attributes:
         live: The profile in force, which `cloudrc link set` changes.
-        relay: Carries the packets; None before `start`.
-        failure: Why the relay has stopped; "" while it works.
-        unread: Direction -> number of packets that the sender's device has dropped.
+        ways: Direction -> what happened to its packets; empty before `begin`.
+        engine: Carries the packets; None before `begin`.
+        unread: Direction -> number of packets that were dropped before the engine has read them.
+    """
+
+    def __init__(self, live: LiveLink, seed: int, stream: str = "") -> None:
+        """Prepare a link; `stream` is its name, as in `cloudrc.link.open`."""
+        self.live, self.seed, self._stream = live, seed, stream
+        self.ways = dict[str, LinkWay]()
+        self.engine: Engine | None = None
+        self.unread = dict[str, int]()
+
+    def begin(self, gives: Mapping[str, Callable[[Any], bool]], changed: Changed) -> None:
+        """Begin the time line; `gives`: direction -> function that hands its packets on."""
+        self.live.serve(self._queue, self._follow, changed)
+        for name, give in gives.items():
+            profile, origin_ns = self.live.profiles[name], self.live.origins_ns[name]
+            up = name == "uplink"
+            link = LinkDirection(profile, self.seed, up, origin_ns, stream=self._stream)
+            self.ways[name] = LinkWay(link, give)
+
+    def _queue(self, change: Callable[[], None]) -> None:
+        assert self.engine is not None
+        self.engine.changes.append(change)
+
+    def _follow(self, name: str, loaded: Loaded, now_ns: int) -> None:
+        """Use another profile from the next packet on."""
+        if way := self.ways.get(name):
+            way.link.replace_profile(loaded.direction, restart=loaded.change.restart)
+            way.first = way.received
+
+    def period(self, name: str) -> Period:
+        """Return which packets of a direction followed its present profile."""
+        profile, origin_ns = self.live.profiles[name], self.live.origins_ns[name]
+        return Period(profile, self.seed, name == "uplink", self.ways[name].first, origin_ns)
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of packets by outcome, and their lateness [ns]."""
+        if self.engine is None:
+            return {}
+        errors = self.engine.errors.in_ns()
+        errors.pop("released", None)
+        return {**self.engine.counts(), "unread": sum(self.unread.values()), **errors}
+
+
+class ExecLink(CarriedLink):
+    """The link between two programs. A thread of its own carries the packets.
+
+    Attributes:
+        failure: Why the engine has stopped; "" while it works.
     """
 
     def __init__(self, live: LiveLink, seed: int) -> None:
         """Prepare a link."""
-        self.live, self.seed = live, seed
-        self.relay: TunRelay | None = None
+        super().__init__(live, seed)
         self.failure = ""
         self.unread = dict.fromkeys(DIRECTIONS, 0)
-        self._first = dict.fromkeys(DIRECTIONS, 0)
-        self._changes = deque[Callable[[], None]]()
         self._stopping = False
         self._thread: threading.Thread | None = None
         self._devices: list[int] = []
@@ -50,35 +147,24 @@ class ExecLink:
         The time line of the profile begins.
         """
         self._devices = list(devices.values())
-        self.live.serve(self._changes.append, self._follow, changed)
-        ways = {}
-        for name, (sender, receiver) in FLOWS.items():
-            profile, origin_ns = self.live.profiles[name], self.live.origins_ns[name]
-            link = LinkDirection(profile, self.seed, name == "uplink", origin_ns)
-            ways[name] = TunWay(link, devices[sender], devices[receiver])
-        relay = self.relay = TunRelay(ways)
-        relay.drain()
-        self._thread = threading.Thread(target=self._work, args=(relay,), daemon=True)
+        flows = FLOWS.items()
+        self.begin({name: partial(write_packet, devices[to]) for name, (_, to) in flows}, changed)
+        port = TunPort({devices[sender]: self.ways[name] for name, (sender, _) in flows})
+        engine = self.engine = Engine(port, list(self.ways.values()), IN_FLIGHT_MAX)
+        port.drain()
+        self._thread = threading.Thread(target=self._work, args=(engine,), daemon=True)
         self._thread.start()
-
-    @property
-    def ways(self) -> Mapping[str, TunWay]:
-        """Direction -> what happened to its packets; empty before `start`."""
-        return self.relay.ways if self.relay else {}
-
-    def period(self, name: str) -> Period:
-        """Return which packets of a direction followed its present profile."""
-        profile, origin_ns = self.live.profiles[name], self.live.origins_ns[name]
-        return Period(profile, self.seed, name == "uplink", self._first[name], origin_ns)
 
     def wait_until_empty(self) -> None:
         """Wait until the packets in flight have arrived, at most `DRAIN_LIMIT`."""
         deadline = time.monotonic() + DRAIN_LIMIT
-        while self.relay and self.relay.in_flight and time.monotonic() < deadline:
+        while self.engine and self.engine.queue.next_ns != NOTHING_NS:
+            if time.monotonic() > deadline:
+                return
             time.sleep(0.005)
 
     def close(self) -> None:
-        """Stop the relay; packets in flight are lost."""
+        """Stop the engine; packets in flight are lost."""
         self._stopping = True
         self.live.close()
         if self._thread:
@@ -86,33 +172,11 @@ class ExecLink:
         for device in self._devices:
             os.close(device)
 
-    def counts(self) -> dict[str, int]:
-        """Return the number of packets of both directions by outcome, and their lateness [ns]."""
-        if self.relay is None:
-            return {}
-        names = ("received", "forwarded", "lost", "overflow", "unsent")
-        ways = self.relay.ways.values()
-        found = {name: sum(getattr(way, name) for way in ways) for name in names}
-        found["unread"] = sum(self.unread.values())
-        errors = self.relay.errors.in_ns()
-        errors.pop("released", None)
-        return found | errors
-
-    def _follow(self, name: str, loaded: Loaded, now_ns: int) -> None:
-        """Use another profile from the next packet on."""
-        assert self.relay is not None
-        way = self.relay.ways[name]
-        way.link.replace_profile(loaded.direction, restart=loaded.change.restart)
-        self._first[name] = way.received
-
-    def _work(self, relay: TunRelay) -> None:
+    def _work(self, engine: Engine) -> None:
         settle()
-        tighten_slack()
         ask_for_fifo()
         try:
             while not self._stopping:
-                while self._changes:
-                    self._changes.popleft()()
-                relay.step(STEP)
+                engine.step(STEP)
         except Exception as error:
             self.failure = f"{type(error).__name__}: {error}"

@@ -35,6 +35,8 @@ class LiveLink:
     """Both directions of a link, whose profile can change.
 
     Attributes:
+        folder: Folder of the states, and of the profile.
+        url: URL beside which the sockets are that take changes.
         states: Direction -> its present state; empty before `serve`.
         profiles: Direction -> its present profile.
         origins_ns: Direction -> start of its time line, monotonic clock [ns].
@@ -54,8 +56,8 @@ class LiveLink:
         sockets beside `url`. `reason` names the command that runs the link.
         """
         self.cause, self._reason, self._check = edit.cause, reason, check
-        self._folder, self._url = folder / LINK_FOLDER, url
-        file = make_folder(self._folder, edit.values)
+        self.folder, self.url = folder / LINK_FOLDER, url
+        file = make_folder(self.folder, edit.values)
         self._files = {
             way: Profiles(file, partial(self._load, way), lambda _: None) for way in DIRECTIONS
         }
@@ -82,14 +84,14 @@ class LiveLink:
             self._publish(way, now_ns)
             take = partial(self._take, way, queue, apply)
             state = partial(self.states.get, way)
-            self._servers.append(ControlServer(link_socket(self._url, way), take, state))
+            self._servers.append(ControlServer(link_socket(self.url, way), take, state))
 
     def close(self) -> None:
         """Take no more changes, and remove the states."""
         for server in self._servers:
             server.shutdown()
             server.server_close()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def status_page(self) -> str:
         """Return the states of both directions as JSON. Any thread may call this method."""
@@ -111,7 +113,7 @@ class LiveLink:
         document: bytes,
     ) -> str:
         """Take a change from `cloudrc link set`; return its number."""
-        loaded = self._files[way].take(document, self._folder)
+        loaded = self._files[way].take(document, self.folder)
 
         def change() -> None:
             now_ns = time.monotonic_ns()
@@ -141,7 +143,7 @@ class LiveLink:
             origin_ns=self.origins_ns[way],
         )
         with suppress(OSError):  # the link works even if the disk is full
-            write_atomically(self._folder / way / STATE_FILE, to_text(state).encode())
+            write_atomically(self.folder / way / STATE_FILE, to_text(state).encode())
         self._changed(state, _news(before, state, restart=loaded.change.restart))
 
 

@@ -5,16 +5,13 @@ from __future__ import annotations
 import contextlib
 import re
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.config.load import edit_profile
-from cloudrc.drivers.local import LINK, announced, socket_folder
 from cloudrc.drivers.namespaces import Forwarder, ProgramEnd, ProgramState, print_lines
 from cloudrc.drivers.realtime import show_address
 from cloudrc.errors import (
@@ -25,11 +22,8 @@ from cloudrc.errors import (
 )
 from cloudrc.link.exec.listening import is_loopback
 from cloudrc.link.exec.namespace import ADDRESSES
-from cloudrc.outside.document import Document
 from cloudrc.records import Counted
-from cloudrc.runs.folder import new_folder
-from cloudrc.runs.links.carrier import FLOWS, ExecLink
-from cloudrc.runs.links.live import LiveLink
+from cloudrc.runs.links.carrier import FLOWS, CarrySettings, ExecLink, Tell, open_live
 
 if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
@@ -40,17 +34,12 @@ COUNT_PERIOD = 1.0  # between two updates of the metrics [s]
 LOOPBACK_PATIENCE = 1.0  # a program may listen at its loopback address first [s]
 FIRST_WORD, WORD_PERIOD = 3.0, 10.0  # until the command says that it waits, and again [s]
 OUTPUT_LIMIT = 2.0  # for the last lines of a program, which may have to be killed [s]
-Tell = Callable[[str], None]
-"""Function that shows a line to the user."""
 
 
 @dataclass(frozen=True)
-class ExecSettings:
+class ExecSettings(CarrySettings):
     """What to run; a field is the flag of this name."""
 
-    link: str  # name or file of a profile
-    settings: Sequence[str]  # changes of the profile: KEY=VALUE
-    seed: int
     server: str  # command for the shell
     client: str  # command for the shell
     expose: Sequence[int]  # ports of the server that this machine can reach
@@ -74,12 +63,9 @@ def run_programs(settings: ExecSettings, tell: Tell) -> tuple[ExecOutcome, ExecL
     Raises:
         CloudrcError: If the link or a program cannot start.
     """
-    edit = edit_profile(Document({}), settings.link, settings.settings, "link exec")
-    for note in edit.notes:
-        tell(f"note: {note}")
     with contextlib.ExitStack() as stack:
-        folder, url = link_folder(settings.output, stack)
-        link = ExecLink(LiveLink(edit, folder, url, "cloudrc link exec"), settings.seed)
+        live = open_live(settings, "link exec", tell, stack, output=settings.output)
+        link = ExecLink(live, settings.seed)
         stack.callback(link.close)
         run = _Run(link, tell)
         run.open_ends(stack)
@@ -91,21 +77,6 @@ def run_programs(settings: ExecSettings, tell: Tell) -> tuple[ExecOutcome, ExecL
             tell(f"127.0.0.1:{port} leads to the server's port {port}, beside the link")
         outcome = run.run(commands, settings.wait)
     return outcome, link
-
-
-def link_folder(
-    output: Path | None, stack: contextlib.ExitStack, flag: str = "-o"
-) -> tuple[Path, str]:
-    """Return a folder for the link's state, and the URL beside whose path its sockets are.
-
-    `flag` is the flag of `output`.
-    """
-    base = tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder())
-    sockets = Path(stack.enter_context(base))
-    folder = sockets if output is None else new_folder(output, "", flag=flag)
-    url = f"unix:{sockets}/api.sock"  # as of a run, though nothing listens there
-    stack.enter_context(announced(folder, url, LINK))
-    return folder, url
 
 
 class _Run:

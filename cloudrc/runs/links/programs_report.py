@@ -7,18 +7,18 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.files import naming
-from cloudrc.link.exec.relay import LOGGED_MAX, PacketLog
-from cloudrc.link.exec.verdict import Period, judge_packets, recording
+from cloudrc.link.carry.log import LOGGED_MAX
 from cloudrc.link.verify.causes import LATE, Findings, ShaperFacts, in_unit
 from cloudrc.link.verify.judge import FEWEST
+from cloudrc.link.verify.packets import judge_packets, recording
 from cloudrc.runs.verify import Report, make_report
 from cloudrc.text import table
 
 if TYPE_CHECKING:
-    from cloudrc.runs.links.live import LiveLink
+    from cloudrc.runs.links.carrier import CarriedLink
     from cloudrc.runs.links.programs import ExecOutcome, ExecSettings
 
 WAITED = 0.01
@@ -28,35 +28,6 @@ MEANINGS = {
     "not believed": "the link did not do what its profile says",
     "undecided": f"a verdict needs {FEWEST} packets in each direction",
 }
-
-
-class Carried(Protocol):
-    """What happened to the packets of one direction."""
-
-    log: PacketLog
-    received: int  # number of packets read
-    waited: int  # packets of full batches: how long they waited to be read is not known
-
-
-class CarriedLink(Protocol):
-    """A link that a relay has carried."""
-
-    live: LiveLink
-    seed: int
-
-    @property
-    def ways(self) -> Mapping[str, Carried]:
-        """Direction -> what happened to its packets."""
-
-    @property
-    def unread(self) -> Mapping[str, int]:
-        """Direction -> number of packets that were dropped before the relay has read them."""
-
-    def period(self, name: str) -> Period:
-        """Return which packets of a direction followed its present profile."""
-
-    def counts(self) -> dict[str, int]:
-        """Return the number of packets by outcome, and their lateness [ns]."""
 
 
 def make_exec_report(settings: ExecSettings, outcome: ExecOutcome, link: CarriedLink) -> Report:
@@ -103,7 +74,7 @@ def _packets(link: CarriedLink, name: str) -> str:
 
 
 def _facts(link: CarriedLink, name: str, late: float) -> ShaperFacts:
-    way, unread = link.ways[name], link.unread[name]
+    way, unread = link.ways[name], link.unread.get(name, 0)
     signs = (
         (late > LATE, f"1 % of packets left later than {in_unit(late, 's')}"),
         (way.waited > WAITED * way.received, f"{way.waited} packets waited to be read"),

@@ -6,38 +6,31 @@ import contextlib
 import os
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from ipaddress import ip_address
 from statistics import quantiles
 from typing import Any
 
-from cloudrc.config.load import edit_profile
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.drivers.realtime import Address, show_address
 from cloudrc.errors import BadInputError
+from cloudrc.link.carry.punctual import settle
+from cloudrc.link.carry.tcp.medium import Medium, refuse_unsupported
+from cloudrc.link.carry.tcp.relay import StreamRelay
 from cloudrc.link.follow import Loaded
-from cloudrc.link.relay import settle, tighten_slack
-from cloudrc.link.relay_tcp.medium import Medium, refuse_unsupported
-from cloudrc.link.relay_tcp.relay import StreamRelay
 from cloudrc.link.state import LinkState
-from cloudrc.outside.document import Document
-from cloudrc.runs.links.live import LiveLink
-from cloudrc.runs.links.programs import link_folder
+from cloudrc.runs.links.carrier import STEP, CarrySettings, open_live
 
-STEP = 0.05  # longest time until the relay reacts to a change or a signal [s]
 WAITING = 512  # connections that the kernel keeps until the relay accepts them
 
 
 @dataclass(frozen=True)
-class RelaySettings:
+class RelaySettings(CarrySettings):
     """What to relay; a field is the flag of this name."""
 
     listen: Address
     to: Address
-    link: str  # name or file of a profile
-    settings: Sequence[str]  # changes of the profile: KEY=VALUE
-    seed: int
 
 
 def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str, Any]:
@@ -46,13 +39,8 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
     Raises:
         BadInputError: If the profile or an address cannot be used.
     """
-    edit = edit_profile(Document({}), settings.link, settings.settings, "relay tcp")
-    for note in edit.notes:
-        tell(f"note: {note}")
     with contextlib.ExitStack() as stack:
-        folder, url = link_folder(None, stack)
-        live = LiveLink(edit, folder, url, "cloudrc relay tcp", refuse_unsupported)
-        stack.callback(live.close)
+        live = open_live(settings, "relay tcp", tell, stack, check=refuse_unsupported)
         family, to = _find(settings.to)
         listening = stack.enter_context(_listen(settings.listen))
         where = show_address(listening.getsockname()[:2])
@@ -76,13 +64,12 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
             if news:
                 tell(news)
 
-        live.serve(relay.changes.append, follow, changed)
+        live.serve(relay.engine.changes.append, follow, changed)
         settle()
-        tighten_slack()
         with contextlib.suppress(KeyboardInterrupt):
             tell(f"{where} leads to {show_address(settings.to)}; link: {live.cause}")
             while True:
-                relay.step(STEP)
+                relay.engine.step(STEP)
         return _summary(relay)
 
 

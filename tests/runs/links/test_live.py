@@ -4,11 +4,8 @@ import contextlib
 
 import pytest
 
-from cloudrc.config.load import edit_profile
-from cloudrc.outside.document import Document
+from cloudrc.runs.links.carrier import CarrySettings, open_live
 from cloudrc.runs.links.change import set_here
-from cloudrc.runs.links.live import LiveLink
-from cloudrc.runs.links.programs import link_folder
 
 
 @pytest.mark.parametrize(
@@ -24,15 +21,13 @@ from cloudrc.runs.links.programs import link_folder
 def test_a_change_is_told_for_the_directions_that_it_changes(profile, settings, changed):
     told = []
     with contextlib.ExitStack() as stack:
-        folder, url = link_folder(None, stack)
-        live = LiveLink(edit_profile(Document({}), "lte", []), folder, url, "a test")
-        stack.callback(live.close)
+        live = open_live(CarrySettings("lte", [], 1), "a test", told.append, stack)
         live.serve(
             lambda change: change(),
             lambda way, loaded, now_ns: None,
             lambda state, news: told.append(news),
         )
-        edit, states = set_here(folder / "link", url, profile, settings, "1")
+        edit, states = set_here(live.folder, live.url, profile, settings, "1")
     assert [state.changes for state in states] == [1, 1]
     assert [news for news in told if news] == [
         f"the {way} has changed: {edit.cause}" for way in changed

@@ -17,8 +17,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from cloudrc.link.carry.tcp.medium import SEGMENT, Medium
 from cloudrc.link.queue import NOTHING_NS, PacketQueue
-from cloudrc.link.relay_tcp.medium import SEGMENT, Medium
 
 WINDOW_BYTES = 3 << 20  # most bytes that are sent and that the receiver has not taken [bytes]
 READ_AHEAD = 256 << 10  # most bytes that wait to be sent [bytes]

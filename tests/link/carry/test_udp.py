@@ -16,9 +16,10 @@ import pytest
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.exposition.table import LINK_OUTCOMES, RELEASE_PERCENTILES
-from cloudrc.link import relay as module
+from cloudrc.link.carry import udp as module
+from cloudrc.link.carry.log import QUANTILES, ReleaseErrors
+from cloudrc.link.carry.udp import AGE_MAX_NS, Relay, Stamps, ask_for_stamps
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.relay import AGE_MAX_NS, QUANTILES, Relay, ReleaseErrors, Stamps, ask_for_stamps
 from cloudrc.link.verify.judge import Flow, Measurement
 from cloudrc.link.verify.probe import PROBE, ProbeEnd
 from cloudrc.runs.verify import find_experiment

@@ -1,6 +1,6 @@
 """Accept TCP connections, and carry each over the emulated link to a server.
 
-The loop sleeps until a socket or the agenda needs it. All sockets are non-blocking.
+All sockets are non-blocking.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ import selectors
 import socket
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 
-from cloudrc.link.queue import PacketQueue
-from cloudrc.link.relay_tcp.medium import Medium
-from cloudrc.link.relay_tcp.stream import LinkStream, run_due
+from cloudrc.link.carry.engine import Engine, Packet
+from cloudrc.link.carry.tcp.medium import Medium
+from cloudrc.link.carry.tcp.stream import LinkStream, run_due
 
 CHUNK = 64 << 10  # most bytes that one call reads [bytes]
 BUFFER = 128 << 10  # of the kernel, for each socket and direction [bytes]
@@ -86,10 +86,10 @@ class RelayedConnection:
         arrival_ns = up.cross(SYN, self.number, attempt, 0, now_ns)
         if arrival_ns is None:
             again_ns = now_ns + (FIRST_RETRY_NS << (attempt - 1))
-            self.relay.agenda.put(self._greet, (again_ns,), (attempt + 1,))
+            self.relay.engine.queue.put(self._greet, (again_ns,), (attempt + 1,))
         else:
             answer_ns = arrival_ns + down.delay_ns(arrival_ns)
-            self.relay.agenda.put(self._greeted, (answer_ns,), ())
+            self.relay.engine.queue.put(self._greeted, (answer_ns,), ())
 
     def _greeted(self, now_ns: int) -> None:
         self.greeted = True
@@ -111,7 +111,7 @@ class RelayedConnection:
 
     def _join(self, source: Side, target: Side, way: Ways) -> None:
         """Make the stream from one side to the other."""
-        stream = LinkStream(self.relay.agenda, way, self.number, partial(self._put, target))
+        stream = LinkStream(self.relay.engine.queue, way, self.number, partial(self._put, target))
         source.source = target.origin = stream
 
     def _begin(self, now_ns: int) -> None:
@@ -189,7 +189,7 @@ class RelayedConnection:
         side.reads = False
         up, down = self.relay.ways
         way = up if side is self.client else down
-        self.relay.agenda.put(self.end, (now_ns + way.delay_ns(now_ns),), ())
+        self.relay.engine.queue.put(self.end, (now_ns + way.delay_ns(now_ns),), ())
 
     def end(self, now_ns: int, *, reset: bool = True) -> None:
         """Close both sockets, by RST with `reset`."""
@@ -210,7 +210,7 @@ class StreamRelay:
 
     Attributes:
         turns: Times from the last byte of a request to the first byte of its answer [ns].
-        changes: Functions that another thread wants the loop to call.
+        engine: Makes the calls of the streams when they are due.
     """
 
     def __init__(
@@ -222,33 +222,35 @@ class StreamRelay:
     ) -> None:
         """Accept connections at the socket `listening`, to a server at the address `to`."""
         self.to, self.family, self.ways = to, family, ways
-        self.agenda, self.connections = PacketQueue(), set[RelayedConnection]()
+        self.engine, self.connections = Engine(self, ()), set[RelayedConnection]()
         self.connected = self.refused = self.up_bytes = self.down_bytes = 0
         self.turns = deque[int](maxlen=TURNS_KEPT)
-        self.changes = deque[Callable[[], None]]()
+        self._ready: list[tuple[selectors.SelectorKey, int]] = []
         self._listening, self._selector = listening, selectors.DefaultSelector()
         listening.setblocking(False)
         self._selector.register(listening, selectors.EVENT_READ)
         self._count = 0
 
-    def step(self, timeout: float) -> None:
-        """Wait at most `timeout` [s] until something is to be done, and do it."""
-        while self.changes:
-            self.changes.popleft()()
-        wait = max(0.0, min(timeout, (self.agenda.next_ns - time.monotonic_ns()) * 1e-9))
+    def wait(self, until_ns: int) -> bool:
+        """Wait for sockets that can be read or written, or until a time [ns]."""
+        wait = max(0.0, (until_ns - time.monotonic_ns()) * 1e-9)
         if wait and hasattr(self._selector, "fileno"):  # its own wait counts milliseconds
             select.select([self._selector.fileno()], (), (), wait)
             wait = 0.0
-        ready = self._selector.select(wait)
-        run_due(self.agenda, time.monotonic_ns())
-        for key, mask in ready:
+        self._ready = self._selector.select(wait)
+        return bool(self._ready)
+
+    def take(self) -> Iterator[Packet]:
+        """Accept and read: the streams put what follows on the engine's queue themselves."""
+        for key, mask in self._ready:
             if key.data is None:
                 self._accept()
             else:
                 connection, side = key.data
                 now_ns = time.monotonic_ns()
-                run_due(self.agenda, now_ns)
+                run_due(self.engine.queue, now_ns)
                 connection.handle(side, mask, now_ns)
+        yield from ()
 
     def watch(self, connection: RelayedConnection, side: Side, mask: int) -> None:
         """Wait for events of a socket; `mask` 0 for none."""

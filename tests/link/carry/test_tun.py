@@ -2,17 +2,21 @@
 
 import os
 import socket
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
 
 from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.link.carry import engine as module
+from cloudrc.link.carry import tun
+from cloudrc.link.carry.engine import Engine, LinkWay
+from cloudrc.link.carry.log import LOST, PacketLog
+from cloudrc.link.carry.tun import TunPort, write_packet
 from cloudrc.link.exec import listening, namespace
-from cloudrc.link.exec import relay as module
-from cloudrc.link.exec.relay import LOST, PacketLog, TunRelay, TunWay
-from cloudrc.link.exec.verdict import Period, judge_packets, recording
 from cloudrc.link.library import KIND
 from cloudrc.link.model import LinkDirection
+from cloudrc.link.verify.packets import Period, judge_packets, recording
 from tests.link.profiles import changed, profile_of
 
 MS = 1_000_000
@@ -28,8 +32,20 @@ def clock(monkeypatch):
         time["now"] += 1_000
         return time["now"]
 
-    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic_ns=read))
+    for each in (module, tun):
+        monkeypatch.setattr(each, "time", SimpleNamespace(monotonic_ns=read))
     return time
+
+
+class Joined:
+    """An engine between two devices."""
+
+    def __init__(self, profile, client, server, capacity=3):
+        self.up = LinkWay(LinkDirection(profile, 1, True), partial(write_packet, server))
+        self.down = LinkWay(LinkDirection(profile, 1, False), partial(write_packet, client))
+        self.port = TunPort({client: self.up, server: self.down})
+        self.engine = Engine(self.port, (self.up, self.down), capacity)
+        self.step, self.counts = self.engine.step, self.engine.counts
 
 
 @pytest.fixture
@@ -37,18 +53,14 @@ def joined():
     """Return a function that makes a relay, and the programs' sides of both devices."""
     opened = []
 
-    def make(uplink, downlink=None):
+    def make(uplink, capacity=3):
         pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2)]
         opened.extend(one for pair in pairs for one in pair)
         for inside, own in pairs:
             inside.setblocking(False)
             own.setblocking(False)
         client, server = (own.fileno() for _, own in pairs)
-        ways = {
-            "uplink": TunWay(LinkDirection(uplink, 1, True), client, server),
-            "downlink": TunWay(LinkDirection(downlink or uplink, 1, False), server, client),
-        }
-        return TunRelay(ways), pairs[0][0], pairs[1][0]
+        return Joined(uplink, client, server, capacity), pairs[0][0], pairs[1][0]
 
     yield make
     for one in opened:
@@ -59,58 +71,58 @@ def test_a_packet_leaves_when_it_is_due_and_not_before(joined, clock):
     relay, client, server = joined(profile_of(0.020))
     client.send(PACKET)
     relay.step(0.0)
-    assert relay.in_flight == 1
+    assert relay.counts()["forwarded"] == 0
     with pytest.raises(BlockingIOError):
         server.recv(2000)
     clock["now"] += 21 * MS
     relay.step(0.0)
     assert server.recv(2000) == PACKET
-    log = relay.ways["uplink"].log
+    log = relay.up.log
     assert log.due[0] - log.sent[0] == 20 * MS
     assert 0 <= log.left[0] - log.due[0] < 2 * MS
-    assert relay.ways["downlink"].received == 0
+    assert relay.down.received == 0
 
 
 def test_the_relay_asks_the_model_for_packets_by_their_numbers_and_sizes(joined, clock):
     """The same packets meet the same fates as in `cloudrc.link.open`."""
     profile = profile_of(0.005, 0.004, loss=0.3)
-    relay, client, _ = joined(profile)
+    relay, client, _ = joined(profile, 100)
     for _ in range(40):
         client.send(PACKET)
         relay.step(0.0)
-    log, model = relay.ways["uplink"].log, LinkDirection(profile, 1, True)
+    log, model = relay.up.log, LinkDirection(profile, 1, True)
     for number, sent_ns in enumerate(log.sent):
         fate = model.send(1, KIND, number, len(PACKET) - 28, sent_ns)
         assert log.due[number] == (fate[0] if fate else LOST)
-    assert relay.ways["uplink"].lost == list(log.due).count(LOST) > 0
+    assert relay.counts()["lost"] == list(log.due).count(LOST) > 0
 
 
 def test_packets_from_before_the_start_are_dropped(joined, clock):
     relay, client, server = joined(profile_of(0.0))
     client.send(b"early")
-    relay.drain()
+    relay.port.drain()
     client.send(PACKET)
     relay.step(0.0)
     assert server.recv(2000) == PACKET
 
 
-def test_more_packets_in_flight_than_memory_are_dropped_and_counted(joined, clock, monkeypatch):
-    monkeypatch.setattr(module, "IN_FLIGHT_BYTES", 3 * len(PACKET))
+def test_more_packets_in_flight_than_memory_are_dropped_and_counted(joined, clock):
     relay, client, _ = joined(profile_of(1.0))
     for _ in range(10):
         client.send(PACKET)
     relay.step(0.0)
-    assert (relay.in_flight, relay.ways["uplink"].overflow) == (4, 6)
+    counts = {"received": 10, "forwarded": 0, "lost": 0, "overflow": 7, "unsent": 0}
+    assert relay.counts() == counts
 
 
-def test_only_the_first_packets_of_a_long_run_are_recorded(joined, clock, monkeypatch):
-    monkeypatch.setattr(module, "LOGGED_MAX", 3)
+def test_only_the_first_packets_of_a_long_run_are_recorded(joined, clock):
     relay, client, server = joined(profile_of(0.0))
-    for _ in range(5):
+    relay.up.log = PacketLog(2)
+    for _ in range(3):
         client.send(PACKET)
     relay.step(0.0)
-    assert [server.recv(2000) for _ in range(5)] == [PACKET] * 5
-    assert len(relay.ways["uplink"].log) == 3
+    assert [server.recv(2000) for _ in range(3)] == [PACKET] * 3
+    assert len(relay.up.log) == 2
 
 
 def log_of(profile, late_ns=0, count=2000):

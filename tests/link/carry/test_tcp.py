@@ -17,8 +17,8 @@ import pytest
 
 from cloudrc import link
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.link.relay_tcp.medium import Medium
-from cloudrc.link.relay_tcp.relay import StreamRelay
+from cloudrc.link.carry.tcp.medium import Medium
+from cloudrc.link.carry.tcp.relay import StreamRelay
 
 pytestmark = pytest.mark.process
 
@@ -259,7 +259,7 @@ def test_a_signal_in_the_middle_of_a_change_does_not_spoil_the_end():
         to = far.getsockname()
         relay = StreamRelay(here, to, socket.AF_INET, ways)
         with socket.create_connection(("127.0.0.1", here.getsockname()[1])) as client:
-            relay.step(1.0)
+            relay.engine.step(1.0)
             (connection,) = relay.connections
             # As if KeyboardInterrupt came between the selector's call and the note of it.
             relay._selector.unregister(connection.server.socket)

@@ -8,7 +8,7 @@ from math import nan
 
 import numpy as np
 
-from cloudrc.link.exec.relay import LOST, PacketLog
+from cloudrc.link.carry.log import LOST, PacketLog
 from cloudrc.link.library import KIND
 from cloudrc.link.model import HEADER_BYTES
 from cloudrc.link.profile import DirectionProfile, Timeline

@@ -6,9 +6,9 @@ import random
 import pytest
 
 from cloudrc.errors import BadInputError
+from cloudrc.link.carry.tcp.medium import SEGMENT, Medium, refuse_unsupported
+from cloudrc.link.carry.tcp.stream import READ_AHEAD, WINDOW_BYTES, LinkStream, run_due
 from cloudrc.link.queue import NOTHING_NS, PacketQueue
-from cloudrc.link.relay_tcp.medium import SEGMENT, Medium, refuse_unsupported
-from cloudrc.link.relay_tcp.stream import READ_AHEAD, WINDOW_BYTES, LinkStream, run_due
 from tests.link.profiles import blackout, changed, in_bursts, profile_of
 
 MS = 1_000_000
