@@ -53,16 +53,6 @@ def format_number(value: float) -> str:
     return f"{value:.3e}"
 
 
-def parse_number(text: str) -> float:
-    """Parse a number of any unit; raise a ValueError for another text.
-
-    Python reads 1_0 as 10; a user means something else, so it is no number here.
-    """
-    if "_" in text:
-        raise ValueError(f"no number: {text!r}")
-    return float(text)
-
-
 def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
     """Align rows of equal length in columns; return one line per row.
 

@@ -31,7 +31,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "files": set(),
     "geometry": set(),
     "geometry.vectors": set(),
-    "outside": set(),
     "plugins": set(),
     "tunnel": {"endpoint"},
     "link": {"files", "tunnel"},

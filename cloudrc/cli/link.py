@@ -15,7 +15,7 @@ from pathlib import Path
 
 from cloudrc.cli.cluster_flags import release_arguments
 from cloudrc.cli.output import output_argument, print_line
-from cloudrc.cli.parser import add_verbs, settings_from
+from cloudrc.cli.parser import add_verbs, number, read_seed, settings_from, whole_number
 from cloudrc.errors import BadInputError
 from cloudrc.files import PICTURES, naming, refuse_other_file
 from cloudrc.link.verify import DEFAULT
@@ -107,7 +107,7 @@ def verify_arguments(parser: argparse.ArgumentParser) -> None:
         "time to send probes (default: as long as needed, at most 120); with --mode cluster: "
         "time to wait for a verdict (default: 270)"
     )
-    add("--seconds", type=float, metavar="S", help=seconds)
+    add("--seconds", type=number(1, 3600, "seconds"), metavar="S", help=seconds)
     shaper = "relay (default), or netem between two network namespaces (needs root)"
     add("--shaper", choices=("relay", "netem"), default="relay", help=shaper)
     mode = "a link started on this machine (default), or the link of a release"
@@ -131,13 +131,13 @@ def show_arguments(parser: argparse.ArgumentParser) -> None:
     picture = "the picture: .png, .svg or .pdf (default: NAME.png)"
     add("-o", "--output", type=Path, metavar="FILE", help=picture)
     seconds = "time to show (default: 30, or the whole time line)"
-    add("--seconds", type=float, metavar="S", help=seconds)
+    add("--seconds", type=number(0.001, 86_400, "seconds"), metavar="S", help=seconds)
     seed = "seed of the random draws (default: 1)"
-    add("--seed", type=int, default=1, metavar="S", help=seed)
+    add("--seed", type=read_seed, default=1, metavar="S", help=seed)
     rate = "packets per second (default: 100)"
-    add("--rate", type=float, default=100.0, metavar="HZ", help=rate)
+    add("--rate", type=number(1, 10_000, "Hz"), default=100.0, metavar="HZ", help=rate)
     packets = "packets for the statistics of an unchanging link (default: 100000)"
-    add("--packets", type=int, default=100_000, metavar="N", help=packets)
+    add("--packets", type=whole_number(1, 10_000_000), default=100_000, metavar="N", help=packets)
 
 
 def show(options: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from cloudrc.cli.output import print_line
-from cloudrc.cli.parser import number, settings_from, whole_number
+from cloudrc.cli.parser import number, read_seed, settings_from, whole_number
 from cloudrc.runs.interrupts import interrupt_on_signals
 
 EPILOG = """\
@@ -39,7 +39,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the action's arguments."""
     add = parser.add_argument
     add("--link", default="ideal", metavar="PROFILE", help="shipped profile, or a file")
-    add("--seed", type=whole_number(0, 2**53 - 1), default=1, metavar="S", help="seed (default: 1)")
+    add("--seed", type=read_seed, default=1, metavar="S", help="seed (default: 1)")
     setting = "change of the profile, such as uplink.loss=0.05; repeatable"
     add("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help=setting)
     ends = {"--server": "the program that serves", "--client": "the program that asks"}

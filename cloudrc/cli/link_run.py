@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from cloudrc.cli.parser import settings_from
+from cloudrc.cli.parser import settings_from, whole_number
 from cloudrc.cli.processes import process_arguments, read_address
 from cloudrc.drivers.process import StopSignal
 
@@ -36,7 +36,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     control = "answer PUT /link on this Unix socket, which changes the link"
     add("--control", type=Path, metavar="FILE", help=control)
     origin = "start of the time line, monotonic clock [ns] (default: when the link comes up)"
-    add("--origin", type=int, default=0, metavar="NS", help=origin)
+    add("--origin", type=whole_number(0, 2**63 - 1), default=0, metavar="NS", help=origin)
 
 
 def execute(options: argparse.Namespace) -> int:

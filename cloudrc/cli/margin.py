@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.compare import flight_arguments
 from cloudrc.cli.output import output_argument, print_result
+from cloudrc.cli.parser import any_number
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.text import escape
@@ -38,9 +39,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("key", metavar="KEY", help="key of the experiment whose value is a number")
     flight_arguments(parser, seeds=3)
     about = "largest value to try (default: 32 times the first, which is the present one)"
-    add("--max", type=float, metavar="X", help=about)
+    add("--max", type=any_number, metavar="X", help=about)
     about = "try multiples of R (default: 10 for a key in ms, 1 for whole numbers, else 0.01)"
-    add("--resolution", type=float, metavar="R", help=about)
+    add("--resolution", type=any_number, metavar="R", help=about)
     output_argument(parser)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.output import output_argument, print_line, print_result
-from cloudrc.cli.parser import add_verbs, settings_from, whole_number
+from cloudrc.cli.parser import add_verbs, read_seed, settings_from
 from cloudrc.cli.processes import read_address
 from cloudrc.runs.interrupts import interrupt_on_signals
 
@@ -78,7 +78,7 @@ def _link_arguments(parser: argparse.ArgumentParser) -> None:
     add("--link", default="ideal", metavar="PROFILE", help="shipped profile, or a file")
     setting = "change of the profile, such as uplink.loss=0.05; repeatable"
     add("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help=setting)
-    add("--seed", type=whole_number(0, 2**53 - 1), default=1, metavar="S", help="seed (default: 1)")
+    add("--seed", type=read_seed, default=1, metavar="S", help="seed (default: 1)")
     output_argument(parser)
 
 

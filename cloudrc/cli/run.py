@@ -24,7 +24,7 @@ from cloudrc.cli.output import (
     print_result,
     warn,
 )
-from cloudrc.cli.parser import read_count, whole_number
+from cloudrc.cli.parser import read_count, read_seed
 from cloudrc.cli.report import print_traceback, report_arguments, summary
 from cloudrc.errors import BadInputError, CloudrcError, NothingFlownError
 from cloudrc.runs.folder import point_to, run_folder
@@ -83,7 +83,7 @@ def experiment_arguments(parser: argparse.ArgumentParser, seed: argparse._Action
     about = "name of a shipped experiment, or a YAML file (default: paper)"
     add("experiment", nargs="?", default="paper", metavar="EXPERIMENT", help=about)
     about = "random seed of this run (default: the experiment's)"
-    seed.add_argument("--seed", type=whole_number(0, 2**53 - 1), metavar="S", help=about)
+    seed.add_argument("--seed", type=read_seed, metavar="S", help=about)
     about = "change one key of the experiment; repeatable"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
     add("--out", type=Path, metavar="DIR", help="folder of the run (default: a new one in runs/)")

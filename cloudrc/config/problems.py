@@ -21,8 +21,8 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.profile import Range
 from cloudrc.outside.document import Document, KeyPath
+from cloudrc.outside.values import Quantity
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _TYPES = {
@@ -196,7 +196,7 @@ def _limits(field: FieldInfo) -> Iterator[str]:
 def _bounds(part: Any) -> Iterator[Ge | Gt | Le | Lt]:
     """Yield the limits in a field or an annotation."""
     inner: Iterable[Any]
-    if isinstance(part, Range):
+    if isinstance(part, Quantity):
         inner = part
     elif isinstance(part, FieldInfo):
         inner = (*part.metadata, part.annotation)

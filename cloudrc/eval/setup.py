@@ -22,12 +22,12 @@ from cloudrc.link.traces import read_lines
 from cloudrc.outside.code import sources
 from cloudrc.outside.document import parse_value, read_document
 from cloudrc.outside.reuse import reuse
+from cloudrc.outside.values import ANY
 from cloudrc.plugins import is_path
 from cloudrc.policy.address import check_url
 from cloudrc.policy.observation import Mapped
 from cloudrc.runs.installed import plugin_code
 from cloudrc.runs.own_files import hash_of
-from cloudrc.text import parse_number
 
 Compute: TypeAlias = float | tuple[float, float] | tuple[str, str]
 """Time for an answer [s]: constant; or mean and deviation; or (FILE, name) or (MEASURED, "")."""
@@ -171,7 +171,7 @@ def read_compute(text: str) -> Compute:
     if text == MEASURED:
         return MEASURED, ""
     try:
-        numbers = [parse_number(each) for each in text.split(",")]
+        numbers = [ANY.read(each) for each in text.split(",")]
     except ValueError:
         if os.path.lexists(text):
             return FILE, text
@@ -209,7 +209,7 @@ def read_times(path: str) -> tuple[float, ...]:
     for number, line in rows:
         text = line.rpartition(",")[2].strip(' \t"')
         try:
-            time = parse_number(text)
+            time = ANY.read(text)
         except ValueError:
             if number == rows[0][0] and not text.lstrip("+-.")[:1].isdigit():
                 continue  # the head

@@ -23,7 +23,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import Corners, Fence, order_of
 from cloudrc.geometry.solids import Solid
 from cloudrc.messages import Vector
-from cloudrc.text import parse_number
+from cloudrc.outside.values import ANY
 
 Numerics: TypeAlias = dict[str, str]
 """Name of a `<numeric>` -> its data."""
@@ -186,7 +186,7 @@ def _shape(name: str, data: str) -> Tube | Plate:
 
 def _numbers(name: str, data: str, count: int) -> list[float]:
     try:
-        numbers = [parse_number(word) for word in data.split()]
+        numbers = [ANY.read(word) for word in data.split()]
     except ValueError:
         numbers = []
     if len(numbers) != count or not all(map(math.isfinite, numbers)):

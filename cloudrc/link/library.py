@@ -6,7 +6,7 @@ direction, stream, episode and number of the packet alone, so two policies meet 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,14 +27,20 @@ from cloudrc.link.draws import (
 )
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Conditions, DirectionProfile
+from cloudrc.outside.refusal import naming
+from cloudrc.outside.values import Quantity
 
 if TYPE_CHECKING:
     from cloudrc.link.streams import Numbers
 
 KIND = 128
 """Kind of the packets of other programs; smaller numbers are those of the testbed's datagrams."""
-SEED_MAX = 2**53 - 1
-"""Largest seed of a link, as in an experiment."""
+SEED = Quantity(ge=0, le=2**53 - 1, whole=True)
+"""Seed of a link, as in an experiment."""
+COUNT = Quantity(ge=0, le=2**63 - 1, whole=True)
+"""Number of a packet or of an episode, size, or time [ns]."""
+PERIOD = Quantity("s", ge=1e-9, le=1e9)
+"""Time between two packets."""
 _PACKETS = 10_000  # of which `expected` is computed
 _CHUNK = 64  # number of blocks that are computed together; their arrays fit into the cache
 
@@ -100,12 +106,12 @@ class OneWay:
         self, profile: DirectionProfile, seed: int, uplink: bool, *, stream: str = ""
     ) -> None:
         """Open a direction; `seed` and `stream` are those of `cloudrc.link.open`."""
-        if not is_whole(seed) or not 0 <= seed <= SEED_MAX:
-            raise BadInputError(f"seed {seed!r}: give a whole number from 0 to 2^53 - 1")
+        with naming("seed"):
+            self._seed = SEED.of(seed)
         if not isinstance(stream, str):
             raise BadInputError(f"stream {stream!r}: give a text, the name of this link")
         self.profile = profile
-        self._seed, self._uplink, self._stream = int(seed), uplink, stream
+        self._uplink, self._stream = uplink, stream
         self._episode = 0
         self._keyed: tuple[int, StreamKey] = -1, (0, 0)
         self._link = self._new()
@@ -127,15 +133,15 @@ class OneWay:
             BadInputError: If an argument is negative, or `episode` or `number` is not whole.
         """
         if episode != self._episode:
-            _check_whole(episode=episode)
-            self._episode, self._link = episode, self._new()
+            with naming("episode"):
+                self._episode, self._link = COUNT.of(episode), self._new()
         try:  # takes less time than to check each packet
-            if not (size >= 0 and now_ns >= 0):  # also NaN
-                _check_whole(size=size, now_ns=now_ns)
+            if type(number) is not int or not (size >= 0 and now_ns >= 0):  # also NaN
+                raise TypeError
             arrivals = self._link.send(episode, KIND, number, size, now_ns)
-        except (IndexError, OverflowError, TypeError):
-            _check_whole(number=number, size=size, now_ns=now_ns)
-            raise
+        except (IndexError, OverflowError, TypeError, ValueError):
+            number, size, now_ns = _whole(number=number, size=size, now_ns=now_ns)
+            arrivals = self._link.send(self._episode, KIND, number, size, now_ns)
         if self._link.corrupts and arrivals and self._is_damaged(episode, number):
             return ()
         return arrivals
@@ -164,7 +170,7 @@ class OneWay:
         Returns:
             The delays [s], shape (count,); NaN for a lost packet.
         """
-        _check_whole(count=count, episode=episode, first=first, size=size)
+        count, episode, first, size = _whole(count=count, episode=episode, first=first, size=size)
         period_ns = _to_ns(period)
         conditions = self._link.only
         if conditions and _is_independent(self.profile, conditions):
@@ -190,7 +196,7 @@ class OneWay:
         """
         from cloudrc.link.streams import numbers, sample
 
-        _check_whole(size=size)
+        (size,) = _whole(size=size)
         link = LinkDirection(
             self.profile, self._seed, self._uplink, stream=f"{self._stream} expected"
         )
@@ -252,23 +258,17 @@ class OneWay:
         return delays
 
 
-def _check_whole(**values: int) -> None:
-    """Raise a BadInputError for a value that is negative or no whole number."""
+def _whole(**values: Any) -> Iterator[int]:
+    """Yield each value as a whole number; raise a BadInputError for one that is none."""
     for name, value in values.items():
-        if not is_whole(value) or value < 0:
-            raise BadInputError(f"{name} {value!r}: give a whole number, 0 or more")
-
-
-def is_whole(value: object) -> bool:
-    """Return whether a value is a whole number, and no boolean."""
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+        with naming(name):
+            yield COUNT.of(value)
 
 
 def _to_ns(period: float) -> int:
     """Return the time between two packets [ns], given in seconds."""
-    if not 1e-9 <= period <= 1e9:
-        raise BadInputError(f"period {period!r}: give the time between two packets in seconds")
-    return round(period * 1e9)
+    with naming("period", "the time between two packets"):
+        return round(float(PERIOD.of(period)) * 1e9)
 
 
 def _is_independent(profile: DirectionProfile, conditions: Conditions) -> bool:

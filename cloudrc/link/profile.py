@@ -15,49 +15,17 @@ from itertools import pairwise
 from math import inf
 from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
+from cloudrc.outside.values import Quantity
 
-class Range:
-    """The values that a key may have."""
-
-    def __init__(
-        self, *, ge: float | None = None, gt: float | None = None, le: float | None = None
-    ) -> None:
-        """Set least and largest value, `ge` and `le`, and what all are above, `gt` [their unit]."""
-        self.ge, self.gt, self.le = ge, gt, le
-
-    # Pydantic accepts a class with these two members in place of the ranges of annotated_types,
-    # whose import takes longer than that of the whole link.
-    @property
-    def __is_annotated_types_grouped_metadata__(self) -> Literal[True]:
-        return True
-
-    def __iter__(self) -> Iterator[Any]:
-        import annotated_types
-
-        for name in ("ge", "gt", "le"):
-            if (limit := getattr(self, name)) is not None:
-                yield getattr(annotated_types, name.capitalize())(limit)
-
-    def allows(self, value: float) -> bool:
-        """Return whether a `value` [any unit] is in the range."""
-        over = self.gt is None or value > self.gt
-        at_least = self.ge is None or value >= self.ge
-        return over and at_least and (self.le is None or value <= self.le)
-
-    def __str__(self) -> str:
-        limits = ((">", self.gt), (">=", self.ge), ("<=", self.le))
-        return " and ".join(f"{sign} {limit}" for sign, limit in limits if limit is not None)
-
-
-NotNegative = Annotated[float, Range(ge=0)]
-Positive = Annotated[float, Range(gt=0)]
-Probability = Annotated[float, Range(ge=0, le=1)]
+NotNegative = Annotated[float, Quantity(ge=0)]
+Positive = Annotated[float, Quantity(gt=0)]
+Probability = Annotated[float, Quantity(ge=0, le=1)]
 COMMAND_AGE_MS = 1, 10_000
 """Smallest and largest value of guard.command_age_max_ms [ms]."""
-CommandAge = Annotated[float, Range(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1])]
+CommandAge = Annotated[float, Quantity(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1])]
 CLOUD_TIME_MAX = 10
 """Largest value of cloud.horizon_max_s and of cloud.freeze_after_s [s]."""
-CloudTime = Annotated[float, Range(gt=0, le=CLOUD_TIME_MAX)]
+CloudTime = Annotated[float, Quantity(gt=0, le=CLOUD_TIME_MAX)]
 DIRECTIONS = ("uplink", "downlink")
 
 
@@ -143,7 +111,7 @@ class DirectionKeys:
     rate_kbit: Positive | None = None
     """Rate of the bottleneck [kbit/s]; each packet counts with 28 bytes of headers;
     null: no bottleneck"""
-    queue_packets: Annotated[int, Range(ge=1, le=1_000_000)] = 1000
+    queue_packets: Annotated[int, Quantity(ge=1, le=1_000_000, whole=True)] = 1000
     """Largest number of packets in the queue of the bottleneck; further packets are dropped"""
     changes: tuple[Change, ...] = ()
     """Changes of the conditions over time; at_s must rise from entry to entry"""

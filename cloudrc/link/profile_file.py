@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
-from math import isfinite
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -16,11 +16,13 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import DIRECTIONS, DirectionKeys, DirectionProfile, ProfileKeys
 from cloudrc.outside.document import Document, KeyPath, Source, read_document
+from cloudrc.outside.refusal import naming
+from cloudrc.outside.values import InvalidValueError, to_plain
 
 FOLDER = Path(__file__).with_name("profiles")
 FILE_KEYS = ("trace", "table")
 """Keys of a direction whose values are paths of files."""
-_WORDS = {int: "a whole number", float: "a number", str: "text", bool: "true or false"}
+_WORDS = {str: "text", bool: "true or false"}
 
 
 def read_keys(profile: str | Path | Mapping[str, Any]) -> ProfileKeys:
@@ -54,7 +56,8 @@ def with_files(direction: DirectionKeys) -> DirectionProfile:
 
 def _document(profile: str | Path | Mapping[str, Any]) -> Document:
     if isinstance(profile, Mapping):
-        return Document(_plain(profile), {(): Source("profile", Path())})
+        with naming("profile"):
+            return Document(to_plain(profile), {(): Source("profile", Path())})
     if not isinstance(profile, str | Path):
         raise BadInputError(
             f"a link is the name or path of a profile, or a mapping; not {type(profile).__name__}"
@@ -69,24 +72,6 @@ def _document(profile: str | Path | Mapping[str, Any]) -> Document:
         names = sorted(shipped.stem for shipped in FOLDER.glob("*.yaml"))
         raise BadInputError(f"{unknown_name_text('profile', name, names)}; no such file: {path}")
     return read_document(path, name)
-
-
-def _plain(profile: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a mapping with plain lists and numbers, also in place of those of numpy."""
-    import json
-
-    def item(value: Any) -> Any:
-        if hasattr(value, "tolist"):
-            return value.tolist()
-        raise TypeError(type(value).__name__)
-
-    try:
-        tree: dict[str, Any] = json.loads(json.dumps(dict(profile), default=item))
-    except (TypeError, ValueError) as error:
-        raise BadInputError(
-            f"the mapping of a link profile holds texts, numbers, lists and mappings, not {error}"
-        ) from None
-    return tree
 
 
 class _WrongValueError(Exception):
@@ -118,8 +103,11 @@ def _value(kind: Any, value: Any, path: KeyPath) -> Any:
         if get_origin(option) is tuple and isinstance(value, list):
             one = get_args(option)[0]
             return tuple(_value(one, each, (*path, str(n))) for n, each in enumerate(value))
-        if _fits(option, value):
-            return float(value) if get_args(option)[:1] == (float,) else value
+        if hasattr(option, "__metadata__"):
+            with suppress(InvalidValueError):
+                return get_args(option)[1].of(value)
+        elif value in get_args(option) if get_origin(option) is Literal else type(value) is option:
+            return value
     shown = f"{value!r:.60}" if isinstance(value, str | int | float) else type(value).__name__
     raise _WrongValueError(path, f"{shown}: must be {' or '.join(map(_words, options))}")
 
@@ -133,21 +121,11 @@ def _options(kind: Any) -> Iterator[Any]:
         yield from _options(one)
 
 
-def _fits(kind: Any, value: Any) -> bool:
-    if get_origin(kind) is Literal:
-        return value in get_args(kind)
-    if not hasattr(kind, "__metadata__"):
-        return type(value) is kind
-    number, limits = get_args(kind)
-    is_number = type(value) is int or (type(value) is number and isfinite(value))
-    return is_number and limits.allows(value)
-
-
 def _words(kind: Any) -> str:
     if get_origin(kind) is Literal:
         return f"one of {', '.join(get_args(kind))}"
     if hasattr(kind, "__metadata__"):
-        return f"{_WORDS[get_args(kind)[0]]} {get_args(kind)[1]}"
+        return str(get_args(kind)[1])
     if get_origin(kind) is tuple:
         return "a list"
     return "null" if kind is NoneType else _WORDS.get(kind, "a mapping of keys")

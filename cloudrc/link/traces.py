@@ -28,8 +28,8 @@ from cloudrc.link.profile import (
     Trace,
 )
 from cloudrc.outside.patience import telling_if_slow
+from cloudrc.outside.values import ANY, InvalidValueError, Quantity
 from cloudrc.rounding import differences
-from cloudrc.text import parse_number
 
 SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a second
 START_MAX = 600.0  # if the first row is later, times count from the first row [s]
@@ -210,11 +210,11 @@ class Row(NamedTuple):
         If the cell contains no such number, raise a BadInputError whose message asks for `wanted`.
         """
         text = self.text(column)
-        value = _parse(text.replace(self.decimal, "."))
-        if value is None or not low <= value <= high or abs(value) == inf:
+        try:
+            return Quantity(ge=low, le=high).read(text.replace(self.decimal, "."))  # type: ignore[no-any-return]
+        except InvalidValueError:
             shown = repr(text[:40]) if text else "nothing"
-            raise BadInputError(f"{self.where}: {column} is {shown}; give {wanted}")
-        return value
+            raise BadInputError(f"{self.where}: {column} is {shown}; give {wanted}") from None
 
 
 def read_rows(
@@ -270,8 +270,8 @@ def _cells(line: str, separator: str, where: str) -> list[str]:
 
 def _parse(text: str) -> float | None:
     try:
-        return parse_number(text)
-    except ValueError:
+        return ANY.read(text)  # type: ignore[no-any-return]
+    except InvalidValueError:
         return None
 
 

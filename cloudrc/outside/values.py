@@ -121,7 +121,8 @@ class Quantity:
     def __str__(self) -> str:
         """Say which numbers are valid, such as "a number >= 0 and <= 1 [s]"."""
         limits = {">=": self.ge, ">": self.gt, "<=": self.le}
-        words = [f"{sign} {limit:.15g}" for sign, limit in limits.items() if abs(limit) < HUGE]
+        form = "" if self.whole else ".15g"
+        words = [f"{sign} {limit:{form}}" for sign, limit in limits.items() if abs(limit) < HUGE]
         kind = "a whole number" if self.whole else "a number" if words else "a finite number"
         return f"{kind} {' and '.join(words)}".rstrip() + f" [{self.unit}]" * (self.unit != "1")
 
@@ -167,26 +168,29 @@ def plain_of(value: Any) -> Any:
     return None if is_masked or not {"m", "M"}.isdisjoint(kinds) else plain
 
 
-def to_plain(value: Any) -> Any:
+def to_plain(value: Any, name: str = "") -> Any:
     """Convert what a program gives in place of a document to texts, numbers, lists and mappings.
 
     Raises:
-        InvalidValueError: If a value is of another kind, or a number that is not finite.
+        InvalidValueError: If a value is of another kind, or a number that is not finite. Its text
+            has the key, below `name`.
     """
     if value is None or isinstance(value, str):
         return value
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if isinstance(value, Mapping):
-        return {str(key): to_plain(each) for key, each in value.items()}
+        above = f"{name}." if name else ""
+        return {str(key): to_plain(each, f"{above}{key}") for key, each in value.items()}
     if getattr(value, "shape", ()) != ():
-        value = ANY.array(value).tolist()
+        value = ANY.array(value, name).tolist()
     if isinstance(value, list | tuple):
-        return [*map(to_plain, value)]
+        return [to_plain(each, f"{name}.{n}") for n, each in enumerate(value)]
     plain = plain_of(value)
-    return (
-        plain if isinstance(plain, bool) else (WHOLE if isinstance(plain, int) else ANY).of(value)
-    )
+    if isinstance(plain, bool):
+        return plain
+    is_whole = isinstance(plain, Rational) and plain.denominator == 1
+    return (WHOLE if is_whole else ANY).of(value, name)
 
 
 def to_arrays(value: Any) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from math import isnan, nan
 from pathlib import Path
 from statistics import fmean
@@ -22,13 +22,6 @@ from cloudrc.text import table
 from cloudrc.tunnel.codec import SIZES, TELEMETRY_SIZES, Kind
 
 PACKETS_MAX = 10_000_000
-RANGES: dict[str, tuple[float, float]] = {
-    "seconds": (0.001, 86_400),
-    "seed": (0, 2**53 - 1),
-    "rate": (1, 10_000),
-    "packets": (1, PACKETS_MAX),
-}
-"""Option of `show` -> its least and largest value."""
 ROWS = 1000  # least number of packets for a trace that has shares of losses
 SECONDS = 30.0  # time that a figure shows by default [s]; a longer time line is shown in full
 Tell: TypeAlias = Callable[[str], None]
@@ -52,10 +45,6 @@ def sample_profile(
     Return the description; and direction -> packets for the figure, and statistics. `tell` receives
     a warning about a doubtful trace, `see` the present step of the work.
     """
-    for key, value in asdict(settings).items():
-        least, most = RANGES[key]
-        if value is not None and not least <= value <= most:
-            raise BadInputError(f"--{key} {value:g}: give a number from {least} to {most}")
     profile, is_trace = _profile(name)
     ways = ("uplink",) if is_trace else ("uplink", "downlink")
     samples = {way: _way(getattr(profile, way), way, settings, tell, see) for way in ways}
