@@ -61,13 +61,11 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
 
 
 def _units(ways: Mapping[str, DirectionProfile]) -> Iterator[str]:
-    """Yield a warning for a heavy loss and for a trace that begins late."""
-    from cloudrc.link.doubts import describe_heavy_loss, describe_trace
+    """Yield a warning for each direction in which no packet arrives."""
+    from cloudrc.link.doubts import describe_heavy_loss
 
     for name, profile in ways.items():
         yield from describe_heavy_loss(profile, name)
-        if doubt := describe_trace(profile.rows):
-            yield f"link.{name}.trace {profile.trace}: {doubt}"
 
 
 def _directions(experiment: ResolvedExperiment) -> dict[str, DirectionProfile]:

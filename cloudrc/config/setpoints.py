@@ -10,7 +10,7 @@ import numpy as np
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import Fence
-from cloudrc.link.traces import Row, read_lines, read_rows, telling_rows
+from cloudrc.link.traces import Row, read_lines, read_rows
 from cloudrc.messages import Vector
 
 COLUMNS = ["time_s", "x_m", "y_m", "z_m"]
@@ -29,13 +29,11 @@ def read_setpoints(path: Path, fence: Fence) -> tuple[TimedPosition, ...]:
     guard lets the robot fly inside `fence`. A robot that stays on the ground needs no column z_m.
     """
     name, fits = f"setpoints {path}", COLUMNS if fence.ground is None else COLUMNS[:3]
-    lines = read_lines(path, name, f"give a CSV file: {','.join(fits)}")
-    columns, rows = read_rows(lines, name, f"the first line must be {','.join(fits)}")
+    columns, rows = read_rows(read_lines(path, name, f"give a CSV file: {','.join(fits)}"), name)
     if columns not in (COLUMNS, fits):
         given = ",".join(columns)[:80] or "missing"
-        raise BadInputError(f"{name}: the columns are {given}; give {','.join(fits)}")
-    with telling_rows(path, lines):
-        found = _take_each(rows, columns, fence)
+        raise BadInputError(f"{name}: the header is {given}; it must be {','.join(fits)}")
+    found = _take_each(rows, columns, fence)
     if len(found) < 2:
         raise BadInputError(f"{name}: has {len(found)} rows; give at least two")
     return tuple((time - found[0][0], position) for time, position in found)

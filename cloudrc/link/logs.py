@@ -16,7 +16,6 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from datetime import datetime
 from math import nan
 from typing import Any, Literal, TypeAlias
 
@@ -202,73 +201,45 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool) -> Packets:
     columns, rows = read_rows(lines, name)
     time, time_unit = _find(columns, TIMES, name)
     delay, unit = _find(columns, DELAYS, name)
-    if not unit:
-        raise BadInputError(f"{name}: {_no_unit(delay)}")
     log = Log(name, halved=delay.startswith("rtt"))
     if log.halved and not halve:
         raise BadInputError(f"{name}, column {delay}: has round trips; {HALVE}")
     # A share of losses must not be passed over in silence.
     losses = [column for column in columns if any(word in column for word in LOSSES)]
-    loss = next((column for column in losses if column in LOSSES), None)
-    if losses and not loss:
+    if {*losses} - {*LOSSES}:
         raise log.error(f"column {losses[0]} is not read; call it loss, 0 or 1, or remove it")
-    raw = [(_csv_time(row, time, time_unit), _csv_delay(row, delay, loss)) for row in rows]
+    raw = [(row.number(time), _csv_delay(row, delay, losses)) for row in rows]
     # For nanoseconds since 1970 a float has a resolution of 256 ns, which is enough here.
     start = min((sent for sent, _ in raw), default=0.0)
-    scales = SCALES[time_unit or "s"], SCALES[unit] * (0.5 if log.halved else 1.0)
+    scales = SCALES[time_unit], SCALES[unit] * (0.5 if log.halved else 1.0)
     log.entries = [((sent - start) * scales[0], value * scales[1]) for sent, value in raw]
     return log.packets()
 
 
 def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, str]:
-    """Find the only column named after one of `kinds`, as in `delay_ms` or, without unit, `delay`.
+    """Return the only column named after one of `kinds` and a unit, as `delay_ms`, and the unit.
 
-    Return the column's name and its unit; "" without unit. Raise an error if there is none, or more
-    than one; `name` is the log's name, for the error.
+    Raise an error if there is none, or more than one; `name` is the log's name, for the error.
     """
-    pattern = re.compile(f"(?:{'|'.join(kinds)})(?:_({'|'.join(SCALES)}))?")
-    found = [(column, it[1] or "") for column in columns if (it := pattern.fullmatch(column))]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        names = " and ".join(column for column, _ in found)
-        raise BadInputError(f"{name}: has {names}; keep only one of them")
-    shown = ",".join(columns)[:200] or "nothing"
-    raise BadInputError(f"{name}: no column {kinds[0]}, found {shown}; name them {COLUMNS}")
+    pattern = re.compile(f"(?:{'|'.join(kinds)})_({'|'.join(SCALES)})")
+    found = [(column, it[1]) for column in columns if (it := pattern.fullmatch(column))]
+    if len(found) != 1:
+        raise BadInputError(
+            f"{name}: has {len(found)} columns {kinds[0]} in {','.join(columns)[:200]!r}; name them"
+            f" {COLUMNS}"
+        )
+    return found[0]
 
 
-def _no_unit(column: str) -> str:
-    names = ", ".join(f"{column}_{unit}" for unit in ("s", "ms", "us"))
-    return f"column {column} does not say its unit; call it {names} or {column}_ns"
-
-
-def _csv_time(row: Row, column: str, unit: str) -> float:
-    """Read a time in `unit`; without a unit, convert date and time to time since 1970 [s]."""
-    if unit:
-        return row.number(column)
-    text = row.text(column)
-    try:
-        return datetime.fromisoformat(text).timestamp()
-    except ValueError:
-        wanted = f"give date and time as 2024-01-20T10:00:00.5; of numbers, {_no_unit(column)}"
-        raise BadInputError(f"{row.where}: {column} is {text[:40]!r}; {wanted}") from None
-
-
-def _csv_delay(row: Row, column: str, loss: str | None) -> float:
+def _csv_delay(row: Row, column: str, losses: list[str]) -> float:
     """Read the delay of a packet from `column`, in the column's unit; return NaN for a lost packet.
 
-    `loss` is the column that marks lost packets; None if the file has no such column.
+    `losses` are the columns that mark lost packets with 1 or "true".
     """
-    if loss:
-        flag = {"false": 0.0, "true": 1.0}.get(row.text(loss).lower())
-        flag = row.number(loss) if flag is None else flag
-        if flag not in (0.0, 1.0):
-            raise BadInputError(f"{row.where}: {loss} is {flag:g}; give 0 or 1 for a packet")
-        if flag:
-            return nan
-    if row.text(column).lower() in ("", "nan"):
+    lost = [row.cells[name].lower() not in ("0", "false") for name in losses]
+    if any(lost) or row.cells[column].lower() in ("", "nan"):
         return nan
-    return row.number(column, wanted="a number that is not negative, or nothing for a lost packet")
+    return row.number(column)
 
 
 _WRAP = 1 << 16  # after 65535 ping goes on with 0

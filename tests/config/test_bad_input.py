@@ -229,9 +229,9 @@ def test_an_invalid_profile_is_refused_with_the_reason(mine, text, reason):
     [
         ("", "has 0 rows; give at least two"),
         ("0,0,0,1\n0,0,0,1\n", "line 3: time_s 0 does not rise"),
-        ("0,0,nan,1\n", "line 2: y_m is 'nan'; give a finite number"),
+        ("0,0,nan,1\n", "line 2: y_m: 'nan', not a finite number"),
         ("0,0,0,1\n1,0,0,9\n", "line 3: z_m is 9; the guard flies from 0.35 to 2.3"),
-        (None, "the columns are time_s,delay_ms; give time_s,x_m,y_m,z_m"),
+        (None, "the header is time_s,delay_ms; it must be time_s,x_m,y_m,z_m"),
     ],
 )
 def test_an_invalid_file_of_setpoints_is_one_line(tmp_path, rows, said):
@@ -256,7 +256,7 @@ def test_an_invalid_file_of_setpoints_is_one_line(tmp_path, rows, said):
 def test_a_file_of_setpoints_without_a_header_is_told_so(tmp_path, lines):
     (tmp_path / "drive.csv").write_text(lines)
     text = refused("hover", f"mission.setpoints={tmp_path / 'drive.csv'}")
-    assert "has numbers without a header; the first line must be time_s,x_m,y_m,z_m" in text
+    assert "it must be time_s,x_m,y_m,z_m" in text
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ def test_a_mission_that_leads_off_the_ground_or_away_is_refused_in_one_line(sett
         ("time_s,x_m,y_m", "", ""),
         ("time_s,x_m,y_m,z_m", ",0.1", ""),
         ("time_s,x_m,y_m,z_m", ",1", "line 2: z_m is 1, but the robot stays on the ground, at 0.1"),
-        ("time_s,x_m", "", "the columns are time_s,x_m; give time_s,x_m,y_m$"),
+        ("time_s,x_m", "", "the header is time_s,x_m; it must be time_s,x_m,y_m$"),
     ],
 )
 def test_a_file_of_setpoints_needs_no_height_and_has_no_other_one(tmp_path, head, z, message):
@@ -81,7 +81,7 @@ def test_a_file_of_setpoints_needs_no_height_and_has_no_other_one(tmp_path, head
 def test_a_robot_that_flies_needs_the_heights_of_setpoints(tmp_path):
     file = tmp_path / "mine.csv"
     file.write_text("time_s,x_m,y_m\n0,0,0\n1,1,0\n")
-    with pytest.raises(BadInputError, match="give time_s,x_m,y_m,z_m"):
+    with pytest.raises(BadInputError, match="must be time_s,x_m,y_m,z_m"):
         load_experiment("steps", [f"mission={{setpoints: {file}}}"])
 
 

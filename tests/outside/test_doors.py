@@ -121,7 +121,7 @@ def test_a_mapping_of_a_profile_reads_what_the_table_says(path):
 
 def test_a_cell_of_a_csv_file_reads_what_the_table_says():
     def read(text):
-        return Row("file, line 2", {"delay_ms": text}, ".").number("delay_ms")
+        return Row("file, line 2", {"delay_ms": text}).number("delay_ms")
 
     texts = TEXTS | {" 5 ": 5}
     assert disagreements(texts.items(), ANY, read, BadInputError) == []

@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 from cloudrc.config.profile import DirectionConfig, Profile, load_profile
 from cloudrc.errors import BadInputError
-from cloudrc.link.doubts import describe_heavy_loss, describe_trace
+from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile, Timeline, Trace
 from cloudrc.link.streams import Numbers, Stream, numbers, sample
@@ -91,8 +91,6 @@ def _way(
     many = shown
     if timeline.only() is not None:
         many = send(range(0, settings.packets * period_ns, period_ns))
-    if doubt := describe_trace(profile.rows):
-        tell(f"warning: {asked.trace}: {doubt}")
     for doubt in describe_heavy_loss(profile, name):
         tell(f"warning: {doubt}")
     return DirectionSample(asked, shown.sent, shown.delays, many.delays), numbers(many)

@@ -25,7 +25,7 @@ from cloudrc.link.logs import (
     trace_of,
 )
 from cloudrc.link.streams import numbers
-from cloudrc.link.traces import read_lines, telling_rows, write_trace
+from cloudrc.link.traces import read_lines, write_trace
 from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
@@ -73,8 +73,7 @@ def _from_log(path: Path, settings: LogSettings) -> Packets:
         return read_irtt("\n".join(lines), name, settings.direction, halve=halve)
     if is_ping(lines):
         return read_ping(lines, name, halve=halve)
-    with telling_rows(path, lines):
-        return read_csv(lines, name, halve=halve)
+    return read_csv(lines, name, halve=halve)
 
 
 def _recording(path: Path) -> Recording:
