@@ -66,7 +66,8 @@ def execute(options: argparse.Namespace) -> int:
     """Run both programs, print the verdict on the link, and return the client's exit code."""
     interrupt_on_signals()
     from cloudrc.runs.links.programs import ExecSettings, run_programs
-    from cloudrc.runs.links.programs_report import as_text, make_exec_report, write_report
+    from cloudrc.runs.links.programs_report import make_exec_report, write_report
+    from cloudrc.runs.verify import as_text
 
     def tell(text: str) -> None:
         print_line(f"cloudrc: {text}", sys.stderr)

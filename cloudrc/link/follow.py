@@ -11,14 +11,15 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc.errors import BadInputError
 from cloudrc.files import version
-from cloudrc.link.profile import DIRECTIONS
-from cloudrc.link.state import CHANGE_FILE, ChangeFacts, parse, read_change
+from cloudrc.link.profile import DIRECTIONS, summary
+from cloudrc.link.state import CHANGE_FILE, ChangeFacts, LinkState, parse, read_change
 from cloudrc.outside.document import write_yaml
 
 if TYPE_CHECKING:
@@ -40,6 +41,23 @@ class Loaded(NamedTuple):
     direction: DirectionProfile  # profile of the direction that this process shapes, in SI units
     values: dict[str, Any]  # content of the file, without defaults, to show to users
     change: ChangeFacts = ChangeFacts()  # the last change of the profile: its number and cause
+
+
+def state_after(before: LinkState | None, loaded: Loaded, now_ns: int, **facts: Any) -> LinkState:
+    """Return the state of a direction that uses a profile from `now_ns` on [ns].
+
+    `facts` are the other fields of the state.
+    """
+    return LinkState(
+        **facts,
+        profile=loaded.values,
+        since=datetime.now(UTC).isoformat(timespec="seconds"),
+        since_ns=now_ns,
+        changes=before.changes + 1 if before else 0,
+        change=loaded.change.number,
+        cause=loaded.change.cause if before else "",
+        asked=summary(loaded.direction),
+    )
 
 
 Load = Callable[[Path], Loaded]

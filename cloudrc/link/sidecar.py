@@ -11,16 +11,15 @@ import json
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 from cloudrc.errors import CloudrcError
 from cloudrc.files import write_atomically
 from cloudrc.link.carry.udp import Address, Relay
-from cloudrc.link.follow import Loaded
-from cloudrc.link.profile import DirectionProfile, summary
-from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, to_text
+from cloudrc.link.follow import Loaded, state_after
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, publish
 
 if TYPE_CHECKING:
     from cloudrc.link.netem import Netem
@@ -176,26 +175,14 @@ class Sidecar:
 
     def _next_state(self, shaper: Shaper, profile: Loaded) -> LinkState:
         """Return the state after a change of profile or shaper."""
-        before = self.state
-        return LinkState(
-            shaper=shaper.name,
-            reason=self._reason,
-            mode=self._mode,
-            direction=self._direction,
-            profile=profile.values,
-            since=datetime.now(UTC).isoformat(timespec="seconds"),
-            since_ns=self._machine.clock(),
-            changes=before.changes + 1 if before else 0,
-            change=profile.change.number,
-            cause=profile.change.cause if before else "",
-            asked=summary(profile.direction),
-            origin_ns=self._origin_ns,
-        )
+        facts = {"shaper": shaper.name, "reason": self._reason, "mode": self._mode}
+        facts |= {"direction": self._direction}
+        now_ns, origin_ns = self._machine.clock(), self._origin_ns
+        return state_after(self.state, profile, now_ns, **facts, origin_ns=origin_ns)
 
     def _publish_state(self, state: LinkState) -> LinkState:
         self.state = state
-        with suppress(OSError):  # shaping continues even if the disk is full
-            write_atomically(self._state_file, to_text(state).encode())
+        publish(state, self._state_file)
         return state
 
     def _publish_route(self, route: Address) -> None:

@@ -7,9 +7,13 @@ records each change; `cloudrc link set` reads in it whether a change has taken e
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
+
+from cloudrc.files import write_atomically
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -63,6 +67,12 @@ class LinkState:
 def to_text(state: LinkState) -> str:
     """Format a state as JSON."""
     return json.dumps(asdict(state), indent=2) + "\n"
+
+
+def publish(state: LinkState, file: Path) -> None:
+    """Write a state to its file, if the disk is not full: the link works without it."""
+    with suppress(OSError):
+        write_atomically(file, to_text(state).encode())
 
 
 T = TypeVar("T")

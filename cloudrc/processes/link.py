@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from cloudrc.config.load import load_link, read_experiment
 from cloudrc.drivers.link_control import ControlServer
+from cloudrc.drivers.link_metrics import export_counts, export_state
 from cloudrc.drivers.process import Feed, StopSignal
 from cloudrc.drivers.programs import Programs, run_tool
 from cloudrc.drivers.realtime import Address
@@ -37,14 +38,12 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.netem import Netem, find_netems
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.sidecar import Machine, Sidecar
-from cloudrc.link.state import LinkState
 from cloudrc.link.traces import link_profile
 from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, warn
-from cloudrc.records import Counted
 from cloudrc.tunnel.codec import peek
 
 if TYPE_CHECKING:
-    from cloudrc.drivers.exporter import Exporter
+    pass
 
 RELEASED_PERIOD = 1.0
 """Time between two updates of the file with the lateness of datagrams [s]."""
@@ -159,20 +158,6 @@ def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None
             time.sleep(random.uniform(shortest, longest))
 
     threading.Thread(target=work, daemon=True).start()
-
-
-def export_state(exporter: Exporter | None, state: LinkState) -> None:
-    """Export the state of one direction as metrics."""
-    if exporter:
-        delay = state.asked["delay"] or 0.0
-        exporter.link.shaped(state.shaper, state.direction, state.mode, delay)
-        exporter.ready(True)
-
-
-def export_counts(exporter: Exporter | None, counts: dict[str, int]) -> None:
-    """Export the counters of a shaper as metrics; `counts`: name of the counter -> value."""
-    if exporter:
-        exporter.see([Counted(0, "link", name, number) for name, number in counts.items()])
 
 
 def status_page(sidecar: Sidecar) -> str:

@@ -49,12 +49,13 @@ POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0  # between requests to a release; limit of 
 PORTS = METRICS["world"]["world"], METRICS["world"]["link"]
 NOT_JUDGED = "NOT JUDGED"  # in a note about a quantity that could not be verified
 KEYS = ("asked", "measured", "low", "high")
-"""Values of a row, in the order of the table's columns."""
+COLUMNS = ("asked", "applied", "measured")
+"""Values of a row in columns of their own; "applied" is what a relay has computed."""
 VERDICTS = {"off": "not believed", "open": "undecided", "ok": "believed"}
 """Worst verdict on any quantity of the link -> verdict on the whole link."""
 MEANINGS = {
     "not believed": ("red", "does not match its profile"),
-    "undecided": ("yellow", "needs more --seconds, or cannot be judged: see the notes"),
+    "undecided": ("yellow", "needs more packets (--seconds), or cannot be judged: see the notes"),
     "believed": ("green", "matches its profile"),
 }
 """Verdict on a link -> its colour, and what it means."""
@@ -280,7 +281,9 @@ def as_text(report: Report, paint: Paint = plain) -> str:
     """Format a report: a table per direction, notes, causes and, in the last line, the verdict."""
     lines = [escape(f"{report['link']}: {report['shaper']}")]
     for way, found in report["directions"].items():
-        rows = [[way, "asked", "measured", "allowed", "verdict"], *map(_cells, found["rows"])]
+        shown = [key for key in COLUMNS if any(key in row for row in found["rows"])]
+        heads = [way, *shown, "allowed", "verdict"]
+        rows = [heads, *(_cells(row, shown) for row in found["rows"])]
         lines += ["", escape(f"{way}: {found['probes']}"), table(rows, [1, 2, 3])]
     causes = [f"  {one['way']}: {one['text']}  [{one['code']}]" for one in report["causes"]]
     lines += ["", *map(escape, [*report["notes"], *causes])]
@@ -290,7 +293,7 @@ def as_text(report: Report, paint: Paint = plain) -> str:
     return "\n".join([*lines, paint(f"{report['verdict'].upper()}: the link {text}", colour)])
 
 
-def _cells(row: Mapping[str, Any]) -> list[str]:
-    values = (row.get(key, nan) for key in KEYS)
-    asked, measured, low, high = (in_unit(value, row["unit"]) for value in values)
-    return [f"  {row['name']}", asked, measured, f"{low} .. {high}", row["verdict"]]
+def _cells(row: Mapping[str, Any], shown: Sequence[str]) -> list[str]:
+    values = {key: in_unit(row.get(key, nan), row["unit"]) for key in (*shown, "low", "high")}
+    allowed = f"{values['low']} .. {values['high']}"
+    return [f"  {row['name']}", *(values[key] for key in shown), allowed, row["verdict"]]

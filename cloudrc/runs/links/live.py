@@ -6,9 +6,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
@@ -16,10 +14,9 @@ from cloudrc.config.load import Edit
 from cloudrc.config.profile import DIRECTIONS, load_profile
 from cloudrc.drivers.link_control import ControlServer
 from cloudrc.drivers.local import LINK_FOLDER, link_socket
-from cloudrc.files import write_atomically
-from cloudrc.link.follow import Loaded, Profiles, make_folder
-from cloudrc.link.profile import DirectionProfile, summary
-from cloudrc.link.state import STATE_FILE, LinkState, to_text
+from cloudrc.link.follow import Loaded, Profiles, make_folder, state_after
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.state import STATE_FILE, LinkState, publish
 from cloudrc.link.traces import link_profile
 
 Apply = Callable[[str, Loaded, int], None]
@@ -128,22 +125,11 @@ class LiveLink:
 
     def _publish(self, way: str, now_ns: int) -> None:
         before, loaded = self.states.get(way), self._loaded[way]
-        state = self.states[way] = LinkState(
-            shaper="relay",
-            reason=self._reason,
-            mode="relay",
-            direction=way,
-            profile=loaded.values,
-            since=datetime.now(UTC).isoformat(timespec="seconds"),
-            since_ns=now_ns,
-            changes=before.changes + 1 if before else 0,
-            change=loaded.change.number,
-            cause=loaded.change.cause if before else "",
-            asked=summary(loaded.direction),
-            origin_ns=self.origins_ns[way],
-        )
-        with suppress(OSError):  # the link works even if the disk is full
-            write_atomically(self.folder / way / STATE_FILE, to_text(state).encode())
+        facts = {"shaper": "relay", "reason": self._reason, "mode": "relay", "direction": way}
+        origin_ns = self.origins_ns[way]
+        state = state_after(before, loaded, now_ns, **facts, origin_ns=origin_ns)
+        self.states[way] = state
+        publish(state, self.folder / way / STATE_FILE)
         self._changed(state, _news(before, state, restart=loaded.change.restart))
 
 

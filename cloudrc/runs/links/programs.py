@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cloudrc.drivers.link_metrics import export_counts, export_state
 from cloudrc.drivers.namespaces import Forwarder, ProgramEnd, ProgramState, print_lines
 from cloudrc.drivers.realtime import show_address
 from cloudrc.errors import (
@@ -22,7 +23,6 @@ from cloudrc.errors import (
 )
 from cloudrc.link.exec.listening import is_loopback
 from cloudrc.link.exec.namespace import ADDRESSES
-from cloudrc.records import Counted
 from cloudrc.runs.links.carrier import FLOWS, CarrySettings, ExecLink, Tell, open_live
 
 if TYPE_CHECKING:
@@ -202,16 +202,12 @@ class _Run:
         now = time.monotonic()
         if self._exporter and now - self._counted_at >= COUNT_PERIOD:
             self._counted_at = now
-            counts = self._link.counts().items()
-            self._exporter.see([Counted(0, "link", name, number) for name, number in counts])
+            export_counts(self._exporter, self._link.counts())
 
     def _changed(self, state: LinkState, news: str) -> None:
         if news:
             self._tell(news)
-        if self._exporter:
-            delay = state.asked["delay"] or 0.0
-            self._exporter.link.shaped(state.shaper, state.direction, state.mode, delay)
-            self._exporter.ready(True)
+        export_state(self._exporter, state)
 
 
 def _describe(link: ExecLink, end: ProgramEnd) -> str:

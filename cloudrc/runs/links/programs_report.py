@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import asdict
-from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cloudrc.files import naming
 from cloudrc.link.carry.log import LOGGED_MAX
 from cloudrc.link.verify.causes import LATE, Findings, ShaperFacts, in_unit
-from cloudrc.link.verify.judge import FEWEST
 from cloudrc.link.verify.packets import judge_packets, recording
 from cloudrc.runs.verify import Report, make_report
-from cloudrc.text import table
 
 if TYPE_CHECKING:
     from cloudrc.runs.links.carrier import CarriedLink
@@ -23,11 +20,6 @@ if TYPE_CHECKING:
 
 WAITED = 0.01
 """Share of packets that were read behind a full batch, above which the relay lacks CPU time."""
-MEANINGS = {
-    "believed": "the link did what its profile says",
-    "not believed": "the link did not do what its profile says",
-    "undecided": f"a verdict needs {FEWEST} packets in each direction",
-}
 
 
 def make_exec_report(settings: ExecSettings, outcome: ExecOutcome, link: CarriedLink) -> Report:
@@ -57,6 +49,7 @@ def make_link_report(link: CarriedLink) -> Report:
             row["applied"] = row.pop("asked")
             if (value := asked[row["name"]]) == value:
                 row["asked"] = value
+    report["notes"] += _lateness(link)
     states = {name: asdict(link.live.states[name]) for name in link.ways}
     return {
         "schemaVersion": 1,
@@ -65,6 +58,16 @@ def make_link_report(link: CarriedLink) -> Report:
         "counts": link.counts(),
         "states": states,
     }
+
+
+def _lateness(link: CarriedLink) -> Iterator[str]:
+    """Yield notes about how late packets left."""
+    counts = link.counts()
+    p50, p99 = (counts.get(f"release_error_{one}_ns", 0) * 1e-9 for one in ("p50", "p99"))
+    yield f"packets left {in_unit(p50, 's')} (median) or {in_unit(p99, 's')} (99 %) late"
+    for name in link.ways:
+        if starved := _facts(link, name, p99).starved:
+            yield f"{name}: the relay lacks CPU time: {starved}"
 
 
 def _packets(link: CarriedLink, name: str) -> str:
@@ -81,31 +84,6 @@ def _facts(link: CarriedLink, name: str, late: float) -> ShaperFacts:
         (unread > 0, f"{unread} packets not read in time"),
     )
     return ShaperFacts(shaper="relay", starved=", ".join(text for holds, text in signs if holds))
-
-
-def as_text(report: Report) -> str:
-    """Format a report: a table per direction, causes and, in the last line, the verdict."""
-    lines = list[str]()
-    for way, found in report["directions"].items():
-        head = [way, "asked", "applied", "measured", "allowed", "verdict"]
-        lines += [
-            f"{way}: {found['probes']}",
-            table([head, *map(_cells, found["rows"])], [1, 2, 3]),
-        ]
-        if starved := found["evidence"].get("starved"):
-            lines.append(f"  the relay lacks CPU time: {starved}")
-    p50, p99 = (report["counts"].get(f"release_error_{one}_ns", 0) * 1e-9 for one in ("p50", "p99"))
-    late = f"packets left {in_unit(p50, 's')} (median) or {in_unit(p99, 's')} (99 %) late"
-    lines.append(late)
-    lines += [f"  {one['way']}: {one['text']}  [{one['code']}]" for one in report["causes"]]
-    verdict = report["verdict"]
-    return "\n".join([*lines, f"{verdict.upper()}: {MEANINGS[verdict]}"])
-
-
-def _cells(row: Mapping[str, Any]) -> list[str]:
-    names = ("asked", "applied", "measured", "low", "high")
-    values = [in_unit(row.get(name, nan), row["unit"]) for name in names]
-    return [f"  {row['name']}", *values[:3], f"{values[3]} .. {values[4]}", row["verdict"]]
 
 
 def write_report(folder: Path, report: Report, link: CarriedLink) -> None:
