@@ -139,9 +139,8 @@ mutants: $(VENV)/dev ## mutate guard, tunnel and store, list the mutants that te
 NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults.json \
 	search-adversarial.json $(ROBOTS:%=search-%.json) search-random.json \
 	link.json mujoco-oldest.json mujoco-newest.json gym-sb3.json) \
-	mutants night-meta-world night-tun night-ros2 night-netem e2e-full $(EVIDENCE)/index.md
+	mutants night-meta-world night-tun night-ros2 night-netem e2e-full
 
-nightly: export CLOUDRC_EVIDENCE = $(CURDIR)/$(EVIDENCE)
 nightly: $(VENV)/dev ## run every test, search and bench; writes build/evidence (needs what e2e needs)
 	rm -rf $(EVIDENCE) && mkdir -p $(EVIDENCE)
 	$(MAKE) --jobs=1 --keep-going $(NIGHT)
@@ -180,9 +179,6 @@ $(EVIDENCE)/gym-sb3.json:
 	rm -rf build/sb3 && $(PYTHON) -m venv build/sb3
 	build/sb3/bin/pip install --quiet '.[gym]' stable-baselines3
 	build/sb3/bin/python -m tools.train > $@
-
-$(EVIDENCE)/index.md:
-	$(bin)/python -m tools.evidence $(EVIDENCE)
 
 .PHONY: night-meta-world night-tun night-ros2 night-netem
 night-meta-world: build/meta-world/done

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 import os
 import shutil
 import signal
@@ -11,7 +10,7 @@ import socket
 import time
 import traceback
 import warnings
-from math import isfinite, nan
+from math import nan
 from pathlib import Path
 
 import pytest
@@ -120,11 +119,10 @@ ROUNDING = 1e-9
 
 
 @pytest.fixture
-def figure(request):
+def figure():
     """Check a number: figure("HOLD after", 0.252, "<=", 0.252, "s", count=200).
 
-    `measured` is the worst of `count` cases; None (not measured) fails. If CLOUDRC_EVIDENCE names
-    a folder, the number is also written to `numbers/*.jsonl` in this folder.
+    `measured` is the worst of `count` cases; None (not measured) fails.
     """
 
     def check(
@@ -136,17 +134,9 @@ def figure(request):
         count: int = 1,
     ) -> None:
         value, asked = nan if measured is None else float(measured), float(asked)
-        if evidence := os.environ.get("CLOUDRC_EVIDENCE"):
-            folder = request.config.invocation_params.dir / evidence / "numbers"
-            folder.mkdir(parents=True, exist_ok=True)
-            row = {
-                **{"test": request.node.nodeid, "name": name, "relation": relation, "unit": unit},
-                **{"measured": value if isfinite(value) else None, "asked": asked, "count": count},
-            }
-            with (folder / f"{os.getpid()}.jsonl").open("a", encoding="utf-8") as file:
-                file.write(f"{json.dumps(row)}\n")
         holds = {"<=": value <= asked + ROUNDING, ">=": value >= asked, "==": value == asked}
-        assert holds[relation], f"{name}: {value:g} {unit}, asked {relation} {asked:g} {unit}"
+        said = f"{value:g} {unit}, the worst of {count}, asked {relation} {asked:g} {unit}"
+        assert holds[relation], f"{name}: {said}"
 
     return check
 
