@@ -225,8 +225,7 @@ api: $(VENV)/dev ## list changes of the public Python API since the last release
 bench: $(VENV)/all ## measure the closed loop against raw physics
 	$(bin)/cloudrc bench
 
-# Without a C compiler, the bench ends with 3; make turns every failure into 2.
-bench-link: $(VENV)/all ## compare the relay with its profiles and with a C program; needs cc
+bench-link: $(VENV)/all ## compare the relay with its profiles
 	$(bin)/python -m tools.bench_link $(BENCH_LINK)
 
 # The end-to-end tests draw the dashboards, with the data of their Prometheus.
