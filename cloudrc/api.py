@@ -187,11 +187,12 @@ def _fly_in_cluster(
     experiment: ResolvedExperiment, place: _Place, out: str | Path | None
 ) -> Result:
     from cloudrc.cluster.client import connect
-    from cloudrc.cluster.flight import fly_in_cluster, refuse_flight, refuse_local_files
+    from cloudrc.cluster.flight import check_can_begin, fly_in_cluster
+    from cloudrc.cluster.own_files import check_experiment
 
-    refuse_local_files(experiment)
+    check_experiment(experiment)
     release = connect(place.context, place.namespace, place.release)
-    refuse_flight(release)
+    check_can_begin(release)
     folder = run_folder(experiment, "cluster", None if out is None else Path(out))
     report = fly_in_cluster(experiment, folder, release, place.timeout)
     if out is None:

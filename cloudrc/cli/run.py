@@ -235,11 +235,12 @@ def _local_flight(
 def _cluster_flight(
     experiment: ResolvedExperiment, options: argparse.Namespace, stream: TextIO
 ) -> Flight:
-    from cloudrc.cluster.flight import fly_in_cluster, refuse_flight, refuse_local_files
+    from cloudrc.cluster.flight import check_can_begin, fly_in_cluster
+    from cloudrc.cluster.own_files import check_experiment
 
-    refuse_local_files(experiment)
+    check_experiment(experiment)
     release = release_from_flags(options)
-    refuse_flight(release)
+    check_can_begin(release)
 
     def tell(text: str) -> None:
         print_line(f"  {text}", stream)

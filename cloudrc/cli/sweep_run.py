@@ -22,7 +22,6 @@ from cloudrc.cli.output import (
 from cloudrc.cli.parser import FLIGHTS_MAX
 from cloudrc.cli.progress import Progress, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
-from cloudrc.cluster.pods import refuse_local_files
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import PICTURES, refuse_other_file, write_atomically
 from cloudrc.metrics.verdict import EXIT_CODES
@@ -103,8 +102,10 @@ def _check(options: argparse.Namespace) -> Grid:
     with closing(Progress(f"checks {unchecked.size}")):
         grid = check(unchecked)
     if options.on:
+        from cloudrc.cluster.own_files import check_local_files
+
         for point in grid.points:
-            refuse_local_files(point.model_dump(mode="json"), "or fly without --on")
+            check_local_files(point.model_dump(mode="json"), "or fly without --on")
     warn(*grid.points)
     return grid
 

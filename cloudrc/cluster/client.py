@@ -28,12 +28,10 @@ RETRIES: dict[str, Any] = {
     **{"backoff_factor": 0.5, "respect_retry_after_header": False},
 }
 """How often urllib3 repeats a request: for 31 s while the API server is overloaded, for 7 s after
-a refused connection or a TLS error, and once if the server does not answer. A request to create an
-object is repeated only after a refused connection or a TLS error."""
+a failed connection or a TLS error, and once if the server does not answer. A request to create an
+object is repeated only after a failed connection or a TLS error."""
 BUSY = (429, 500, 502, 503, 504)
 """HTTP status codes after which the same request may succeed later."""
-ADMISSION = ("exceeded quota", " usage per ", "violates PodSecurity")
-"""Words of a refusal that is about the object and not about the user's permission."""
 PROGRAM_LIMIT = 120.0
 """Time limit for one command of kubectl or helm [s], such as the copy of a recording."""
 STOP_LIMIT = 2.0
@@ -42,7 +40,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 _KINDS = {
     **{
         name: ("CoreV1Api", name[:-1])
-        for name in ("pods", "services", "secrets", "events", "namespaces")
+        for name in ("pods", "secrets", "events", "namespaces", "nodes")
     },
     "configmaps": ("CoreV1Api", "config_map"),
     "resourcequotas": ("CoreV1Api", "resource_quota"),
@@ -54,7 +52,7 @@ _KINDS = {
 
 
 class ClusterError(CloudrcError):
-    """Report that the cluster refused a request, or that an object in the cluster failed."""
+    """Report that the cluster has denied a request, or that an object in the cluster failed."""
 
     exit_code = 5
 
@@ -133,7 +131,7 @@ class Release:
             arguments: Arguments of the Kubernetes client, such as `name`.
 
         Raises:
-            ClusterError: If the API server refuses or does not answer.
+            ClusterError: If the API server denies it or does not answer.
         """
         from kubernetes import client
 
@@ -143,7 +141,7 @@ class Release:
         if verb == "list all":
             scope, where = {}, f"in all namespaces{self.of_context}"
             method = f"list_{noun}_for_all_namespaces"
-        elif kind == "namespaces":
+        elif kind in ("namespaces", "nodes"):
             scope, method = {}, method.replace("_namespaced", "")
         call = getattr(getattr(client, name)(self.client), method)
         with explain_errors(f"{verb.partition(' ')[0]} {kind}", where):
@@ -223,9 +221,8 @@ def _refusal(error: Any, doing: str) -> str:
     message = " ".join(str(message).split())
     if error.status == 401 or "system:anonymous" in message:
         return "the API server does not know you; log in to the cluster again"
-    remedy = f"; check your permission: kubectl auth can-i {doing}"
-    by_admission = any(words in message for words in ADMISSION)
-    return message + remedy * (error.status == 403 and not by_admission)
+    is_of_user = " cannot " in message  # not of the object, such as a quota
+    return message + f"; check your permission: kubectl auth can-i {doing}" * is_of_user
 
 
 def _root(error: BaseException) -> str:

@@ -26,7 +26,7 @@ from cloudrc.cluster.client import (
 from cloudrc.cluster.jobs import JobGoneError, delete_job, failure_of, follow, job_key, run_job
 from cloudrc.cluster.missions import release_api, settle_mission
 from cloudrc.cluster.own_files import find_own_files, give_to_release, send_own_files
-from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError, TimedOutError
+from cloudrc.errors import CloudrcError, InterruptedRunError, TimedOutError
 from cloudrc.teleop.client import find_mission
 
 if TYPE_CHECKING:
@@ -110,61 +110,39 @@ def _why_not_ready(release: Release) -> tuple[str, str]:
     """Say why the pods of a release are not ready, and why they will never be; "" if not so."""
     states = {each: _state(release, each) for each in COMPONENTS}
     words = "; ".join(f"{component}: {why}" for component, (why, _) in states.items() if why)
-    return words, _why_never({each: why for each, (why, bad) in states.items() if bad})
-
-
-def _why_never(causes: Mapping[str, str]) -> str:
-    """Say why pods can never run: component -> cause; a cause of both pods is told once."""
-    words = {c: why.replace(f"container '{c}'", "the main container") for c, why in causes.items()}
-    if len(words) > 1 and len(set(words.values())) == 1:
-        return f"the pods of {' and '.join(words)} cannot run: {next(iter(words.values()))}"
-    return "; ".join(f"the {each} pod cannot run: {why}" for each, why in causes.items())
+    never = [f"the {each} pod cannot run: {why}" for each, (why, bad) in states.items() if bad]
+    return words, "; ".join(never)
 
 
 def _state(release: Release, component: str) -> tuple[str, bool]:
     """Return why a component is not ready ("" if ready), and whether it can never be ready."""
     deployment = pods.find_deployment(release, component)
-    spec = deployment.spec.template.spec
     for condition in deployment.status.conditions or []:  # for example Pod Security or a quota
         if condition.type == "ReplicaFailure" and condition.status == "True":
             return str(condition.message), True
     found = pods.list_pods(release, component)
     for pod in found:
         if why := pods.pod_failure(pod):
-            return why + _secret_in(why, spec), True
-    if not (found and _is_current(deployment)):
+            return why, True
+    status = deployment.status
+    is_observed = (status.observed_generation or 0) >= deployment.metadata.generation
+    if not (found and is_observed and status.updated_replicas == status.replicas == 1):
         return "its pod is being created", False
     return _pod_state(release, found[0])
-
-
-def _is_current(deployment: Any) -> bool:
-    """Return whether a Deployment has one pod, of its newest version."""
-    status = deployment.status
-    observed = (status.observed_generation or 0) >= deployment.metadata.generation
-    return bool(observed and status.updated_replicas == status.replicas == 1)
 
 
 def _pod_state(release: Release, pod: Any) -> tuple[str, bool]:
     """Return why a pod is not ready ("" if ready), and whether it can never be ready."""
     if any(each.type == "Ready" and each.status == "True" for each in pod.status.conditions or []):
         return "", False
-    if pod.status.phase == "Pending" and (why := pods.mount_failure(release, pod)):
-        return why, any(words in why for words in MISSING)
+    failed = pods.events_of(release, pod, "FailedMount") if pod.status.phase == "Pending" else []
+    if failed:
+        return failed[-1], any(words in failed[-1] for words in MISSING)
     waiting = [each.name for each in pods.container_statuses(pod) if not each.ready]
     return f"container {' and '.join(waiting)} is not ready yet" if waiting else "it starts", False
 
 
-def _secret_in(why: str, pod: Any) -> str:
-    """Name the Secret whose folder in a pod an error names; "" if it names none."""
-    secrets = {v.name: v.secret.secret_name for v in pod.volumes or [] if v.secret is not None}
-    for container in pod.containers:
-        for mount in container.volume_mounts or []:
-            if mount.name in secrets and f"{mount.mount_path}" in why:
-                return f"; {mount.mount_path} has the content of Secret '{secrets[mount.name]}'"
-    return ""
-
-
-def refuse_second_flight(release: Release) -> None:
+def check_free(release: Release) -> None:
     """Raise a ClusterError if a Job or mission is under way: installing would replace the pods.
 
     If the API does not answer, return: installing may repair the release.
@@ -230,11 +208,11 @@ def cancelling_command(release: Release, job: str) -> str:
     return f"{release.kubectl} delete job {job}"
 
 
-def refuse_flight(release: Release) -> None:
+def check_can_begin(release: Release) -> None:
     """Raise an error if no flight can begin on a release now; nothing is changed yet."""
     for name in ("helm", "kubectl"):
         program(name)
-    refuse_second_flight(release)
+    check_free(release)
 
 
 def fly_in_cluster(
@@ -294,24 +272,6 @@ def chart_values(
     for kind in own:
         del flown["world"][kind]
     return {**before, **files, "link": link, "mission": mission, "experiment": flown}
-
-
-def refuse_local_files(experiment: ResolvedExperiment) -> None:
-    """Raise a BadInputError if an experiment needs files that the cluster cannot get.
-
-    Also raise it if the mission has random steps, because the API accepts only waypoints. Files of
-    the user's metrics are allowed, because this machine evaluates the metrics. The file of the link
-    profile is allowed, because the experiment contains its values.
-    """
-    find_own_files(experiment.world)
-    sent: dict[str, Any] = {"report": True, "link": {"profile"}, "world": {"robot", "scene"}}
-    flown = experiment.model_dump(mode="json", exclude=sent)
-    pods.refuse_local_files(flown, "or fly with --mode local")
-    if experiment.mission.steps is not None:
-        raise BadInputError(
-            "mission.steps: a mission in a cluster has waypoints; fly steps with --mode local "
-            "or --mode virtual"
-        )
 
 
 def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> bool:

@@ -11,7 +11,6 @@ import json
 import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
 from math import ceil
 from typing import Any, NamedTuple
 
@@ -23,11 +22,12 @@ from cloudrc.cluster.pods import (
     UNSCHEDULED,
     container_statuses,
     describe_end,
+    events_of,
     find_deployment,
     pod_failure,
     pod_log,
 )
-from cloudrc.errors import CloudrcError, TimedOutError, to_one_line
+from cloudrc.errors import TimedOutError, to_one_line
 
 COMPONENT = "mission"
 """Label `component` of the Jobs, pods and ConfigMaps of missions, and name of their container."""
@@ -78,10 +78,10 @@ def run_job(
         release: Release that flies the mission.
         mission: Mission in the API's format: name, start, time_limit_s, waypoints.
         name: Name of the Job; default: an unused name.
-        queue: Whether to wait while another mission flies; if False, the API refuses the mission.
+        queue: Whether to wait while another mission flies; else the API takes no second one.
 
     Raises:
-        ClusterError: If the cluster refuses the Job, or if the release does not exist.
+        ClusterError: If the cluster denies the Job, or if the release does not exist.
     """
     # A Job's pod has a longer name than the Job; the limit is 63 characters.
     name = name or f"{release.name[:40].rstrip('-.')}-mission-{secrets.token_hex(3)}"
@@ -91,7 +91,7 @@ def run_job(
     owner = owner_of("apps/v1", "Deployment", deployment)
     job["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
     given = mission.get("time_limit_s")
-    # The API refuses a mission with any other limit.
+    # The API takes a mission with such a limit only.
     limit = ceil(given) if isinstance(given, int | float) and 0 < given <= 1e6 else LIMIT_MAX
     deadline = limit + START_ALLOWANCE + queue * QUEUE_ALLOWANCE
     job["spec"] |= {"activeDeadlineSeconds": deadline, "ttlSecondsAfterFinished": KEEP_FINISHED}
@@ -145,9 +145,8 @@ def create_job(release: Release, job: Any, files: Any) -> None:
     files["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
     try:
         release.request("create", "configmaps", body=files)
-    except BaseException:  # Ctrl-C too: without its files the Job would wait forever
-        with suppress(CloudrcError):
-            delete_job(release, name)
+    except ClusterError:  # without its files the Job would wait
+        delete_job(release, name)
         raise
 
 
@@ -274,7 +273,7 @@ class JobReader:
             selector = f"{UID_LABEL}={self.key}"
             pods = self._release.request("list", "pods", label_selector=selector)
             pods.sort(key=lambda pod: str(pod.metadata.creation_timestamp))
-            self._refuse_suspended(pods)
+            self._check_suspended(pods)
             self._tell_once("" if has_ended else _why_waiting(self._release, self.job, pods))
             for pod in pods:
                 yield from self._read_pod(pod)
@@ -295,7 +294,7 @@ class JobReader:
         if self.job.metadata.deletion_timestamp is not None:
             raise JobGoneError("its Job was deleted", self.key)
 
-    def _refuse_suspended(self, pods: list[Any]) -> None:
+    def _check_suspended(self, pods: list[Any]) -> None:
         """Raise a JobGoneError if a mission's Job is suspended in flight.
 
         A queue, such as Kueue, may suspend a new Job, and the Job of a sweep at any time.
@@ -345,11 +344,11 @@ class JobReader:
 def _why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
     """Return a sentence on why pods of a Job wait; "" if none waits.
 
-    Raise a ClusterError if a pod will never run, or if the cluster refuses to make the pods.
+    Raise a ClusterError if a pod will never run, or if the cluster denies the pods.
     """
     found = [pod_failure(pod) for pod in pods if pod.status.phase == "Pending"]
-    if not pods:  # the cluster may refuse them, for example for a quota
-        found = _refusals(release, job)
+    if not pods:  # the cluster may deny them, for example for a quota
+        found = events_of(release, job, "FailedCreate")
     name = job.metadata.name
     for why in found:
         if why and not why.startswith(UNSCHEDULED):
@@ -358,10 +357,3 @@ def _why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
                 f"{release.kubectl} delete job {name}"
             )
     return next((f"waiting: {why}" for why in found if why), "")
-
-
-def _refusals(release: Release, job: Any) -> list[str]:
-    """Return why the cluster has refused to make pods of a Job."""
-    selector = f"involvedObject.uid={job.metadata.uid}"
-    events = release.request("list", "events", field_selector=selector)
-    return [event.message for event in events if event.reason == "FailedCreate"]

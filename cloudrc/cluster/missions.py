@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from cloudrc.cluster.client import Release
-from cloudrc.cluster.pods import api_url, operator_token
+from cloudrc.cluster.pods import API_PORT, find_pod, forwarded, operator_token
 from cloudrc.errors import CloudrcError, InterruptedRunError
 from cloudrc.teleop.client import Api, describe_mission, find_mission, mission_path
 
@@ -19,8 +19,9 @@ def release_api(release: Release, token: Callable[[], str] | None = None) -> Ite
     """
     known = operator_token(release) if token is None else ""
     place = f"release '{release.name}' {release.where}"
-    with api_url(release) as url:
-        yield Api(url, token or (lambda: known), place)
+    pod = find_pod(release, "cloud").metadata.name
+    with forwarded(release, pod, [API_PORT]) as ports:
+        yield Api(f"http://127.0.0.1:{ports[API_PORT]}", token or (lambda: known), place)
 
 
 def settle_mission(release: Release, key: str, why: str) -> tuple[str, int]:

@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import base64
 import json
-import re
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from cloudrc.cluster.client import NotFoundError, Release, run
 from cloudrc.cluster.jobs import owner_of
 from cloudrc.cluster.pods import find_deployment
 from cloudrc.config.hull import hull_of
+from cloudrc.config.load import ResolvedExperiment, local_files
 from cloudrc.config.robot import files_of, find_robot
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import ROBOT_FILE, is_path
@@ -28,7 +29,6 @@ SIZE_MAX = 1 << 20
 """Largest total size of the files in a ConfigMap [bytes]; a limit of Kubernetes."""
 REMEDY = "or build an image with it: charts/cloudrc/README.md, 'A robot or a scene of your own'"
 """End of the messages about files that a ConfigMap cannot hold."""
-_KEY = re.compile(r"[-._a-zA-Z0-9]{1,253}")
 
 
 def find_own_files(world: World) -> dict[str, dict[str, Path]]:
@@ -65,14 +65,9 @@ def _check(key: str, folder: Path, needed: set[Path], files: Mapping[str, Path])
     if elsewhere := sorted({path.resolve() for path in needed} - here):
         text = f"needs {elsewhere[0]}, but a ConfigMap has no folders"
         raise BadInputError(f"{key}: {text}; put the file into {folder}, {REMEDY}")
-    if names := [name for name in files if not _KEY.fullmatch(name)]:
-        text = f"a ConfigMap takes no file named '{names[0]}', only letters, digits and -._"
-        raise BadInputError(f"{key}: {folder}: {text}; rename or move it")
-    sizes = {path.stat().st_size: name for name, path in files.items()}
     if (total := sum(path.stat().st_size for path in files.values())) > SIZE_MAX:
         text = f"has {total} bytes, but a ConfigMap takes {SIZE_MAX} (1 MiB)"
-        largest = f"the largest is {sizes[max(sizes)]} with {max(sizes)}; move what is not needed"
-        raise BadInputError(f"{key}: {folder}: {text}; {largest}, {REMEDY}")
+        raise BadInputError(f"{key}: {folder}: {text}; move what is not needed, {REMEDY}")
 
 
 def _check_size(name: str) -> None:
@@ -82,6 +77,30 @@ def _check_size(name: str) -> None:
         radius = float(hull_of(name).few.radii[0])
         text = f"in a cluster a robot needs its size; add the line hull_m: {radius + 0.0005:.3f}"
         raise BadInputError(f"world.robot: {Path(name) / ROBOT_FILE}: {text}")
+
+
+def check_local_files(values: Mapping[str, Any], remedy: str) -> None:
+    """Refuse the path of a local file in `values`; `remedy` is the end of the error's text."""
+    for key, path in local_files(values).items():
+        text = f"the pods do not have this file; build it into an image, {remedy}"
+        raise BadInputError(f"{key}: {path}: {text}")
+
+
+def check_experiment(experiment: ResolvedExperiment) -> None:
+    """Refuse an experiment that needs files that the cluster cannot get, or that has random steps.
+
+    Files of the user's metrics are allowed, because this machine evaluates the metrics. The file of
+    the link profile is allowed, because the experiment contains its values.
+    """
+    find_own_files(experiment.world)
+    sent: dict[str, Any] = {"report": True, "link": {"profile"}, "world": {"robot", "scene"}}
+    flown = experiment.model_dump(mode="json", exclude=sent)
+    check_local_files(flown, "or fly with --mode local")
+    if experiment.mission.steps is not None:  # the API takes waypoints alone
+        raise BadInputError(
+            "mission.steps: a mission in a cluster has waypoints; fly steps with --mode local "
+            "or --mode virtual"
+        )
 
 
 def send_own_files(release: Release, found: Mapping[str, Mapping[str, Path]]) -> dict[str, str]:

@@ -14,14 +14,14 @@ import subprocess
 import tempfile
 import time
 import urllib.request
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 from cloudrc.cluster.client import ClusterError, Release, end_process, last_words, program, run
 from cloudrc.cluster.releases import no_release
-from cloudrc.errors import BadInputError, TimedOutError, to_one_line
+from cloudrc.errors import TimedOutError, to_one_line
 
 FATAL = {
     **dict.fromkeys(
@@ -136,7 +136,7 @@ def _container_failure(status: Any) -> str:
 def describe_end(container: str, ended: Any) -> str:
     """Describe the end of a container; `ended` is its state `terminated`."""
     if ended.reason == "OOMKilled":
-        key = f"{value_key(container)}.limits.memory"
+        key = f"{VALUES.get(container, container)}.resources.limits.memory"
         return f"was killed, because it used more memory than its limit: raise {key}"
     code = ended.exit_code
     try:
@@ -148,29 +148,11 @@ def describe_end(container: str, ended: Any) -> str:
     return f"was ended by {name} (exit code {code})"
 
 
-def value_key(container: str) -> str:
-    """Return the chart's value with the resources of a container."""
-    return f"{VALUES.get(container, container)}.resources"
-
-
-def mount_failure(release: Release, pod: Any) -> str:
-    """Return why a volume of a pod, such as a Secret, cannot be mounted; "" if none has failed."""
-    selector = f"involvedObject.uid={pod.metadata.uid}"
-    events = release.request("list", "events", field_selector=selector)
-    failed = [to_one_line(event.message) for event in events if event.reason == "FailedMount"]
-    return failed[-1] if failed else ""
-
-
-def refuse_local_files(values: Mapping[str, Any], remedy: str) -> None:
-    """Raise a BadInputError if one of `values` is the path of a local file, which the pods lack.
-
-    `remedy` is the end of the error's text.
-    """
-    from cloudrc.config.load import local_files
-
-    for key, path in local_files(values).items():
-        text = f"the pods do not have this file; build it into an image, {remedy}"
-        raise BadInputError(f"{key}: {path}: {text}")
+def events_of(release: Release, thing: Any, reason: str) -> list[str]:
+    """Return what Kubernetes said about an object with this reason, such as FailedMount."""
+    selector = f"involvedObject.uid={thing.metadata.uid},reason={reason}"
+    found = release.request("list", "events", field_selector=selector)
+    return [to_one_line(event.message) for event in found]
 
 
 def container_statuses(pod: Any) -> list[Any]:
@@ -178,23 +160,13 @@ def container_statuses(pod: Any) -> list[Any]:
     return [*(pod.status.init_container_statuses or []), *(pod.status.container_statuses or [])]
 
 
-def tokens_secret(release: Release) -> str:
-    """Return the name of the Secret with the API's tokens."""
-    for volume in find_deployment(release, "cloud").spec.template.spec.volumes or []:
-        if volume.name == TOKENS and volume.secret is not None:
-            return str(volume.secret.secret_name)
-    raise ClusterError(
-        f"release '{release.name}' {release.where} mounts no tokens: it has another version of "
-        "the chart; upgrade it: helm upgrade"
-    )
-
-
 def operator_token(release: Release) -> str:
     """Read the operator's token; the user needs the permission to get Secrets.
 
     No error message contains the token.
     """
-    name = tokens_secret(release)
+    volumes = find_deployment(release, "cloud").spec.template.spec.volumes
+    name = next(volume.secret.secret_name for volume in volumes if volume.name == TOKENS)
     secret = release.request("get", "secrets", name=name)
     try:
         token = base64.b64decode((secret.data or {})[OPERATOR], validate=True)
@@ -204,13 +176,6 @@ def operator_token(release: Release) -> str:
             f"Secret '{name}' {release.where} has no token under '{OPERATOR}'; "
             "give a file with it: --token-file"
         ) from None
-
-
-@contextmanager
-def api_url(release: Release) -> Iterator[str]:
-    """Forward a port of this machine to a release's API during the `with` block; yield the URL."""
-    with forwarded(release, find_pod(release, "cloud").metadata.name, [API_PORT]) as ports:
-        yield f"http://127.0.0.1:{ports[API_PORT]}"
 
 
 @contextmanager

@@ -175,29 +175,18 @@ def no_release(release: Release, what: str = "") -> ClusterError:
     `what` is the beginning of its text, by default "no release 'NAME' in namespace ...".
     """
     what = what or f"no release '{release.name}' {release.where}"
-    if not namespace_exists(release):
-        what = f"no namespace '{release.namespace}'{release.of_context}"
-    known = _known(release)
-    if known:
+    try:
+        places = find_releases(release, everywhere=True)
+    except ClusterError:  # no right to list all namespaces
+        places = []
+    if places:
+        known = ", ".join(f"'{place.name}' in namespace '{place.namespace}'" for place in places)
         return ClusterError(f"{what}; there are: {known}; name one: --release NAME -n NAMESPACE")
     flags = " ".join(release.helm_flags)
     return ClusterError(
         f"{what}; install it: helm install {release.name} charts/cloudrc {flags}, "
         "or name another: --release NAME -n NAMESPACE"
     )
-
-
-def _known(release: Release) -> str:
-    """Name the releases that the user may see, at most ten; "" if there is none."""
-    places: list[Any] = []
-    for everywhere in (True, False):
-        try:
-            places = find_releases(release, everywhere=everywhere)
-            break
-        except ClusterError:  # no right to list all namespaces
-            continue
-    shown = [f"'{place.name}' in namespace '{place.namespace}'" for place in places]
-    return ", ".join([*shown[:10], *(["..."] if len(shown) > 10 else [])])
 
 
 def namespace_exists(release: Release) -> bool:

@@ -106,7 +106,7 @@ def permissions(release: Release) -> Finding:
     wanted = list(ALSO)
     for group, kinds in NEEDED.items():
         wanted += [(group, verb, kind) for kind in kinds.split() for verb in VERBS]
-    refused = []
+    denied = []
     for group, verb, kind in wanted:
         resource, _, subresource = kind.partition("/")
         asked = {
@@ -121,10 +121,10 @@ def permissions(release: Release) -> Finding:
                 {"spec": {"resourceAttributes": asked}}, _request_timeout=REQUEST_TIMEOUT
             )
         if not answer.status.allowed:
-            refused.append(f"{verb} {kind}")
-    if refused:
+            denied.append(f"{verb} {kind}")
+    if denied:
         fix = "ask the administrator for the ClusterRole 'edit' in this namespace"
-        return Finding("permissions", "missing", f"you may not {', '.join(refused)}", fix)
+        return Finding("permissions", "missing", f"you may not {', '.join(denied)}", fix)
     return Finding("permissions", "ok", f"enough {release.where}")
 
 
@@ -264,12 +264,8 @@ def nodes(release: Release, pods: dict[str, dict[str, Any]]) -> Iterator[Finding
 
 def schedulable_nodes(release: Release) -> list[str] | None:
     """List the nodes that take pods without a toleration; None if the user may not list nodes."""
-    from kubernetes import client
-
-    api: Any = client.CoreV1Api(release.client)
     try:
-        with explain_errors("list nodes", release.where):
-            found = api.list_node(_request_timeout=REQUEST_TIMEOUT).items
+        found = release.request("list", "nodes")
     except ClusterError:
         return None
     return [

@@ -17,7 +17,6 @@ import numpy as np
 
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
-from cloudrc.errors import BadInputError
 from cloudrc.faults.schedule import DURATION, PAPER, Schedule, compose, generator
 from cloudrc.geometry.fence import Fence
 from cloudrc.messages import (
@@ -165,16 +164,16 @@ def dishonesty(schedule: Schedule, fence: Fence) -> tuple[list[Lie], Words | Non
 
     The functions in the list change commands. The function after the list forges operator requests;
     it is None if the policy forges no requests. `fence` is that of the scene. Most clouds send no
-    vertical velocity to a robot that stays on the ground, because it refuses such commands.
+    vertical velocity to a robot that stays on the ground, because its guard drops such commands.
 
     Raises:
-        BadInputError: If the policy does not exist; the message lists all policies.
+        ValueError: If the policy does not exist; the message lists all policies.
     """
     if not schedule.policy:
         return [], None
     if schedule.policy not in POLICIES:
         names = ", ".join(POLICIES)
-        raise BadInputError(f"no policy '{schedule.policy}' of a cloud; there are: {names}")
+        raise ValueError(f"no policy '{schedule.policy}' of a cloud; there are: {names}")
     lies = [POLICIES[schedule.policy](generator(schedule.seed, 666), fence)]
     if fence.ground is not None and generator(schedule.seed, 668).random() < FLAT_SHARE:
         lies.append(_flat)
@@ -370,7 +369,7 @@ def _operators_voice(rng: Generator, fence: Fence) -> Lie:
     return FASTEST[int(rng.integers(len(FASTEST)))](rng, fence)
 
 
-def _refused_and_released(rng: Generator, fence: Fence) -> Lie:
+def _rejected_and_released(rng: Generator, fence: Fence) -> Lie:
     """Fly fast, and from time to time send NaN, so that the guard lands the robot.
 
     Cloud also forges requests of the operator (`at_bad_moments`), which acknowledge the landings.
@@ -385,12 +384,12 @@ def _refused_and_released(rng: Generator, fence: Fence) -> Lie:
 
 
 FASTEST: tuple[Policy, ...] = (_towards_a_face, _face_after_face, _greedy, _on_the_limit, _random)
-SPEAKING = ("operators-voice", "plans-and-requests", "refused-and-released")
+SPEAKING = ("operators-voice", "plans-and-requests", "rejected-and-released")
 POLICIES: dict[str, Policy] = {
     policy.__name__[1:].replace("_", "-"): policy
     for policy in (
         *(*FASTEST, _false_basis, _hostile_plans, _operators_voice),
-        *(_refused_and_released, _shaking, _stop_and_go, _strange_numbers),
+        *(_rejected_and_released, _shaking, _stop_and_go, _strange_numbers),
     )
 } | {"plans-and-requests": _hostile_plans}
 """Name, such as towards-a-face -> policy."""

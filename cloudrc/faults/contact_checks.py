@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from cloudrc.faults.facts import ESTOP, FLOWN, HOLD, LAND, REELS_NS, Facts, Note
+from typing import TYPE_CHECKING
+
+from cloudrc.faults.facts import ESTOP, FLOWN, HOLD, LAND, REELS_NS
 from cloudrc.messages import GuardState, Vector
 from cloudrc.records import Contact
 from cloudrc.world.simulator import Simulator
+
+if TYPE_CHECKING:
+    from cloudrc.faults.invariants import Watch
 
 STANDS = 0.2  # speed per axis up to which a robot stands when it is switched off [m/s]
 FALL = 1.0
@@ -22,8 +27,8 @@ class ContactChecks:
         is_asked: Whether the operator has just asked to stop or to reset the robot.
     """
 
-    def __init__(self, facts: Facts, note: Note, simulator: Simulator, *, honest: bool) -> None:
-        self._facts, self._note = facts, note
+    def __init__(self, watch: Watch, simulator: Simulator, *, honest: bool) -> None:
+        self._facts, self._note = watch.facts, watch.note
         self._simulator, self._honest = simulator, honest
         self._touches, self._seen = simulator.touches, 0
         self._landed_ns = -2 * BRAKE_NS

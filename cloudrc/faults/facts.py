@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import inf
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from cloudrc.config.load import ResolvedExperiment, ResolvedGuard
 from cloudrc.config.robot import find_robot
@@ -15,8 +14,6 @@ GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 FLOWN, LATCHED = (TRACK, HOLD, LAND), (LAND, ESTOP)
 """States in which the actuators are on; states that the operator's acknowledgement ends."""
 REELS_NS = 1_000_000_000  # time after a collision in which it explains the robot's motion [ns]
-Note: TypeAlias = Callable[[int, str, str], None]
-"""Function that records a breach: time on world's clock [ns], name of the invariant, text."""
 
 
 class Facts(NamedTuple):
@@ -31,7 +28,7 @@ class Facts(NamedTuple):
 
     @classmethod
     def of(cls, experiment: ResolvedExperiment) -> Facts:
-        """Read the facts of an experiment; raise a BadInputError as `fence_in` and `find_robot`."""
+        """Read the facts of an experiment."""
         world = experiment.world
         robot, fence = find_robot(world.robot), fence_in(world)
         low, high = fence.low, fence.high

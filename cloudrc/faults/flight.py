@@ -63,8 +63,8 @@ class FaultRun:
         """Prepare a flight; comments in the signature describe the arguments.
 
         Raises:
-            BadInputError: If the schedule names an unknown link profile or an unknown policy of a
-                dishonest cloud, if its faults do not fit the profile, or if a setting is wrong.
+            ValueError: If the schedule names an unknown policy of a dishonest cloud, or if its
+                faults do not fit the link's profile.
         """
         self.schedule = schedule
         plans = ["guard.plan_max_s=0.8"] if "plans" in schedule.policy else []
@@ -121,7 +121,7 @@ class FaultRun:
         return Order(plan, touch=self.experiment.mission.touch)
 
     def order_if_possible(self, now_ns: int) -> None:
-        """Order the experiment's mission; teleop may refuse the order. `now_ns` is not used."""
+        """Order the experiment's mission; teleop may not take the order. `now_ns` is not used."""
         order = self.make_order()
         self.teleop.ask(lambda service, now_ns: service.create(order, now_ns))
 

@@ -7,20 +7,22 @@ from dataclasses import replace
 from functools import partial
 from itertools import islice
 from math import inf, nan
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cloudrc.drivers.virtual import Clock
-from cloudrc.errors import BadInputError
 from cloudrc.faults.adversary import Lie
-from cloudrc.faults.models import Action, Call, RestartableEndpoint, Tamper, TeleopModel
+from cloudrc.faults.models import Action, Call, RestartableEndpoint, Tamper
 from cloudrc.faults.schedule import FaultEvent, Schedule, generator
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
 from cloudrc.messages import Command
 from cloudrc.records import Control
 from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.keys import Key, KeySet
+
+if TYPE_CHECKING:
+    from cloudrc.faults.flight import FaultRun
 
 SECRET = KeySet(Key(b"a key of the fault suite, 32 b.."))
 CAPTURED = 2_000  # number of datagrams that an intruder keeps
@@ -30,40 +32,18 @@ BUGS = ("values_invalid", "values_huge")  # faults of an honest cloud whose cont
 IMPOSSIBLE = (nan, inf, -inf)
 
 
-class Target(Protocol):
-    """What faults act on: the processes and keys of a flight."""
-
-    schedule: Schedule
-    world: RestartableEndpoint
-    cloud: RestartableEndpoint
-    teleop: TeleopModel
-    secrets: dict[str, KeySet]  # "world" and "cloud" -> the keys in their key files
-
-    def restart_pod(self, now_ns: int, down: float) -> None:
-        """Kill cloud and teleop at `now_ns` [ns]; start new processes after `down` [s]."""
-
-    def replace_key(self, end: str, keys: KeySet) -> None:
-        """Replace the keys of `end`, "world" or "cloud"."""
-
-    def end_rival(self) -> None:
-        """Stop the second cloud."""
-
-    def order_if_possible(self, now_ns: int) -> None:
-        """Order a further mission at `now_ns` [ns]; teleop may refuse the order."""
-
-
 def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> DirectionProfile:
     """Return the profile of one direction ("up" or "down") with the link faults of a schedule.
 
     Raises:
-        BadInputError: If both the profile and a fault change the conditions over time.
+        ValueError: If both the profile and a fault change the conditions over time.
     """
     mine = [event for event in schedule.events if event.way in ("both", way)]
     lasting = [event for event in mine if event.kind == "blackout" and event.duration > 0.0]
     blackouts = [Blackout(start_s=one.at, duration_s=one.duration) for one in lasting]
     waves = [e for e in mine if e.kind in ("delay", "jitter", "loss", "bursts")]
     if waves and (profile.changes or profile.rows is not None):
-        raise BadInputError(
+        raise ValueError(
             f"the link's profile {schedule.profile} changes over time, so that the fault "
             f"{waves[0].kind} cannot be added; choose a profile without changes"
         )
@@ -98,7 +78,7 @@ def _change(profile: DirectionProfile, active: list[FaultEvent], at: float) -> C
     return Change(at_s=at, delay_ms=delay_ms, jitter_ms=jitter_ms, loss=loss)
 
 
-def inject(flight: Target) -> None:
+def inject(flight: FaultRun) -> None:
     """Schedule the faults of processes, keys, datagrams, teleop and the operator in a flight."""
     schedule = flight.schedule
     for event in schedule.events:
@@ -114,7 +94,7 @@ def inject(flight: Target) -> None:
 
 
 def _actions(
-    flight: Target, process: RestartableEndpoint, event: FaultEvent
+    flight: FaultRun, process: RestartableEndpoint, event: FaultEvent
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
     """Return how to inject `event`: kind of fault -> pairs of time [s] and action.
 

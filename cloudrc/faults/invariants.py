@@ -103,9 +103,8 @@ class RobotInvariants:
         self._stopped = robot.onboard.stopped
         self._was = self._state = robot.guard.state  # after the last step; after the last event
         self._next_ns, self._steps = start_ns, 0
-        self._orders = OrderChecks(watch.facts, watch.note)
-        self._motion = MotionChecks(watch.facts, watch)
-        self._contacts = ContactChecks(watch.facts, watch.note, robot.simulator, honest=honest)
+        self._orders, self._motion = OrderChecks(watch), MotionChecks(watch)
+        self._contacts = ContactChecks(watch, robot.simulator, honest=honest)
 
     def see_step(self, now_ns: int, readings: Readings, commands: Commands) -> None:
         """Implement `Observer.see_step`: check all invariants."""

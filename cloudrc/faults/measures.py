@@ -165,7 +165,7 @@ def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
     return float(generator(seed, 77).uniform(first, last))
 
 
-def refused(outcome: Outcome, flight: FaultRun, *reasons: str) -> None:
+def rejected(outcome: Outcome, flight: FaultRun, *reasons: str) -> None:
     """Check that world has refused at least one datagram or command for each reason."""
     for reason in reasons:
         outcome.least(f"refused as {reason}", flight.count(reason), 1)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import insort
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from heapq import heappop, heappush
 from typing import TypeAlias, TypeVar
 
 from cloudrc.drivers.teleop import PERIOD_NS, RemoteTeleop, TeleopLoop, UnixPeer
@@ -70,7 +70,7 @@ class RestartableEndpoint:
     def at(self, seconds: float, action: Action) -> None:
         """Schedule an action at the virtual time `seconds` [s]."""
         self._scheduled += 1
-        heappush(self._actions, (round(seconds * 1e9), self._scheduled, action))
+        insort(self._actions, (round(seconds * 1e9), self._scheduled, action))
         self._set_deadline()
 
     def kill(self, now_ns: int) -> None:
@@ -124,7 +124,7 @@ class RestartableEndpoint:
     def handle_deadline(self, now_ns: int) -> None:
         """Implement `Endpoint.handle_deadline`: inject due faults, then run the process."""
         while self._actions and self._actions[0][0] <= now_ns:
-            heappop(self._actions)[2](now_ns)
+            self._actions.pop(0)[2](now_ns)
         if 0 <= self._frozen_until_ns <= now_ns:
             self._frozen_until_ns = -1
             waiting, self._waiting = self._waiting, []

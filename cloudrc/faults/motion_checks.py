@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from math import hypot, inf, sqrt
-from typing import Protocol
+from typing import TYPE_CHECKING
 
-from cloudrc.faults.facts import ESTOP, FLOWN, LAND, REELS_NS, TRACK, Facts
+from cloudrc.faults.facts import ESTOP, FLOWN, LAND, REELS_NS, TRACK
 from cloudrc.messages import ZERO, GuardState, Vector
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.readings import Readings
 from cloudrc.world.robot import STEP
+
+if TYPE_CHECKING:
+    from cloudrc.faults.invariants import Watch
 
 SLACK = 1e-9  # tolerance for rounding [m/s]
 STILL = 0.12
@@ -22,16 +25,6 @@ FALL_MAX = 1.5  # largest distance that a falling robot may leave the fence [m]
 THROWN_NS = 3_000_000_000  # time after a collision in which the robot may leave the fence [ns]
 
 
-class Extremes(Protocol):
-    """Takes breaches, and has the extreme values of a flight."""
-
-    margin: float  # smallest distance of the base to the fence, without the floor [m]
-    speed: float  # largest reference [m/s]
-
-    def note(self, now_ns: int, kind: str, text: str) -> None:
-        """Record a breach of the invariant `kind` at `now_ns` [ns]; `text` describes it."""
-
-
 class MotionChecks:
     """Checks a robot's position and velocity reference in every step.
 
@@ -40,9 +33,9 @@ class MotionChecks:
         before: The last reference [m/s].
     """
 
-    def __init__(self, facts: Facts, watch: Extremes) -> None:
-        self._facts, self._watch, self._note = facts, watch, watch.note
-        self._stop_coefficient = 1.0 / (2.0 * facts.braking)
+    def __init__(self, watch: Watch) -> None:
+        self._facts, self._watch, self._note = watch.facts, watch, watch.note
+        self._stop_coefficient = 1.0 / (2.0 * watch.facts.braking)
         self.before = ZERO
         self._left, self._way = ZERO, inf  # where TRACK ended, and how far the robot may go
         self.falls = False

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections import deque
 from math import inf
+from typing import TYPE_CHECKING
 
-from cloudrc.faults.facts import ESTOP, GROUND, HOLD, LAND, LATCHED, TRACK, Facts, Note
+from cloudrc.faults.facts import ESTOP, GROUND, HOLD, LAND, LATCHED, TRACK
 from cloudrc.messages import PLAN_STEP_NS, Command, GuardState, OperatorRequest, Request, Start
 from cloudrc.world.robot import STEP_NS
+
+if TYPE_CHECKING:
+    from cloudrc.faults.invariants import Watch
 
 RESUME_COMMANDS, RESUME_NS = 10, 500_000_000
 """Number of fresh commands that end a HOLD, and the time within which they must arrive [ns]."""
@@ -24,12 +28,12 @@ RAMP_MIN = 1.0
 class OrderChecks:
     """Checks each change of the guard's state, from the commands and requests that came before."""
 
-    def __init__(self, facts: Facts, note: Note) -> None:
-        self._note, limits = note, facts.limits
+    def __init__(self, watch: Watch) -> None:
+        self._note, limits = watch.note, watch.facts.limits
         self._age_ns = round(limits.command_age_max_ms * 1e6)
         self._plan_ns = round(limits.plan_max_s * 1e9)
         self._hold_ns = round(limits.hold_max_s * 1e9)
-        self._ramp_ns = round(max(RAMP_MIN, limits.speed_max_mps / facts.braking) * 1e9)
+        self._ramp_ns = round(max(RAMP_MIN, limits.speed_max_mps / watch.facts.braking) * 1e9)
         self._fresh_until_ns = -1  # when the last accepted command gets too old [ns]
         self._ramp_until_ns, self._alone_ns = -1, 0
         self._tracked_ns = -SETTLE_NS

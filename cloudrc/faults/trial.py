@@ -74,7 +74,7 @@ def fly_file(path: Path) -> TrialResult:
     schedule = load(path)
     try:
         return fly(schedule, keep=True)
-    except BadInputError as error:  # an unknown profile or policy
+    except (BadInputError, ValueError) as error:  # an unknown profile or policy
         raise BadInputError(f"{path}: {error}") from error
 
 
@@ -84,8 +84,9 @@ def fly(schedule: Schedule, *, keep: bool = False) -> TrialResult:
     With `keep` the records are kept and hashed, which doubles the time.
 
     Raises:
-        BadInputError: If the schedule names an unknown link profile or an unknown policy of a
-            dishonest cloud, or if its faults do not fit the profile.
+        BadInputError: If the schedule names an unknown link profile.
+        ValueError: If it names an unknown policy of a dishonest cloud, or if its faults do not fit
+            the profile.
     """
     flight = FaultRun(schedule, keep=keep)
     watch, operator = flight.watch, TrialOperator(flight)

@@ -165,9 +165,3 @@ def pod_specs(objects):
 def containers(spec):
     found = (*spec.get("initContainers", ()), *spec["containers"])
     return {container["name"]: container for container in found}
-
-
-def metrics_ports(spec):
-    """Return the names and numbers of the ports at which a pod's containers serve metrics."""
-    ports = (port for container in containers(spec).values() for port in container["ports"])
-    return {p["name"]: p["containerPort"] for p in ports if p["name"].endswith("metrics")}

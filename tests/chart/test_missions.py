@@ -12,7 +12,7 @@ import cloudrc
 from cloudrc.cli.mission import TERMINATED
 from cloudrc.cli.parser import build_parser
 from cloudrc.config.load import load_experiment
-from tests.chart.conftest import CHART, of_kind, pod_specs, render
+from tests.chart.conftest import CHART, of_kind, render
 
 EXAMPLES = {
     name: list(yaml.safe_load_all((CHART / "examples" / f"{name}.yaml").read_text()))
@@ -29,26 +29,6 @@ def jobs(values=None, **where):
     return list(of_kind(render(values, **where), "Job").values())
 
 
-@pytest.mark.parametrize(
-    "job", [*jobs(ENABLED), EXAMPLES["mission-paper"][1]], ids=["chart", "mission-paper"]
-)
-def test_a_job_flies_once_and_has_time_limits(job):
-    spec = job["spec"]
-    assert spec["backoffLimit"] == 0
-    assert spec["activeDeadlineSeconds"] > 60
-    assert spec["ttlSecondsAfterFinished"] >= 3600
-    pod = spec["template"]["spec"]
-    assert pod["restartPolicy"] == "Never"
-    (container,) = pod["containers"]
-    assert container["terminationMessagePolicy"] == "FallbackToLogsOnError"
-    assert container["args"][:2] == ["mission", "fly"]
-    (variable,) = container["env"]
-    field = variable["valueFrom"]["fieldRef"]["fieldPath"]
-    assert field == "metadata.labels['batch.kubernetes.io/controller-uid']"
-    assert f"--key=$({variable['name']})" in container["args"]
-    assert "--lease=60" in container["args"]
-
-
 @pytest.mark.parametrize("job", [*jobs(ENABLED), *(job for _, job in EXAMPLES.values())])
 def test_a_stopped_watcher_does_not_fail_its_job(job):
     rules = job["spec"]["podFailurePolicy"]["rules"]
@@ -59,17 +39,6 @@ def test_a_stopped_watcher_does_not_fail_its_job(job):
     (container,) = job["spec"]["template"]["spec"]["containers"]
     assert codes["containerName"] == container["name"]
     assert set(codes["values"]) == {128 + signal.SIGKILL, TERMINATED}
-
-
-def test_a_job_calls_the_releases_api():
-    assert jobs() == [], "no mission flies by default"
-    values = {"mission": {"enabled": True, "queue": True}, "teleop": {"service": {"port": 80}}}
-    objects = render(values)
-    (container,) = pod_specs(objects)["mission"]["containers"]
-    service = of_kind(objects, "Service")["api"]
-    assert service["spec"]["publishNotReadyAddresses"] is True
-    assert f"--api=http://{service['metadata']['name']}:80" in container["args"]
-    assert "--queue" in container["args"]
 
 
 POINT = {"position_m": [0.0, 0.0, 1.0], "dwell_s": 2.0}

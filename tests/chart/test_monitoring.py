@@ -11,7 +11,7 @@ import yaml
 
 from cloudrc.exposition import table
 from cloudrc.exposition.table import METRICS, MetricKind
-from tests.chart.conftest import CHART, OPERATOR, metrics_ports, of_kind, pod_specs, render
+from tests.chart.conftest import CHART, OPERATOR, of_kind, render
 from tools.dashboards import draw, expressions, fetch
 
 KINDS = {"PodMonitor", "PrometheusRule"}
@@ -32,22 +32,6 @@ def test_monitors_need_the_value_and_the_kind_or_force():
     assert monitors({"enabled": False}, apis=[OPERATOR]) == set()
     assert monitors({}) == set()
     assert monitors({}, apis=[OPERATOR]) == monitors({"force": True}) == KINDS
-    objects = render({"metrics": {"podMonitor": {"enabled": True}}}, apis=[OPERATOR])
-    (monitor,) = of_kind(objects, "PodMonitor").values()
-    asked = {endpoint["port"] for endpoint in monitor["spec"]["podMetricsEndpoints"]}
-    pods = pod_specs(objects)
-    assert asked == {name for end in ("world", "cloud") for name in metrics_ports(pods[end])}
-
-
-@pytest.mark.parametrize("wanted", [True, False])
-def test_scrape_annotations_are_optional(wanted):
-    for thing in of_kind(render({"metrics": {"annotations": wanted}}), "Deployment").values():
-        template = thing["spec"]["template"]
-        found = {k: v for k, v in template["metadata"]["annotations"].items() if "prometheus" in k}
-        assert bool(found) is wanted
-        if wanted:
-            assert found["prometheus.io/scrape"] == "true"
-            assert int(found["prometheus.io/port"]) in metrics_ports(template["spec"]).values()
 
 
 def series():
@@ -185,19 +169,6 @@ def queries(**where):
     ]
 
 
-def test_dashboards_are_optional_and_found_by_the_sidecar():
-    assert not [name for name in of_kind(render(), "ConfigMap") if "grafana-" in name]
-    values = {"labels": {"team": "robots"}, "annotations": {"grafana_folder": "lab"}}
-    maps, shown = dashboards(values)
-    topics = {path.stem for path in (CHART / "files" / "dashboards").iterdir()}
-    assert topics == {"loop", "guard", "link", "resources", "missions"}
-    assert len(maps) == len(shown) == len(topics)
-    for one in maps:
-        assert one["metadata"]["annotations"] == values["annotations"]
-        wanted = values["labels"] | {"grafana_dashboard": "1"}
-        assert one["metadata"]["labels"].items() > wanted.items()
-
-
 def test_dashboards_of_several_releases_do_not_collide():
     """Grafana refuses two dashboards with one uid, or with one title in a folder."""
     places = (("demo", "lab"), ("demo", "class"), ("other", "lab"), ("d" * 53, "n" * 63))
@@ -252,18 +223,6 @@ def test_panels_show_the_pods_of_one_release_though_its_name_begins_that_of_anot
     for query in queries(release="cloudrc"):
         for pattern in re.findall(r'pod=~"(.*?)"', query):
             assert {pod for pod in pods if re.fullmatch(pattern, pod)} == own
-
-
-def test_all_shows_metrics_without_the_labels_of_the_operator():
-    (one, *_) = dashboards()[1].values()
-    every = {v["name"]: v["allValue"] for v in one["templating"]["list"] if "allValue" in v}
-    (panel, *_) = one["panels"]
-    asked = panel["targets"][0]["expr"]
-    for name, value in every.items():
-        asked = asked.replace(f"${name}", value)
-    patterns = re.findall(r'(?:namespace|pod)=~"(.*?)"', asked)
-    assert len(patterns) > 1
-    assert all(re.fullmatch(pattern, "") for pattern in patterns)
 
 
 @needs_promtool

@@ -3,10 +3,9 @@
 import pytest
 import yaml
 
-from tests.chart.conftest import a_namespace, containers, notes, of_kind, pod_specs, render
+from tests.chart.conftest import a_namespace, notes, of_kind, render
 
 OWN = {"robot": {"configMap": "mine"}, "scene": {"configMap": "lab"}}
-FOLDERS = {"robot": "/etc/cloudrc-robot/mine", "scene": "/etc/cloudrc-scene/lab"}
 
 
 def files(name, *keys):
@@ -15,30 +14,6 @@ def files(name, *keys):
 
 
 PRESENT = [files("mine", "robot.yaml", "robot.xml"), files("lab", "scene.xml")]
-
-
-def test_the_users_robot_and_scene_replace_those_of_the_experiment():
-    given = {"seed": 4, "world": {"robot": "rover", "odometry_rate_hz": 50}}
-    data = of_kind(render({**OWN, "experiment": given}), "ConfigMap")["experiment"]["data"]
-    experiment = yaml.safe_load(data["experiment.yaml"])
-    world = {"robot": FOLDERS["robot"], "scene": f"{FOLDERS['scene']}/scene.xml"}
-    assert experiment == {"seed": 4, "world": {**world, "odometry_rate_hz": 50}}
-
-
-def test_every_container_that_reads_the_experiment_reads_robot_and_scene():
-    pods = pod_specs(render({**OWN, "console": {"enabled": True}, "ros": {"enabled": True}}))
-    seen = set()
-    for end in ("world", "cloud"):
-        volumes = {each["name"]: each for each in pods[end]["volumes"]}
-        for name, container in containers(pods[end]).items():
-            mounts = {m["mountPath"]: m["name"] for m in container.get("volumeMounts") or ()}
-            if "/etc/cloudrc" not in mounts:
-                continue
-            seen.add(name)
-            for kind, folder in FOLDERS.items():
-                source = volumes[mounts[folder]]["configMap"]["name"]
-                assert source == OWN[kind]["configMap"]
-    assert seen == {"world", "link", "cloud", "teleop", "bridge", "console"}
 
 
 @pytest.mark.parametrize(

@@ -1,19 +1,27 @@
-"""Every values file renders to valid Kubernetes objects, as with helm."""
+"""Every values file renders to valid Kubernetes objects, as with helm, and to those in rendered/.
+
+`rendered/default.yaml` has the objects of the default values. The other files have what other
+values change: a line with - is one of the default, a line with + comes instead or in addition. To
+renew a file, delete it and run the tests.
+"""
 
 import functools
 import json
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 import yaml
 
+import cloudrc
 from tests.chart.conftest import (
     CHART,
     METADATA,
     OPERATOR,
     VALUES,
+    a_namespace,
     containers,
     each_file,
     pod_specs,
@@ -23,9 +31,141 @@ from tests.chart.conftest import (
 
 kubernetes_validate = pytest.importorskip("kubernetes_validate", reason="comes with the extra dev")
 
+RENDERED = Path(__file__).parent / "rendered"
 OLDEST = re.match(r">=(\d+\.\d+)\.0-0 ", METADATA["kubeVersion"])[1]
 NAMES_IN_LAB = ("lab-cloudrc", "lab-robot-b")
 NEWEST = ".".join(kubernetes_validate.latest_version().split(".")[:2])
+ON = {"enabled": True}
+MINE = {"prometheus.io/scrape": "false", "example.org/owner": "me"}
+INJECT = {"sidecar.istio.io/inject": "false"}
+CASES = {
+    "placed": {
+        "commonLabels": {"team": "robots", "site": "a"},
+        "world": {"podLabels": {"site": "b"}},
+        "cloud": {
+            "nodeSelector": {"disk": "fast"},
+            "tolerations": [{"key": "lab", "operator": "Exists"}],
+            "affinity": {"nodeAffinity": {}},
+            "podAnnotations": MINE,
+        },
+        "mission": {**ON, "queue": True, "podAnnotations": INJECT, "podLabels": INJECT},
+        "teleop": {"service": {"port": 80}, "journal": {"keep": True}},
+        "metrics": {"podMonitor": {**ON, "force": True, "labels": {"team": "ops"}}},
+    },
+    "ros": {"cloud": {"ros": {**ON, "image": {"repository": "lab/nodes"}}}, "mission": ON},
+    "bridge": {"ros": ON},
+    "steered": {
+        "ros": {**ON, "steer": True, "namespace": "drone1"},
+        "cloud": {"ros": {**ON, "launch": ["ros2", "gain:=0.5 # not YAML", "true"]}},
+    },
+    "console": {"console": ON},
+    "own": {
+        "robot": {"configMap": "mine"},
+        "scene": {"configMap": "lab"},
+        "experiment": {"seed": 4, "world": {"robot": "rover", "odometry_rate_hz": 50}},
+    },
+    "openshift": {
+        "podSecurityContext": None,
+        "containerSecurityContext": None,
+        "ipFamilyPolicy": None,
+        "metrics": {"annotations": False},
+        "serviceAccount": {"create": False, "name": "robots"},
+    },
+    "images": {
+        "image": {
+            "registry": "ghcr.io/me",
+            "tag": "9.9.9",
+            "world": {"digest": "sha256:" + "0" * 64},
+        }
+    },
+    "secrets": {
+        "secret": {"existingSecret": "lab-key"},
+        "teleop": {"tokens": {"existingSecret": "lab-tokens"}},
+        "podSecurityContext": {"runAsUser": 12_345},
+    },
+    "scraped": {
+        "metrics": {"allowFrom": [{"namespaceSelector": {"matchLabels": {"name": "monitoring"}}}]},
+        "teleop": {"allowFrom": [{"ipBlock": {"cidr": "10.0.0.0/8"}}]},
+    },
+    **{path.stem.replace("values", "").strip("-"): values_of(path) for path in VALUES[1:]},
+}
+"""Name of a file in rendered/ -> values."""
+
+
+class Dumper(yaml.SafeDumper):
+    def ignore_aliases(self, data):
+        return True
+
+
+def shown(values):
+    """Render what does not change by itself: without Secrets, hashes, versions and long texts."""
+    objects = render(values, lookup=a_namespace() if "netem" in str(values) else (lambda *_: {}))
+    text = json.dumps([thing for thing in objects if thing["kind"] != "Secret"])
+    text = re.sub(r'("checksum/\w+": )"\w+"', r'\1"HASH"', text)
+    text = re.sub(r"-mission-[0-9a-f]{8}", "-mission-HASH", text)
+    text = text.replace(cloudrc.__version__, "VERSION")
+    found = json.loads(text)
+    for thing in found:
+        if thing["kind"] in ("ConfigMap", "PrometheusRule"):
+            own = thing["metadata"]["name"].endswith("experiment")
+            thing["data"] = thing.get("data") if own else [*thing.get("data", ())]
+            thing.pop("spec", None)
+    return found
+
+
+def leaves(part, path=""):
+    """Yield a line for each value; an item of a list is named by its name, if it has one."""
+    if isinstance(part, dict) and part:
+        for key, value in part.items():
+            yield from leaves(value, f"{path}.{key}")
+    elif isinstance(part, list) and part:
+        for number, each in enumerate(part):
+            names = each if isinstance(each, dict) else {"name": ""}
+            place = names.get("mountPath", names.get("name", number))
+            yield from leaves(each, f"{path}[{place}]")
+    else:
+        yield f"{path}: {json.dumps(part)}"
+
+
+def lines(objects):
+    found = []
+    for thing in objects:
+        name = re.sub("^(demo-cloudrc|robot)-", "", thing["metadata"]["name"])
+        for line in leaves({k: v for k, v in thing.items() if k not in ("kind", "apiVersion")}):
+            found.append(f"{thing['kind']} {name}{line}".replace(".spec.template.spec.", "."))
+    return found
+
+
+@functools.cache
+def default_lines():
+    return lines(shown({}))
+
+
+def compare(name, text):
+    path = RENDERED / name
+    if not path.exists():
+        path.write_text(text)
+    assert text == path.read_text()
+
+
+def test_the_default_values_give_these_objects():
+    assert METADATA["version"] == METADATA["appVersion"] == cloudrc.__version__
+    text = yaml.dump_all(
+        shown({}), None, Dumper, sort_keys=False, width=100, default_flow_style=None
+    )
+    compare("default.yaml", text)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_other_values_change_these_lines(name):
+    found, default = lines(shown(CASES[name])), default_lines()
+    gone = [f"- {line}" for line in default if line not in {*found}]
+    new = [f"+ {line}" for line in found if line not in {*default}]
+    compare(f"{name}.diff", "".join(f"{line}\n" for line in sorted((*gone, *new), key=_place)))
+
+
+def _place(line):
+    return line[2:].partition(": ")[0], line
 
 
 @pytest.mark.parametrize("version", sorted({OLDEST, NEWEST}))

@@ -1,9 +1,6 @@
 """The pods satisfy Pod Security "restricted", except a link with netem."""
 
-import pytest
-
 from tests.chart.conftest import (
-    a_namespace,
     containers,
     each_file,
     of_kind,
@@ -59,48 +56,3 @@ def test_a_release_passes_restricted_with_the_relay(path):
     for deployment in of_kind(objects, "Deployment").values():
         assert deployment["spec"]["replicas"] == 1
         assert deployment["spec"]["strategy"] == {"type": "Recreate"}
-
-
-@pytest.mark.parametrize("mode", ["netem", "auto"])
-def test_netem_adds_one_capability_to_one_container(mode):
-    assert not any(map(breaches, pod_specs(render()).values())), "the namespace is unknown"
-    pods = pod_specs(render({"link": {"mode": mode}}, lookup=a_namespace()))
-    expected = ["link: root", "link: capabilities"]
-    found = {name: breaches(pod) for name, pod in pods.items()}
-    assert found == {"world": expected, "cloud": expected, "test": [], "test-link": []}
-    link = containers(pods["world"])["link"]["securityContext"]
-    assert link["capabilities"] == {"drop": ["ALL"], "add": ["NET_ADMIN"]}
-    assert link["runAsUser"] == 0
-
-
-def test_security_contexts_can_be_left_out_or_changed():
-    """OpenShift gives each namespace its own user ids and refuses others."""
-    values = {"podSecurityContext": None, "containerSecurityContext": None}
-    objects = render({**values, "cloud": {"backgroundLoad": {"enabled": True}}})
-    assert "securityContext" not in str(pod_specs(objects))
-    for pod in pod_specs(render({"podSecurityContext": {"runAsUser": 12_345}})).values():
-        assert pod["securityContext"]["runAsUser"] == 12_345
-        assert pod["securityContext"]["runAsNonRoot"] is True
-
-
-def test_service_accounts_are_made_or_named():
-    def accounts(values=None):
-        objects = render(values)
-        made = {thing["metadata"]["name"] for thing in of_kind(objects, "ServiceAccount").values()}
-        return made, {pod["serviceAccountName"] for pod in pod_specs(objects).values()}
-
-    made, used = accounts()
-    assert made == used
-    named = {"serviceAccount": {"create": False, "name": "robots"}}
-    assert accounts(named) == (set(), {"robots"})
-
-
-def test_probes_use_the_metrics_port_and_liveness_needs_no_peer():
-    asked = {"startupProbe": "/healthz", "livenessProbe": "/healthz", "readinessProbe": "/readyz"}
-    for thing in of_kind(render(), "Deployment").values():
-        for part in containers(thing["spec"]["template"]["spec"]).values():
-            gets = {probe: part[probe]["httpGet"] for probe in asked}
-            assert {probe: get["path"] for probe, get in gets.items()} == asked
-            (port,) = {get["port"] for get in gets.values()}
-            assert port.endswith("metrics")
-            assert port in {each["name"] for each in part["ports"]}

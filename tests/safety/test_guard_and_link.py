@@ -9,7 +9,7 @@ from cloudrc.messages import GuardState
 from cloudrc.world.guard.state import Guard
 from tests.fences import FENCE
 
-HOSTILE = {"stop-and-go": 9, "false-basis": 8, "strange-numbers": 9, "refused-and-released": 3}
+HOSTILE = {"stop-and-go": 9, "false-basis": 8, "strange-numbers": 9, "rejected-and-released": 3}
 """Name of a hostile cloud's policy -> seed. Together, these flights reach all guard states."""
 BOUNDS = {
     *("command_age_max_ns", "acceleration_max", "_hold_max_ns", "_plan_max_ns", "_ramp_ns"),

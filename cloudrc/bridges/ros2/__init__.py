@@ -10,10 +10,7 @@ import importlib.util
 import os
 import sys
 
-from cloudrc.errors import BadInputError, MissingPrerequisiteError, to_one_line
-
-DOMAIN_MAX = 232
-"""Largest number of a domain of ROS 2: larger ones would need ports that do not exist."""
+from cloudrc.errors import MissingPrerequisiteError, to_one_line
 
 
 def require_ros(purpose: str, module: str, packages: str) -> None:
@@ -22,9 +19,6 @@ def require_ros(purpose: str, module: str, packages: str) -> None:
     `purpose`, such as "cloud.controller ros2", is for the error text. `module` is the module of
     this folder that is needed; its `load_messages` loads those of the ROS packages `packages`.
     """
-    domain = os.environ.get("ROS_DOMAIN_ID", "") or "0"
-    if not domain.isdecimal() or int(domain) > DOMAIN_MAX:
-        raise BadInputError(f"ROS_DOMAIN_ID={domain}: give a number from 0 to {DOMAIN_MAX}")
     python = f"Python {sys.version_info.major}.{sys.version_info.minor}"
     if importlib.util.find_spec("rclpy") is None:
         raise MissingPrerequisiteError(

@@ -81,7 +81,7 @@ class RosLockStep:
         return 0.0, [answer.row]
 
     def _check_other(self, answered_ns: int | None, stamp_ns: int) -> None:
-        """Refuse an answer to another estimate, unless cloudrc itself has repeated that one."""
+        """Raise an error for an answer to another estimate, unless cloudrc repeated that one."""
         if answered_ns is not None and answered_ns == self._repeated_ns:
             return
         twice = answered_ns == self._answered_ns

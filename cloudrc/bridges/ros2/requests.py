@@ -44,7 +44,7 @@ class BridgedRobot(NamedTuple):
 
 
 class RosRequests:
-    """Passes the requests of nodes on to teleop; says in one line what it refuses.
+    """Passes the requests of nodes on to teleop; says in one line what it does not take.
 
     Attributes:
         position: The robot's newest position [m], world frame, shape (3,).
@@ -67,7 +67,7 @@ class RosRequests:
             robot: The robot.
             tell: Gets words for the user.
             prefix: Prefix of the robot's frames.
-            observes: Whether to refuse every request.
+            observes: Whether to take no request.
         """
         self._steering, self._robot, self._tell_user = steering, robot, tell
         self._base, self._observes = prefix + BASE, observes
@@ -132,7 +132,7 @@ class RosRequests:
         self._wanted = (x, y, 0.0 if self._robot.planar else z), time.monotonic() + DRIVE_LASTS
 
     def pass_on(self) -> None:
-        """Pass the newest velocity on, if it is due; say why teleop has refused a request."""
+        """Pass the newest velocity on, if it is due; say why teleop has not taken a request."""
         now = time.monotonic()
         wanted = self._wanted
         if wanted is not None and now - self._passed >= DRIVE_PERIOD:

@@ -16,7 +16,7 @@ from cloudrc.config.schema import MissionConfig
 from cloudrc.faults import measures
 from cloudrc.faults.adversary import Lie
 from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.measures import Outcome, fly_safely, refused, scenario
+from cloudrc.faults.measures import Outcome, fly_safely, rejected, scenario
 from cloudrc.faults.schedule import FaultEvent, Schedule, Way, generator
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.geometry.scene import Tube
@@ -91,7 +91,7 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
     outcome.true("mission failed", flight.mission.state == "failed")
     coded = "world_restarted" in str(flight.mission.verdict)
     outcome.true("with the code world_restarted", coded)
-    refused(outcome, flight, "old_epoch")  # commands for the old world
+    rejected(outcome, flight, "old_epoch")  # commands for the old world
 
 
 @scenario(
@@ -114,7 +114,7 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     flight.cloud.members = flight.cloud.members[1:]  # the first leaves
     flight.fly(at + 14.0)
     measures.safe(outcome, flight)
-    refused(outcome, flight, "busy")
+    rejected(outcome, flight, "busy")
     told = measures.told(flight.cloud.others, "busy")
     outcome.true("the second reports once why it waits", [r.text for r in told] == [BUSY_TEXT])
     said = min((r.stamp_ns * 1e-9 for r in told), default=nan)
@@ -171,13 +171,13 @@ def _invalid_values(outcome: Outcome, seed: int) -> None:
         outcome.same(f"{name}: flown again without the operator", len(again), 0)
         causes = [change.cause for change in measures.changes_into(flight, GuardState.LAND)]
         outcome.true(f"{name}: the cause is reported", "impossible commands" in " ".join(causes))
-        refused(outcome, flight, "range")
+        rejected(outcome, flight, "range")
     for limit, changes in EXCESSIVE.items():
         lie, harmless = _for_a_while(at, 1.0, changes), limit != "speed"  # it may hit a tube
         flight = FaultRun(Schedule(seed), honest=harmless, lies=[lie]).fly(40.0)
         measures.safe(outcome, flight)
-        rejected = sum("impossible" in change.cause for change in flight.changes)
-        outcome.same(f"100 times {limit}: rejected as impossible", rejected, 0)
+        impossible = sum("impossible" in change.cause for change in flight.changes)
+        outcome.same(f"100 times {limit}: rejected as impossible", impossible, 0)
         outcome.least(f"100 times {limit}: limited", flight.count(f"limited_{limit}"), 20)
     one = FaultRun(Schedule(seed), lies=[_for_a_while(at, 0.005, IMPOSSIBLE["NaN"])]).fly(40.0)
     measures.safe(outcome, one)

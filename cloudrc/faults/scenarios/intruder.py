@@ -10,7 +10,7 @@ from typing import TypeAlias
 from cloudrc.faults import measures
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.inject import flipped
-from cloudrc.faults.measures import Outcome, fly_safely, refused, scenario
+from cloudrc.faults.measures import Outcome, fly_safely, rejected, scenario
 from cloudrc.faults.schedule import Schedule, generator
 from cloudrc.tunnel import codec
 
@@ -43,7 +43,7 @@ def _check_no_effect(
     fly_safely(outcome, flight)
     same = clean.trajectory() == flight.trajectory()
     outcome.true("the same path, bit by bit", same)
-    refused(outcome, flight, *refusals)
+    rejected(outcome, flight, *refusals)
     outcome.least("hostile datagrams", sum(sent), 1000)
     same = measures.epochs(clean) == measures.epochs(flight)
     outcome.true("hostile datagrams opened no session", same)
@@ -69,7 +69,7 @@ def _corruption(outcome: Outcome, seed: int) -> None:
     flight.world.tamper = flight.cloud.tamper = tamper
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
-    refused(outcome, flight, "tag")
+    rejected(outcome, flight, "tag")
     outcome.least("corrupted datagrams", len(sent), 100)
     outcome.same("epochs opened", len(measures.epochs(flight)), 2)
 
