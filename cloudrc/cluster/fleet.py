@@ -36,7 +36,7 @@ def list_releases(
         tell(f"only the releases {here.where}: {error}")
         found = look(here, everywhere=False)
     if not (found or everywhere or namespace_exists(here)):
-        raise no_release(here)
+        raise no_release(here, f"no namespace '{here.namespace}'{here.of_context}")
     places = [replace(here, namespace=each.namespace, name=each.name) for each in found]
     with ThreadPoolExecutor(AT_ONCE) as pool:
         missions = pool.map(partial(_mission_of, tell=tell), places)

@@ -96,21 +96,6 @@ def test_a_failed_job_is_kept_and_named(started, api, release):
     assert api.jobs()
 
 
-def test_a_failed_job_says_how_its_last_pod_failed(started, api, release):
-    add_pod(api, "a", "Failed", state=terminated(3, "a package cannot be imported"))
-    api.end("sweep-1", "Failed", reason="FailedIndexes", message="Job has failed indexes")
-    with pytest.raises(ClusterError, match="failed with exit code 3: a package cannot be imp"):
-        lines(release)
-
-
-def test_a_pod_without_memory_is_told_as_that(started, api, release):
-    killed = {"terminated": {"exitCode": 137, "reason": "OOMKilled", "message": ""}}
-    add_pod(api, "a", "Failed", state=killed)
-    api.end("sweep-1", "Complete")
-    (said,) = lines(release)[1]
-    assert "more memory than the limit" in said
-
-
 def test_the_first_pod_that_refuses_the_flights_ends_the_job(started, api, release):
     """For example, the image has other code: no shard of the Job can succeed."""
     said = "the flights come from code 1, this image has code 2"
@@ -143,23 +128,4 @@ def test_pods_may_wait_for_a_node_but_not_for_an_image(started, api, release):
     batch.start(release, "sweep-1", b"flights", 4, **WORDS)
     add_pod(api, "b", "Pending", state={"waiting": {"reason": "ImagePullBackOff"}})
     with pytest.raises(ClusterError, match="cannot start"):
-        lines(release)
-
-
-def test_a_sweep_that_a_queue_suspends_in_flight_waits(started, api, release):
-    add_pod(api, "a", "Running", "row 1\n")
-    spec = api.get("jobs", "sweep-1")["spec"]
-    spec["suspend"] = True
-
-    def resume():
-        spec["suspend"] = False
-        api.end("sweep-1", "Complete")
-
-    api.at_look(3, resume)
-    assert lines(release) == (["row 1"], ["waiting: the Job is suspended"])
-
-
-def test_a_deleted_job_of_a_sweep_is_named(started, api, release):
-    api.at_look(2, lambda: api.objects.pop(("jobs", "sweep-1")))
-    with pytest.raises(ClusterError, match=r"^Job 'sweep-1' was deleted; repeat the command$"):
         lines(release)

@@ -14,7 +14,6 @@ from cloudrc.cluster.client import ClusterError, connect
 from cloudrc.cluster.jobs import run_job
 from cloudrc.config.load import load_experiment
 from cloudrc.config.shipped import FOLDERS
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry.scene import SCENES
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import LinkChanged
@@ -111,17 +110,6 @@ def test_a_flight_on_a_cluster_writes_a_whole_run(ready, tmp_path, call):
     assert "--namespace=demo --create-namespace" in line
 
 
-def test_a_job_flies_a_carrot_mission_over_the_users_profile(ready, tmp_path, call):
-    (tmp_path / "own.yaml").write_text("uplink: {delay_ms: 5}")
-    ends(ready)
-    own = "--set mission.carrot.speed_mps=1.5 --set link.profile=./own.yaml"
-    call(f"{LINE} --out out {own}", code=6)
-    maps = [body["data"] for key, body in ready.objects.items() if key[0] == "configmaps"]
-    (text,) = (data["mission.yaml"] for data in maps if "mission.yaml" in data)
-    assert json.loads(text)["carrot"] == {"speed_mps": 1.5, "acceleration_mps2": 2.0}
-    assert "touch" in json.loads(text), "else the body to touch is an obstacle"
-
-
 def test_the_users_robot_and_scene_fly_as_configmaps_that_belong_to_the_release(
     ready, tmp_path, call
 ):
@@ -137,12 +125,6 @@ def test_the_users_robot_and_scene_fly_as_configmaps_that_belong_to_the_release(
     patched = (tmp_path / "patched").read_text()
     assert all(f"patch configmap {name}" in patched for name in names.values())
     assert ready.get("deployments", "cloudrc-world")["metadata"]["uid"] in patched
-
-
-def test_a_run_with_a_shipped_robot_replaces_the_users_robot_of_the_release():
-    values = flight.chart_values(load_experiment("hover"), {"robot": {"configMap": "mine"}}, {})
-    assert (values["robot"], values["scene"]) == ({"configMap": ""}, {"configMap": ""})
-    assert values["experiment"]["world"]["robot"] == "pelican"
 
 
 def test_a_refused_mission_leaves_no_run(ready, tmp_path, call):
@@ -195,20 +177,6 @@ def test_a_program_gets_the_result_of_a_flight_on_a_cluster(ready, tmp_path, cap
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_program_gets_an_error_if_nothing_flies_on_a_cluster(ready, teleop, tmp_path):
-    with pytest.raises(BadInputError, match="waypoints"):
-        cloudrc.fly("steps", mode="cluster")
-    with pytest.raises(MissingPrerequisiteError, match="no context 'other'"):
-        cloudrc.fly(NAME, mode="cluster", context="other")
-    ends(ready, "Failed", 5, "mission m-1 is under way")
-    with pytest.raises(ClusterError, match="did not fly its mission"):
-        cloudrc.fly(NAME, mode="cluster")
-    assert list((tmp_path / "runs").glob("*")) == []
-    teleop.mission = {"id": "m7"}
-    with pytest.raises(ClusterError, match="mission m7 is under way"):
-        cloudrc.fly(NAME, mode="cluster")
-
-
 def test_an_interrupted_flight_cancels_and_reports_its_mission(
     ready, teleop, tmp_path, call, monkeypatch
 ):
@@ -234,15 +202,10 @@ def test_a_run_does_not_end_a_flight_in_progress(ready, teleop, tmp_path, call):
     assert not (tmp_path / "out").exists()
 
 
-FITTED = "cloud.predictor={name: command_history, model: ./mine.yaml}"
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
         (["hover", "--set", "cloud.predictor=./mine.py"], "the pods do not have this file"),
-        (["hover", "--set", "world.robot=./mine.xml"], "world.robot: /"),
-        (["hover", "--set", FITTED], "cloud.predictor.model: /"),
         (["steps"], "mission.steps"),
     ],
 )
@@ -252,8 +215,5 @@ def test_files_that_pods_lack_are_refused_before_the_install(
     monkeypatch.chdir(tmp_path)
     plugin = "from cloudrc.cloud.predictors.last_sample import build as build\n"
     (tmp_path / "mine.py").write_text(plugin)
-    shutil.copy(SCENES / "empty.xml", tmp_path / "mine.xml")
-    fitted = "{time_constant: [1, 1, 1], dead_time: [0, 0, 0], gain: [1, 1, 1]}"
-    (tmp_path / "mine.yaml").write_text(fitted)
     assert words in call("run --mode cluster", *settings, code=2).err
     assert not (tmp_path / "runs").exists()

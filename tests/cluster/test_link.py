@@ -96,16 +96,6 @@ def test_a_change_reaches_both_pods_and_the_configmap(cluster, call):
     assert "downlink   netem" in out
 
 
-def test_of_several_releases_none_is_guessed(cluster, refused):
-    for name in ("cloudrc", "other"):
-        link = item("ConfigMap", f"{name}-link", "link", data={"profile.yaml": PROFILE})
-        link["metadata"]["labels"]["app.kubernetes.io/instance"] = name
-        cluster.items.append(link)
-    del cluster.items[0]
-    assert "several releases in namespace 'demo': cloudrc, other; name one" in refused(LINE)
-    assert not cluster.kept
-
-
 def test_a_local_trace_is_stored_beside_the_profile(cluster, tmp_path, monkeypatch, call):
     (tmp_path / "my trace.csv").write_text(TRACE)
     setting = [f"uplink.trace={tmp_path / 'my trace.csv'}"]
@@ -165,12 +155,6 @@ def test_a_refused_change_is_not_written_to_the_configmap(cluster, refused):
     assert not cluster.kept
 
 
-def test_a_missing_pod_is_named(cluster, running, refused):
-    running.get("pods", "world-1")["status"]["phase"] = "Pending"
-    del cluster.items[2]
-    assert "the world pod of release 'cloudrc' does not run" in refused(LINE, code=5)
-
-
 # The pipe in the link container, with a real Python.
 
 NOTE = json.dumps({"number": "b2", "cause": "zwölf", "restart": False})
@@ -202,12 +186,6 @@ def test_the_pipe_carries_a_change_to_the_socket_and_the_state_back():
     assert got == [DOCUMENT, DOCUMENT[:-1]]
     assert read_answer(done.stdout) == state
     assert cut.returncode == 0
-
-
-def test_the_pipe_says_that_no_link_answers(tmp_path):
-    done = through_pipe(tmp_path / "none", b"")
-    assert done.returncode == 1
-    assert done.stderr.startswith(b"error: no link answers here: ")
 
 
 # The Role among the chart's examples.

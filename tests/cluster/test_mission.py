@@ -88,22 +88,6 @@ def test_the_status_tells_the_last_words_of_a_pod_that_ends(running, teleop, cal
     assert cloud in err
 
 
-def test_the_status_tells_why_a_pod_waits(running, teleop, call):
-    teleop.state = SILENT
-    waits = {"state": {"waiting": {"reason": "ErrImagePull"}}, "phase": "Pending"}
-    running.put("pods", pod("world-1", "world", ready=False, **waits))
-    last = call("mission status").out.splitlines()[-1]
-    assert last.startswith("the world pod waits: the image cloudrc/cloud:0.1.0 of container")
-
-
-def test_an_api_that_does_not_answer_tells_the_last_words_of_its_pod(running, pretend, refused):
-    pretend("kubectl", "echo 'Forwarding from 127.0.0.1:9 -> 8080'\nexec sleep 60")
-    assert "does not answer" in refused("mission list -n demo", code=5)
-    state = {"waiting": {"reason": "CrashLoopBackOff"}}
-    running.put("pods", pod("cloud-1", "cloud", ready=False, state=state, last=CRASHES))
-    assert UNKNOWN in refused("mission list -n demo", code=5)
-
-
 def test_run_waits_until_the_release_is_ready(lands, call):
     """`helm install` does not wait for the pods."""
     lands.put("pods", pod("cloud-1", "cloud", ready=False, phase="Pending"))
@@ -132,13 +116,6 @@ def test_a_run_that_loses_the_api_server_says_that_the_job_continues(running, ca
     assert said.endswith(f"kubectl --namespace=demo logs --follow job/{job['metadata']['name']}\n")
 
 
-def test_an_interrupted_run_names_the_mission_of_its_job(running, teleop, call, monkeypatch):
-    teleop.missions = lambda: missions_of(running)
-    monkeypatch.setattr(flight, "follow", Mock(side_effect=KeyboardInterrupt))
-    said = call("mission run one.yaml", code=130).err
-    assert "cloudrc mission cancel m4 --namespace=demo --release=cloudrc\n" in said
-
-
 def forget_jobs(api):
     for key in [key for key in api.objects if key[0] == "jobs"]:
         api.objects.pop(key)
@@ -163,14 +140,6 @@ def test_a_deleted_job_cancels_its_mission_if_it_still_flies(
     running.at_look(3, delete)
     assert words in call("mission run one.yaml", code=code).out.splitlines()[-1]
     assert teleop.posted == ([] if ended else ["/v1/missions/m4/cancel"])
-
-
-def test_a_mission_that_cannot_be_cancelled_ends_with_its_lease(running, pretend, call):
-    pretend("kubectl", "echo 'error: pod is gone' >&2; exit 1")
-    running.at_look(3, lambda: forget_jobs(running))
-    last = call("mission run one.yaml", code=130).out.splitlines()[-1]
-    assert last.startswith("its Job was deleted; the mission ends with its lease")
-    assert "pod is gone" in last
 
 
 @pytest.fixture

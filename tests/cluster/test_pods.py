@@ -72,37 +72,6 @@ def test_the_wait_for_a_release_ends_with_the_cause(running, release, body, erro
         wait_ready(release, timeout=0.03)
 
 
-WRONG_KEY = terminated(
-    2, "cloudrc: warning: a word\ncloudrc: error: --key /etc/key/key: not a key\n"
-)
-
-
-def with_secret(component, name="lab-key"):
-    body = deployment(component)
-    volumes = [{"name": "secret", "secret": {"secretName": name}}]
-    mounts = [{"name": "secret", "mountPath": "/etc/key"}]
-    containers = [{"name": component, "volumeMounts": mounts}]
-    body["spec"]["template"]["spec"] = {"containers": containers, "volumes": volumes}
-    return body
-
-
-def test_a_wrong_secret_of_both_pods_is_told_once_and_named(running, release):
-    for each in ("world", "cloud"):
-        running.put("deployments", with_secret(each))
-        crashing = {"state": waiting("CrashLoopBackOff"), "ready": False}
-        crashing["last"] = WRONG_KEY
-        running.put("pods", pod(f"{each}-1", each, **crashing))
-    lines = []
-    with pytest.raises(ClusterError) as told:
-        wait_ready(release, timeout=1.0, tell=lines.append)
-    assert str(told.value).startswith(
-        "the pods of world and cloud cannot run: the main container ends repeatedly: it ended with "
-        "exit code 2: --key /etc/key/key: not a key; /etc/key has the content of Secret 'lab-key'; "
-        "see: "
-    )
-    assert lines == []
-
-
 def test_a_secret_that_does_not_exist_is_named(running, release):
     running.put("pods", pod("cloud-1", "cloud", ready=False, phase="Pending"))
     about = {"involvedObject": {"uid": running.get("pods", "cloud-1")["metadata"]["uid"]}}
@@ -116,19 +85,13 @@ def test_a_secret_that_does_not_exist_is_named(running, release):
         wait_ready(release, timeout=1.0)
 
 
-@pytest.mark.parametrize("data", [{}, {"operator": "%%%"}, {"operator": "//4gc2VjcmV0"}])
+@pytest.mark.parametrize("data", [{}, {"operator": "//4gc2VjcmV0"}])
 def test_a_secret_without_a_token_is_named_and_not_shown(running, release, data):
     assert operator_token(release) == TOKEN
     running.get("secrets", "cloudrc-tokens")["data"] = data
     with pytest.raises(ClusterError, match=r"'cloudrc-tokens' .* has no token under") as refused:
         operator_token(release)
     assert "secret'" not in str(refused.value)
-    running.refuse["GET", "secrets"] = (403, "secrets is forbidden")
-    with pytest.raises(ClusterError, match="can-i get secrets"):
-        operator_token(release)
-    running.get("deployments", "cloudrc-cloud")["spec"]["template"]["spec"]["volumes"] = []
-    with pytest.raises(ClusterError, match=r"mounts no tokens: .* upgrade it: helm upgrade"):
-        operator_token(release)
 
 
 def test_ports_are_forwarded_while_the_block_runs(release, pretend, monkeypatch, tmp_path):

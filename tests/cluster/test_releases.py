@@ -6,7 +6,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from cloudrc.cluster.client import ClusterError, connect
+from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.pods import find_deployment
 from cloudrc.cluster.releases import only_release
 from cloudrc.errors import BadInputError
@@ -39,26 +39,6 @@ def test_the_releases_that_exist_are_named(api, release, find):
     put(api, "robot", "lab")
     with pytest.raises(ClusterError, match=r"there are: 'robot' in namespace 'lab'; name one"):
         find(release)
-
-
-def test_a_namespace_that_does_not_exist_is_named(api):
-    put(api, "cloudrc", "lab")
-    release = connect(None, "labb")
-    for find in (only_release, lambda release: find_deployment(release, "cloud")):
-        with pytest.raises(ClusterError, match=r"^no namespace 'labb'; there are: 'cloudrc' in"):
-            find(release)
-
-
-def test_a_user_of_one_namespace_is_not_asked_for_more_rights(api, release):
-    put(api, "other")
-    api.refuse["GET", "namespaces"] = 403, "namespaces is forbidden"
-    refuse = {"code": 403, "message": "deployments is forbidden"}
-    everywhere = "/apis/apps/v1/deployments"
-    api.hooks.append(lambda path: (403, refuse) if path.startswith(everywhere) else None)
-    with pytest.raises(
-        ClusterError, match=r"^no release 'cloudrc' .*: 'other' in namespace 'demo'"
-    ):
-        find_deployment(release, "cloud")
 
 
 def release_in(api, name, namespace, *, ready, robot="", profile="uplink: {delay_ms: 40}"):

@@ -62,22 +62,6 @@ def test_a_node_without_an_image_is_told(cluster, release):
     assert "the image i of container 'world' is not on the node" in seen.found
 
 
-def test_the_charts_values_go_to_helm_and_its_pull_secrets_to_the_probes(
-    cluster, release, tmp_path, pretend, monkeypatch
-):
-    secret = "      imagePullSecrets: [{name: lab}]\n---"
-    rendered = "".join(CHART.replace("COMPONENT", each) for each in ("world", "cloud"))
-    rendered = rendered.replace("---", secret)
-    pretend("helm", f"echo \"$@\" >{tmp_path}/asked; cat <<'END'\n{rendered}END")
-    made = []
-    keep = survey.create_pod
-    monkeypatch.setattr(survey, "create_pod", lambda *a, **k: made.append(a[2]) or keep(*a, **k))
-    values = ["--values=my.yaml", "--set=image.registry=r.example/me"]
-    assert {one.state for one in survey.survey(release, values)} == {"ok"}
-    assert (tmp_path / "asked").read_text().split()[-2:] == values
-    assert [spec["imagePullSecrets"] for spec in made] == [[{"name": "lab"}]] * 3
-
-
 FILES = """\
 apiVersion: v1
 kind: ConfigMap
@@ -93,11 +77,8 @@ data:
     ("experiment", "profile", "words"),
     [
         ("cloud: {predictor: nosuch}", "{}", "no predictor named 'nosuch'"),
-        ("cloud: {predictor: {name: kalman, gian: 1}}", "{}", "cloud.predictor.gian: unknown key"),
-        ("world: {robot: rover}", "{}", "stays on the ground"),
         ("seed: 1", "uplink: {delay_ms: 0, trace: none.csv}", "none.csv"),
         ("world: {robot: /etc/cloudrc-robot/mine}", "{}", ""),
-        ("world: {robot: /opt/mine}\n    cloud: {estimator: x}", "{}", "no estimator named 'x'"),
         ("link: {profile: lte}", "profile: satellite", ""),
     ],
 )

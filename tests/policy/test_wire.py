@@ -89,12 +89,8 @@ def infer(observation):
     kind = observation["kind"]
     if kind == "raise":
         raise RuntimeError("no such thing")
-    if kind == "exit":
-        raise SystemExit(3)
-    return {"shape": {"actions": [1.0]}, "key": {"action": [[1.0]]}, "none": None,
-            "nan": {"actions": [[float("nan")]]}, "object": {"actions": [[1.0]], "x": object()},
-            "text": {"actions": [["1"]]}, "mixed": {"actions": [[0.5, True]]},
-            "empty": {"actions": []}}[kind]
+    return {"shape": {"actions": [1.0]}, "none": None, "nan": {"actions": [[float("nan")]]},
+            "object": {"actions": [[1.0]], "x": object()}}[kind]
 """
 
 
@@ -102,15 +98,10 @@ def infer(observation):
     ("kind", "text"),
     [
         ("raise", "RuntimeError: no such thing"),
-        ("exit", "SystemExit"),
         ("shape", r"shape \(1,\)"),
-        ("key", "no key 'actions'; its keys: action"),
         ("none", "not a map"),
         ("nan", "not a finite number"),
         ("object", "cannot be packed"),
-        ("text", r"value at \[0, 0\] is '1'"),
-        ("mixed", r"value at \[0, 1\] is True"),
-        ("empty", "shape"),
     ],
 )
 def test_a_failing_policy_tells_its_client_and_serves_the_next(policy, kind, text):
@@ -129,7 +120,7 @@ def test_a_failing_policy_tells_its_client_and_serves_the_next(policy, kind, tex
     assert all("\n" not in line for line in log)
 
 
-@pytest.mark.parametrize("frame", ["text", b"\xc1", b"\x91\x01"])
+@pytest.mark.parametrize("frame", ["text", b"\xc1"])
 def test_a_wrong_frame_of_a_client_is_answered_with_an_error(policy, frame):
     with serving(policy()) as url, connect(url) as stock:
         stock.recv()
@@ -141,15 +132,11 @@ def test_a_wrong_frame_of_a_client_is_answered_with_an_error(policy, frame):
     ("source", "text"),
     [
         ("x = 1", "no function infer"),
-        ("infer = 1", "no function infer"),
-        ("def build():\n    return 1", "no function infer"),
         (
             "def build():\n    raise ValueError('no weights')",
             "cannot be built: expert.py:2: no weights",
         ),
         ("import no_such_module", "no_such_module"),
-        ("raise SystemExit", "SystemExit"),
-        ("(", "SyntaxError"),
     ],
 )
 def test_a_file_without_a_policy_is_refused(policy, source, text):
@@ -157,15 +144,7 @@ def test_a_file_without_a_policy_is_refused(policy, source, text):
         LoadedPolicy(str(policy(source)))
 
 
-@pytest.mark.parametrize("name", ["expert", "no_such.py"])
-def test_a_policy_is_named_by_the_path_of_its_file(name):
-    with pytest.raises(BadInputError, match=name):
-        LoadedPolicy(name)
-
-
-@pytest.mark.parametrize(
-    "url", ["127.0.0.1:8000", "http://h:1", "ws://", "ws://:8000", "ws://h:99999", "ws://[::1", ""]
-)
+@pytest.mark.parametrize("url", ["127.0.0.1:8000", "http://h:1", "ws://h:99999"])
 def test_an_address_that_is_none_is_refused(url):
     with pytest.raises(BadInputError, match="give scheme, host and port"):
         PolicyClient(url)
@@ -175,8 +154,6 @@ def test_an_address_that_is_none_is_refused(url):
     ("answer", "text"),
     [
         ("Traceback\n  File\nValueError: bad prompt\n", "error: ValueError: bad prompt$"),
-        ("", "an empty text"),
-        (b"\x91\x01", "cannot be read"),
         (b"\xc1", "cannot be read"),
     ],
 )
@@ -214,15 +191,6 @@ def test_a_server_that_dies_is_named():
             client.infer(STATE)
 
 
-def test_a_server_that_closes_is_named_with_its_reason():
-    with (
-        stock_like(lambda c, f: c.close(1011, "out of memory")) as url,
-        PolicyClient(url) as client,
-    ):
-        with pytest.raises(SilentServerError, match="1011 out of memory"):
-            client.infer(STATE)
-
-
 def test_two_answers_to_one_observation_are_refused():
     """The second would be taken for the answer to the next observation."""
 
@@ -233,13 +201,6 @@ def test_two_answers_to_one_observation_are_refused():
     with stock_like(twice) as url, PolicyClient(url) as client:
         with pytest.raises(PolicyServerError, match="belongs to no observation"):
             [client.infer(STATE) for _ in range(100)]  # the second answer may arrive later
-
-
-def test_an_answer_beyond_the_limit_is_named(monkeypatch):
-    monkeypatch.setattr("cloudrc.policy.client.MESSAGE_MAX", 1 << 20)
-    with stock_like(lambda link, frame: actions(1.0, (50_000, 4))) as url:
-        with PolicyClient(url) as client, pytest.raises(PolicyServerError, match="larger than 1 M"):
-            client.infer(STATE)
 
 
 def test_nobody_listening_and_other_servers_are_one_line():

@@ -1,12 +1,9 @@
 """Files from somebody else: cloudrc waits for no pipe, limits sizes, and follows no link."""
 
-import json
 import os
 import signal
 import stat
 from contextlib import suppress
-from itertools import pairwise
-from math import nan
 from pathlib import Path
 
 import pytest
@@ -19,14 +16,12 @@ from cloudrc.files import atomic_file, write_atomically
 from cloudrc.link.traces import read_trace
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
-from cloudrc.record.writer import COUNTS
-from cloudrc.report.document import clock_offset_document, write_json
+from cloudrc.report.document import write_json
 from cloudrc.report.figures import FIGURES
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
 from cloudrc.runs.grid import read_grid
-from tests.metrics.conftest import flown
-from tests.record.conftest import cloud_records, rewrite, world_records, write, write_mission
+from tests.record.conftest import cloud_records, world_records, write
 
 
 @pytest.fixture(autouse=True)
@@ -65,73 +60,6 @@ def test_what_is_beyond_the_limit_is_refused_and_not_cut(tmp_path):
     for path in (tmp_path / "a", Path("/proc/self/status")):
         with pytest.raises(files.TooLongError, match="longer than 100 bytes"):
             files.read(path, 100)
-
-
-@pytest.mark.parametrize("named", ["/dev/zero", "./loop", "~nobody/x.csv", "a\\0/b.py"])
-def test_an_unusable_file_in_a_configuration_is_refused(tmp_path, named):
-    (tmp_path / "loop").symlink_to("loop")
-    for where in ("mission: ", "link: {uplink: {trace: ", "link: {uplink: {table: "):
-        (tmp_path / "config.yaml").write_text(f'{where}"{named}"' + "}" * where.count("{"))
-        with pytest.raises(BadInputError, match=r"^[^\n]*config\.yaml:1: [^\n]*$"):
-            read_experiment(tmp_path / "config.yaml")
-
-
-def test_nested_aliases_of_yaml_are_limited(tmp_path):
-    names = "abcdefghij"
-    lines = [f"{y}: &{y} [{', '.join(f'*{x}' for _ in names)}]" for x, y in pairwise(names)]
-    (tmp_path / "config.yaml").write_text("\n".join(["a: &a [1]", *lines]))
-    with pytest.raises(BadInputError, match="more than 300000 values"):
-        read_experiment(tmp_path / "config.yaml")
-
-
-@pytest.fixture
-def run(tmp_path):
-    """A run without a report."""
-    (tmp_path / "config.yaml").write_text("name: theirs")
-    write_mission(tmp_path / "mission.mcap", *flown().ends())
-    return tmp_path
-
-
-def test_facts_in_a_recording_are_used_completely_or_not_at_all(run):
-    _, _, anew = read_run(run)
-    good = {"mode": "local", "shaper": "netem", "notes": ["seen"]}
-    wrong = {"notes": [1]}, {"mode": "elsewhere"}, {"interrupted": {"a": 1}}
-    for facts in (
-        *(json.dumps(good | changed) for changed in wrong),
-        "null",
-        '{"mode":',
-        "[" * 10**5,
-    ):
-        write_mission(run / "mission.mcap", *flown().ends(), metadata={"run": facts})
-        assert read_run(run)[2] == anew, facts[:99]
-    write_mission(run / "mission.mcap", *flown().ends(), metadata={"run": json.dumps(good)})
-    assert read_run(run)[2].notes == ("seen",)
-
-
-@pytest.mark.parametrize("counts", ["[1]", "7", '"x"', "[" * 10**5])
-def test_counts_of_others_do_not_matter(run, counts):
-    foreign = rewrite(run / "mission.mcap", run / "foreign.mcap", noted={COUNTS: counts})
-    assert Recording.read(foreign).note == ""
-
-
-@pytest.mark.parametrize("uncertainty", ["abc", "1" * 400])
-def test_an_offset_of_others_does_not_matter(uncertainty):
-    noted = {"clock_offset_method": "packets", "clock_offset_uncertainty_ns": uncertainty}
-    assert clock_offset_document(noted) == {"method": "packets"}
-
-
-def test_a_report_of_others_does_not_matter(run):
-    for report in ("null", "[1]", '{"complete":', "[" * 10**5):
-        (run / "report.json").write_text(report)
-        write_report(run, *read_run(run), page=False)
-
-
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_undrawable_data_gives_one_line_of_error(run):
-    log = flown(lambda seconds: (nan, nan, nan))
-    write_mission(run / "mission.mcap", log.ends()[0], ())
-    with pytest.raises(BadInputError, match=r"^[^\n]*cannot be drawn \(ValueError: [^\n]*$"):
-        write_report(run, *read_run(run))
 
 
 # Links.
