@@ -233,38 +233,38 @@ def _joined(cells: Iterable[str]) -> str:
 class SweepView(Progress):
     """Counts flights; prints the first failure of each verdict."""
 
-    def __init__(self, head: str, total: int) -> None:
+    def __init__(self, head: str, total: int, *, says_on_stdout: bool = False) -> None:
         """Print the headline `head`; set `total`, the number of flights to fly."""
-        super().__init__("flies", total)
+        super().__init__("flies", total, says_on_stdout=says_on_stdout)
         self.say(escape(head))
-        self._done = self._failed = 0
+        self._total, self._done, self._failed = total, 0, 0
         self._told = set[str]()
 
     def see(self, row: Row) -> None:
-        """Count a finished flight; print why a metric has no value once per text."""
+        """Count a finished flight, and tell about it."""
         self._done += 1
         self._failed += row["verdict"] != "success"
+        self._tell(row)
+        self._step = f"flies, {self._failed} failed" if self._failed else "flies"
+        self.count(self._done)
+
+    def _tell(self, row: Row) -> None:
+        """Print the first failure of each verdict, and why a metric has no value once per text."""
         kind = row["verdict"] if row["failures"] else row["text"]
         if row["text"] and kind not in self._told:
             self._told.add(kind)
             self.say(escape(f"{row['key']}: {row['verdict']}: {row['text']}"))
-        self._step = f"flies, {self._failed} failed" if self._failed else "flies"
-        self.count(self._done)
 
 
-class SeedsView(Progress):
+class SeedsView(SweepView):
     """Prints a line per flight on stdout, with its seed, its verdict and why it failed."""
 
     def __init__(self, head: str, total: int) -> None:
         """Print the headline `head`; set `total`, the number of flights to fly."""
-        super().__init__("flies", total, says_on_stdout=True)
-        self.say(escape(head))
-        self._total, self._done, self._told = total, 0, set[str]()
+        super().__init__(head, total, says_on_stdout=True)
 
-    def see(self, row: Row) -> None:
-        """Print the line of a finished flight; say why a metric has no value once per text."""
-        self._done += 1
-        self.count(self._done)
+    def _tell(self, row: Row) -> None:
+        """Print the line of a flight; say why a metric has no value once per text."""
         count = f"{self._done}/{self._total}"
         line = f"{count:>7}  seed {row['seed']}  {row['verdict']}"
         if row["failures"] or row["text"] not in ("", *self._told):

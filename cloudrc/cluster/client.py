@@ -45,6 +45,7 @@ _KINDS = {
     "configmaps": ("CoreV1Api", "config_map"),
     "resourcequotas": ("CoreV1Api", "resource_quota"),
     "pods/log": ("CoreV1Api", "pod_log"),
+    "selfsubjectaccessreviews": ("AuthorizationV1Api", "self_subject_access_review"),
     "jobs": ("BatchV1Api", "job"),
     "deployments": ("AppsV1Api", "deployment"),
 }
@@ -141,7 +142,7 @@ class Release:
         if verb == "list all":
             scope, where = {}, f"in all namespaces{self.of_context}"
             method = f"list_{noun}_for_all_namespaces"
-        elif kind in ("namespaces", "nodes"):
+        elif kind in ("namespaces", "nodes", "selfsubjectaccessreviews"):
             scope, method = {}, method.replace("_namespaced", "")
         call = getattr(getattr(client, name)(self.client), method)
         with explain_errors(f"{verb.partition(' ')[0]} {kind}", where):

@@ -13,7 +13,6 @@ from cloudrc.cluster.releases import look, namespace_exists, no_release
 from cloudrc.errors import CloudrcError
 from cloudrc.text import table
 
-HEADS = ("NAME", "NAMESPACE", "ROBOT", "LINK", "STATE", "MISSION")
 AT_ONCE = 8
 """Number of releases that are asked for their mission at the same time."""
 UNKNOWN = "?"
@@ -37,19 +36,18 @@ def list_releases(
         found = look(here, everywhere=False)
     if not (found or everywhere or namespace_exists(here)):
         raise no_release(here, f"no namespace '{here.namespace}'{here.of_context}")
-    places = [replace(here, namespace=each.namespace, name=each.name) for each in found]
+    places = [replace(here, namespace=each["namespace"], name=each["name"]) for each in found]
     with ThreadPoolExecutor(AT_ONCE) as pool:
         missions = pool.map(partial(_mission_of, tell=tell), places)
-    rows = [(*each, mission) for each, mission in zip(found, missions, strict=True)]
-    keys = [head.lower() for head in HEADS]
-    return [dict(zip(keys, row, strict=True)) for row in rows]
+    return [{**each, "mission": one} for each, one in zip(found, missions, strict=True)]
 
 
 def as_text(releases: Sequence[dict[str, str]]) -> str:
     """Format the result of `list_releases` for people."""
     if not releases:
         return "no releases; install one: helm install"
-    return table([HEADS, *(tuple(each.values()) for each in releases)])
+    heads = tuple(key.upper() for key in releases[0])
+    return table([heads, *(tuple(each.values()) for each in releases)])
 
 
 def _mission_of(release: Release, tell: Callable[[str], None]) -> str:

@@ -142,11 +142,14 @@ def _pod_state(release: Release, pod: Any) -> tuple[str, bool]:
     return f"container {' and '.join(waiting)} is not ready yet" if waiting else "it starts", False
 
 
-def check_free(release: Release) -> None:
-    """Raise a ClusterError if a Job or mission is under way: installing would replace the pods.
+def check_can_begin(release: Release) -> None:
+    """Raise an error if a program is missing, or if a Job or mission is under way.
 
-    If the API does not answer, return: installing may repair the release.
+    Installing would replace the pods. If the API does not answer, return: installing may repair the
+    release.
     """
+    for name in ("helm", "kubectl"):
+        program(name)
     for job in release.find("jobs", "mission"):
         if failure_of(job) is None:
             name, end = job.metadata.name, f"{release.kubectl} delete job"
@@ -158,8 +161,7 @@ def check_free(release: Release) -> None:
     with suppress(CloudrcError), release_api(release) as api:
         mission = api.get("/v1/state")["mission"]
     if mission is not None:
-        flags = " ".join([*release.flags, f"--release={release.name}"])
-        cancel = f"cloudrc mission cancel {mission['id']} {flags}"
+        cancel = _cancel_command(release, mission["id"])
         raise ClusterError(
             f"mission {mission['id']} is under way on release '{release.name}' {release.where}; "
             f"wait for it, end it: {cancel}, or fly on a release of your own: --release NAME"
@@ -203,16 +205,13 @@ def cancelling_command(release: Release, job: str) -> str:
     """Return the command that cancels the mission of a Job."""
     with suppress(CloudrcError), release_api(release) as api:
         if mission := find_mission(api, job_key(release, job)):
-            flags = " ".join([*release.flags, f"--release={release.name}"])
-            return f"cloudrc mission cancel {mission['id']} {flags}"
+            return _cancel_command(release, mission["id"])
     return f"{release.kubectl} delete job {job}"
 
 
-def check_can_begin(release: Release) -> None:
-    """Raise an error if no flight can begin on a release now; nothing is changed yet."""
-    for name in ("helm", "kubectl"):
-        program(name)
-    check_free(release)
+def _cancel_command(release: Release, mission: str) -> str:
+    flags = " ".join([*release.flags, f"--release={release.name}"])
+    return f"cloudrc mission cancel {mission} {flags}"
 
 
 def fly_in_cluster(

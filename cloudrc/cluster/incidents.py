@@ -1,4 +1,4 @@
-"""Say what happened to pods: evictions and ended containers."""
+"""Say what happens to the pods of a release: events as Kubernetes tells them, ended containers."""
 
 from __future__ import annotations
 
@@ -13,14 +13,6 @@ from cloudrc.cluster.pods import (
     pod_failure,
 )
 from cloudrc.errors import to_one_line
-
-
-def eviction(pod: Any) -> str:
-    """Return why Kubernetes has evicted a pod; "" if it has not."""
-    for condition in pod.status.conditions or []:
-        if condition.type == "DisruptionTarget" and condition.status == "True":
-            return to_one_line(f"evicted: {condition.reason}: {condition.message}")
-    return ""
 
 
 def troubles(release: Release) -> list[str]:
@@ -50,30 +42,27 @@ class ReleaseWatch:
     def __init__(self, release: Release) -> None:
         """Note the present state: only what happens after it is told."""
         self._release = release
-        self._told = set[tuple[str, str]]()  # pod's UID and what was told about the pod
-        self._known = {pod.metadata.uid for _, pod in self._pods()}
+        self._pods, self._told = set[str](), set[str]()
         for _ in self.look():
             pass
 
     def look(self) -> Iterator[str]:
-        """Yield a sentence about each container or pod that has ended, and each pod that waits."""
-        for component, pod in self._pods():
-            uid, cause = pod.metadata.uid, eviction(pod)
-            ends = _ended_containers(component, pod)
-            found = [(f"{one.name} {time}", text) for one, time, text in ends]
-            if cause or pod.metadata.deletion_timestamp is not None:
-                cause = cause or "it was deleted or replaced"
-                found.append(("end", f"the {component} pod ends: {cause}"))
-            elif uid not in self._known:
-                found.append(("start", f"a new {component} pod starts: {pod.metadata.name}"))
-                if why := pod_failure(pod):
-                    found.append((why, f"the {component} pod waits: {why}"))
-            for key, sentence in found:
-                if (uid, key) not in self._told:
-                    self._told.add((uid, key))
-                    yield sentence
-
-    def _pods(self) -> list[tuple[str, Any]]:
-        """List the pods with their components, the oldest first."""
-        pods = [(each, pod) for each in COMPONENTS for pod in self._release.find("pods", each)]
-        return sorted(pods, key=lambda pair: str(pair[1].metadata.creation_timestamp))
+        """Yield a sentence about each container that has ended, and each event of a pod."""
+        found = list[tuple[str, str]]()
+        for component in COMPONENTS:
+            for pod in self._release.find("pods", component):
+                self._pods.add(pod.metadata.uid)
+                ends = _ended_containers(component, pod)
+                found += [
+                    (f"{pod.metadata.uid} {one.name} {time}", text) for one, time, text in ends
+                ]
+        for event in self._release.request("list", "events"):
+            pod, is_end = event.involved_object, event.reason == "Killing"
+            is_warning = event.type == "Warning" and event.reason != "Unhealthy"
+            if pod.uid in self._pods and (is_end or is_warning):
+                text = f"pod {pod.name}: {event.reason}: {to_one_line(event.message)}"
+                found.append((event.metadata.uid, text))
+        for key, sentence in found:
+            if key not in self._told:
+                self._told.add(key)
+                yield sentence

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from cloudrc.cluster.client import ClusterError, NotFoundError, Release, chart_folder
-from cloudrc.cluster.incidents import ReleaseWatch, eviction
+from cloudrc.cluster.incidents import ReleaseWatch
 from cloudrc.cluster.pods import (
     UNSCHEDULED,
     container_statuses,
@@ -254,8 +254,8 @@ class JobReader:
         """Read the Job `name`.
 
         `see_end` receives the final state of the container of each pod that ends; it may return a
-        sentence about it. `tell` receives this sentence, and others if a pod waits for a node, is
-        evicted, or if the log of an ended pod cannot be read. `tell` also receives the sentences
+        sentence about it. `tell` receives this sentence, and others if a pod waits for a node,
+        or if the log of an ended pod cannot be read. `tell` also receives the sentences
         that `look` returns.
         """
         self._release, self._name, self._tell = release, name, tell
@@ -317,8 +317,6 @@ class JobReader:
         is_done = ended is not None or pod.status.phase in ("Succeeded", "Failed")
         if is_done:
             self._read.add(uid)
-        if cause := eviction(pod):
-            self._tell_once(f"pod {pod.metadata.name} of the Job ends: {cause}")
         if ended is not None:
             self._tell_once(self._see_end(ended))
         for line in self._log_of(pod, component, is_done).splitlines():

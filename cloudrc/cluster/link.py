@@ -169,9 +169,8 @@ def _raise_refused(states: list[LinkState], failed: list[CloudrcError], number: 
     if refused := [state for state in states if state.refused == number]:
         said = [f"the {state.direction} is unchanged: {state.refusal}" for state in refused]
         said += [f"the {s.direction} has the change" for s in states if s not in refused]
-        said += map(str, failed)
         kept = "the ConfigMap is unchanged, and restarted pods take it"
-        raise BadInputError("; ".join([*said, kept]))
+        raise BadInputError("; ".join([*said, *map(str, failed), kept]))
 
 
 def keep(release: Release, link: LinkParts, sent: Sent) -> None:

@@ -23,20 +23,10 @@ from cloudrc.cluster.client import ClusterError, Release, end_process, last_word
 from cloudrc.cluster.releases import no_release
 from cloudrc.errors import TimedOutError, to_one_line
 
-FATAL = {
-    **dict.fromkeys(
-        ("ErrImagePull", "ImagePullBackOff", "ErrImageNeverPull", "InvalidImageName"),
-        "the image {image} of container '{name}' is not on the node and cannot be pulled "
-        "({reason}); name one that the nodes can pull: --set image.registry=... "
-        "--set image.tag=..., or load your own into kind: make kind-load",
-    ),
-    **dict.fromkeys(
-        ("CreateContainerConfigError", "CreateContainerError", "RunContainerError"),
-        "container '{name}' cannot be created: {message}",
-    ),
-    **dict.fromkeys(("CrashLoopBackOff", "Error"), "container '{name}' ends repeatedly{end}"),
-}
-"""Kubernetes' reason why a container will never run -> text of the error message."""
+NO_IMAGE = ("ErrImagePull", "ImagePullBackOff", "ErrImageNeverPull", "InvalidImageName")
+NOT_MADE = ("CreateContainerConfigError", "CreateContainerError", "RunContainerError")
+CRASHES = ("CrashLoopBackOff", "Error")
+"""Kubernetes' reasons why a container will never run."""
 VALUES = {
     **{"load": "cloud.backgroundLoad", "ros": "cloud.ros", "nodes": "cloud.ros"},
     "bridge": "ros",
@@ -122,15 +112,19 @@ def pod_failure(pod: Any) -> str:
 def _container_failure(status: Any) -> str:
     """Describe in one sentence why a container will never run; return "" if it may run."""
     waiting, ended = status.state.waiting, status.last_state and status.last_state.terminated
-    reason = waiting.reason if waiting else ""
-    if (status.restart_count or 0) > RESTARTS_MAX and reason not in FATAL:
-        reason = "CrashLoopBackOff"
-    if reason not in FATAL:
-        return ""
-    message = to_one_line(waiting and waiting.message)
-    end = f": it {describe_end(status.name, ended)}" if ended else ""
-    words = {"name": status.name, "image": status.image, "reason": reason}
-    return FATAL[reason].format(**words, message=message, end=end)
+    reason, container = waiting.reason if waiting else "", f"container '{status.name}'"
+    if reason in NO_IMAGE:
+        return (
+            f"the image {status.image} of {container} is not on the node and cannot be pulled "
+            f"({reason}); name one that the nodes can pull: --set image.registry=... "
+            "--set image.tag=..., or load your own into kind: make kind-load"
+        )
+    if reason in NOT_MADE:
+        return f"{container} cannot be created: {to_one_line(waiting.message)}"
+    if reason in CRASHES or (status.restart_count or 0) > RESTARTS_MAX:
+        end = f": it {describe_end(status.name, ended)}" if ended else ""
+        return f"{container} ends repeatedly{end}"
+    return ""
 
 
 def describe_end(container: str, ended: Any) -> str:

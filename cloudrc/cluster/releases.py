@@ -46,17 +46,7 @@ def find_releases(release: Release, *, everywhere: bool) -> list[Place]:
     return sorted(map(_place, found))
 
 
-class ReleaseView(NamedTuple):
-    """What `cloudrc list releases` shows of a release, except its mission."""
-
-    name: str
-    namespace: str
-    robot: str
-    link: str
-    state: str
-
-
-def look(release: Release, *, everywhere: bool) -> list[ReleaseView]:
+def look(release: Release, *, everywhere: bool) -> list[dict[str, str]]:
     """Describe the releases in the namespace of `release`, or in all namespaces.
 
     Raise a ClusterError if the user may not list Deployments or ConfigMaps there.
@@ -72,13 +62,13 @@ def look(release: Release, *, everywhere: bool) -> list[ReleaseView]:
         not_ready = [] if each.status.available_replicas else [each.metadata.labels[COMPONENT]]
         waits[_place(each)] += not_ready
     return [
-        ReleaseView(
-            place.name,
-            place.namespace,
-            _robot(files[place].get("experiment.yaml", "")),
-            _link(files[place]),
-            f"{' and '.join(sorted(waits[place]))} not ready" if waits[place] else "ready",
-        )
+        {
+            "name": place.name,
+            "namespace": place.namespace,
+            "robot": _robot(files[place].get("experiment.yaml", "")),
+            "link": _link(files[place]),
+            "state": f"{' and '.join(sorted(waits[place]))} not ready" if waits[place] else "ready",
+        }
         for place in sorted(waits)
     ]
 

@@ -12,17 +12,16 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from itertools import product
 from typing import Any, Literal, NamedTuple
 
 import yaml
 
 from cloudrc.cluster.client import (
-    REQUEST_TIMEOUT,
     ClusterError,
     NotFoundError,
     Release,
     chart_folder,
-    explain_errors,
     run,
 )
 from cloudrc.cluster.pods import pod_failure
@@ -99,33 +98,25 @@ def survey(release: Release, values: Sequence[str] = ()) -> Iterator[Finding]:
 
 def permissions(release: Release) -> Finding:
     """Ask the API server what the user may do in the namespace."""
-    from kubernetes import client
-
-    api: Any = client.AuthorizationV1Api(release.client)
-    review = api.create_self_subject_access_review
-    wanted = list(ALSO)
-    for group, kinds in NEEDED.items():
-        wanted += [(group, verb, kind) for kind in kinds.split() for verb in VERBS]
     denied = []
-    for group, verb, kind in wanted:
+    for group, verb, kind in (*ALSO, *_needs()):
         resource, _, subresource = kind.partition("/")
-        asked = {
-            "namespace": release.namespace,
-            "group": group,
-            "verb": verb,
-            "resource": resource,
-            "subresource": subresource,
-        }
-        with explain_errors("ask for permissions", release.where):
-            answer = review(
-                {"spec": {"resourceAttributes": asked}}, _request_timeout=REQUEST_TIMEOUT
-            )
-        if not answer.status.allowed:
+        asked = {"namespace": release.namespace, "group": group, "verb": verb}
+        asked |= {"resource": resource, "subresource": subresource}
+        body = {"spec": {"resourceAttributes": asked}}
+        if not release.request("create", "selfsubjectaccessreviews", body=body).status.allowed:
             denied.append(f"{verb} {kind}")
     if denied:
         fix = "ask the administrator for the ClusterRole 'edit' in this namespace"
         return Finding("permissions", "missing", f"you may not {', '.join(denied)}", fix)
     return Finding("permissions", "ok", f"enough {release.where}")
+
+
+def _needs() -> Iterator[tuple[str, str, str]]:
+    """Yield API group, verb and kind of each permission that an install needs."""
+    for group, kinds in NEEDED.items():
+        for kind, verb in product(kinds.split(), VERBS):
+            yield group, verb, kind
 
 
 def render_chart(release: Release, values: Sequence[str]) -> list[Any]:
@@ -203,43 +194,34 @@ def quotas(release: Release, pods: dict[str, dict[str, Any]]) -> Iterator[Findin
     """Compare the requests and limits of all pods together with what each quota has left."""
     from kubernetes import utils
 
-    quantity: Any = utils.parse_quantity  # not annotated
-    needed = _needed(pods, quantity)
+    amount: Any = utils.parse_quantity  # not annotated
+    needed = _needed(pods, amount)
     for quota in release.request("list", "resourcequotas"):
-        used, hard = quota.status.used or {}, quota.status.hard or {}
-
-        def left(key: str, used: Any = used, hard: Any = hard) -> Any:
-            return quantity(hard[key]) - quantity(used.get(key, 0))
-
+        name, hard = f"quota {quota.metadata.name}", quota.status.hard or {}
+        used = Counter(quota.status.used or {})
         lacks = [
-            f"{key} {_text(amount)}, and {_text(left(key))} is left"
-            for key, amount in needed.items()
-            if key in hard and amount > left(key)
+            f"more {key}: {used[key]} of {hard[key]} are used"
+            for key in needed.keys() & hard.keys()
+            if needed[key] > amount(hard[key]) - amount(used[key])
         ]
-        name = f"quota {quota.metadata.name}"
         if lacks:
             fix = "ask for a larger quota, or set smaller resources of the containers"
-            yield Finding(name, "missing", f"the release needs {', '.join(lacks)}", fix)
+            yield Finding(name, "missing", f"the release needs {'; '.join(sorted(lacks))}", fix)
         else:
             yield Finding(name, "ok", "has enough left for one release")
 
 
-def _needed(pods: dict[str, dict[str, Any]], quantity: Callable[[Any], Any]) -> Counter[str]:
+def _needed(pods: dict[str, dict[str, Any]], amount: Callable[[Any], Any]) -> Counter[str]:
     """Return what all pods together need: name as in a quota, such as requests.cpu -> amount."""
     needed = Counter[str]()
     for spec in pods.values():
         for container in [*spec.get("initContainers", []), *spec["containers"]]:
             for kind, amounts in container.get("resources", {}).items():
-                for resource, amount in amounts.items():
-                    needed[f"{kind}.{resource}"] += quantity(amount)
+                for resource, text in amounts.items():
+                    needed[f"{kind}.{resource}"] += amount(text)
     needed |= {"cpu": needed["requests.cpu"], "memory": needed["requests.memory"]}
     needed |= {"pods": len(pods), "count/pods": len(pods)}
     return needed
-
-
-def _text(amount: Any) -> str:
-    """Format cores, bytes or a count: bytes in Mi."""
-    return f"{float(amount) / 2**20:g}Mi" if amount >= 2**20 else f"{float(amount):g}"
 
 
 def nodes(release: Release, pods: dict[str, dict[str, Any]]) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""What happens to pods in flight is told: evictions, killed containers."""
+"""What happens to pods in flight is told: events, killed containers."""
 
 import functools
 from types import SimpleNamespace
@@ -10,13 +10,6 @@ from cloudrc.cluster.jobs import JobGoneError, follow, run_job
 from cloudrc.cluster.pods import describe_end
 from tests.chart.conftest import CHART, values_of
 from tests.cluster.conftest import MISSION, pod, terminated
-
-DRAINED = {
-    "type": "DisruptionTarget",
-    "status": "True",
-    "reason": "EvictionByEvictionAPI",
-    "message": "drained",
-}
 
 
 def ended(exit_code, reason="Error", message="", at="2026-01-01T00:00:01Z"):
@@ -70,28 +63,20 @@ def kept(api, name="cloud-1"):
 
 
 @pytest.mark.parametrize(
-    ("conditions", "deleted", "words"),
+    ("kind", "reason", "told"),
     [
-        ([DRAINED], True, "evicted: EvictionByEvictionAPI: drained"),
-        ([{**DRAINED, "status": "False"}], True, "it was deleted or replaced"),
+        ("Normal", "Killing", ["pod world-1: Killing: by somebody"]),
+        ("Warning", "Evicted", ["pod world-1: Evicted: by somebody"]),
+        ("Warning", "Unhealthy", []),
+        ("Normal", "Started", []),
     ],
 )
-def test_a_pod_that_ends_in_flight_is_told_with_its_cause(
-    running, watch, conditions, deleted, words
-):
-    body = pod("world-1", "world", conditions=conditions)
-    body["metadata"] |= kept(running, "world-1")["metadata"]
-    if deleted:
-        body["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:01Z"
-    running.put("pods", body)
-    (sentence,) = watch.look()
-    assert sentence.startswith("the world pod ends: ")
-    assert words in sentence
-    waits = [{"type": "PodScheduled", "status": "False", "message": "0/1 nodes: unschedulable"}]
-    running.put("pods", pod("world-2", "world", ready=False, phase="Pending", conditions=waits))
-    starts, waits = watch.look()
-    assert starts == "a new world pod starts: world-2"
-    assert "no node takes it: 0/1 nodes: unschedulable" in waits
+def test_what_kubernetes_says_of_a_pod_in_flight_is_told_once(running, watch, kind, reason, told):
+    about = {"uid": running.get("pods", "world-1")["metadata"]["uid"], "name": "world-1"}
+    said = {"type": kind, "reason": reason, "message": "by\nsomebody", "involvedObject": about}
+    running.put("events", {"metadata": {"name": "e"}, **said})
+    assert list(watch.look()) == told
+    assert list(watch.look()) == []
 
 
 def gone(api, release):

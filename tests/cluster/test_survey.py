@@ -124,7 +124,7 @@ def test_a_quota_is_compared_with_both_pods_together(cluster, release):
     cluster.put("resourcequotas", {"metadata": {"name": "small"}, "status": status})
     seen = found(release)["quota small"]
     assert seen.state == "missing"
-    assert "needs requests.cpu 0.16, and 0.15 is left" in seen.found
+    assert "needs more requests.cpu: 0 of 150m are used" in seen.found
     status["hard"]["requests.cpu"] = "160m"
     assert found(release)["quota small"].state == "ok"
 
