@@ -3,13 +3,11 @@
 import copy
 import re
 import shlex
-import signal
 
 import pytest
 import yaml
 
 import cloudrc
-from cloudrc.cli.mission import TERMINATED
 from cloudrc.cli.parser import build_parser
 from cloudrc.config.load import load_experiment
 from tests.chart.conftest import CHART, of_kind, render
@@ -27,18 +25,6 @@ def load(mission):
 
 def jobs(values=None, **where):
     return list(of_kind(render(values, **where), "Job").values())
-
-
-@pytest.mark.parametrize("job", [*jobs(ENABLED), *(job for _, job in EXAMPLES.values())])
-def test_a_stopped_watcher_does_not_fail_its_job(job):
-    rules = job["spec"]["podFailurePolicy"]["rules"]
-    assert {rule["action"] for rule in rules} == {"Ignore"}
-    conditions = [each["type"] for rule in rules for each in rule.get("onPodConditions", [])]
-    assert conditions == ["DisruptionTarget"]
-    (codes,) = (rule["onExitCodes"] for rule in rules if "onExitCodes" in rule)
-    (container,) = job["spec"]["template"]["spec"]["containers"]
-    assert codes["containerName"] == container["name"]
-    assert set(codes["values"]) == {128 + signal.SIGKILL, TERMINATED}
 
 
 POINT = {"position_m": [0.0, 0.0, 1.0], "dwell_s": 2.0}

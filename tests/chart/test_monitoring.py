@@ -169,19 +169,6 @@ def queries(**where):
     ]
 
 
-def test_dashboards_of_several_releases_do_not_collide():
-    """Grafana refuses two dashboards with one uid, or with one title in a folder."""
-    places = (("demo", "lab"), ("demo", "class"), ("other", "lab"), ("d" * 53, "n" * 63))
-    found = [item for r, n in places for item in dashboards(release=r, namespace=n)[1].items()]
-    for distinct in (
-        {name for name, _ in found},
-        {one["uid"] for _, one in found},
-        {one["title"] for _, one in found},
-    ):
-        assert len(distinct) == len(found)
-    assert max(len(one["uid"]) for _, one in found) <= 40, "Grafana's limit"
-
-
 def test_panels_have_their_places_queries_and_states():
     states = {}
     for one in dashboards()[1].values():

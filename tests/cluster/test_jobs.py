@@ -1,7 +1,6 @@
 """Jobs of missions on the fake API server: created, followed, deleted."""
 
 import json
-from dataclasses import replace
 
 import pytest
 
@@ -33,14 +32,6 @@ def test_a_job_posts_the_mission_to_its_release(running, release):
     assert TOKEN not in str(job)
     run_job(release, MISSION, name="patient", queue=True)
     assert "--queue" in pod_of(running, "patient")["containers"][0]["args"]
-
-
-def test_a_job_has_an_unused_and_short_name(running, release):
-    for body in list(running.objects.values()):
-        body["metadata"].setdefault("labels", {})["app.kubernetes.io/instance"] = "r" * 53
-    names = {run_job(replace(release, name="r" * 53), MISSION) for _ in range(5)}
-    assert len(names) == 5
-    assert max(map(len, names)) <= 63 - len("-xxxxx")
 
 
 def test_follow_writes_each_line_once_and_returns_the_verdict(running, release):

@@ -135,17 +135,6 @@ def test_an_unreachable_or_silent_container_is_changed_later(cluster, refused):
     assert "a link container has another version: not a LinkState: " in said
 
 
-def test_a_failed_write_names_where_the_change_is_in_force(cluster, refused):
-    cluster.refused.add("patch")
-    said = refused(LINE, code=5)
-    assert "the ConfigMap is unchanged: 'kubectl patch' failed" in said
-    for way in ("uplink", "downlink"):
-        assert f"the {way} has the change until its pod is replaced" in said
-    cluster.refused.add("exec")
-    said = refused(LINE, code=5)
-    assert (said.count("this is forbidden"), "has the change" in said) == (3, False)
-
-
 def test_a_refused_change_is_not_written_to_the_configmap(cluster, refused):
     cluster.cannot["cloud-1"] = "corrupt"
     assert refused("link set downlink.corrupt=0.5 uplink.delay_ms=9 -n demo") == (

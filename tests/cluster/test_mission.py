@@ -11,7 +11,7 @@ from cloudrc.cluster import flight
 from cloudrc.cluster.client import NoAnswerError
 from cloudrc.drivers import local
 from cloudrc.runs.missions import read_mission
-from tests.cluster.conftest import OUT_OF_MEMORY, TOKEN, missions_of, pod, terminated
+from tests.cluster.conftest import TOKEN, missions_of, pod, terminated
 
 WAYPOINTS = "waypoints: [{position_m: [0.5, 0.0, 1.0]}]"
 VERDICT = {0: "SUCCESS: all met", 1: "FAILURE: pipe_contact"}
@@ -69,23 +69,6 @@ def test_the_other_verbs_go_to_the_api_of_the_release(running, teleop, call, ref
 UNKNOWN = "cloud.predictor: no predictor named 'nosuch'; available: kalman"
 CRASHES = terminated(2, f"cloudrc: error: {UNKNOWN}\n")
 SILENT = {"mission": None, "queue": [], "seen": None, "cloud_age_s": None}
-
-
-@pytest.mark.parametrize("state", [{"waiting": {"reason": "CrashLoopBackOff"}}, {"running": {}}])
-def test_the_status_tells_the_last_words_of_a_pod_that_ends(running, teleop, call, state):
-    teleop.state = SILENT
-    assert "container" not in call("mission status").out, "all pods run"
-    running.put("pods", pod("cloud-1", "cloud", ready=False, state=state, last=CRASHES))
-    running.put("pods", pod("world-1", "world", ready=False, state=state, last=OUT_OF_MEMORY))
-    _, silent, world, cloud = call("mission status").out.splitlines()
-    assert silent == "no telemetry from the robot yet; last message from cloud: never"
-    assert world.endswith("raise world.resources.limits.memory; it starts again")
-    assert cloud == (
-        f"container 'cloud' of the cloud pod ended with exit code 2: {UNKNOWN}; it starts again"
-    )
-    out, err = call("mission status -o json")
-    assert json.loads(out).items() > SILENT.items()
-    assert cloud in err
 
 
 def test_run_waits_until_the_release_is_ready(lands, call):

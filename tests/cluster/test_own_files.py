@@ -1,8 +1,6 @@
 """The user's robot and scene reach the pods as ConfigMaps, or one line says why they cannot."""
 
-import base64
 import shutil
-from pathlib import Path
 
 import pytest
 
@@ -41,22 +39,6 @@ def refused(robot):
 def test_files_in_the_robots_folder_are_found_and_unneeded_folders_left_out(robot):
     assert find_own_files(World(robot="rover", scene="pillars")) == {}
     assert sorted(find(robot)["robot"]) == ["robot.xml", "robot.yaml"]
-
-
-def test_a_linked_file_is_sent_with_the_content_that_the_link_leads_to(robot, api, release):
-    elsewhere = shutil.move(robot / "robot.xml", robot.parent / "shared.xml")
-    (robot / "robot.xml").symlink_to(elsewhere)
-    names = send_own_files(release, find(robot))
-    assert names == {"robot": "cloudrc-own-robot"}
-    data = api.get("configmaps", "cloudrc-own-robot")["binaryData"]
-    assert base64.b64decode(data["robot.xml"]) == Path(elsewhere).read_bytes()
-
-
-def test_a_second_run_replaces_the_files_of_the_first(robot, api, release):
-    send_own_files(release, find(robot))
-    (robot / "more.py").write_text("MORE = 1\n")
-    send_own_files(release, find(robot))
-    assert "more.py" in api.get("configmaps", "cloudrc-own-robot")["binaryData"]
 
 
 def test_a_missing_namespace_is_made_for_the_files(robot, api, release):

@@ -71,9 +71,7 @@ def in_msgpack_numpy_texts(array):
 
 
 @pytest.mark.parametrize("write", [in_texts, in_msgpack_numpy, in_msgpack_numpy_texts])
-@pytest.mark.parametrize(
-    "array", [np.arange(6, dtype="<f4").reshape(2, 3), np.array(2.5), np.float32(1.5), np.int64(3)]
-)
+@pytest.mark.parametrize("array", [np.arange(6, dtype="<f4").reshape(2, 3), np.float32(1.5)])
 def test_the_other_dialects_of_numpy_are_read(write, array):
     found = unpack(msgpack.packb({"in": {"a": write(array)}}))["in"]["a"]
     assert type(found) is type(array)

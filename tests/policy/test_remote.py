@@ -2,7 +2,6 @@
 
 import json
 import socket
-import threading
 from collections import Counter
 
 import numpy as np
@@ -70,14 +69,6 @@ def test_a_remote_controller_drives_a_robot_on_the_ground(policy):
     assert np.array_equal(served, true_path(load_experiment("pillars", ON_GROUND)))
 
 
-def test_a_remote_controller_that_leads_off_the_ground_ends_the_flight(policy):
-    source = PID.replace("[[*output.velocity,", "[[*output.velocity[:2], 3.0,")
-    with serving(policy(source)) as url, pytest.raises(ControllerLostError) as raised:
-        true_path(experiment(url, name="pillars", short=ON_GROUND))
-    assert raised.value.code == "controller_invalid"
-    assert f"{url}: its velocity in z is 3 m/s, but the robot rover stays" in str(raised.value)
-
-
 def lost(answer, tmp_path, metadata=b"\x80", settings=()):
     """Fly with a server that behaves as `answer`; return the error and the report."""
     with stock_like(answer, metadata) as url, pytest.raises(ControllerLostError) as raised:
@@ -125,15 +116,6 @@ def test_a_wrong_answer_in_flight_ends_it_with_one_line_and_a_recording(tmp_path
     assert report is not None
     with pytest.raises(ControllerLostError, match=text):
         raise error
-
-
-def test_a_late_answer_in_flight_ends_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(remote, "VIRTUAL_LIMIT", 0.05)
-    ended = threading.Event()
-    error, report = lost(after(20, lambda link: ended.wait(0.3) and None), tmp_path)
-    assert report is not None
-    assert error.code == "controller_silent"
-    assert "no answer within 0.05 s" in str(error)
 
 
 @pytest.fixture
@@ -298,19 +280,6 @@ def test_answers_of_an_earlier_mission_do_not_count(flight):
     assert flight.step() == [0.0]
     flight.answer(2.0)
     assert flight.step() == [2.0]
-
-
-def test_short_pauses_of_a_busy_loop_do_not_hide_that_a_program_is_silent(flight):
-    flight.step()
-    flight.answer(1.0)
-
-    def step_and_pause():
-        flight.step(10)
-        flight.now_ns += 150_000_000
-        return True
-
-    with pytest.raises(ControllerLostError, match="for 5 s"):
-        assert all(step_and_pause() for _ in range(60))
 
 
 def test_a_pause_of_the_loop_is_no_silence_of_the_program(flight):

@@ -182,15 +182,6 @@ def test_a_late_answer_is_not_taken_for_the_next_one():
             client.infer(STATE)
 
 
-def test_a_server_that_dies_is_named():
-    def die(connection, frame):
-        connection.socket.shutdown(socket.SHUT_RDWR)
-
-    with stock_like(die) as url, PolicyClient(url) as client:
-        with pytest.raises(SilentServerError, match="ended before its answer"):
-            client.infer(STATE)
-
-
 def test_two_answers_to_one_observation_are_refused():
     """The second would be taken for the answer to the next observation."""
 
