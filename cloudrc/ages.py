@@ -1,69 +1,45 @@
-"""Simulate how old commands and their confirmations become, before a flight.
+"""Compute how old commands and their confirmations become, before a flight.
 
 The delays are those of the flight, because link and cloud draw the same random numbers.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cloudrc.assembly import build_compute_time
 from cloudrc.config.robot import known_robot
+from cloudrc.link.draws import BLOCK, OVERTAKES, impairments, stream_key
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.queue import PacketQueue
 from cloudrc.link.traces import link_profile
-from cloudrc.messages import plan_length
+from cloudrc.messages import NEVER_NS, plan_length
 from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES, Kind
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
 
 DURATION_NS = 20_000_000_000
-"""Simulated time [ns]."""
-NEVER_NS = -1
-"""Stamp of a datagram that no end has received yet [ns]."""
-Datagram: TypeAlias = tuple[int, int]
-"""Stamp of a datagram, and the stamp that it confirms [ns]."""
+"""Time of the streams [ns]."""
+Array: TypeAlias = NDArray[np.int64]
 
 
-class _Way:
-    """One direction of the link, with the stream of datagrams that cross it.
+class _Arrivals(NamedTuple):
+    """The arrivals of a stream of datagrams, the earliest first."""
 
-    Attributes:
-        newest: The datagram that the far end uses; None before the first.
-    """
+    at_ns: Array  # times of arrival [ns], shape (n,)
+    newest: Array  # number of the datagram that the far end uses from then on [1], shape (n,)
+    at_once: Array  # whether the datagram arrived when its end began to make it, shape (n,)
 
-    def __init__(
-        self, link: LinkDirection, kind: Kind, size: int, rate_hz: int, *, newest_wins: bool
-    ) -> None:
-        self._link, self._kind, self._size, self._newest_wins = link, kind, size, newest_wins
-        self._period_ns, self._due_ns = round(1e9 / rate_hz), 0
-        self.newest: Datagram | None = None
-
-    def is_due(self, now_ns: int) -> bool:
-        """Whether an end that is free sends a datagram now: once per period."""
-        if now_ns < self._due_ns:
-            return False
-        self._due_ns = self.next_period_ns(now_ns)
-        return True
-
-    def next_period_ns(self, now_ns: int) -> int:
-        """Return when the next period begins [ns]."""
-        return (now_ns // self._period_ns + 1) * self._period_ns
-
-    def send(self, queue: PacketQueue, datagram: Datagram, now_ns: int) -> None:
-        """Send a datagram at `now_ns` [ns]."""
-        count = datagram[0] // self._period_ns
-        queue.put(self, self._link.send(1, self._kind, count, self._size, now_ns), datagram)
-
-    def arrive(self, datagram: Datagram) -> None:
-        """Take a datagram at the far end."""
-        if self.newest is None or datagram[0] > self.newest[0] or not self._newest_wins:
-            self.newest = datagram
+    def used_before(self, times_ns: Array) -> Array:
+        """Return the number of the datagram in use before each time [ns], shape (m,); -1: none."""
+        return np.append(self.newest, -1)[self.at_ns.searchsorted(times_ns) - 1]
 
 
 def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]:
-    """Simulate telemetry and commands over the experiment's link, without its blackouts.
+    """Compute the ages of telemetry and commands over the experiment's link, without blackouts.
 
     While cloud computes a command, it begins no other one.
 
@@ -71,54 +47,92 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
     follows, and of the newest command that telemetry has confirmed. Both have an age at each
     departure and arrival of a datagram, just before it.
     """
-    plan = plan_length(experiment.cloud.plan_s)
+    world, cloud = experiment.world, experiment.cloud
+    plan = plan_length(cloud.plan_s)
     newest_wins = experiment.tunnel.order == "newest" or plan > 0
-    up = _Way(
-        _always_up(experiment, uplink=True),
-        Kind.TELEMETRY,
-        TELEMETRY_SIZES[len(known_robot(experiment.world.robot).sensors)],
-        experiment.world.odometry_rate_hz,
-        newest_wins=newest_wins,
-    )
-    down = _Way(
-        _always_up(experiment, uplink=False),
-        Kind.COMMAND,
-        COMMAND_SIZES[plan],
-        experiment.cloud.command_rate_hz,
-        newest_wins=newest_wins,
-    )
-    queue, compute = PacketQueue(), build_compute_time(experiment)
-    ages, echoes = list[float](), list[float]()
-    now_ns = free_ns = 0  # cloud has sent its last command at `free_ns`
-    while now_ns < DURATION_NS:
-        _deliver(queue, now_ns)
-        if up.is_due(now_ns):
-            up.send(queue, (now_ns, NEVER_NS if down.newest is None else down.newest[0]), now_ns)
-            _deliver(queue, now_ns)
-        if now_ns >= free_ns and down.is_due(now_ns) and up.newest is not None:
-            free_ns = now_ns + (0 if compute is None else compute.end())
-            down.send(queue, (now_ns, up.newest[0]), free_ns)
-            _deliver(queue, now_ns)
-        next_ns = min(queue.next_ns, *(way.next_period_ns(now_ns) for way in (up, down)))
-        if now_ns < free_ns:
-            next_ns = min(next_ns, free_ns)
-        if down.newest is not None:
-            ages.append((next_ns - down.newest[1]) * 1e-9)
-        if up.newest is not None and up.newest[1] != NEVER_NS:
-            echoes.append((next_ns - up.newest[1]) * 1e-9)
-        now_ns = next_ns
-    return ages, echoes
+    grids_ns = [
+        np.arange(0, DURATION_NS + period_ns, period_ns)
+        for period_ns in (
+            round(1e9 / rate) for rate in (world.odometry_rate_hz, cloud.command_rate_hz)
+        )
+    ]
+    measured_ns, grid_ns = (grid_ns[grid_ns < DURATION_NS] for grid_ns in grids_ns)
+    size = TELEMETRY_SIZES[len(known_robot(world.robot).sensors)]
+    up = _cross(experiment, Kind.TELEMETRY, size, measured_ns, measured_ns, newest_wins)
+    heard_ns = up.at_ns.min(initial=DURATION_NS)
+    begun_ns, sent_ns = _commands(experiment, grid_ns[grid_ns >= heard_ns])
+    down = _cross(experiment, Kind.COMMAND, COMMAND_SIZES[plan], begun_ns, sent_ns, newest_wins)
+    times_ns = np.unique(np.concatenate([*grids_ns, sent_ns, up.at_ns, down.at_ns]))
+    times_ns = times_ns[1 : times_ns.searchsorted(DURATION_NS) + 1]
+    basis_ns = measured_ns[up.used_before(begun_ns + 1)]
+    # Telemetry leaves before a command of the same time, even if this needs no time at all.
+    echoed = down._replace(at_ns=down.at_ns + down.at_once).used_before(measured_ns + 1)
+    echo_ns = np.append(begun_ns, NEVER_NS)[echoed]
+    ages = _ages(times_ns, basis_ns, down.used_before(times_ns))
+    return ages, _ages(times_ns, echo_ns, up.used_before(times_ns))
 
 
-def _deliver(queue: PacketQueue, now_ns: int) -> None:
-    """Let all datagrams arrive that are due at `now_ns` [ns]."""
-    while queue.next_ns <= now_ns:
-        _, way, datagram = queue.pop()
-        way.arrive(datagram)
+def _commands(experiment: ResolvedExperiment, grid_ns: Array) -> tuple[Array, Array]:
+    """Return when cloud begins each command, and when it sends it [ns].
+
+    `grid_ns` are the begins of the periods since the first telemetry arrived [ns], shape (n,).
+    """
+    compute = build_compute_time(experiment)
+    if compute is None or not len(grid_ns):
+        return grid_ns, grid_ns
+    period_ns, begin_ns = round(1e9 / experiment.cloud.command_rate_hz), int(grid_ns[0])
+    begun_ns, sent_ns = list[int](), list[int]()
+    while begin_ns < DURATION_NS:
+        begun_ns.append(begin_ns)
+        sent_ns.append(begin_ns + compute.end())
+        begin_ns = max(sent_ns[-1], (begin_ns // period_ns + 1) * period_ns)
+    return np.array(begun_ns), np.array(sent_ns)
 
 
-def _always_up(experiment: ResolvedExperiment, *, uplink: bool) -> LinkDirection:
-    """Return a direction of the experiment's link without blackouts and without damage."""
+def _cross(
+    experiment: ResolvedExperiment,
+    kind: Kind,
+    size: int,
+    begun_ns: Array,
+    sent_ns: Array,
+    newest_wins: bool,
+) -> _Arrivals:
+    """Send datagrams of `size` bytes over one direction of the link; return their arrivals.
+
+    `begun_ns` are the times at which their end began to make them, `sent_ns` those of sending [ns].
+    """
+    uplink = kind is Kind.TELEMETRY
     way = experiment.uplink if uplink else experiment.downlink
-    way = way.model_copy(update={"blackouts": (), "corrupt": 0.0})
-    return LinkDirection(link_profile(way), experiment.seed, uplink)
+    rate_hz = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
+    numbers = (begun_ns // round(1e9 / rate_hz)).tolist()
+    profile = link_profile(way.model_copy(update={"blackouts": (), "corrupt": 0.0}))
+    link = LinkDirection(profile, experiment.seed, uplink)
+    if (only := link.only) is not None:  # nearly all links: a call per block of packets
+        key = stream_key(experiment.seed, uplink, 1, kind)
+        blocks = range(numbers[-1] // BLOCK + 1 if numbers else 0)
+        tables = [impairments(key, block, profile, only.jitter, only.loss) for block in blocks]
+        fates = [tables[number // BLOCK][number % BLOCK] for number in numbers]
+    else:
+        datagrams = zip(numbers, sent_ns.tolist(), strict=True)
+        fates = [link.send(1, kind, number, size, now_ns) for number, now_ns in datagrams]
+    copies = [(row, entry) for row, fate in enumerate(fates) for entry in fate]
+    rows, at_ns = np.array(copies, np.int64).reshape(-1, 2).T
+    if only is not None:
+        delays_ns = np.where(at_ns == OVERTAKES, 0, only.delay_ns + at_ns)
+        at_ns = sent_ns[rows] + np.maximum(delays_ns, 0)
+    order = at_ns.argsort(kind="stable")
+    rows, at_ns = rows[order], at_ns[order]
+    newest = np.maximum.accumulate(rows) if newest_wins else rows
+    return _Arrivals(at_ns, newest, at_ns == begun_ns[rows])
+
+
+def _ages(times_ns: Array, stamps_ns: Array, used: Array) -> list[float]:
+    """Return the ages of the stamps that datagrams have [s], at each of `times_ns` [ns].
+
+    `stamps_ns` are the stamps of all datagrams [ns], or NEVER_NS. `used` are those in use at
+    the times, -1 if none; then there is no age.
+    """
+    found_ns = np.append(stamps_ns, NEVER_NS)[used]
+    known = found_ns != NEVER_NS
+    ages: list[float] = ((times_ns[known] - found_ns[known]) * 1e-9).tolist()
+    return ages

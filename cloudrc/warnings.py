@@ -12,6 +12,7 @@ from itertools import pairwise
 from math import ceil, dist, exp, floor
 from typing import TYPE_CHECKING, Any
 
+from cloudrc.config.reuse import reuse_results
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.rounding import exceeds, format_limit
 
@@ -29,8 +30,13 @@ FITTED = "command_history", "kalman", "model_based"
 """Predictors that use the response of a robot that has no better model."""
 
 
-def advise(experiment: ResolvedExperiment) -> Iterator[str]:
-    """Yield a warning for each group of settings that do not fit together."""
+@reuse_results()  # ten checks look at the file of the robot
+def advise(experiment: ResolvedExperiment) -> list[str]:
+    """Return a warning for each group of settings that do not fit together."""
+    return list(_advise(experiment))
+
+
+def _advise(experiment: ResolvedExperiment) -> Iterator[str]:
     from cloudrc.ages import simulate_ages
 
     ways = _directions(experiment)
