@@ -96,6 +96,13 @@ class GroundTruth(NamedTuple):
     reference: Annotated[Vector, "m/s", "after the guard's caps, world frame"]
 
 
+class SensorLabel(NamedTuple):
+    """What robot.yaml says of a sensor."""
+
+    name: str
+    unit: str
+
+
 class ContactForce(NamedTuple):
     """Made by world at each odometry sample: true force on the probe. Topic /contact_force.
 
@@ -106,12 +113,14 @@ class ContactForce(NamedTuple):
     force: Annotated[float, "N", "on the robot's probe"]
     force_peak: Annotated[float, "N", "largest of all physics steps since the row before"]
     impulse: Annotated[float, "N s", "force times time since the row before"]
+    sensor: SensorLabel | None = None  # of the sensor in robot.yaml that shows this force
 
 
 class SensorRead(NamedTuple):
     """Made by world at each odometry sample: what one of the robot's own sensors shows.
 
-    Topic /sensor. Telemetry carries these values to cloud.
+    Topic /sensor. Telemetry carries these values to cloud. The sensor that shows the force on the
+    probe has no such record: its rows of the topic come from `ContactForce`.
     """
 
     stamp_ns: int

@@ -33,6 +33,7 @@ from cloudrc.records import (
     Arrival,
     CommandApplied,
     Contact,
+    ContactForce,
     Control,
     Counted,
     Fault,
@@ -192,6 +193,12 @@ class WorldEnd(End):
     def _on_sensorread(self, record: SensorRead) -> None:
         _, name, unit, value = record
         self._set("cloudrc_sensor_value", name, {unit: value})
+
+    def _on_contactforce(self, record: ContactForce) -> None:
+        if record.sensor is not None:
+            self._set(
+                "cloudrc_sensor_value", record.sensor.name, {record.sensor.unit: record.force}
+            )
 
     def _on_commandapplied(self, record: CommandApplied) -> None:
         self._basis_ns = record.basis_stamp_ns

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, repeat
 from pathlib import Path
@@ -24,7 +24,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.record.content import Content
 from cloudrc.record.content import Message as Message  # callers take it from here, too
 from cloudrc.record.topics import ADDED, BY_SOURCE, TOPICS, Kind, Topic
-from cloudrc.records import Arrival, Record
+from cloudrc.records import Record
 
 Column: TypeAlias = NDArray[Any]
 
@@ -80,7 +80,7 @@ class Table:
 def _column(kind: Kind, values: Any) -> Column:
     dtype, shape = _TYPES[kind]
     if shape and not isinstance(values, np.ndarray):  # asarray takes three times as long
-        values = np.fromiter(chain.from_iterable(values), dtype)
+        values = np.fromiter(chain.from_iterable(values), dtype, len(values) * shape[0])
     column: Column = np.asarray(values, dtype=dtype).reshape(-1, *shape)
     column.flags.writeable = False
     return column
@@ -190,6 +190,21 @@ class Recording(Content):
         return Table(TOPICS[topic], zip(*rows, strict=True))
 
 
+class _Values(dict[str, Any]):
+    """The values of named tuples of one class: dotted path of a field -> a value per tuple."""
+
+    def __init__(self, tuples: Sequence[Any], path: str = "") -> None:
+        names = tuples[0]._fields
+        super().__init__(
+            zip([path + name for name in names], zip(*tuples, strict=True), strict=True)
+        )
+
+    def __missing__(self, path: str) -> Any:
+        head = path.rpartition(".")[0]
+        self |= _Values(self[head], f"{head}.")
+        return self[path]
+
+
 class RecordStore:
     """Keeps the records of a flight as columns, which take less memory than the records."""
 
@@ -206,21 +221,23 @@ class RecordStore:
 
     def _convert(self, kind: type[Record]) -> None:
         """Convert the waiting records of one class to a block for each of their topics."""
-        records: list[Any] = self._waiting.pop(kind, [])
+        if not (records := self._waiting.pop(kind, [])):
+            return
+        whole = _Values(records)
         for topic in BY_SOURCE[kind]:
-            chosen = records
-            if kind is Arrival:
-                is_uplink = topic.end == "cloud"
-                chosen = [record for record in records if record.uplink == is_uplink]
-            columns = zip(*map(topic.row, chosen), strict=True)
-            self._blocks[topic.name].append(Table(topic, columns))
+            if chosen := topic.choose(records):
+                values = whole if chosen is records else _Values(chosen)
+                block = Table(topic, map(values.__getitem__, topic.paths[kind]))
+                self._blocks[topic.name].append(block)
 
     def table(self, topic: Topic) -> Table:
         """Make the table of a topic; the stamps of all records must be on one clock."""
-        self._convert(topic.source)
-        blocks = self._blocks[topic.name]
+        for kind in topic.paths:
+            self._convert(kind)
+        if not (blocks := self._blocks[topic.name]):
+            return Table(topic, ())
         columns = [np.concatenate([block[name] for block in blocks]) for name in blocks[0].names]
-        if topic.end == "either":  # in the order of time, world's row first
+        if topic.end == "either" or topic.also:  # in the order of time, world's row first
             order = np.argsort(columns[0], kind="stable")
             columns = [column[order] for column in columns]
         return Table(topic, columns)

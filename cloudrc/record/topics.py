@@ -53,6 +53,7 @@ class Topic:
     text: str  # meaning of a row
     names: str = ""  # the columns after `stamp_ns`, separated by spaces; "": all values of `parts`
     parts: tuple[str, ...] = ("",)  # paths of nested records, each with a final dot; "": `source`
+    also: tuple[type[Record], str] | None = None  # further class of records, paths of the columns
 
     @cached_property
     def fields(self) -> tuple[Field, ...]:
@@ -62,13 +63,27 @@ class Topic:
         return tuple(field for field in known if field.name in names)
 
     @cached_property
-    def row(self) -> Callable[[Record], Row]:
-        """Function that converts a record to a row."""
-        return attrgetter(f"{self.parts[0]}stamp_ns", *(field.path for field in self.fields))
+    def paths(self) -> dict[type[Record], list[str]]:
+        """Class of records -> dotted paths of stamp and columns in such a record."""
+        own = [f"{self.parts[0]}stamp_ns", *(field.path for field in self.fields)]
+        return {self.source: own} | ({self.also[0]: self.also[1].split()} if self.also else {})
 
-    def contains(self, record: Record) -> bool:
-        """Return whether a record of the class `source` gives a row of this topic."""
-        return not isinstance(record, rec.Arrival) or record.uplink == (self.end == "cloud")
+    @cached_property
+    def _getters(self) -> dict[type[Record], Callable[[Record], Row]]:
+        return {kind: attrgetter(*paths) for kind, paths in self.paths.items()}
+
+    def row(self, record: Record) -> Row:
+        """Convert a record to a row."""
+        return self._getters[type(record)](record)
+
+    def choose(self, records: list[Any]) -> list[Any]:
+        """Return those of the records, all of one class, that give a row of this topic."""
+        if self.source is rec.Arrival:
+            is_uplink = self.end == "cloud"
+            return [record for record in records if record.uplink == is_uplink]
+        if self.also and isinstance(records[0], self.also[0]):
+            return [record for record in records if record.sensor is not None]
+        return records
 
 
 _KINDS: dict[Any, Kind] = {
@@ -101,7 +116,8 @@ _TABLE = (
     Topic("/contact_force", "cloudrc_msgs/msg/ContactForce", rec.ContactForce, "world",
         "Force on the touch sensor of the robot's probe, world's clock. Only with such a sensor"),
     Topic("/sensor", "cloudrc_msgs/msg/SensorRead", rec.SensorRead, "world",
-        "Value of one of the robot's own sensors, world's clock. Telemetry carries it to cloud"),
+        "Value of one of the robot's own sensors, world's clock. Telemetry carries it to cloud",
+        also=(rec.ContactForce, "stamp_ns sensor.name sensor.unit force")),
     Topic("/reference", "geometry_msgs/msg/TwistStamped", rec.GroundTruth, "world",
         "Velocity that the guard lets the onboard controller follow, world's clock", "reference"),
     Topic("/uplink_delay", "cloudrc_msgs/msg/Arrival", rec.Arrival, "cloud",
@@ -166,7 +182,7 @@ VIEWS: dict[str, str] = {
 Foxglove and Lichtblick can show (`cloudrc/report/views.py`). A report does not read them."""
 
 BY_SOURCE: dict[type[Record], list[Topic]] = {
-    source: [topic for topic in _TABLE if topic.source is source]
+    source: [topic for topic in _TABLE if source in topic.paths]
     for source in {topic.source for topic in _TABLE}
 }
 """Class of records -> its topics."""
@@ -174,4 +190,4 @@ BY_SOURCE: dict[type[Record], list[Topic]] = {
 
 def topics_of(record: Record) -> list[Topic]:
     """List the topics in which a record gives a row, in the order of `TOPICS`."""
-    return [topic for topic in BY_SOURCE[type(record)] if topic.contains(record)]
+    return [topic for topic in BY_SOURCE[type(record)] if topic.choose([record])]

@@ -212,9 +212,10 @@ class WorldEndpoint(TunnelEnd):
         truth, shown = simulator.truth(now_ns), simulator.read_sensors()
         records.append(_new(GroundTruth, (now_ns, truth, self.robot.guard.reference)))
         if (force := simulator.take_contact_force()) is not None:
-            records.append(_new(ContactForce, (now_ns, *force)))
+            records.append(_new(ContactForce, (now_ns, *force, simulator.force_sensor)))
         for (name, unit, _), value in zip(simulator.sensors, shown, strict=True):
-            records.append(_new(SensorRead, (now_ns, name, unit, value)))
+            if (name, unit) != simulator.force_sensor:  # it is in the contact force
+                records.append(_new(SensorRead, (now_ns, name, unit, value)))
         return truth, shown
 
     def _record_events(self, now_ns: int) -> None:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import ZERO, Odometry, Vector
-from cloudrc.records import Contact
+from cloudrc.records import Contact, SensorLabel
 from cloudrc.world.onboard import Actuators, Commands, Inputs
 from cloudrc.world.own_sensors import OwnSensor, find_force
 from cloudrc.world.plant import Wind
@@ -47,6 +47,7 @@ class Simulator:
         steps: Number of steps since the last reset.
         contacts: Number of contacts in the last step.
         sensors: The robot's own sensors, those of its `robot.yaml`.
+        force_sensor: Label of the one of `sensors` that shows the force on the probe, if any.
         force_peak: Largest force on the probe since the last call of `take_contact_force` [N].
         impulse: Integral over time of the force on the probe since that call [N s].
         touches: Contacts that began since the last call of `take_contacts`.
@@ -87,6 +88,8 @@ class Simulator:
         self._addresses = [each.address for each in sensors]
         self._probe = -1 if probe is None else find_site(model, probe)
         self._force_address = find_force(model, self._probe)
+        of_force = (each for each in sensors if each.address == self._force_address)
+        self.force_sensor = next((SensorLabel(each.name, each.unit) for each in of_force), None)
         self._probe_offset: Vector = ZERO
         self._probe_radius = -1.0
         if self._probe >= 0:

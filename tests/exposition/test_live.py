@@ -15,11 +15,13 @@ from cloudrc.records import (
     Arrival,
     CommandApplied,
     Contact,
+    ContactForce,
     Counted,
     GuardChange,
     Lateness,
     LinkChecked,
     MissionEvent,
+    SensorLabel,
     SensorRead,
     SessionOpened,
     TelemetrySent,
@@ -168,8 +170,10 @@ def test_each_own_sensor_of_the_robot_has_a_value_and_a_robot_without_has_none()
     live = LiveMetrics("world")
     assert "cloudrc_sensor_value" not in live.read()
     live.see([SensorRead(0, "battery", "V", 11.9), SensorRead(0, "range", "m", math.nan)])
-    live.see([SensorRead(1, "battery", "V", 11.8)])
+    live.see([SensorRead(1, "battery", "V", 11.8), ContactForce(1, 0.5, 0.6, 0.0)])
     assert live.read()["cloudrc_sensor_value"] == {("battery", "V"): 11.8}
+    live.see([ContactForce(2, 0.5, 0.6, 0.0, SensorLabel("tip", "N"))])
+    assert value(live, "cloudrc_sensor_value", "tip", "N") == 0.5
 
 
 def test_changes_of_the_guard_are_counted_by_cause():

@@ -34,6 +34,8 @@ def _unit(q):
 def _strategy(name, kind):
     if hasattr(kind, "_fields"):
         return instances(kind)
+    if kind == rec.SensorLabel | None:
+        return st.none() | instances(rec.SensorLabel)
     if get_origin(kind) is tuple:
         return st.tuples(*[_metres] * 3) if len(get_args(kind)) == 3 else _directions.map(_unit)
     if issubclass(kind, IntEnum):

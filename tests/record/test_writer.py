@@ -1,5 +1,6 @@
 """The file is a valid MCAP, and only recording needs the packages for it."""
 
+import gc
 import subprocess
 import sys
 import tracemalloc
@@ -62,6 +63,7 @@ def test_an_hour_of_recording_takes_no_memory(tmp_path):
                 writer.write([record._replace(stamp_ns=stamp_ns) for record in records])
                 writer.flush()
                 if n % count == 0:
+                    gc.collect()
                     grown.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()

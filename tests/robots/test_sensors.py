@@ -69,6 +69,7 @@ def test_the_contact_force_needs_no_entry_in_sensors(seeing):
     found = cloudrc.fly("hover", HOVER | {"world.robot": seeing("probe: tip")})
     assert len(found["/contact_force"]) == len(found["/ground_truth"])
     assert len(found["/sensor"]) == 0
+    assert len(found["/sensor"]) == 0
 
 
 def test_the_pelican_tells_the_force_on_its_probe_as_its_own_sensor():
