@@ -14,7 +14,6 @@ from cloudrc.metrics.definitions import (
     delay_error,
     prediction_error,
     real_time_factor,
-    target_ns,
     tracking_error,
 )
 from cloudrc.metrics.flight import (
@@ -28,7 +27,7 @@ from cloudrc.metrics.flight import (
     rms,
     select,
 )
-from cloudrc.record.columns import Table
+from cloudrc.record.columns import datagrams, join
 from cloudrc.rounding import differences
 
 
@@ -41,32 +40,27 @@ def _echoes(flight: Flight) -> Columns:
         arrival [s]; `rtt`, the same without the hold time in world [s]; `is_first`, whether no
         earlier row is about the same command; `is_sample`, whether the estimator got the row.
     """
-    applied, sent = flight.recording["/command_applied"], flight.recording["/telemetry"]
-    estimates, arrivals = flight.recording["/delay_estimate"], flight.during("/uplink_delay")
-    made = dict(zip(_numbers(estimates), estimates["stamp_ns"].tolist(), strict=True))
+    applied, estimates = flight.recording["/command_applied"], flight.recording["/delay_estimate"]
+    telemetry, arrivals = flight.recording["/telemetry"], flight.during("/uplink_delay")
+    is_echo = telemetry["echo_stamp_ns"] != NEVER_NS
+    sent_ns, held_ns = (telemetry[name][is_echo] for name in ("stamp_ns", "echo_hold_ns"))
+    used = select(arrivals, arrivals["used"])
+    arrived, echo = join(datagrams(used), datagrams(telemetry)[is_echo])
     # The stamp in an echo may be on another clock than the recording: the time of application,
     # world's clock, tells the command.
-    commands = dict(zip(applied["stamp_ns"].tolist(), _numbers(applied), strict=True))
-    echoed = sent["echo_stamp_ns"] != NEVER_NS
-    applied_ns, holds_ns = sent["stamp_ns"] - sent["echo_hold_ns"], sent["echo_hold_ns"]
-    rows = zip(applied_ns[echoed].tolist(), holds_ns[echoed].tolist(), strict=True)
-    telemetry = dict(zip(_numbers(sent, echoed), rows, strict=True))
-    known, found = set[tuple[int, int]](), list[tuple[int, int, int, bool]]()
-    used = arrivals["used"]
-    for number, stamp_ns in zip(
-        _numbers(arrivals, used), arrivals["stamp_ns"][used].tolist(), strict=True
-    ):
-        at_ns, hold_ns = telemetry.get(number, (NEVER_NS, 0))
-        command = commands.get(at_ns)
-        if command in made:
-            found.append((stamp_ns, stamp_ns - made[command], hold_ns, command not in known))
-            known.add(command)
-    stamps_ns, loops_ns, held_ns, is_first = np.array(found, np.int64).reshape(-1, 4).T
+    echoed, command = join((sent_ns - held_ns)[echo], applied["stamp_ns"])
+    numbers = datagrams(applied)[command]
+    rows, made = join(numbers, datagrams(estimates))
+    echoed = echoed[rows]
+    stamps_ns, held_ns = used["stamp_ns"][arrived[echoed]], held_ns[echo[echoed]]
+    loops_ns = stamps_ns - estimates["stamp_ns"][made]
+    is_first = np.zeros(len(rows), dtype=bool)
+    is_first[np.unique(numbers[rows], return_index=True)[1]] = True
     return {
         "stamp_ns": stamps_ns,
         "loop_delay": loops_ns * 1e-9,
         "rtt": (loops_ns - held_ns) * 1e-9,
-        "is_first": is_first.astype(bool),
+        "is_first": is_first,
         "is_sample": held_ns <= FRESH_ECHO_PERIODS * round(1e9 / flight.command_rate_hz),
     }
 
@@ -81,12 +75,6 @@ def delay_samples(flight: Flight) -> Array:
     """Return the loop delays that the estimator got as samples [s], in order of arrival."""
     rows = _echoes(flight)
     return np.asarray(rows["loop_delay"][rows["is_sample"]])
-
-
-def _numbers(table: Table | Columns, rows: Array | slice = slice(None)) -> list[tuple[int, int]]:
-    """Return epoch and counter, which identify a datagram, of the `rows` of a table."""
-    epochs, counters = table["epoch"][rows].tolist(), table["counter"][rows].tolist()
-    return list(zip(epochs, counters, strict=True))
 
 
 def _age_of_information(flight: Flight) -> float | None:
@@ -196,8 +184,7 @@ def estimate_errors(flight: Flight) -> tuple[float | None, Array, Array]:
     The result is that of `compare_with_truth`.
     """
     control = flight.control
-    each = zip(control["basis_stamp_ns"].tolist(), control["horizon"].tolist(), strict=True)
-    at_ns = np.array([target_ns(*one) for one in each], dtype=np.int64)
+    at_ns = control["basis_stamp_ns"] + np.rint(control["horizon"] * 1e9).astype(np.int64)
     return compare_with_truth(flight, at_ns, control["position"])
 
 

@@ -3,7 +3,8 @@
 Each quantity is computed step by step. Live metrics and console do so while the records arrive, the
 report does so afterwards, with the same functions. So the same records give the same value, except
 for two quantities of which the report knows more: it waits longer for a missing datagram before
-it counts the datagram as lost (`WINDOW_MAX`), and it knows the true positions (`PredictionJudge`).
+it counts the datagram as lost (`link.WINDOW_MAX`), and it knows the true positions
+(`PredictionJudge`).
 """
 
 from __future__ import annotations
@@ -185,9 +186,7 @@ class DelayJudge:
 WINDOW = 128
 """In flight, a missing datagram counts as lost after this number of newer datagrams: 1.28 s at 100
 Hz, so that a loss shows soon."""
-WINDOW_MAX = 1024
-"""In a report, a missing datagram counts as lost after this number of newer datagrams; the receiver
-refuses an older one, whether it is new or repeated (`cloudrc.tunnel.channel.WINDOW`)."""
+ALL_SEEN = (1 << WINDOW) - 1
 
 
 class DatagramTally:
@@ -196,32 +195,20 @@ class DatagramTally:
     The sender numbers datagrams by a counter, which restarts in each epoch (session).
 
     Attributes:
-        lost: Number of datagrams that had not arrived when the peer had sent `window` newer ones.
+        lost: Number of datagrams that had not arrived when the peer had sent `WINDOW` newer ones.
         reordered: Number of datagrams that arrived after a newer one, without repetitions.
     """
 
-    def __init__(self, window: int = WINDOW) -> None:
-        """Count a missing datagram as lost after `window` newer datagrams, > 0."""
+    def __init__(self) -> None:
         self.lost = self.reordered = 0
-        self._window, self._mask = window, (1 << window) - 1
         self._before = 0  # value of `expected` at the end of the last epoch
         self._epoch = self._first = self._newest = -1
-        self._seen = self._mask  # bit k: the datagram with the counter newest - k has arrived
+        self._seen = ALL_SEEN  # bit k: the datagram with the counter newest - k has arrived
 
     @property
     def expected(self) -> int:
         """Number of datagrams for which the receiver no longer waits: arrived or lost."""
-        return self._before + max(0, self._newest - self._first - self._window + 1)
-
-    @property
-    def loss(self) -> float:
-        """Share of the expected datagrams that were lost, in [0, 1]; NaN if none was expected."""
-        return self.lost / self.expected if self.expected else nan
-
-    def begin(self, epoch: int, first: int) -> None:
-        """Expect the datagrams of a session, from the counter `first` on."""
-        self._before = self.expected
-        self._epoch, self._first, self._newest, self._seen = epoch, first, first - 1, self._mask
+        return self._before + max(0, self._newest - self._first - WINDOW + 1)
 
     def take(self, epoch: int, counter: int) -> bool:
         """Count the arrival of a datagram; return True if the datagram is certainly new.
@@ -230,25 +217,21 @@ class DatagramTally:
         """
         if epoch != self._epoch:
             # Datagrams before the first arrival are not lost: the receiver may not have run.
-            self.begin(epoch, counter)
-        ahead, window = counter - self._newest, self._window
+            self._before = self.expected
+            self._epoch, self._first, self._newest = epoch, counter, counter - 1
+            self._seen = ALL_SEEN
+        ahead = counter - self._newest
         if ahead > 0:  # the skipped datagrams are lost or late
-            leaving = min(ahead, window)
-            self.lost += ahead - (self._seen >> (window - leaving)).bit_count()
-            self._seen = (self._seen << ahead | 1) & self._mask if ahead < window else 1
+            leaving = min(ahead, WINDOW)
+            self.lost += ahead - (self._seen >> (WINDOW - leaving)).bit_count()
+            self._seen = (self._seen << ahead | 1) & ALL_SEEN if ahead < WINDOW else 1
             self._newest = counter
-        elif ahead > -window and not self._seen >> -ahead & 1:
+        elif ahead > -WINDOW and not self._seen >> -ahead & 1:
             self._seen |= 1 << -ahead
             self.reordered += 1
         else:
             return False
         return True
-
-    def end(self, last: int) -> None:
-        """End the session: what is still missing up to the newest sent counter, `last`, is lost."""
-        self.lost += self._window - self._seen.bit_count() + last - self._newest
-        self._before += last - self._first + 1
-        self._first, self._newest, self._seen = last + 1, last, self._mask
 
 
 # Time.

@@ -23,7 +23,7 @@ from cloudrc.geometry.obstacles import Obstacle, has_surface, obstacles
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
 from cloudrc.metrics.counters import growth
-from cloudrc.record.columns import Recording, Table
+from cloudrc.record.columns import Recording, Table, datagrams, join
 from cloudrc.record.holes import Hole
 from cloudrc.records import UNDER_WAY
 
@@ -255,11 +255,7 @@ class Flight:
         command with a plan, the start of the plan [ns]; `position` is the predicted position [m].
         """
         commands = self.during("/command_applied")
-        keys = zip(self._control["epoch"], self._control["counter"], strict=True)
-        rows = {key: row for row, key in enumerate(keys)}
-        keys = zip(commands["epoch"], commands["counter"], strict=True)
-        joined = np.array([rows.get(key, -1) for key in keys], dtype=np.int64)
-        known, source = joined >= 0, joined[joined >= 0]
+        known, source = join(datagrams(commands), datagrams(self._control))
         columns = select(self._control, source) | select(commands, known)
         planned, stamp = columns["planned_ns"], columns["stamp_ns"]
         return columns | {"stamp_ns": np.where(planned >= 0, planned, stamp)}

@@ -10,9 +10,8 @@ from functools import partial
 import numpy as np
 
 from cloudrc.metrics.counters import growth
-from cloudrc.metrics.definitions import WINDOW_MAX, DatagramTally
-from cloudrc.metrics.flight import Flight, add_metrics, finite, mean, select
-from cloudrc.record.columns import Recording, Table
+from cloudrc.metrics.flight import Array, Flight, add_metrics, mean, select
+from cloudrc.record.columns import Recording, datagrams, join
 
 WAYS = {"uplink": "from world to cloud", "downlink": "from cloud to world"}
 """Direction -> words for the direction in the description of a metric."""
@@ -20,6 +19,9 @@ SENT = {"uplink": "/telemetry", "downlink": "/delay_estimate"}
 """Direction -> topic with one row for each datagram that is sent in this direction."""
 SENDER = {"uplink": "world", "downlink": "cloud"}
 """Direction -> the end that sends in this direction."""
+WINDOW_MAX = 1024
+"""A missing datagram counts as lost after this number of newer datagrams; the receiver refuses an
+older one, whether it is new or repeated (`cloudrc.tunnel.channel.WINDOW`)."""
 PERCENTILES = {"p50": "median", "p99": "99th percentile", "p999": "99.9th percentile"}
 COUNTS = {
     "relay_overflow": "that the relay dropped because its queue was full.",
@@ -47,15 +49,10 @@ def transit_ns(recording: Recording, way: str) -> int:
     time counts, arrived or not. An offset between two clocks is in the result, as in all arrivals.
     """
     sent, arrivals = recording[SENT[way]], recording[f"/{way}_delay"]
-    sent_ns = dict(zip(_names(sent), sent["stamp_ns"].tolist(), strict=True))
-    latest_first = list(zip(_names(arrivals), arrivals["stamp_ns"].tolist(), strict=True))[::-1]
-    arrived_ns = dict(latest_first)  # of a repeated datagram, the first arrival remains
-    return max((arrived_ns[one] - sent_ns[one] for one in arrived_ns if one in sent_ns), default=0)
-
-
-def _names(datagrams: Table) -> list[tuple[int, int]]:
-    """Return session and number of each datagram."""
-    return list(zip(datagrams["epoch"].tolist(), datagrams["counter"].tolist(), strict=True))
+    numbers, first = np.unique(datagrams(arrivals), return_index=True)
+    rows, source = join(numbers, datagrams(sent))
+    transits_ns = arrivals["stamp_ns"][first[rows]] - sent["stamp_ns"][source]
+    return int(transits_ns.max()) if len(transits_ns) else 0
 
 
 def loss(flight: Flight, way: str) -> float | None:
@@ -68,16 +65,24 @@ def loss(flight: Flight, way: str) -> float | None:
     if not len(world):
         return None
     sent = select(sent, sent["stamp_ns"] < world[-1] - transit_ns(flight.recording, way))
-    tally = DatagramTally(WINDOW_MAX)
-    for epoch in np.unique(sent["epoch"]).tolist():
+    expected = accepted = 0
+    for epoch in np.unique(sent["epoch"]):
         counters = sent["counter"][sent["epoch"] == epoch]
-        first, last = int(counters.min()), int(counters.max())
+        first, last = counters.min(), counters.max()
         arrived = arrivals["counter"][arrivals["epoch"] == epoch]
-        tally.begin(epoch, first)
-        for counter in arrived[(arrived >= first) & (arrived <= last)].tolist():
-            tally.take(epoch, counter)
-        tally.end(last)
-    return finite(tally.loss)
+        arrived = arrived[(arrived >= first) & (arrived <= last)]
+        accepted += count_accepted(arrived, int(first))
+        expected += int(last - first) + 1
+    return (expected - accepted) / expected if expected else None
+
+
+def count_accepted(arrived: Array, first: int) -> int:
+    """Count the datagrams that a receiver accepts, each once.
+
+    `arrived` are their counters in the order of arrival, `first` is the first one sent.
+    """
+    newest = np.maximum.accumulate(np.append(first - 1, arrived))[:-1]
+    return len(np.unique(arrived[arrived > newest - WINDOW_MAX]))
 
 
 def _sent(flight: Flight, way: str, name: str) -> float | None:

@@ -190,6 +190,26 @@ class Recording(Content):
         return Table(TOPICS[topic], zip(*rows, strict=True))
 
 
+def datagrams(table: Table | Mapping[str, Column]) -> Column:
+    """Return the number that identifies the datagram of each row: from session and counter."""
+    numbers: Column = table["epoch"] << 32 | table["counter"]
+    return numbers
+
+
+def join(left: Column, right: Column) -> tuple[Column, Column]:
+    """Find equal values in two columns of integers.
+
+    Return the rows of `left` whose value is in `right`, in their order, and for each of them the
+    last row of `right` with this value.
+    """
+    if not len(right):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    order = right.argsort(kind="stable")
+    rows = order[right[order].searchsorted(left, "right") - 1]
+    known = np.flatnonzero(right[rows] == left)
+    return known, rows[known]
+
+
 class _Values(dict[str, Any]):
     """The values of named tuples of one class: dotted path of a field -> a value per tuple."""
 

@@ -16,7 +16,7 @@ Telemetry contains this lag.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError
-from cloudrc.record.columns import Recording, Table
+from cloudrc.record.columns import Recording, Table, datagrams, join
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, union
 from cloudrc.record.topics import TOPICS
 from cloudrc.records import UNDER_WAY
@@ -80,14 +80,9 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
     """Return the least (arrival stamp - sending stamp) of a packet [ns]; None if none arrived."""
-
-    def packets(table: Table) -> Iterator[tuple[tuple[int, int], int]]:
-        numbers = zip(table["epoch"].tolist(), table["counter"].tolist(), strict=True)
-        return zip(numbers, table["stamp_ns"].tolist(), strict=True)
-
-    sent_ns = dict(packets(sent))
-    differences = (at_ns - sent_ns[one] for one, at_ns in packets(arrived) if one in sent_ns)
-    return min(differences, default=None)
+    rows, source = join(datagrams(arrived), datagrams(sent))
+    differences = arrived["stamp_ns"][rows] - sent["stamp_ns"][source]
+    return int(differences.min()) if len(rows) else None
 
 
 def _first_ns(recording: Recording) -> int:
