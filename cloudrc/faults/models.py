@@ -14,15 +14,9 @@ from cloudrc.endpoint import Endpoint
 from cloudrc.geometry.fence import Fence
 from cloudrc.messages import NEVER_NS
 from cloudrc.records import Fault, MissionEvent, Record
+from cloudrc.teleop.refusals import ConflictError, UnavailableError
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import (
-    ConflictError,
-    MissionRecord,
-    MissionStore,
-    Order,
-    UnavailableError,
-    connect,
-)
+from cloudrc.teleop.store import MissionRecord, MissionStore, Order, connect
 from cloudrc.teleop.wire import ALARM, Message
 
 T = TypeVar("T")

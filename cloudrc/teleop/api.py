@@ -28,15 +28,9 @@ from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.messages import Vector
 from cloudrc.teleop import models
 from cloudrc.teleop.auth import BEARER, REFUSED, Gate
+from cloudrc.teleop.refusals import ConflictError, UnavailableError, UnknownMissionError
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import (
-    ConflictError,
-    Event,
-    MissionRecord,
-    Order,
-    UnavailableError,
-    UnknownMissionError,
-)
+from cloudrc.teleop.store import Event, MissionRecord, Order
 from cloudrc.teleop.wire import Leg, RobotStatus, write_line
 from cloudrc.version import __version__
 

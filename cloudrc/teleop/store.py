@@ -22,6 +22,7 @@ from pydantic import TypeAdapter
 from cloudrc.config.schema import Touch
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.metrics.verdict import Observations
+from cloudrc.teleop.refusals import UnavailableError, UnknownMissionError
 from cloudrc.teleop.wire import ENDED, QUEUED, STATES, Plan
 
 Event: TypeAlias = dict[str, Any]
@@ -114,29 +115,8 @@ class MissionRecord:
         }
 
 
-class UnknownMissionError(CloudrcError):
-    """Report that no mission has this id."""
-
-
-class UnavailableError(CloudrcError):
-    """Report that teleop cannot act now, for example because the disk refuses a mission."""
-
-
 class StoreLockedError(CloudrcError):
     """Report that another process has locked the file of missions."""
-
-
-class ConflictError(CloudrcError):
-    """Report a request that the present state forbids.
-
-    `mission` is the id of the mission that blocks the request; "" if no mission blocks it.
-    """
-
-    exit_code = 5
-
-    def __init__(self, text: str, mission: str = "") -> None:
-        super().__init__(text)
-        self.mission = mission
 
 
 SCHEMA = "CREATE TABLE missions (n INTEGER PRIMARY KEY, plan TEXT NOT NULL, status TEXT NOT NULL)"

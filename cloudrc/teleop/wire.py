@@ -55,14 +55,13 @@ class Leg:
         """Return whether a position [m] is within the tolerance."""
         return not exceeds(dist(position, self.position), self.tolerance)
 
-    def is_facing(self, orientation_wxyz: Quaternion) -> bool:
-        """Return whether a robot has the leg's heading, if it has one.
-
-        `orientation_wxyz` is a unit quaternion [1], body to world.
-        """
+    def has(self, seen: RobotStatus) -> bool:
+        """Return whether a robot is at the waypoint, and has its heading, if it has one."""
+        if not self.is_at(seen.position):
+            return False
         if self.yaw is None:
             return True
-        return not exceeds(abs(turn_to(self.yaw, orientation_wxyz)), self.yaw_tolerance)
+        return not exceeds(abs(turn_to(self.yaw, seen.orientation_wxyz)), self.yaw_tolerance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,10 +97,6 @@ class Plan:
     def unit(self) -> str:
         """Name of each leg: "waypoint", or "step" if only its time counts."""
         return "step" if isinf(self.legs[0].tolerance) else "waypoint"
-
-
-NO_PLAN = Plan((Leg(ZERO),))
-"""Placeholder for the plan before the first mission; it is never flown."""
 
 
 class RobotStatus(NamedTuple):

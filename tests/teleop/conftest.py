@@ -26,8 +26,9 @@ from cloudrc.teleop.auth import Gate, Tokens
 from cloudrc.teleop.carrot import setpoint_at
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.models import read_drive, read_goto, read_order
+from cloudrc.teleop.refusals import ConflictError, UnavailableError
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import ConflictError, MissionStore, Order, UnavailableError
+from cloudrc.teleop.store import MissionStore, Order
 from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
 from tests.conftest import wait_until
 from tests.fences import FENCE
@@ -91,7 +92,14 @@ class Flight:
         if verb == "start":
             words = [store.MissionRecord("m1", Order(*words), number)]
         try:
-            getattr(self.teleop, verb)(self.now_ns, *words)
+            if verb == "acknowledge":
+                self.teleop.acknowledge()
+            elif verb in ("start", "stop"):
+                getattr(self.teleop, verb)(self.now_ns, *words)
+            elif verb == "cancel":
+                self.teleop.flight.end(self.now_ns, "cancelled", "mission cancelled")
+            else:
+                getattr(self.teleop.flight, verb)(self.now_ns, *words)
         finally:
             self._collect()
 
@@ -109,7 +117,16 @@ class Flight:
 
     @property
     def state(self):
-        return self.teleop.state.upper()
+        flight = self.teleop.flight
+        return flight.state.upper() if flight else "IDLE"
+
+    @property
+    def leg(self):
+        return self.teleop.flight.route.leg
+
+    @property
+    def outcome(self):
+        return self.teleop.flight and self.teleop.flight.outcome
 
     @property
     def requests(self):

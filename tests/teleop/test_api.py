@@ -21,7 +21,7 @@ from cloudrc.teleop import api as api_module
 from cloudrc.teleop import auth, models
 from cloudrc.teleop.api import ApiServer, Bridge
 from cloudrc.teleop.client import Api, UnreachableError
-from cloudrc.teleop.store import ConflictError
+from cloudrc.teleop.refusals import ConflictError
 from tests.conftest import needs_ipv6
 from tests.teleop.conftest import (
     A_MISSION,

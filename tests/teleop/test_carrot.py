@@ -71,7 +71,7 @@ def test_it_rests_and_leaves_by_time_alone():
     left = []
     for behind in (0.0, 0.3):
         flight = led()
-        while flight.teleop.leg == 0:
+        while flight.leg == 0:
             x, y, z = reference(flight).position
             flight.step((x - behind, y, z))
         motion = flight.setpoints[-1].motion
@@ -84,9 +84,9 @@ def test_it_rests_and_leaves_by_time_alone():
 def test_it_waits_for_a_robot_that_is_too_far_behind():
     flight = led()
     flight.step((3.0, 0.0, 1.0), seconds=5.0)
-    assert (flight.teleop.leg, reference(flight).position) == (0, A)
+    assert (flight.leg, reference(flight).position) == (0, A)
     flight.step((3.6 - 1e-12, 0.0, 1.0))  # at the edge of the tolerance, up to rounding
-    assert flight.teleop.leg == 1
+    assert flight.leg == 1
     assert flight.setpoints[-1].motion.begin_ns == flight.now_ns
 
 
@@ -101,7 +101,7 @@ def test_it_waits_at_a_robot_that_holds_and_starts_from_there():
     flight.step()
     assert reference(flight).position == (1.4, 0.1, 1.0)
     follow(flight, 5.0)
-    assert flight.teleop.leg == 1
+    assert flight.leg == 1
 
 
 def test_it_starts_again_from_the_robot_after_a_silence():

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from cloudrc.messages import ZERO, GuardState, Setpoint
 from cloudrc.teleop.carrot import ACCELERATION, setpoint_at, steer
-from cloudrc.teleop.store import ConflictError
+from cloudrc.teleop.refusals import ConflictError
 from cloudrc.teleop.wire import decode, encode
 from tests.fences import FENCE
 from tests.teleop.conftest import (

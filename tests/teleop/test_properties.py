@@ -5,8 +5,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from cloudrc.errors import BadInputError
 from cloudrc.messages import OperatorRequest, Request, Setpoint, Start
+from cloudrc.teleop.refusals import ConflictError
 from cloudrc.teleop.wire import Leg, Plan
 from tests.teleop.conftest import Flight
 
@@ -59,12 +59,16 @@ class MissionMachine(RuleBasedStateMachine):
     @rule(verb=verbs)
     def operate(self, verb):
         flight = self.flight
-        before = (flight.state, len(flight.said), flight.teleop.outcome)
+        before = (flight.state, len(flight.said), flight.outcome)
         if flight.state not in ALLOWED[verb[0]]:
-            if verb[0] in ("hold", "resume", "go_to"):  # the service sees to the others
-                with pytest.raises(BadInputError):
+            if flight.state != "IDLE" and verb[0] in (
+                "hold",
+                "resume",
+                "go_to",
+            ):  # the service sees to the others
+                with pytest.raises(ConflictError):
                     flight.operate(*verb)
-            assert before == (flight.state, len(flight.said), flight.teleop.outcome)
+            assert before == (flight.state, len(flight.said), flight.outcome)
             return
         flight.operate(*verb)
         self.operated_ns = flight.now_ns
@@ -143,7 +147,7 @@ class MissionMachine(RuleBasedStateMachine):
             assert self.newest.request in asked
 
     def check_the_outcome(self):
-        flight, outcome = self.flight, self.flight.teleop.outcome
+        flight, outcome = self.flight, self.flight.outcome
         if flight.state in UNDER_WAY | {"IDLE"}:
             assert outcome is None
             return

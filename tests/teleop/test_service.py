@@ -12,8 +12,10 @@ from cloudrc.exposition.table import MISSION_OUTCOMES
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Cause, GuardState, Setpoint, Start
 from cloudrc.teleop.api import Bridge
-from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, next_step
-from cloudrc.teleop.store import ConflictError, Order, UnavailableError
+from cloudrc.teleop.refusals import ConflictError, UnavailableError
+from cloudrc.teleop.service import QUEUE_MAX
+from cloudrc.teleop.store import Order
+from cloudrc.teleop.view import NO_CLOUD, NOT_HEARD, next_step
 from cloudrc.teleop.wire import ENDED, STATES, Leg, Plan
 from tests.teleop.conftest import FROM_SPAWN, PLACES, A, ServiceFlight, play, service_flying
 

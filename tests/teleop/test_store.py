@@ -15,15 +15,13 @@ from cloudrc.errors import BadInputError
 from cloudrc.messages import Start
 from cloudrc.teleop import models
 from cloudrc.teleop.client import describe_mission
+from cloudrc.teleop.refusals import ConflictError, UnavailableError, UnknownMissionError
 from cloudrc.teleop.store import (
     KEPT,
     SHOWN,
-    ConflictError,
     MissionStore,
     Order,
     StoreLockedError,
-    UnavailableError,
-    UnknownMissionError,
     connect,
     open_store,
 )

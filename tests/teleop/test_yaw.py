@@ -34,7 +34,7 @@ def test_a_waypoint_with_a_yaw_is_reached_within_5_degrees(yaw, seen, reached, s
     flight = flying(Plan((Leg(A, radians(yaw), speed=speed), Leg(B)), Start.HERE))
     flight.orientation = facing(seen)
     flight.step(position=A, seconds=4.0)
-    assert (flight.teleop.leg == 1) is reached
+    assert (flight.leg == 1) is reached
 
 
 def test_turning_away_at_the_waypoint_restarts_the_dwell_time():
@@ -44,9 +44,9 @@ def test_turning_away_at_the_waypoint_restarts_the_dwell_time():
     flight.step()
     flight.orientation = facing(0)
     flight.step(seconds=0.45)
-    assert flight.teleop.leg == 0
+    assert flight.leg == 0
     flight.step(seconds=0.06)
-    assert flight.teleop.leg == 1
+    assert flight.leg == 1
 
 
 def test_the_setpoint_turns_only_at_a_waypoint_with_a_yaw_and_keeps_the_last_one():

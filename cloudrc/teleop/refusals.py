@@ -1,0 +1,26 @@
+"""Define why teleop refuses a request."""
+
+from __future__ import annotations
+
+from cloudrc.errors import CloudrcError
+
+
+class UnknownMissionError(CloudrcError):
+    """Report that no mission has this id."""
+
+
+class UnavailableError(CloudrcError):
+    """Report that teleop cannot act now, for example because the disk refuses a mission."""
+
+
+class ConflictError(CloudrcError):
+    """Report a request that the present state forbids.
+
+    `mission` is the id of the mission that blocks the request; "" if no mission blocks it.
+    """
+
+    exit_code = 5
+
+    def __init__(self, text: str, mission: str = "") -> None:
+        super().__init__(text)
+        self.mission = mission
