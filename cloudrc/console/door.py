@@ -67,7 +67,7 @@ WEB = Path(__file__).parent / "web"
 class Desk(NamedTuple):
     """What the door needs of the console; it calls these functions in its own threads."""
 
-    stop: Callable[[], bool]  # switches the robot off, does not wait; False: not ready, ask again
+    stop: Callable[[], None]  # switches the robot off, does not wait
     acts: Mapping[str, Callable[[], str]]  # name of a button -> act, returns the answer in words
     describe: Callable[[], list[str]]  # the state, line by line
     has_pilot: Callable[[], bool]  # whether a page with the scene steers
@@ -214,9 +214,8 @@ class Door(uvicorn.Server):
         """Carry out what a page asks for."""
         name = request.path_params["name"]
         if name == "stop":
-            if self._desk.stop():
-                return PlainTextResponse("switching the robot off", 202)
-            return PlainTextResponse("the console starts; ask again", 503)
+            self._desk.stop()
+            return PlainTextResponse("switching the robot off", 202)
         if (act := self._desk.acts.get(name)) is None:
             return Response(status_code=404)
         if self._desk.has_pilot():

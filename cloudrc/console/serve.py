@@ -50,24 +50,21 @@ def serve(
     """
     with ExitStack() as opened:
         sys.setswitchinterval(SWITCH_PERIOD)
-        page = Page(port, flight.token, origins)
-        opened.callback(page.close)
         config = opened.enter_context(flight.config.open())
         try:
             fcntl.flock(config, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             text = "this run has a console already; open its page, or end it first"
             raise BadInputError(text) from None
-        except OSError:  # a network file system may refuse the lock: then nothing is checked
-            pass
-        ready(page)
         experiment = read_experiment(str(flight.config))
         known = obstacles(scene_of(experiment.world), touch=experiment.mission.touched)
         feed = FlightFeed(tuple(filter(has_surface, known)), known_hull(experiment.world.robot))
         steering = Steering(flight.api, flight.link)
+        page = Page(experiment, feed, steering, port, flight.token, origins)
+        opened.callback(page.close)
         steering.watch()
         steering.start()
-        page.fill(experiment, feed, steering)
+        ready(page)
         due = 0.0
         while not flight.has_ended():
             with suppress(CloudrcError):  # teleop starts or ends; the page says what is wrong

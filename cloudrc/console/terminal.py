@@ -39,21 +39,6 @@ PLACES = {
     **{"ς": "w", "σ": "s", "η": "h", "Χ": "X"},  # noqa: RUF001
 }
 """Letter of a Cyrillic or Greek keyboard -> Latin letter in the same place."""
-PASTE_ON, PASTE_OFF = "\x1b[?2004h", "\x1b[?2004l"
-"""Ask the terminal to mark pasted text, and no longer to mark it."""
-PASTE_BEGINS, PASTE_ENDS = "\x1b[200~", "\x1b[201~"
-ARROWS = {
-    "A": curses.KEY_UP,
-    "B": curses.KEY_DOWN,
-    "C": curses.KEY_RIGHT,
-    "D": curses.KEY_LEFT,
-}
-"""Last character of an arrow's sequence -> its key. Terminals send `Esc [ A` or `Esc O A`; curses
-knows only the one of both that TERM names."""
-PASTE_GAP = 1.0
-"""Longest pause within pasted text [s]; later, a key counts even without the mark of the end."""
-SEQUENCE_MAX = 16
-"""Largest number of characters in a sequence that begins with Esc."""
 HELP = (
     "arrows: x and y, w and s: up and down, space: stop moving, h: hold, q: quit",
     "X (capital): emergency stop, a robot in the air falls",
@@ -67,67 +52,11 @@ def drive(api: Api) -> None:
     steering = Steering(api)
     steering.start()
     try:
-        _send(PASTE_ON)
         curses.wrapper(_handle_keys, steering, api)
     except curses.error as error:
         raise BadInputError(f"mission drive: {error}; set TERM, for example to xterm") from None
     finally:
-        _send(PASTE_OFF)
         steering.end_drive()
-
-
-def _send(sequence: str) -> None:
-    """Send a sequence of control characters to the terminal."""
-    sys.stdout.write(sequence)
-    sys.stdout.flush()
-
-
-class KeyReader:
-    """Finds keys in what a terminal sends; leaves out pasted text and unknown sequences."""
-
-    def __init__(self) -> None:
-        """Begin outside of pasted text."""
-        self.note = ""  # what was left out, in words
-        self._sequence, self._is_paste, self._until = "", False, 0.0
-
-    def take(self, key: str | int, now: float) -> str | int | None:
-        """Return the key that is meant; None if there is none. `now` is the time [s]."""
-        if now > self._until:
-            self._sequence, self._is_paste = "", False
-        self._until = now + PASTE_GAP
-        if isinstance(key, str) and self._belongs_to_sequence(key):
-            found = self._take_whole_sequence()
-            if found is None:
-                return None
-            key = found
-        self._sequence = ""
-        if self._is_paste:
-            return None
-        self.note = ""
-        return meant_key(key)
-
-    def _belongs_to_sequence(self, key: str) -> bool:
-        """Return whether a character is a part of a sequence, and add it."""
-        before = self._sequence
-        if key == "\x1b":
-            self._sequence = key
-        elif not before or len(before) >= SEQUENCE_MAX or (len(before) == 1 and key not in "[O"):
-            return False  # Esc with another key means this key
-        else:
-            self._sequence += key
-        return True
-
-    def _take_whole_sequence(self) -> int | None:
-        """Return the arrow that a whole sequence means, else None; obey marks of pasted text."""
-        sequence = self._sequence
-        if len(sequence) < 3 or not (sequence[-1].isalpha() or sequence[-1] == "~"):
-            return None
-        self._sequence = ""
-        if sequence == PASTE_BEGINS:
-            self._is_paste, self.note = True, "pasted text has no effect"
-        elif sequence == PASTE_ENDS:
-            self._is_paste = False
-        return ARROWS.get(sequence[2:])
 
 
 def meant_key(key: str | int) -> str | int:
@@ -140,13 +69,13 @@ def meant_key(key: str | int) -> str | int:
 
 def _handle_keys(screen: curses.window, steering: Steering, api: Api) -> None:
     curses.curs_set(0)
-    reader, note = KeyReader(), ""
+    note = ""
     while not _is_gone():
         for sent in _sent(screen):
-            key = reader.take(sent, time.monotonic())
+            key = meant_key(sent)
             if key == "q":
                 return
-            note = reader.note if key is None else _obey(key, sent, steering)
+            note = _obey(key, sent, steering)
         _draw(screen, _lines(steering, api, note))
 
 

@@ -25,8 +25,8 @@ def served():
         def post(self, path, body=None):
             posted.append(path)
 
-    page = Page(0, lambda: TOKEN, [PROXY])
-    page.fill(load_experiment("hover"), FlightFeed(), Steering(Api()))
+    flight = load_experiment("hover"), FlightFeed(), Steering(Api())
+    page = Page(*flight, 0, lambda: TOKEN, [PROXY])
     yield page, posted
     page.close()
 

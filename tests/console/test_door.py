@@ -33,10 +33,9 @@ VERSION = f"viser-v{viser.__version__}"
 @pytest.fixture
 def page(api):
     api.answers["/v1/state"] = {"mission": None, "seen": {"next_step": "start a mission"}}
-    page = Page(0)
     steering = Steering(api)
     steering.watch()
-    page.fill(load_experiment("hover"), FlightFeed(), steering)
+    page = Page(load_experiment("hover"), FlightFeed(), steering)
     yield page
     page.close()
 
@@ -101,16 +100,6 @@ def test_a_request_without_an_end_is_ended(page, monkeypatch):
     with socket.create_connection(("127.0.0.1", page.port), 10) as other:
         other.sendall(b"GET / HTTP/1.1\r\nA: " + b"a" * door.HEAD_MAX)
         assert b" 400 " in other.recv(100)
-
-
-def test_stop_before_the_console_is_ready_is_asked_again(api):
-    page = Page(0)
-    try:
-        assert call(page, "stop", "POST")[0] == 503
-        assert json.loads(call(page, "state")[1])["lines"] == ["the console starts"]
-        assert call(page, "hold", "POST")[1] == "the console starts; ask again"
-    finally:
-        page.close()
 
 
 def test_the_plain_page_shows_the_state_and_its_buttons_act(page, api):
@@ -234,8 +223,8 @@ def test_viser_listens_on_the_socket_alone(tmp_path):
         scene_page("<html></html>", {})
 
 
-def test_a_port_in_use_is_an_error():
+def test_a_port_in_use_is_an_error(api):
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(BadInputError, match=f"--port {port}: is in use"):
-            Page(port)
+            Page(load_experiment("hover"), FlightFeed(), Steering(api), port)

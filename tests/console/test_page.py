@@ -5,6 +5,7 @@ import threading
 import time
 import urllib.request
 from argparse import Namespace
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from PIL import Image
 from cloudrc.cli import console
 from cloudrc.config.load import load_experiment
 from cloudrc.console import in_pod
+from cloudrc.console.controls import KEYS, Controls
 from cloudrc.console.feed import FlightFeed
-from cloudrc.console.page import KEYS, PANEL_WIDTH, Page, _with_gaps
+from cloudrc.console.page import PANEL_WIDTH, Page, _with_gaps
 from cloudrc.console.steering import Steering
 from cloudrc.drivers.local import LINK_FOLDER
 from cloudrc.geometry.scene import load_scene
@@ -59,15 +61,15 @@ def flight(session):
 @pytest.fixture
 def filled(api):
     """Make the page of an experiment without a browser: the page, its feed and its steering."""
-    page = Page(0)
+    with ExitStack() as opened:
 
-    def fill(name):
-        feed, steering = FlightFeed(), Steering(api)
-        page.fill(load_experiment(name), feed, steering)
-        return page, feed, steering
+        def fill(name):
+            feed, steering = FlightFeed(), Steering(api)
+            page = Page(load_experiment(name), feed, steering)
+            opened.callback(page.close)
+            return page, feed, steering
 
-    yield fill
-    page.close()
+        yield fill
 
 
 def button(page, name):
@@ -259,8 +261,9 @@ def test_the_state_tells_what_the_mission_follows(filled, waypoints, shown):
 
 def test_controls_of_a_browser_that_left_do_not_end_the_console(filled):
     page, _, steering = filled("hover")
-    slider = page._server.gui.add_slider("Up", 0.0, 500.0, 1.0, 0.0)
-    page._sliders, steering.conditions = {"uplink.delay_ms": slider}, {"uplink.delay_ms": 60.0}
+    page._controls = Controls(page._server, page._acts, steering, page._place)
+    slider = page._controls._sliders["uplink.delay_ms"]
+    steering.conditions = {"uplink.delay_ms": 60.0}
     page.update(1.0)
     assert slider.value == 60.0
     slider.remove()
@@ -270,14 +273,14 @@ def test_controls_of_a_browser_that_left_do_not_end_the_console(filled):
 
 @pytest.mark.parametrize(("name", "axes"), [("hover", 3), ("pillars", 2)])
 def test_controls_have_heights_only_for_a_robot_that_flies(filled, name, axes):
-    page, _, _ = filled(name)
-    page._add_controls(page._server)
+    page, _, steering = filled(name)
+    page._controls = Controls(page._server, page._acts, steering, page._place)
     handles = page._server.gui._gui_input_handle_from_uuid.values()
     labels = {handle.label: handle for handle in handles if hasattr(handle, "label")}
     keys = {label for label, direction in KEYS.values() if axes == 3 or not direction[2]}
     assert keys == labels.keys() & {label for label, _ in KEYS.values()}
     assert len(labels["Target [m]"].value) == axes
-    gizmo, numbers = page._target
+    gizmo, numbers = page._controls._gizmo, page._controls._numbers
     assert tuple(gizmo.active_axes) == (True, True, axes == 3)
     page.update(1.0)
     assert tuple(numbers.value) == tuple(gizmo.position[:axes])
