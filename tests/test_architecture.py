@@ -72,7 +72,8 @@ MAY_IMPORT: dict[str, set[str]] = {
         "world",
     },
     "console": {
-        *("config", "drivers", "exposition", "geometry", "metrics.definitions", "teleop", "world"),
+        *("config", "drivers", "exposition", "files", "geometry", "metrics.definitions"),
+        *("teleop", "world"),
     },
     "cluster": {"config", "geometry", "link", "record", "report", "teleop"},
     "statistics": set(),

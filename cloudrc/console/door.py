@@ -7,7 +7,6 @@ passes the WebSockets of checked pages on to viser, up to `PAGES_MAX`.
 from __future__ import annotations
 
 import asyncio
-import errno
 import html
 import json
 import socket
@@ -31,7 +30,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from cloudrc.console.access import PARAMETER, Access
 from cloudrc.drivers.local import socket_folder
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import CloudrcError
+from cloudrc.files import naming
 
 PAGES_MAX = 50
 """Largest number of pages that have the scene; each further one gets the plain page."""
@@ -111,15 +111,9 @@ class Door(uvicorn.Server):
             access: Rules by which requests are refused.
             desk: Functions of the console.
             scene: HTML of the page with the scene.
-
-        Raises:
-            BadInputError: If the port cannot be opened.
         """
-        try:
+        with naming(f"--port {port}"):
             opened = socket.create_server(("127.0.0.1", port), backlog=512)
-        except OSError as error:
-            why = "is in use" if error.errno == errno.EADDRINUSE else str(error.strerror)
-            raise BadInputError(f"--port {port}: {why}; name another port, or none") from None
         # The new socket names its protocol: only then does asyncio disable Nagle's algorithm.
         self._socket = socket.socket(fileno=opened.detach())
         self.port: int = self._socket.getsockname()[1]

@@ -73,9 +73,6 @@ class Page:
             port: TCP port; 0 means any free port.
             token: Function that returns the page's present token; None makes one.
             origins: Origins of proxies that may serve the page.
-
-        Raises:
-            BadInputError: If the port cannot be opened.
         """
         self._experiment, self._feed, self._steering = experiment, feed, steering
         own = token_hex(16)

@@ -71,17 +71,13 @@ def _start(command: str, log: Path) -> subprocess.Popen[bytes]:
     with log.open("wb") as output:
         output.write(f"$ {command}\n".encode(errors="replace"))
         output.flush()
-        try:
-            return subprocess.Popen(
-                split_command(command),
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,  # its children are in its group, which is ended
-            )
-        except OSError as error:
-            text = f"--with '{command}': cannot be started: {error.strerror or error}"
-            raise BadInputError(text) from None
+        return subprocess.Popen(
+            split_command(command),
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,  # its children are in its group, which is ended
+        )
 
 
 def _wait_for(url: str, program: subprocess.Popen[bytes], log: Path) -> None:

@@ -19,7 +19,6 @@ import secrets
 import selectors
 import shutil
 import signal
-import socket
 import subprocess
 import tempfile
 import time
@@ -31,7 +30,6 @@ from typing import IO, NamedTuple
 from cloudrc.drivers.machine import Deadline, interpreter
 from cloudrc.drivers.process import PARENT, READY, from_line
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.drivers.teleop import PATH_MAX
 from cloudrc.errors import ControllerLostError, InvalidRunError, TimedOutError
 from cloudrc.files import make_own_folder, who_may_write
 from cloudrc.link.follow import PROFILE
@@ -49,6 +47,8 @@ line at least once a second."""
 PAUSE = 1.0
 """Longest turn of the supervisor's loop [s]. A longer turn means that the supervisor was paused; it
 does not count for time limits."""
+PATH_MAX = 107
+"""Longest path of a socket, without its final zero [bytes]. Source: unix(7), `sun_path`."""
 SOCKET_NAME = "/cloudrc-12345678/downlink.sock"
 """Longest path of a socket, relative to the folder for temporary files."""
 API_FILE = "api.json"
@@ -160,26 +160,24 @@ def under_way(*, links: bool = False) -> dict[Path, str]:
 def flight_files() -> dict[Path, FlightFile]:
     """Return the flights of this user under way: folder of the run -> its flight file.
 
-    A file that another user could have written is ignored: it could name any process and address.
+    A folder in which another user could write is ignored: its files could name any process and
+    address.
     """
     found = dict[Path, FlightFile]()
     folder = flights_folder()
-    with contextlib.suppress(OSError):
-        if who_may_write(folder):
-            return found
+    if not folder.is_dir() or who_may_write(folder):
+        return found
     for path in folder.glob("*.json"):
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open() as file:
-            if who_may_write(path):
-                continue
+        with contextlib.suppress(FileNotFoundError), path.open() as file:  # it has just ended
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:  # locked: the flight is under way
                 flight = json.load(file)
-                about = FlightFile(str(flight["api"]), str(flight["kind"]), int(flight["pid"]))
+                about = FlightFile(flight["api"], flight["kind"], flight["pid"])
                 found[Path(flight["run"])] = about
             else:  # not locked: the process of this flight was killed
                 path.unlink()
-                _remove_sockets(str(json.load(file)["api"]))
+                _remove_sockets(json.load(file)["api"])
     return found
 
 
@@ -460,19 +458,14 @@ def socket_folder() -> str:
     """Choose a folder for the sockets of a run: on this machine, with a short path, not cleaned.
 
     Some machines clean /tmp during a flight; then no command could stop the robot. Therefore the
-    folder is beside the flight files, if Unix sockets are possible there.
+    folder is beside the flight files, if their path is short enough.
     """
     own = flights_folder().parent
-    with contextlib.suppress(OSError):
-        if own.is_absolute() and not make_own_folder(own):
-            with (
-                tempfile.TemporaryDirectory(prefix="cloudrc-", dir=own) as folder,
-                socket.socket(socket.AF_UNIX) as probe,
-            ):
-                probe.bind(f"{folder}/downlink.sock")  # the longest name
-            return str(own)
-    given = tempfile.gettempdir()
-    return given if len(os.fsencode(given)) + len(SOCKET_NAME) <= PATH_MAX else "/tmp"
+    is_own = own.is_absolute() and not _make_flights_folder(own)
+    for folder in (str(own) if is_own else "", tempfile.gettempdir()):
+        if folder and len(os.fsencode(folder)) + len(SOCKET_NAME) <= PATH_MAX:
+            return folder
+    return "/tmp"
 
 
 def _remove_sockets(api: str) -> None:

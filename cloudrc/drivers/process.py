@@ -10,7 +10,7 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -267,12 +267,10 @@ class LinkNotes:
             seen = version(self._path)
             if begins or seen != self._seen:
                 self._seen = seen  # do not read a malformed file again and again
-                with suppress(Exception):  # a missing or malformed file
-                    noted += self._read_state(begins, now_ns, slip_ns)
+                noted += _if_readable(lambda: self._read_state(begins, now_ns, slip_ns))
         if now_ns >= self._released_ns:
             self._released_ns = now_ns + RELEASED_PERIOD_NS
-            with suppress(Exception):
-                noted += self._read_lateness(now_ns - slip_ns)
+            noted += _if_readable(lambda: self._read_lateness(now_ns - slip_ns))
         return noted
 
     def _read_lateness(self, stamp_ns: int) -> list[Counted]:
@@ -304,6 +302,13 @@ class LinkNotes:
             conditions=json.dumps(state.profile.get(state.direction, {})),
         )
         return [changed] if begins or since_ns != state.since_ns else []
+
+
+def _if_readable(read: Callable[[], Sequence[Record]]) -> Sequence[Record]:
+    try:
+        return read()
+    except Exception:  # a missing or malformed file
+        return []
 
 
 @dataclass

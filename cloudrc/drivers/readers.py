@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import os
 import select
-import socket
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
 from cloudrc.drivers.process import from_line, to_line
+from cloudrc.drivers.teleop import bind_datagrams
 from cloudrc.messages import Telemetry
 from cloudrc.records import Record, TelemetrySent
 
@@ -41,7 +41,7 @@ class RecordSender:
         """Send to the readers whose sockets are in `folder`."""
         self._folder, self._due_ns = folder, 0
         self._sent: dict[Path, int] = {}  # reader -> records for it so far
-        self._socket = _bind(folder / CLOUD)
+        self._socket = bind_datagrams(folder / CLOUD)
 
     def see(self, epoch: int, counter: int, telemetry: Telemetry) -> None:
         """Send telemetry that cloud uses; datagrams of it have `epoch` and `counter`."""
@@ -81,7 +81,7 @@ class RecordReader:
         """Begin to receive; `folder` has the sockets of cloud and its readers."""
         self._path = folder / f"r{os.getpid()}.sock"
         self._cloud = str(folder / CLOUD)
-        self._socket = _bind(self._path)
+        self._socket = bind_datagrams(self._path)
         self._connect()
         self._next = 0
         self.dropped = 0
@@ -111,15 +111,6 @@ class RecordReader:
         self.dropped += max(0, before - self._next)
         self._next = before + len(lines)  # a new process of cloud counts from 0
         return [from_line(line) for line in lines]
-
-
-def _bind(path: Path) -> socket.socket:
-    """Open a socket for datagrams at `path`, in place of that of an earlier process."""
-    datagrams = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    datagrams.setblocking(False)
-    path.unlink(missing_ok=True)
-    datagrams.bind(str(path))
-    return datagrams
 
 
 def _parts(lines: Iterable[str]) -> Iterator[list[str]]:

@@ -84,14 +84,14 @@ class LockStep:
 
     def _connect(self) -> PolicyClient:
         try:
-            return PolicyClient(
-                self._url,
-                key=os.environ.get(KEY_VARIABLE, ""),
-                start_limit=self._start_limit,
-                answer_limit=VIRTUAL_LIMIT,
-            )
+            return _connect(self._url, self._start_limit, VIRTUAL_LIMIT)
         except CloudrcError as error:
             raise _lost(error) from None
+
+
+def _connect(url: str, start_limit: float, answer_limit: float) -> PolicyClient:
+    key = os.environ.get(KEY_VARIABLE, "")
+    return PolicyClient(url, key=key, start_limit=start_limit, answer_limit=answer_limit)
 
 
 def _lost(error: CloudrcError) -> ControllerLostError:
@@ -228,12 +228,7 @@ class RemoteDriver:
         self._client = None
 
     def _connect(self) -> PolicyClient:
-        return PolicyClient(
-            self._url,
-            key=os.environ.get(KEY_VARIABLE, ""),
-            start_limit=self._start_limit,
-            answer_limit=SILENCE,
-        )
+        return _connect(self._url, self._start_limit, SILENCE)
 
 
 def tell_ended(folder: Path) -> None:

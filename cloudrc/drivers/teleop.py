@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.errors import BadInputError
+from cloudrc.files import naming
 from cloudrc.messages import OperatorRequest, Request, Setpoint
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop.wire import Message, Output, RobotStatus, decode, encode
@@ -27,8 +27,6 @@ DATAGRAM_MAX = 8_192
 """Size limit of a datagram between teleop and cloud [bytes]; all messages are smaller."""
 DRAIN_MAX = 1024
 """Largest number of messages that `receive` returns at once: more than a socket can queue."""
-PATH_MAX = 107
-"""Longest path of a socket, without its final zero [bytes]. Source: unix(7), `sun_path`."""
 PERIOD_NS = 20_000_000
 """Period of the loop of teleop's process [ns]."""
 TELL_NS = PERIOD_NS - 5_000_000
@@ -47,27 +45,27 @@ Make = Callable[[int], None]
 """Function that makes the calls that other threads have queued, at a time [ns], monotonic clock."""
 
 
+def bind_datagrams(path: Path) -> socket.socket:
+    """Open a socket for datagrams at `path`, in place of that of an earlier process."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    datagrams = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    datagrams.setblocking(False)
+    with naming(path):
+        datagrams.bind(str(path))
+    return datagrams
+
+
 class UnixDatagrams:
     """Exchanges datagrams with another process over two Unix sockets."""
 
     def __init__(self, own: Path, other: Path, size_max: int = DATAGRAM_MAX) -> None:
         """Bind the path `own`, in place of an earlier process's socket; send to the path `other`.
 
-        `size_max` is the size limit of a datagram [bytes]. Raise a BadInputError if `own` cannot be
-        bound.
+        `size_max` is the size limit of a datagram [bytes].
         """
         self._other, self._size_max = str(other), size_max
-        if len(bytes(own)) > PATH_MAX:
-            raise BadInputError(f"--socket: {own} is longer than {PATH_MAX} bytes; choose another")
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-        try:
-            own.parent.mkdir(parents=True, exist_ok=True)
-            own.unlink(missing_ok=True)
-            self._socket.bind(str(own))
-        except OSError as error:
-            self._socket.close()
-            raise BadInputError(f"--socket: cannot make {own}: {error.strerror}") from error
+        self._socket = bind_datagrams(own)
 
     def fileno(self) -> int:
         """Return the descriptor of the socket, to wait for datagrams."""

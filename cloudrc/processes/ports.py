@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.config.load import ResolvedExperiment, fingerprint
 from cloudrc.drivers.realtime import Address, show_address
-from cloudrc.errors import BadInputError
+from cloudrc.files import naming
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
@@ -61,15 +61,10 @@ def warn_if_exposed(listen: Address) -> None:
 
 @contextmanager
 def listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn if other machines can reach `listen`; convert an OSError to an error about `flag`."""
+    """Warn if other machines can reach `listen`; an OSError names it and its `flag`."""
     warn_if_exposed(listen)
-    try:
+    with naming(f"{flag} {show_address(listen)}"):
         yield
-    except OSError as error:
-        raise BadInputError(
-            f"{flag} {show_address(listen)}: cannot receive there: {error.strerror or error};"
-            " name an address of this machine and a port that is free"
-        ) from error
 
 
 def open_exporter(

@@ -28,7 +28,7 @@ from cloudrc.processes.ports import open_exporter, warn, warn_if_exposed
 from cloudrc.records import Counted, Fault, Record
 from cloudrc.teleop.api import ApiServer, Bridge, create_app
 from cloudrc.teleop.auth import Gate, Tokens
-from cloudrc.teleop.models import read_drive, read_goto, read_order
+from cloudrc.teleop.models import RequestReader
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import MissionStore, Order, StoreLockedError, connect, open_store
 from cloudrc.teleop.wire import ALARM
@@ -101,21 +101,24 @@ def serve_api(settings: TeleopSettings, experiment: ResolvedExperiment, scene: S
     if not isinstance(settings.api, Path):
         warn_if_exposed(settings.api)
     bridge = Bridge()
-    found = known_robot(experiment.world.robot)
-    grounded = f"the robot {Path(experiment.world.robot).name}" if found.planar else ""
-    speed_max, robot = experiment.guard.speed_max_mps, hull_of(experiment.world.robot).dense
+    world = experiment.world
+    robot = known_robot(world.robot)
     plan = partial(
         assembly.mission_plan,
-        fence=steered_in(experiment.world),
-        speed_max=speed_max,
+        fence=steered_in(world),
+        speed_max=experiment.guard.speed_max_mps,
         turn_rate_max=experiment.guard.yaw_rate_max_radps,
     )
+    reader = RequestReader(
+        scene,
+        hull_of(world.robot).dense,
+        plan,
+        experiment.mission.touch,
+        planar=robot.planar,
+        heading=robot.heading,
+    )
     tokens = Tokens(settings.tokens, log_line) if settings.tokens else None
-    planar, heading = found.planar, found.heading
-    order = partial(read_order, scene=scene, robot=robot, planar=planar, heading=heading, plan=plan)
-    touch = experiment.mission.touch
-    goto = partial(read_goto, scene=scene, robot=robot, planar=planar, heading=heading, touch=touch)
-    app = create_app(bridge, order, goto, partial(read_drive, grounded=grounded), log_line)
+    app = create_app(bridge, reader, log_line)
     server = ApiServer(Gate(app, tokens, log_line), bridge, settings.api)
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     files = FILES_MAX if hard == resource.RLIM_INFINITY else min(FILES_MAX, hard)

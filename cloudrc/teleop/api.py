@@ -25,13 +25,13 @@ from starlette.requests import ClientDisconnect
 
 from cloudrc.config.section import Section
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.messages import Vector
+from cloudrc.files import naming
 from cloudrc.teleop import models
 from cloudrc.teleop.auth import BEARER, REFUSED, Gate
 from cloudrc.teleop.refusals import ConflictError, UnavailableError, UnknownMissionError
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import Event, MissionRecord, Order
-from cloudrc.teleop.wire import Leg, RobotStatus, write_line
+from cloudrc.teleop.store import Event, MissionRecord
+from cloudrc.teleop.wire import RobotStatus, write_line
 from cloudrc.version import __version__
 
 ROBOT_PERIOD = 0.033
@@ -170,17 +170,12 @@ class Bridge:
 
 
 def create_app(
-    bridge: Bridge,
-    read_order: Callable[[bytes], Order],
-    read_goto: Callable[[bytes], Leg],
-    read_drive: Callable[[bytes], Vector],
-    complain: Callable[[str], None],
+    bridge: Bridge, reader: models.RequestReader, complain: Callable[[str], None]
 ) -> FastAPI:
     """Make the ASGI application of the API; run it behind a `Gate`, which checks the tokens.
 
-    `read_order` reads and checks the body of an order to fly a mission, `read_goto` the body of an
-    order to fly to a point, `read_drive` that of a velocity. `complain` receives one line about
-    each internal error.
+    `reader` reads and checks the bodies of orders. `complain` receives one line about each internal
+    error.
     """
     app = FastAPI(
         title="cloudrc teleop",
@@ -190,8 +185,7 @@ def create_app(
         redoc_url=None,
         redirect_slashes=False,
     )
-    app.state.bridge, app.state.read_order, app.state.read_goto = bridge, read_order, read_goto
-    app.state.read_drive = read_drive
+    app.state.bridge, app.state.reader = bridge, reader
 
     @app.exception_handler(CloudrcError)
     async def refuse(request: Request, error: CloudrcError) -> JSONResponse:
@@ -262,7 +256,7 @@ router = APIRouter(prefix="/v1", dependencies=[Depends(BEARER)], responses=REFUS
 )
 async def fly_mission(body: Body, bridge: Bridged, request: Request, response: Response) -> Any:
     """Fly a mission now, or after the missions in the queue."""
-    order = await run_in_threadpool(request.app.state.read_order, body)
+    order = await run_in_threadpool(request.app.state.reader.order, body)
 
     def call(service: MissionService, now_ns: int) -> tuple[dict[str, Any], bool]:
         mission, new = service.create(order, now_ns)
@@ -320,7 +314,7 @@ async def resume(bridge: Bridged) -> Any:
 @router.post("/goto", response_model=models.MissionView, openapi_extra=_takes(models.GoToRequest))
 async def go_to(body: Body, bridge: Bridged, request: Request) -> Any:
     """Fly straight to a point, during a held mission or as a new mission."""
-    leg = await run_in_threadpool(request.app.state.read_goto, body)
+    leg = await run_in_threadpool(request.app.state.reader.goto, body)
     return await bridge.move(lambda service, now_ns: service.go_to(leg, now_ns))
 
 
@@ -335,7 +329,7 @@ async def drive(body: Body, bridge: Bridged, request: Request) -> Any:
     rest, and the robot holds there. After a hold, a stop or the end of a mission, let go first:
     send the velocity zero, or nothing for 0.5 s. The answer is 409 while a mission flies.
     """
-    velocity = request.app.state.read_drive(body)
+    velocity = request.app.state.reader.drive(body)
     return await bridge.move(lambda service, now_ns: service.drive(velocity, now_ns).summary())
 
 
@@ -435,8 +429,7 @@ class ApiServer(uvicorn.Server):
     def __init__(self, gate: Gate, bridge: Bridge, address: Address) -> None:
         """Bind the address; with port 0 the kernel chooses a port.
 
-        Raise a BadInputError if the address cannot be bound, or if `gate` has no tokens and the
-        address is not that of a Unix socket.
+        Raise a BadInputError if `gate` has no tokens and the address is not that of a Unix socket.
         """
         if gate.tokens is None and not isinstance(address, Path):
             raise BadInputError(
@@ -481,25 +474,21 @@ class ApiServer(uvicorn.Server):
 
 
 def _bind(address: Address) -> tuple[socket.socket, str]:
-    unix, url = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM), f"unix:{address}"
-    try:
-        if isinstance(address, Path):
-            if address.is_socket():  # an earlier server left it there
-                address.unlink()
-            os.fchmod(unix.fileno(), 0o600)  # Linux gives the file the mode of the socket
+    if isinstance(address, Path):
+        if address.is_socket():  # an earlier server left it there
+            address.unlink()
+        unix = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        os.fchmod(unix.fileno(), 0o600)  # Linux gives the file the mode of the socket
+        with naming(f"--api unix:{address}"):
             unix.bind(str(address))
-            unix.listen()
-            return unix, url
-        host, port = address[0].strip("[]"), address[1]
-        is_6 = ":" in host
-        url = f"http://[{host}]:{port}" if is_6 else f"http://{host}:{port}"
-        family = socket.AF_INET6 if is_6 else socket.AF_INET
+        unix.listen()
+        return unix, f"unix:{address}"
+    host, port = address[0].strip("[]"), address[1]
+    is_6 = ":" in host
+    url = f"http://[{host}]" if is_6 else f"http://{host}"
+    family = socket.AF_INET6 if is_6 else socket.AF_INET
+    with naming(f"--api {url}:{port}"):
         server = socket.create_server((host, port), family=family, dualstack_ipv6=is_6)
-    except (OSError, UnicodeError) as error:  # UnicodeError: the host has an invalid name
-        unix.close()
-        reason = getattr(error, "strerror", None) or error
-        raise BadInputError(f"--api {url}: {reason}; choose another address") from error
-    unix.close()
     # The new socket names its protocol: only then does asyncio disable Nagle's algorithm.
     named = socket.socket(fileno=server.detach())
-    return named, f"{url.rpartition(':')[0]}:{named.getsockname()[1]}"
+    return named, f"{url}:{named.getsockname()[1]}"

@@ -7,6 +7,7 @@ configuration file, so that the same code checks both and describes the problems
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from math import radians
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -255,76 +256,64 @@ class RefusedError(BadInputError):
 _Request = TypeVar("_Request", bound=Section)
 
 
-def read_order(
-    body: bytes,
-    scene: Scene,
-    robot: Spheres,
-    *,
-    planar: bool = False,
-    heading: Heading = "free",
-    plan: Callable[[MissionConfig, float | None], Plan],
-) -> Order:
-    """Read, check and plan the mission in the body of a request.
+@dataclass(frozen=True)
+class RequestReader:
+    """Reads and checks the bodies of requests; raises a RefusedError that lists all problems.
 
-    A `planar` robot stays on the ground. `heading` says whether the robot obeys a yaw. `plan` makes
-    a plan from a mission and a time limit [s], which may be None. Raise a RefusedError that lists
-    all problems.
+    Attributes:
+        scene: The robot flies in it.
+        robot: Hull of the robot.
+        plan: Makes a plan from a mission and a time limit [s], which may be None.
+        touch: What the experiment's mission has to touch: a point there is no problem.
+        planar: Whether the robot stays on the ground.
+        heading: Whether the robot obeys a yaw.
     """
-    request = _parse(body, MissionRequest)
-    if not request.waypoints:  # only an experiment may have steps instead
-        raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
-    mission = MissionConfig(
-        start=request.start,
-        waypoints=request.waypoints,
-        carrot=request.carrot,
-        judged_by=request.judged_by,
-        touch=request.touch,
-    )
-    mission = put_on_ground(mission, scene) if planar else mission
-    if problems := check_mission(mission, scene, robot, planar=planar, heading=heading):
-        raise RefusedError(problems)
-    planned = plan(without_held_yaws(mission, heading), request.time_limit_s)
-    lease = request.lease_s or 0.0
-    return Order(planned, request.name, request.key, request.touch, request.queue, lease)
 
+    scene: Scene
+    robot: Spheres
+    plan: Callable[[MissionConfig, float | None], Plan]
+    touch: Touch | None = None
+    planar: bool = False
+    heading: Heading = "free"
 
-def read_goto(
-    body: bytes,
-    scene: Scene,
-    robot: Spheres,
-    *,
-    touch: Touch | None = None,
-    planar: bool = False,
-    heading: Heading = "free",
-) -> Leg:
-    """Read and check a point in a request's body; raise a RefusedError that lists all problems.
+    def order(self, body: bytes) -> Order:
+        """Read and plan a mission."""
+        request = _parse(body, MissionRequest)
+        if not request.waypoints:  # only an experiment may have steps instead
+            raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
+        kept = ("start", "waypoints", "carrot", "judged_by", "touch")
+        mission = MissionConfig(**{name: getattr(request, name) for name in kept})
+        mission = put_on_ground(mission, self.scene) if self.planar else mission
+        if problems := self._check(mission):
+            raise RefusedError(problems)
+        planned = self.plan(without_held_yaws(mission, self.heading), request.time_limit_s)
+        lease = request.lease_s or 0.0
+        return Order(planned, request.name, request.key, request.touch, request.queue, lease)
 
-    The experiment's mission has to `touch` a body, so that a point there is none of the problems.
-    A `planar` robot stays on the ground. `heading` says whether the robot obeys a yaw.
-    """
-    request = _parse(body, GoToRequest)
-    position = on_ground(request.position_m, scene) if planar else request.position_m
-    waypoint = Waypoint(position_m=position, yaw_deg=request.yaw_deg)
-    # What is an obstacle depends on the mission under way; the service checks the way there.
-    mission = MissionConfig(start="here", waypoints=(waypoint,), touch=touch)
-    problems = check_mission(mission, scene, robot, planar=planar, heading=heading)
-    if problems:
-        raise RefusedError([ConfigProblem(p.path[2:], p.value, p.reason) for p in problems])
-    (waypoint,) = without_held_yaws(mission, heading).waypoints
-    return Leg(position, None if waypoint.yaw_deg is None else radians(waypoint.yaw_deg))
+    def goto(self, body: bytes) -> Leg:
+        """Read a point."""
+        request = _parse(body, GoToRequest)
+        place = request.position_m
+        position = on_ground(place, self.scene) if self.planar else place
+        waypoint = Waypoint(position_m=position, yaw_deg=request.yaw_deg)
+        # What is an obstacle depends on the mission under way; the service checks the way there.
+        mission = MissionConfig(start="here", waypoints=(waypoint,), touch=self.touch)
+        if problems := self._check(mission):
+            raise RefusedError([ConfigProblem(p.path[2:], p.value, p.reason) for p in problems])
+        (waypoint,) = without_held_yaws(mission, self.heading).waypoints
+        return Leg(position, None if waypoint.yaw_deg is None else radians(waypoint.yaw_deg))
 
+    def drive(self, body: bytes) -> Vector:
+        """Read a velocity [m/s]."""
+        velocity = _parse(body, DriveRequest).velocity_mps
+        if self.planar and velocity[2] != 0.0:
+            reason = "leads up or down, but this robot stays on the ground; set it to 0"
+            raise RefusedError([ConfigProblem(("velocity_mps", "2"), f"{velocity[2]:g}", reason)])
+        return velocity
 
-def read_drive(body: bytes, *, grounded: str = "") -> Vector:
-    """Read the velocity [m/s] in a request's body; raise a RefusedError that lists all problems.
-
-    `grounded` is the name of a robot that stays on the ground, so that it has no vertical velocity;
-    "" for other robots.
-    """
-    velocity = _parse(body, DriveRequest).velocity_mps
-    if grounded and velocity[2] != 0.0:
-        reason = f"leads up or down, but {grounded} stays on the ground; set it to 0"
-        raise RefusedError([ConfigProblem(("velocity_mps", "2"), f"{velocity[2]:g}", reason)])
-    return velocity
+    def _check(self, mission: MissionConfig) -> list[ConfigProblem]:
+        how: Any = {"planar": self.planar, "heading": self.heading}
+        return check_mission(mission, self.scene, self.robot, **how)
 
 
 def as_json(problem: ConfigProblem) -> dict[str, str | int | None]:

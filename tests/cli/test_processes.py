@@ -48,7 +48,7 @@ def taken():
 @pytest.mark.parametrize(
     ("flag", "code", "said"),
     [
-        ("--listen", 2, "--listen {}: cannot receive there: Address already in use; name"),
+        ("--listen", 2, "--listen {}: Address already in use"),
         ("--metrics", 3, "metrics cannot be served on {}: Address already in use; end"),
     ],
 )

@@ -11,7 +11,7 @@ from cloudrc.config.hull import hull_of
 from cloudrc.config.load import dump, load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
-from cloudrc.teleop.models import RefusedError, read_drive, read_goto, read_order
+from cloudrc.teleop.models import RefusedError, RequestReader
 from tests.fences import FENCE
 
 SCENE = load_scene("pillars")
@@ -97,7 +97,7 @@ def test_a_robot_that_flies_is_told_that_its_waypoints_need_a_height(robot):
     with pytest.raises(BadInputError, match=r"\[1, 0, 0\]: a robot that flies needs a height"):
         load_experiment("steps", [*with_points((1, 0))[2:], *where])
     with pytest.raises(RefusedError, match="a robot that flies needs a height"):
-        read_goto(b'{"position_m": [1, 0]}', SCENE, hull_of(robot).dense)
+        RequestReader(SCENE, hull_of(robot).dense, PLAN).goto(b'{"position_m": [1, 0]}')
 
 
 def test_the_rover_drives_through_the_pillars_without_a_vertical_command():
@@ -123,35 +123,35 @@ def test_a_silent_link_makes_the_rover_hold_and_then_stop_for_good():
     assert speed.max() < 1e-3
 
 
+PLAN = partial(mission_plan, fence=FENCE)
+
+
 def order(point):
     return json.dumps({"waypoints": [{"position_m": point}]}).encode()
 
 
 def test_teleop_takes_two_numbers_and_refuses_heights():
-    options = {"planar": True, "plan": partial(mission_plan, fence=FENCE)}
-    taken = read_order(order([1.5, 1.2]), SCENE, SIZE, **options)
+    read = RequestReader(SCENE, SIZE, PLAN, planar=True)
+    taken = read.order(order([1.5, 1.2]))
     assert taken.plan.legs[0].position == (1.5, 1.2, 0.1)
     with pytest.raises(RefusedError, match="has a height"):
-        read_order(order([1.5, 1.2, 1.0]), SCENE, SIZE, **options)
-    assert read_goto(b'{"position_m": [1, 1.2]}', SCENE, SIZE, planar=True).position == (
-        1.0,
-        1.2,
-        0.1,
-    )
+        read.order(order([1.5, 1.2, 1.0]))
+    assert read.goto(b'{"position_m": [1, 1.2]}').position == (1.0, 1.2, 0.1)
     with pytest.raises(RefusedError, match=r"position_m: .* has a height"):
-        read_goto(b'{"position_m": [1, 1.2, 1]}', SCENE, SIZE, planar=True)
+        read.goto(b'{"position_m": [1, 1.2, 1]}')
 
 
 @pytest.mark.parametrize(
-    ("z", "grounded", "fits"), [(0, "rover", True), (0.5, "rover", False), (0.5, "", True)]
+    ("z", "planar", "fits"), [(0, True, True), (0.5, True, False), (0.5, False, True)]
 )
-def test_a_drive_up_or_down_is_refused(z, grounded, fits):
+def test_a_drive_up_or_down_is_refused(z, planar, fits):
+    read = RequestReader(SCENE, SIZE, PLAN, planar=planar)
     body = json.dumps({"velocity_mps": [1, 0, z]}).encode()
     if fits:
-        assert read_drive(body, grounded=grounded) == (1.0, 0.0, z)
+        assert read.drive(body) == (1.0, 0.0, z)
     else:
         with pytest.raises(
             RefusedError,
-            match=r"velocity_mps.2: 0.5: leads up or down, but rover stays on the ground",
+            match=r"velocity_mps.2: 0.5: leads up or down, but this robot stays on the ground",
         ):
-            read_drive(body, grounded=grounded)
+            read.drive(body)

@@ -14,7 +14,7 @@ from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
 from cloudrc.runs.experiment import check_mode
-from cloudrc.teleop.models import RefusedError, read_goto, read_order
+from cloudrc.teleop.models import RefusedError, RequestReader
 from tests.fences import FENCE
 
 SCENE = load_scene("empty")
@@ -99,16 +99,18 @@ def test_a_flight_with_a_controller_that_leaves_the_yaw_alone_is_refused(tmp_pat
 
 
 def test_teleop_takes_and_refuses_yaws_as_a_mission_does():
-    plan, size = partial(mission_plan, fence=FENCE), hull_of("x2").dense
+    known = SCENE, hull_of("x2").dense, partial(mission_plan, fence=FENCE)
+    read, fixed = RequestReader(*known), RequestReader(*known, heading="fixed")
+    velocity = RequestReader(*known, heading="velocity")
     order = json.dumps({"waypoints": [{"position_m": [0, 0, 1], "yaw_deg": 90}]}).encode()
     goto = b'{"position_m": [0, 0, 1], "yaw_deg": 90}'
-    assert read_order(order, SCENE, size, plan=plan).plan.legs[0].yaw == radians(90)
-    assert read_goto(goto, SCENE, size).yaw == radians(90)
-    assert read_goto(b'{"position_m": [0, 0, 1]}', SCENE, size).yaw is None
+    assert read.order(order).plan.legs[0].yaw == radians(90)
+    assert read.goto(goto).yaw == radians(90)
+    assert read.goto(b'{"position_m": [0, 0, 1]}').yaw is None
     with pytest.raises(RefusedError, match=r"^yaw_deg: .*must be a number >= -360 and <= 360"):
-        read_goto(goto.replace(b"90", b"361"), SCENE, size)
+        read.goto(goto.replace(b"90", b"361"))
     with pytest.raises(RefusedError, match=r"^yaw_deg: 90: the onboard controller"):
-        read_goto(goto, SCENE, size, heading="fixed")
+        fixed.goto(goto)
     with pytest.raises(RefusedError, match=r"waypoints.0.yaw_deg: 90: the heading"):
-        read_order(order, SCENE, size, heading="velocity", plan=plan)
-    assert read_goto(goto.replace(b"90", b"0"), SCENE, size, heading="fixed").yaw is None
+        velocity.order(order)
+    assert fixed.goto(goto.replace(b"90", b"0")).yaw is None

@@ -16,11 +16,10 @@ from cloudrc.config.load import load_experiment
 from cloudrc.console import in_pod
 from cloudrc.console.controls import KEYS, Controls
 from cloudrc.console.feed import FlightFeed
-from cloudrc.console.page import PANEL_WIDTH, Page, _with_gaps
+from cloudrc.console.page import PANEL_WIDTH, Page
 from cloudrc.console.steering import Steering
 from cloudrc.drivers.local import LINK_FOLDER
 from cloudrc.geometry.scene import load_scene
-from cloudrc.runs import requirements
 from cloudrc.runs.links.change import read_states
 from tests.conftest import wait_until
 from tests.console.conftest import (
@@ -286,11 +285,6 @@ def test_controls_have_heights_only_for_a_robot_that_flies(filled, name, axes):
     assert tuple(numbers.value) == tuple(gizmo.position[:axes])
 
 
-def test_a_curve_has_gaps_and_an_unknown_one_keeps_its_axis():
-    assert _with_gaps(np.array([np.nan, 0.2])) == [None, 0.2]
-    assert _with_gaps(np.full(2, np.nan)) == [-1.0, None]
-
-
 def test_in_a_pod_a_slider_requests_a_change_and_returns(monkeypatch, capsys, tmp_path):
     profile = tmp_path / "profile.yaml"
     profile.write_text("uplink: {delay_ms: 40}")
@@ -302,11 +296,6 @@ def test_in_a_pod_a_slider_requests_a_change_and_returns(monkeypatch, capsys, tm
     assert link.read()["uplink"] == {"delay_ms": 120.0}
     monkeypatch.setattr(in_pod, "OWN_S", 0.0)
     assert link.read()["uplink"] == {"delay_ms": 40}
-
-
-def test_without_the_extra_one_line_says_what_to_install(monkeypatch, refused):
-    monkeypatch.setitem(requirements.EXTRAS, "console", ("viser_is_not_here",))
-    assert "pip install 'cloudrc[console]'" in refused("console", code=3)
 
 
 def test_without_a_flight_the_console_says_so(monkeypatch, refused, tmp_path):

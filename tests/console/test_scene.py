@@ -77,10 +77,3 @@ def test_balls_of_setpoint_and_waypoints_do_not_hide_a_small_robot(server):
     scene.set_waypoints(np.eye(3), 0)
     size = read_shapes(load_experiment("hover", ("world.robot=nano",)).world).size
     assert max(nodes["/setpoint"].radius, nodes["/waypoints/1"].radius) < size / 4
-
-
-@pytest.mark.parametrize("robot", ["nano", "pelican"])
-def test_a_robot_that_is_hard_to_see_has_its_size_as_a_label(server, robot):
-    far = "mission.waypoints=[{position_m: [8, 4, 1]}, {position_m: [8, -8, 1]}]"
-    nodes = shown(server, "hover", f"world.robot={robot}", far)[1]
-    assert ("/robot/size" in nodes) == (robot == "nano")

@@ -56,12 +56,6 @@ def test_a_flying_mission_is_held_before_a_goto(api, steering):
     assert api.posted == [goto]
 
 
-def test_a_target_on_the_ground_has_two_numbers(api, steering):
-    assert steering.go_to((0.5, -1.0))
-    assert api.posted == [("/v1/goto", {"position_m": [0.5, -1.0]})]
-    assert steering.answer[0] == "going to (0.5, -1)"
-
-
 def test_a_start_ends_a_drive_that_waits_for_keys(api, steering):
     steering.state = {"mission": {"by_hand": True, "state": "held"}}
     steering.start_mission({"waypoints": []})
@@ -79,14 +73,6 @@ def test_a_start_ends_a_drive_that_waits_for_keys(api, steering):
     assert "set back to its spawn" in steering.answer[0]
     steering.start_mission({"waypoints": [], "start": "here"})
     assert steering.answer[0] == "starting"
-
-
-def test_a_refusal_is_told_in_the_words_of_the_api(api, steering):
-    api.refused["/v1/goto"] = "outside of the fence"
-    assert not steering.go_to((50.0, 0.0, 1.2))
-    text, is_refusal, _ = steering.answer
-    assert is_refusal
-    assert "outside of the fence" in text
 
 
 def test_the_route_is_asked_once_for_each_mission(api, steering):

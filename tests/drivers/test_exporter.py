@@ -2,10 +2,8 @@
 
 import select
 import socket
-import threading
 import urllib.error
 import urllib.request
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -104,14 +102,12 @@ def test_the_sync_age_is_absent_until_it_is_known():
 
 
 LIMITED = "nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n"
-OLD = "nr_periods 4\nnr_throttled 2\nthrottled_time 500000000\n"
 
 
 @pytest.mark.parametrize(
     ("file", "text", "counts"),
     [
         ("cpu.stat", LIMITED, [120, 17, 1.25]),
-        ("cpu,cpuacct/cpu.stat", OLD, [4, 2, 0.5]),
         ("cpu.stat", "usage_usec 4402130\n", []),  # without a limit
         ("none", "", []),
     ],
@@ -153,26 +149,6 @@ def test_metrics_and_probes_are_on_one_port(served, monkeypatch):
     with urllib.request.urlopen(f"http://{HOST}:{port}/metrics", timeout=10) as answer:
         assert answer.headers["Content-Type"] == "text/plain; version=0.0.4; charset=utf-8"
     assert get(port, "/") == (404, "there are /metrics, /healthz, /readyz, /link.json\n")
-
-
-def test_scrapers_that_come_at_once_have_one_page_made(served, monkeypatch):
-    exporter, port = served
-    monkeypatch.setattr(exporters, "KEPT", 60.0)
-    write, calls, all_wait = exporter.text, [], threading.Event()
-
-    def slowly():
-        calls.append(1)
-        assert all_wait.wait(10.0)
-        return write()
-
-    monkeypatch.setattr(exporter, "text", slowly)
-    with ThreadPoolExecutor(8) as scrapers:
-        answers = [scrapers.submit(get, port, "/metrics") for _ in range(8)]
-        while threading.active_count() < 16:  # eight clients and eight server threads
-            assert get(port, "/healthz")[0] == 200  # probes do not wait for scrapes
-        all_wait.set()
-        pages = {each.result() for each in answers}
-    assert (len(pages), len(calls)) == (1, 1)
 
 
 def test_a_loop_that_stands_still_is_not_alive(served, monkeypatch):

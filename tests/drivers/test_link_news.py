@@ -36,19 +36,3 @@ def test_a_change_is_told_once_with_old_and_new_values(tmp_path, changed, said):
     assert news.look(LOOK_NS + 1) == "", "it is not due"
     assert news.look(2 * LOOK_NS) == said
     assert news.look(3 * LOOK_NS) == ""
-
-
-def test_a_malformed_state_is_ignored_and_a_long_value_is_cut(tmp_path):
-    path = tmp_path / "link.json"
-    news = LinkNews(path)
-    path.write_text(to_text(STATE))
-    news.look(0)
-    path.write_text("{")
-    assert news.look(LOOK_NS) == ""
-    times = [{"at_s": at, "delay_ms": 9} for at in range(100)]
-    profile = {**STATE.profile, "uplink": {**WAY, "changes": times}}
-    path.write_text(to_text(replace(STATE, profile=profile)))
-    told = news.look(2 * LOOK_NS)
-    assert "uplink.changes [{" in told
-    assert "... (was not set)" in told
-    assert len(told) < 200

@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import time
-from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -144,26 +143,3 @@ def check_delays(recording):
     parts = [delays[(sent_ns > a + 1e8) & (sent_ns < b)] for a, b in pairwise(edges)]
     asked = [0.045, 0.120, 0.025]
     assert list(map(np.median, parts)) == pytest.approx(asked, abs=0.005), "beside other tests"
-
-
-def private_memory(pid):
-    """Return the private memory of a process [MB]."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    return 1.024e-3 * int(status.partition("RssAnon:")[2].split()[0])
-
-
-@pytest.mark.full
-def test_an_hour_of_recording_takes_below_a_megabyte(tmp_path, figure):
-    """Measured over half an hour, once a quarter of an hour has filled all buffers."""
-    run = start(tmp_path / "run", "criteria.time_limit_s=3600", dwell=3000.0)
-    pids = {name: pid for name, pid in wait_until_flying(run).items() if name in ENDS}
-    memory = []
-    for minutes in (15, 30):
-        with suppress(subprocess.TimeoutExpired):  # reads what the run prints meanwhile
-            run.communicate(timeout=60.0 * minutes)
-        memory.append({name: private_memory(pid) for name, pid in pids.items()})
-    run.terminate()
-    run.communicate(timeout=60)
-    for name in ENDS:
-        grown = (memory[1][name] - memory[0][name]) * 2
-        figure(f"{name} with a recording: memory grown in an hour", grown, "<=", 1.0, "MB")

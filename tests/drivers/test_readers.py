@@ -91,12 +91,6 @@ def test_a_reader_goes_on_with_a_new_process_of_cloud(tmp_path, sender, reader, 
     again.close()
 
 
-def test_without_a_reader_nothing_is_encoded(sender, monkeypatch):
-    monkeypatch.setattr("cloudrc.drivers.readers.to_line", None)
-    sender.see(1, 1, TELEMETRY)
-    sender.put([arrival(1)])
-
-
 def test_a_reader_that_has_ended_is_forgotten(tmp_path, sender, reader, clock):
     reader.close()
     sender.put([arrival(1)])

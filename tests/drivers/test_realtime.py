@@ -17,7 +17,6 @@ from cloudrc.drivers.realtime import (
     bind,
     serve,
     show_address,
-    split_address,
 )
 from tests.conftest import needs_ipv6
 from tests.flights.conftest import bare_world, ring
@@ -28,14 +27,6 @@ MS = 1_000_000
 LONG_NS = 10 * STALL_NS
 
 
-def test_an_address_is_a_host_and_a_port():
-    known = {"127.0.0.1:7401\n": HERE, "[::1]:7400": ("::1", 7400), "cloud:7400": ("cloud", 7400)}
-    assert {text: split_address(text) for text in known} == known
-    for text in ("1.2.3.4", ":7401", "1.2.3.4:0", "1.2.3.4:65536", "::1:7400", "[1.2.3.4]:1"):
-        with pytest.raises(ValueError, match=r"HOST:PORT|brackets"):
-            split_address(text)
-
-
 def write(path, text, moment_ns):
     path.write_text(text)
     os.utime(path, ns=(moment_ns, moment_ns))
@@ -44,7 +35,6 @@ def write(path, text, moment_ns):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda path: path.write_bytes(b"\x00\xff"),
         lambda path: path.write_bytes(b"name:7400"),
         lambda path: None,
     ],

@@ -25,7 +25,7 @@ from cloudrc.teleop.api import STARTING, ApiServer, Bridge, create_app
 from cloudrc.teleop.auth import Gate, Tokens
 from cloudrc.teleop.carrot import setpoint_at
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.models import read_drive, read_goto, read_order
+from cloudrc.teleop.models import RequestReader
 from cloudrc.teleop.refusals import ConflictError, UnavailableError
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import MissionStore, Order
@@ -345,11 +345,9 @@ class Running:
         self.flight.uplink = uplink
         self.alarms, self.complaints, self.log = [], [], []
         self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
-        how = {"plan": partial(assembly.mission_plan, fence=FENCE)}
-        where = {"scene": self.scene, "robot": PELICAN.dense}
-        order, goto = (partial(read, **where) for read in (read_order, read_goto))
-        order = partial(order, **how)
-        app = create_app(self.bridge, order, goto, read_drive, self.complaints.append)
+        plan = partial(assembly.mission_plan, fence=FENCE)
+        reader = RequestReader(self.scene, PELICAN.dense, plan)
+        app = create_app(self.bridge, reader, self.complaints.append)
         tokens = None if unix else Tokens(folder, self.complaints.append)
         self.gate = Gate(app, tokens, self.log.append)
         self.address = folder / "api.sock" if unix else (host, 0)

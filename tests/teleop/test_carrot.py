@@ -31,12 +31,6 @@ def test_the_carrot_speeds_up_cruises_and_stops():
     assert arrival_ns(Setpoint(A)) == 0
 
 
-def test_a_way_of_no_length_is_no_motion():
-    resting = Setpoint(A, motion=Motion(A, SECOND, 2.0, 2.0))
-    for now_ns in (0, SECOND, 2 * SECOND):
-        assert setpoint_at(resting, now_ns) == resting
-
-
 @given(POINTS, POINTS, SIZES, SIZES, st.integers(0, 10 * SECOND))
 def test_the_carrot_keeps_its_limits(start, end, speed, acceleration, now_ns):
     moving = Setpoint(end, motion=Motion(start, 0, speed, acceleration))

@@ -8,7 +8,6 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from itertools import pairwise
 from math import dist, hypot
 
 import pytest
@@ -56,16 +55,6 @@ def test_the_setpoint_keeps_its_limits_and_rests(steps, start):
             assert change <= ACCELERATION * 0.01 + 1e-9
     assert (after.velocity, after.position) == (ZERO, setpoint.position)
     assert decode(encode(setpoint)) == setpoint
-
-
-def test_it_slows_down_before_the_fence():
-    setpoint, now_ns, speeds = Setpoint((6.0, 0.0, 1.0)), 0, []
-    while now_ns < 8_000_000_000:
-        setpoint, now_ns = steer(setpoint, (1.5, 0.0, 0.0), now_ns, FENCE), now_ns + 10 * PERIOD_NS
-        speeds.append(setpoint_at(setpoint, now_ns).velocity[0])
-    assert max(speeds) == 1.5
-    assert setpoint_at(setpoint, now_ns).position[0] == pytest.approx(FENCE.inner_high[0], abs=0.01)
-    assert min(b - a for a, b in pairwise(speeds)) >= -ACCELERATION * 0.1
 
 
 def press(flight, velocity=EAST, seconds=1.0):
@@ -283,19 +272,3 @@ def test_keys_in_a_terminal_drive_the_robot():
         api.until(lambda: flight.guard is GuardState.ESTOP)
         terminal.type("q")
         assert terminal.process.wait(10.0) == 0
-
-
-@pytest.mark.process
-def test_drive_runs_in_a_small_terminal_and_ends_with_it():
-    with running(unix=True) as api:
-        terminal = Terminal(api, lines=4, columns=20)
-        terminal.close()
-        terminal.process.wait(10.0)
-
-
-@pytest.mark.process
-def test_without_a_terminal_drive_says_so():
-    how = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True}
-    said = subprocess.run([*COMMAND, "unix:nowhere"], **how)
-    assert (said.returncode, said.stderr.count("\n")) == (2, 1)
-    assert "needs a terminal" in said.stderr

@@ -50,13 +50,6 @@ def test_dwell_starts_again_outside_of_the_tolerance():
     assert last_event(flight) == "reached"
 
 
-def test_a_robot_at_the_edge_of_the_tolerance_is_at_the_waypoint():
-    """In floating point 1.1 - 1.0 is above 0.1."""
-    flight = flying()
-    flight.step(position=(1.1, 0.0, 1.0), seconds=0.6)
-    assert last_event(flight) == "reached"
-
-
 def test_time_in_hold_or_unseen_is_no_dwell():
     flight = flying()
     flight.guard = HOLD
@@ -98,21 +91,6 @@ def test_setpoints_end_on_time_and_tell_the_distance_from_the_last_one(at):
     texts = " ".join(event.text for event in flight.events)
     assert f"{dist(at, B):.2f} m from the last one" in texts
     assert "waypoint" not in texts
-
-
-def test_a_robot_seen_to_hold_gets_the_first_waypoint_at_once():
-    """One that was told to start does not: an armed robot flies to a setpoint at once."""
-    flight = flying(Plan((Leg(A, dwell=0.0),)))
-    flight.step(position=A)
-    flight.step(seconds=0.15)
-    assert (flight.state, flight.guard) == ("DONE", HOLD)
-    before = len(flight.setpoints)
-    flight.operate("start", PLAN)
-    assert flight.setpoints[before:] == [Setpoint(A, 0.3, 0, turns=True)]
-    flight.operate("cancel")
-    before = len(flight.setpoints)
-    flight.operate("start", PLAN)
-    assert flight.setpoints[before:] == []
 
 
 def started():

@@ -22,17 +22,11 @@ def waypoint(**more):
         ({"waypoints": [POINT, {"position_m": [99, 0, 1]}]},
          "waypoints.1.position_m", 1, "beyond the fence"),
         (waypoint(position_m=[-0.4, 2.0, 0.8]), "waypoints.0.position_m", 0, "wall of pipe"),
-        (waypoint(position_m=[0]), "waypoints.0.position_m.1", 0, "is missing"),
         (waypoint(position_m=[0, 0]), "waypoints.0.position_m", 0, "needs a height"),
-        (waypoint(position_m=[0, 0, "high"]), "waypoints.0.position_m.2", 0, "be a number [m]"),
         (waypoint(dwell=1), "waypoints.0.dwell", 0, "did you mean dwell_s"),
         (waypoint(tolerance_m=0), "waypoints.0.tolerance_m", 0, "> 0"),
-        ({**waypoint(), "time_limit_s": 1e308}, "time_limit_s", None, "and <= 1000000"),
-        ({**waypoint(), "key": "k" * 201}, "key", None, "must be text of at most 200 characters"),
-        ({**waypoint(), "\u00b3": 1}, "\u00b3", None, ""),  # `int` does not read this digit
         ({"waypoints": [POINT] * 6000 + [{}]},
          "waypoints.6000.position_m", 6000, "is missing"),
-        (b'{"waypoints": [{"position_m": [0, 0, NaN]}]}', "waypoints.0.position_m.2", 0, "finite"),
         (b"nonsense", "", None, "must be JSON"),
         (b'{"waypoints":' + b"[" * 100_000, "", None, "must be JSON"),
         (b"[]", "", None, "mapping"),
@@ -81,15 +75,6 @@ def test_nobody_is_sent_straight_through_a_pipe(api, here, there, free):
     status, answer = api.post("/v1/goto", {"position_m": there})
     assert (status, answer["id"]) == (200 if free else 409, mission_id)
     assert free or "through the wall of pipe_1; go round it first" in answer["detail"]
-
-
-def test_nor_does_a_mission_go_on_through_its_wall(api):
-    mission_id = api.fly(waypoint(position_m=EAST))
-    api.post("/v1/hold")
-    for here, status, state in ((BORE, 409, "held"), ((0.5, 0.0, 2.0), 200, "flying")):
-        at(api, here)
-        assert api.post("/v1/resume")[0] == status
-        assert api.state_of(mission_id) == state
 
 
 def test_a_mission_from_here_begins_with_a_free_way(api):

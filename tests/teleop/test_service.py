@@ -12,10 +12,10 @@ from cloudrc.exposition.table import MISSION_OUTCOMES
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Cause, GuardState, Setpoint, Start
 from cloudrc.teleop.api import Bridge
-from cloudrc.teleop.refusals import ConflictError, UnavailableError
+from cloudrc.teleop.refusals import ConflictError
 from cloudrc.teleop.service import QUEUE_MAX
 from cloudrc.teleop.store import Order
-from cloudrc.teleop.view import NO_CLOUD, NOT_HEARD, next_step
+from cloudrc.teleop.view import NO_CLOUD, NOT_HEARD
 from cloudrc.teleop.wire import ENDED, STATES, Leg, Plan
 from tests.teleop.conftest import FROM_SPAWN, PLACES, A, ServiceFlight, play, service_flying
 
@@ -168,42 +168,16 @@ def test_what_follows_from_a_script(name, script, expected):
 
 
 @pytest.mark.parametrize(
-    ("script", "action", "said"),
-    [
-        ("create 0.05 A", "create", "m1 is flying; cancel it first, or queue the new one"),
-        ("create 0.05 A", "resume", "resume: the mission is flying; it must be held"),
-        ("mute stop", "create", "an emergency stop is on its way to the robot; find the cause"),
-        ("stop 0.1", "create", "the guard is in ESTOP (emergency stop) and lets nothing fly; find"),
-        ("create queue full", "cancelm2", "m2 is cancelled, but waits again if teleop restarts"),
-    ],
-)
-def test_a_refusal_says_why(script, action, said):
-    flight = ServiceFlight()
-    flight.step()
-    play(flight, script)
-    with pytest.raises((ConflictError, UnavailableError), match=re.escape(said)):
-        play(flight, action)
-
-
-@pytest.mark.parametrize(
     ("script", "said"),
     [
         ("cancel", "mission cancelled"),
-        ("LAND 0.05", "guard went to LAND (fresh command) on the way to waypoint 2 of 3"),
         ("60", "mission not done within 60 s (time_limit_s): on the way to waypoint 2 of 3"),
-        ("foreign 0.05", "somebody else has started another mission on the way to waypoint 2 of 3"),
-        ("full B 0.1 restart free 0.1", "waypoint 2 of 3 reached, as the robot reports"),
-        ("queue cancelm2", "mission cancelled before it began"),
         (
             "deaf 15.4 link 0.05",
             "no telemetry since 0.04 s (teleop does not hear cloud); last seen "
             "at (1.00, 0.00, 1.00) m, with the guard in TRACK",
         ),
         ("deaf 15.4 link 0.05", "telemetry again at 15.45 s, after 15.4 s: guard in TRACK"),
-        (
-            "HOLD 3 TRACK 0.05",
-            "guard in HOLD since 0.05 s (fresh command)",
-        ),
         ("HOLD 3 TRACK 0.05", "guard in TRACK at 3.05 s, after 3.0 s in HOLD"),
     ],
 )
@@ -212,13 +186,6 @@ def test_an_event_says_what_happened_once(script, said):
     play(flight, script)
     events = flight.teleop.book.events_after(0)
     assert [said in event["text"] for event in events].count(True) == 1
-
-
-def test_short_interruptions_are_not_told():
-    flight, mission_id = service_flying()
-    before = flight.names(mission_id)
-    play(flight, "HOLD 0.4 TRACK 0.1 deaf 0.9 link 0.1 HOLD 0.4 TRACK 0.1")
-    assert flight.names(mission_id) == before
 
 
 @pytest.mark.parametrize(
@@ -279,14 +246,6 @@ def test_a_mission_without_its_watcher_is_cancelled_when_its_lease_ends():
     verdict = flight.view(mission_id)["verdict"]
     assert (verdict["outcome"], verdict["exit_code"]) == ("interrupted", 130)
     assert "its watcher is gone" in flight.view(mission_id)["events"][-1]["text"]
-
-
-def test_a_new_watcher_with_the_same_key_renews_the_lease():
-    flight, mission_id = service_flying(lease=10.0, key="uid")
-    flight.step(seconds=9.0)
-    assert flight.create(lease=10.0, key="uid") == mission_id
-    flight.step(seconds=9.0)
-    assert state(flight) == "flying"
 
 
 def test_a_waiting_mission_without_its_watcher_is_cancelled_and_never_flown():
@@ -399,29 +358,9 @@ def test_the_state_has_its_cause_and_its_duration():
     flight.uplink = False
     flight.step(seconds=2.0)
     assert (shown(flight)["guard_for_s"], shown(flight)["cause"]) == (None, "no fresh commands")
-    assert shown(flight)["age_s"] == pytest.approx(2.0)
     flight.uplink = True
     flight.step(position=(nan, 0.0, inf))
     assert shown(flight)["position_m"] == [None, 0.0, None], "JSON has no such numbers"
-    assert shown(flight)["guard_for_s"] == pytest.approx(2.01)
-    flight.restart()
-    flight.guard = HOLD
-    flight.step()
-    assert shown(flight)["guard_for_s"] == 0.0
-
-
-@pytest.mark.parametrize(
-    ("guard", "mission", "said"),
-    [
-        (GROUND, None, "waits for a mission; it starts, after a stop or a landing only when"),
-        (GROUND, "flying", "starts with the mission's first commands, after a stop"),
-        (TRACK, "held", "cloudrc mission resume"),
-        (HOLD, None, "waits for a mission"),
-        (HOLD, "held", "continues by itself when they arrive"),
-    ],
-)
-def test_what_comes_next_follows_from_the_guard_and_the_mission(guard, mission, said):
-    assert said in next_step(guard, 0.0, 0.0, mission)
 
 
 @pytest.mark.parametrize("values", [(11.9, nan), (11.9,), ()])
@@ -437,14 +376,9 @@ def test_the_state_names_the_sensors_and_says_nothing_about_those_of_another_rob
 def test_a_silent_robot_is_told_from_a_silent_cloud():
     flight = ServiceFlight()
     assert flight.teleop.state(0)["cloud_age_s"] is None
-    flight.teleop.hear(1_000_000_000)  # before the robot is seen
-    told = {"mission": None, "queue": [], "cloud_age_s": 2.0, "seen": None}
-    assert flight.teleop.state(3_000_000_000) == told
-    for cloud in (True, False):
+    for cloud, said in ((True, NOT_HEARD), (False, NO_CLOUD)):
         flight.step()
         flight.now_ns += 2_000_000_000
         if cloud:
             flight.teleop.hear(flight.now_ns)
-        age = flight.teleop.state(flight.now_ns + 50_000_000)["cloud_age_s"]
-        assert age == pytest.approx(0.05 if cloud else 2.05)
-        assert shown(flight)["next_step"] == (NOT_HEARD if cloud else NO_CLOUD)
+        assert shown(flight)["next_step"] == said

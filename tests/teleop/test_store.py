@@ -15,7 +15,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.messages import Start
 from cloudrc.teleop import models
 from cloudrc.teleop.client import describe_mission
-from cloudrc.teleop.refusals import ConflictError, UnavailableError, UnknownMissionError
+from cloudrc.teleop.refusals import UnavailableError, UnknownMissionError
 from cloudrc.teleop.store import (
     KEPT,
     SHOWN,
@@ -276,7 +276,3 @@ def test_waypoints_are_reached_once_whenever_teleop_is_killed(kill):
         assert flight.stored().missions == flight.teleop.book.missions
         assert list(flight.teleop.book.missions) == ["m1"]
     assert at > 6
-
-
-def test_a_conflict_names_the_mission_in_the_way():
-    assert ConflictError("a mission flies", "m1").mission == "m1"

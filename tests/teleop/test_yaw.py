@@ -37,18 +37,6 @@ def test_a_waypoint_with_a_yaw_is_reached_within_5_degrees(yaw, seen, reached, s
     assert (flight.leg == 1) is reached
 
 
-def test_turning_away_at_the_waypoint_restarts_the_dwell_time():
-    flight = flying(Plan((Leg(A, 0.0), Leg(B)), Start.HERE))
-    flight.step(position=A, seconds=0.45)
-    flight.orientation = facing(20)
-    flight.step()
-    flight.orientation = facing(0)
-    flight.step(seconds=0.45)
-    assert flight.leg == 0
-    flight.step(seconds=0.06)
-    assert flight.leg == 1
-
-
 def test_the_setpoint_turns_only_at_a_waypoint_with_a_yaw_and_keeps_the_last_one():
     plan = Plan((Leg(A, 0.5, dwell=0.0, yaw_tolerance=pi), Leg(B, dwell=0.0)), Start.HERE)
     flight = flying(plan)
