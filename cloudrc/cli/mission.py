@@ -278,9 +278,7 @@ def _order(options: argparse.Namespace, api: Api) -> int:
 
 
 def _stay(api: Api) -> str:
-    with suppress(CloudrcError):
-        return describe_stay(api.get("/v1/state"))
-    return "holding"
+    return describe_stay(api.get("/v1/state"))
 
 
 def _estop(options: argparse.Namespace, api: Api) -> int:

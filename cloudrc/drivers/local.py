@@ -212,8 +212,9 @@ class Child:
         *lines, self.unread = (self.unread + data).split(b"\n")
         for line in lines:
             self.heard = time.monotonic()
-            self.ready |= line == READY.encode()
-            with contextlib.suppress(ValueError):  # the line is READY or not a record
+            if line == READY.encode():
+                self.ready = True
+            else:
                 records.append(from_line(line.decode()))
         return records
 
@@ -294,24 +295,43 @@ class LocalRun:
         names = ("world", "cloud", "teleop", "uplink", "downlink")
         self._metrics = dict(zip(names, ports[4:], strict=False))
 
+        flights = ("--record-flights",) if session else ()
+
         def start_end(name: str, way: str, **more: object) -> None:
-            more |= {"listen": at[name], "route": folder / LINK_FOLDER / way / ROUTE_FILE}
-            more |= {"key": sockets / "key", "record": folder / f"{name}.mcap"}
-            self._start(name, name, *(("--record-flights",) if session else ()), **more)
+            self._start(
+                name,
+                name,
+                *flights,
+                listen=at[name],
+                route=folder / LINK_FOLDER / way / ROUTE_FILE,
+                key=sockets / "key",
+                record=folder / f"{name}.mcap",
+                **more,
+            )
 
         def start_link(way: str, end: str, peer: str) -> None:
-            more: dict[str, object] = {"listen": at[way], "end": at[end], "peer": at[peer]}
-            words = link_words(folder / LINK_FOLDER, way)
-            more["control"] = link_socket(url, way)
-            self._start(way, *words, mode="relay", origin=origin_ns, **more)
+            self._start(
+                way,
+                *link_words(folder / LINK_FOLDER, way),
+                mode="relay",
+                origin=origin_ns,
+                listen=at[way],
+                end=at[end],
+                peer=at[peer],
+                control=link_socket(url, way),
+            )
 
         start_end("world", "uplink")
         # Only this user can open the socket of the API: no token is needed.
-        given: dict[str, object] = {"api": url, "api-file": folder / API_FILE}
-        given |= {"link": folder / LINK_FOLDER / "downlink" / STATE_FILE}
-        given |= {"journal": folder / JOURNAL_FILE} if session else {}
-        start = () if session else ("--start",)
-        self._start("teleop", "teleop", *start, socket=sockets, **given)
+        self._start(
+            "teleop",
+            "teleop",
+            *([f"--journal={folder / JOURNAL_FILE}"] if session else ["--start"]),
+            f"--api-file={folder / API_FILE}",
+            socket=sockets,
+            api=url,
+            link=folder / LINK_FOLDER / "downlink" / STATE_FILE,
+        )
         self._wait_until_ready()
         # With cloud, which sends first: the time lines of the link begin shortly before the flight.
         origin_ns = time.monotonic_ns()  # one start for both directions

@@ -12,9 +12,9 @@ import select
 import threading
 import time
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import Any
 
 from cloudrc.drivers.teleop import UnixDatagrams
@@ -22,7 +22,7 @@ from cloudrc.errors import CloudrcError, ControllerLostError
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.address import KEY_VARIABLE
 from cloudrc.policy.client import PolicyClient, SilentServerError
-from cloudrc.policy.codec import WireError, pack, unpack
+from cloudrc.policy.codec import pack, unpack
 
 WIDTH = 4
 """Numbers of a row: vx, vy, vz [m/s], yaw rate [rad/s]."""
@@ -140,8 +140,7 @@ class RemoteLink:
         message = {"episode": self._episode, "sent_ns": now_ns, "observation": observation}
         self._peer.send_data(pack(message))
         for data in self._peer.receive_data():
-            with suppress(WireError):
-                self._take(unpack(data))
+            self._take(unpack(data))
         if self._newest is not None:
             sent_ns, rows = self._newest
             if now_ns - sent_ns <= len(rows) * self._period_ns + HOLD_NS:
@@ -196,9 +195,8 @@ class RemoteDriver:
     def _work(self) -> None:
         while True:
             data = self._waiting.get()
-            with suppress(Empty):
-                while True:  # only the newest observation counts
-                    data = self._waiting.get_nowait()
+            while not self._waiting.empty():  # only the newest observation counts
+                data = self._waiting.get()
             message = unpack(data)
             answer = self._ask(message["episode"], message["observation"])
             self._peer.send_data(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -166,7 +166,11 @@ def open_end(settings: EndSettings, name: str) -> tuple[ResolvedExperiment, Iden
     link = settings.route.with_name(STATE_FILE)
     with listening("--listen", settings.listen):
         peer = Peer(bind(settings.listen), settings.route)
-    attached = _flown(experiment) if name == "world" else {}
+    attached = dict[str, bytes]()
+    if name == "world":
+        from cloudrc.world.shapes import flown_files
+
+        attached = flown_files(experiment.world)
     recorder = open_recorder(settings.record, settings.record_max, name, clock, attached)
     end = EndProcess(
         end=name,
@@ -180,13 +184,6 @@ def open_end(settings: EndSettings, name: str) -> tuple[ResolvedExperiment, Iden
         check=link_monitor(experiment, uplink=name == "cloud", trusted=settings.feed),
     )
     return experiment, Identity(clock, os.urandom(16), keys.ring), end
-
-
-def _flown(experiment: ResolvedExperiment) -> dict[str, bytes]:
-    """Return the files to attach to a recording: what its report needs of robot and scene."""
-    from cloudrc.world.shapes import flown_files
-
-    return flown_files(experiment.world)
 
 
 def open_recorder(
@@ -208,9 +205,8 @@ def open_recorder(
     from cloudrc.record.writer import McapWriter
 
     kept, size_max = 0, None
-    with suppress(OSError):  # the recorder will meet the same error and report it
-        if path.is_file() and (kept := path.stat().st_size):
-            path.replace(path.with_name(f"{path.stem}.before{path.suffix}"))
+    if path.is_file() and (kept := path.stat().st_size):
+        path.replace(path.with_name(f"{path.stem}.before{path.suffix}"))
     if limit:
         room = round(0.9 * limit)
         size_max = max(room - kept, room // 10)

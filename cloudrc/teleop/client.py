@@ -75,8 +75,7 @@ class Api:
 
     def get(self, path: str) -> Any:
         """Send a GET request; result and errors are those of `post`."""
-        with self._answer("GET", path, None, REQUEST_TIMEOUT) as answer:
-            return self._read(answer)
+        return self._ask("GET", path, None)
 
     def post(self, path: str, body: Mapping[str, Any] | None = None) -> Any:
         """Send a POST request; return the decoded JSON of the answer.
@@ -86,9 +85,7 @@ class Api:
             BadInputError: If a value is invalid.
             ApiError: If the API refuses the request for another reason.
         """
-        data = b"" if body is None else json.dumps(body).encode()
-        with self._answer("POST", path, data, REQUEST_TIMEOUT) as answer:
-            return self._read(answer)
+        return self._ask("POST", path, b"" if body is None else json.dumps(body).encode())
 
     def events(self, after: int = 0) -> Iterator[dict[str, Any]]:
         """Yield the events with an id above `after`, of all missions, until teleop ends."""
@@ -120,11 +117,11 @@ class Api:
             try:
                 connection.request(method, self._prefix + path, body, headers)
                 answer = connection.getresponse()
-                if answer.status < 400 and not _is_from_api(answer):
-                    answer.close()
-                    raise self._foreign(answer)
                 if not 200 <= answer.status < 300:
                     raise _refusal(answer, self.place, with_token=bool(token))
+                if answer.headers.get_content_type() == "text/html":
+                    answer.close()
+                    raise ApiError(f"{self.url} answers with a page: {FOREIGN}")
                 yield answer
             except (OSError, ValueError, http.client.HTTPException) as error:
                 text = f"the API at {self.url} does not answer"
@@ -133,19 +130,9 @@ class Api:
                 why = getattr(error, "strerror", None) or error
                 raise UnreachableError(f"{text} ({why})") from None
 
-    def _read(self, answer: http.client.HTTPResponse) -> Any:
-        """Decode the JSON of an answer; raise an ApiError if it is none."""
-        text = answer.read()
-        try:
-            return json.loads(text)
-        except ValueError:
-            raise self._foreign(answer) from None
-
-    def _foreign(self, answer: http.client.HTTPResponse) -> ApiError:
-        """Return an error which says that another program has answered."""
-        target, kind = answer.headers.get("Location"), answer.headers.get_content_type()
-        said = f"{answer.status} {answer.reason} {f'to {target}' if target else f'and {kind}'}"
-        return ApiError(escape(f"{self.url} answers with {said}: {FOREIGN}"))
+    def _ask(self, method: str, path: str, body: bytes | None) -> Any:
+        with self._answer(method, path, body, REQUEST_TIMEOUT) as answer:
+            return json.loads(answer.read())
 
     def _connection(self, limit: float) -> http.client.HTTPConnection:
         """Make a connection without a proxy: the API is on this machine or in the cluster."""
@@ -180,11 +167,6 @@ class _UnixConnection(http.client.HTTPConnection):
 def mission_path(mission_id: str) -> str:
     """Return the URL path of a mission; quote special characters of its id."""
     return f"/v1/missions/{quote(mission_id, safe='', errors='surrogateescape')}"
-
-
-def _is_from_api(answer: http.client.HTTPResponse) -> bool:
-    """Return whether an answer without an error can be that of teleop."""
-    return answer.status < 300 and answer.headers.get_content_type() != "text/html"
 
 
 def _refusal(answer: http.client.HTTPResponse, place: str, *, with_token: bool) -> CloudrcError:

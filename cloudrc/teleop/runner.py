@@ -88,10 +88,10 @@ class MissionRunner:
 
     def operate(self, act: Callable[[MissionFlight], None], now_ns: int) -> MissionRecord:
         """Let the operator act on the mission under way; raise ConflictError without one."""
-        mission, flight = self.current, self._teleop.flight
-        if mission is None or flight is None:
+        mission = self.current
+        if mission is None:
             raise ConflictError("no mission is under way")
-        act(flight)
+        act(self._flight)
         self.collect(now_ns)
         return mission
 
@@ -124,14 +124,15 @@ class MissionRunner:
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process telemetry that has arrived at `now_ns`."""
-        before, mission, flight = self.seen, self.current, self._teleop.flight
+        before, mission = self.seen, self.current
         if self._inherits_stop and seen.mission_id == self._inherits_stop.number:
             if seen.guard in AIRBORNE:  # the stop has not reached the robot
                 self._teleop.stop(now_ns)
         self._view.see(before, seen, now_ns)
-        if mission is not None and flight is not None:
+        if mission is not None:
+            flight = self._flight
             if (mission.number, mission.world) == (seen.mission_id, seen.world):
-                self._witness(mission, flight, seen, now_ns)
+                self._witness(mission, seen, now_ns)
                 if before is not None and before.epoch != seen.epoch:
                     text = f"cloud has a new session; the mission is {mission.state}"
                     self.note(mission, "new_session", f"{text} {flight.route.where}", now_ns)
@@ -176,9 +177,8 @@ class MissionRunner:
         self, mission: MissionRecord, event: str, text: str, now_ns: int, **changed: Any
     ) -> None:
         """Store an event of a mission, and the fields that it has `changed`."""
-        flight = self._teleop.flight
-        if mission is self.current and flight is not None:
-            changed["elapsed"] = round(flight.elapsed(now_ns), 3)
+        if mission is self.current:
+            changed["elapsed"] = round(self._flight.elapsed(now_ns), 3)
         self.book.note(mission, event, text, **changed)
 
     def tell_link(self, text: str, now_ns: int) -> None:
@@ -196,12 +196,16 @@ class MissionRunner:
         unknown = self.seen is None and not self._teleop.stopping
         return self.book.stopped() if unknown else None
 
-    def _witness(
-        self, mission: MissionRecord, flight: MissionFlight, seen: RobotStatus, now_ns: int
-    ) -> None:
+    @property
+    def _flight(self) -> MissionFlight:
+        flight = self._teleop.flight
+        assert flight is not None, "a mission is under way"
+        return flight
+
+    def _witness(self, mission: MissionRecord, seen: RobotStatus, now_ns: int) -> None:
         """Note what telemetry shows about contacts, touches and slips in a mission."""
         before, known = self.seen, mission.witness
-        time, touched = flight.elapsed(now_ns), mission.order.touched
+        time, touched = self._flight.elapsed(now_ns), mission.order.touched
         first = known.first_contact
         if seen.obstacle_contacts and not first:
             place = self._obstacles.describe_contact(seen, touched)
@@ -218,22 +222,21 @@ class MissionRunner:
 
     def _tell_silence(self, now_ns: int) -> None:
         """Note if the mission under way gets no telemetry."""
-        mission, flight, view = self.current, self._teleop.flight, self._view
-        if mission is None or flight is None:
+        mission, view = self.current, self._view
+        if mission is None:
             return
         cloud_ns = self._began_ns if view.heard_ns is None else view.heard_ns
         for event, text in self._interruptions.wait(
             self.seen,
-            flight.elapsed(now_ns),
+            self._flight.elapsed(now_ns),
             (now_ns - max(view.seen_ns, self._began_ns)) * 1e-9,
             cloud_is_silent=(now_ns - cloud_ns) * 1e-9 > SILENCE,
         ):
             self.note(mission, event, text, now_ns)
 
     def _process_event(self, event: MissionEvent, now_ns: int) -> None:
-        mission, flight, seen = self.current, self._teleop.flight, self.seen
+        mission, flight, seen = self.current, self._flight, self.seen
         assert mission is not None, "an event belongs to a mission"
-        assert flight is not None, "an event belongs to a mission"
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
             changed |= {"world": seen.world, "witness": Observations()}

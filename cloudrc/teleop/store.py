@@ -12,7 +12,6 @@ import json
 import sqlite3
 from collections import Counter, deque
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -144,8 +143,8 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
         raise BadInputError(f"--journal {path}: {reason}; repair or move it, or name another file")
     aside = path.with_name(f"{path.name}.damaged")
     for ending in ("", "-wal"):  # the files of one database
-        with suppress(FileNotFoundError):
-            Path(f"{path}{ending}").replace(f"{aside}{ending}")
+        if (part := Path(f"{path}{ending}")).exists():
+            part.replace(f"{aside}{ending}")
     text = f"journal repaired: {path}: {reason}; its missions are lost, it is kept as {aside}"
     return MissionStore(connect(path), salt, text)
 
@@ -165,7 +164,7 @@ def connect(path: Path | None = None, factory: Any = sqlite3.Connection) -> sqli
         )
         if db.execute("PRAGMA schema_version").fetchone() == (0,):  # a new file
             db.executescript(SCHEMA)
-    except BaseException:
+    except sqlite3.DatabaseError:
         db.close()
         raise
     return db
@@ -242,7 +241,8 @@ class MissionStore:
         mission = MissionRecord(mission_id, replace(order, queue=False), number)
         ended = [each.id for each in self.missions.values() if each.ended]
         old = ended[: max(0, len(ended) - KEPT)]
-        self._commit(mission, old)
+        if not self._commit(mission, old):
+            raise UnavailableError(f"no mission can start: {self.trouble}")
         self.missions[mission_id] = mission
         for each in old:
             del self.missions[each]
@@ -255,15 +255,13 @@ class MissionStore:
         self._events += 1
         self._unsaved.add(mission.id)
         mission.apply(self._events, event, text, **changed)
-        with suppress(UnavailableError):
-            self._commit()
+        self._commit()
 
     def catch_up(self, now_ns: int) -> None:
         """Write again the events that the disk has refused, if a retry is due at `now_ns` [ns]."""
         if self.trouble and now_ns >= self._keep_ns:
             self._keep_ns = now_ns + KEEP_PERIOD_NS
-            with suppress(UnavailableError):
-                self._commit()
+            self._commit()
 
     def events_after(self, number: int) -> list[Event]:
         """Return the events of all missions after the event `number`, oldest first."""
@@ -281,8 +279,11 @@ class MissionStore:
         """Close the file, so that the next teleop can open it."""
         self._db.close()
 
-    def _commit(self, new: MissionRecord | None = None, old: Sequence[str] = ()) -> None:
-        """Write unsaved events and the mission `new` to the disk; delete missions `old` there."""
+    def _commit(self, new: MissionRecord | None = None, old: Sequence[str] = ()) -> bool:
+        """Write unsaved events and the mission `new` to the disk; delete missions `old` there.
+
+        Return whether the disk has them; if not, `trouble` says why.
+        """
         db = self._db
         try:
             db.execute("BEGIN")
@@ -296,12 +297,12 @@ class MissionStore:
             db.executemany("DELETE FROM missions WHERE n = ?", [(_row(each),) for each in old])
             db.commit()
         except sqlite3.DatabaseError as error:
-            with suppress(sqlite3.DatabaseError):
-                db.rollback()
+            db.rollback()
             self.trouble = f"the journal cannot be written: {error}; free or repair its volume"
-            raise UnavailableError(f"no mission can start: {self.trouble}") from error
+            return False
         self._unsaved.clear()
         self.trouble = ""
+        return True
 
     def _read(self) -> None:
         for row, ordered, status in self._db.execute("SELECT * FROM missions ORDER BY n"):

@@ -53,13 +53,9 @@ PAGE = "<!DOCTYPE html><title>Please log in</title>"
 @pytest.mark.parametrize(
     ("answer", "said"),
     [
-        ((200, "text/html; charset=utf-8", PAGE, {}), "200 OK and text/html: a proxy or"),
-        ((200, "text/plain", "hello", {}), "200 OK and text/plain: a proxy or another"),
-        ((302, "text/html", "", {"Location": "https://sso/x"}), "302 Found to https://sso/x: "),
-        ((308, "text/html", "", {"Location": "/v1/state/"}), "308 Permanent Redirect to /v1"),
+        ((200, "text/html; charset=utf-8", PAGE, {}), "answers with a page: a proxy or"),
+        ((302, "text/html", "", {"Location": "https://sso/x"}), "302 Found: a proxy or"),
         ((404, "text/html", PAGE, {}), "404 Not Found: a proxy or another"),
-        ((403, "text/html", PAGE, {}), "the API answered 403 Forbidden: a proxy or another"),
-        ((501, "text/html", PAGE, {}), "the API answered 501 Not Implemented: a proxy or another"),
     ],
 )
 @pytest.mark.parametrize("method", ["get", "post"])

@@ -58,53 +58,32 @@ def names(page):
 def foreign_origins(port):
     own = f"http://127.0.0.1:{port}"
     return [
-        *("https://example.org", "http://example.org", f"http://example.org:{port}"),
-        *("null", "", "*", "about:blank", "file://", "data:", "blob:", "undefined", "none"),
-        *(f"https://127.0.0.1:{port}", f"ws://127.0.0.1:{port}", f"wss://127.0.0.1:{port}"),
-        *("http://127.0.0.1", "http://127.0.0.1:1", f"http://127.0.0.1:{port}0"),
-        *(f"{own}/", f"{own}/x", f"{own}?", f"{own}#", f"{own},{own}", f"{own} {own}"),
-        *(f"HTTP://127.0.0.1:{port}", f"127.0.0.1:{port}", f"//127.0.0.1:{port}"),
-        *(f"http://127.0.0.1.:{port}", f"http://127.0.0.1.example.org:{port}"),
-        *(f"http://user@127.0.0.1:{port}", f"http://127.0.0.1:{port}@example.org"),
-        *(f"http://example.org/127.0.0.1:{port}", f"http://127.0.0.1%2eexample.org:{port}"),
-        *(f"http://2130706433:{port}", f"http://0x7f000001:{port}", f"http://127.1:{port}"),
-        *(f"http://0177.0.0.1:{port}", f"http://127.0.0.2:{port}", f"http://0.0.0.0:{port}"),
-        *(f"http://[::1]:{port}", f"http://[::ffff:127.0.0.1]:{port}", f"http://[::]:{port}"),
-        *(f"http://localhost:{port}", f"http://localhost.:{port}", f"http://LOCALHOST:{port}"),
-        *(f"http://x.localhost:{port}", f"http://localhost.example.org:{port}"),
-        *(f"http://\xb9\xb227.0.0.1:{port}", f"http://127.0.0.1:0{port}"),
-        *("http://hub.example.org", f"{PROXY}:443", f"{PROXY}/", "https://hub.example.org."),
+        *("https://example.org", f"http://example.org:{port}", "null", "", "*", "file://"),
+        *(f"https://127.0.0.1:{port}", "http://127.0.0.1", f"{own}0", f"{own}/", f"{own},{own}"),
+        *(f"HTTP://127.0.0.1:{port}", f"127.0.0.1:{port}", f"http://user@127.0.0.1:{port}"),
+        *(f"{own}@example.org", f"http://127.0.0.1.example.org:{port}", f"http://127.1:{port}"),
+        *(f"http://2130706433:{port}", f"http://0.0.0.0:{port}", f"http://[::1]:{port}"),
+        *(f"http://localhost:{port}", f"http://x.localhost:{port}", f"http://127.0.0.1:0{port}"),
+        *("http://hub.example.org", f"{PROXY}:443", f"{PROXY}/", "https://HUB.example.org"),
         *("https://x.hub.example.org", "https://hub.example.org.evil.example"),
-        *("https://evil-hub.example.org", "https://HUB.example.org", "https://hub_example.org"),
-        "chrome-extension://abcdefghijklmnop",
     ]
 
 
 def foreign_hosts(port):
     return [
-        *("example.org", f"example.org:{port}", "", " ", ":", f":{port}", "*", "null"),
-        *(f"127.0.0.1.:{port}", f"localhost.:{port}", f"LOCALHOST:{port}", f"x.localhost:{port}"),
-        *(f"127.0.0.1.example.org:{port}", f"localhost.example.org:{port}"),
+        *("example.org", f"example.org:{port}", "", " ", f":{port}", "*", f"127.0.0.1.:{port}"),
+        *(f"LOCALHOST:{port}", f"x.localhost:{port}", f"127.0.0.1.example.org:{port}"),
         *(f"user@127.0.0.1:{port}", f"127.0.0.1:{port}@example.org", f"127.0.0.1:{port}/"),
-        *(f"2130706433:{port}", f"0x7f000001:{port}", f"127.1:{port}", f"0177.0.0.1:{port}"),
-        *(f"127.0.0.2:{port}", f"0.0.0.0:{port}", f"[::1]:{port}", f"[::ffff:127.0.0.1]:{port}"),
-        *(f"[::ffff:7f00:1]:{port}", f"::1:{port}", f"127.0.0.1:{port},example.org"),
-        *(f"127.0.0.1:{port} example.org", "127.0.0.1:", "127.0.0.1:x", "127.0.0.1:123456"),
-        *(
-            f"http://127.0.0.1:{port}",
-            f"127.0.0.1%00:{port}",
-            f"\xb9\xb227.0.0.1:{port}",
-        ),
+        *(f"127.1:{port}", f"127.0.0.2:{port}", f"0.0.0.0:{port}", f"[::1]:{port}"),
+        *(f"127.0.0.1:{port},example.org", "127.0.0.1:", "127.0.0.1:x", "127.0.0.1:123456"),
         *("hub.example.org:8000", "x.hub.example.org", "hub.example.org.", "HUB.example.org"),
     ]
 
 
 WRONG_TOKENS = [
-    *("", "x", "null", "undefined", "0", "*", TOKEN[:-1], f"{TOKEN}0", TOKEN.upper(), TOKEN[::-1]),
-    *(f" {TOKEN}", f"{TOKEN}%20", f"%20{TOKEN}", f"{TOKEN}%00", f"+{TOKEN}", f'"{TOKEN}"'),
-    *(f"%30{TOKEN[1:]}", "".join(f"%{ord(each):02x}" for each in TOKEN), f"{TOKEN};", f"{TOKEN}#"),
-    *(f"{TOKEN}&token=", f"{TOKEN}&token=x", f"x&token={TOKEN}", f"{TOKEN},{TOKEN}", "0" * 32),
-    *(f"token={TOKEN}", f"{TOKEN}/", f"\xe9{TOKEN}", "0" * 12_000),
+    *("", "x", "null", "*", TOKEN[:-1], f"{TOKEN}0", TOKEN.upper(), TOKEN[::-1], "0" * 12_000),
+    *(f" {TOKEN}", f"{TOKEN}%20", f"%30{TOKEN[1:]}", f"{TOKEN};", f"{TOKEN}&token=x"),
+    *(f"x&token={TOKEN}", f"token={TOKEN}", f"{TOKEN}/", f"\xe9{TOKEN}"),
 ]
 
 
@@ -128,7 +107,7 @@ def test_the_own_page_connects_with_the_token(served):
 
 
 def test_no_foreign_origin_host_or_token_connects(served):
-    """More than 100 shapes; each has everything right but the one."""
+    """Each shape has everything right but the one."""
     page, _ = served
     own, cookie = names(page)
     host, origin = f"Host: {own}", f"Origin: http://{own}"
@@ -163,7 +142,6 @@ def test_no_foreign_origin_host_or_token_connects(served):
         ([cookie, "Host: hub.example.org", f"Origin: http://{own}"], ""),
         ([cookie, "Host: hub.example.org", "Origin: http://hub.example.org"], ""),
     ]
-    assert len(shapes) > 100
     accepted = [shape for shape in shapes if {*both_doors(page, *shape)} & {101, 200, 202, 303}]
     assert not accepted
 

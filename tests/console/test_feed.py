@@ -43,14 +43,6 @@ def test_a_prediction_is_compared_at_its_own_instant(feed):
     assert feed.samples[-1].estimate_error == pytest.approx(0.020)
 
 
-def test_no_prediction_is_judged_across_two_sessions(feed):
-    for step in range(4):
-        at = 0.03 * step
-        feed.take(status(at, control=control(at, at, horizon=0.06)), 1.0 + at)
-    feed.take(status(0.12, control=control(0.12, 0.12, measured=(5, 5, 5)), epoch=2), 1.12)
-    assert isnan(feed.samples[-1].estimate_error)
-
-
 def test_error_and_estimate_are_unknown_without_control(feed):
     feed.take(status(0.1, control=control(0.1)), 1.0)
     assert feed.control(1.0)

@@ -232,20 +232,6 @@ def test_the_first_view_shows_the_whole_mission(filled):
     assert forward[0] > abs(forward[1]), "along +x"
 
 
-def test_the_state_tells_a_drive_and_names_buttons(filled):
-    page, feed, steering = filled("hover")
-    drive = {"id": "m1", "by_hand": True, "state": "held", "reached": []}
-    words = "to continue: cloudrc mission resume, or cancel"
-    steering.state = {"mission": drive, "seen": {"next_step": words}}
-    feed.take(status(0.1), 1.0)
-    page.update(1.0)
-    assert "Mission: drive, waits for keys" in page._status.content
-    assert "to continue: resume, or cancel" in page._status.content
-    steering.hold_key("up", (0.0, 0.0, 0.4), 60.0)
-    page.update(2.0)
-    assert "Mission: driving" in page._status.content
-
-
 @pytest.mark.parametrize(
     ("waypoints", "shown"), [(7, "0 of 7 waypoints"), (0, "setpoints of a file")]
 )

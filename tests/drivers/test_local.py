@@ -90,14 +90,6 @@ def test_other_users_cannot_open_a_flight_file(tmp_path, flights):
         os.umask(before)
 
 
-def test_sockets_lie_beside_the_flight_files_where_nobody_cleans(monkeypatch):
-    with tempfile.TemporaryDirectory(prefix="s", dir="/tmp") as short:  # as /run/user/1000
-        monkeypatch.setenv("XDG_RUNTIME_DIR", short)
-        own = local.flights_folder().parent
-        assert socket_folder() == str(own)
-        assert [*own.iterdir()] == [], "the trial leaves nothing"
-
-
 def test_sockets_lie_in_a_folder_with_a_short_path(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / ("x" * 90)))
     (tmp_path / ("x" * 90)).mkdir()

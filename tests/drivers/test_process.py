@@ -93,17 +93,6 @@ def test_where_nobody_watches_events_are_said_in_words(pipe):
     assert os.read(pipe[0], 1 << 20) == f"{EVENT.text}\ncaf\\udce9\n".encode()
 
 
-def test_a_line_is_told_whole_however_long(pipe):
-    """A pipe holds 64 KiB; the rest of a longer line is written before the next line."""
-    feed, data = Feed(pipe[1]), b""
-    long = EVENT._replace(text="x" * 150_000)
-    for event in (long, EVENT, EVENT, EVENT):
-        feed.tell([event])
-        data += os.read(pipe[0], 1 << 20)
-    *lines, rest = data.decode().split("\n")
-    assert ([from_line(line) for line in lines], rest) == ([long, EVENT, EVENT], "")
-
-
 MS = 1_000_000
 STATE = LinkState(
     *("relay", "link.mode=relay", "relay", "downlink"),

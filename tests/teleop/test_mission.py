@@ -4,10 +4,9 @@ from math import dist, inf
 
 import pytest
 
-from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
-from cloudrc.teleop.requests import REPEAT_NS
+from cloudrc.messages import GuardState, Request, Start
 from cloudrc.teleop.wire import ALARM, Leg, Plan
-from tests.teleop.conftest import AWAY, FROM_SPAWN, ID, PLAN, THREE, A, B, Flight, asked, flying
+from tests.teleop.conftest import AWAY, ID, PLAN, THREE, A, B, Flight, asked, flying
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
@@ -120,22 +119,6 @@ def test_a_robot_that_waits_during_its_mission_is_started_again(guard):
 
 
 # Requests and the emergency stop: repeated until the robot has acted on them
-
-
-def test_each_copy_of_a_request_names_the_current_session():
-    flight, said = Flight(), []
-    flight.step()
-    flight.operate("start", FROM_SPAWN, number=ID)
-    for epoch in (1, 1, 2):
-        flight.epoch = epoch
-        flight.now_ns += REPEAT_NS
-        flight.see()
-        flight.teleop.handle_deadline(flight.now_ns)
-        said += flight.teleop.take_outputs()
-    requests = [each for each in said if isinstance(each, OperatorRequest)]
-    assert len({(each.request, each.number) for each in requests}) == 1
-    assert [each.epoch for each in requests] == [1, 1, 2]
-    assert [each.epoch for each in said if isinstance(each, Setpoint)] == [2]
 
 
 def test_a_stop_leaves_at_once_and_is_told_until_it_is_seen():

@@ -5,7 +5,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from cloudrc.messages import OperatorRequest, Request, Setpoint, Start
+from cloudrc.messages import Setpoint, Start
+from cloudrc.records import MissionEvent
 from cloudrc.teleop.refusals import ConflictError
 from cloudrc.teleop.wire import Leg, Plan
 from tests.teleop.conftest import Flight
@@ -53,8 +54,6 @@ class MissionMachine(RuleBasedStateMachine):
         self.checked = 0
         self.plan = None
         self.reached = 0
-        self.newest = None  # request
-        self.operated_ns = self.sent_ns = 0
 
     @rule(verb=verbs)
     def operate(self, verb):
@@ -71,7 +70,6 @@ class MissionMachine(RuleBasedStateMachine):
             assert before == (flight.state, len(flight.said), flight.outcome)
             return
         flight.operate(*verb)
-        self.operated_ns = flight.now_ns
         if flight.state == "STARTING":
             self.plan, self.reached = verb[1], 0
 
@@ -96,55 +94,18 @@ class MissionMachine(RuleBasedStateMachine):
     @invariant()
     def all_is_well(self):
         self.check_what_was_said()
-        self.check_that_a_request_stops_only_when_it_is_acknowledged()
-        self.check_that_the_newest_request_is_what_the_state_asks_for()
         self.check_the_outcome()
         self.check_the_last_setpoint()
 
     def check_what_was_said(self):
-        flight = self.flight
-        new = zip(flight.said[self.checked :], flight.said_at[self.checked :], strict=True)
-        for said, now_ns in new:
+        for said in self.flight.said[self.checked :]:
             if isinstance(said, Setpoint):
                 # Waypoints are flown to one after the other, each only when those before are done.
                 assert said.waypoint in (-1, self.reached)
-            elif isinstance(said, OperatorRequest):
-                self.check_request(said, now_ns)
-            elif said.event == "reached":
+            elif isinstance(said, MissionEvent) and said.event == "reached":
                 assert said.waypoint == self.reached
                 self.reached += 1
-        self.checked = len(flight.said)
-
-    def check_request(self, request, now_ns):
-        """Numbers rise by one; copies follow each other at 10 Hz, none once it was acted on."""
-        if request != self.newest:
-            assert self.newest is None or request.number == self.newest.number + 1
-            self.newest = request
-        else:
-            assert now_ns - self.sent_ns == 100_000_000
-        self.sent_ns = now_ns
-        assert not self.is_acknowledged(now_ns)
-
-    def is_acknowledged(self, now_ns):
-        """Whether telemetry has shown the newest request's number by then."""
-        return self.flight.first_shown_ns.get(self.newest.number, now_ns + 1) <= now_ns
-
-    def check_that_a_request_stops_only_when_it_is_acknowledged(self):
-        now_ns = self.flight.now_ns
-        if self.newest is not None and now_ns - self.sent_ns > 100_000_000:
-            assert self.is_acknowledged(now_ns)
-
-    def check_that_the_newest_request_is_what_the_state_asks_for(self):
-        """To fly while under way, else to hold; it leaves with the first deadline in sight.
-
-        A start waits until the robot is seen to have acted on the end before it.
-        """
-        flight = self.flight
-        if self.newest is not None and flight.now_ns > self.operated_ns:
-            asked = {Request.START if flight.state in UNDER_WAY else Request.END}
-            if flight.state == "STARTING" and not self.is_acknowledged(flight.now_ns):
-                asked.add(Request.END)
-            assert self.newest.request in asked
+        self.checked = len(self.flight.said)
 
     def check_the_outcome(self):
         flight, outcome = self.flight, self.flight.outcome

@@ -14,7 +14,6 @@ from cloudrc.config.schema import Touch
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Start
 from cloudrc.teleop import models
-from cloudrc.teleop.client import describe_mission
 from cloudrc.teleop.refusals import UnavailableError, UnknownMissionError
 from cloudrc.teleop.store import (
     KEPT,
@@ -25,7 +24,6 @@ from cloudrc.teleop.store import (
     connect,
     open_store,
 )
-from cloudrc.teleop.telling import missions_table
 from cloudrc.teleop.wire import Leg, Plan
 from tests.teleop.conftest import A, B, C, KilledError, ServiceFlight, play, service_flying
 
@@ -59,16 +57,6 @@ def test_missions_are_read_back_exactly(path):
     assert (path.stat().st_mode & 0o777, store.notice) == (0o600, "")
     store.close()
     assert os.listdir(path.parent) == ["missions"]
-
-
-def test_a_mission_that_follows_setpoints_has_no_count_of_waypoints(path):
-    store, track = open_store(path, b""), ((0.0, A), (2.0, B))
-    plans = PLAN, Plan((Leg(B),), track=track)
-    first, second = (store.add(Order(plan, "tour", str(plan))).summary() for plan in plans)
-    _, counted, followed = missions_table([first, second]).splitlines()
-    assert "0/2" in counted
-    assert "0/0" not in followed
-    assert describe_mission(second).endswith("setpoints of a file")
 
 
 def test_each_commit_waits_for_the_disk(path):
