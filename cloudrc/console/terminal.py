@@ -39,6 +39,8 @@ PLACES = {
     **{"ς": "w", "σ": "s", "η": "h", "Χ": "X"},  # noqa: RUF001
 }
 """Letter of a Cyrillic or Greek keyboard -> Latin letter in the same place."""
+PASTED = 8
+"""Largest number of keys that arrive at once from a keyboard; more of them are pasted text."""
 HELP = (
     "arrows: x and y, w and s: up and down, space: stop moving, h: hold, q: quit",
     "X (capital): emergency stop, a robot in the air falls",
@@ -71,7 +73,10 @@ def _handle_keys(screen: curses.window, steering: Steering, api: Api) -> None:
     curses.curs_set(0)
     note = ""
     while not _is_gone():
-        for sent in _sent(screen):
+        arrived = [*_sent(screen)]
+        if len(arrived) > PASTED:
+            note, arrived = "pasted text has no effect", []
+        for sent in arrived:
             key = meant_key(sent)
             if key == "q":
                 return

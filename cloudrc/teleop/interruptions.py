@@ -20,19 +20,20 @@ HOLD_TOLD = 0.5
 class Interruption:
     """Times of one kind of interruption in a mission."""
 
-    def __init__(self) -> None:
+    def __init__(self, shortest: float) -> None:
+        """Tell interruptions that last for `shortest` [s] or longer."""
+        self._shortest = shortest
         self.since: float | None = None  # beginning of the present interruption [s]; None: none
         self.is_told = False  # whether the present interruption lasts long enough to be told
         self._first, self._total = 0.0, 0.0  # of the told ones: beginning of the first; sum [s]
 
-    def begin(self, time: float) -> None:
-        """Begin an interruption at `time` [s], unless one lasts already."""
-        if self.since is None:
-            self.since = time
+    def lasts(self, since: float, time: float) -> bool:
+        """Return whether the interruption has become long enough at `time` [s].
 
-    def tell(self, time: float, shortest: float) -> bool:
-        """Return whether the interruption, at `time` [s], has just lasted for `shortest` [s]."""
-        if self.since is None or self.is_told or time - self.since < shortest:
+        It has begun at `since` [s], unless one lasts already.
+        """
+        self.since = since if self.since is None else self.since
+        if self.is_told or time - self.since < self._shortest:
             return False
         self._first = self._first if self._total else self.since
         self.is_told = True
@@ -57,7 +58,7 @@ class Interruptions:
     """Interruptions of one mission."""
 
     def __init__(self) -> None:
-        self._silence, self._hold = Interruption(), Interruption()
+        self._silence, self._hold = Interruption(0.0), Interruption(HOLD_TOLD)
 
     def see(self, seen: RobotStatus, time: float, *, flies: bool) -> Iterator[tuple[str, str]]:
         """Process telemetry; yield event and text of each interruption that begins or ends.
@@ -72,8 +73,7 @@ class Interruptions:
             if lasted := self._hold.end(time):
                 yield "hold_over", f"{guard} at {time:.2f} s, after {lasted:.1f} s in HOLD"
             return
-        self._hold.begin(time)
-        if self._hold.tell(time, HOLD_TOLD):
+        if self._hold.lasts(time, time):
             yield "guard_holds", f"{guard} since {self._hold.since:.2f} s ({seen.cause.words})"
 
     def wait(
@@ -84,10 +84,7 @@ class Interruptions:
         `seen` is the newest telemetry, `age` its age [s], or the time for which this process has
         waited for it. `time` is the time since the mission began [s].
         """
-        if age <= SILENCE:
-            return
-        self._silence.begin(time - age)
-        if self._silence.tell(time, 0.0):
+        if age > SILENCE and self._silence.lasts(time - age, time):
             why = "teleop does not hear cloud" if cloud_is_silent else "cloud hears nothing"
             text = f"no telemetry since {self._silence.since:.2f} s ({why})"
             if seen is not None:

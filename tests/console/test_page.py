@@ -19,7 +19,6 @@ from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import PANEL_WIDTH, Page
 from cloudrc.console.steering import Steering
 from cloudrc.drivers.local import LINK_FOLDER
-from cloudrc.geometry.scene import load_scene
 from cloudrc.runs.links.change import read_states
 from tests.conftest import wait_until
 from tests.console.conftest import (
@@ -217,11 +216,7 @@ def test_the_second_browser_reads_and_stop_works_under_load(browse, flight, page
 def test_the_first_view_shows_the_whole_mission(filled):
     page, _, _ = filled("paper")
     camera = page._server.initial_camera
-    pipes = load_scene("pipes").tubes
     spots = [point.position_m for point in page._experiment.mission.waypoints]
-    for pipe in pipes:
-        along, wide = 0.5 * pipe.length * np.array(pipe.axis), (0.0, 0.0, pipe.outer)
-        spots += [pipe.centre + a * along + b * np.array(wide) for a in (-1, 1) for b in (-1, 1)]
     forward = camera.look_at - camera.position
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, (0, 0, 1)) / np.hypot(*forward[:2])

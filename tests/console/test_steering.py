@@ -62,17 +62,10 @@ def test_a_start_ends_a_drive_that_waits_for_keys(api, steering):
     start = ("/v1/missions", {"waypoints": [], "queue": True})
     assert api.posted == [("/v1/resume", None), start]
     api.posted.clear()
-    for by_hand, words in ((True, "ending the drive"), (False, "resumed")):
-        steering.state = {"mission": {"by_hand": by_hand, "state": "held"}}
-        assert steering.resume()
-        assert steering.answer[0] == words
-    api.posted.clear()
     steering.state = {"mission": None}
     steering.start_mission({"waypoints": []})
     assert api.posted == [("/v1/missions", {"waypoints": []})]
     assert "set back to its spawn" in steering.answer[0]
-    steering.start_mission({"waypoints": [], "start": "here"})
-    assert steering.answer[0] == "starting"
 
 
 def test_the_route_is_asked_once_for_each_mission(api, steering):

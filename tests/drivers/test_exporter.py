@@ -91,16 +91,6 @@ def test_a_pod_has_less_than_200_series(pod, flight):
     assert sum(not line.startswith("#") for text in texts for line in text.splitlines()) < 200
 
 
-@pytest.mark.promise("unknown-is-absent")
-def test_the_sync_age_is_absent_until_it_is_known():
-    ages = [None, 0.25]
-    world = Exporter("world")
-    assert "sync_age" not in world.text()
-    world.recording(lambda: ages.pop(0))
-    assert "sync_age" not in world.text()
-    assert "cloudrc_recorder_sync_age_seconds 0.25" in world.text()
-
-
 LIMITED = "nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n"
 
 

@@ -5,15 +5,12 @@ import os
 import stat
 import tempfile
 from contextlib import suppress
-from functools import partial
-from math import inf
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from cloudrc.drivers import local
-from cloudrc.drivers.local import Child, LocalRun, socket_folder
+from cloudrc.drivers.local import LocalRun, socket_folder
 from cloudrc.drivers.machine import Deadline
 from cloudrc.records import MissionEvent
 
@@ -119,30 +116,6 @@ def test_a_deadline_does_not_count_the_time_of_a_pause():
         now += step
         assert deadline.passed() is passed
     assert deadline.pause == 7.0
-
-
-def test_a_pause_at_any_point_of_a_turn_ends_no_flight(tmp_path, monkeypatch):
-    """The supervisor stands still after it has looked for pauses, before it looks for silence."""
-    now, polls, run = 0.0, iter([None, None, 0]), LocalRun(tmp_path, lambda records: None)
-    child = Child("teleop", SimpleNamespace(poll=lambda: next(polls)), tmp_path / "teleop.log")
-
-    def listen():
-        nonlocal now
-        now += 0.05
-        child.heard = now
-        return []
-
-    def stand_still():
-        nonlocal now
-        now += 10.0
-
-    run._children = [child]
-    monkeypatch.setattr(run, "_listen", listen)
-    monkeypatch.setattr(run, "_check_alive", stand_still)
-    monkeypatch.setattr(local, "Deadline", partial(Deadline, clock=lambda: now))
-    monkeypatch.setattr(local, "time", SimpleNamespace(monotonic=lambda: now))
-    run._watch(inf, tmp_path)
-    assert run.notes[0].startswith("the supervisor of this run stood still for 10.")
 
 
 def test_the_key_of_a_run_is_for_its_user_alone_and_goes_with_it(tmp_path, monkeypatch):

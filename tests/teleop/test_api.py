@@ -92,22 +92,16 @@ def test_a_lease_is_renewed_and_an_impossible_one_refused(api):
 
 def test_a_mission_may_have_to_touch_a_body_of_the_scene(api):
     pipes = load_experiment("paper").mission.model_dump(include={"waypoints", "touch"})
-    for mission, touched in ((MISSION, None), (pipes, "board")):
-        _, view = api.post("/v1/missions", mission)
-        assert api.flight.teleop.book.find(view["id"]).order.touched == touched
-        api.post(f"/v1/missions/{view['id']}/cancel")
-    for touch in ({"body": "bord"}, {"body": "floor"}, {"body": "board", "speed_max_mps": 0}):
-        status, answer = api.post("/v1/missions", {**pipes, "touch": touch})
-        assert (status, answer["problems"][0]["path"][:6]) == (422, "touch.")
+    _, view = api.post("/v1/missions", pipes)
+    assert api.flight.teleop.book.find(view["id"]).order.touched == "board"
+    status, answer = api.post("/v1/missions", {**pipes, "touch": {"body": "bord"}})
+    assert (status, answer["problems"][0]["path"]) == (422, "touch.body")
 
 
 def test_requests_and_refusals_become_metrics(api):
     api.fly(MISSION)
-    far = {"position_m": [100.0, 0.0, 1.0]}
-    refused = [("/v1/missions", {"waypoints": [far]}), ("/v1/goto", far), ("/v1/missions", b"{")]
-    assert [api.post(*order)[0] for order in refused] == [422, 422, 422]
+    assert api.post("/v1/goto", {"position_m": [100.0, 0.0, 1.0]})[0] == 422
     assert api.post("/v1/missions", MISSION)[0] == 409
-    assert api.post("/v1/acknowledge")[0] == 409  # refused, but no order
     assert api.post("/v1/hold", token=READER)[0] == 403
 
     def reading(name):
@@ -115,9 +109,8 @@ def test_requests_and_refusals_become_metrics(api):
         live.see([Counted(0, "teleop", *count) for count in api.server.counts.items()])
         return live.read().get(f"cloudrc_{name}_total")
 
-    wanted = {("invalid",): 3, ("conflict",): 1}
+    wanted = {("invalid",): 1, ("conflict",): 1}
     api.until(lambda: reading("missions_refused") == wanted)  # counted after the answer
-    api.until(lambda: reading("api_requests")[()] >= 6)
     assert reading("api_rejected")[("role",)] == 1
 
 
@@ -186,25 +179,6 @@ def test_a_reader_follows_the_robot_until_teleop_ends():
         assert next(statuses).position == A
         api.bridge.closed = "teleop ends"
         assert len([*statuses]) < 5
-
-
-def test_a_client_that_does_not_read_misses_statuses(monkeypatch):
-    monkeypatch.setattr(api_module, "ROBOT_PERIOD", 0.0)
-    monkeypatch.setattr(auth, "SEND_LIMIT", 1.0)
-    with running() as api, connect(api) as stream:
-        sent = []
-        monkeypatch.setattr(api_module, "write_line", lambda seen: sent.append(1) or b"x" * 4096)
-        stream.sendall(head("GET", "/v1/robot", token=READER))
-        before = -1
-        while before < len(sent):  # until the buffers are full
-            before = len(sent)
-            time.sleep(0.2)
-        assert len(sent) < 10_000
-        assert api.post("/v1/estop")[0] == 200
-        api.until(
-            lambda: not api.gate._in_flight[auth.READER]
-        )  # a client that stalls keeps no slot
-        assert api.complaints == []
 
 
 # Stop and hold

@@ -49,25 +49,6 @@ def test_unusable_tokens_are_refused_and_not_shown(tmp_path, tokens, said):
     assert not [text for text in tokens.values() if text and text in str(refused.value)]
 
 
-@pytest.mark.parametrize(
-    ("mode", "owner", "told"),
-    [
-        *((0o600, 0, ""), (0o640, 0, "read"), (0o440, 1, ""), (0o602, 0, "changed")),
-    ],
-)
-def test_a_token_file_that_others_can_read_or_change_is_warned_of(
-    tmp_path, monkeypatch, mode, owner, told
-):
-    """Kubernetes lets the pod's group read a Secret's files, which belong to root."""
-    path = token_folder(tmp_path / "t", operator=OPERATOR, reader=READER) / "reader"
-    path.chmod(mode)
-    user, warnings = os.geteuid(), []
-    monkeypatch.setattr(os, "geteuid", lambda: user + owner)
-    Tokens(path.parent, warnings.append)
-    expected = [f"warning: {path} can be {told} by others: chmod 600 {path}"]
-    assert warnings == (expected if told else [])
-
-
 def test_a_changed_token_file_counts_at_once():
     with running() as api:
 
