@@ -12,8 +12,8 @@ from itertools import pairwise
 from math import ceil, dist, exp, floor
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.config.reuse import reuse_results
 from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.outside.reuse import reuse_results
 from cloudrc.rounding import exceeds, format_limit
 
 if TYPE_CHECKING:
