@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from itertools import pairwise
-from math import ceil, dist, exp, floor
+from math import ceil, dist, floor
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.errors import MissingPrerequisiteError
@@ -18,14 +18,12 @@ from cloudrc.rounding import exceeds, format_limit
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.config.schema import Waypoint
     from cloudrc.link.profile import DirectionProfile
 
 GUARD_STEP = 0.002
 """Time between two looks of the guard at the age of a command [s]."""
-SEEN_MIN = 1e-3
-"""Chance to measure the robot within a tolerance for a whole dwell time, below which a waypoint
-counts as never reached [1]."""
+
+
 FITTED = "command_history", "kalman", "model_based"
 """Predictors that use the response of a robot that has no better model."""
 
@@ -42,10 +40,7 @@ def _advise(experiment: ResolvedExperiment) -> Iterator[str]:
     ways = _directions(experiment)
     yield from _units(ways)
     yield from _time(experiment)
-    yield from _never(experiment, ways)
-    yield from _noise(experiment)
     yield from _slow(experiment)
-    yield from _robot(experiment)
     yield from _tuning(experiment)
     yield from _balance(experiment)
     carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
@@ -147,34 +142,6 @@ def _time(experiment: ResolvedExperiment) -> Iterator[str]:
         )
 
 
-def _never(experiment: ResolvedExperiment, ways: Mapping[str, DirectionProfile]) -> Iterator[str]:
-    """Yield a warning if a change or a blackout of the link is later than the mission may last."""
-    from cloudrc.assembly import GRACE, build_plan
-
-    starts = list(_starts(ways))
-    if not starts:
-        return
-    limit = build_plan(experiment).time_limit
-    late = [(key, at) for key, at in starts if at > limit + GRACE]
-    if late:
-        key, at = late[0]
-        more = f" (and {len(late) - 1} more)" if late[1:] else ""
-        yield (
-            f"{key}{more} is {at:,.6g} s, after the mission's limit of {limit:,.6g} s: in a flight "
-            "of this mission it never begins; give times in seconds, or a longer "
-            "criteria.time_limit_s"
-        )
-
-
-def _starts(ways: Mapping[str, DirectionProfile]) -> Iterator[tuple[str, float]]:
-    """Yield key and time [s] of each change and blackout of the link."""
-    for name, profile in ways.items():
-        for number, change in enumerate(profile.changes):
-            yield f"link.{name}.changes.{number}.at_s", change.at_s
-        for number, blackout in enumerate(profile.blackouts):
-            yield f"link.{name}.blackouts.{number}.start_s", blackout.start_s
-
-
 def _fast_track(experiment: ResolvedExperiment) -> Iterator[str]:
     """Yield a warning if the setpoints of a file move faster than the robot may."""
     from cloudrc.assembly import build_plan
@@ -192,32 +159,6 @@ def _fast_track(experiment: ResolvedExperiment) -> Iterator[str]:
             f"the guard caps the speed at {cap:.3g} m/s: the robot falls behind, and the mission "
             "fails if the robot is not at the last row in time"
         )
-
-
-def _noise(experiment: ResolvedExperiment) -> Iterator[str]:
-    """Yield a warning if cloud cannot see from its measurements that the robot has arrived."""
-    noise, mission = experiment.world.sensors.position_noise_m, experiment.mission
-    key = "world.sensors.position_noise_m"
-    missed = [waypoint for waypoint in mission.waypoints if _is_missed(waypoint, experiment)]
-    if missed:
-        tightest = min(missed, key=lambda waypoint: waypoint.tolerance_m)
-        number, tolerance = mission.waypoints.index(tightest) + 1, tightest.tolerance_m
-        yield (
-            f"{key} is {noise:g}: cloud hardly ever measures the robot within {tolerance:g} m of "
-            f"waypoint {number} for {tightest.dwell_s:g} s, so the waypoint is not reached; give "
-            f"it in metres, a value that fits: --set {key}={tolerance / 5:.2g}"
-        )
-
-
-def _is_missed(waypoint: Waypoint, experiment: ResolvedExperiment) -> bool:
-    """Return whether the noise of the position hardly ever lets a waypoint count as reached."""
-    noise = experiment.world.sensors.position_noise_m
-    if not noise:
-        return False
-    # The chance in a plane; in space it is smaller.
-    within = 1.0 - exp(-0.5 * (waypoint.tolerance_m / noise) ** 2)
-    chance: float = within ** (waypoint.dwell_s * experiment.world.odometry_rate_hz)
-    return chance < SEEN_MIN
 
 
 def _slow(experiment: ResolvedExperiment) -> Iterator[str]:
@@ -251,15 +192,6 @@ def _slow(experiment: ResolvedExperiment) -> Iterator[str]:
             f"mission's way in {time:.4g} s; a value that fits: "
             f"--set {key}={_round_up(2 * way / time, 0.01):g}"
         )
-
-
-def _robot(experiment: ResolvedExperiment) -> Iterator[str]:
-    """Yield what in a user's model of a robot cannot be right; nothing without MuJoCo."""
-    from cloudrc.config.hull import doubts
-
-    if "/" in experiment.world.robot:
-        with suppress(MissingPrerequisiteError):
-            yield from doubts(experiment.world.robot)
 
 
 def _tuning(experiment: ResolvedExperiment) -> Iterator[str]:
