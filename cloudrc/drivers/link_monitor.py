@@ -11,13 +11,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from math import inf, isnan, nan
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from cloudrc.errors import BadInputError, describe_error
+from cloudrc.errors import BadInputError
 from cloudrc.link.profile import DirectionProfile, Timeline, settled
 from cloudrc.link.profile_file import read_keys
 from cloudrc.link.streams import Stream
@@ -85,8 +84,7 @@ class LinkMonitor:
     def request(self, values: dict[str, Any] | None) -> None:
         """Judge the link by a profile with the `values` of its file; None: they are unknown.
 
-        The thread loads the profile later. If the profile is invalid, the old one stays. If a file
-        that it names cannot be used, the profile is unknown.
+        The thread loads the profile later. If it cannot be used, it is unknown.
         """
         self._news.append(values)
 
@@ -104,8 +102,8 @@ class LinkMonitor:
     def _load(self, values: dict[str, Any] | None) -> Asked | None:
         if values is None:
             return None
-        keys = read_keys(values)
         try:
+            keys = read_keys(values)
             uplink, downlink = (
                 link_profile(k, self._file_max) for k in (keys.uplink, keys.downlink)
             )
@@ -121,25 +119,16 @@ class LinkMonitor:
         return [self._outbox.get_nowait() for _ in range(self._outbox.qsize())]
 
     def _run(self, inbox: queue.SimpleQueue[tuple[Sequence[Record], int]]) -> None:
-        failed = False
         while True:
             for _ in range(inbox.qsize()):
-                records, now_ns = inbox.get()
-                try:
-                    found = self._see(records, now_ns)
-                except Exception as error:  # the next attempt may succeed
-                    text = f"the monitor of the link failed ({describe_error(error)}); it goes on"
-                    found = [] if failed else [Fault(now_ns, "link_check", text)]
-                    failed = True
-                for record in found:
+                for record in self._see(*inbox.get()):
                     self._outbox.put(record)
             threading.Event().wait(FOLLOW_PERIOD)
 
     def _see(self, records: Sequence[Record], now_ns: int) -> list[Record]:
         """Store records; return new verdicts every `CHECK_NS`, an empty list in between."""
         while self._news:
-            with suppress(Exception):  # an invalid profile; the link's process may be hostile
-                self.follow(self._load(self._news.popleft()))
+            self.follow(self._load(self._news.popleft()))
         for record in records:
             self._store(record)
         if self._asked is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +35,11 @@ class LinkNews:
         if (seen := version(self._path)) == self._seen:
             return ""
         self._seen = seen  # do not read a malformed file again and again
-        with suppress(Exception):  # a missing or malformed file, which a link process repairs
+        try:
             before, self._state = self._state, from_text(read_file(self._path, STATE_MAX))
-            return describe_change(before, self._state)
-        return ""
+        except (OSError, ValueError):  # missing or malformed, which a link process repairs
+            return ""
+        return describe_change(before, self._state)
 
 
 def describe_change(before: LinkState | None, after: LinkState) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
@@ -19,7 +18,7 @@ from cloudrc.files import write_atomically
 from cloudrc.link.carry.udp import Address, Relay
 from cloudrc.link.follow import Loaded, state_after
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, publish
+from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, publish, to_text
 
 if TYPE_CHECKING:
     from cloudrc.link.netem import Netem
@@ -106,8 +105,7 @@ class Sidecar:
         """Write the lateness of datagrams to a file, which the own end of the tunnel reads."""
         shaper = self._shaper  # another thread may replace it
         if shaper and (released := shaper.released()):
-            with suppress(OSError):
-                write_atomically(self._released_file, json.dumps(released).encode())
+            publish(json.dumps(released), self._released_file)
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
         """Run netem or the relay until `stop()` is true, or until a profile needs the other."""
@@ -182,7 +180,7 @@ class Sidecar:
 
     def _publish_state(self, state: LinkState) -> LinkState:
         self.state = state
-        publish(state, self._state_file)
+        publish(to_text(state), self._state_file)
         return state
 
     def _publish_route(self, route: Address) -> None:

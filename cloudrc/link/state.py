@@ -69,10 +69,10 @@ def to_text(state: LinkState) -> str:
     return json.dumps(asdict(state), indent=2) + "\n"
 
 
-def publish(state: LinkState, file: Path) -> None:
-    """Write a state to its file, if the disk is not full: the link works without it."""
+def publish(text: str, file: Path) -> None:
+    """Write what a link tells to a file, if the disk is not full: the link works without it."""
     with suppress(OSError):
-        write_atomically(file, to_text(state).encode())
+        write_atomically(file, text.encode())
 
 
 T = TypeVar("T")

@@ -6,7 +6,6 @@ import os
 import select
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 
 from cloudrc.link.carry.engine import BATCH, LinkWay, Packet
 from cloudrc.link.exec.namespace import MTU
@@ -35,10 +34,9 @@ class TunPort:
 
     def drain(self) -> None:
         """Drop the packets that came before the link: the kernel's own, which find nobody."""
-        for source in self._devices:
-            with suppress(OSError):
-                while True:
-                    os.read(source, MTU)
+        while self.wait(0):
+            for _ in self.take():
+                pass
 
     def wait(self, until_ns: int) -> bool:
         """Wait until a device can be read, or until a time [ns]; return whether one can."""

@@ -16,7 +16,7 @@ from cloudrc.drivers.link_control import ControlServer
 from cloudrc.drivers.local import LINK_FOLDER, link_socket
 from cloudrc.link.follow import Loaded, Profiles, make_folder, state_after
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.state import STATE_FILE, LinkState, publish
+from cloudrc.link.state import STATE_FILE, LinkState, publish, to_text
 from cloudrc.link.traces import link_profile
 
 Apply = Callable[[str, Loaded, int], None]
@@ -129,7 +129,7 @@ class LiveLink:
         origin_ns = self.origins_ns[way]
         state = state_after(before, loaded, now_ns, **facts, origin_ns=origin_ns)
         self.states[way] = state
-        publish(state, self.folder / way / STATE_FILE)
+        publish(to_text(state), self.folder / way / STATE_FILE)
         self._changed(state, _news(before, state, restart=loaded.change.restart))
 
 

@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 
 LOOK_PERIOD = 0.05  # between two looks at the programs [s]
 COUNT_PERIOD = 1.0  # between two updates of the metrics [s]
-LOOPBACK_PATIENCE = 1.0  # a program may listen at its loopback address first [s]
-FIRST_WORD, WORD_PERIOD = 3.0, 10.0  # until the command says that it waits, and again [s]
+PATIENCE = 3.0  # until the command says that it waits [s]
 OUTPUT_LIMIT = 2.0  # for the last lines of a program, which may have to be killed [s]
 
 
@@ -154,7 +153,7 @@ class _Run:
 
     def _wait_for_server(self, server: ProgramEnd, limit: float) -> int | None:
         """Wait until other namespaces can reach the server; return its exit code if it ends."""
-        began, noted, word_at = time.monotonic(), False, FIRST_WORD
+        began, told = time.monotonic(), False
         while (waited := time.monotonic() - began) < limit:
             state = server.state()
             if state.code is not None and (state.code or not state.lives):
@@ -163,14 +162,10 @@ class _Run:
                 return state.code or InvalidRunError.exit_code
             if not all(is_loopback(host) for host, _ in state.listens):
                 return None
-            if state.listens and waited > LOOPBACK_PATIENCE and not noted:
-                noted = True
-                self._tell(f"note: {_only_loopback(state)}")
-            if waited >= word_at:
-                word_at += WORD_PERIOD
-                place = "another address" if state.listens else "a port"
-                spent = f"{waited:.0f} of {limit:g} s; --wait"
-                self._tell(f"waits until the server listens at {place} ({spent})")
+            if waited > PATIENCE and not told:
+                told = True
+                why = f"; {_only_loopback(state)}" if state.listens else ""
+                self._tell(f"waits up to {limit:g} s (--wait) until the server listens{why}")
             time.sleep(LOOK_PERIOD)
         if limit:
             why = _only_loopback(state) if state.listens else "it listens at no port"

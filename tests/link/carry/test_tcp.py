@@ -15,10 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc import link
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.link.carry.tcp.medium import Medium
-from cloudrc.link.carry.tcp.relay import StreamRelay
 
 pytestmark = pytest.mark.process
 
@@ -250,19 +247,3 @@ def test_a_port_in_use_is_named(refused):
         port = taken.getsockname()[1]
         text = refused(f"relay tcp --listen 127.0.0.1:{port} --to 127.0.0.1:1")
     assert f"--listen 127.0.0.1:{port}: Address already in use" in text
-
-
-def test_a_signal_in_the_middle_of_a_change_does_not_spoil_the_end():
-    profile = link.read_profile("ideal")
-    ways = (Medium(profile.uplink, 1, True, 0), Medium(profile.downlink, 1, False, 0))
-    with socket.create_server(("127.0.0.1", 0)) as far, socket.create_server(("", 0)) as here:
-        to = far.getsockname()
-        relay = StreamRelay(here, to, socket.AF_INET, ways)
-        with socket.create_connection(("127.0.0.1", here.getsockname()[1])) as client:
-            relay.engine.step(1.0)
-            (connection,) = relay.connections
-            # As if KeyboardInterrupt came between the selector's call and the note of it.
-            relay._selector.unregister(connection.server.socket)
-            relay.close()
-            with pytest.raises(ConnectionResetError):
-                client.recv(1)

@@ -36,19 +36,10 @@ def wait(monkeypatch):
     return _wait
 
 
-def test_the_wait_for_a_server_is_told_after_3_s_and_every_10_s(wait):
-    said = wait(lambda at: REACHABLE if at > 25.0 else NOWHERE, 60.0)
-    assert said == [
-        f"waits until the server listens at a port ({at} of 60 s; --wait)" for at in (3, 13, 23)
-    ]
-    assert wait(lambda at: REACHABLE if at > 2.0 else NOWHERE, 60.0) == []
-
-
-def test_the_wait_for_a_server_at_its_loopback_address_says_so(wait):
-    note, *words, end = wait(lambda at: LOOPBACK, 14.5)
-    assert "127.0.0.1" in note
-    assert words == [
-        f"waits until the server listens at another address ({at} of 14.5 s; --wait)"
-        for at in (3, 13)
-    ]
+@pytest.mark.parametrize(("place", "note"), [(NOWHERE, ""), (LOOPBACK, "only at 127.0.0.1:80")])
+def test_a_server_that_does_not_listen_is_told_once(wait, place, note):
+    said, end = wait(lambda at: place, 14.5)
+    assert said.startswith("waits up to 14.5 s (--wait) until the server listens")
+    assert note in said
     assert end == "timeout"
+    assert wait(lambda at: REACHABLE if at > 2.0 else place, 60.0) == []

@@ -257,8 +257,7 @@ class StreamRelay:
         if mask == side.mask:
             return
         if not mask:
-            with suppress(KeyError):  # a signal has ended a change in its middle
-                self._selector.unregister(side.socket)
+            self._selector.unregister(side.socket)
         elif not side.mask:
             self._selector.register(side.socket, mask, (connection, side))
         else:
