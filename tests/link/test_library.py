@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import cloudrc.link
 from cloudrc.config import shipped
 from cloudrc.errors import BadInputError
-from cloudrc.link import DirectionProfile, GilbertElliott, OneWay, PacketQueue, Trace
+from cloudrc.link import DirectionProfile, GilbertElliott, OneWay, Trace
 from cloudrc.link.library import KIND
 from cloudrc.link.model import LinkDirection
 from cloudrc.tunnel.codec import Kind
@@ -36,13 +36,15 @@ def sent(way, count, period_ns=10 * MS, first=0, episode=0):
     return delays
 
 
-def test_importing_the_library_takes_no_heavy_package_along():
+def test_opening_a_link_loads_little_and_nothing_of_the_testbed():
     program = (
-        "import sys, cloudrc, cloudrc.link as link; link.OneWay, link.PacketQueue, link.open;"
-        "print({'pydantic', 'mujoco', 'cryptography', 'yaml'} & sys.modules.keys())"
+        "import sys, cloudrc.link as link; link.open('lte', 1);"
+        "print(*sorted(name for name in sys.modules if name.startswith(('cloudrc', 'pydantic'))))"
     )
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert found.stdout == "set()\n", found.stderr
+    loaded = found.stdout.split()
+    assert 0 < len(loaded) <= 16, found.stderr
+    assert not [one for one in loaded if one.startswith(("pydantic", "cloudrc.config"))]
 
 
 def test_a_link_without_a_name_has_the_random_numbers_of_the_testbed():
@@ -89,13 +91,6 @@ def test_robots_with_one_seed_and_two_names_share_no_fate():
     assert not np.intersect1d(second, third).size
 
 
-def test_packets_between_others_do_not_change_their_fate():
-    one, other = (OneWay(LIVELY, 1, uplink=True) for _ in range(2))
-    for n in range(100):
-        other.send(1, 1000 + n, 100, n * MS)
-        assert one.send(1, n, 100, n * MS) == other.send(1, n, 100, n * MS)
-
-
 def test_an_episode_begins_with_an_empty_bottleneck_and_at_the_start_of_the_time_line():
     slow = profile_of(0.01, rate=5e4, changes=(change(0.5, 0.1),))
     way = OneWay(slow, 1, uplink=True)
@@ -113,19 +108,6 @@ def test_a_damaged_packet_is_lost_and_a_copy_that_comes_first_counts():
             twice.table(1, 0.01, first=n)[0]
             == (min(twice.send(0, n, 1, 10 * MS * n)) - 10 * MS * n) * 1e-9
         )
-
-
-def test_packets_in_flight_arrive_in_order_with_their_data():
-    up, down = cloudrc.link.open({"uplink": {"delay_ms": 5}, "downlink": {"delay_ms": 3}}, 1)
-    queue = PacketQueue()
-    queue.put(up, up.send(1, 0, 10, 0), "observation")
-    queue.put(down, down.send(1, 0, 10, 0), "action")
-    queue.put(up, (), "lost")
-    assert [queue.pop() for _ in range(2)] == [
-        (3 * MS, down, "action"),
-        (5 * MS, up, "observation"),
-    ]
-    assert queue.lost == 1
 
 
 def test_the_expected_statistics_are_those_of_the_profile():
@@ -165,8 +147,13 @@ def test_a_mapping_is_read_as_a_file_and_has_the_plain_classes(tmp_path):
         ("./none.yaml", "no such file"),
         ({"uplink": {"delay": 40}}, "uplink.delay: unknown key; did you mean delay_ms"),
         ({"uplink": {"loss": 5}}, "uplink.loss: 5: must be a number >= 0 and <= 1"),
-        ({"up": {}}, "up: unknown key"),
         ({"uplink": {"delay_ms": float("nan")}}, "its uplink.delay_ms is nan"),
+        ({"uplink": {"loss": {"bad_start": 0.1}}}, "uplink.loss.bad_end: is missing"),
+        (
+            {"uplink": {"changes": {}, "distribution": "gauss"}},
+            "uplink.changes: dict: must be a li",
+        ),
+        ({"uplink": {"distribution": "table"}}, "uplink: distribution: table needs the key table"),
         ({"uplink": {"delay_ms": object()}}, "its uplink.delay_ms is object"),
         ({"uplink": {"trace": "none.csv"}}, "none.csv"),
         (70, "not int"),

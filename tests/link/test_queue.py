@@ -50,10 +50,3 @@ def test_a_full_queue_drops_and_counts_what_does_not_fit():
     for counter in range(5):
         send(queue, link, counter)
     assert (len(arrivals(queue)), queue.overflow, queue.lost) == (2, 3, 0)
-
-
-def test_a_damaged_packet_arrives_as_the_model_damages_it():
-    queue, link = PacketQueue(), direction(0.010, corrupt=1.0)
-    send(queue, link, 7)
-    ((_, _, data),) = arrivals(queue)
-    assert data == link.corrupted(1, 3, 7, b"data") != b"data"

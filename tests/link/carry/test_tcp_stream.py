@@ -67,7 +67,6 @@ def test_nothing_is_sent_before_the_connection_is_open():
     assert Far(PLAIN, start_ns=80 * MS).send(b"x") == pytest.approx(120)
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
     "profile",
     [
@@ -77,28 +76,14 @@ def test_nothing_is_sent_before_the_connection_is_open():
         profile_of(0.020, blackouts=(blackout(0.05, 0.7),)),
     ],
 )
-def test_all_bytes_arrive_once_and_in_order(profile, seed):
-    data = random.Random(seed).randbytes(700_000)
-    far = Far(profile, seed=seed)
+def test_all_bytes_arrive_once_and_in_order(profile):
+    data = random.Random(1).randbytes(700_000)
+    far = Far(profile)
     far.send(data)
     far.stream.write(b"", 60_000 * MS)
     run_due(far.agenda, 90_000 * MS)
     assert hashlib.sha256(far.bytes).digest() == hashlib.sha256(data).digest()
     assert far.end_ns is not None
-
-
-@pytest.mark.full
-def test_a_million_segments_arrive_once_and_in_order():
-    far = Far(profile_of(0.001, loss=0.0001))
-    sent, found, source, now_ns = hashlib.sha256(), hashlib.sha256(), random.Random(1), 0
-    for _ in range(1_000):
-        data = source.randbytes(1_000 * SEGMENT)
-        sent.update(data)
-        now_ns += round(far.send(data, now_ns) * MS)
-        found.update(far.bytes)
-        far.bytes.clear()
-        far.times.clear()
-    assert found.digest() == sent.digest()
 
 
 def test_a_lost_segment_costs_one_round_trip_if_a_later_one_arrives():
@@ -121,16 +106,6 @@ def test_the_time_out_doubles_while_nothing_arrives():
     """Sent at 0, .28 and .84 s; the link is back at .6 s."""
     far = Far(changed(PLAIN, blackouts=(blackout(0.0, 0.6),)))
     assert far.send(b"x") == pytest.approx(280 + 560 + 40)
-
-
-def test_each_message_has_a_loss_of_its_own():
-    far, took, now_ns = Far(profile_of(0.010, loss=0.2)), [], 0
-    for _ in range(200):
-        took.append(far.send(bytes(200), now_ns))
-        now_ns = far.times[-1] + 20 * MS
-        run_due(far.agenda, now_ns)
-    assert 20 <= sum(time > 11 for time in took) <= 60
-    assert min(took) == pytest.approx(10)
 
 
 def test_a_link_that_keeps_the_order_holds_up_all_connections():
@@ -166,12 +141,6 @@ def test_a_change_of_the_profile_acts_on_an_open_connection():
     assert far.send(b"y", 1_000 * MS) == pytest.approx(100)
 
 
-def test_a_perfect_link_hands_on_at_once():
-    far = Far(profile_of(0.0))
-    assert far.send(bytes(1_000_000)) == 0.0
-
-
-@pytest.mark.parametrize("key", ["duplicate", "corrupt", "reorder"])
-def test_what_a_stream_of_bytes_cannot_show_is_refused(key):
-    with pytest.raises(BadInputError, match=rf"uplink.{key}: .*link exec"):
-        refuse_unsupported(profile_of(0.040, **{key: 0.01}), "uplink")
+def test_what_a_stream_of_bytes_cannot_show_is_refused():
+    with pytest.raises(BadInputError, match=r"uplink.reorder: .*link exec"):
+        refuse_unsupported(profile_of(0.040, reorder=0.01), "uplink")

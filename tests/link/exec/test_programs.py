@@ -127,10 +127,8 @@ def test_curl_downloads_over_a_lossy_link_and_the_link_is_believed(folder):
     ("server", "client", "code"),
     [
         (HTTP, "exit 3", 3),
-        (HTTP, "no-such-program", 127),
         (HTTP, "kill -9 $$", 137),
         (f"{QUIET} & sleep 2; exit 9", "sleep 60", 9),
-        ("exit 8", "true", 8),
         ("true", "true", 6),
         (f"{QUIET} & exit 0", "curl -s http://{server}:8000/blob -o copy", 0),
     ],
@@ -139,10 +137,6 @@ def test_the_exit_code_is_the_clients_or_the_servers_if_it_fails_first(
     folder, server, client, code
 ):
     run(server=server, client=client, code=code)
-
-
-def test_a_server_that_listens_late_is_waited_for(folder):
-    run(server=f"sleep 2; {HTTP}", client="curl -sf http://{server}:8000/blob -o copy")
 
 
 def test_a_server_that_no_client_can_reach_ends_the_command(folder):
@@ -275,7 +269,7 @@ def alive(namespaces):
 @pytest.mark.parametrize(
     "way",
     [
-        *("SIGINT", "SIGTERM", "SIGHUP", "holder", "second"),
+        *("SIGTERM", "holder"),
         pytest.param("SIGKILL", marks=pytest.mark.smoke),
     ],
 )
@@ -288,12 +282,12 @@ def test_nothing_is_left_whatever_ends_the_command(folder, way):
     namespaces = {identity(one) for one in holders}
     assert len(namespaces) == 2
     assert identity() not in namespaces
-    if way in ("holder", "second"):
-        os.kill(holders[way == "second"], signal.SIGKILL)
+    if way == "holder":
+        os.kill(holders[0], signal.SIGKILL)
     else:
         process.send_signal(getattr(signal, way))
     took = wait_until(lambda: not alive(namespaces) and process.poll() is not None, 10.0)
-    codes = {"SIGKILL": -9, "holder": 6, "second": 6}
+    codes = {"SIGKILL": -9, "holder": 6}
     assert process.returncode == codes.get(way, 130)
     assert took < 6.0
     process.communicate()
@@ -305,97 +299,6 @@ def test_user_namespaces_suffice(folder):
     client = "curl -s -o copy http://{server}:8000/blob"
     _, error = run(before=before, client=client)
     assert "by unprivileged user namespaces" in error
-
-
-WITHOUT_IPV6 = """
-import ctypes, os, struct, sys
-
-call = {"x86_64": 41, "aarch64": 198}[os.uname().machine]  # socket()
-rules = (
-    (0x20, 0, 0, 0),  # load the number of the call
-    (0x15, 0, 3, call),
-    (0x20, 0, 0, 16),  # load its first argument
-    (0x15, 0, 1, 10),  # AF_INET6
-    (0x06, 0, 0, 0x00050000 | 97),  # fail with EAFNOSUPPORT
-    (0x06, 0, 0, 0x7FFF0000),  # allow
-)
-code = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *rule) for rule in rules))
-filter = ctypes.create_string_buffer(struct.pack("HxxxxxxP", len(rules), ctypes.addressof(code)))
-kernel = ctypes.CDLL(None)
-assert kernel.prctl(38, 1, 0, 0, 0) == 0  # PR_SET_NO_NEW_PRIVS
-assert kernel.prctl(22, 2, ctypes.byref(filter)) == 0  # PR_SET_SECCOMP
-os.execvp(sys.argv[1], sys.argv[1:])
-"""
-"""Runs a command for which the kernel has no IPv6, as after `ipv6.disable=1` at its start.
-
-Source: Linux, include/uapi/linux/filter.h, seccomp.h.
-"""
-
-
-@pytest.mark.skipif(os.uname().machine not in ("x86_64", "aarch64"), reason="needs its call")
-def test_a_machine_without_ipv6_has_ipv4_alone(folder):
-    before = (sys.executable, "-c", WITHOUT_IPV6)
-    out, error = run(before=before, client="curl -s -o copy http://{server}:8000/ && echo done")
-    assert out == "[client] done\n"
-    assert "client 10.77.0.1, server 10.77.0.2" in error
-    _, error = run(before=before, client="curl http://[{server6}]:8000/", code=3)
-    assert error.splitlines() == [
-        "cloudrc: error: --client: {server6} needs IPv6, which is off on this machine; use {server}"
-    ]
-
-
-GRPC_SERVER = """
-from concurrent.futures import ThreadPoolExecutor
-import grpc
-from grpc_health.v1 import health, health_pb2, health_pb2_grpc
-
-server, servicer = grpc.server(ThreadPoolExecutor(2)), health.HealthServicer()
-health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
-servicer.set("arm", health_pb2.HealthCheckResponse.SERVING)
-server.add_insecure_port("[::]:50051")
-server.start()
-server.wait_for_termination()
-"""
-GRPC_CLIENT = """
-import sys, time
-import grpc
-from grpc_health.v1 import health_pb2, health_pb2_grpc
-
-with grpc.insecure_channel(sys.argv[1]) as channel:
-    stub, ask = health_pb2_grpc.HealthStub(channel), health_pb2.HealthCheckRequest(service="arm")
-    watch = stub.Watch(ask)
-    assert next(watch).status == health_pb2.HealthCheckResponse.SERVING
-    watch.cancel()
-    for _ in range(20):
-        began = time.monotonic()
-        stub.Check(ask, timeout=20)
-        print(time.monotonic() - began)
-"""
-
-
-@pytest.mark.full
-def test_grpcs_own_health_service_answers_over_the_link(folder, figure):
-    """A call and a stream of grpcio, in an environment of its own; needs a package index."""
-    subprocess.run([sys.executable, "-m", "venv", "rpc"], check=True)
-    words = [
-        "rpc/bin/pip",
-        "install",
-        "--quiet",
-        "grpcio==1.85.1",
-        "grpcio-health-checking==1.85.1",
-    ]
-    subprocess.run(words, check=True)
-    (folder / "serve.py").write_text(GRPC_SERVER)
-    (folder / "ask.py").write_text(GRPC_CLIENT)
-    for host in ("{server}", "[{server6}]"):
-        client = f"rpc/bin/python ask.py {host}:50051"
-        out, _ = run("--link", "paper-p3", server="rpc/bin/python serve.py", client=client)
-        calls = [float(line.removeprefix("[client] ")) for line in out.splitlines()]
-        assert len(calls) == 20
-        # A round trip is 140 ms; a segment that overtakes another waits for it.
-        figure(f"call of gRPC, {host}, median", float(np.median(calls)), "<=", 0.2, "s")
-        assert min(calls) >= 0.060
-    shutil.rmtree(folder / "rpc")
 
 
 @pytest.mark.full
@@ -421,16 +324,6 @@ def test_throughput_and_lateness(folder, figure):
     run("--link", "wifi", "-o", "out", client=client)
     counts = json.loads((folder / "out" / "link.json").read_text())["counts"]
     figure("lateness of a packet, p99", counts["release_error_p99_ns"] * 1e-6, "<=", 0.5, "ms")
-
-
-def test_time_is_not_lost_on_an_ideal_link(folder, figure):
-    (folder / "echo.py").write_text(ECHO.format(family="socket.AF_INET"))
-    (folder / "ask.py").write_text(ASK.format(family="socket.AF_INET", count=500, period=0.004))
-    python = sys.executable
-    out, _ = run(server=f"{python} echo.py", client=f"{python} ask.py {{server}}")
-    lines = [line.removeprefix("[client] ").split() for line in out.splitlines()]
-    added = np.median([(int(line[3]) - int(line[1])) * 0.5e-6 for line in lines])
-    figure("one way over an ideal link, median", float(added), "<=", 0.2, "ms", count=len(lines))
 
 
 def test_the_commands_of_the_page_work(folder):
