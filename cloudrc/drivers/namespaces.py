@@ -10,6 +10,7 @@ import json
 import os
 import signal
 import socket
+import socketserver
 import subprocess
 import threading
 from contextlib import suppress
@@ -182,53 +183,57 @@ def print_lines(source: IO[bytes], target: IO[bytes], prefix: str) -> threading.
     return thread
 
 
-class Forwarder:
+class _Forwarded(socketserver.BaseRequestHandler):
+    server: Forwarder
+
+    def handle(self) -> None:
+        with self.server.connect() as inside:
+            back = threading.Thread(target=_pump, args=(inside, self.request), daemon=True)
+            back.start()
+            _pump(self.request, inside)
+            back.join()
+
+
+class Forwarder(socketserver.ThreadingTCPServer):
     """Forwards connections to a port of this machine to the same port in a namespace."""
+
+    daemon_threads = True
+    block_on_close = False
+    allow_reuse_address = True
 
     def __init__(self, end: ProgramEnd, port: int) -> None:
         """Listen at `port` on 127.0.0.1, on threads of its own."""
+        self._end, self._port = end, port
         try:
-            self._listening = socket.create_server(("127.0.0.1", port))
+            super().__init__(("127.0.0.1", port), _Forwarded)
         except OSError as error:
             raise BadInputError(
                 f"--expose {port}: cannot listen at 127.0.0.1:{port}:"
                 f" {os.strerror(error.errno or 0)}; end what listens there"
             ) from None
-        self._end, self._port = end, port
-        threading.Thread(target=self._accept, daemon=True).start()
+        threading.Thread(target=self.serve_forever, args=(0.1,), daemon=True).start()
 
     def close(self) -> None:
         """Accept no more connections."""
-        with suppress(OSError):
-            self._listening.shutdown(socket.SHUT_RDWR)
-        self._listening.close()
+        self.shutdown()
+        self.server_close()
 
-    def _accept(self) -> None:
-        with suppress(OSError):  # closed
-            while True:
-                outside, _ = self._listening.accept()
-                threading.Thread(target=self._serve, args=(outside,), daemon=True).start()
-
-    def _serve(self, outside: socket.socket) -> None:
-        with outside, suppress(OSError, InvalidRunError):
-            with self._connect() as inside:
-                back = threading.Thread(target=_pump, args=(inside, outside), daemon=True)
-                back.start()
-                _pump(outside, inside)
-                back.join()
-
-    def _connect(self) -> socket.socket:
+    def connect(self) -> socket.socket:
         """Connect to the program: at the address of the link, else at its own loopback address."""
         try:
             return self._end.connect(namespace.ADDRESSES[self._end.name].ipv4, self._port)
         except OSError:
             return self._end.connect("127.0.0.1", self._port)
 
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Ignore a program that does not listen, and clients that disconnect early."""
+
 
 def _pump(source: socket.socket, target: socket.socket) -> None:
     """Copy a stream of bytes until its end, and hand on the end."""
-    with suppress(OSError):
+    try:
         while data := source.recv(CHUNK):
             target.sendall(data)
-    with suppress(OSError):
         target.shutdown(socket.SHUT_WR)
+    except OSError:  # the other side is closed
+        return

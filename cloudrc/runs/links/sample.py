@@ -21,7 +21,7 @@ from cloudrc.report.figures.link import DirectionSample
 from cloudrc.text import table
 from cloudrc.tunnel.codec import SIZES, TELEMETRY_SIZES, Kind
 
-PACKETS_MAX = 10_000_000
+PACKETS_MAX = 10_000_000  # in one direction
 ROWS = 1000  # least number of packets for a trace that has shares of losses
 SECONDS = 30.0  # time that a figure shows by default [s]; a longer time line is shown in full
 Tell: TypeAlias = Callable[[str], None]

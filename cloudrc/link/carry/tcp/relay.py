@@ -22,9 +22,6 @@ CHUNK = 64 << 10  # most bytes that one call reads [bytes]
 BUFFER = 128 << 10  # of the kernel, for each socket and direction [bytes]
 ACCEPTED_MAX = 64  # connections that one turn of the loop accepts
 TURNS_KEPT = 100_000  # newest turns of which the times are kept
-FIRST_RETRY_NS = 1_000_000_000  # time until the first packet of a connection is sent again [ns]
-GREETINGS = 7  # times that the first packet of a connection is sent
-SYN = 0  # epoch of the draws of all first packets; that of a connection's bytes is its number
 _RESET = b"\x01\0\0\0\0\0\0\0"  # struct linger: on, 0 s: close sends RST
 
 Ways = tuple[Medium, Medium]
@@ -57,10 +54,11 @@ class RelayedConnection:
             for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
                 # Larger ones would hide from a sender that the receiver has stopped.
                 side.socket.setsockopt(socket.SOL_SOCKET, option, BUFFER)
-        self.greeted = False  # whether the first packets of the connection have crossed
         self.server.socket.connect_ex(relay.to)
         relay.watch(self, self.server, selectors.EVENT_WRITE)
-        self._greet(1, time.monotonic_ns())
+        up, down = relay.ways
+        now_ns = time.monotonic_ns()
+        self.opens_ns = now_ns + up.delay_ns(now_ns) + down.delay_ns(now_ns)
 
     def handle(self, side: Side, mask: int, now_ns: int) -> None:
         """Handle a socket that can be read or written."""
@@ -75,54 +73,27 @@ class RelayedConnection:
             self._read(side, now_ns)
         self.update()
 
-    def _greet(self, attempt: int, now_ns: int) -> None:
-        """Send the first packet of the connection; again later if it is lost."""
-        if self.dead:
-            return
-        if attempt > GREETINGS:
-            self.end(now_ns)
-            return
-        up, down = self.relay.ways
-        arrival_ns = up.cross(SYN, self.number, attempt, 0, now_ns)
-        if arrival_ns is None:
-            again_ns = now_ns + (FIRST_RETRY_NS << (attempt - 1))
-            self.relay.engine.queue.put(self._greet, (again_ns,), (attempt + 1,))
-        else:
-            answer_ns = arrival_ns + down.delay_ns(arrival_ns)
-            self.relay.engine.queue.put(self._greeted, (answer_ns,), ())
-
-    def _greeted(self, now_ns: int) -> None:
-        self.greeted = True
-        self._begin(now_ns)
-
     def _connected(self, now_ns: int) -> None:
-        """Take what the client sends, or note that the server refuses it."""
+        """Open the streams, or refuse the client, a round trip after the client has asked."""
         self.connecting = False
         self.relay.watch(self, self.server, 0)
+        opens_ns = max(now_ns, self.opens_ns)
         if self.server.socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
             self.relay.refused += 1
-        else:
-            self.relay.connected += 1
-            up, down = self.relay.ways
-            self._join(self.client, self.server, (up, down))
-            self._join(self.server, self.client, (down, up))
-            self.update()
-        self._begin(now_ns)
+            self.relay.engine.queue.put(self.end, (opens_ns,), ())
+            return
+        self.relay.connected += 1
+        up, down = self.relay.ways
+        self._join(self.client, self.server, (up, down), opens_ns)
+        self._join(self.server, self.client, (down, up), opens_ns + up.delay_ns(opens_ns))
+        self.update()
 
-    def _join(self, source: Side, target: Side, way: Ways) -> None:
+    def _join(self, source: Side, target: Side, way: Ways, opens_ns: int) -> None:
         """Make the stream from one side to the other."""
-        stream = LinkStream(self.relay.engine.queue, way, self.number, partial(self._put, target))
+        deliver = partial(self._put, target)
+        stream = LinkStream(self.relay.engine.queue, way, self.number, deliver)
         source.source = target.origin = stream
-
-    def _begin(self, now_ns: int) -> None:
-        """Open the streams, or refuse the client, once the server and the link have answered."""
-        if self.dead or self.connecting or not self.greeted:
-            return
-        if self.client.source is None or self.server.source is None:
-            self.end(now_ns)
-            return
-        self.client.source.open(now_ns)
-        self.server.source.open(now_ns + self.relay.ways[0].delay_ns(now_ns))
+        stream.open(opens_ns)
 
     def update(self) -> None:
         """Watch the sockets for what the streams can take and give."""
