@@ -300,9 +300,16 @@ def _acknowledge(options: argparse.Namespace, api: Api) -> int:
 
 
 def _drive(_: argparse.Namespace, api: Api) -> int:
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise BadInputError("mission drive needs a terminal; from a program use POST /v1/drive")
+    import curses
+
     from cloudrc.console.terminal import drive
 
-    drive(api)
+    try:
+        drive(api)
+    except curses.error as error:
+        raise BadInputError(f"mission drive: {error}; set TERM, for example to xterm") from None
     print_line("the drive has ended; to see what the robot does next: cloudrc mission status")
     return 0
 

@@ -8,7 +8,8 @@ import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from shlex import quote
+from shlex import quote, split
+from shutil import which
 from typing import TYPE_CHECKING, Any, TextIO
 
 from cloudrc.cli.cluster_flags import (
@@ -109,12 +110,16 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _check_beside(options: argparse.Namespace, mode: str) -> None:
-    from cloudrc.drivers.companion import split_command
-
     if options.seeds or mode == "cluster":
         other = "--seeds" if options.seeds else "--mode cluster"
         raise BadInputError(f"--with starts a program for one flight here; leave out {other}")
-    split_command(options.beside)
+    try:
+        words = split(options.beside)
+    except ValueError as error:
+        raise BadInputError(f"--with '{options.beside}': no command: {error}") from None
+    if not words or which(words[0]) is None:
+        program = words[0] if words else ""
+        raise BadInputError(f"--with '{options.beside}': there is no program '{program}' here")
 
 
 def _experiment(options: argparse.Namespace, *, is_session: bool) -> ResolvedExperiment:

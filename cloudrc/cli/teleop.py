@@ -9,6 +9,7 @@ from cloudrc.cli.parser import settings_from
 from cloudrc.cli.processes import process_arguments, read_address
 from cloudrc.drivers.process import StopSignal
 from cloudrc.drivers.realtime import Address
+from cloudrc.errors import BadInputError
 from cloudrc.runs.requirements import require
 
 EPILOG = """\
@@ -57,6 +58,11 @@ def api_address(text: str) -> Address | Path:
 
 def execute(options: argparse.Namespace) -> int:
     """Run teleop until a signal stops the process or, with --start, the mission has ended."""
+    if options.tokens is None and not isinstance(options.api, Path):
+        raise BadInputError(
+            "--api HOST:PORT needs --tokens DIR, with a file 'operator' in it; "
+            "without tokens only a socket file is served: --api unix:PATH"
+        )
     require("the API of teleop", ("api",))
     stop = StopSignal()
     from cloudrc.processes.teleop import TeleopSettings, run_teleop

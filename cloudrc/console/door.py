@@ -108,7 +108,7 @@ class Door(uvicorn.Server):
 
         Args:
             port: TCP port.
-            access: Rules by which requests are refused.
+            access: Rules by which requests are admitted.
             desk: Functions of the console.
             scene: HTML of the page with the scene.
         """
@@ -158,12 +158,12 @@ class Door(uvicorn.Server):
         self._folder.cleanup()
 
     async def _check(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request of the own page with the token; refuse all others unread."""
+        """Answer a request of the own page with the token; turn all others away unread."""
         answer = self._refusal(HTTPConnection(scope)) or self._routes
         await answer(scope, receive, send)
 
     def _refusal(self, request: HTTPConnection) -> Response | None:
-        """Return the answer to a request that is refused; None if it is admitted."""
+        """Return the answer to a request that is not admitted, else None."""
         try:
             if not self._access.is_own_page(request):
                 return PlainTextResponse(FOREIGN, 403)

@@ -114,7 +114,7 @@ class Steering:
         return True
 
     def say(self, text: str, *, is_refusal: bool = False) -> None:
-        """Make `text` the newest answer on the page; `is_refusal` marks it as a refused request."""
+        """Make `text` the newest answer on the page; `is_refusal`: nothing was done."""
         self.answer = text, is_refusal, time.monotonic()
 
     def cancel(self) -> None:

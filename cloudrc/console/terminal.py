@@ -15,7 +15,6 @@ from contextlib import suppress
 from textwrap import wrap
 
 from cloudrc.console.steering import Steering
-from cloudrc.errors import BadInputError
 from cloudrc.messages import Vector
 from cloudrc.teleop.client import Api, describe_mission
 from cloudrc.text import describe_point, describe_sensors, escape
@@ -48,15 +47,11 @@ HELP = (
 
 
 def drive(api: Api) -> None:
-    """Let the user steer the robot until the key q; raise a BadInputError without a terminal."""
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        raise BadInputError("mission drive needs a terminal; from a program use POST /v1/drive")
+    """Let the user steer the robot by the keys of this terminal, until the key q."""
     steering = Steering(api)
     steering.start()
     try:
         curses.wrapper(_handle_keys, steering, api)
-    except curses.error as error:
-        raise BadInputError(f"mission drive: {error}; set TERM, for example to xterm") from None
     finally:
         steering.end_drive()
 
@@ -145,7 +140,7 @@ def _lines(steering: Steering, api: Api, note: str) -> list[str]:
         ]
         if shown := describe_sensors(seen["sensors"]):
             lines.append(f"sensors: {shown}")
-    lines.insert(1, f"refused: {text}" if is_refusal else text)
+    lines.insert(1, f"not done: {text}" if is_refusal else text)
     lines[1:1] = [note] if note else []
     lines.append(describe_mission(mission) if mission else "no mission is under way")
     lines += ["", *HELP, f"cloudrc mission drive {api.place or api.url}"]

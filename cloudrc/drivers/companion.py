@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import os
 import shlex
-import shutil
 import signal
 import subprocess
 import time
@@ -14,7 +13,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from cloudrc.errors import BadInputError, ControllerLostError, to_one_line
+from cloudrc.errors import ControllerLostError, to_one_line
 from cloudrc.records import CONTROLLER_LOST
 
 LOG_FILE = "with.log"
@@ -37,7 +36,6 @@ def companion(command: str, folder: Path, url: str = "") -> Iterator[Callable[[]
     end of the block, the program and all its children are ended.
 
     Raises:
-        BadInputError: If the program cannot be started.
         ControllerLostError: If nobody listens in time, or if the block raises it. Its text tells
             whether the program has ended.
     """
@@ -55,24 +53,12 @@ def companion(command: str, folder: Path, url: str = "") -> Iterator[Callable[[]
         _end(program)
 
 
-def split_command(command: str) -> list[str]:
-    """Return the words of a command; raise a BadInputError if it cannot be started."""
-    try:
-        words = shlex.split(command)
-    except ValueError as error:
-        raise BadInputError(f"--with '{command}': no command: {error}") from None
-    if not words or shutil.which(words[0]) is None:
-        program = words[0] if words else ""
-        raise BadInputError(f"--with '{command}': there is no program '{program}' here")
-    return words
-
-
 def _start(command: str, log: Path) -> subprocess.Popen[bytes]:
     with log.open("wb") as output:
         output.write(f"$ {command}\n".encode(errors="replace"))
         output.flush()
         return subprocess.Popen(
-            split_command(command),
+            shlex.split(command),
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,

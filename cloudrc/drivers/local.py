@@ -309,18 +309,6 @@ class LocalRun:
                 **more,
             )
 
-        def start_link(way: str, end: str, peer: str) -> None:
-            self._start(
-                way,
-                *link_words(folder / LINK_FOLDER, way),
-                mode="relay",
-                origin=origin_ns,
-                listen=at[way],
-                end=at[end],
-                peer=at[peer],
-                control=link_socket(url, way),
-            )
-
         start_end("world", "uplink")
         # Only this user can open the socket of the API: no token is needed.
         self._start(
@@ -335,8 +323,9 @@ class LocalRun:
         self._wait_until_ready()
         # With cloud, which sends first: the time lines of the link begin shortly before the flight.
         origin_ns = time.monotonic_ns()  # one start for both directions
-        start_link("uplink", "world", "cloud")
-        start_link("downlink", "cloud", "world")
+        world, cloud = at["world"], at["cloud"]
+        self._start_link("uplink", url, origin_ns, listen=at["uplink"], end=world, peer=cloud)
+        self._start_link("downlink", url, origin_ns, listen=at["downlink"], end=cloud, peer=world)
         if self._remote:
             self._start(CONTROLLER, "policy", "drive", socket=sockets)
             self._wait_until_ready()
@@ -345,6 +334,10 @@ class LocalRun:
         if session:
             session(url, self._metrics)
         self._watch(limit, sockets)
+
+    def _start_link(self, way: str, url: str, origin_ns: int, **at: str) -> None:
+        words, control = link_words(self._folder / LINK_FOLDER, way), link_socket(url, way)
+        self._start(way, *words, mode="relay", origin=origin_ns, control=control, **at)
 
     def _start(self, name: str, *words: str, **options: object) -> None:
         options["config"] = self._folder / "config.yaml"

@@ -1,8 +1,8 @@
 """Let other programs of this machine read cloud's records during a flight.
 
 A reader has a socket in a folder, usually that of the run's sockets. Cloud sends its records to
-each reader, and never waits for one: what a reader's full socket refuses is dropped. A datagram
-begins with the number of records before it, from which the reader counts the dropped ones.
+each reader, and never waits for one: what does not fit into a reader's socket is dropped. A
+datagram begins with the number of records before it, from which the reader counts the dropped ones.
 
 Each reader connects to cloud's socket: Linux then limits the bytes that wait for the reader, a
 second of records. Without a connection it limits the datagrams, usually to ten.

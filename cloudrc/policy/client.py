@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, NoReturn
@@ -12,8 +11,8 @@ from websockets.frames import CloseCode
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
-from cloudrc.errors import BadInputError, CloudrcError, describe_error, to_one_line
-from cloudrc.policy.address import KEY_VARIABLE, check_url
+from cloudrc.errors import CloudrcError, describe_error, to_one_line
+from cloudrc.policy.address import KEY_VARIABLE
 from cloudrc.policy.codec import MESSAGE_MAX, WireError, pack, unpack
 
 START_LIMIT = 60.0
@@ -22,8 +21,6 @@ ANSWER_LIMIT = 30.0
 """Time limit for each further answer [s]."""
 CLOSE_LIMIT = 0.5
 """Time for which a client waits for the server's end of a connection [s]."""
-RETRY_PERIOD = 0.1
-"""Time between two attempts to connect to a server that does not listen yet [s]."""
 
 
 class PolicyServerError(CloudrcError):
@@ -54,7 +51,6 @@ class PolicyClient:
         key: str = "",
         start_limit: float = START_LIMIT,
         answer_limit: float = ANSWER_LIMIT,
-        patience: float = 0.0,
     ) -> None:
         """Connect, and read the metadata.
 
@@ -63,14 +59,9 @@ class PolicyClient:
             key: API key; "" for none.
             start_limit: Time limit for the metadata and for the first answer [s].
             answer_limit: Time limit for each further answer [s].
-            patience: Time in which a server that is being started begins to listen [s].
         """
-        try:
-            self.url = check_url(url)
-        except ValueError as error:
-            raise BadInputError(str(error)) from None
-        self._limit, self._answer_limit = start_limit, answer_limit
-        self._connection: Connection | None = self._connect(key, patience)
+        self.url, self._limit, self._answer_limit = url, start_limit, answer_limit
+        self._connection: Connection | None = self._connect(key)
         self.metadata = self._receive("metadata")
 
     def __enter__(self) -> PolicyClient:
@@ -88,7 +79,7 @@ class PolicyClient:
         """Send an observation and return the answer; raise a PolicyServerError without one."""
         if self._connection is None:
             raise SilentServerError(f"{self.url}: the connection is closed; connect again")
-        self._refuse_early_answer()
+        self._find_early_answer()
         try:
             self._connection.send(pack(observation))
         except ConnectionClosed:
@@ -99,7 +90,7 @@ class PolicyClient:
         self._limit = self._answer_limit
         return answer
 
-    def _refuse_early_answer(self) -> None:
+    def _find_early_answer(self) -> None:
         """Raise a PolicyServerError if the server has sent more than one answer per observation.
 
         Its answers would be taken for those of later observations.
@@ -113,7 +104,7 @@ class PolicyClient:
             self.close()
             text = f"{self.url}: the server sent an answer that belongs to no observation"
             raise PolicyServerError(f"{text}; send one answer for each")
-        self._refuse_text(frame)
+        self._fail_with(frame)
 
     def close(self) -> None:
         """Close the connection."""
@@ -121,34 +112,29 @@ class PolicyClient:
         if connection is not None:
             connection.close()
 
-    def _connect(self, key: str, patience: float) -> Connection:
-        headers = {"Authorization": f"Api-Key {key}"} if key else None
-        deadline = time.monotonic() + patience
-        while True:
-            try:
-                return connect(
-                    self.url,
-                    additional_headers=headers,
-                    compression=None,
-                    max_size=MESSAGE_MAX,
-                    open_timeout=self._limit,
-                    close_timeout=CLOSE_LIMIT,
-                    ping_interval=None,  # a server that computes answers no ping
-                    proxy=None,
-                ).__enter__()  # else version 17 warns; `close` does what `__exit__` would
-            except ConnectionError as error:
-                if time.monotonic() >= deadline:
-                    text = f"{self.url}: nobody listens there ({error.strerror or error})"
-                    raise SilentServerError(f"{text}; start the policy's server") from None
-                time.sleep(RETRY_PERIOD)
-            except TimeoutError:
-                raise self._silent("the server does not accept the connection") from None
-            except InvalidStatus as error:
-                code = error.response.status_code
-                raise PolicyServerError(f"{self.url}: {_explain_status(code)}") from None
-            except (OSError, EOFError, InvalidHandshake, InvalidURI) as error:
-                text = describe_error(error).partition(": ")[2] or describe_error(error)
-                raise PolicyServerError(f"{self.url}: no connection: {text}") from None
+    def _connect(self, key: str) -> Connection:
+        try:
+            return connect(
+                self.url,
+                additional_headers={"Authorization": f"Api-Key {key}"} if key else None,
+                compression=None,
+                max_size=MESSAGE_MAX,
+                open_timeout=self._limit,
+                close_timeout=CLOSE_LIMIT,
+                ping_interval=None,  # a server that computes answers no ping
+                proxy=None,
+            ).__enter__()  # else version 17 warns; `close` does what `__exit__` would
+        except ConnectionError as error:
+            text = f"{self.url}: nobody listens there ({error.strerror or error})"
+            raise SilentServerError(f"{text}; start the policy's server") from None
+        except TimeoutError:
+            raise self._silent("the server does not accept the connection") from None
+        except InvalidStatus as error:
+            code = error.response.status_code
+            raise PolicyServerError(f"{self.url}: {_explain_status(code)}") from None
+        except (OSError, EOFError, InvalidHandshake, InvalidURI) as error:
+            text = describe_error(error).partition(": ")[2] or describe_error(error)
+            raise PolicyServerError(f"{self.url}: no connection: {text}") from None
 
     def _receive(self, what: str) -> dict[Any, Any]:
         assert self._connection is not None
@@ -161,14 +147,14 @@ class PolicyClient:
             self.close()
             raise SilentServerError(f"{self.url}: {_explain_end(error, what)}") from None
         if isinstance(frame, str):
-            self._refuse_text(frame)
+            self._fail_with(frame)
         try:
             return unpack(frame)
         except WireError as error:
             self.close()
             raise PolicyServerError(f"{self.url}: the {what} cannot be read: {error}") from None
 
-    def _refuse_text(self, text: str) -> NoReturn:
+    def _fail_with(self, text: str) -> NoReturn:
         self.close()
         last = to_one_line(text.strip()[-2000:].rpartition("\n")[2]) or "an empty text"
         raise PolicyServerError(f"{self.url}: the server sent an error: {last}")
@@ -179,7 +165,7 @@ class PolicyClient:
 
 def _explain_status(code: int) -> str:
     if code in (401, 403):
-        return f"the server refuses the API key ({code}); set {KEY_VARIABLE}"
+        return f"the server denies the API key ({code}); set {KEY_VARIABLE}"
     return f"the server answers with HTTP status {code}; is it a policy's server?"
 
 

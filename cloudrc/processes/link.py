@@ -136,7 +136,7 @@ def _machine(settings: LinkSettings, seed: int, programs: Programs, tables: Path
 
     def relay(profile: DirectionProfile, origin_ns: int) -> Relay:
         settle()
-        if ask_for_fifo():  # refused in most pods, which do not need it
+        if ask_for_fifo():  # not in most pods, which do not need it
             log("the relay runs under SCHED_FIFO")
         direction = LinkDirection(profile, seed, settings.direction == "uplink", origin_ns)
         with listening("--listen", settings.listen):

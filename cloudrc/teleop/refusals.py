@@ -1,4 +1,4 @@
-"""Define why teleop refuses a request."""
+"""Define why teleop cannot do what a request asks for."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class UnknownMissionError(CloudrcError):
 
 
 class UnavailableError(CloudrcError):
-    """Report that teleop cannot act now, for example because the disk refuses a mission."""
+    """Report that teleop cannot act now, for example because the disk is full."""
 
 
 class ConflictError(CloudrcError):

@@ -60,7 +60,7 @@ class MissionService(MissionRunner):
     """Stores and flies all missions of one robot, as the operator commands.
 
     The methods for the operator's commands raise ConflictError if the state of mission or robot
-    forbids the command. They raise UnavailableError if the disk refuses the mission, or if this
+    forbids the command. They raise UnavailableError if the disk takes no mission, or if this
     process ends.
     """
 
@@ -76,7 +76,7 @@ class MissionService(MissionRunner):
     ) -> None:
         """Begin with the missions in the store `book`, in a scene with `fence`.
 
-        With a `scene`, the service refuses straight ways of the robot's `hull` through obstacles.
+        With a `scene`, the service forbids straight ways of the robot's `hull` through obstacles.
         `units` are the names of the robot's own sensors, in the order of telemetry, and their units
         (None: no sensors). `speed_max` is the guard's speed limit [m/s]: a drive by hand is not
         faster, and never faster than `SPEED_MAX`.

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import urllib.request
+from contextlib import suppress
 
 import msgpack
 import numpy as np
@@ -15,8 +16,10 @@ from websockets.sync.client import connect
 
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.policy.address import check_url
 from cloudrc.policy.client import PolicyClient, PolicyServerError, SilentServerError
 from cloudrc.policy.load import LoadedPolicy
+from tests.conftest import wait_until
 from tests.policy.conftest import actions, serving, stock_like
 
 STATE = {"state": np.arange(3.0)}
@@ -144,10 +147,18 @@ def test_a_file_without_a_policy_is_refused(policy, source, text):
         LoadedPolicy(str(policy(source)))
 
 
-@pytest.mark.parametrize("url", ["127.0.0.1:8000", "http://h:1", "ws://h:99999"])
+@pytest.mark.parametrize("name", ["expert", "no_such.py"])
+def test_a_policy_is_named_by_the_path_of_its_file(name):
+    with pytest.raises(BadInputError, match=name):
+        LoadedPolicy(name)
+
+
+@pytest.mark.parametrize(
+    "url", ["127.0.0.1:8000", "http://h:1", "ws://:8000", "ws://h:99999", "ws://[::1"]
+)
 def test_an_address_that_is_none_is_refused(url):
-    with pytest.raises(BadInputError, match="give scheme, host and port"):
-        PolicyClient(url)
+    with pytest.raises(ValueError, match="give scheme, host and port"):
+        check_url(url)
 
 
 @pytest.mark.parametrize(
@@ -203,33 +214,6 @@ def test_nobody_listening_and_other_servers_are_one_line():
         PolicyClient(f"ws://127.0.0.1:{free}")
     with pytest.raises(PolicyServerError, match="no connection"):
         PolicyClient("ws://no-such-host.invalid:1")
-
-
-def test_a_client_waits_for_a_server_that_is_being_started(policy):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-    found = []
-
-    def ask():
-        with PolicyClient(f"ws://127.0.0.1:{port}", patience=10) as client:
-            found.append(client.infer({})["actions"])
-
-    asking = threading.Thread(target=ask, daemon=True)
-    asking.start()
-    from websockets.sync.server import serve
-
-    def handle(connection):
-        connection.send(b"\x80")
-        connection.recv()
-        connection.send(actions(2.0))
-
-    with serve(handle, "127.0.0.1", port) as server:
-        serving_thread = threading.Thread(target=server.serve_forever, daemon=True)
-        serving_thread.start()
-        asking.join(10)
-        server.shutdown()
-        serving_thread.join(10)
-    assert found[0].tolist() == [[2.0] * 4]
 
 
 STOCK = """
@@ -305,6 +289,12 @@ WebsocketPolicyServer(Policy(), "127.0.0.1", int(sys.argv[1]), {"robot": "arm"})
 """
 
 
+def listens(port):
+    with suppress(OSError), socket.create_connection(("127.0.0.1", port)):
+        return True
+    return False
+
+
 @pytest.mark.full
 def test_our_client_asks_the_stock_server_of_openpi(stock):
     """The package's server is the file of openpi's repository, byte by byte."""
@@ -317,7 +307,8 @@ def test_our_client_asks_the_stock_server_of_openpi(stock):
         "prompt": "go",
     }
     try:
-        with PolicyClient(f"ws://127.0.0.1:{port}", patience=30) as client:
+        wait_until(lambda: listens(port), 30.0)
+        with PolicyClient(f"ws://127.0.0.1:{port}") as client:
             assert client.metadata == {"robot": "arm"}
             for _ in range(2):
                 answer = client.infer(observation)

@@ -10,11 +10,8 @@ import pytest
 
 from cloudrc.cli.teleop import api_address
 from cloudrc.config.load import load_experiment
-from cloudrc.errors import BadInputError
 from cloudrc.exposition.live import LiveMetrics
-from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
-from cloudrc.processes.teleop import TeleopSettings, serve_api
 from cloudrc.records import Counted
 from cloudrc.teleop import api as api_module
 from cloudrc.teleop import auth, models
@@ -293,16 +290,12 @@ def test_the_api_and_its_client_speak_both_address_families():
 
 
 @pytest.mark.parametrize(
-    ("where", "host", "warns"),
-    [("0", "127.0.0.1", False), ("[::1]:0", "::1", False), ("0.0.0.0:0", "0.0.0.0", True)],
+    ("where", "host"), [("0", "127.0.0.1"), ("[::1]:0", "::1"), ("0.0.0.0:0", "0.0.0.0")]
 )
-def test_a_network_address_needs_tokens(where, host, warns, tmp_path, capsys):
-    address = api_address(where)
-    settings = TeleopSettings(tmp_path / "hover.yaml", tmp_path, address)
-    assert address == (host, 0)
-    with pytest.raises(BadInputError, match="needs --tokens DIR"):
-        serve_api(settings, load_experiment("hover"), load_scene("empty"))
-    assert ("can be reached from outside" in capsys.readouterr().err) is warns
+def test_a_network_address_needs_tokens(where, host, refused):
+    assert api_address(where) == (host, 0)
+    line = refused(f"teleop --config hover.yaml --socket . --api {where}")
+    assert "needs --tokens DIR" in line
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
