@@ -3,7 +3,7 @@
 The tables of docs/experiment.md come from the models in `cloudrc/config/schema.py` and from the
 signatures of the shipped plug-ins. The tables of docs/topics.md come from
 `cloudrc/record/topics.py`, those of docs/metrics.md from `cloudrc/exposition/table.py`. The text
-around the tables is written by hand.
+around the tables is written by hand. `QUANTITIES` gives panels to the dashboard of missions.
 
 The chart's schema and table come from its `values.yaml`. Shipped profiles and missions are copied,
 because a chart can read only its own files.
@@ -29,6 +29,7 @@ from cloudrc.config.profile import DirectionConfig, Profile
 from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import Experiment, MissionConfig
 from cloudrc.exposition.table import METRICS, ROLES
+from cloudrc.metrics.definitions import QUANTITIES, Quantity
 from cloudrc.record.topics import TOPICS
 from tools.chart_values import make_schema, table_rows
 
@@ -72,6 +73,8 @@ _STAMPS = {
 }  # fmt: skip
 SAMPLING = {name: about for about, names in _STAMPS.items() for name in names.split()}
 """Topic -> meaning of a row's stamp, and when a row is written."""
+GRAFANA_UNITS = {"m": "lengthm", "s": "s", "m/s": "velocityms", "N": "forceN"}
+"""Unit -> its name in Grafana."""
 OPEN = {
     "version": "the version",
     "config": "the first 12 digits of the SHA-256 of the process's configuration with all "
@@ -95,6 +98,7 @@ def outputs() -> dict[Path, str]:
         **insert(ROOT / "docs" / "topics.md", _topics()),
         **insert(ROOT / "docs" / "metrics.md", _metrics()),
         **insert(CHART / "README.md", f"\n{rows}"),
+        **insert(CHART / "files" / "dashboards" / "missions.yaml", f"{panels(QUANTITIES)}# "),
         CHART / "values.schema.json": json.dumps(make_schema(values), indent=2) + "\n",
         **{
             CHART / "files" / f"{kind}s" / path.name: path.read_text()
@@ -155,6 +159,20 @@ def _experiment() -> str:
     blocks += ["## One direction of a link\n", _summary(DirectionConfig), _keys(DirectionConfig)]
     blocks += ["How each key acts: [link.md](link.md).\n", "## Shipped files\n", _shipped()]
     return "\n".join(blocks)
+
+
+def panels(quantities: Iterable[Quantity]) -> str:
+    """Format the panels of the dashboard that quantities have."""
+    texts = []
+    for each in quantities:
+        if each.panel:
+            legend = "{{axis}}" if "[axis]" in each.live else "value"
+            query = each.live.partition("[")[0] + "{$pods}"
+            panel = {"title": each.panel, "unit": GRAFANA_UNITS.get(each.unit, "short")}
+            panel |= {"queries": {legend: query}}
+            text = yaml.safe_dump([panel], sort_keys=False, width=100)
+            texts.append(re.sub("^", "  ", text, flags=re.MULTILINE).rstrip(" "))
+    return "".join(texts)
 
 
 def _is_section(annotation: Any) -> bool:

@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from math import dist, hypot, inf, nan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cloudrc.geometry.clearance import NO_SIZE, Array, Hull, clearance
 from cloudrc.geometry.obstacles import Obstacle
 from cloudrc.messages import NEVER_NS, GuardState
-from cloudrc.metrics.definitions import Echoes, PredictionJudge, tracking_error
+from cloudrc.metrics.definitions import CHARTED, Echoes, PredictionJudge
 from cloudrc.records import Control
 from cloudrc.teleop.wire import RobotStatus
 
@@ -39,9 +39,9 @@ class Sample(NamedTuple):
     uplink: float = nan  # one-way delay [s]
     downlink: float = nan  # one-way delay [s]
     estimate: float = nan  # delay by which cloud predicts ahead [s]
-    error: float = nan  # distance from measured position to setpoint [m]
     estimate_error: float = nan  # distance from predicted to measured position [m]
     speed: float = nan  # [m/s]
+    charted: tuple[float, ...] = (nan,) * len(CHARTED)  # of `CHARTED`, each in its unit
 
 
 class FlightFeed:
@@ -108,11 +108,12 @@ class FlightFeed:
         return rows[:, :3], rows[:, 3]
 
     def columns(self, step: int = 3) -> Array:
-        """Return every `step`-th sample of the charts, shape (fields of `Sample`, n).
+        """Return every `step`-th sample of the charts, shape (values of `Sample`, n).
 
         The times are relative to the newest returned sample [s]. Unknown values are NaN.
         """
-        rows = np.array([*self.samples][::step] or [Sample(0.0)], dtype=np.float64)
+        samples = [*self.samples][::step] or [Sample(0.0)]
+        rows = np.array([(*sample[:-1], *sample.charted) for sample in samples], dtype=np.float64)
         rows[:, 0] -= rows[-1, 0]
         return np.ascontiguousarray(rows.T)
 
@@ -145,7 +146,12 @@ class FlightFeed:
             uplink,
             self._downlink if echoed else nan,
             control.horizon,
-            hypot(*tracking_error(control.setpoint, control.measured)),
             hypot(*self._judge.error) if judged else nan,
             speed,
+            tuple(_size(quantity.value(control)) for quantity in CHARTED),
         )
+
+
+def _size(value: Any) -> float:
+    """Return the length of a vector, or the number itself, in its unit."""
+    return hypot(*value) if isinstance(value, tuple) else float(value)

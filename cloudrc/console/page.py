@@ -28,6 +28,7 @@ from cloudrc.console.scene import LEGEND, FlightScene
 from cloudrc.console.steering import Steering, is_drive
 from cloudrc.geometry.clearance import Array
 from cloudrc.messages import ZERO, Quaternion, Vector
+from cloudrc.metrics.definitions import CHARTED
 from cloudrc.text import describe_sensors
 from cloudrc.world.shapes import read_shapes
 
@@ -42,12 +43,14 @@ ASPECT = (1280 - 2 * PANEL_WIDTH) / 800
 BLUE, RED, GREEN = "#0072b2", "#d55e00", "#009e73"
 CHARTS: dict[str, tuple[float, float, dict[str, tuple[int, str]]]] = {
     "Delay [ms]": (1e3, 150, {"up": (1, BLUE), "down": (2, RED), "estimate": (3, GREEN)}),
-    "Tracking error [m]": (1.0, 0.2, {"error": (4, BLUE)}),
-    "Estimate error [mm]": (1e3, 20, {"error": (5, BLUE)}),
-    "Speed [m/s]": (1.0, 0.5, {"speed": (6, BLUE)}),
+    "Estimate error [mm]": (1e3, 20, {"error": (4, BLUE)}),
+    "Speed [m/s]": (1.0, 0.5, {"speed": (5, BLUE)}),
 }
 """Title of a chart -> factor from SI units, smallest range of its axis, and its curves: name ->
-place in `Sample`, and colour."""
+row of `FlightFeed.columns`, and colour."""
+for _row, _quantity in enumerate(CHARTED, start=6):
+    _title, _factor, _range = _quantity.chart or ("", 1.0, 1.0)
+    CHARTS[_title] = _factor, _range, {_title.partition(" [")[0].lower(): (_row, BLUE)}
 BELOW_STOP = '<div style="height: 36px"></div>'
 """Keeps the panel's first lines below STOP, which lies over the panel."""
 

@@ -17,6 +17,7 @@ from cloudrc.exposition.parts import Histogram, Readings, samples
 from cloudrc.exposition.table import LiveMetric, MetricKind, of_role
 from cloudrc.messages import NEVER_NS, Cause, GuardState
 from cloudrc.metrics.definitions import (
+    QUANTITIES,
     WAITING_MAX,
     DatagramTally,
     DelayJudge,
@@ -25,7 +26,6 @@ from cloudrc.metrics.definitions import (
     PredictionJudge,
     age,
     real_time_factor,
-    tracking_error,
 )
 from cloudrc.records import (
     BY_HAND,
@@ -37,7 +37,6 @@ from cloudrc.records import (
     Control,
     Counted,
     Fault,
-    GroundTruth,
     GuardChange,
     Lateness,
     LinkChecked,
@@ -187,9 +186,6 @@ class WorldEnd(End):
         super()._on_sessionopened(record)
         self._values["cloudrc_clouds_admitted_total"] += record.cause == ADMITTED
 
-    def _on_groundtruth(self, record: GroundTruth) -> None:
-        self._values["cloudrc_position_meters"] = record.odometry.position
-
     def _on_sensorread(self, record: SensorRead) -> None:
         _, name, unit, value = record
         self._set("cloudrc_sensor_value", name, {unit: value})
@@ -288,16 +284,11 @@ class CloudEnd(End):
         self._used_count = 0
         self._delay.sent(record)
         values = self._values
-        values["cloudrc_delay_estimate_seconds"] = record.horizon
         delay_error = nan if self._has_plans else self._delay.error
         values["cloudrc_delay_estimate_error_seconds"] = delay_error
         values["cloudrc_estimate_error_meters"] = self._prediction.error
         values["cloudrc_estimate_error_square_meters_total"] = self._prediction.square
         values["cloudrc_predictions_judged_total"] = self._prediction.judged
-        values["cloudrc_tracking_error_meters"] = tracking_error(record.setpoint, record.measured)
-        values["cloudrc_setpoint_meters"] = record.setpoint
-        values["cloudrc_command_velocity_meters_per_second"] = record.command
-        values["cloudrc_command_yaw_rate_radians_per_second"] = record.yaw_rate
         terms = values["cloudrc_pid_output"]
         terms["proportional"] = record.proportional
         terms["integral"] = record.integral
@@ -410,6 +401,10 @@ class LiveMetrics:
         mission = MissionMetrics(values) if role == table.TELEOP else None
         self._places = _places(metrics, values)
         self._handlers = _handlers(self, self.end, self.end and self.end.check, mission)
+        self._gauges = defaultdict[type, list[tuple[str, Callable[[Any], Any]]]](list)
+        for quantity in QUANTITIES:
+            if (name := quantity.live.partition("[")[0]) in values:
+                self._gauges[quantity.source].append((name, quantity.value))
 
     def _on_counted(self, record: Counted) -> None:
         for values, key in self._places.get(record.name, ()):
@@ -420,6 +415,8 @@ class LiveMetrics:
         for record in records:
             if handle := self._handlers.get(type(record)):
                 handle(record)
+            for name, value in self._gauges.get(type(record), ()):
+                self._values[name] = value(record)
 
     def read(self) -> Readings:
         """Return the current metrics, without metrics whose values are unknown."""

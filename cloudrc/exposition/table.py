@@ -14,7 +14,8 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from cloudrc.messages import Cause, GuardState
-from cloudrc.records import FAILURES
+from cloudrc.metrics.definitions import QUANTITIES
+from cloudrc.records import FAILURES, Control
 
 WORLD, CLOUD, TELEOP, LINK = "world", "cloud", "teleop", "link"
 ROLES = (WORLD, CLOUD, TELEOP, LINK)
@@ -109,7 +110,6 @@ cloudrc_clouds_admitted_total: Cloud processes that got a session, restarted one
 cloudrc_sessions_refused_total = busy: Sessions refused because another cloud controls the robot.
 cloudrc_downlink_delay_seconds: One-way delay from cloud to world, late datagrams included; absent
     unless both ends prove that they share a clock.
-cloudrc_position_meters[axis]: True position of the base, world frame.
 cloudrc_sensor_value[sensor, unit]: What one of the robot's own sensors shows, in its unit.
 cloudrc_command_age_seconds: Age of the current command in TRACK, sampled every period: time since
     the odometry from which cloud computed the command, on world's clock.
@@ -138,7 +138,6 @@ cloudrc_loop_delay_seconds: Round trip of applied commands, with their time in w
     counts once.
 cloudrc_delay_sample_seconds: Delay samples of the estimator, one per telemetry that cloud used: the
     paper's tau_n, which eq. (1) averages.
-cloudrc_delay_estimate_seconds: Clamped delay estimate: how far ahead cloud predicts the odometry.
 cloudrc_delay_estimate_error_seconds: Delay estimate minus the true time from the odometry to the
     application of the command, for the newest command that the robot confirmed; absent with plans.
 cloudrc_estimate_error_meters[axis]: Predicted minus measured position at the instant of the
@@ -146,11 +145,7 @@ cloudrc_estimate_error_meters[axis]: Predicted minus measured position at the in
 cloudrc_estimate_error_square_meters_total: Sum of the squared lengths of all estimate errors
     since the process started.
 cloudrc_predictions_judged_total: Predictions compared with a measurement.
-cloudrc_tracking_error_meters[axis]: Setpoint minus measured position, in the newest period.
-cloudrc_setpoint_meters[axis]: Position setpoint, world frame.
 cloudrc_pid_output[term, axis]: Terms of the controller's output [m/s], in the newest period.
-cloudrc_command_velocity_meters_per_second[axis]: Commanded velocity, world frame.
-cloudrc_command_yaw_rate_radians_per_second: Commanded yaw rate.
 cloudrc_horizon_clamped_total = horizon_clamped: Delay estimates clamped to the range 0 to
     cloud.horizon_max_s.
 cloudrc_commands_frozen_total = frozen: Commands of zero velocity, because the robot confirmed no
@@ -195,7 +190,8 @@ cloudrc_link_released_early_total = released_early: Datagrams that left the rela
 cloudrc_dns_errors_total = unresolved: Failed look-ups of the peer's name; the last known address
     stays in use.
 """
-"""All metrics, in blocks: the processes that expose them, then name[labels] = count: meaning."""
+"""All metrics but those of `QUANTITIES`, in blocks: the processes that expose them, then
+name[labels] = count: meaning."""
 _LABELS: Mapping[str, Labels] = {
     **dict.fromkeys(("version", "config", "sensor", "unit", "body"), ()),
     "role": ROLES,
@@ -256,10 +252,22 @@ def _metrics() -> Iterator[LiveMetric]:
                 kind = MetricKind.COUNTER
             one_line = " ".join(meaning.split())
             yield LiveMetric(name, kind, one_line, tuple(roles.split()), labels, buckets, count)
+    for quantity in QUANTITIES:
+        if quantity.live:
+            name, is_vector, _ = quantity.live.partition("[axis]")
+            labels = {"axis": AXES} if is_vector else {}
+            role = CLOUD if quantity.source is Control else WORLD
+            yield LiveMetric(name, MetricKind.GAUGE, quantity.now, (role,), labels, (), "")
 
 
-METRICS: Mapping[str, LiveMetric] = MappingProxyType({metric.name: metric for metric in _metrics()})
-"""All metrics by name."""
+_PROCESSES = [tuple(block.partition("\n")[0].split()) for block in _TABLE.strip().split("\n\n")]
+METRICS: Mapping[str, LiveMetric] = MappingProxyType(
+    {
+        metric.name: metric
+        for metric in sorted(_metrics(), key=lambda metric: _PROCESSES.index(metric.roles))
+    }
+)
+"""All metrics by name, in the order of the blocks of `_TABLE`."""
 
 
 def of_role(role: str) -> list[LiveMetric]:

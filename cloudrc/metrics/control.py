@@ -264,6 +264,7 @@ add_metrics(
      "above criteria.age_deadline_s.", _age_violation),
     ("commands_applied", "1", "Number of commands that reached the low-level controller.",
      lambda flight: flight.count(len(flight.during("/command_applied")["epoch"]))),
+    rtt_mean="round trip, mean",
 )  # fmt: skip
 add_metrics(
     "Estimation and tracking",
@@ -273,11 +274,7 @@ add_metrics(
      "instant of the prediction.", _estimate_error),
     ("delay_estimate_error_rms", "s", "RMS difference between the horizon and the true delay from "
      "odometry to applied command, from the first echo on; without plans only.", _delay_error),
-    ("tracking_rms_measured", "m", "RMS distance between the setpoint and the measured position "
-     "that cloud used.",
-     lambda flight: rms(tracking_errors(flight, flight.control["measured"]))),
-    ("tracking_rms_estimated", "m", "RMS distance between the setpoint and cloud's estimated "
-     "position.", lambda flight: rms(tracking_errors(flight, flight.control["position"]))),
+    prediction_error_rms="prediction error, RMS",
 )  # fmt: skip
 add_metrics(
     "Real time",
@@ -294,4 +291,5 @@ add_metrics(
     ("controller_gaps", "1", "Number of times that the program of cloud.controller remote was "
      "silent for 0.2 s, so that the robot stood still.",
      lambda flight: flight.growth("controller_gaps")),
+    real_time_factor="real-time factor",
 )  # fmt: skip

@@ -1,5 +1,9 @@
 """Define the quantities that a flight's report, its live metrics and the console all show.
 
+`QUANTITIES` has a row for each quantity with a value per record: the row is all that report, rows
+of sweeps, Prometheus, dashboard, console and documentation need. The other quantities depend on
+several records.
+
 Each quantity is computed step by step. Live metrics and console do so while the records arrive, the
 report does so afterwards, with the same functions. So the same records give the same value, except
 for two quantities of which the report knows more: it waits longer for a missing datagram before
@@ -9,13 +13,14 @@ it counts the datagram as lost (`link.WINDOW_MAX`), and it knows the true positi
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from heapq import heappop, heappush
 from math import nan
-from typing import Any
+from typing import Any, Literal
 
 from cloudrc.messages import Cause, GuardState, Vector
-from cloudrc.records import Control
+from cloudrc.records import Control, GroundTruth
 
 # Delays. Stamps are subtracted only from stamps of the same clock.
 
@@ -86,6 +91,100 @@ def prediction_error(
     y = py - ay - share * (by - ay)
     z = pz - az - share * (bz - az)
     return x, y, z
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A quantity with a value for each record of a class, and where people see it.
+
+    Its number is in report, page, sweeps and `cloudrc list metrics`, its newest value in flight.
+    """
+
+    source: type[Any]  # class of the records; not `Arrival`, which two ends make
+    # Value of a record, or of all rows of a flight as one record: its fields are then arrays.
+    # A vector is a tuple of x, y and z; all other values are numbers or arrays.
+    value: Callable[[Any], Any]
+    unit: str  # SI unit as text; "1" for counts and shares
+    name: str = ""  # of its number, in report.json; "": none
+    statistic: Literal["mean", "rms", "p95", "p99", "max"] = "mean"  # number over a flight
+    meaning: str = ""  # of its number, one sentence
+    group: str = "Estimation and tracking"  # title above its number in report.html
+    label: str = ""  # of its number in the summary of a report; "": not there
+    live: str = ""  # name of its Prometheus metric, with [axis] for a vector; "": none
+    now: str = ""  # meaning of the metric, one sentence
+    panel: str = ""  # title of its panel in the dashboard; "": none
+    # Chart of the console: title, factor from the SI unit, and smallest range of its axis. Only for
+    # records that telemetry's reader gets, `Control`.
+    chart: tuple[str, float, float] | None = None
+
+
+QUANTITIES = (
+    Quantity(
+        GroundTruth,
+        lambda row: row.odometry.position,
+        "m",
+        live="cloudrc_position_meters[axis]",
+        now="True position of the base, world frame.",
+    ),
+    Quantity(
+        GroundTruth,
+        lambda row: row.odometry.velocity,
+        "m/s",
+        "speed_max",
+        "max",
+        "Largest true speed of the robot's base.",
+        "Mission",
+    ),
+    Quantity(
+        Control,
+        lambda row: row.horizon,
+        "s",
+        live="cloudrc_delay_estimate_seconds",
+        now="Clamped delay estimate: how far ahead cloud predicts the odometry.",
+    ),
+    Quantity(
+        Control,
+        lambda row: tracking_error(row.setpoint, row.measured),
+        "m",
+        "tracking_rms_measured",
+        "rms",
+        "RMS distance between the setpoint and the measured position that cloud used.",
+        live="cloudrc_tracking_error_meters[axis]",
+        now="Setpoint minus measured position, in the newest period.",
+        chart=("Tracking error [m]", 1.0, 0.2),
+    ),
+    Quantity(
+        Control,
+        lambda row: tracking_error(row.setpoint, row.position),
+        "m",
+        "tracking_rms_estimated",
+        "rms",
+        "RMS distance between the setpoint and cloud's estimated position.",
+    ),
+    Quantity(
+        Control,
+        lambda row: row.setpoint,
+        "m",
+        live="cloudrc_setpoint_meters[axis]",
+        now="Position setpoint, world frame.",
+    ),
+    Quantity(
+        Control,
+        lambda row: row.command,
+        "m/s",
+        live="cloudrc_command_velocity_meters_per_second[axis]",
+        now="Commanded velocity, world frame.",
+    ),
+    Quantity(
+        Control,
+        lambda row: row.yaw_rate,
+        "rad/s",
+        live="cloudrc_command_yaw_rate_radians_per_second",
+        now="Commanded yaw rate.",
+    ),
+)
+CHARTED = tuple(each for each in QUANTITIES if each.chart)
+"""Quantities with a chart in the console."""
 
 
 GAP_MAX_NS = 50_000_000

@@ -7,10 +7,11 @@ Both end with the event that ends the mission or, without such an event, with th
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property, partial, reduce
 from math import isfinite
+from types import SimpleNamespace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -23,14 +24,16 @@ from cloudrc.geometry.obstacles import Obstacle, has_surface, obstacles
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
 from cloudrc.metrics.counters import growth
+from cloudrc.metrics.definitions import QUANTITIES, Quantity
 from cloudrc.record.columns import Recording, Table, datagrams, join
 from cloudrc.record.holes import Hole
-from cloudrc.records import UNDER_WAY
+from cloudrc.record.topics import BY_SOURCE
+from cloudrc.records import UNDER_WAY, Control, Record
 
 Array: TypeAlias = NDArray[Any]
 Columns: TypeAlias = dict[str, Array]
 
-CONTROL_TOPICS = "/estimated_odometry", "/setpoint_position", "/cmd_vel", "/delay_estimate", "/pid"
+CONTROL_TOPICS = tuple(topic.name for topic in BY_SOURCE[Control])
 """Topics that the control loop writes in every period."""
 
 
@@ -190,7 +193,28 @@ class Flight:
 
     @cached_property
     def _control(self) -> Columns:
-        tables = [_columns(self.recording[topic]) for topic in CONTROL_TOPICS]
+        return self._joined(CONTROL_TOPICS)
+
+    def rows(self, source: type[Record]) -> Any:
+        """Return the flight's records of a class as one record, whose fields are arrays.
+
+        A vector is a tuple of x, y and z.
+        """
+        topics = BY_SOURCE[source]
+        columns = self._within(self._joined([topic.name for topic in topics]))
+        found = SimpleNamespace(stamp_ns=columns["stamp_ns"])
+        for field in (field for topic in topics for field in topic.fields):
+            *parents, name = field.path.split(".")
+            part = found
+            for parent in parents:
+                part = vars(part).setdefault(parent, SimpleNamespace())
+            column = columns[field.name]
+            setattr(part, name, tuple(column.T) if column.ndim > 1 else column)
+        return found
+
+    def _joined(self, topics: Iterable[str]) -> Columns:
+        """Return all columns of topics in whose rows the same records are."""
+        tables = [_columns(self.recording[topic]) for topic in topics]
         # In the last period of a torn recording some topics may be missing.
         stamps = reduce(np.intersect1d, [table["stamp_ns"] for table in tables])
         columns: Columns = {}
@@ -309,15 +333,37 @@ class Metric:
     meaning: str  # one sentence
     measure: Measure
     group: str = "Others"  # title above the metric in report.html
+    label: str = ""  # in the summary of a report; "": not there
 
 
 SHIPPED: dict[str, Metric] = {}
 """The metrics of cloudrc by name; complete once `cloudrc.metrics.measure` is imported."""
 
 
-def add_metrics(group: str, *rows: tuple[str, str, str, Measure]) -> None:
-    """Add metrics of cloudrc to a group; each row has name, unit, meaning and function."""
-    SHIPPED.update({row[0]: Metric(*row, group) for row in rows})
+def add_metrics(group: str, *rows: tuple[str, str, str, Measure], **labels: str) -> None:
+    """Add metrics of cloudrc to a group; each row has name, unit, meaning and function.
+
+    `labels` are the labels of those that the summary of a report shows.
+    """
+    SHIPPED.update({row[0]: Metric(*row, group, labels.get(row[0], "")) for row in rows})
+
+
+def add_quantities() -> None:
+    """Add the metrics of `QUANTITIES`."""
+    for each in QUANTITIES:
+        if each.name:
+            row = each.name, each.unit, each.meaning, partial(_statistic, each)
+            add_metrics(each.group, row, **{each.name: each.label})
+
+
+def _statistic(quantity: Quantity, flight: Flight) -> float | None:
+    found = quantity.value(flight.rows(quantity.source))
+    values = np.stack(found, axis=1) if isinstance(found, tuple) else np.asarray(found)
+    if quantity.statistic == "rms":
+        return rms(values)
+    sizes = np.linalg.norm(values, axis=1) if values.ndim > 1 else values
+    percent = {"p95": 95.0, "p99": 99.0, "max": 100.0}.get(quantity.statistic)
+    return mean(sizes) if percent is None else percentile(sizes, percent)
 
 
 def finite(value: float) -> float | None:
@@ -364,11 +410,6 @@ def _distance(flight: Flight) -> float | None:
     return float(np.linalg.norm(steps, axis=1).sum()) if len(steps) else None
 
 
-def _speed_max(flight: Flight) -> float | None:
-    speeds = np.linalg.norm(flight.truth["velocity"], axis=1)
-    return float(speeds.max()) if len(speeds) else None
-
-
 add_metrics(
     "Mission",
     ("duration", "s", "Time from the start of the mission to its end.",
@@ -376,7 +417,7 @@ add_metrics(
     ("start_delay", "s", "Time from the start of the mission until the robot followed its first "
      "command.", lambda flight: flight.start_ns and float(flight.seconds(flight.start_ns))),
     ("distance_flown", "m", "Length of the path that the robot's base flew.", _distance),
-    ("speed_max", "m/s", "Largest true speed of the robot's base.", _speed_max),
+    duration="mission took",
 )  # fmt: skip
 add_metrics(
     "Distance to obstacles",
@@ -384,4 +425,5 @@ add_metrics(
      "is inside a tube.", partial(_least_clearance, inside=True)),
     ("min_clearance_flight", "m", "Smallest distance between the robot and an obstacle during the "
      "whole flight.", partial(_least_clearance, inside=False)),
+    min_clearance="least clearance",
 )  # fmt: skip

@@ -79,7 +79,7 @@ def loss(flight: Flight, way: str) -> float | None:
 def count_accepted(arrived: Array, first: int) -> int:
     """Count the datagrams that a receiver accepts, each once.
 
-    `arrived` are their counters in the order of arrival, `first` is the first one sent.
+    `arrived` are their counters in the order of arrival [1], shape (n,), `first` is the first sent.
     """
     newest = np.maximum.accumulate(np.append(first - 1, arrived))[:-1]
     return len(np.unique(arrived[arrived > newest - WINDOW_MAX]))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from cloudrc import plugins
 from cloudrc.errors import BadInputError, describe_error
 from cloudrc.metrics import control, link, mission, response
-from cloudrc.metrics.flight import SHIPPED, Flight, Metric
+from cloudrc.metrics.flight import SHIPPED, Flight, Metric, add_quantities
 from cloudrc.outside import code
 from cloudrc.outside.patience import telling_if_slow
 from cloudrc.outside.values import RESULT
@@ -19,6 +19,7 @@ from cloudrc.record.holes import goes_on
 from cloudrc.text import unknown_name_text
 
 # The imported modules add the metrics of cloudrc to SHIPPED.
+add_quantities()
 __all__ = ["SHIPPED", "Flight", "Metric", "control", "link", "mission", "response"]
 
 METRIC_NOTE = "metric "

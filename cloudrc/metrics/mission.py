@@ -365,6 +365,11 @@ add_metrics(
      _steady_force),
     *((f"steady_error_{name}", "m", f"Mean distance from the setpoint along {name} over the last "
        "5 s of a hover.", partial(_steady_error, axis=axis)) for axis, name in enumerate("xyz")),
+    waypoints_reached="waypoints reached",
+    final_error="from the last setpoint, at the end",
+    contact_time="first touch at",
+    touch_speed="speed at the first touch",
+    steady_contact_force="steady contact force",
 )  # fmt: skip
 add_metrics(
     "Guard and faults",
@@ -376,4 +381,5 @@ add_metrics(
      "plug-in in the flight, and each other fault once.", _fault_count),
     ("recorder_dropped", "1", "Number of records that the recorder dropped, since it started, "
      "because the loop must not wait for a disk.", _recorder_dropped),
+    hold_count="times in HOLD",
 )  # fmt: skip

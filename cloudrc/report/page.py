@@ -21,7 +21,7 @@ from cloudrc.record import wall_time
 from cloudrc.report.document import Assessment, Run
 from cloudrc.report.figures import Picture
 from cloudrc.report.figures.style import PAGE
-from cloudrc.report.summary import main_numbers, readable
+from cloudrc.report.summary import in_groups, main_numbers, readable
 from cloudrc.version import __version__
 
 HEADLINES = {
@@ -132,16 +132,20 @@ def _figure(number: int, picture: Picture) -> str:
 
 
 def _table_rows(numbers: Mapping[str, Number]) -> str:
-    groups: dict[str, list[str]] = {metric.group: [] for metric in SHIPPED.values()}
-    for name in sorted(numbers, key=[*SHIPPED, *numbers].index):
-        group = SHIPPED[name].group if name in SHIPPED else "Others"
-        groups.setdefault(group, []).append(_row(name, numbers[name]))
-    bodies = []
-    for title, rows in groups.items():
-        if rows:
-            head = f'<tr><th scope="rowgroup" colspan="4">{escape(title)}</th></tr>'
-            bodies.append("\n".join(["<tbody>", head, *rows, "</tbody>"]))
-    return "\n".join(bodies)
+    groups: dict[str, list[str]] = {}
+    for metric in in_groups():
+        if metric.name in numbers:
+            groups.setdefault(metric.group, []).append(_row(metric.name, numbers[metric.name]))
+    others = [_row(name, number) for name, number in numbers.items() if name not in SHIPPED]
+    return "\n".join(
+        "\n".join(
+            [
+                f'<tbody>\n<tr><th scope="rowgroup" colspan="4">{escape(title)}</th></tr>',
+                *(*rows, "</tbody>"),
+            ]
+        )
+        for title, rows in (groups | ({"Others": others} if others else {})).items()
+    )
 
 
 def _row(name: str, number: Number) -> str:

@@ -5,24 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from cloudrc.metrics import METRIC_NOTE, Number, scale
+from cloudrc.metrics import METRIC_NOTE, SHIPPED, Metric, Number, scale
 from cloudrc.report.document import INCOMPLETE
 from cloudrc.text import Paint, escape, plain, table
 
-MAIN = {
-    "waypoints_reached": "waypoints reached",
-    "final_error": "from the last setpoint, at the end",
-    "duration": "mission took",
-    "contact_time": "first touch at",
-    "touch_speed": "speed at the first touch",
-    "steady_contact_force": "steady contact force",
-    "min_clearance": "least clearance",
-    "rtt_mean": "round trip, mean",
-    "prediction_error_rms": "prediction error, RMS",
-    "hold_count": "times in HOLD",
-    "real_time_factor": "real-time factor",
-}
-"""Numbers that a summary shows, and their labels."""
 SHARES = ("loss_", "late_", "overshoot_")
 """Prefixes of the names of metrics that readers see in per cent."""
 NO_NUMBERS = {
@@ -70,11 +56,20 @@ def _warnings(report: Mapping[str, Any], paint: Paint) -> Iterable[str]:
 
 
 def main_numbers(numbers: Mapping[str, Number]) -> list[tuple[str, str, str]]:
-    """Return label, digits and unit of each number in `MAIN` that was measured."""
+    """Return label, digits and unit of each number with a label that was measured."""
     # A mission with a last setpoint has no waypoints.
     hidden = "waypoints_reached" if "final_error" in numbers else None
-    names = [name for name in MAIN if name in numbers and name != hidden]
-    return [(MAIN[name], *readable(name, numbers[name])) for name in names]
+    return [
+        (metric.label, *readable(metric.name, numbers[metric.name]))
+        for metric in in_groups()
+        if metric.label and metric.name in numbers and metric.name != hidden
+    ]
+
+
+def in_groups() -> list[Metric]:
+    """Return the metrics of cloudrc by their groups, in the order of the first of each group."""
+    groups = dict.fromkeys(metric.group for metric in SHIPPED.values())
+    return [metric for group in groups for metric in SHIPPED.values() if metric.group == group]
 
 
 def readable(name: str, number: Number) -> tuple[str, str]:

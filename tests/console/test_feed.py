@@ -30,7 +30,8 @@ def test_the_downlink_s_delay_is_round_trip_minus_uplink(feed):
 def test_error_and_speed_are_those_of_the_newest_status(feed):
     near = control(0.1, setpoint=(0.0, 0.3, 1.4))
     feed.take(status(0.1, control=near, velocity=(0.6, 0.0, -0.8)), 1.0)
-    assert feed.samples[-1].error == pytest.approx(0.5)
+    assert feed.samples[-1].charted == (pytest.approx(0.5),)
+    assert feed.columns(1)[-1].tolist() == [pytest.approx(0.5)]
     assert feed.samples[-1].speed == pytest.approx(1.0)
 
 
@@ -50,7 +51,7 @@ def test_error_and_estimate_are_unknown_without_control(feed):
     feed.take(status(0.7, control=control(0.1)), 1.6)  # no new command
     feed.take(status(0.8, control=control(0.8), guard=GuardState.GROUND), 1.7)
     for sample in [*feed.samples][1:]:
-        assert isnan(sample.error)
+        assert isnan(sample.charted[0])
         assert isnan(sample.estimate)
 
 

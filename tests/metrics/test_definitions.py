@@ -6,10 +6,12 @@ the same value in live metrics and in the report.
 
 import math
 import random
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,18 +19,22 @@ from cloudrc.cloud.estimators import DelaySample
 from cloudrc.cloud.estimators.running_mean import RunningMean
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition.live import LiveMetrics
+from cloudrc.exposition.table import METRICS
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
 from cloudrc.metrics import SHIPPED
 from cloudrc.metrics.control import estimate_errors, round_trips
 from cloudrc.metrics.definitions import (
     GAP_MAX_NS,
     LONG_AGO_NS,
+    QUANTITIES,
     WINDOW,
     DatagramTally,
     Echoes,
     PredictionJudge,
+    Quantity,
     real_time_factor,
 )
+from cloudrc.metrics.flight import _statistic
 from cloudrc.metrics.link import WINDOW_MAX, count_accepted, transit_ns
 from cloudrc.records import (
     Arrival,
@@ -44,6 +50,7 @@ from cloudrc.tunnel.channel import WINDOW as REMEMBERED
 from tests.console.conftest import control
 from tests.flights.conftest import fly, records
 from tests.metrics.conftest import SECOND, Log, at, flown
+from tools.docs import panels
 
 
 def taken(counters):
@@ -133,6 +140,30 @@ def test_a_round_trip_is_new_once():
 def test_the_real_time_factor_is_simulated_time_over_machine_time():
     assert real_time_factor(9.0, 1.0) == 0.9
     assert math.isnan(real_time_factor(0.0, 0.0))
+
+
+def test_one_row_is_a_number_a_live_metric_and_a_panel():
+    row = Quantity(
+        Control,
+        lambda row: row.horizon,
+        "s",
+        "horizon_p95",
+        "p95",
+        "Horizon: 95th percentile.",
+        label="horizon",
+        live="cloudrc_horizon_seconds",
+        now="Horizon.",
+        panel="Horizon",
+        chart=("Horizon [ms]", 1e3, 10),
+    )
+    flight = flown().flight()
+    assert _statistic(row, flight) == 0.08
+    assert _statistic(replace(row, statistic="mean"), flight) == pytest.approx(0.08)
+    (panel,) = yaml.safe_load(panels([row, replace(row, panel="")]))
+    assert panel["queries"] == {"value": "cloudrc_horizon_seconds{$pods}"}
+    names = {each.live.partition("[")[0] for each in QUANTITIES} - {""}
+    assert names <= METRICS.keys()
+    assert {each.name for each in QUANTITIES} - {""} <= SHIPPED.keys()
 
 
 @cache

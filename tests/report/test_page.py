@@ -43,7 +43,7 @@ def test_the_page_says_what_the_flight_did(folder):
     experiment, recording = paper()
     for said in (
         "The mission succeeded.",
-        "waypoints reached7 mission took31.14 s",
+        "mission took31.14 s waypoints reached7",
         "first touch at27.87 s",
         "least clearance0.153 m",
         "cloudrc run config.yaml --mode virtual",
