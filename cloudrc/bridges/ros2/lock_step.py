@@ -34,7 +34,7 @@ class RosLockStep:
         self._repeated_ns: int | None = None
         try:
             self._meet()
-        except BaseException:
+        except ControllerLostError:
             self._node.close()
             raise
 
