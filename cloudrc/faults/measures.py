@@ -12,8 +12,9 @@ from math import dist, hypot, isfinite, nan
 from typing import Any, Literal, TypeAlias
 
 from cloudrc.errors import describe_error
+from cloudrc.faults.adversary import Lie
 from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.schedule import generator
+from cloudrc.faults.schedule import Schedule, generator
 from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.records import CommandApplied, Fault, GuardChange, Record, SessionOpened
@@ -66,6 +67,7 @@ class Outcome:
     sha256: str = ""  # hash of the records of all its flights
     seconds: float = 0.0  # how long it ran [s]
     error: str = ""  # the exception that ended it, if any
+    seed: int = 1  # of all its flights
 
     def flown(self, sha256: str) -> None:
         """Add the hash of one flight's records."""
@@ -88,6 +90,53 @@ class Outcome:
         """Check that the statement `text` is true; `holds` tells whether it is."""
         self.checks.append(Requirement(text, float(holds), "==", 1.0, YES))
 
+    def instant(self, first: float = 4.0, last: float = 24.0) -> float:
+        """Choose a time from `first` to `last` [s]; by default, the robot is among the tubes."""
+        return float(generator(self.seed, 77).uniform(first, last))
+
+    def prepare(
+        self, *settings: str, lies: Sequence[Lie] = (), honest: bool = True, **faults: Any
+    ) -> FaultRun:
+        """Prepare a flight with `faults`, the values of a `Schedule`; the rest is as there."""
+        return FaultRun(Schedule(self.seed, **faults), *settings, honest=honest, lies=lies)
+
+    def fly(self, *settings: str, limit: float = 120.0, **faults: Any) -> FaultRun:
+        """Fly the mission, at most until `limit` [s]; check that it was safe and was completed."""
+        return self.fly_safely(self.prepare(*settings, **faults), limit)
+
+    def fly_safely(self, flight: FaultRun, limit: float = 120.0) -> FaultRun:
+        """Fly the mission, at most until `limit` [s]; check that it was safe and was completed."""
+        flight.fly_mission(limit)
+        self.safe(flight)
+        self.done(flight)
+        return flight
+
+    def safe(self, flight: FaultRun) -> None:
+        """Add whether the flight broke an invariant, and the hash of its records."""
+        self.same("breaches of an invariant", flight.watch.counts.total(), 0)
+        for breach in flight.watch.breaches:
+            self.true(f"{breach.kind} at {breach.time:.3f} s: {breach.text}", False)
+        self.flown(flight.sha256())
+
+    def done(self, flight: FaultRun) -> None:
+        """Check that the mission was completed, with each waypoint reached once and in order."""
+        self.true("mission done", flight.mission.state == "done")
+        reached = [event.waypoint for event in flight.events("reached")]
+        self.true("each waypoint reached once, in order", reached == list(range(len(reached))))
+
+    def rejected(self, flight: FaultRun, *reasons: str) -> None:
+        """Check that world has refused at least one datagram or command for each reason."""
+        for reason in reasons:
+            self.least(f"refused as {reason}", flight.count(reason), 1)
+
+    def no_hold(self, flight: FaultRun, text: str = "HOLDs") -> None:
+        """Check that the guard never changed to HOLD before the mission's end."""
+        self.same(text, len(held(flight)), 0)
+
+    def held_in_time(self, flight: FaultRun, text: str = "HOLD after") -> None:
+        """Check that every HOLD began within one step after the last command became too old."""
+        self.most(text, basis_age_at_hold(flight), AGE_MAX, "s")
+
     @property
     def passed(self) -> bool:
         """Whether the scenario ran to its end, with at least one check, and all checks passed."""
@@ -99,8 +148,8 @@ class Outcome:
         return "passed" if self.passed else "FAILED"
 
 
-Inject: TypeAlias = Callable[[Outcome, int], None]
-"""Function that injects a fault into a flight with a seed, and adds checks to an outcome."""
+Inject: TypeAlias = Callable[[Outcome], None]
+"""Function that injects a fault into flights with the seed of an outcome, and adds checks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,9 +169,9 @@ class Scenario:
 
     def run(self, seed: int) -> Outcome:
         """Inject the fault, and check the reaction; an exception becomes the outcome's `error`."""
-        outcome = Outcome()
+        outcome = Outcome(seed=seed)
         try:
-            self.inject(outcome, seed)
+            self.inject(outcome)
         except Exception as error:  # the other scenarios still run
             outcome.error = describe_error(error)
         return outcome
@@ -160,17 +209,6 @@ def scenario(number: int, name: str, *, injects: str, expects: str) -> Callable[
 # Measurements in a flight.
 
 
-def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
-    """Choose a time from `first` to `last` [s]; by default, the robot is among the tubes then."""
-    return float(generator(seed, 77).uniform(first, last))
-
-
-def rejected(outcome: Outcome, flight: FaultRun, *reasons: str) -> None:
-    """Check that world has refused at least one datagram or command for each reason."""
-    for reason in reasons:
-        outcome.least(f"refused as {reason}", flight.count(reason), 1)
-
-
 # The guard.
 
 
@@ -187,14 +225,6 @@ def first_into(flight: FaultRun, state: GuardState) -> float:
 def held(flight: FaultRun) -> list[GuardChange]:
     """Return the guard's changes to HOLD, without the HOLD at the end of a mission."""
     return changes_into(flight, GuardState.HOLD)
-
-
-def held_in_time(outcome: Outcome, flight: FaultRun, text: str = "HOLD after") -> None:
-    """Check that every HOLD began within one step after the last command became too old.
-
-    `text` names the check in the outcome.
-    """
-    outcome.most(text, basis_age_at_hold(flight), AGE_MAX, "s")
 
 
 def basis_age_at_hold(flight: FaultRun) -> float:
@@ -268,26 +298,3 @@ def epochs(flight: FaultRun) -> list[int]:
     """Return the epochs of the sessions that world began, in order."""
     opened = [r for r in flight.of_world if isinstance(r, SessionOpened)]
     return [record.epoch for record in opened if record.end == "world"]
-
-
-def done(outcome: Outcome, flight: FaultRun) -> None:
-    """Check that the mission was completed, with each waypoint reached once and in order."""
-    outcome.true("mission done", flight.mission.state == "done")
-    reached = [event.waypoint for event in flight.events("reached")]
-    outcome.true("each waypoint reached once, in order", reached == list(range(len(reached))))
-
-
-def fly_safely(outcome: Outcome, flight: FaultRun, limit: float = 120.0) -> FaultRun:
-    """Fly the mission, at most until `limit` [s]; check that it was safe and was completed."""
-    flight.fly_mission(limit)
-    safe(outcome, flight)
-    done(outcome, flight)
-    return flight
-
-
-def safe(outcome: Outcome, flight: FaultRun) -> None:
-    """Add to `outcome`: whether the flight broke an invariant, and the hash of its records."""
-    outcome.same("breaches of an invariant", flight.watch.counts.total(), 0)
-    for breach in flight.watch.breaches:
-        outcome.true(f"{breach.kind} at {breach.time:.3f} s: {breach.text}", False)
-    outcome.flown(flight.sha256())

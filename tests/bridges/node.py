@@ -8,21 +8,18 @@ import time
 import rclpy
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.utilities import remove_ros_args
 
 KIND, *MORE = remove_ros_args(sys.argv)[1:]
 AFTER = 30
 """Number of answers before a node becomes wrong."""
-PAUSES = {"late": 0.1, "tardy": 0.6}
-"""Time for which such a node thinks about each answer [s]."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-LOSSY = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 rclpy.init()
 node = rclpy.create_node(KIND, namespace=MORE[0] if MORE else None)
 kind = Twist if KIND == "unstamped" else PoseStamped if KIND == "type" else TwistStamped
-commands = node.create_publisher(kind, "cloudrc/cmd_vel", LOSSY if KIND == "lossy" else 1)
+commands = node.create_publisher(kind, "cloudrc/cmd_vel", 1)
 count = 0
 setpoint = None
 
@@ -39,8 +36,8 @@ def answer(estimate):
         return
     if KIND == "slow" and count > AFTER:
         time.sleep(10)
-    if KIND in PAUSES:
-        time.sleep(PAUSES[KIND])
+    if KIND == "tardy":
+        time.sleep(0.6)
     command = kind()
     if KIND in ("unstamped", "type"):
         twist = command if KIND == "unstamped" else None
@@ -55,21 +52,13 @@ def answer(estimate):
     if count > AFTER:
         if KIND == "nan":
             twist.linear.y = float("nan")
-        elif KIND == "frame":
-            command.header.frame_id = "base_link"
         elif KIND == "stamp":
             command.header.stamp.nanosec += 5
-        elif KIND == "now":
-            command.header.stamp = node.get_clock().now().to_msg()
         elif KIND == "twice":
             commands.publish(command)
             time.sleep(0.05)
-        elif KIND == "dies":
-            sys.exit(7)
         elif KIND == "killed":
             os.kill(os.getpid(), signal.SIGKILL)
-        elif KIND == "short":
-            command = bytes(20)
     commands.publish(command)
 
 

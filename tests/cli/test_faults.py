@@ -32,7 +32,7 @@ def test_the_command_prints_json(call):
 
 
 def test_a_failed_check_ends_in_exit_code_1(monkeypatch, call):
-    def run(outcome, seed, number):
+    def run(outcome, number):
         outcome.same("collisions", 2.0 * (number == 1), 0)
         if number == 2:
             raise ValueError("broken")

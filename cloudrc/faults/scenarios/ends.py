@@ -15,9 +15,8 @@ from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import MissionConfig
 from cloudrc.faults import measures
 from cloudrc.faults.adversary import Lie
-from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.measures import Outcome, fly_safely, rejected, scenario
-from cloudrc.faults.schedule import FaultEvent, Schedule, Way, generator
+from cloudrc.faults.measures import Outcome, scenario
+from cloudrc.faults.schedule import FaultEvent, Way, generator
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.geometry.scene import Tube
 from cloudrc.messages import Command, GuardState, Vector
@@ -42,11 +41,10 @@ EXCESSIVE: dict[str, dict[str, Any]] = {
     injects="SIGKILL of the cloud process; a new process starts 0.8 s later",
     expects="HOLD within 252 ms; new commands in <= 2 s; the mission continues at its waypoint",
 )
-def _cloud_killed(outcome: Outcome, seed: int) -> None:
-    at, down = measures.instant(seed), 0.8
-    flight = FaultRun(Schedule(seed, events=(FaultEvent("cloud_killed", at, down),)))
-    fly_safely(outcome, flight)
-    measures.held_in_time(outcome, flight)
+def _cloud_killed(outcome: Outcome) -> None:
+    at, down = outcome.instant(), 0.8
+    flight = outcome.fly(events=(FaultEvent("cloud_killed", at, down),))
+    outcome.held_in_time(flight)
     commands = [r.stamp_ns * 1e-9 - at for r in flight.of_world if isinstance(r, CommandApplied)]
     again = min((t for t in commands if t > down), default=nan)
     outcome.most("the new process commands after", again, 2.0, "s")
@@ -60,10 +58,10 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
     injects="SIGSTOP of the cloud process for 5 s",
     expects="HOLD; world applies no command that is too old",
 )
-def _cloud_paused(outcome: Outcome, seed: int) -> None:
-    paused = FaultEvent("cloud_paused", measures.instant(seed), 5.0)
-    flight = fly_safely(outcome, FaultRun(Schedule(seed, events=(paused,))))
-    measures.held_in_time(outcome, flight)
+def _cloud_paused(outcome: Outcome) -> None:
+    paused = FaultEvent("cloud_paused", outcome.instant(), 5.0)
+    flight = outcome.fly(events=(paused,))
+    outcome.held_in_time(flight)
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
     old = [r for r in applied if r.stamp_ns - r.basis_stamp_ns > measures.AGE_MAX * 1e9]
     outcome.same("commands applied that were too old", len(old), 0)
@@ -76,11 +74,11 @@ def _cloud_paused(outcome: Outcome, seed: int) -> None:
     expects="the robot is at its spawn on the ground, and stays there; a new epoch; world rejects "
     "commands of the old epoch",
 )
-def _world_restarted(outcome: Outcome, seed: int) -> None:
-    at = measures.instant(seed)
-    flight = FaultRun(Schedule(seed, events=(FaultEvent("world_killed", at, 2.0),)))
+def _world_restarted(outcome: Outcome) -> None:
+    at = outcome.instant()
+    flight = outcome.prepare(events=(FaultEvent("world_killed", at, 2.0),))
     flight.fly(at + 12.0)
-    measures.safe(outcome, flight)
+    outcome.safe(flight)
     after = [c for c in flight.changes if c.stamp_ns * 1e-9 > at]
     outcome.same("changes of the guard after the restart", len(after), 0)
     path = [r for r in flight.trajectory() if r.stamp_ns * 1e-9 > at]
@@ -91,7 +89,7 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
     outcome.true("mission failed", flight.mission.state == "failed")
     coded = "world_restarted" in str(flight.mission.verdict)
     outcome.true("with the code world_restarted", coded)
-    rejected(outcome, flight, "old_epoch")  # commands for the old world
+    outcome.rejected(flight, "old_epoch")  # commands for the old world
 
 
 @scenario(
@@ -101,25 +99,25 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
     expects="the first cloud keeps the session until it leaves; then HOLD, and the second cloud "
     "gets a higher epoch; commands of both never mix",
 )
-def _two_clouds(outcome: Outcome, seed: int) -> None:
-    at = measures.instant(seed, 4.0, 12.0)
-    flight = FaultRun(Schedule(seed, events=(FaultEvent("second_cloud", at, 60.0),)))
+def _two_clouds(outcome: Outcome) -> None:
+    at = outcome.instant(4.0, 12.0)
+    flight = outcome.prepare(events=(FaultEvent("second_cloud", at, 60.0),))
     flight.fly(at + 5.0)
     opened = max(measures.epochs(flight), default=-1)
     outcome.same("epochs while both clouds run", opened, 2)
     flight.fly(at + 6.0)
-    outcome.same("HOLDs while both clouds run", len(measures.held(flight)), 0)
+    outcome.no_hold(flight, "HOLDs while both clouds run")
     faults = [record for record in flight.of_cloud if isinstance(record, Fault)]
     outcome.same("faults that the first cloud reports", len(faults), 0)
     flight.cloud.members = flight.cloud.members[1:]  # the first leaves
     flight.fly(at + 14.0)
-    measures.safe(outcome, flight)
-    rejected(outcome, flight, "busy")
+    outcome.safe(flight)
+    outcome.rejected(flight, "busy")
     told = measures.told(flight.cloud.others, "busy")
     outcome.true("the second reports once why it waits", [r.text for r in told] == [BUSY_TEXT])
     said = min((r.stamp_ns * 1e-9 for r in told), default=nan)
     outcome.most("the second cloud reports it after", said - at, 1.0, "s")
-    measures.held_in_time(outcome, flight, "HOLD after the first cloud has left")
+    outcome.held_in_time(flight, "HOLD after the first cloud has left")
     later = [epoch for epoch in measures.epochs(flight) if epoch > 2]
     outcome.true("the second cloud then gets a higher epoch", bool(later))
 
@@ -131,22 +129,21 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     "order",
     expects="always a safe state; the mission continues",
 )
-def _swizzle(outcome: Outcome, seed: int) -> None:
+def _swizzle(outcome: Outcome) -> None:
     """Block both directions of the link, then stop the processes; resume all in random order.
 
     Source: FoundationDB, "Simulation and Testing", swizzle-clogging.
     """
-    rng = generator(seed, 40)
-    starts = measures.instant(seed) + np.cumsum(rng.uniform(0.1, 1.0, 5))
+    rng = generator(outcome.seed, 40)
+    starts = outcome.instant() + np.cumsum(rng.uniform(0.1, 1.0, 5))
     ends = rng.permutation(starts[-1] + np.cumsum(rng.uniform(0.1, 1.5, 5)))
     spans = zip(starts.tolist(), (ends - starts).tolist(), strict=True)
     ways: tuple[Way, ...] = ("up", "down", "both", "both", "both")
     kinds = ("blackout", "blackout", "cloud_paused", "world_paused", "teleop_killed")
     faults = zip(kinds, spans, ways, strict=True)
     events = tuple(FaultEvent(kind, *span, way=way) for kind, span, way in faults)
-    flight = FaultRun(Schedule(seed, events=events), "criteria.time_limit_s=120")
-    fly_safely(outcome, flight)
-    measures.held_in_time(outcome, flight)
+    flight = outcome.fly("criteria.time_limit_s=120", events=events)
+    outcome.held_in_time(flight)
     for end, records in (("cloud", flight.of_cloud), ("world", flight.of_world)):
         outcome.least(f"times that {end} reports: late", len(measures.told(records, "late")), 1)
     restarted = measures.events_of_missions(flight, "restarted")
@@ -159,11 +156,11 @@ def _swizzle(outcome: Outcome, seed: int) -> None:
     injects="NaN, infinite, huge and excessive values in authentic commands",
     expects="rejected or limited; 5 rejected commands in 1 s cause LAND until acknowledged",
 )
-def _invalid_values(outcome: Outcome, seed: int) -> None:
-    at = measures.instant(seed)
+def _invalid_values(outcome: Outcome) -> None:
+    at = outcome.instant()
     for name, changes in IMPOSSIBLE.items():
-        flight = FaultRun(Schedule(seed), lies=[_for_a_while(at, 1.0, changes)]).fly(40.0)
-        measures.safe(outcome, flight)
+        flight = outcome.prepare(lies=[_for_a_while(at, 1.0, changes)]).fly(40.0)
+        outcome.safe(flight)
         landed = measures.first_into(flight, GuardState.LAND)
         outcome.most(f"{name}: LAND after", landed - at, 1.0, "s")
         tracked = measures.changes_into(flight, GuardState.TRACK)
@@ -171,17 +168,17 @@ def _invalid_values(outcome: Outcome, seed: int) -> None:
         outcome.same(f"{name}: flown again without the operator", len(again), 0)
         causes = [change.cause for change in measures.changes_into(flight, GuardState.LAND)]
         outcome.true(f"{name}: the cause is reported", "impossible commands" in " ".join(causes))
-        rejected(outcome, flight, "range")
+        outcome.rejected(flight, "range")
     for limit, changes in EXCESSIVE.items():
         lie, harmless = _for_a_while(at, 1.0, changes), limit != "speed"  # it may hit a tube
-        flight = FaultRun(Schedule(seed), honest=harmless, lies=[lie]).fly(40.0)
-        measures.safe(outcome, flight)
+        flight = outcome.prepare(honest=harmless, lies=[lie]).fly(40.0)
+        outcome.safe(flight)
         impossible = sum("impossible" in change.cause for change in flight.changes)
         outcome.same(f"100 times {limit}: rejected as impossible", impossible, 0)
         outcome.least(f"100 times {limit}: limited", flight.count(f"limited_{limit}"), 20)
-    one = FaultRun(Schedule(seed), lies=[_for_a_while(at, 0.005, IMPOSSIBLE["NaN"])]).fly(40.0)
-    measures.safe(outcome, one)
-    measures.done(outcome, one)
+    one = outcome.prepare(lies=[_for_a_while(at, 0.005, IMPOSSIBLE["NaN"])]).fly(40.0)
+    outcome.safe(one)
+    outcome.done(one)
     outcome.same("a single NaN: LAND", len(measures.changes_into(one, GuardState.LAND)), 0)
 
 
@@ -201,7 +198,7 @@ def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
     injects="waypoints of NaN, in a wall, behind a wall, beyond the fence; 10,001 waypoints",
     expects="the whole mission is refused before the flight",
 )
-def _impossible(outcome: Outcome, seed: int) -> None:
+def _impossible(outcome: Outcome) -> None:
     experiment, first = read_experiment("paper"), (0.5, 0.0, 0.8)
     scene, robot = scene_of(experiment.world), hull_of(experiment.world.robot).dense
     points: dict[str, Vector] = {
@@ -244,8 +241,8 @@ def _wall_of(tube: Tube) -> Vector:
     injects="cloud commands the robot to stay where it is",
     expects="the leg ends at its time limit, and HOLD begins",
 )
-def _unreachable(outcome: Outcome, seed: int) -> None:
-    at, stays = measures.instant(seed, 12.0, 20.0), list[Vector]()
+def _unreachable(outcome: Outcome) -> None:
+    at, stays = outcome.instant(12.0, 20.0), list[Vector]()
 
     def stalled(command: Command, control: Control) -> Command:
         if control.stamp_ns * 1e-9 < at:
@@ -254,9 +251,9 @@ def _unreachable(outcome: Outcome, seed: int) -> None:
         x, y, z = (a - b for a, b in zip(stays[0], control.measured, strict=True))
         return command._replace(velocity=(x, y, z))
 
-    flight = FaultRun(Schedule(seed), "criteria.time_limit_s=300", lies=[stalled])
+    flight = outcome.prepare("criteria.time_limit_s=300", lies=[stalled])
     flight.fly_mission(200.0)
-    measures.safe(outcome, flight)
+    outcome.safe(flight)
     outcome.true("the mission ends", flight.mission.state == "failed")
     verdict = str(flight.mission.verdict)
     outcome.true("with the code leg_timed_out", "leg_timed_out" in verdict)

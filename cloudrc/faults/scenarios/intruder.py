@@ -10,7 +10,7 @@ from typing import TypeAlias
 from cloudrc.faults import measures
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.inject import flipped
-from cloudrc.faults.measures import Outcome, fly_safely, rejected, scenario
+from cloudrc.faults.measures import Outcome, scenario
 from cloudrc.faults.schedule import Schedule, generator
 from cloudrc.tunnel import codec
 
@@ -22,7 +22,7 @@ SETTLED = 2.0
 
 
 def _check_no_effect(
-    outcome: Outcome, seed: int, makes: Sequence[Make], *refusals: str, since: float = 0.0
+    outcome: Outcome, makes: Sequence[Make], *refusals: str, since: float = 0.0
 ) -> None:
     """Fly with and without hostile datagrams; check that both flights are equal.
 
@@ -30,8 +30,8 @@ def _check_no_effect(
     for world, an optional second function makes datagrams for cloud. `refusals` are names of
     world's counters that must rise.
     """
-    clean = FaultRun(Schedule(seed)).fly_mission()
-    flight, sent = FaultRun(Schedule(seed)), list[int]()
+    clean = outcome.prepare().fly_mission()
+    flight, sent = outcome.prepare(), list[int]()
 
     def tamper(make: Make, data: bytes, now_ns: int) -> list[bytes]:
         hostile = list(make(data)) if now_ns * 1e-9 >= since else []
@@ -40,10 +40,10 @@ def _check_no_effect(
 
     for process, make in zip((flight.world, flight.cloud), makes, strict=False):
         process.tamper = partial(tamper, make)
-    fly_safely(outcome, flight)
+    outcome.fly_safely(flight)
     same = clean.trajectory() == flight.trajectory()
     outcome.true("the same path, bit by bit", same)
-    rejected(outcome, flight, *refusals)
+    outcome.rejected(flight, *refusals)
     outcome.least("hostile datagrams", sum(sent), 1000)
     same = measures.epochs(clean) == measures.epochs(flight)
     outcome.true("hostile datagrams opened no session", same)
@@ -55,8 +55,8 @@ def _check_no_effect(
     injects="one bit flips in 1 % of the datagrams; for 1 s, 1 % of all bits flip",
     expects="corrupted datagrams are dropped",
 )
-def _corruption(outcome: Outcome, seed: int) -> None:
-    at, rng, sent = measures.instant(seed), generator(seed, 8), list[bytes]()
+def _corruption(outcome: Outcome) -> None:
+    at, rng, sent = outcome.instant(), generator(outcome.seed, 8), list[bytes]()
 
     def tamper(data: bytes, now_ns: int) -> list[bytes]:
         storm = at <= now_ns * 1e-9 < at + 1.0
@@ -65,11 +65,11 @@ def _corruption(outcome: Outcome, seed: int) -> None:
             sent.append(data := flipped(data, rng, flips))
         return [data]
 
-    flight = FaultRun(Schedule(seed))
+    flight = outcome.prepare()
     flight.world.tamper = flight.cloud.tamper = tamper
-    fly_safely(outcome, flight)
-    measures.held_in_time(outcome, flight)
-    rejected(outcome, flight, "tag")
+    outcome.fly_safely(flight)
+    outcome.held_in_time(flight)
+    outcome.rejected(flight, "tag")
     outcome.least("corrupted datagrams", len(sent), 100)
     outcome.same("epochs opened", len(measures.epochs(flight)), 2)
 
@@ -80,12 +80,12 @@ def _corruption(outcome: Outcome, seed: int) -> None:
     injects="10,000 random datagrams per second arrive at world's port",
     expects="no effect: the same path, bit by bit",
 )
-def _flood(outcome: Outcome, seed: int) -> None:
+def _flood(outcome: Outcome) -> None:
     """Send datagrams of random bytes.
 
     Two of three begin with a valid header: one of them is too short, one has the right length.
     """
-    rng = generator(seed, 20)
+    rng = generator(outcome.seed, 20)
 
     def garbage(data: bytes) -> Iterable[bytes]:
         size, head = len(data), data[: codec.HEADER_SIZE]
@@ -93,7 +93,7 @@ def _flood(outcome: Outcome, seed: int) -> None:
             noise = rng.bytes(size)
             yield (noise, head + noise[:32], head + noise[len(head) :])[n % 3]
 
-    _check_no_effect(outcome, seed, [garbage], "malformed", "tag")
+    _check_no_effect(outcome, [garbage], "malformed", "tag")
 
 
 @scenario(
@@ -102,9 +102,9 @@ def _flood(outcome: Outcome, seed: int) -> None:
     injects="world and cloud get the captured datagrams of an earlier flight",
     expects="no effect: the same path, bit by bit",
 )
-def _old_session(outcome: Outcome, seed: int) -> None:
+def _old_session(outcome: Outcome) -> None:
     captured: list[bytes] = []
-    first = FaultRun(Schedule(seed), life=7)
+    first = FaultRun(Schedule(outcome.seed), life=7)
 
     def record(data: bytes, now_ns: int) -> list[bytes]:
         captured.append(data)
@@ -114,7 +114,7 @@ def _old_session(outcome: Outcome, seed: int) -> None:
     first.fly_mission()
     tapes = iter(captured), iter(captured)
     makes = [lambda data, tape=tape: islice(tape, 6) for tape in tapes]
-    _check_no_effect(outcome, seed, makes, "tag", since=SETTLED)
+    _check_no_effect(outcome, makes, "tag", since=SETTLED)
     left = sum(len(list(tape)) for tape in tapes)
     outcome.same("captured datagrams that were not sent", left, 0)
 
@@ -125,14 +125,14 @@ def _old_session(outcome: Outcome, seed: int) -> None:
     injects="copies of datagrams with flipped bits, and with a much higher counter",
     expects="no effect: the same path, bit by bit",
 )
-def _forgery(outcome: Outcome, seed: int) -> None:
-    rng = generator(seed, 20)
+def _forgery(outcome: Outcome) -> None:
+    rng = generator(outcome.seed, 20)
 
     def forged(data: bytes) -> Iterable[bytes]:
         ahead = data[:8] + (2**63).to_bytes(8, "little") + data[16:]
         return [flipped(data, rng, 1), flipped(data, rng, 2), ahead]
 
-    _check_no_effect(outcome, seed, [forged], "tag")
+    _check_no_effect(outcome, [forged], "tag")
 
 
 @scenario(
@@ -143,20 +143,20 @@ def _forgery(outcome: Outcome, seed: int) -> None:
     expects="dropped before any cryptography: the same path, bit by bit; no session between two "
     "versions",
 )
-def _malformed(outcome: Outcome, seed: int) -> None:
-    rng, newer = generator(seed, 20), bytes([codec.VERSION + 1])
+def _malformed(outcome: Outcome) -> None:
+    rng, newer = generator(outcome.seed, 20), bytes([codec.VERSION + 1])
 
     def strange(data: bytes) -> Iterable[bytes]:
         cut, oversized = int(rng.integers(0, len(data))), bytes(codec.DATAGRAM_MAX + 1)
         return [b"", data[:cut], data + b"\0", oversized, data[:1] * 2048, newer + data[1:]]
 
-    _check_no_effect(outcome, seed, [strange], "malformed", "version")
-    flight = FaultRun(Schedule(seed))
+    _check_no_effect(outcome, [strange], "malformed", "version")
+    flight = outcome.prepare()
     flight.world.tamper = lambda data, now_ns: [newer + data[1:]]
     flight.fly(2.0)
     flight.world.tamper = None
     outcome.same("a cloud of another version: sessions", len(measures.epochs(flight)), 0)
-    fly_safely(outcome, flight)
+    outcome.fly_safely(flight)
     told = [fault.text for fault in measures.told(flight.of_world, "version")]
     text = f"peer speaks v{codec.VERSION + 1}, we speak v{codec.VERSION}"
     outcome.true(f"reported once: {text}", len(told) == 1 and told[0].startswith(text))

@@ -6,8 +6,8 @@ from math import isnan, nan
 
 from cloudrc.faults import measures
 from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.measures import Outcome, fly_safely, scenario
-from cloudrc.faults.schedule import WAYS, FaultEvent, Schedule
+from cloudrc.faults.measures import Outcome, scenario
+from cloudrc.faults.schedule import WAYS, FaultEvent
 from cloudrc.messages import Cause, GuardState
 from cloudrc.records import Arrival, Control
 
@@ -22,17 +22,16 @@ STEADY = "link.both.jitter_ms=0"
     injects="both directions silent for 0.1 s; one of them alone",
     expects="stays in TRACK, no step above the acceleration cap",
 )
-def _short_silence(outcome: Outcome, seed: int) -> None:
+def _short_silence(outcome: Outcome) -> None:
     """Fly three times: interrupt both directions, then only the uplink, then only the downlink.
 
     The last two flights have no jitter, because jitter, too, makes gaps between datagrams.
     """
-    at = measures.instant(seed)
+    at = outcome.instant()
     for silent in WAYS:
         what, settings = ("both ways", []) if silent == "both" else (silent, [STEADY])
-        cut = Schedule(seed, events=(FaultEvent("blackout", at, 0.1, way=silent),))
-        flight = fly_safely(outcome, FaultRun(cut, *settings))
-        outcome.same(f"silent {what}: HOLDs", len(measures.held(flight)), 0)
+        flight = outcome.fly(*settings, events=(FaultEvent("blackout", at, 0.1, way=silent),))
+        outcome.no_hold(flight, f"silent {what}: HOLDs")
         for way, link in (("up", flight.uplink), ("down", flight.downlink)):
             most = 11 if silent in ("both", way) else 0
             outcome.most(f"silent {what}: datagrams lost, {way}", link.blackouts, most)
@@ -44,14 +43,14 @@ def _short_silence(outcome: Outcome, seed: int) -> None:
     injects="both directions silent for 0.5, 3 and 20 s",
     expects="HOLD after 252 ms, below 0.05 m/s in 1 s, drift <= 0.10 m, TRACK <= 1 s after the end",
 )
-def _silence(outcome: Outcome, seed: int) -> None:
-    at = measures.instant(seed)
+def _silence(outcome: Outcome) -> None:
+    at = outcome.instant()
     for duration in (0.5, 3.0, 20.0):
         back, what = at + duration, f"{duration:g} s of silence"
         slow = ("guard.speed_max_mps=1.5", "criteria.time_limit_s=150")
-        cut = Schedule(seed, events=(FaultEvent("blackout", at, duration),))
-        flight = fly_safely(outcome, FaultRun(cut, *slow), 150.0)
-        measures.held_in_time(outcome, flight, f"{what}: HOLD after")
+        cut = FaultEvent("blackout", at, duration)
+        flight = outcome.fly(*slow, limit=150.0, events=(cut,))
+        outcome.held_in_time(flight, f"{what}: HOLD after")
         if duration >= 3.0:
             began = measures.first_into(flight, GuardState.HOLD)
             calm = measures.calm_after(flight, began, back)
@@ -67,24 +66,24 @@ def _silence(outcome: Outcome, seed: int) -> None:
     injects="both directions silent for 75 s, over the floor and among obstacles",
     expects="HOLD; LAND after 60 s at 0.5 m/s; switches off after touch-down; stays in LAND",
 )
-def _long_silence(outcome: Outcome, seed: int) -> None:
+def _long_silence(outcome: Outcome) -> None:
     """Interrupt the link for 75 s in two flights: above the free floor, and among obstacles."""
-    flight = _landed(outcome, seed, measures.instant(seed, 1.6, 2.6), "over the floor")
+    flight = _landed(outcome, outcome.instant(1.6, 2.6), "over the floor")
     first, last = (flight.trajectory()[n].odometry.position for n in (0, -1))
     text = "over the floor: base above where it took off"
     outcome.most(text, abs(last[2] - first[2]), 0.02, "m")
-    _landed(outcome, seed, measures.instant(seed, 8.0), "amid obstacles")
+    _landed(outcome, outcome.instant(8.0), "amid obstacles")
 
 
-def _landed(outcome: Outcome, seed: int, at: float, where: str) -> FaultRun:
+def _landed(outcome: Outcome, at: float, where: str) -> FaultRun:
     """Interrupt the link at `at` [s] for 75 s; check that the robot lands and switches off.
 
     `where` is the place of the robot, for the texts of the checks.
     """
-    cut = Schedule(seed, events=(FaultEvent("blackout", at, 75.0),))
-    flight = FaultRun(cut, "criteria.time_limit_s=200")
+    cut = FaultEvent("blackout", at, 75.0)
+    flight = outcome.prepare("criteria.time_limit_s=200", events=(cut,))
     flight.fly(at + 80.0)
-    measures.safe(outcome, flight)
+    outcome.safe(flight)
     held = measures.first_into(flight, GuardState.HOLD)
     landed = measures.first_into(flight, GuardState.LAND)
     outcome.most(
@@ -109,10 +108,10 @@ def _landed(outcome: Outcome, seed: int, at: float, where: str) -> FaultRun:
     injects="30 % independent loss both ways",
     expects="TRACK, tracking error <= 1.5 times that without loss",
 )
-def _loss(outcome: Outcome, seed: int) -> None:
-    clean = FaultRun(Schedule(seed)).fly_mission()
-    flight = fly_safely(outcome, FaultRun(Schedule(seed), "link.both.loss=0.3"))
-    outcome.same("HOLDs", len(measures.held(flight)), 0)
+def _loss(outcome: Outcome) -> None:
+    clean = outcome.prepare().fly_mission()
+    flight = outcome.fly("link.both.loss=0.3")
+    outcome.no_hold(flight)
     error, usual = (measures.number(each, "tracking_rms_measured") for each in (flight, clean))
     outcome.most("tracking error, relative to that without loss", error / usual, 1.5)
     outcome.least("loss in the report", measures.number(flight, "loss_uplink"), 0.25)
@@ -124,13 +123,13 @@ def _loss(outcome: Outcome, seed: int) -> None:
     injects="Gilbert-Elliott loss, mean bursts of 50, 200 and 500 ms",
     expects="at most 2 changes between TRACK and HOLD in any second",
 )
-def _bursts(outcome: Outcome, seed: int) -> None:
+def _bursts(outcome: Outcome) -> None:
     for packets in (5, 20, 50):
         loss = f"link.both.loss={{bad_start: 0.005, bad_end: {1 / packets}}}"
-        flight = FaultRun(Schedule(seed), "criteria.time_limit_s=150", loss).fly_mission(150.0)
-        measures.safe(outcome, flight)
+        flight = outcome.prepare("criteria.time_limit_s=150", loss).fly_mission(150.0)
+        outcome.safe(flight)
         if packets < 50:  # else it hardly ever rests on the body for 4 s, and a leg may time out
-            measures.done(outcome, flight)
+            outcome.done(flight)
         outcome.true("the mission has ended", flight.mission.ended)
         text, busiest = f"bursts of {packets * 10} ms", measures.busiest_second(flight.changes)
         outcome.most(f"{text}: changes of the guard in any second", busiest, 2)
@@ -144,9 +143,9 @@ def _bursts(outcome: Outcome, seed: int) -> None:
     injects="25 % of the datagrams overtake the others by 50 ms",
     expects="late commands are dropped, never applied",
 )
-def _disorder(outcome: Outcome, seed: int) -> None:
+def _disorder(outcome: Outcome) -> None:
     link = STEADY, "link.both.delay_ms=50"
-    flight = fly_safely(outcome, FaultRun(Schedule(seed, reorder=0.25), *link))
+    flight = outcome.fly(*link, reorder=0.25)
     outcome.least("late commands dropped", flight.count("late"), 100)
 
 
@@ -156,9 +155,9 @@ def _disorder(outcome: Outcome, seed: int) -> None:
     injects="every datagram arrives twice, on a link without jitter, which keeps the order",
     expects="the same path, bit by bit",
 )
-def _copies(outcome: Outcome, seed: int) -> None:
-    clean = FaultRun(Schedule(seed), STEADY).fly_mission()
-    flight = fly_safely(outcome, FaultRun(Schedule(seed, duplicate=1.0), STEADY))
+def _copies(outcome: Outcome) -> None:
+    clean = outcome.prepare(STEADY).fly_mission()
+    flight = outcome.fly(STEADY, duplicate=1.0)
     same = clean.trajectory() == flight.trajectory()
     outcome.true("the same path, bit by bit", same)
     outcome.least("copies dropped", flight.count("repeated"), 1000)
@@ -170,16 +169,15 @@ def _copies(outcome: Outcome, seed: int) -> None:
     injects="cloud's clock is 47 h or 49 h ahead of world's, or drifts by 500 ppm",
     expects="the same path, bit by bit; no HOLD with the drift",
 )
-def _clocks(outcome: Outcome, seed: int) -> None:
-    clean = FaultRun(Schedule(seed)).fly_mission()
+def _clocks(outcome: Outcome) -> None:
+    clean = outcome.prepare().fly_mission()
     for hours in (47, 49):
-        apart = FaultRun(Schedule(seed, cloud_offset=hours * HOUR)).fly_mission()
+        apart = outcome.prepare(cloud_offset=hours * HOUR).fly_mission()
         text = f"cloud's clock {hours} h ahead: the same path, bit by bit"
         outcome.true(text, clean.trajectory() == apart.trajectory())
     for ppm in (-500, 500):
-        drift = Schedule(seed, cloud_offset=HOUR, cloud_drift=ppm)
-        drifting = fly_safely(outcome, FaultRun(drift))
-        outcome.same(f"drift of {ppm} ppm: HOLDs", len(measures.held(drifting)), 0)
+        drifting = outcome.fly(cloud_offset=HOUR, cloud_drift=ppm)
+        outcome.no_hold(drifting, f"drift of {ppm} ppm: HOLDs")
 
 
 @scenario(
@@ -188,18 +186,17 @@ def _clocks(outcome: Outcome, seed: int) -> None:
     injects="the round trip steps from 20 to 200 ms",
     expects="estimator `split` within 20 % in 0.5 s; no HOLD; the caps hold",
 )
-def _delay_step(outcome: Outcome, seed: int) -> None:
-    at = measures.instant(seed)
+def _delay_step(outcome: Outcome) -> None:
+    at = outcome.instant()
     link = "cloud.estimator=split", "link.both.delay_ms=10", "link.both.jitter_ms=1"
-    step = Schedule(seed, events=(FaultEvent("delay", at, HOUR, 0.09),))
-    flight = fly_safely(outcome, FaultRun(step, *link))
+    flight = outcome.fly(*link, events=(FaultEvent("delay", at, HOUR, 0.09),))
     off = [
         abs(r.horizon - r.loop_delay) / r.loop_delay
         for r in flight.of_cloud
         if isinstance(r, Control) and at + 0.5 <= r.stamp_ns * 1e-9 < at + 2.0
     ]
     outcome.most("relative error of the delay estimate after 0.5 s", max(off, default=nan), 0.2)
-    outcome.same("HOLDs", len(measures.held(flight)), 0)
+    outcome.no_hold(flight)
 
 
 @scenario(
@@ -208,11 +205,10 @@ def _delay_step(outcome: Outcome, seed: int) -> None:
     injects="10 ms up, 190 ms down, two clocks an hour apart",
     expects="no HOLD, because ages need only one clock; no one-way delay is reported",
 )
-def _asymmetry(outcome: Outcome, seed: int) -> None:
-    apart = Schedule(seed, "ideal", cloud_offset=HOUR)
+def _asymmetry(outcome: Outcome) -> None:
     delays = "link.uplink.delay_ms=10", "link.downlink.delay_ms=190"
-    flight = fly_safely(outcome, FaultRun(apart, *delays))
-    outcome.same("HOLDs", len(measures.held(flight)), 0)
+    flight = outcome.fly(*delays, profile="ideal", cloud_offset=HOUR)
+    outcome.no_hold(flight)
     rtt = measures.number(flight, "rtt_mean")
     outcome.most("deviation of the mean round trip from 0.2 s", abs(rtt - 0.2), 0.01, "s")
     arrivals = [r for r in (*flight.of_world, *flight.of_cloud) if isinstance(r, Arrival)]
@@ -225,11 +221,11 @@ def _asymmetry(outcome: Outcome, seed: int) -> None:
     injects="jitter of 40 ms, then a delay of 150 ms with 150 ms of jitter",
     expects="first no HOLD; then at most 2 changes between TRACK and HOLD in any second",
 )
-def _jitter(outcome: Outcome, seed: int) -> None:
-    flight = fly_safely(outcome, FaultRun(Schedule(seed, "paper-p3")))
-    outcome.same("jitter 40 ms: HOLDs", len(measures.held(flight)), 0)
+def _jitter(outcome: Outcome) -> None:
+    flight = outcome.fly(profile="paper-p3")
+    outcome.no_hold(flight, "jitter 40 ms: HOLDs")
     link = "link.both.delay_ms=150", "link.both.jitter_ms=150"
-    flight = FaultRun(Schedule(seed), *link).fly(60.0)
-    measures.safe(outcome, flight)
+    flight = outcome.prepare(*link).fly(60.0)
+    outcome.safe(flight)
     busiest = measures.busiest_second(flight.changes)
     outcome.most("jitter 150 ms: changes of the guard in any second", busiest, 2)
