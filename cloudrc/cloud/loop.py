@@ -105,7 +105,7 @@ class ControlLoop:
         the horizon plus `freeze_after` [s]. `period_ns` is the time between two commands [ns]. Each
         command contains a plan, the velocities of the next `plan` [s]; 0 means no plan.
 
-        Here the failure of a plug-in is a BadInputError, because the robot does not fly yet.
+        Here the failure of a plug-in ends the command, because the robot does not fly yet.
         """
         self._build_estimator, self._predictor = build_estimator, predictor
         self._controller = controller

@@ -86,7 +86,7 @@ def test_the_age_of_a_mean_is_the_weighted_mean_of_the_ages():
 def test_the_ensemble_refuses_actions_without_a_mean():
     env = Networked(gymnasium.make("CartPole-v1"), chunk=4, executor="ensemble")
     env.reset()
-    with pytest.raises(BadInputError, match="floating-point"):
+    with pytest.raises(ValueError, match="floating-point"):
         env.step([0, 1, 0, 1])
 
 

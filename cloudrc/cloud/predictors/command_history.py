@@ -16,7 +16,7 @@ from cloudrc.cloud.motion import Body
 from cloudrc.cloud.predictors._history import COUNT, PERIOD_NS, Replay
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotFacts
 from cloudrc.config.schema import Constants, DeadTimes, NotNegatives, Positive
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import CloudrcError
 from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Command, Odometry, Vector
 from cloudrc.outside.document import read_document
@@ -142,8 +142,7 @@ def build(
         robot: What is known of the robot.
 
     Raises:
-        BadInputError: If neither robot nor parameters tell the response.
-        ValueError: If the file is not a model.
+        ValueError: If neither robot nor parameters tell the response, or if the file is no model.
     """
     response = robot.response if robot else None
     given = {"time_constant": time_constant, "dead_time": dead_time, "gain": gain}
@@ -153,7 +152,7 @@ def build(
         getattr(response, name, None) if value is None else value for name, value in given.items()
     ]
     if None in found:
-        raise BadInputError(
+        raise ValueError(
             f"the robot {robot.name if robot else 'is unknown and'} has no response in its "
             "robot.yaml; measure it with 'cloudrc identify', or choose a predictor without a model"
         )

@@ -19,7 +19,6 @@ from cloudrc.cloud.predictors._history import Replay
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.robot import RobotFacts
 from cloudrc.config.schema import PlugIn, Positive
-from cloudrc.errors import BadInputError
 from cloudrc.messages import Command, Odometry
 
 Array: TypeAlias = NDArray[np.float64]
@@ -122,7 +121,7 @@ def build(
 
     Raises:
         ValueError: If `white_box` has a `model_file`, or `parameters` has the key name or model.
-        BadInputError: If the robot has no such model, or if the predictor refuses a parameter.
+            Also if the robot has no such model.
     """
     choice = _replay_of(model, parameters or {}, model_file, robot)
     replay = build_plugin("predictors", choice, robot=robot)
@@ -153,4 +152,4 @@ def _check_white_box(model_file: Path | None, robot: RobotFacts | None) -> None:
         raise ValueError("model_file: needs `model: first_order`; set that, or omit model_file")
     if robot is None or robot.motion is None:
         name = robot.name if robot else "the robot"
-        raise BadInputError(f"model: {name} has no white_box (motion in robot.yaml); omit model")
+        raise ValueError(f"model: {name} has no white_box (motion in robot.yaml); omit model")

@@ -19,7 +19,6 @@ from cloudrc.cloud.predictors._history import Replay
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.robot import RobotFacts
 from cloudrc.config.schema import PlugIn, Positive
-from cloudrc.errors import BadInputError
 from cloudrc.messages import Odometry
 
 GAP_NS = 500_000_000
@@ -85,12 +84,12 @@ def build(
             assumes in place of those in robot.yaml, `world.tuning` and `world.onboard`.
 
     Raises:
-        BadInputError: If the robot has no model, or if the model has no such parameter.
+        ValueError: If the robot has no model, but parameters of one are given.
     """
     if robot is None or robot.motion is None:
         if onboard:
             name = robot.name if robot else "a robot"
-            raise BadInputError(
+            raise ValueError(
                 f"{', '.join(onboard)}: {name} has no model with parameters of the onboard "
                 "controller (motion in robot.yaml), so only acceleration_max is known here"
             )

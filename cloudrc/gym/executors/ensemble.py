@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.errors import BadInputError
 from cloudrc.gym.executors import Chunk, Executor
 
 DECAY = 0.01
@@ -28,7 +27,7 @@ class Ensemble(Executor):
     def receive(self, chunk: Chunk, tick: int) -> None:
         """Keep the answer."""
         if np.asarray(chunk.actions[0]).dtype.kind != "f":
-            raise BadInputError(
+            raise ValueError(
                 "executor 'ensemble' computes means of actions, which must be floating-point "
                 "numbers; use 'time-indexed' for other actions"
             )
