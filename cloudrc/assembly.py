@@ -32,6 +32,7 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
 from cloudrc.messages import Start
 from cloudrc.outside.code import apart
+from cloudrc.outside.reuse import reuse_results
 from cloudrc.records import CONTROLLER_LOST, Fault
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.wire import Leg, Plan
@@ -70,6 +71,7 @@ VIRTUAL_RING = KeyRing(KeySet(Key(b"nothing is secret in one process")))
 """Keys of world and cloud in virtual time; with them both ends refuse damaged datagrams."""
 
 
+@reuse_results()
 def assemble(
     experiment: ResolvedExperiment,
     make_loop: Callable[..., ControlLoop] = ControlLoop,

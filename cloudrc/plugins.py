@@ -142,11 +142,17 @@ def signature(kind: str, name: str) -> inspect.Signature:
 def load(kind: str, name: str, /, **parameters: Any) -> Any:
     """Find a plug-in and build it; raise a BadInputError if it is missing or its `build` fails."""
     build = builder(kind, name, look=False)
-    slow = "" if name in _shipped(kind) else f"{name} is still being built"
+    slow = slow_text(kind, name, f"{name} is still being built")
     with calling(f"{one(kind)} {name!r} cannot be built", slow=slow):
         plugin = build(**parameters)
         _check_methods(kind, plugin)
     return plugin
+
+
+def slow_text(kind: str, name: str, text: str) -> str:
+    """Return what to log if a plug-in of a user takes long; "" for a shipped one."""
+    is_ours = name in _shipped(kind) or (is_path(name) and _module_of(Path(name)))
+    return "" if is_ours else text
 
 
 def _check_methods(kind: str, plugin: Any) -> None:

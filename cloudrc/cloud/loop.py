@@ -126,7 +126,8 @@ class ControlLoop:
         estimator = build_estimator()
         for kind, plug_in in (("predictor", predictor), ("controller", controller)):
             what = f"cloud.{kind}: its reset() failed"
-            with calling(what, slow=f"reset() of cloud.{kind} is still running"):
+            slow = "" if is_ours(plug_in) else f"reset() of cloud.{kind} is still running"
+            with calling(what, slow=slow):
                 plug_in.reset()
         self._begin(estimator)
 

@@ -332,7 +332,8 @@ def _complete(
     plugin = plugins.load(kind, name, **dict(checked), **more)
     if kind != "estimators":
         what = f"{path[-1]} {name!r}: its reset() failed"
-        with code.calling(what, slow=f"reset() of {name} is still running"):
+        slow = plugins.slow_text(kind, name, f"reset() of {name} is still running")
+        with code.calling(what, slow=slow):
             plugin.reset()
     if _plans_ahead(document):
         if kind == "predictors":
@@ -438,7 +439,8 @@ def _check(kind: str, name: str, parameters: dict[str, Any]) -> BaseModel:
     """
     model, text = _parameters_of(kind, name), json.dumps(parameters)
     what = f"{plugins.one(kind)} {name!r}: a check of a parameter failed"
-    with code.calling(what, slow=f"{name} still checks its parameters"):
+    slow = plugins.slow_text(kind, name, f"{name} still checks its parameters")
+    with code.calling(what, slow=slow):
         try:
             return model.model_validate_json(text)
         except ValidationError as error:
