@@ -19,7 +19,7 @@ from cloudrc.messages import NEVER_NS, plan_length
 from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES, Kind
 
 if TYPE_CHECKING:
-    from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.config.resolved import ResolvedExperiment
 
 DURATION_NS = 20_000_000_000
 """Time of the streams [ns]."""

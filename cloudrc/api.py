@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.config.load import ResolvedExperiment, dump
+from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Columns

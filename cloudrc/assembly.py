@@ -21,8 +21,8 @@ from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
 from cloudrc.cloud.planar import Planar
 from cloudrc.config import schema
-from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.overrides import build_plugin, build_predictor
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import facts, is_planar
 from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints

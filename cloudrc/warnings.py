@@ -17,7 +17,7 @@ from cloudrc.outside.reuse import reuse_results
 from cloudrc.rounding import exceeds, format_limit
 
 if TYPE_CHECKING:
-    from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.config.resolved import ResolvedExperiment
     from cloudrc.link.profile import DirectionProfile
 
 GUARD_STEP = 0.002

@@ -18,7 +18,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.shipped import names
 from cloudrc.errors import CloudrcError
 from cloudrc.link.profile import Timeline

@@ -16,7 +16,7 @@ from cloudrc.files import naming
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
-    from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.config.resolved import ResolvedExperiment
 
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1"}
 

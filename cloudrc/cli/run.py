@@ -34,7 +34,7 @@ from cloudrc.runs.requirements import MODES, require
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
-    from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.config.resolved import ResolvedExperiment
 
 Flight = Callable[[Path], dict[str, Any]]
 """Function that flies, writes all files of the run into a folder, and returns the report."""

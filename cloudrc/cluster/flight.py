@@ -30,7 +30,7 @@ from cloudrc.errors import CloudrcError, InterruptedRunError, TimedOutError
 from cloudrc.teleop.client import find_mission
 
 if TYPE_CHECKING:
-    from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.config.resolved import ResolvedExperiment
     from cloudrc.record.columns import Recording
 
 Tell = Callable[[str], None]
@@ -237,7 +237,7 @@ def fly_in_cluster(
         page: Whether to write report.html.
         figures: Whether to write the files in figures/.
     """
-    from cloudrc.config.load import dump
+    from cloudrc.config.resolved import dump
 
     try:
         began = time.monotonic()

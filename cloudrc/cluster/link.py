@@ -22,7 +22,8 @@ from typing import Any, NamedTuple
 
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, run
 from cloudrc.cluster.releases import INSTANCE, several_releases
-from cloudrc.config.load import Edit, edit_profile, load_link
+from cloudrc.config.link_edit import Edit, edit_profile
+from cloudrc.config.load import load_link
 from cloudrc.config.profile import DIRECTIONS, FILE_READERS
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 from cloudrc.link.control import APPLY_LIMIT, SOCKET, put_request, read_answer

@@ -16,7 +16,7 @@ from cloudrc.cluster.client import NotFoundError, Release, run
 from cloudrc.cluster.jobs import owner_of
 from cloudrc.cluster.pods import find_deployment
 from cloudrc.config.hull import hull_of
-from cloudrc.config.load import ResolvedExperiment, local_files
+from cloudrc.config.resolved import ResolvedExperiment, local_files
 from cloudrc.config.robot import files_of, find_robot
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import ROBOT_FILE, is_path

@@ -7,20 +7,15 @@ error lists all problems of an experiment, each with its file and line.
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from math import inf, sqrt
+from math import inf
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from pydantic import (
-    Field,
     ValidationError,
-    ValidationInfo,
-    ValidatorFunctionWrapHandler,
-    field_validator,
 )
 
 from cloudrc import plugins
@@ -33,9 +28,6 @@ from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.profile import (
     DIRECTIONS,
-    ChangeConfig,
-    CloudTime,
-    CommandAge,
     DirectionConfig,
     Profile,
     check_file,
@@ -43,145 +35,33 @@ from cloudrc.config.profile import (
     load_profile,
     resolve_files,
 )
-from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, known_robot, parameters
+from cloudrc.config.resolved import (
+    COMMAND_AGE_MAX_MS,
+    FREEZE_AFTER_S,
+    HORIZON_MAX_S,
+    PLAN_MAX_S,
+    Bounds,
+    ResolvedExperiment,
+    speed_cap,
+)
+from cloudrc.config.robot import DEFAULT_LIMITS, known_robot, parameters
 from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import (
-    SPEED_MPS,
-    Acceleration,
     Cloud,
     Experiment,
-    GuardConfig,
     MissionConfig,
-    PlanMax,
-    PlugIn,
-    Speed,
     World,
 )
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import NO_SIZE
 from cloudrc.geometry.obstacles import fence_of, known
 from cloudrc.geometry.scene import Scene
-from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.traces import read_trace
-from cloudrc.outside.document import Document, KeyPath, read_document, write_yaml
+from cloudrc.outside.document import Document, KeyPath, read_document
 from cloudrc.outside.reuse import reuse, reuse_results
-from cloudrc.rounding import format_limit
 
-HORIZON_MAX_S = 1.0
-"""Default of cloud.horizon_max_s [s]. Source: docs/reference/control.md, "Predictors"."""
-FREEZE_AFTER_S = 0.4
-"""Default of cloud.freeze_after_s [s]. Source: docs/reference/plant.md, "Frozen reference"."""
-COMMAND_AGE_MAX_MS = 250.0
-"""Default of guard.command_age_max_ms if experiment and link profile give no value [ms].
-Source: docs/reference/plant.md, "Command age"."""
-PLAN_MAX_S = 0.8
-"""Default of guard.plan_max_s if cloud sends plans [s].
-Source: docs/reference/plant.md, "Plan"."""
 _PROFILE_KEYS = {("link",), ("link", "profile")}
 """If a setting gives one of these keys, it replaces the whole link profile."""
-
-
-class Bounds(NamedTuple):
-    """What robot and scene tell about the limits of the guard."""
-
-    robot: RobotLimits
-    room: float  # within which the robot stops, see `Fence.room` [m]
-
-
-def speed_cap(command_age_max_ms: float, plan_max_s: float, bounds: Bounds) -> float:
-    """Compute the speed cap: the largest speed v [m/s] from which the robot stops in the fence.
-
-    If commands stop arriving, the robot follows the last one for the time T, reacts within 0.2 s
-    and brakes at a, its `braking_mps2`: v · (T + 0.2 s) + v^2 / (2a) = room. T is the largest age
-    of a command, `command_age_max_ms` [ms], plus the longest plan, `plan_max_s` [s]. The cap is
-    lower for a robot that cannot follow this speed.
-    Source: docs/reference/plant.md, "Speed cap".
-    """
-    robot, room = bounds.robot, max(bounds.room, 0.0)
-    delay, braking = command_age_max_ms * 1e-3 + plan_max_s + 0.2, robot.braking_mps2
-    stops = round(braking * (sqrt(delay * delay + 2.0 * room / braking) - delay), 6)
-    slowest, fastest = SPEED_MPS
-    return min(max(stops, slowest), robot.speed_max_mps or fastest)
-
-
-class ResolvedGuard(GuardConfig):
-    """The section `guard`, in which every limit has a value.
-
-    The context of its validation is the `RobotLimits` of the robot; without one, `DEFAULT_LIMITS`.
-    """
-
-    command_age_max_ms: CommandAge = COMMAND_AGE_MAX_MS
-    plan_max_s: PlanMax = 0.0
-    speed_max_mps: Speed = Field(None, validate_default=True)
-    acceleration_max_mps2: Acceleration = Field(None, validate_default=True)
-
-    @field_validator("speed_max_mps", mode="wrap")
-    @classmethod
-    def _limit_speed(
-        cls, given: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo
-    ) -> float:
-        age_max = info.data.get("command_age_max_ms", COMMAND_AGE_MAX_MS)
-        plan_max, bounds = info.data.get("plan_max_s", 0.0), info.context or bounds_of(World())
-        cap = speed_cap(age_max, plan_max, bounds)
-        speed_max: float = cap if given is None else check(given)
-        if speed_max > cap + 1e-6:
-            most = format_limit(cap)
-            if cap == bounds.robot.speed_max_mps:
-                raise ValueError(f"must be at most {most} m/s, the largest speed of the robot")
-            plan = f" and plans of {plan_max:g} s" if plan_max else ""
-            raise ValueError(
-                f"must be at most {most} m/s: above it the robot does not stop in time, within "
-                f"{bounds.room:g} m, with commands {age_max:g} ms old{plan}; lower it or "
-                "guard.command_age_max_ms"
-            )
-        return speed_max
-
-    @field_validator("acceleration_max_mps2", mode="wrap")
-    @classmethod
-    def _limit_acceleration(
-        cls, given: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo
-    ) -> float:
-        robot = info.context.robot if info.context else DEFAULT_LIMITS
-        most: float = robot.acceleration_max_mps2
-        acceleration: float = most if given is None else check(given)
-        if info.context and acceleration > most + 1e-6:
-            raise ValueError(
-                f"must be at most {format_limit(most)} m/s^2, the largest acceleration of the robot"
-            )
-        return acceleration
-
-
-class ResolvedCloud(Cloud):
-    """The section `cloud` with all parameters of the plug-ins, including defaults."""
-
-    estimator: PlugIn
-    predictor: PlugIn
-    controller: PlugIn
-    horizon_max_s: CloudTime = HORIZON_MAX_S
-    freeze_after_s: CloudTime = FREEZE_AFTER_S
-
-
-class ResolvedExperiment(Experiment):
-    """An experiment that contains its mission (not only the name), and a value for every key."""
-
-    mission: MissionConfig
-    guard: ResolvedGuard
-    cloud: ResolvedCloud
-
-    @property
-    def uplink(self) -> DirectionConfig:
-        """Conditions of the link from world to cloud."""
-        return self.link.uplink
-
-    @property
-    def downlink(self) -> DirectionConfig:
-        """Conditions of the link from cloud to world."""
-        return self.link.downlink
-
-    @property
-    def link_values(self) -> dict[str, Any]:
-        """Content of a profile of this link, without defaults."""
-        return self.link.model_dump(mode="json", include={*DIRECTIONS}, exclude_defaults=True)
 
 
 @reuse_results()
@@ -347,34 +227,6 @@ def _link_of(document: Document, name: str) -> Profile:
     return Profile(uplink=link.uplink, downlink=link.downlink)
 
 
-def dump(experiment: ResolvedExperiment) -> str:
-    """Format an experiment as YAML; loading this YAML returns an equal experiment."""
-    return write_yaml(experiment.model_dump(mode="json"))
-
-
-def fingerprint(experiment: ResolvedExperiment) -> str:
-    """Return the SHA-256 of the YAML from `dump`; experiments with equal hashes are equal."""
-    return hashlib.sha256(dump(experiment).encode()).hexdigest()
-
-
-def local_files(value: Any) -> dict[str, str]:
-    """Return dotted key -> path of each existing file whose absolute path is in `value`."""
-    return {key: path for key, path in absolute_paths(value).items() if Path(path).is_file()}
-
-
-def absolute_paths(value: Any, key: str = "") -> dict[str, str]:
-    """Return dotted key -> each text in `value` that is an absolute path, if only by its form.
-
-    `key` is the dotted key of `value` itself.
-    """
-    if isinstance(value, str):
-        return {key: value} if value.startswith("/") else {}
-    listed = dict(enumerate(value)) if isinstance(value, list) else value
-    inner = listed.items() if isinstance(listed, dict) else ()
-    parts = [absolute_paths(each, f"{key}.{name}".lstrip(".")) for name, each in inner]
-    return {where: path for part in parts for where, path in part.items()}
-
-
 def _is_inside_name(path: KeyPath) -> bool:
     """Return whether a key is inside the mission or a direction of the link.
 
@@ -492,12 +344,6 @@ def _plan_max(document: Document) -> float:
     return PLAN_MAX_S if isinstance(plan, float | int) and plan > 0 else 0.0
 
 
-def bounds_of(world: World) -> Bounds:
-    """Return what robot and scene of an experiment tell about the limits of the guard."""
-    scene = scene_of(world)
-    return Bounds(known_robot(world.robot).guard, fence_of(scene).room(scene.spawn))
-
-
 def _no_bounds(document: Document) -> Bounds | None:
     """Return bounds that allow the limits that the file gives; None if it does not give all."""
     speed, acceleration = (
@@ -577,73 +423,3 @@ def _places_of_files(document: Document) -> list[KeyPath]:
     metrics = document.get("report", "metrics")
     count = len(metrics) if isinstance(metrics, list) else 0
     return paths + [("report", "metrics", str(index)) for index in range(count)]
-
-
-CHANGEABLE_KEYS = ChangeConfig.model_fields.keys() - {"at_s"}
-"""Keys of a direction that an entry of its list `changes` may set."""
-TIME_LINE_KEYS = ("changes", "trace", "blackouts")
-"""Keys of a direction that make up its time line: how the link's conditions change over time."""
-_SETTING = "downlink.delay_ms=120"
-_EXAMPLE = f"for example {_SETTING}, or --profile handover"
-
-
-class Edit(NamedTuple):
-    """A link profile after a change by `cloudrc link set`."""
-
-    values: dict[str, Any]  # as in a profile file, without defaults; paths are absolute
-    cause: str  # the request in words
-    restart: bool  # whether the time line starts again when the profile takes effect
-    notes: list[str]  # sentences for the user about side effects
-
-
-def edit_profile(
-    before: Document, profile: str | None, settings: Sequence[str], command: str = "link set"
-) -> Edit:
-    """Set values in the link profile `before`, or in the profile named `profile` if it is given.
-
-    For each key in `settings`, remove the changes over time from the profile (for the delay also
-    the trace), so that the key keeps the user's value. Raise a BadInputError, which names the
-    `command`, if the request is empty or invalid.
-    """
-    if profile is None and not settings:
-        raise BadInputError(f"nothing to set; name a value, {_EXAMPLE}")
-    document, notes, restart = before, list[str](), profile is not None
-    if profile is not None:
-        new = load_profile(profile)
-        document = shipped.read("profile", profile, Path())
-        document.tree = new.model_dump(mode="json", exclude_defaults=True)
-        if new.command_age_max_ms is not None:
-            notes.append(
-                f"profile {profile} needs guard.command_age_max_ms={new.command_age_max_ms:g}; the "
-                "guard keeps the limit that it started with, so the robot may hold"
-            )
-    changes: Settings = {}
-    for path, setting in overrides.parse_settings(settings, command, _SETTING).items():
-        way, *keys = path[1:] if path[0] == "link" else path
-        if not keys or way not in DIRECTIONS:
-            raise BadInputError(f"{'.'.join(path)}: set a key of uplink or downlink, {_EXAMPLE}")
-        changes[way, *keys] = setting
-        restart |= keys[0] in TIME_LINE_KEYS
-        notes += _drop_from_time_line(document, way, keys[0])
-    overrides.apply_overrides(document, changes)
-    new_profile = check_profile(document, command)
-    for way in DIRECTIONS:
-        notes += describe_heavy_loss(getattr(new_profile, way), way)
-    values = new_profile.model_dump(mode="json", exclude_defaults=True)
-    words = [f"profile {profile}"] if profile else []
-    return Edit(values, ", ".join([*words, *settings]), restart, notes)
-
-
-def _drop_from_time_line(document: Document, way: str, key: str) -> list[str]:
-    """Remove what changes `key` over time in the direction `way`; return notes for the user."""
-    direction = document.get(way)
-    if not isinstance(direction, dict) or key not in CHANGEABLE_KEYS:
-        return []
-    notes = []
-    if [entry for entry in direction.get("changes") or () if entry.pop(key, None) is not None]:
-        notes.append(f"the time line of the {way} no longer changes {key}")
-    if key == "delay_ms" and direction.pop("trace", None) is not None:
-        notes.append(f"the {way} no longer follows its trace")
-    elif key == "loss" and direction.get("trace"):
-        notes.append(f"if the trace of the {way} has a column loss, it still sets the loss")
-    return notes

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import is_planar
 from cloudrc.config.scene import scene_of
 from cloudrc.console.feed import FlightFeed

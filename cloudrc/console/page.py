@@ -18,7 +18,7 @@ import numpy as np
 import rich
 import viser
 
-from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.scene import scene_of
 from cloudrc.console.access import PARAMETER, Access
 from cloudrc.console.controls import KEYS, Controls, TargetPlace, acts_of

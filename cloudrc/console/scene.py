@@ -10,7 +10,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.geometry.clearance import CLEARANCE_SHOWN, Array
 from cloudrc.geometry.scene import FLOOR, Scene
 from cloudrc.geometry.shapes import Rgba, Shapes, Surface, merged

@@ -12,7 +12,7 @@ from typing import Any
 
 import gymnasium
 
-from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.eval.setup import EvalSetup
 from cloudrc.outside.code import OWN, is_installed
 from cloudrc.plugins import is_path

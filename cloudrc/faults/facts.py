@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf
 from typing import NamedTuple
 
-from cloudrc.config.load import ResolvedExperiment, ResolvedGuard
+from cloudrc.config.resolved import ResolvedExperiment, ResolvedGuard
 from cloudrc.config.robot import find_robot
 from cloudrc.config.scene import fence_in
 from cloudrc.messages import GuardState, Vector

@@ -34,7 +34,7 @@ from cloudrc.report.write import assess
 from cloudrc.runs.requirements import SIM, require
 
 if TYPE_CHECKING:
-    from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.config.resolved import ResolvedExperiment
     from cloudrc.endpoint import Endpoint
 
 NEVER_NS = 1 << 62

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 from cloudrc import assembly
 from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.cloud.controllers.ros2 import RosController
-from cloudrc.config.load import ResolvedExperiment, load_experiment, read_experiment
+from cloudrc.config.load import load_experiment, read_experiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import known_robot
 from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.link_monitor import LinkMonitor

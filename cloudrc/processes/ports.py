@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
-from cloudrc.config.load import ResolvedExperiment, fingerprint
+from cloudrc.config.resolved import ResolvedExperiment, fingerprint
 from cloudrc.drivers.realtime import Address, show_address
 from cloudrc.files import naming
 from cloudrc.text import escape

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 
 from cloudrc import assembly
 from cloudrc.config.hull import hull_of
-from cloudrc.config.load import ResolvedExperiment, read_experiment
+from cloudrc.config.load import read_experiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import known_robot
 from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.drivers.link_news import LinkNews

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from cloudrc.config.load import ResolvedExperiment, read_experiment
+from cloudrc.config.load import read_experiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.report.folder import read_run

@@ -12,7 +12,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
-from cloudrc.config.load import ResolvedExperiment, fingerprint
+from cloudrc.config.resolved import ResolvedExperiment, fingerprint
 from cloudrc.files import write_atomically
 from cloudrc.metrics import Flight, Number
 from cloudrc.metrics.response import steps

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from cloudrc.config.flown import FLOWN_FILE, FlownWorld
 from cloudrc.config.hull import known_hull
-from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import is_planar
 from cloudrc.config.scene import scene_of
 from cloudrc.errors import BadInputError, MissingPrerequisiteError

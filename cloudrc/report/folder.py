@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from cloudrc.config.load import ResolvedExperiment, read_experiment
+from cloudrc.config.load import read_experiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import BadInputError
 from cloudrc.files import read
 from cloudrc.metrics.flight import CONTROL_TOPICS

@@ -14,7 +14,7 @@ from importlib.resources import files
 from string import Template
 from typing import Any
 
-from cloudrc.config.load import ResolvedExperiment, dump
+from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.metrics import SHIPPED, Flight, Number
 from cloudrc.metrics.verdict import FlightFailure
 from cloudrc.record import wall_time

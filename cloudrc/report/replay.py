@@ -14,7 +14,7 @@ import numpy as np
 import rich
 import viser
 
-from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.console.scene import FlightScene
 from cloudrc.errors import BadInputError
 from cloudrc.metrics import Flight

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.metrics import Flight
 from cloudrc.metrics.control import prediction_errors, tracking_errors
 from cloudrc.metrics.flight import Array, Columns, select

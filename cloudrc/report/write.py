@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import read, write_atomically

@@ -8,9 +8,9 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 from cloudrc import plugins
-from cloudrc.config.load import ResolvedGuard
 from cloudrc.config.overrides import BRAKING, build_plugin, check_plugin, default_parameters
 from cloudrc.config.problems import ConfigProblem, ProblemsError
+from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import GENERAL, RobotFiles, find_robot, parameters
 from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.config.schema import PlugIn, World

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cloudrc.config.hull import doubts, hull_of
-from cloudrc.config.load import ResolvedGuard
 from cloudrc.config.problems import ProblemsError
+from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotFiles, find_robot
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from cloudrc.assembly import assemble
-from cloudrc.config.load import ResolvedExperiment, load_experiment
+from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import CloudrcError
 from cloudrc.records import Record
 from cloudrc.robots.build import describe_steps

@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
-from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.metrics import SHIPPED
 from cloudrc.rounding import differences

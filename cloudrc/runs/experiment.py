@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from contextlib import suppress
 
 from cloudrc import metrics
-from cloudrc.config.load import ResolvedExperiment, load_experiment
+from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import OUTSIDE, ROS2, parse_settings
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.schema import Parameters, World
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.outside.reuse import reuse

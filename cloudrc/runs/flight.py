@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 from cloudrc import assembly, metrics, plugins
 from cloudrc.cloud.loop import ControlLoop
-from cloudrc.config.load import ResolvedExperiment, absolute_paths
+from cloudrc.config.resolved import ResolvedExperiment, absolute_paths
 from cloudrc.errors import MissingPrerequisiteError, describe_error, machine_error
 from cloudrc.outside import code
 from cloudrc.outside.reuse import reuse_results

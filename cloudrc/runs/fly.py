@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc import assembly
-from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.config.overrides import OUTSIDE, REMOTE
+from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.drivers.companion import companion
 from cloudrc.drivers.local import LINK_FOLDER, LocalRun
 from cloudrc.errors import CloudrcError, ControllerLostError, InterruptedRunError, machine_error

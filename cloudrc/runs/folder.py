@@ -12,7 +12,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.runs.lock import claim_folder
 
 if TYPE_CHECKING:
-    from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.config.resolved import ResolvedExperiment
 
 RUNS = Path("runs")
 """Folder for runs, in the working folder."""

@@ -20,9 +20,10 @@ from pydantic import Field
 
 from cloudrc import files, metrics, source
 from cloudrc.config import problems, shipped
-from cloudrc.config.load import ResolvedExperiment, load_experiment
+from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import Settings, collect_settings
 from cloudrc.config.problems import ConfigProblem, ProblemsError, validate
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.section import Section
 from cloudrc.errors import BadInputError
 from cloudrc.outside.document import Document, Source, parse_yaml, read_document, write_yaml

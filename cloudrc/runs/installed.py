@@ -7,8 +7,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from cloudrc import plugins
-from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.overrides import KINDS
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import known_robot
 from cloudrc.outside.code import is_installed
 from cloudrc.outside.reuse import reuse

@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterable
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args, get_origin
 
 from cloudrc.ages import simulate_ages
-from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.problems import exceeds, expectation
 from cloudrc.config.profile import COMMAND_AGE_MS
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.schema import Experiment
 from cloudrc.errors import BadInputError
 from cloudrc.outside.document import child

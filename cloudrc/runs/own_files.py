@@ -8,7 +8,8 @@ import sys
 from hashlib import file_digest, sha256
 from pathlib import Path
 
-from cloudrc.config.load import ResolvedExperiment, absolute_paths, local_files, read_experiment
+from cloudrc.config.load import read_experiment
+from cloudrc.config.resolved import ResolvedExperiment, absolute_paths, local_files
 from cloudrc.config.robot import files_of
 from cloudrc.errors import BadInputError
 from cloudrc.files import read

@@ -10,7 +10,8 @@ from contextlib import closing
 from pathlib import Path
 
 from cloudrc.assembly import with_order
-from cloudrc.config.load import ResolvedExperiment, dump, read_experiment
+from cloudrc.config.load import read_experiment
+from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.drivers.local import JOURNAL_FILE, under_way

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cloudrc import assembly
 from cloudrc.ages import simulate_ages
-from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
 from cloudrc.errors import describe_error, machine_error

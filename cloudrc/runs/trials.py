@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from typing import Any, NamedTuple, TypeAlias
 
-from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import BadInputError
 from cloudrc.runs import flight, stability
 from cloudrc.runs.experiment import check_world, load, refuse_seed

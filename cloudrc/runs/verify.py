@@ -19,8 +19,9 @@ from typing import Any, TypeAlias
 from cloudrc.cluster.client import Release
 from cloudrc.cluster.pods import METRICS, NO_PROXY, find_pod, forwarded
 from cloudrc.config import shipped
-from cloudrc.config.load import ResolvedExperiment, read_experiment
+from cloudrc.config.load import read_experiment
 from cloudrc.config.profile import Profile
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import known_robot
 from cloudrc.config.schema import Experiment
 from cloudrc.drivers.programs import run_tool

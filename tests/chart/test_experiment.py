@@ -3,8 +3,9 @@
 import pytest
 import yaml
 
-from cloudrc.config.load import dump, load_experiment, load_link
+from cloudrc.config.load import load_experiment, load_link
 from cloudrc.config.profile import load_profile
+from cloudrc.config.resolved import dump
 from cloudrc.config.shipped import names
 from tests.chart.conftest import of_kind, render
 

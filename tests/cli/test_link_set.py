@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
-from cloudrc.config.load import edit_profile
+from cloudrc.config.link_edit import edit_profile
 from cloudrc.drivers import local
 from cloudrc.drivers.link_control import ControlServer, ask
 from cloudrc.drivers.local import link_socket

@@ -18,7 +18,8 @@ from websockets.sync.client import connect
 
 from cloudrc import assembly
 from cloudrc.cli import session
-from cloudrc.config.load import dump, load_experiment, read_experiment
+from cloudrc.config.load import load_experiment, read_experiment
+from cloudrc.config.resolved import dump
 from cloudrc.config.setpoints import write_setpoints
 from cloudrc.config.shipped import file_of
 from cloudrc.drivers import local

@@ -6,7 +6,8 @@ import re
 import pytest
 
 from cloudrc.config import problems
-from cloudrc.config.load import dump, load_experiment
+from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import dump
 from cloudrc.config.schema import Experiment
 from tests.config.conftest import refused
 

@@ -8,7 +8,8 @@ import pytest
 import cloudrc
 from cloudrc.assembly import mission_plan
 from cloudrc.config.hull import hull_of
-from cloudrc.config.load import dump, load_experiment
+from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import dump
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
 from cloudrc.teleop.models import RefusedError, RequestReader

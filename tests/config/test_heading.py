@@ -9,7 +9,8 @@ import pytest
 
 from cloudrc.assembly import build_plan, mission_plan
 from cloudrc.config.hull import hull_of
-from cloudrc.config.load import dump, load_experiment
+from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import dump
 from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene

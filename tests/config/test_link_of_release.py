@@ -2,8 +2,9 @@
 
 import pytest
 
-from cloudrc.config.load import dump, load_experiment, load_link
+from cloudrc.config.load import load_experiment, load_link
 from cloudrc.config.profile import load_profile
+from cloudrc.config.resolved import dump
 from cloudrc.errors import BadInputError
 
 

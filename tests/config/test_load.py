@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.config import shipped
-from cloudrc.config.load import dump, fingerprint, load_experiment, read_experiment
+from cloudrc.config.load import load_experiment, read_experiment
 from cloudrc.config.profile import load_profile
+from cloudrc.config.resolved import dump, fingerprint
 from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.obstacles import intangible, without_file

@@ -12,7 +12,8 @@ from itertools import combinations, product
 import pytest
 
 from cloudrc.config import problems
-from cloudrc.config.load import dump, load_experiment
+from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import dump
 from cloudrc.config.schema import Experiment
 from cloudrc.errors import BadInputError
 from cloudrc.outside.reuse import reuse_results

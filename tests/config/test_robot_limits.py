@@ -4,7 +4,8 @@ import re
 
 import pytest
 
-from cloudrc.config.load import dump, load_experiment
+from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import dump
 from cloudrc.errors import BadInputError
 
 DRIVES = ["world.robot=rover", "mission={waypoints: [{position_m: [1, 0]}]}", "world.scene=empty"]

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.config.load import dump, load_experiment
+from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import dump
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.errors import CloudrcError

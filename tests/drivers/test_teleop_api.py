@@ -11,7 +11,8 @@ from statistics import median
 
 import pytest
 
-from cloudrc.config.load import dump, load_experiment
+from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import dump
 from cloudrc.teleop.client import Api
 from tests.conftest import needs_ipv6, wait_until
 from tests.drivers.conftest import LIMIT, TOKEN

@@ -2,7 +2,8 @@
 
 import pytest
 
-from cloudrc.config.load import dump, load_experiment
+from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import dump
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry import obstacles
 from cloudrc.geometry.fence import Fence

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from cloudrc.config.load import dump
+from cloudrc.config.resolved import dump
 from cloudrc.errors import BadInputError
 from cloudrc.metrics.verdict import exit_code
 from cloudrc.record.columns import Recording

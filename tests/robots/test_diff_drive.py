@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import cloudrc
-from cloudrc.config.load import ResolvedGuard, load_experiment
+from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import Plant, World
 from cloudrc.config.shipped import file_of

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cloudrc
-from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli.main import main
-from cloudrc.config.load import dump, read_experiment
+from cloudrc.config.load import read_experiment
+from cloudrc.config.resolved import dump
 from cloudrc.config.schema import PlugIn
 from cloudrc.drivers.machine import interpreter
 from cloudrc.processes import ends

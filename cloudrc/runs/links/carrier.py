@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cloudrc.config.load import edit_profile
+from cloudrc.config.link_edit import edit_profile
 from cloudrc.drivers.local import LINK, announced, socket_folder
 from cloudrc.link.carry.engine import Engine, LinkWay
 from cloudrc.link.carry.punctual import ask_for_fifo, settle

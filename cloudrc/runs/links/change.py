@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cloudrc.config.load import Edit, edit_profile
+from cloudrc.config.link_edit import Edit, edit_profile
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.drivers.link_control import ask
 from cloudrc.drivers.local import link_socket

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
-from cloudrc.config.load import Edit
+from cloudrc.config.link_edit import Edit
 from cloudrc.config.profile import DIRECTIONS, load_profile
 from cloudrc.drivers.link_control import ControlServer
 from cloudrc.drivers.local import LINK_FOLDER, link_socket

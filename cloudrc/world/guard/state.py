@@ -45,7 +45,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from math import inf
 
-from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits
 from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.vectors import step_towards

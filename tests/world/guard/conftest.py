@@ -14,7 +14,7 @@ from random import Random
 import pytest
 import z3
 
-from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState
 from cloudrc.robots.pelican.low_level import LowLevel
 from cloudrc.world.guard.state import Guard

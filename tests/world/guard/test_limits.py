@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.load import Bounds, ResolvedGuard, speed_cap
+from cloudrc.config.resolved import Bounds, ResolvedGuard, speed_cap
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.world.guard import limits as rules

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.messages import Cause, GuardState
 from cloudrc.tunnel.codec import PLAN_MAX
 from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX

@@ -6,7 +6,7 @@ from math import nan
 
 import pytest
 
-from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotLimits
 from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.world.guard.state import Guard

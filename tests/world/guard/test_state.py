@@ -4,7 +4,7 @@ from math import cos, dist, inf, nan, nextafter, radians, sin
 
 import pytest
 
-from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.world.guard.hold import LAND_SPEED, STILL_SPEED

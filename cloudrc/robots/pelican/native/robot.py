@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import find_robot
 from cloudrc.config.shipped import file_of
 from cloudrc.geometry.compiled import mujoco

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from cloudrc import assembly
-from cloudrc.config.load import ResolvedGuard, load_experiment
+from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import DEFAULT_LIMITS, find_robot
 from cloudrc.config.shipped import file_of
 from cloudrc.geometry.compiled import mujoco

@@ -1,0 +1,177 @@
+"""An experiment that is resolved: it contains its mission, and a value for every key."""
+
+from __future__ import annotations
+
+import hashlib
+from math import sqrt
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import Field, ValidationInfo, ValidatorFunctionWrapHandler, field_validator
+
+from cloudrc.config.profile import DIRECTIONS, CloudTime, CommandAge, DirectionConfig
+from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, known_robot
+from cloudrc.config.scene import scene_of
+from cloudrc.config.schema import (
+    SPEED_MPS,
+    Acceleration,
+    Cloud,
+    Experiment,
+    GuardConfig,
+    MissionConfig,
+    PlanMax,
+    PlugIn,
+    Speed,
+    World,
+)
+from cloudrc.geometry.obstacles import fence_of
+from cloudrc.outside.document import write_yaml
+from cloudrc.rounding import format_limit
+
+HORIZON_MAX_S = 1.0
+"""Default of cloud.horizon_max_s [s]. Source: docs/reference/control.md, "Predictors"."""
+FREEZE_AFTER_S = 0.4
+"""Default of cloud.freeze_after_s [s]. Source: docs/reference/plant.md, "Frozen reference"."""
+COMMAND_AGE_MAX_MS = 250.0
+"""Default of guard.command_age_max_ms if experiment and link profile give no value [ms].
+Source: docs/reference/plant.md, "Command age"."""
+PLAN_MAX_S = 0.8
+"""Default of guard.plan_max_s if cloud sends plans [s].
+Source: docs/reference/plant.md, "Plan"."""
+
+
+class Bounds(NamedTuple):
+    """What robot and scene tell about the limits of the guard."""
+
+    robot: RobotLimits
+    room: float  # within which the robot stops, see `Fence.room` [m]
+
+
+def speed_cap(command_age_max_ms: float, plan_max_s: float, bounds: Bounds) -> float:
+    """Compute the speed cap: the largest speed v [m/s] from which the robot stops in the fence.
+
+    If commands stop arriving, the robot follows the last one for the time T, reacts within 0.2 s
+    and brakes at a, its `braking_mps2`: v · (T + 0.2 s) + v^2 / (2a) = room. T is the largest age
+    of a command, `command_age_max_ms` [ms], plus the longest plan, `plan_max_s` [s]. The cap is
+    lower for a robot that cannot follow this speed.
+    Source: docs/reference/plant.md, "Speed cap".
+    """
+    robot, room = bounds.robot, max(bounds.room, 0.0)
+    delay, braking = command_age_max_ms * 1e-3 + plan_max_s + 0.2, robot.braking_mps2
+    stops = round(braking * (sqrt(delay * delay + 2.0 * room / braking) - delay), 6)
+    slowest, fastest = SPEED_MPS
+    return min(max(stops, slowest), robot.speed_max_mps or fastest)
+
+
+class ResolvedGuard(GuardConfig):
+    """The section `guard`, in which every limit has a value.
+
+    The context of its validation is the `RobotLimits` of the robot; without one, `DEFAULT_LIMITS`.
+    """
+
+    command_age_max_ms: CommandAge = COMMAND_AGE_MAX_MS
+    plan_max_s: PlanMax = 0.0
+    speed_max_mps: Speed = Field(None, validate_default=True)
+    acceleration_max_mps2: Acceleration = Field(None, validate_default=True)
+
+    @field_validator("speed_max_mps", mode="wrap")
+    @classmethod
+    def _limit_speed(
+        cls, given: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo
+    ) -> float:
+        age_max = info.data.get("command_age_max_ms", COMMAND_AGE_MAX_MS)
+        plan_max, bounds = info.data.get("plan_max_s", 0.0), info.context or bounds_of(World())
+        cap = speed_cap(age_max, plan_max, bounds)
+        speed_max: float = cap if given is None else check(given)
+        if speed_max > cap + 1e-6:
+            most = format_limit(cap)
+            if cap == bounds.robot.speed_max_mps:
+                raise ValueError(f"must be at most {most} m/s, the largest speed of the robot")
+            plan = f" and plans of {plan_max:g} s" if plan_max else ""
+            raise ValueError(
+                f"must be at most {most} m/s: above it the robot does not stop in time, within "
+                f"{bounds.room:g} m, with commands {age_max:g} ms old{plan}; lower it or "
+                "guard.command_age_max_ms"
+            )
+        return speed_max
+
+    @field_validator("acceleration_max_mps2", mode="wrap")
+    @classmethod
+    def _limit_acceleration(
+        cls, given: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo
+    ) -> float:
+        robot = info.context.robot if info.context else DEFAULT_LIMITS
+        most: float = robot.acceleration_max_mps2
+        acceleration: float = most if given is None else check(given)
+        if info.context and acceleration > most + 1e-6:
+            raise ValueError(
+                f"must be at most {format_limit(most)} m/s^2, the largest acceleration of the robot"
+            )
+        return acceleration
+
+
+class ResolvedCloud(Cloud):
+    """The section `cloud` with all parameters of the plug-ins, including defaults."""
+
+    estimator: PlugIn
+    predictor: PlugIn
+    controller: PlugIn
+    horizon_max_s: CloudTime = HORIZON_MAX_S
+    freeze_after_s: CloudTime = FREEZE_AFTER_S
+
+
+class ResolvedExperiment(Experiment):
+    """An experiment that contains its mission (not only the name), and a value for every key."""
+
+    mission: MissionConfig
+    guard: ResolvedGuard
+    cloud: ResolvedCloud
+
+    @property
+    def uplink(self) -> DirectionConfig:
+        """Conditions of the link from world to cloud."""
+        return self.link.uplink
+
+    @property
+    def downlink(self) -> DirectionConfig:
+        """Conditions of the link from cloud to world."""
+        return self.link.downlink
+
+    @property
+    def link_values(self) -> dict[str, Any]:
+        """Content of a profile of this link, without defaults."""
+        return self.link.model_dump(mode="json", include={*DIRECTIONS}, exclude_defaults=True)
+
+
+def bounds_of(world: World) -> Bounds:
+    """Return what robot and scene of an experiment tell about the limits of the guard."""
+    scene = scene_of(world)
+    return Bounds(known_robot(world.robot).guard, fence_of(scene).room(scene.spawn))
+
+
+def dump(experiment: ResolvedExperiment) -> str:
+    """Format an experiment as YAML; loading this YAML returns an equal experiment."""
+    return write_yaml(experiment.model_dump(mode="json"))
+
+
+def fingerprint(experiment: ResolvedExperiment) -> str:
+    """Return the SHA-256 of the YAML from `dump`; experiments with equal hashes are equal."""
+    return hashlib.sha256(dump(experiment).encode()).hexdigest()
+
+
+def local_files(value: Any) -> dict[str, str]:
+    """Return dotted key -> path of each existing file whose absolute path is in `value`."""
+    return {key: path for key, path in absolute_paths(value).items() if Path(path).is_file()}
+
+
+def absolute_paths(value: Any, key: str = "") -> dict[str, str]:
+    """Return dotted key -> each text in `value` that is an absolute path, if only by its form.
+
+    `key` is the dotted key of `value` itself.
+    """
+    if isinstance(value, str):
+        return {key: value} if value.startswith("/") else {}
+    listed = dict(enumerate(value)) if isinstance(value, list) else value
+    inner = listed.items() if isinstance(listed, dict) else ()
+    parts = [absolute_paths(each, f"{key}.{name}".lstrip(".")) for name, each in inner]
+    return {where: path for part in parts for where, path in part.items()}
