@@ -54,7 +54,7 @@ class ProgramEnd:
         With `reads_stdin`, the program reads this process's standard input.
 
         Raises:
-            MissingPrerequisiteError: If this machine refuses; the text says what to allow.
+            MissingPrerequisiteError: If this machine forbids it; the text says what to allow.
         """
         self.name, self._lock = name, threading.Lock()
         self._connection, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -146,7 +146,7 @@ class ProgramEnd:
         if not data:
             raise self._lost()
         answer = json.loads(data)
-        if text := answer.get("refused"):
+        if text := answer.get("missing"):
             raise MissingPrerequisiteError(text)
         return answer, found
 

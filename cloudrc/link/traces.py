@@ -1,8 +1,8 @@
 """Read and write traces: CSV files of delay and loss over time, which link profiles use.
 
 A trace has the header `time_s,delay_ms` or `time_s,delay_ms,loss`, and one row per instant in
-rising order of time; `delay_us` may replace `delay_ms`. Delays are one way. `link/logs.py` converts
-the logs of other tools to traces.
+rising order of time; `delay_us` may replace `delay_ms`. Delays are one way.
+`link/trace_logs.py` converts the logs of other tools to traces.
 """
 
 from __future__ import annotations

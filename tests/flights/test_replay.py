@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cloudrc.link.logs import trace_of
+from cloudrc.link.trace_logs import trace_of
 from cloudrc.link.traces import write_trace
 from cloudrc.runs.links.trace import one_way
 from tests.flights.conftest import fly

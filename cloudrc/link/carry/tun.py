@@ -16,7 +16,7 @@ IN_FLIGHT_MAX = 50_000  # packets in both directions, 75 MB at most; more are dr
 
 
 def write_packet(device: int, data: bytes) -> bool:
-    """Write a packet to a device; the kernel refuses a damaged one, or has no memory."""
+    """Write a packet to a device; the kernel takes no damaged one, or has no memory."""
     try:
         os.write(device, data)
     except OSError:

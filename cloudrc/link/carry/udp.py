@@ -94,7 +94,7 @@ class Relay:
         `peek` reads kind, epoch and counter of a datagram.
         """
         self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        # The kernel refuses to send from a socket bound to 127.0.0.1 to another machine.
+        # The kernel does not send from a socket bound to 127.0.0.1 to another machine.
         self._outside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._inside.bind(listen)
@@ -146,7 +146,7 @@ class Relay:
 
         The outcomes are `received`; `forwarded` (including copies); `lost` on the link; `malformed`
         (not from the tunnel); `overflow` (too many in flight, see `IN_FLIGHT_MAX`); `unread` (the
-        socket's buffer was full); `unsent` (the receiver is unknown or the kernel refused).
+        socket's buffer was full); `unsent` (the receiver is unknown or the kernel failed).
 
         If this method is called once a second, the percentiles cover the last 10 s.
         `released_early` is the number of datagrams since the start that left before they were due.

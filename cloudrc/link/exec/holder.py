@@ -36,7 +36,7 @@ def main(descriptor: int, end: str) -> None:
             way = namespace.enter()
             device, has_ipv6 = namespace.open_device(namespace.ADDRESSES[end])
         except MissingPrerequisiteError as error:
-            command.send(json.dumps({"refused": str(error)}).encode())
+            command.send(json.dumps({"missing": str(error)}).encode())
             return
         own = namespace.identity()
         try:

@@ -54,7 +54,7 @@ def enter() -> str:
         The privilege that allowed it: "root", or "unprivileged user namespaces".
 
     Raises:
-        MissingPrerequisiteError: If the kernel refuses; the text says what to allow.
+        MissingPrerequisiteError: If the kernel does not allow it; the text says what to allow.
     """
     if not hasattr(os, "memfd_create"):  # Linux alone has it
         raise MissingPrerequisiteError(f"network namespaces need Linux; use Linux, {OTHERWISE}")
@@ -64,7 +64,7 @@ def enter() -> str:
         _enter_user_namespace()
         return "unprivileged user namespaces"
     except OSError as error:
-        raise _refused(f"no network namespace: {error.strerror}") from None
+        raise _not_allowed(f"no network namespace: {error.strerror}") from None
     return "root"
 
 
@@ -77,7 +77,7 @@ def _enter_user_namespace() -> None:
         Path("/proc/self/uid_map").write_text(f"{user} {user} 1", encoding="ascii")
         Path("/proc/self/gid_map").write_text(f"{group} {group} 1", encoding="ascii")
     except OSError as error:
-        raise _refused(f"no user namespace: {error.strerror}") from None
+        raise _not_allowed(f"no user namespace: {error.strerror}") from None
 
 
 def _unshare(flags: int) -> None:
@@ -87,8 +87,8 @@ def _unshare(flags: int) -> None:
         raise OSError(number, os.strerror(number))
 
 
-def _refused(what: str) -> MissingPrerequisiteError:
-    """Return an error about `what` was refused, with the setting of this machine that allows it."""
+def _not_allowed(what: str) -> MissingPrerequisiteError:
+    """Return an error about `what`, with the setting of this machine that allows it."""
     settings = (
         ("kernel/apparmor_restrict_unprivileged_userns", "1", "0"),  # Ubuntu 23.10 and newer
         ("kernel/unprivileged_userns_clone", "0", "1"),  # Debian
@@ -128,7 +128,7 @@ def open_device(own: Addresses) -> tuple[int, bool]:
         return device, _configure(own)
     except OSError as error:
         os.close(device)
-        raise _refused(f"no TUN device: {error.strerror}") from None
+        raise _not_allowed(f"no TUN device: {error.strerror}") from None
 
 
 def _configure(own: Addresses) -> bool:

@@ -94,7 +94,7 @@ class ProbeEnd:
         return (header * (size // len(header) + 1))[:size]
 
     def send(self, number: int) -> None:
-        """Send a probe; a probe that the kernel refuses counts as lost."""
+        """Send a probe; a probe that the kernel does not take counts as lost."""
         self._sent_ns[number] = time.time_ns()
         with suppress(OSError):
             self.socket.sendto(self.probes[number], self.route)

@@ -60,7 +60,7 @@ def open_live(
     temporary folder. `check` is that of `LiveLink`.
 
     Raises:
-        BadInputError: If the profile or a setting cannot be used.
+        CloudrcError: If the profile or a setting cannot be used.
     """
     edit = edit_profile(Document({}), asked.link, asked.settings, command)
     for note in edit.notes:

@@ -22,7 +22,7 @@ from cloudrc.link.traces import link_profile
 Apply = Callable[[str, Loaded, int], None]
 """Function that lets a direction follow a profile, at a time on the monotonic clock [ns]."""
 Check = Callable[[DirectionProfile, str], None]
-"""Function that raises a BadInputError if a direction cannot have a profile."""
+"""Function that raises an error if a direction cannot have a profile."""
 Changed = Callable[[LinkState, str], None]
 """Function that gets each new state of a direction, and a sentence for the user if the direction
 has changed; "" at the start, and for a change of the other direction."""
@@ -47,7 +47,7 @@ class LiveLink:
         reason: str,
         check: Check = lambda profile, name: None,
     ) -> None:
-        """Prepare a link with the profile `edit.values`; raise a BadInputError if `check` does.
+        """Prepare a link with the profile `edit.values`; raise an error if `check` does.
 
         `folder` gets the state of the link, for `cloudrc link set`, which changes it through the
         sockets beside `url`. `reason` names the command that runs the link.

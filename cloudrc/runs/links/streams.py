@@ -16,9 +16,10 @@ from cloudrc.config.profile import DIRECTIONS
 from cloudrc.drivers.realtime import Address, show_address
 from cloudrc.errors import BadInputError
 from cloudrc.link.carry.punctual import settle
-from cloudrc.link.carry.tcp.medium import Medium, refuse_unsupported
+from cloudrc.link.carry.tcp.medium import Medium
 from cloudrc.link.carry.tcp.relay import StreamRelay
 from cloudrc.link.follow import Loaded
+from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.state import LinkState
 from cloudrc.runs.links.carrier import STEP, CarrySettings, open_live
 
@@ -71,6 +72,16 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
             while True:
                 relay.engine.step(STEP)
         return _summary(relay)
+
+
+def refuse_unsupported(profile: DirectionProfile, name: str) -> None:
+    """Raise a BadInputError if bytes of a TCP connection cannot show a key of the profile."""
+    for key in ("duplicate", "corrupt", "reorder"):
+        if getattr(profile, key):
+            raise BadInputError(
+                f"{name}.{key}: TCP hands bytes on once, undamaged and in order, so a relay of"
+                f" bytes cannot show it; set {name}.{key}=0, or use 'cloudrc link exec'"
+            )
 
 
 def _listen(where: Address) -> socket.socket:

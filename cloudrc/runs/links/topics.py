@@ -39,8 +39,7 @@ def relay_topic(settings: TopicSettings, tell: Callable[[str], None]) -> Report:
     """Relay messages until KeyboardInterrupt; return the verdict on the link.
 
     Raises:
-        BadInputError: If the profile or a topic cannot be used.
-        MissingPrerequisiteError: If there is no ROS 2, or if it does not have the type.
+        CloudrcError: If the profile or a topic cannot be used, or ROS 2 and the type are missing.
     """
     require_ros("relay ros", "relay", "rclpy")
     from cloudrc.bridges.ros2.relay import TopicRelay

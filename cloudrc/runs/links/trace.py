@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 from cloudrc.errors import BadInputError
 from cloudrc.files import naming
-from cloudrc.link.logs import (
+from cloudrc.link.streams import numbers
+from cloudrc.link.trace_logs import (
     Direction,
     Log,
     Packets,
@@ -24,7 +25,6 @@ from cloudrc.link.logs import (
     read_ping,
     trace_of,
 )
-from cloudrc.link.streams import numbers
 from cloudrc.link.traces import read_lines, write_trace
 from cloudrc.runs.requirements import require
 

@@ -5,8 +5,7 @@ import random
 
 import pytest
 
-from cloudrc.errors import BadInputError
-from cloudrc.link.carry.tcp.medium import SEGMENT, Medium, refuse_unsupported
+from cloudrc.link.carry.tcp.medium import SEGMENT, Medium
 from cloudrc.link.carry.tcp.stream import READ_AHEAD, WINDOW_BYTES, LinkStream, run_due
 from cloudrc.link.queue import NOTHING_NS, PacketQueue
 from tests.link.profiles import blackout, changed, in_bursts, profile_of
@@ -139,8 +138,3 @@ def test_a_change_of_the_profile_acts_on_an_open_connection():
     far.send(b"x")
     far.up.replace_profile(profile_of(0.100))
     assert far.send(b"y", 1_000 * MS) == pytest.approx(100)
-
-
-def test_what_a_stream_of_bytes_cannot_show_is_refused():
-    with pytest.raises(BadInputError, match=r"uplink.reorder: .*link exec"):
-        refuse_unsupported(profile_of(0.040, reorder=0.01), "uplink")

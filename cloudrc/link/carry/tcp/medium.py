@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 
-from cloudrc.errors import BadInputError
 from cloudrc.link.library import KIND
 from cloudrc.link.model import LinkDirection, enqueue
 from cloudrc.link.profile import Conditions, DirectionProfile, Timeline
@@ -18,16 +17,6 @@ SEGMENT = 1448
 stamps [bytes]."""
 HEADERS = 52  # headers of IPv4 and of TCP with time stamps [bytes]
 _NO_LIMIT = 1 << 62  # number of packets: `room_ns` has looked at the queue before
-
-
-def refuse_unsupported(profile: DirectionProfile, name: str) -> None:
-    """Raise a BadInputError if bytes of a TCP connection cannot show a key of the profile."""
-    for key in ("duplicate", "corrupt", "reorder"):
-        if getattr(profile, key):
-            raise BadInputError(
-                f"{name}.{key}: TCP hands bytes on once, undamaged and in order, so a relay of"
-                f" bytes cannot show it; set {name}.{key}=0, or use 'cloudrc link exec'"
-            )
 
 
 class Medium:

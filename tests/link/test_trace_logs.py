@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.logs import (
+from cloudrc.link.streams import numbers
+from cloudrc.link.trace_logs import (
     Packets,
     is_ping,
     read_csv,
@@ -15,7 +16,6 @@ from cloudrc.link.logs import (
     read_ping,
     trace_of,
 )
-from cloudrc.link.streams import numbers
 
 
 def read(text, *, halve=False):
