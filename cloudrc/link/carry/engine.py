@@ -89,6 +89,7 @@ class Engine:
 
     def take_in(self) -> None:
         """Take packets from the port, and compute when each is due."""
+        put, leave = self.queue.put, self._leave
         for way, (kind, epoch, counter), size, data, now_ns in self._port.take():
             link, number = way.link, way.received
             way.received += 1
@@ -99,14 +100,15 @@ class Engine:
                     arrivals = ()
                 data = damaged
             way.log.enter(now_ns, size + HEADER_BYTES, arrivals)
-            self.queue.put(self._leave, arrivals, (way, number, data))
+            put(leave, arrivals, (way, number, data))
 
     def _release(self) -> None:
         """Make up to `BATCH` calls that are due."""
+        queue, clock = self.queue, time.monotonic_ns
         for _ in range(BATCH):
-            if self.queue.next_ns > time.monotonic_ns():
+            if queue.next_ns > clock():
                 return
-            due_ns, call, arguments = self.queue.pop()
+            due_ns, call, arguments = queue.pop()
             call(*arguments, due_ns)
 
     def _leave(self, way: LinkWay, number: int, data: Any, due_ns: int) -> None:

@@ -46,15 +46,16 @@ class TunPort:
 
     def take(self) -> Iterator[Packet]:
         """Read up to `BATCH` packets from each device."""
+        read, clock = os.read, time.monotonic_ns
         for source in self._readable:
             way = self._devices[source]
             for _ in range(BATCH):
                 try:
-                    data = os.read(source, MTU)
+                    data = read(source, MTU)
                 except OSError:  # no packet waits
                     break
                 # The model counts the bytes of UDP payload, and adds the headers itself.
                 size = len(data) - HEADER_BYTES
-                yield Packet(way, (KIND, 1, way.received), size, data, time.monotonic_ns())
+                yield Packet(way, (KIND, 1, way.received), size, data, clock())
             else:
                 way.waited += BATCH
