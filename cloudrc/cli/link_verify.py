@@ -5,29 +5,67 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from contextlib import closing
+from typing import TYPE_CHECKING
 
-from cloudrc.cli.cluster_flags import flown_release
-from cloudrc.cli.output import paint, print_result
-from cloudrc.cli.progress import Progress
+from cloudrc.cli.cluster_flags import flown_release, release_arguments
+from cloudrc.cli.output import output_argument, paint, print_result
+from cloudrc.cli.parser import number
 from cloudrc.errors import BadInputError
+from cloudrc.link.verify import DEFAULT
 from cloudrc.runs.interrupts import interrupt_on_signals
-from cloudrc.runs.verify import (
-    RELEASE_TIMEOUT,
-    Report,
-    as_text,
-    check_seconds,
-    forwarded_pods,
-    pods_at,
-    verify,
-    verify_release,
-)
 
+if TYPE_CHECKING:
+    from cloudrc.runs.verify import Report
+
+EPILOG = """\
+examples:
+  cloudrc link verify                       the link of the paper's experiment
+  cloudrc link verify satellite
+  cloudrc link verify paper --set link.uplink.loss=0.05 -o json
+
+The command starts the link's processes on this machine, one per direction, and
+sends numbered probes through each. The random numbers of a relay are known, so
+the command can predict the delay of each probe; it compares netem with 200
+simulated links. Tolerances: max(2 ms, 5 %) of the mean delay, 10 % of the
+jitter, max(2 percentage points, 25 %) of the loss. It measures a second time
+before it reports that something is off.
+
+With --mode cluster the command judges the link of a release in flight by the
+tunnel's own datagrams, within a minute. It reports what it cannot judge.
+
+exit codes: 0 believed, 1 not believed or undecided, 2 bad input,
+3 missing prerequisite, 4 no answer in time, 5 cluster, 6 a process died"""
 AWAITED = "waits for the verdicts of both pods"
 """Step of a measurement on a cluster."""
 
 
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    target = f"name of a shipped one, or a file (default: {DEFAULT})"
+    add("target", nargs="?", default=DEFAULT, metavar="PROFILE|EXPERIMENT", help=target)
+    setting = "override one value of the experiment, for example link.uplink.loss=0.1"
+    add("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help=setting)
+    seconds = (
+        "time to send probes (default: as long as needed, at most 120); with --mode cluster: "
+        "time to wait for a verdict (default: 270)"
+    )
+    add("--seconds", type=number(1, 3600, "seconds"), metavar="S", help=seconds)
+    shaper = "relay (default), or netem between two network namespaces (needs root)"
+    add("--shaper", choices=("relay", "netem"), default="relay", help=shaper)
+    mode = "a link started on this machine (default), or the link of a release"
+    add("--mode", choices=("local", "cluster"), default="local", help=mode)
+    ends = "hosts of a release's two pods, from inside its cluster; used by 'helm test'"
+    add("--ends", metavar="WORLD,CLOUD", help=ends)
+    release_arguments(parser)
+    output_argument(parser)
+
+
 def execute(options: argparse.Namespace) -> int:
     """Measure the link and print the verdict; return 0 if the link matches its profile, else 1."""
+    from cloudrc.cli.progress import Progress
+    from cloudrc.runs.verify import as_text  # imports large packages
+
     interrupt_on_signals()  # on a signal, remove namespaces and processes
     with closing(Progress("starts")) as view:
         report = _verify(options, view.tell)
@@ -36,6 +74,15 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _verify(options: argparse.Namespace, tell: Callable[[str], None]) -> Report:
+    from cloudrc.runs.verify import (
+        RELEASE_TIMEOUT,
+        check_seconds,
+        forwarded_pods,
+        pods_at,
+        verify,
+        verify_release,
+    )
+
     limit = check_seconds(options.seconds) or RELEASE_TIMEOUT
     if options.ends:
         hosts = options.ends.split(",")

@@ -1,0 +1,82 @@
+"""Run `cloudrc link show`: draw a profile and print its statistics."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+from cloudrc.cli.output import print_line
+from cloudrc.cli.parser import number, read_seed, settings_from, whole_number
+from cloudrc.errors import BadInputError
+from cloudrc.files import PICTURES, naming, refuse_other_file
+from cloudrc.runs.requirements import require
+from cloudrc.text import escape
+
+EPILOG = """\
+examples:
+  cloudrc link show lossy
+  cloudrc link show my.yaml --seconds 120 -o my.svg
+  cloudrc link show trace.csv
+  cloudrc link show ./my.yaml --packets 300000 --rate 200
+
+The delays come from the same link model as in a flight, packet by packet: a
+flight with the same seed has exactly these delays. All delays are one way.
+A trace has one packet per row, whatever the duration of the row; a short trace
+with losses between 0 and 1 has several."""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    add("profile", metavar="PROFILE", help="shipped profile, a file, or a trace in CSV")
+    picture = "the picture: .png, .svg or .pdf (default: NAME.png)"
+    add("-o", "--output", type=Path, metavar="FILE", help=picture)
+    seconds = "time to show (default: 30, or the whole time line)"
+    add("--seconds", type=number(0.001, 86_400, "seconds"), metavar="S", help=seconds)
+    seed = "seed of the random draws (default: 1)"
+    add("--seed", type=read_seed, default=1, metavar="S", help=seed)
+    rate = "packets per second (default: 100)"
+    add("--rate", type=number(1, 10_000, "Hz"), default=100.0, metavar="HZ", help=rate)
+    packets = "packets for the statistics of an unchanging link (default: 100000)"
+    add("--packets", type=whole_number(1, 10_000_000), default=100_000, metavar="N", help=packets)
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Write a picture of a profile; print statistics and, in the last line, the file's path."""
+    require("a picture of a link", ("report",))
+    output = options.output or Path(f"{Path(options.profile).stem}.png")
+    if output.suffix[1:] not in PICTURES:
+        raise BadInputError(f"-o {output}: not a picture; end its name in .png, .svg or .pdf")
+    refuse_other_file(output, PICTURES[output.suffix[1:]])
+    from cloudrc.cli.progress import Progress
+
+    with closing(Progress(f"reads {options.profile}")) as view:
+        title, text, picture = _drawn(options, output.suffix[1:], view.tell)
+    with naming(output):
+        output.write_bytes(picture)
+    print(title)
+    print(text)
+    print_line(str(output))
+    return 0
+
+
+def _drawn(
+    options: argparse.Namespace, kind: str, see: Callable[[str], None]
+) -> tuple[str, str, bytes]:
+    """Return title, statistics and picture of a profile; `see` gets each step of the work."""
+    from cloudrc.report.figures.link import render_link
+    from cloudrc.runs.links.sample import SampleSettings, sample_profile, statistics_table
+
+    settings = settings_from(options, SampleSettings)
+    about, ways = sample_profile(
+        options.profile, settings, lambda text: print_line(f"cloudrc: {text}", sys.stderr), see
+    )
+    see("draws the picture")
+    title = escape(": ".join(filter(None, (Path(options.profile).stem, about))))
+    samples = [sample for sample, _ in ways.values()]
+    picture = render_link(title, samples[0], samples[1] if samples[1:] else None, kind)
+    text = statistics_table({name: numbers for name, (_, numbers) in ways.items()})
+    return title, text, picture
