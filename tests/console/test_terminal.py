@@ -44,3 +44,7 @@ def test_a_key_is_obeyed_or_named(key, sent, done, note, monkeypatch):
     assert _obey(key, sent, steering).startswith(note)
     assert bool(note) == bool(_obey(key, sent, steering))
     assert set(called) == ({done} if done else set())
+
+
+def test_without_a_terminal_drive_says_so(refused):
+    assert "needs a terminal" in refused("mission drive --api unix:nowhere")

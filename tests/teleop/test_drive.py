@@ -262,6 +262,9 @@ def test_keys_in_a_terminal_drive_the_robot():
         api.until(lambda: reference(flight).velocity == ZERO)
         terminal.type("hh")
         api.until(lambda: "must be flying" in terminal.screen)
+        terminal.type("X" * 20)
+        api.until(lambda: "pasted text" in terminal.screen)
+        assert flight.guard is not GuardState.ESTOP
         terminal.type("X")
         api.until(lambda: flight.guard is GuardState.ESTOP)
         terminal.type("q")
