@@ -131,19 +131,22 @@ def warn_if_readable(path: Path, warn: Callable[[str], None]) -> None:
             )
 
 
-def read_token(path: Path) -> str:
-    """Read the token of teleop's API from a file; raise a ValueError with the reason if it fails.
+def read_token(path: Path, named: str) -> str:
+    """Read the token of teleop's API from a file.
 
-    The reason does not contain the token.
+    If it has none, raise a BadInputError whose text begins with `named` and has no part of the
+    file.
     """
     try:
         token = read(path).strip()
+        reason = "" if _TOKEN.fullmatch(token) else "a token is 16 to 512 visible ASCII characters"
     except OSError as error:
-        raise ValueError(error.strerror) from None
-    except ValueError as error:  # the caller names the file
-        raise ValueError(str(error).removeprefix(f"{path}: ")) from None
-    if not _TOKEN.fullmatch(token):
-        raise ValueError("a token is 16 to 512 visible ASCII characters")
+        reason = error.strerror or str(error)
+    except ValueError as error:
+        reason = str(error).removeprefix(f"{path}: ")
+    if reason:
+        make = f"(umask 077; openssl rand -hex 32 > {path})"
+        raise BadInputError(f"{named}: {reason}; make one: {make}")
     return token.decode("ascii")
 
 

@@ -11,10 +11,8 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 from cloudrc.cli.output import print_line
-from cloudrc.errors import BadInputError
 from cloudrc.files import read_token, warn_if_readable
 from cloudrc.teleop.client import VARIABLE
 
@@ -25,38 +23,16 @@ def token_argument(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--token-file", type=Path, metavar="FILE", help=text)
 
 
-class TokenFile(NamedTuple):
-    """A file with a token; `given` is how the user named it, for errors."""
-
-    path: Path
-    given: str
-
-
-def token_file(options: argparse.Namespace) -> TokenFile | None:
-    """Return the token file from the flag, else from the environment, else None."""
-    if path := options.token_file:
-        return TokenFile(path, f"--token-file {path}")
-    if name := os.environ.get(VARIABLE):
-        return TokenFile(Path(name), f"{VARIABLE}={name}")
-    return None
-
-
 def given_token(options: argparse.Namespace) -> Callable[[], str] | None:
     """Return a function that reads the token from the file that the user has named, else None.
 
-    Print a warning if other users can read the file.
+    The flag comes before the environment. Print a warning if other users can read the file.
     """
-    return token_reader(file) if (file := token_file(options)) else None
-
-
-def token_reader(file: TokenFile) -> Callable[[], str]:
-    """Return a function that reads the token from `file`, as `given_token` does."""
-    warn_if_readable(file.path, lambda text: print_line(f"cloudrc: {text}", sys.stderr))
-    return lambda: _read(file)
-
-
-def _read(file: TokenFile) -> str:
-    try:
-        return read_token(file.path)
-    except ValueError as error:
-        raise BadInputError(f"{file.given}: {error}; name another file") from None
+    if path := options.token_file:
+        named = f"--token-file {path}"
+    elif name := os.environ.get(VARIABLE):
+        path, named = Path(name), f"{VARIABLE}={name}"
+    else:
+        return None
+    warn_if_readable(path, lambda text: print_line(f"cloudrc: {text}", sys.stderr))
+    return lambda: read_token(path, named)

@@ -88,19 +88,12 @@ class Tokens:
         for role in (OPERATOR, READER):
             path = self._folder / role
             if role == OPERATOR or path.exists():
-                digest = hashlib.sha256(_read_token(path).encode()).digest()
+                token = read_token(path, f"--tokens: {path}")
+                digest = hashlib.sha256(token.encode()).digest()
                 if digest in known:  # then a reader's token would allow commands
                     raise BadInputError(f"--tokens {self._folder}: both roles have the same token")
                 known[digest] = Caller(role, f"{role}-{digest.hex()[:8]}")
         return known
-
-
-def _read_token(path: Path) -> str:
-    try:
-        return read_token(path)
-    except ValueError as error:
-        make = f"(umask 077; openssl rand -hex 32 > {path})"
-        raise BadInputError(f"--tokens: {path}: {error}; make one: {make}") from None
 
 
 class Gate:

@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.cli import mission as command
-from cloudrc.cli.token_flag import TokenFile, token_reader
+from cloudrc.files import read_token
 from cloudrc.teleop.client import Api
 from tests.conftest import wait_until
 from tests.teleop.conftest import A, B, running
@@ -174,7 +174,7 @@ def test_list_status_and_logs(api, mission):
     assert json.loads(mission("status m1 -o json").out)["events"][1]["event"] == "started"
     assert mission("logs").out == mission("logs m1").out != ""
     assert "no mission 'm9'" in mission("status m9", 5).err
-    events = Api(api.url, token_reader(TokenFile(api.token_file, ""))).events()
+    events = Api(api.url, lambda: read_token(api.token_file, "")).events()
     assert [next(events)["event"] for _ in range(2)] == ["starting", "started"]
     events.close()
 
