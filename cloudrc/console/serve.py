@@ -56,6 +56,8 @@ def serve(
         except BlockingIOError:
             text = "this run has a console already; open its page, or end it first"
             raise BadInputError(text) from None
+        except OSError:  # a network file system may refuse the lock: then nothing is checked
+            pass
         experiment = read_experiment(str(flight.config))
         known = obstacles(scene_of(experiment.world), touch=experiment.mission.touched)
         feed = FlightFeed(tuple(filter(has_surface, known)), known_hull(experiment.world.robot))
