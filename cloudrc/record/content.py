@@ -37,13 +37,6 @@ class Content:
                 f" {quote(str(path))}"
             )
 
-    def unreadable(self, name: str) -> BadInputError:
-        """Return the error that an attachment of an undamaged file is not readable."""
-        return BadInputError(
-            f"{self.source}: its attachment {name} is not readable, as another program has changed"
-            " it; use the recording that cloudrc wrote, or a new copy of it by: cloudrc recover"
-        )
-
     @property
     def note(self) -> str:
         """What is missing or wrong, in words; "" if no message of the flight is missing."""

@@ -11,7 +11,7 @@ import json
 import os
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from io import BufferedReader
 from itertools import pairwise
@@ -27,7 +27,7 @@ from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file
 from cloudrc.record.content import Content
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, of_metadata, union
-from cloudrc.record.ros import converter
+from cloudrc.record.ros import is_known
 from cloudrc.record.topics import TOPICS, VIEWS
 from cloudrc.record.writer import CLOCK, COUNTS, MISSING
 
@@ -67,8 +67,7 @@ class _Reader:
         self._file = _WholeReads(file)
         self._channels: dict[int, mcap.Channel] = {}
         self._schemas: dict[int, mcap.Schema] = {}
-        # Channel -> converter of its messages; None if cloudrc does not record its topic so.
-        self._ours: dict[int, Callable[[bytes], bytes] | None] = {}
+        self._ours: dict[int, bool] = {}  # channel -> whether cloudrc records its topic so
         self._sequences = array("L")
         self._data_ended = False  # whether all messages were read; only the index follows
 
@@ -149,24 +148,22 @@ class _Reader:
         number = message.channel_id
         channel = self._channels[number]
         if number not in self._ours:
-            self._ours[number] = self._converter(channel)
-        convert = self._ours[number]
-        if convert is None:
+            self._ours[number] = self._is_ours(channel)
+        if not self._ours[number]:
             return
         if channel.topic in VIEWS:
             self.content.views.append((channel.topic, message.log_time, message.data))
         else:
-            data = convert(message.data)
-            self.content.messages.append((channel.topic, message.log_time, data))
+            self.content.messages.append((channel.topic, message.log_time, message.data))
             self._sequences.append(message.sequence)
 
-    def _converter(self, channel: mcap.Channel) -> Callable[[bytes], bytes] | None:
-        """Return the converter of a channel's messages; None if cloudrc does not record them so."""
+    def _is_ours(self, channel: mcap.Channel) -> bool:
+        """Return whether cloudrc records the topic of a channel in this layout."""
         topic, schema = TOPICS.get(channel.topic), self._schemas.get(channel.schema_id)
         ros_type = topic.ros_type if topic else VIEWS.get(channel.topic)
         if schema is None or ros_type is None or schema.name != ros_type:
-            return None
-        return converter(ros_type, schema.data.decode("utf-8", "replace"))
+            return False
+        return is_known(ros_type, schema.data.decode("utf-8", "replace"))
 
     def _sort(self) -> None:
         messages = self.content.messages
@@ -183,7 +180,7 @@ class _Reader:
         """
         content = self.content
         metadata = content.metadata
-        others = {self._channels[n].topic for n, convert in self._ours.items() if convert is None}
+        others = {self._channels[n].topic for n, is_ours in self._ours.items() if not is_ours}
         if foreign := sorted(others - TOPICS.keys()):
             told = f"has topics that cloudrc does not record: {_list_some(foreign)}"
             content.remarks += (to_one_line(told),)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from functools import cache, partial
 from typing import Any, TypeAlias
 
@@ -66,59 +65,16 @@ def type_hash(ros_type: str) -> str:
     return STORE.hash_rihs01(ros_type)
 
 
-def converter(ros_type: str, text: str) -> Callable[[bytes], bytes] | None:
-    """Return a function that gives a file's messages the layout that `decode` expects.
-
-    `text` is the definition of the type in the file. A type of cloudrc may have further fields
-    there, as in a file of another version; they are left out. The result is None for any other
-    difference.
-    """
+def is_known(ros_type: str, text: str) -> bool:
+    """Return whether `text`, a type's definition in a file, has the layout of this version."""
     if text == definition(ros_type):
-        return _as_they_are
+        return True
     try:
         found = get_types_from_msg(text, ros_type)
     except Exception:  # rosbags' parser may raise anything on a foreign text
-        return None
-    others = _other_types(found)
-    if not others:
-        return _as_they_are
-    is_longer = others == {ros_type} and _has_all_fields(ros_type, found)
-    return _without_other_fields(ros_type, found) if is_longer and ros_type in _OWN else None
-
-
-def _other_types(found: Any) -> set[str]:
-    """Return the names of the types in `found` that have another layout here."""
+        return False
     known = {name: fields for name, (_, fields) in STORE.fielddefs.items()}
-    return {name for name, (_, fields) in found.items() if known.get(name) != fields}
-
-
-def _has_all_fields(ros_type: str, found: Any) -> bool:
-    """Return whether the type in `found` has all fields of the type here, in their order."""
-    known = STORE.fielddefs[ros_type][1]
-    return [field for field in found[ros_type][1] if field in known] == known
-
-
-def _as_they_are(data: bytes) -> bytes:
-    return data
-
-
-def _without_other_fields(ros_type: str, found: Any) -> Callable[[bytes], bytes]:
-    """Return a function that leaves out the fields of a message that only the type in `found` has.
-
-    It returns malformed bytes as they are; `decode` refuses them.
-    """
-    store, make = get_typestore(Stores.ROS2_JAZZY), _type[ros_type]
-    store.register({ros_type: found[ros_type]})
-    names = [name for name, _ in STORE.fielddefs[ros_type][1]]
-
-    def convert(data: bytes) -> bytes:
-        with suppress(Exception):  # rosbags may raise anything on malformed bytes
-            message = store.deserialize_cdr(data, ros_type)
-            kept = make(*[getattr(message, name) for name in names])
-            return bytes(STORE.serialize_cdr(kept, ros_type, little_endian=True))
-        return data
-
-    return convert
+    return all(known.get(name) == fields for name, (_, fields) in found.items())
 
 
 _SECOND_NS = 1_000_000_000

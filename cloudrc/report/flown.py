@@ -7,7 +7,7 @@ from cloudrc.config.hull import known_hull
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import is_planar
 from cloudrc.config.scene import scene_of
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.geometry.shapes import SHAPES_FILE, Shapes
 from cloudrc.metrics import Flight
 from cloudrc.record.columns import Recording
@@ -32,10 +32,7 @@ def flown_world(recording: Recording, experiment: ResolvedExperiment) -> FlownWo
             them, if the files are missing or unsuitable.
     """
     if (data := recording.attachments.get(FLOWN_FILE)) is not None:
-        try:
-            return FlownWorld.from_bytes(data)
-        except BadInputError as error:
-            raise recording.unreadable(FLOWN_FILE) from error
+        return FlownWorld.from_bytes(data)
     world = experiment.world
     return FlownWorld(scene_of(world), known_hull(world.robot), is_planar(world.robot))
 
@@ -51,10 +48,7 @@ def flown_shapes(recording: Recording, experiment: ResolvedExperiment) -> Shapes
             shapes, if the files are missing or unsuitable.
     """
     if (data := recording.attachments.get(SHAPES_FILE)) is not None:
-        try:
-            return Shapes.from_bytes(data)
-        except BadInputError as error:
-            raise recording.unreadable(SHAPES_FILE) from error
+        return Shapes.from_bytes(data)
     try:
         from cloudrc.world.shapes import read_shapes
 

@@ -90,10 +90,7 @@ def _lacking(recording: Recording, config: Path, *, whole: bool) -> Iterator[str
             " is left, move report.json away"
         )
     if "config.yaml" in recording.attachments:
-        try:
-            there = _flown(recording.attachments["config.yaml"], "config.yaml")
-        except BadInputError as error:
-            raise recording.unreadable("config.yaml") from error
+        there = _flown(recording.attachments["config.yaml"], "config.yaml")
         here = _flown(read(config), str(config))
         if names := sorted(key for key in there | here if there.get(key) != here.get(key)):
             yield f"is the recording of an experiment with other values for: {', '.join(names)}"

@@ -92,25 +92,6 @@ def test_a_report_is_that_of_the_flight_without_the_users_files(run, call):
     assert "No replay in 3-D" not in (folder / "report.html").read_text()
 
 
-def test_a_report_is_that_of_the_flight_after_the_users_files_have_changed(run, call):
-    folder, files, _ = run
-    before = measured(folder)
-    changed = {
-        files / "robot" / "robot.yaml": ("hull_m: 0", "hull_m: 1"),
-        files / "scene.xml": ("</worldbody>", '<body name="x"><geom size="2"/></body></worldbody>'),
-    }
-    texts = {file: file.read_text() for file in changed}
-    for file, (old, new) in changed.items():
-        assert old in texts[file]
-        file.write_text(texts[file].replace(old, new))
-    try:
-        call("report", folder)
-    finally:
-        for file, text in texts.items():
-            file.write_text(text)
-    assert measured(folder) == before
-
-
 def test_a_recording_without_the_numbers_of_the_world_needs_the_users_files(run):
     folder, files, experiment = run
     recording = Recording.read(folder / "mission.mcap")

@@ -127,15 +127,6 @@ def test_a_torn_or_damaged_recording_has_a_report_that_says_so(run, change, said
     assert [line for line in rest if f"The recording is incomplete: {said}" in line]
 
 
-@pytest.mark.parametrize("name", ["config.yaml", "geometry.json", "shapes.npz"])
-def test_an_attachment_that_another_program_broke_is_named_with_its_file(run, refused, name):
-    mission = run / "mission.mcap"
-    recording = Recording.read(mission)
-    recording.attachments[name] = b"\0"
-    recording.write(mission)
-    assert f"{mission}: its attachment {name} is not readable" in refused("report", run)
-
-
 @pytest.mark.parametrize("was_interrupted", [False, True])
 @pytest.mark.parametrize("copies", [False, True])
 def test_a_run_whose_end_is_lost_is_invalid_unless_it_was_interrupted(run, was_interrupted, copies):
