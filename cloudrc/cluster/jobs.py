@@ -95,12 +95,8 @@ def run_job(
     limit = ceil(given) if isinstance(given, int | float) and 0 < given <= 1e6 else LIMIT_MAX
     deadline = limit + START_ALLOWANCE + queue * QUEUE_ALLOWANCE
     job["spec"] |= {"activeDeadlineSeconds": deadline, "ttlSecondsAfterFinished": KEEP_FINISHED}
-    pod = job["spec"]["template"]["spec"]
-    for volume in pod["volumes"]:
-        if "configMap" in volume:
-            volume["configMap"]["name"] = name
     if queue:
-        pod["containers"][0]["args"].append("--queue")
+        job["spec"]["template"]["spec"]["containers"][0]["args"].append("--queue")
     data = {FILE: json.dumps(mission, indent=2) + "\n"}
     create_job(release, job, {"apiVersion": "v1", "kind": "ConfigMap", "data": data})
     return name
@@ -127,19 +123,20 @@ def read_example(release: Release, component: str, name: str) -> tuple[Any, Any]
     # The NetworkPolicies select pods by the labels of the release.
     labels |= {**release.labels(component), "app.kubernetes.io/managed-by": "cloudrc"}
     template["metadata"]["labels"] = labels
-    for volume in template["spec"]["volumes"]:
-        if "configMap" in volume:
-            volume["configMap"]["name"] = name
     job["metadata"]["name"] = name
     return files, job
 
 
 def create_job(release: Release, job: Any, files: Any) -> None:
-    """Create a Job, and `files` as a ConfigMap of the same name.
+    """Create a Job, and `files` as a ConfigMap of the same name, which its pods mount.
 
     If the ConfigMap cannot be created, delete the Job.
     """
-    name, created = job["metadata"]["name"], release.request("create", "jobs", body=job)
+    name = job["metadata"]["name"]
+    for volume in job["spec"]["template"]["spec"]["volumes"]:
+        if "configMap" in volume:
+            volume["configMap"]["name"] = name
+    created = release.request("create", "jobs", body=job)
     owner = owner_of("batch/v1", "Job", created)
     labels = job["metadata"]["labels"]
     files["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}

@@ -31,7 +31,7 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
-from cloudrc.records import Counted, GroundTruth, GuardChange, MissionEvent, Record
+from cloudrc.records import CommandApplied, Counted, GroundTruth, GuardChange, MissionEvent, Record
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import MissionRecord, Order
 from cloudrc.tunnel.end import Identity
@@ -157,6 +157,10 @@ class FaultRun:
     def trajectory(self) -> list[GroundTruth]:
         """Return the records of the ground truth, one every 10 ms."""
         return [record for record in self.of_world if isinstance(record, GroundTruth)]
+
+    def applied(self) -> list[CommandApplied]:
+        """Return the records of the commands that world has applied."""
+        return [record for record in self.of_world if isinstance(record, CommandApplied)]
 
     def count(self, name: str) -> int:
         """Return the last value of world's counter `name` [1]; 0 if it was never recorded."""

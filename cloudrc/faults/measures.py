@@ -17,7 +17,7 @@ from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.schedule import Schedule, generator
 from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
-from cloudrc.records import CommandApplied, Fault, GuardChange, Record, SessionOpened
+from cloudrc.records import Fault, GuardChange, Record, SessionOpened
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 from cloudrc.text import Paint, escape, plain
@@ -229,10 +229,9 @@ def held(flight: FaultRun) -> list[GuardChange]:
 
 def basis_age_at_hold(flight: FaultRun) -> float:
     """Return the largest age that the commands' newest odometry had when a HOLD began [s]."""
-    applied = [(r.stamp_ns, r.basis_stamp_ns) for r in flight.of_world if type(r) is CommandApplied]
-    ages = []
+    applied, ages = flight.applied(), []
     for change in held(flight):
-        before = [basis_ns for stamp_ns, basis_ns in applied if stamp_ns <= change.stamp_ns]
+        before = [each.basis_stamp_ns for each in applied if each.stamp_ns <= change.stamp_ns]
         ages += [(change.stamp_ns - max(before)) * 1e-9] if before else []
     return max(ages, default=nan)
 

@@ -20,7 +20,7 @@ from cloudrc.faults.schedule import FaultEvent, Way, generator
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.geometry.scene import Tube
 from cloudrc.messages import Command, GuardState, Vector
-from cloudrc.records import CommandApplied, Control, Fault
+from cloudrc.records import Control, Fault
 from cloudrc.tunnel.handshake import BUSY_TEXT
 
 IMPOSSIBLE: dict[str, dict[str, Any]] = {
@@ -45,7 +45,7 @@ def _cloud_killed(outcome: Outcome) -> None:
     at, down = outcome.instant(), 0.8
     flight = outcome.fly(events=(FaultEvent("cloud_killed", at, down),))
     outcome.held_in_time(flight)
-    commands = [r.stamp_ns * 1e-9 - at for r in flight.of_world if isinstance(r, CommandApplied)]
+    commands = [r.stamp_ns * 1e-9 - at for r in flight.applied()]
     again = min((t for t in commands if t > down), default=nan)
     outcome.most("the new process commands after", again, 2.0, "s")
     outcome.most("TRACK again after its start", measures.resumed_after(flight, at + down), 1.0, "s")
@@ -62,8 +62,7 @@ def _cloud_paused(outcome: Outcome) -> None:
     paused = FaultEvent("cloud_paused", outcome.instant(), 5.0)
     flight = outcome.fly(events=(paused,))
     outcome.held_in_time(flight)
-    applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
-    old = [r for r in applied if r.stamp_ns - r.basis_stamp_ns > measures.AGE_MAX * 1e9]
+    old = [r for r in flight.applied() if r.stamp_ns - r.basis_stamp_ns > measures.AGE_MAX * 1e9]
     outcome.same("commands applied that were too old", len(old), 0)
 
 
