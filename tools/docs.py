@@ -29,7 +29,7 @@ from cloudrc.config.profile import DirectionConfig, Profile
 from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import Experiment, MissionConfig
 from cloudrc.exposition.table import METRICS, ROLES
-from cloudrc.metrics.definitions import QUANTITIES, Quantity
+from cloudrc.metrics.definitions import QUANTITIES, RecordQuantity
 from cloudrc.record.topics import TOPICS
 from tools.chart_values import make_schema, table_rows
 
@@ -161,7 +161,7 @@ def _experiment() -> str:
     return "\n".join(blocks)
 
 
-def panels(quantities: Iterable[Quantity]) -> str:
+def panels(quantities: Iterable[RecordQuantity]) -> str:
     """Format the panels of the dashboard that quantities have."""
     texts = []
     for each in quantities:

@@ -94,7 +94,7 @@ def prediction_error(
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class RecordQuantity:
     """A quantity with a value for each record of a class, and where people see it.
 
     Its number is in report, page, sweeps and `cloudrc list metrics`, its newest value in flight.
@@ -119,14 +119,14 @@ class Quantity:
 
 
 QUANTITIES = (
-    Quantity(
+    RecordQuantity(
         GroundTruth,
         lambda row: row.odometry.position,
         "m",
         live="cloudrc_position_meters[axis]",
         now="True position of the base, world frame.",
     ),
-    Quantity(
+    RecordQuantity(
         GroundTruth,
         lambda row: row.odometry.velocity,
         "m/s",
@@ -135,14 +135,14 @@ QUANTITIES = (
         "Largest true speed of the robot's base.",
         "Mission",
     ),
-    Quantity(
+    RecordQuantity(
         Control,
         lambda row: row.horizon,
         "s",
         live="cloudrc_delay_estimate_seconds",
         now="Clamped delay estimate: how far ahead cloud predicts the odometry.",
     ),
-    Quantity(
+    RecordQuantity(
         Control,
         lambda row: tracking_error(row.setpoint, row.measured),
         "m",
@@ -153,7 +153,7 @@ QUANTITIES = (
         now="Setpoint minus measured position, in the newest period.",
         chart=("Tracking error [m]", 1.0, 0.2),
     ),
-    Quantity(
+    RecordQuantity(
         Control,
         lambda row: tracking_error(row.setpoint, row.position),
         "m",
@@ -161,21 +161,21 @@ QUANTITIES = (
         "rms",
         "RMS distance between the setpoint and cloud's estimated position.",
     ),
-    Quantity(
+    RecordQuantity(
         Control,
         lambda row: row.setpoint,
         "m",
         live="cloudrc_setpoint_meters[axis]",
         now="Position setpoint, world frame.",
     ),
-    Quantity(
+    RecordQuantity(
         Control,
         lambda row: row.command,
         "m/s",
         live="cloudrc_command_velocity_meters_per_second[axis]",
         now="Commanded velocity, world frame.",
     ),
-    Quantity(
+    RecordQuantity(
         Control,
         lambda row: row.yaw_rate,
         "rad/s",

@@ -24,7 +24,7 @@ from cloudrc.geometry.obstacles import Obstacle, has_surface, obstacles
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
 from cloudrc.metrics.counters import growth
-from cloudrc.metrics.definitions import QUANTITIES, Quantity
+from cloudrc.metrics.definitions import QUANTITIES, RecordQuantity
 from cloudrc.record.columns import Recording, Table, datagrams, join
 from cloudrc.record.holes import Hole
 from cloudrc.record.topics import BY_SOURCE
@@ -356,7 +356,7 @@ def add_quantities() -> None:
             add_metrics(each.group, row, **{each.name: each.label})
 
 
-def _statistic(quantity: Quantity, flight: Flight) -> float | None:
+def _statistic(quantity: RecordQuantity, flight: Flight) -> float | None:
     found = quantity.value(flight.rows(quantity.source))
     values = np.stack(found, axis=1) if isinstance(found, tuple) else np.asarray(found)
     if quantity.statistic == "rms":

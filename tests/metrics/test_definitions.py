@@ -30,7 +30,7 @@ from cloudrc.metrics.definitions import (
     DatagramTally,
     Echoes,
     PredictionJudge,
-    Quantity,
+    RecordQuantity,
     real_time_factor,
 )
 from cloudrc.metrics.flight import _statistic
@@ -142,7 +142,7 @@ def test_the_real_time_factor_is_simulated_time_over_machine_time():
 
 
 def test_one_row_is_a_number_a_live_metric_and_a_panel():
-    row = Quantity(
+    row = RecordQuantity(
         Control,
         lambda row: row.horizon,
         "s",
