@@ -198,6 +198,7 @@ night-netem:
 lint: $(VENV)/dev ## check format and rules
 	$(bin)/ruff format --check .
 	$(bin)/ruff check .
+	$(bin)/lint-imports
 	$(bin)/hadolint images/*/Dockerfile
 	$(bin)/shellcheck $(SCRIPTS)
 	@if command -v actionlint >/dev/null; then actionlint -ignore SC1090; \

@@ -9,103 +9,12 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from importlinter.cli import lint_imports
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "cloudrc"
 FILES = sorted(PACKAGE.rglob("*.py"))
 TREES = {path: ast.parse(path.read_text()) for path in FILES}
-EVERYTHING = {"*"}
-
-# Part of cloudrc -> the parts it may import besides itself, errors, messages and records. A module
-# with a row of its own is no longer a part of its package.
-MAY_IMPORT: dict[str, set[str]] = {
-    "errors": set(),
-    "messages": set(),
-    "outside": {"files"},
-    "records": set(),
-    "rounding": set(),
-    "source": set(),
-    "text": set(),
-    "version": set(),
-    "endpoint": set(),
-    "files": set(),
-    "geometry": set(),
-    "geometry.vectors": set(),
-    "plugins": set(),
-    "tunnel": {"endpoint"},
-    "link": {"files", "tunnel"},
-    "config": {"plugins", "geometry", "link", "files", "policy.address"},
-    "world": {
-        "endpoint",
-        "tunnel",
-        "config",
-        "plugins",
-        "geometry",
-        "geometry.vectors",
-        "files",
-        "metrics.definitions",
-    },
-    "robots": {
-        *("world", "config", "geometry", "geometry.vectors", "files", "plugins", "cloud.motion"),
-    },
-    "cloud.motion": {"cloud"},
-    "cloud": {
-        *("cloud.motion", "endpoint", "geometry.vectors", "tunnel", "config", "plugins", "teleop"),
-    },
-    "teleop": {"config", "files", "geometry", "geometry.vectors", "metrics"},
-    "policy": {"plugins", "policy.address"},
-    "policy.address": set(),
-    "exposition": {"metrics.definitions"},
-    "drivers": {
-        *("endpoint", "tunnel", "link", "exposition", "files", "policy", "policy.address"),
-        *("metrics.definitions", "record", "teleop"),
-    },
-    "bridges": {
-        *("config", "console", "drivers", "geometry.vectors", "link", "metrics.definitions"),
-        *("policy", "record", "report"),
-    },
-    "record": {"endpoint", "files"},
-    "metrics": {"metrics.definitions", "record", "config", "geometry", "plugins"},
-    "metrics.definitions": set(),  # live metrics import it in every process, with no heavy library
-    "report": {
-        *("assembly", "record", "metrics", "config", "geometry", "link", "files", "console"),
-        "world",
-    },
-    "console": {
-        *("config", "drivers", "exposition", "files", "geometry", "metrics.definitions"),
-        *("teleop", "world"),
-    },
-    "cluster": {"config", "geometry", "link", "record", "report", "teleop"},
-    "statistics": set(),
-    "runs": {
-        *("ages", "assembly", "bridges", "cloud", "cluster", "config", "drivers", "files"),
-        *("geometry", "link"),
-        *("metrics", "plugins", "record", "report", "robots", "statistics"),
-        *("teleop", "tunnel", "warnings", "world"),
-    },
-    "gym": {
-        *("assembly", "cloud", "config", "drivers", "endpoint", "link", "metrics", "plugins"),
-        *("record", "report", "runs"),
-    },
-    "eval": {
-        *("config", "files", "gym", "link", "plugins", "policy"),
-        *("policy.address", "report", "runs", "statistics"),
-    },
-    "assembly": EVERYTHING,
-    "ages": {"assembly", "config", "link", "tunnel"},
-    "warnings": {"ages", "assembly", "config", "link", "robots", "tunnel"},
-    "api": {"runs", "cluster", "config", "metrics", "plugins", "record", "report"},
-    "processes": EVERYTHING,
-    "exercise": {"cloud", "config", "drivers", "files", "plugins", "runs"},
-    "faults": EVERYTHING,
-    "cli": EVERYTHING,
-    "__main__": {"cli"},
-    "__init__": {"api"},
-}
-ALWAYS = {
-    *("errors", "messages", "outside", "records", "rounding", "source", "text"),
-    "version",
-}
 
 ROS = (
     *("rclpy", "diagnostic_msgs", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs"),
@@ -183,97 +92,20 @@ def imports(tree):
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def part_of(name):
-    """Return the part of cloudrc to which a dotted name or a place belongs; "" if there is none."""
-    words = name.removesuffix(".py").replace("/", ".").split(".")
-    return next((part for part in (".".join(words[:2]), words[0]) if part in MAY_IMPORT), "")
+def test_the_parts_hold_the_contracts_of_pyproject():
+    """Layers, circles and walls: `lint-imports` explains what breaks one."""
+    assert lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True) == 0
 
 
-def violations(place, tree):
-    """Return the forbidden imports of a file at `place`, a path below cloudrc/."""
-    part = part_of(place)
-    allowed = MAY_IMPORT[part] | ALWAYS | {part}
-    found = []
-    for name in imports(tree):
-        top, _, rest = name.partition(".")
-        known = part_of(rest) or rest.split(".")[0]
-        if top == "cloudrc" and known not in allowed and "*" not in allowed:
-            found.append(f"imports {name}")
-        for reserved, places in RESERVED.items():
-            if f"{name}.".startswith(f"{reserved}.") and not place.startswith(places):
-                found.append(f"imports {name}")
-    return found
-
-
-def test_a_file_imports_only_allowed_modules():
-    found = {place_of(path): violations(place_of(path), tree) for path, tree in TREES.items()}
-    assert {place: breaches for place, breaches in found.items() if breaches} == {}
-
-
-def run_time_nodes(node):
-    """Yield the nodes of a file, also inside of functions, but not what only type checkers see."""
-    yield node
-    is_typing = isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
-    for child in node.orelse if is_typing else ast.iter_child_nodes(node):
-        yield from run_time_nodes(child)
-
-
-def imported_files(tree, names):
-    """Return those of the dotted `names` of files that a file imports itself."""
-    found = set()
-    for node in run_time_nodes(tree):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            inner = {f"{node.module}.{alias.name}": node.module for alias in node.names}
-            found |= {name if name in names else package for name, package in inner.items()}
-    return found & names
-
-
-def circles(trees):
-    """Return the groups of files that import each other; `trees`: dotted name -> tree."""
-    graph = {name: imported_files(tree, trees.keys()) for name, tree in trees.items()}
-    reached = {}
-    for name in graph:
-        reached[name], waiting = set(), [name]
-        while waiting:
-            new = graph[waiting.pop()] - reached[name]
-            reached[name] |= new
-            waiting += new
-    return {
-        tuple(sorted(other for other in reached[name] if name in reached[other]))
-        for name in graph
-        if name in reached[name]
-    }
-
-
-def test_no_files_import_each_other_in_a_circle():
-    names = {path: ".".join(path.relative_to(ROOT).with_suffix("").parts) for path in FILES}
-    trees = {names[path].removesuffix(".__init__"): tree for path, tree in TREES.items()}
-    assert circles(trees) == set()
-
-
-@pytest.mark.parametrize(
-    ("last", "found"),
-    [
-        ("from own.a import f", {("own.a", "own.b", "own.c")}),
-        ("def f():\n    from own import a", {("own.a", "own.b", "own.c")}),
-        ("class C:\n    import own.a as other", {("own.a", "own.b", "own.c")}),
-        ("import own.c", {("own.c",)}),
-        ("if TYPE_CHECKING:\n    from own import a", set()),
-        ("if typing.TYPE_CHECKING:\n    x = 1\nelse:\n    import own.b", {("own.b", "own.c")}),
-        ("import other.a", set()),
-    ],
-)
-def test_a_circle_of_files_is_found_wherever_the_import_is(last, found):
-    sources = {
-        "own": "",
-        "own.a": "from own import b",
-        "own.b": "def f():\n    from own.c import g",
-        "own.c": last,
-        "own.d": "import own.a",
-    }
-    assert circles({name: ast.parse(source) for name, source in sources.items()}) == found
+def test_a_reserved_package_is_imported_only_in_its_places():
+    found = [
+        f"{place_of(path)} imports {name}"
+        for path, tree in TREES.items()
+        for name in imports(tree)
+        for reserved, places in RESERVED.items()
+        if f"{name}.".startswith(f"{reserved}.") and not place_of(path).startswith(places)
+    ]
+    assert found == []
 
 
 def test_live_metrics_load_neither_recordings_nor_heavy_libraries():
