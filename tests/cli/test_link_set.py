@@ -37,7 +37,6 @@ def traced(tmp_path):
     [
         ("uplink.loss=0.02 link.uplink.delay_ms=60", "uplink", {"delay_ms": 60.0, "loss": 0.02},
          []),
-        ("uplink.loss=0.02", "downlink", TIMED["downlink"], []),
         ("uplink.loss=1", "uplink", {"delay_ms": 40.0, "loss": 1.0},
          ["the uplink loses 100 % of its packets: its loss is a share from 0 to 1, so 1 % is"
           " 0.01 (link.uplink.loss)"]),
@@ -80,7 +79,6 @@ def test_a_profile_takes_the_place_of_all_values():
     [
         ([], "nothing to set"),
         (["delay_ms=3"], "delay_ms: set a key of uplink or downlink"),
-        (["uplink.delay=3"], "delay_ms"),
         (["loss"], r"must be key=value; for example downlink\.delay_ms=120$"),
         (["uplink.loss=1.5"], "link set: uplink.loss: 1.5"),
     ],

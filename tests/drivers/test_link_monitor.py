@@ -10,7 +10,7 @@ from cloudrc.link.verify.judge import netem_makes
 from cloudrc.records import Lateness, LinkChecked, Record
 from tests.console.conftest import control
 from tests.link.profiles import changed, profile_of
-from tests.link.verify.conftest import PERIOD_NS, arrivals, asked, checked, hearing, is_believed
+from tests.link.verify.conftest import arrivals, asked, checked, hearing, is_believed
 
 PAPER = asked("paper-p2", "downlink")
 
@@ -65,18 +65,6 @@ def test_simulated_compute_time_is_no_delay_of_the_link():
     assert faults == []
     assert "loss" in moments[-1]
     assert not {"mean", "deviation"} & moments[-1].keys()
-
-
-def test_a_slower_flow_has_its_own_period():
-    """Without a common clock, the period gives the times of sending."""
-    ways = {"up": PAPER, "down": PAPER, "uplink": True}
-    slow = [
-        one._replace(stamp_ns=one.stamp_ns + one.counter * PERIOD_NS, delay=nan)
-        for one in arrivals(PAPER, uplink=True)
-    ]
-    moments, faults = checked(hearing(**ways, period=2 * PERIOD_NS * 1e-9), sorted(slow))
-    assert faults == []
-    assert moments[-1]["reordered"].verdict == "ok"
 
 
 def test_a_new_session_starts_undecided():

@@ -174,7 +174,7 @@ def test_the_delay_is_applied_to_the_tunnels_flow_alone(shaped):
     assert least(off, WITHIN) < WITHIN
 
 
-@pytest.mark.parametrize("distribution", ["pareto", "table"])
+@pytest.mark.parametrize("distribution", ["uniform", "normal", "pareto", "table"])
 def test_jitter_is_distributed_as_asked(shaped, distribution):
     drawn = np.sort(np.random.default_rng(5).gamma(2.0, size=2000))
     measured = (drawn - drawn.mean()) / drawn.std()

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.streams import numbers
 from cloudrc.link.trace_logs import (
     Packets,
     is_ping,
@@ -144,33 +143,14 @@ def test_irtt_gives_the_delays_of_each_direction(direction, sent, delays):
     assert lost == {"uplink": [1, 3], "downlink": [1, 2], None: [1, 2, 3]}[direction]
 
 
-def test_losses_on_the_way_back_are_no_losses_of_the_uplink():
-    fates = ["false"] * 100 + ["true_down"] * 40 + ["true_up"] * 10 + ["false"] * 50
-    trips = [trip(n, fate if fate != "false" else False) for n, fate in enumerate(fates)]
-    up, down = irtt(trips, "uplink"), irtt(trips, "downlink")
-    assert up.notes == ("40 lost on the way back, delay unknown",)
-    assert down.notes == ()
-    assert numbers(up).loss == pytest.approx(10 / 200)
-    assert numbers(up).runs == (10,)
-    assert numbers(down).loss == pytest.approx(40 / 190)
-    assert sum(trace_of(up).losses) == 10
-
-
-NO_STAMPS = [trip(0)]
-del NO_STAMPS[0]["delay"]["send"]
-
-
 @pytest.mark.parametrize("direction", ["uplink", "downlink"])
-@pytest.mark.parametrize(
-    ("trips", "says"),
-    [
-        ([trip(0, send=60, receive=-5)], "arrived 5 ms before it was sent: the two clocks dif"),
-        (NO_STAMPS, r"server sent no stamps.*--halve-rtt"),
-    ],
-)
-def test_irtt_without_good_clocks_is_refused(trips, says, direction):
-    with pytest.raises(BadInputError, match=says):
-        irtt(trips, direction)
+def test_irtt_without_good_clocks_is_refused(direction):
+    with pytest.raises(BadInputError, match="arrived 5 ms before it was sent: the two clocks dif"):
+        irtt([trip(0, send=60, receive=-5)], direction)
+    unstamped = trip(0)
+    del unstamped["delay"]["send"]
+    with pytest.raises(BadInputError, match=r"server sent no stamps.*--halve-rtt"):
+        irtt([unstamped], direction)
 
 
 @pytest.mark.parametrize("text", ["{", "{}", '{"round_trips": [{}]}'])
@@ -246,7 +226,6 @@ FIVE = [reply(number, number / 5) for number in range(1, 6)]
     [
         ([HEAD], "has no replies"),
         ([HEAD, *FIVE, HEAD], "more than one session of ping"),
-        ([*FIVE, reply(1, 900.0)], "more than one session of ping"),
         (
             [reply(n, 50.0 + n - 10.0 * (n > 5)) for n in range(1, 12)],
             "at packet 6 the times go back by 9 s: .* a step of the clock",

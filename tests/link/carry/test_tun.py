@@ -166,12 +166,6 @@ def test_a_relay_that_loses_packets_by_itself_is_not_believed():
     assert verdicts(log, profile)["loss"] == "off"
 
 
-def test_few_packets_give_no_verdict_and_none_give_no_row():
-    profile = profile_of(0.040)
-    assert set(verdicts(log_of(profile, count=100), profile).values()) == {"open"}
-    assert judge_packets(PacketLog(), Period(profile, 7, True, 0, 0)) == []
-
-
 @pytest.mark.parametrize(
     ("rate", "waits"),
     [

@@ -129,11 +129,6 @@ def test_directions_are_told_apart(up, down, known, causes):
     assert [(cause.code, cause.way) for cause in found] == causes
 
 
-def test_too_few_or_dead_probes_decide_nothing():
-    assert verdict_of(rows_of(PAPER, PAPER, seconds=1.0)) == "open"
-    assert ("mean", "open") in doubts(rows_of(PAPER, changed(PAPER, loss=1.0)))
-
-
 def test_a_quantity_is_off_only_after_two_measurements():
     good, slow, lossy = (
         rows_of(PAPER, changed(PAPER, **values))
