@@ -32,6 +32,7 @@ from cloudrc.exposition.table import METRICS, ROLES
 from cloudrc.metrics.definitions import QUANTITIES, RecordQuantity
 from cloudrc.record.topics import TOPICS
 from tools.chart_values import make_schema, table_rows
+from tools.dashboards import UNITS
 
 ROOT = Path(__file__).resolve().parents[1]
 CHART = ROOT / "charts" / "cloudrc"
@@ -73,8 +74,6 @@ _STAMPS = {
 }  # fmt: skip
 SAMPLING = {name: about for about, names in _STAMPS.items() for name in names.split()}
 """Topic -> meaning of a row's stamp, and when a row is written."""
-GRAFANA_UNITS = {"m": "lengthm", "s": "s", "m/s": "velocityms", "N": "forceN"}
-"""Unit -> its name in Grafana."""
 OPEN = {
     "version": "the version",
     "config": "the first 12 digits of the SHA-256 of the process's configuration with all "
@@ -85,6 +84,8 @@ OPEN = {
     "body": "the name of the body in the scene",
 }
 """Label of a metric that has too many values for a list -> description of the values."""
+GRAFANA = {symbol: name for name, symbol in UNITS.items()}
+"""Symbol of a unit -> its name in Grafana."""
 COPIED = ("profile", "mission")
 """Kinds of shipped files of which the chart has copies."""
 
@@ -168,7 +169,7 @@ def panels(quantities: Iterable[RecordQuantity]) -> str:
         if each.panel:
             legend = "{{axis}}" if "[axis]" in each.live else "value"
             query = each.live.partition("[")[0] + "{$pods}"
-            panel = {"title": each.panel, "unit": GRAFANA_UNITS.get(each.unit, "short")}
+            panel = {"title": each.panel, "unit": GRAFANA.get(each.unit, "short")}
             panel |= {"queries": {legend: query}}
             text = yaml.safe_dump([panel], sort_keys=False, width=100)
             texts.append(re.sub("^", "  ", text, flags=re.MULTILINE).rstrip(" "))

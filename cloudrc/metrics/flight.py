@@ -137,7 +137,13 @@ class Flight:
 
     def during(self, topic: str) -> Columns:
         """Select the rows of a topic from the first to the last instant of the flight."""
-        return self._within(_columns(self.recording[topic]))
+        if topic not in self._during:  # fifty metrics ask for ten topics
+            self._during[topic] = self._within(_columns(self.recording[topic]))
+        return self._during[topic]
+
+    @cached_property
+    def _during(self) -> dict[str, Columns]:
+        return {}
 
     def true_position(self, stamp_ns: Array) -> Array:
         """Interpolate the base's true position at `stamp_ns` [ns], world's clock, shape (n,).

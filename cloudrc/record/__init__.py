@@ -6,7 +6,6 @@ Only the modules `ros`, `writer` and `reader` need the packages of `cloudrc[reco
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 
 WALL_OFFSET = "wall_clock_offset_ns"
@@ -19,7 +18,7 @@ def wall_time(metadata: Mapping[str, str], stamp_ns: int) -> datetime | None:
 
     The result ignores the lag of world's clock (`slip_ns`) and later steps of the wall clock.
     """
-    with suppress(ValueError, OverflowError):
-        micros = (int(metadata.get(WALL_OFFSET, "")) + stamp_ns) // 1000
-        return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=micros)
-    return None
+    if WALL_OFFSET not in metadata:
+        return None
+    micros = (int(metadata[WALL_OFFSET]) + stamp_ns) // 1000
+    return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=micros)

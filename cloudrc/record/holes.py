@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 HOLES = "holes"
 """Metadata key: start and end of each hole as JSON [ns]."""
@@ -76,15 +76,4 @@ def to_metadata(holes: Iterable[Hole]) -> dict[str, str]:
 
 def of_metadata(metadata: Mapping[str, str]) -> tuple[Hole, ...] | None:
     """Return the holes that a file's metadata name; None if they say nothing about holes."""
-    if HOLES not in metadata:
-        return None
-    try:
-        return tuple(_hole(*pair) for pair in json.loads(metadata[HOLES]))
-    except (ValueError, TypeError, RecursionError):  # the file may come from somebody else
-        return (SOMEWHERE,)
-
-
-def _hole(begin_ns: Any, end_ns: Any) -> Hole:
-    if not (isinstance(begin_ns, int) and isinstance(end_ns, int) and begin_ns <= end_ns):
-        raise ValueError(f"no hole: {begin_ns} to {end_ns}")
-    return Hole(max(begin_ns, 0), min(end_ns, END_NS))
+    return tuple(Hole(*pair) for pair in json.loads(metadata[HOLES])) if HOLES in metadata else None

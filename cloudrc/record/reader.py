@@ -12,7 +12,6 @@ import os
 from array import array
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
 from io import BufferedReader
 from itertools import pairwise
 from pathlib import Path
@@ -227,11 +226,7 @@ def read(path: Path) -> Content:
 
 def _stored_counts(content: Content) -> Counter[str]:
     """Return the number of messages by topic that the writer has noted; empty if it has not."""
-    with suppress(ValueError, RecursionError):
-        stored = json.loads(content.metadata.get(COUNTS) or "{}")
-        if isinstance(stored, dict):
-            return Counter({t: n for t in TOPICS if isinstance(n := stored.get(t), int)})
-    return Counter()
+    return Counter(json.loads(content.metadata.get(COUNTS) or "{}"))
 
 
 def _list_some(topics: list[str]) -> str:

@@ -103,10 +103,10 @@ def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
     method = metadata.get("clock_offset_method", "same clock")
     if method == "same clock":
         return None
-    known = None
-    with suppress(KeyError, ValueError, OverflowError):  # the file may come from somebody else
-        known = {"value": int(metadata["clock_offset_uncertainty_ns"]) * 1e-9, "unit": "s"}
-    return _known({"method": method, "uncertainty": known})
+    found: dict[str, Any] = {"method": method}
+    if uncertainty := metadata.get("clock_offset_uncertainty_ns"):
+        found["uncertainty"] = {"value": int(uncertainty) * 1e-9, "unit": "s"}
+    return found
 
 
 def environment_document(

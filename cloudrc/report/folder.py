@@ -13,14 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import TypeAdapter
 
 from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import BadInputError
 from cloudrc.files import read
-from cloudrc.metrics.flight import CONTROL_TOPICS
 from cloudrc.outside.document import parse_yaml
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
@@ -94,10 +92,6 @@ def _lacking(recording: Recording, config: Path, *, whole: bool) -> Iterator[str
         here = _flown(read(config), str(config))
         if names := sorted(key for key in there | here if there.get(key) != here.get(key)):
             yield f"is the recording of an experiment with other values for: {', '.join(names)}"
-    for topic in ("/ground_truth", *CONTROL_TOPICS):
-        steps = np.diff(recording[topic]["stamp_ns"])
-        if wrong := int((steps < (topic == "/ground_truth")).sum()):
-            yield f"has {wrong} rows on {topic} that are not later than the row before"
 
 
 def _flown(data: bytes, name: str) -> dict[str, Any]:
@@ -121,6 +115,6 @@ def _read_facts(recording: Recording) -> Run:
     A torn recording may not contain them. Then assume a local run if the recording has rows on
     /lateness, else a virtual run.
     """
-    with suppress(ValueError):
-        return TypeAdapter(Run).validate_json(recording.metadata.get(RUN, ""))
+    if facts := recording.metadata.get(RUN):
+        return TypeAdapter(Run).validate_json(facts)
     return Run("local", "relay") if len(recording["/lateness"]) else Run("virtual", "virtual")

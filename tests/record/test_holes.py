@@ -1,13 +1,11 @@
 """A recording knows the times in which its messages are lost, and every copy of it knows them."""
 
-import json
-
 import pytest
 from mcap.reader import make_reader
 
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
-from cloudrc.record.holes import END_NS, HOLES, SOMEWHERE, Hole, describe, of_metadata, union
+from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, describe, union
 from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.record.writer import COUNTS, McapWriter
 from cloudrc.records import Counted, MissionEvent
@@ -68,12 +66,6 @@ def test_a_copy_that_was_torn_again_is_counted_by_its_own_writer(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     found = Recording.read(path)
     assert found.holes == (Hole(found.messages[-1][1], END_NS),)
-
-
-@pytest.mark.parametrize("noted", ["[[1]]", "[[5, 1]]", '["a", 3]', "{", "3", "[[1.5, 2]]"])
-def test_strange_holes_in_the_metadata_are_holes_somewhere(noted):
-    assert of_metadata({HOLES: noted}) == (SOMEWHERE,)
-    assert of_metadata({HOLES: json.dumps([Hole(1, 2)])}) == (Hole(1, 2),)
 
 
 def test_a_merged_recording_has_the_holes_of_both_ends_on_worlds_clock(tmp_path):
