@@ -13,7 +13,14 @@ import pytest
 from tests.conftest import nightly
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", "docs/experiment.md", "docs/plugins.md", "docs/scene.md")
+PAGES = (
+    "README.md",
+    "docs/experiment.md",
+    "docs/plugins.md",
+    "docs/plugins-predictor.md",
+    "docs/plugins-controller.md",
+    "docs/scene.md",
+)
 TEXT = "\n".join((ROOT / page).read_text() for page in PAGES)
 
 BLOCK = re.compile(r"(?:<!-- test: (\S+) -->\n)?```(\w+)\n(.*?)```", re.DOTALL)
