@@ -1,11 +1,20 @@
-"""`make api` sees what breaks a caller of a public module, and nothing else."""
+"""`make api` sees what breaks a caller of a public name, and nothing else."""
+
+import re
 
 import griffe
 import pytest
 
-from tools.api import PAGE, breaking_changes, public_modules
+from tools.api import PAGE, breaking_changes, public_names
 
-BEFORE = "def load(name, folder=None): ...\nclass Kept:\n    size = 1\n"
+ROOT = PAGE.parents[1]
+PAGES = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+BEFORE = """
+def load(name, folder=None) -> Kept: ...
+class Kept:
+    size = 1
+    _own = 2
+"""
 
 
 def visit(source):
@@ -20,34 +29,42 @@ def visit(source):
         (BEFORE + "def more(): ...\n", 0),
         (BEFORE.replace(", folder=None", ""), 1),
         (BEFORE.replace("load", "read"), 1),
-        (BEFORE.replace("    size = 1\n", "    pass\n"), 1),
+        (BEFORE.replace("    size = 1\n", ""), 1),
+        (BEFORE.replace("    _own = 2\n", ""), 0),
     ],
 )
-def test_a_change_of_a_public_module_is_told_if_it_breaks_a_caller(source, told):
+def test_a_change_of_a_public_name_is_told_if_it_breaks_a_caller(source, told):
     before, now = visit(BEFORE), visit(source)
-    assert len(list(breaking_changes(before, now, {"cloudrc"}))) == told
+    assert len(list(breaking_changes(before, now, {"cloudrc.load"}))) == told
     assert not list(breaking_changes(before, now, {"cloudrc.other"}))
 
 
-@pytest.mark.parametrize(("now", "told"), [("from own.api import fly\n", 0), ("", 1)])
-def test_a_name_that_a_module_no_longer_hands_on_is_told_there(now, told):
-    def package(source):
-        files = {"__init__.py": source, "api.py": "def fly(): ...\n"}
-        return griffe.temporary_visited_package("own", files)
+@pytest.mark.parametrize(
+    ("package", "defined", "told"),
+    [
+        ("from own.api import fly\n", "def fly(): ...\n", 0),
+        ("", "def fly(): ...\n", 1),
+        ("from own.api import fly\n", "def fly(mode): ...\n", 1),
+    ],
+)
+def test_a_name_that_a_package_hands_on_is_compared(package, defined, told):
+    def packed(source, api):
+        return griffe.temporary_visited_package("own", {"__init__.py": source, "api.py": api})
 
     exported = '__all__ = ["fly"]\n'
     with (
-        package(f"from own.api import fly\n{exported}") as before,
-        package(now + exported * bool(now)) as after,
+        packed(f"from own.api import fly\n{exported}", "def fly(): ...\n") as before,
+        packed(package + exported * bool(package), defined) as after,
     ):
-        assert len(list(breaking_changes(before, after, {"own"}))) == told
+        assert len(list(breaking_changes(before, after, {"own.fly"}))) == told
 
 
-def test_the_page_lists_modules_that_exist():
-    assert "cloudrc" in public_modules(PAGE.read_text())
-    root = PAGE.parents[1]
-    modules = public_modules(PAGE.read_text())
-    assert modules
-    for module in modules:
-        path = root.joinpath(*module.split("."))
-        assert path.with_suffix(".py").is_file() or (path / "__init__.py").is_file(), module
+def test_the_page_lists_names_that_exist_and_all_that_examples_of_the_docs_import():
+    listed = public_names(PAGE.read_text())
+    package = griffe.load("cloudrc", search_paths=[ROOT])
+    assert all(package[name.removeprefix("cloudrc.")] for name in listed)
+    text = "\n".join(page.read_text() for page in PAGES)
+    imported = re.findall(r"^ *from (cloudrc[\w.]*) import (.+)$", text, re.MULTILINE)
+    assert imported
+    names = {f"{module}.{name}" for module, names in imported for name in names.split(", ")}
+    assert names <= listed

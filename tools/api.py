@@ -1,7 +1,7 @@
 """Compare the public Python API with an earlier commit: `make api`.
 
-docs/api.md lists the public modules; in them, names without an underscore are public. After the
-first release, a change that breaks a caller ends with exit code 1. Before, changes are only listed.
+docs/api.md lists the public names. After the first release, a change that breaks a caller ends with
+exit code 1. Before, changes are only listed.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "api.md"
 
 
-def public_modules(page: str) -> set[str]:
-    """Return the modules in the first column of a table of docs/api.md."""
-    return set(re.findall(r"^\| `(cloudrc(?:\.\w+)*)` \|", page, re.MULTILINE))
+def public_names(page: str) -> set[str]:
+    """Return the names in the table of docs/api.md, each with its module."""
+    rows = re.findall(r"^\| `(cloudrc[\w.]*)` \| (`[^|]+`) \|", page, re.MULTILINE)
+    return {f"{module}.{name}" for module, names in rows for name in re.findall(r"\w+", names)}
 
 
 def last_release() -> str | None:
@@ -30,16 +31,29 @@ def last_release() -> str | None:
     return found.stdout.strip() or None
 
 
+def paths_of(package: griffe.Object | griffe.Alias, name: str) -> Iterator[str]:
+    """Yield a public name, where the package defines it, and the class that it returns."""
+    yield name
+    try:
+        found = package[name.removeprefix(f"{package.path}.")]
+    except KeyError:
+        return
+    yield found.canonical_path
+    if isinstance(returned := getattr(found, "returns", None), griffe.Expr):
+        yield returned.canonical_path
+
+
 def breaking_changes(
-    before: griffe.Object | griffe.Alias, now: griffe.Object | griffe.Alias, modules: set[str]
+    before: griffe.Object | griffe.Alias, now: griffe.Object | griffe.Alias, names: set[str]
 ) -> Iterator[str]:
-    """Describe each difference between two packages that breaks a caller of `modules`."""
+    """Describe each difference between two packages that breaks a caller of `names`."""
+    public = {path for name in names for one in (before, now) for path in paths_of(one, name)}
     for change in griffe.find_breaking_changes(before, now):
-        # Upwards by parents: `module` of an imported name is where the name was defined.
-        module = change.obj
-        while module.kind is not griffe.Kind.MODULE and module.parent is not None:
-            module = module.parent
-        if module.path in modules:
+        # A member belongs to its class. Upwards by parents: an imported name keeps its own path.
+        found = change.obj
+        while found.path not in public and found.parent is not None:
+            found = found.parent
+        if found.path in public:
             yield change.explain(griffe.ExplanationStyle.ONE_LINE)
 
 
@@ -52,7 +66,7 @@ def main() -> int:
         return 0
     before = griffe.load_git("cloudrc", ref=base, repo=ROOT)
     now = griffe.load("cloudrc", search_paths=[ROOT])
-    found = list(breaking_changes(before, now, public_modules(PAGE.read_text())))
+    found = list(breaking_changes(before, now, public_names(PAGE.read_text())))
     print("\n".join(found) or f"the public API has no breaking change since {base}")
     return 1 if found and release else 0
 
