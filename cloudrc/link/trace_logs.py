@@ -4,7 +4,7 @@
     irtt client -i 10ms -l 204 -d 1m -o irtt.json HOST
 
 Every reader fills a `Log` with packets, and `Log.packets` checks them. `Packets.notes` counts the
-packets that are left out or sorted. docs/link.md describes the formats.
+packets that are left out or sorted. docs/traces.md describes the formats.
 
 Source: ping(8) of iputils; irtt-client(1), JSON format 1.
 """
