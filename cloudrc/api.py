@@ -407,7 +407,7 @@ def verify(
         cloudrc.errors.MissingPrerequisiteError: If root rights or a kubeconfig are missing.
         cloudrc.errors.TimedOutError: If the link or the pods do not answer in time.
     """
-    from cloudrc.runs import verify as work
+    from cloudrc.runs.links import verify as work
 
     if mode == "local":
         texts = _texts(settings or {})

@@ -27,7 +27,7 @@ from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.judge import Flow, Measurement
 from cloudrc.link.verify.probe import FIRST_PROBE, PROBE
 from cloudrc.runs.links.under_test import WAYS, measure, run_link
-from cloudrc.runs.verify import find_experiment
+from cloudrc.runs.links.verify import find_experiment
 from cloudrc.text import table
 from cloudrc.tunnel.codec import SIZES
 

@@ -67,7 +67,7 @@ def execute(options: argparse.Namespace) -> int:
     interrupt_on_signals()
     from cloudrc.runs.links.programs import ExecSettings, run_programs
     from cloudrc.runs.links.programs_report import make_exec_report, write_report
-    from cloudrc.runs.verify import as_text
+    from cloudrc.runs.links.verify import as_text
 
     def tell(text: str) -> None:
         print_line(f"cloudrc: {text}", sys.stderr)

@@ -15,7 +15,7 @@ from cloudrc.link.verify import DEFAULT
 from cloudrc.runs.interrupts import interrupt_on_signals
 
 if TYPE_CHECKING:
-    from cloudrc.runs.verify import Report
+    from cloudrc.runs.links.verify import Report
 
 EPILOG = """\
 examples:
@@ -64,7 +64,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Measure the link and print the verdict; return 0 if the link matches its profile, else 1."""
     from cloudrc.cli.progress import Progress
-    from cloudrc.runs.verify import as_text  # imports large packages
+    from cloudrc.runs.links.verify import as_text  # imports large packages
 
     interrupt_on_signals()  # on a signal, remove namespaces and processes
     with closing(Progress("starts")) as view:
@@ -74,7 +74,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _verify(options: argparse.Namespace, tell: Callable[[str], None]) -> Report:
-    from cloudrc.runs.verify import (
+    from cloudrc.runs.links.verify import (
         RELEASE_TIMEOUT,
         check_seconds,
         forwarded_pods,

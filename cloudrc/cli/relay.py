@@ -100,7 +100,7 @@ def _tcp(options: argparse.Namespace) -> int:
 
 def _ros(options: argparse.Namespace) -> int:
     from cloudrc.runs.links.topics import TopicSettings, relay_topic
-    from cloudrc.runs.verify import as_text
+    from cloudrc.runs.links.verify import as_text
 
     report = relay_topic(settings_from(options, TopicSettings), _tell)
     print_result(options.output, report, as_text(report))

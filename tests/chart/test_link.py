@@ -3,7 +3,7 @@
 import pytest
 
 from cloudrc.cli.parser import build_parser
-from cloudrc.runs.verify import RELEASE_TIMEOUT
+from cloudrc.runs.links.verify import RELEASE_TIMEOUT
 from tests.chart.conftest import a_namespace, containers, notes, nothing, of_kind, pod_specs, render
 
 

@@ -11,8 +11,8 @@ from cloudrc.drivers.exporter import Exporter
 from cloudrc.errors import TimedOutError
 from cloudrc.link.verify.causes import Findings, ShaperFacts
 from cloudrc.records import LinkChecked
-from cloudrc.runs import verify
-from cloudrc.runs.verify import as_text, find_experiment, verify_release
+from cloudrc.runs.links import verify
+from cloudrc.runs.links.verify import as_text, find_experiment, verify_release
 
 PAGE = {"shaper": "relay", "reason": "", "interface": "eth0", "netems": {}}
 MEASURED = {"ok": 0.0451, "open": 0.0451, "off": 0.0902}

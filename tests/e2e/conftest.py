@@ -19,7 +19,7 @@ from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import METRICS, fetch_recording, forwarded
 from cloudrc.errors import CloudrcError
-from cloudrc.runs.verify import fetch
+from cloudrc.runs.links.verify import fetch
 from tests.drivers.conftest import WORK, slower
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -13,7 +13,7 @@ from cloudrc.config.resolved import dump
 from cloudrc.config.schema import PlugIn
 from cloudrc.drivers.machine import interpreter
 from cloudrc.processes import ends
-from cloudrc.runs.verify import find_experiment
+from cloudrc.runs.links.verify import find_experiment
 from cloudrc.runs.workers import map_in_order
 from tests.metrics.conftest import flown
 from tests.record.conftest import write_mission

@@ -12,7 +12,7 @@ from cloudrc.files import naming
 from cloudrc.link.carry.log import LOGGED_MAX
 from cloudrc.link.verify.causes import LATE, Findings, ShaperFacts, in_unit
 from cloudrc.link.verify.packets import judge_packets, recording
-from cloudrc.runs.verify import Report, make_report
+from cloudrc.runs.links.verify import Report, make_report
 
 if TYPE_CHECKING:
     from cloudrc.runs.links.carrier import CarriedLink

@@ -15,7 +15,7 @@ from cloudrc.link.carry.punctual import ask_for_fifo, settle
 from cloudrc.link.state import LinkState
 from cloudrc.runs.links.carrier import STEP, CarriedLink, CarrySettings, open_live
 from cloudrc.runs.links.programs_report import make_link_report, write_report
-from cloudrc.runs.verify import Report
+from cloudrc.runs.links.verify import Report
 
 if TYPE_CHECKING:
     from cloudrc.bridges.ros2.relay import TopicRelay

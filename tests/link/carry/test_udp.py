@@ -22,7 +22,7 @@ from cloudrc.link.carry.udp import AGE_MAX_NS, Relay, Stamps, ask_for_stamps
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.verify.judge import Flow, Measurement
 from cloudrc.link.verify.probe import PROBE, ProbeEnd
-from cloudrc.runs.verify import find_experiment
+from cloudrc.runs.links.verify import find_experiment
 from cloudrc.tunnel.codec import Kind, encode_header
 from tests.conftest import wait_until
 from tests.link.profiles import profile_of
