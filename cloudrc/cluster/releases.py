@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -53,7 +55,7 @@ def look(release: Release, *, everywhere: bool) -> list[dict[str, str]]:
     deployments = release.request(verb, "deployments", **chosen)
     files = defaultdict[Place, dict[str, str]](dict)
     for each in release.request(verb, "configmaps", **chosen):
-        if each.metadata.labels.get(COMPONENT) in ("experiment", "link"):
+        if is_of_experiment(each.metadata.labels):
             files[_place(each)] |= each.data or {}
     waits = defaultdict[Place, list[str]](list)
     for each in deployments:
@@ -90,16 +92,29 @@ def _link(files: dict[str, str]) -> str:
     from cloudrc.config.load import load_link
     from cloudrc.config.profile import DIRECTIONS
 
-    with TemporaryDirectory(prefix="cloudrc-") as folder:
-        for name, text in {"experiment.yaml": "{}", "profile.yaml": "{}", **files}.items():
-            Path(folder, name).write_text(text, encoding="utf-8")
+    with as_files(files) as folder:
         try:
-            link = load_link(Path(folder, "profile.yaml"), Path(folder, "experiment.yaml"))
+            link = load_link(folder / "profile.yaml", folder / "experiment.yaml")
         except BadInputError:
             return "invalid"
     values = link.model_dump(mode="json", exclude_defaults=True)
     texts = [_way(values.get(way, {})) for way in DIRECTIONS]
     return texts[0] if texts[0] == texts[1] else " / ".join(texts)
+
+
+def is_of_experiment(labels: Mapping[str, str]) -> bool:
+    """Return whether a ConfigMap with these labels has files of the experiment or of the link."""
+    return labels.get(COMPONENT) in ("experiment", "link")
+
+
+@contextmanager
+def as_files(files: Mapping[str, str]) -> Iterator[Path]:
+    """Yield a folder with the files of experiment and link, as the pods see them."""
+    with TemporaryDirectory(prefix="cloudrc-") as name:
+        folder = Path(name)
+        for key, text in {"experiment.yaml": "{}", "profile.yaml": "{}", **files}.items():
+            (folder / key).write_text(text, encoding="utf-8")
+        yield folder
 
 
 def _way(way: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Survey a cluster before an install: permissions, admission, quota, nodes, images.
+"""Survey a cluster before an install: permissions, experiment, admission, quota, nodes, images.
 
 The pods of the chart are sent to the API server as a dry run, so that Pod Security, LimitRanges and
 quotas judge them themselves. A small pod on each node, which is deleted again, shows whether the
@@ -25,7 +25,8 @@ from cloudrc.cluster.client import (
     run,
 )
 from cloudrc.cluster.pods import pod_failure
-from cloudrc.errors import to_one_line
+from cloudrc.cluster.releases import as_files, is_of_experiment
+from cloudrc.errors import CloudrcError, to_one_line
 
 NEEDED = {
     "": "pods services configmaps secrets serviceaccounts persistentvolumeclaims",
@@ -81,7 +82,9 @@ def survey(release: Release, values: Sequence[str] = ()) -> Iterator[Finding]:
     yield (allowed := permissions(release))
     if allowed.state != "ok":
         return
-    pods = pods_of_chart(render_chart(release, values))
+    rendered = render_chart(release, values)
+    yield experiment(rendered)
+    pods = pods_of_chart(rendered)
     for component, spec in pods.items():
         try:
             yield admission(release, component, spec)
@@ -121,6 +124,31 @@ def render_chart(release: Release, values: Sequence[str]) -> list[Any]:
     arguments = ["template", release.name, str(chart_folder()), *release.helm_flags]
     arguments += ["--dry-run=server", *values]
     return [thing for thing in yaml.safe_load_all(run("helm", arguments)) if thing]
+
+
+def experiment(rendered: list[Any]) -> Finding:
+    """Read experiment and link of the chart's objects, as the pods do, with their plug-ins.
+
+    A robot or scene whose files are only in the cluster is not compared with the mission.
+    """
+    from cloudrc.config.load import load_experiment, load_link
+
+    files = dict[str, str]()
+    for thing in rendered:
+        if thing["kind"] == "ConfigMap" and is_of_experiment(thing["metadata"]["labels"]):
+            files |= thing["data"]
+    world = (yaml.safe_load(files.get("experiment.yaml", "")) or {}).get("world", {})
+    with as_files(files) as folder:
+        path = folder / "experiment.yaml"
+        away = any(str(world.get(kind)).startswith("/") for kind in ("robot", "scene"))
+        try:
+            load_experiment(path, flown=away)
+            load_link(folder / "profile.yaml", path)
+        except CloudrcError as error:
+            text = to_one_line(str(error).replace(f"{folder}/", ""))
+            fix = "correct the values; if your image has the plug-in, install its package here, too"
+            return Finding("experiment", "missing", text, fix)
+    return Finding("experiment", "ok", "its values and plug-ins are valid")
 
 
 def pods_of_chart(rendered: list[Any]) -> dict[str, dict[str, Any]]:
