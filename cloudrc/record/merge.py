@@ -19,7 +19,7 @@ import heapq
 from collections.abc import Callable
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,15 +96,7 @@ def world_time_ns(telemetry: Table, machine_ns: NDArray[np.int64]) -> NDArray[np
     World's clock is behind the machine's clock after a stall. Telemetry contains this lag; between
     two telemetry stamps, the lag is interpolated linearly. The times stay in their order.
     """
-    lag_ns = telemetry["slip_ns"]
-    if not lag_ns.any():
-        return machine_ns
-    known_ns = telemetry["stamp_ns"] + lag_ns
-    # Differences are exact in float64; the stamps themselves need not be.
-    first: Any = known_ns[0]
-    since, known = (machine_ns - first).astype(float), (known_ns - first).astype(float)
-    at_ns: NDArray[np.int64] = machine_ns - np.rint(np.interp(since, known, lag_ns)).astype(int)
-    return at_ns
+    return machine_ns - _lag_ns(telemetry, telemetry["stamp_ns"] + telemetry["slip_ns"], machine_ns)
 
 
 def machine_time_ns(telemetry: Table, world_ns: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -112,13 +104,19 @@ def machine_time_ns(telemetry: Table, world_ns: NDArray[np.int64]) -> NDArray[np
 
     This is the inverse of `world_time_ns`.
     """
-    stamps_ns, lag_ns = telemetry["stamp_ns"], telemetry["slip_ns"]
-    if not lag_ns.any():
-        return world_ns
-    first: Any = stamps_ns[0]
-    since, known = (world_ns - first).astype(float), (stamps_ns - first).astype(float)
-    at_ns: NDArray[np.int64] = world_ns + np.rint(np.interp(since, known, lag_ns)).astype(int)
-    return at_ns
+    return world_ns + _lag_ns(telemetry, telemetry["stamp_ns"], world_ns)
+
+
+def _lag_ns(
+    telemetry: Table, known_ns: NDArray[np.int64], at_ns: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Interpolate the lag of world's clock, known at `known_ns` [ns], at the times `at_ns` [ns]."""
+    if not telemetry["slip_ns"].any():
+        return np.zeros_like(at_ns)
+    # Differences are exact in float64; the stamps themselves need not be.
+    since, known = ((each - known_ns[0]).astype(float) for each in (at_ns, known_ns))
+    lag_ns: NDArray[np.int64] = np.rint(np.interp(since, known, telemetry["slip_ns"])).astype(int)
+    return lag_ns
 
 
 def merge(world: Path, cloud: Path) -> Recording:
