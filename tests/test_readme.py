@@ -80,7 +80,7 @@ def folder(tmp_path_factory):
     return path
 
 
-PROGRESS = re.compile(r"([a-z]+s .*\n)*")
+PROGRESS = re.compile(r"(([a-z]+s| +[\d.]+ s) .*\n)*")
 """What a quick command says on a busy machine."""
 
 
