@@ -198,8 +198,8 @@ def build_world(
     that the duration of compiling the scene does not count.
     """
     from cloudrc.robots.build import build_robot
+    from cloudrc.sim.plant import Wind
     from cloudrc.world.endpoint import WorldEndpoint
-    from cloudrc.world.plant import Wind
     from cloudrc.world.sensors import Sensors
 
     world, seed = experiment.world, experiment.seed

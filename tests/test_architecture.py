@@ -24,10 +24,10 @@ ROS = (
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it. Ruff checks
 # clocks, sockets, threads, signals, chance, and calls such as `eval` and `print` (pyproject.toml).
 RESERVED: dict[str, tuple[str, ...]] = {
-    "mujoco": ("world/", "geometry/compiled"),
+    "mujoco": ("sim/",),
     # The simulator packs forces into MuJoCo's buffers; this is the fastest way.
     "struct": (
-        *("tunnel/codec", "record/", "world/simulator", "robots/pelican/native/robot"),
+        *("tunnel/codec", "record/", "sim/simulator", "sim/memory", "robots/pelican/native/robot"),
         "link/exec/namespace",
     ),
     "yaml": ("outside/", "config/", "record/", "report/", "cli/", "cluster/"),

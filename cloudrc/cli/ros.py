@@ -114,7 +114,7 @@ def _open(stack: ExitStack, options: argparse.Namespace, flight: _Flight) -> tup
     from cloudrc.console.steering import Steering
     from cloudrc.drivers.readers import RecordReader
     from cloudrc.report.markers import encode_markers, scene_shapes
-    from cloudrc.world.shapes import read_shapes
+    from cloudrc.robots.shapes import read_shapes
 
     world = read_experiment(str(flight.config)).world
     robot = find_robot(world.robot)

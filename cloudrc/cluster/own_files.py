@@ -74,7 +74,7 @@ def _check_size(name: str) -> None:
     """Refuse a robot without a size, because the cloud pod has no MuJoCo to measure the model."""
     robot = find_robot(name)
     if robot.hull is None and robot.hull_points is None:
-        radius = float(hull_of(name).few.radii[0])
+        radius = float(hull_of(name).radii[0])
         text = f"in a cluster a robot needs its size; add the line hull_m: {radius + 0.0005:.3f}"
         raise BadInputError(f"world.robot: {Path(name) / ROBOT_FILE}: {text}")
 

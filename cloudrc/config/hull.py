@@ -11,7 +11,7 @@ from cloudrc import plugins
 from cloudrc.config.robot import RobotFiles, known_robot
 from cloudrc.config.shipped import ROBOT_FILE
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
-from cloudrc.geometry.clearance import Hull, Spheres, ball
+from cloudrc.geometry.clearance import Spheres, ball
 from cloudrc.outside.reuse import reuse
 from cloudrc.outside.values import RESULT
 
@@ -19,8 +19,8 @@ TOLERANCE = 1e-3
 """Length by which geoms may reach out of the hull [m]: hull_m is rounded."""
 
 
-def hull_of(name: str) -> Hull:
-    """Return the hull of a robot, given as for `find_robot`.
+def hull_of(name: str) -> Spheres:
+    """Return the spheres that contain a robot, given as for `find_robot`.
 
     Raises:
         BadInputError: If its model or its file of spheres is wrong.
@@ -29,7 +29,7 @@ def hull_of(name: str) -> Hull:
     return reuse(("hull", name), lambda: _read_hull(name, known_robot(name)))
 
 
-def known_hull(name: str) -> Hull | None:
+def known_hull(name: str) -> Spheres | None:
     """Return the hull of a robot; None if its files cannot be read here."""
     try:
         return hull_of(name)
@@ -44,7 +44,7 @@ def doubts(name: str) -> Iterator[str]:
         BadInputError: If the model does not compile.
         MissingPrerequisiteError: If MuJoCo is missing.
     """
-    from cloudrc.geometry.compiled import reach_of
+    from cloudrc.sim.bodies import reach_of
 
     robot = known_robot(name)
     if robot.hull is None or robot.hull_points is not None:
@@ -54,10 +54,9 @@ def doubts(name: str) -> Iterator[str]:
         yield f"{name}/{ROBOT_FILE}: {text}"
 
 
-def _read_hull(name: str, robot: RobotFiles) -> Hull:
+def _read_hull(name: str, robot: RobotFiles) -> Spheres:
     if robot.hull_points is not None:
-        file = plugins.find("hull", robot.hull_points, look=False)
-        return Hull(*(_spheres(file, part) for part in Hull._fields))
+        return _spheres(plugins.find("hull", robot.hull_points, look=False))
     if robot.hull is not None:
         return ball(robot.hull)
     if find_spec("mujoco") is None:
@@ -65,21 +64,17 @@ def _read_hull(name: str, robot: RobotFiles) -> Hull:
             f"robot {name}: its size needs MuJoCo; give hull_m in its robot.yaml, or run: "
             "pip install 'cloudrc[world]'"
         )
-    from cloudrc.geometry.compiled import reach_of
+    from cloudrc.sim.bodies import reach_of
 
     return ball(reach_of(robot.model))
 
 
-def _spheres(file: plugins.Found, part: str) -> Spheres:
-    """Return the spheres of one function of a file."""
-    with file.calling(part) as function:
+def _spheres(file: plugins.Found) -> Spheres:
+    """Return the spheres of the function `few` of a file."""
+    with file.calling("few") as function:
         numbers = RESULT.array(function()).astype(np.float64)
-        if numbers.ndim != 2 or numbers.shape[1] != 4:
+        if numbers.ndim != 2 or numbers.shape[1] != 4 or not len(numbers):
             raise ValueError(
                 f"it returned shape {numbers.shape}, not rows of x, y, z, radius [m]: shape (n, 4)"
             )
-        if not len(numbers):
-            raise ValueError("it returned no row; give at least one: x, y, z, radius [m]")
-        if (numbers[:, 3] < 0.0).any():
-            raise ValueError("it returned a radius below 0")
         return Spheres(numbers[:, :3], numbers[:, 3])

@@ -53,9 +53,7 @@ from cloudrc.config.schema import (
     World,
 )
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.clearance import NO_SIZE
-from cloudrc.geometry.obstacles import fence_of, known
-from cloudrc.geometry.scene import Scene
+from cloudrc.geometry.obstacles import fence_of
 from cloudrc.link.traces import read_trace
 from cloudrc.outside.document import Document, KeyPath, read_document
 from cloudrc.outside.reuse import reuse, reuse_results
@@ -128,7 +126,7 @@ def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> Res
         parameters(robot, experiment.world)
     found += _without_effect(document, experiment)
     mission = put_on_ground(mission, scene) if robot.planar else mission
-    fit = _check_fit(mission, scene, experiment.world.robot)
+    fit = _check_fit(mission, experiment.world)
     if fit and (other := _other_command(fit[0], experiment.world)):
         found, fit = [], [fit[0]._replace(reason=f"{fit[0].reason}; this flies: {other}")]
     found += [_blame_scene(document, each) for each in fit]
@@ -169,25 +167,21 @@ def _blame_scene(document: Document, problem: ConfigProblem) -> ConfigProblem:
     return ConfigProblem(scene, str(document.get(*scene)), f"does not fit: {problem}")
 
 
-def _check_fit(mission: MissionConfig, scene: Scene, robot: str) -> list[ConfigProblem]:
+def _check_fit(mission: MissionConfig, world: World) -> list[ConfigProblem]:
     """List the problems of a mission in a scene, with their paths in the experiment."""
-    planar, heading = known_robot(robot).planar, known_robot(robot).heading
+    robot, scene = known_robot(world.robot), scene_of(world)
 
     def check() -> list[ConfigProblem]:
-        try:
-            size = hull_of(robot).dense
-        except BadInputError:
-            if known_robot(robot).hull_points is not None:
-                raise
-            size = NO_SIZE.dense  # `check_robot` says what is wrong with its model
-        if above := check_scene(scene, size, touch=mission.touched, planar=planar):
+        size = hull_of(world.robot)
+        if above := check_scene(scene, size, touch=mission.touched, planar=robot.planar):
             return above
-        wrong = check_mission(mission, scene, size, planar=planar, heading=heading)
-        if not wrong and known_robot(robot).probe is None:
+        wrong = check_mission(mission, scene, size, planar=robot.planar, heading=robot.heading)
+        if not wrong and robot.probe is None:
             wrong = check_reach(mission, scene, size)
         return [problem._replace(path=("mission", *problem.path)) for problem in wrong]
 
-    return reuse(("mission", mission.model_dump_json(), repr(scene), robot), check)
+    key = "mission", mission.model_dump_json(), world.scene, world.fence_m, world.robot
+    return reuse(key, check)
 
 
 def read_experiment(
@@ -370,7 +364,7 @@ def _bounds(document: Document, found: list[ConfigProblem]) -> Bounds:
         if ("world", "scene") not in [problem.path for problem in found]:
             with problems.collect(found, ("world", "scene")):
                 scene = scene_of(world)
-                if scene.own_fence or known(scene) or not document.get("guard", "speed_max_mps"):
+                if scene.own_fence or not document.get("guard", "speed_max_mps"):
                     room = fence_of(scene).room(scene.spawn)
     return Bounds(limits, room)
 

@@ -199,7 +199,7 @@ def _default_onboard(document: Document, parameter: str) -> Any:
     folder = document.source(("world", "robot")).folder
     robot = find_robot(shipped.model_path("robot", world.robot, folder))
     given = parameters(robot, world)
-    if parameter in given or robot.onboard is None:
+    if parameter in given:
         return given.get(parameter)
     return default_parameters("onboard", robot.onboard.name).get(parameter)
 
@@ -382,15 +382,6 @@ def build_predictor(choice: PlugIn, robot: RobotFacts) -> Any:
     """Build a predictor as `build_plugin` does; if its `build` takes `robot`, it gets it."""
     more = {"robot": robot} if _takes_robot("predictors", choice.name) else {}
     return build_plugin("predictors", choice, **more)
-
-
-def check_plugin(kind: str, choice: PlugIn) -> list[ConfigProblem]:
-    """List the problems of the parameters of a plug-in."""
-    try:
-        _check(kind, choice.name, choice.model_extra or {})
-    except ProblemsError as error:
-        return [*error.problems]
-    return []
 
 
 def parameter_names(kind: str, name: str) -> list[str]:

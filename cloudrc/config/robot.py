@@ -6,13 +6,12 @@ folders in `cloudrc/robots/`.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from cloudrc.config import shipped
 from cloudrc.config.heading import Heading
@@ -60,7 +59,7 @@ class RobotLimits(Section):
 DEFAULT_LIMITS = RobotLimits()
 """Limits of a robot that flies."""
 GENERAL = "multirotor"
-"""Onboard controller of a model without `robot.yaml` that is not like the Pelican."""
+"""Onboard controller of a model without `robot.yaml`."""
 ON_GROUND = {GENERAL: False, "diff_drive": True}
 """Shipped onboard controller -> whether its robots stay on the ground."""
 OF_GENERAL = RobotLimits(acceleration_max_mps2=4.0)
@@ -90,28 +89,19 @@ class Tuning(Parameters):
     """As response of the robot, but with this tuning. null: predictors take that of the robot"""
 
 
-def _check_name(name: str) -> str:
-    if not re.fullmatch("[a-z][a-z0-9_]{0,39}", name):
-        raise ValueError("a name has small letters, digits and _, begins with a letter, at most 40")
-    return name
-
-
-def _check_unit(unit: str) -> str:
-    if not 0 < len(unit.strip()) == len(unit) <= 16 or not unit.isprintable():
-        raise ValueError("must be text of 1 to 16 characters, such as N, rad/s or 1")
-    return unit
+SensorName = Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,39}$")]
+Unit = Annotated[str, Field(min_length=1, max_length=16, pattern=r"^\S(.*\S)?$")]
 
 
 class SensorConfig(Section):
     """A sensor of the robot's own."""
 
-    unit: Annotated[str, AfterValidator(_check_unit)]
+    unit: Unit
     """Unit of its value, such as N or rad/s; 1 without a unit"""
     sensor: Annotated[str, Field(min_length=1)]
     """Name of a sensor of the model that shows one number"""
 
 
-SensorName = Annotated[str, AfterValidator(_check_name)]
 Sensors = Annotated[dict[SensorName, SensorConfig], Field(max_length=SENSORS_MAX)]
 
 
@@ -154,9 +144,8 @@ class RobotFile(Section):
     """The robot's own sensors, at most 16: name -> unit, and sensor of the model. Telemetry carries
     their values to cloud"""
     hull_points: str | None = None
-    """Python file with spheres in place of the ball of hull_m: its functions `few` and `dense`
-    return rows x, y, z, radius [m], body frame, for the distance from obstacles and for the check
-    of paths. null: there is none"""
+    """Python file with spheres in place of the ball of hull_m: its function `few` returns rows x,
+    y, z, radius [m], body frame, for the distance from obstacles. null: there is none"""
 
     @model_validator(mode="after")
     def _check_stop(self) -> RobotFile:
@@ -172,9 +161,7 @@ class RobotFiles:
     """A robot whose files are found."""
 
     model: Path  # MJCF file
-    # With the absolute path of a Python file, or the name of a plug-in. None for a model alone:
-    # which controller flies it depends on the model.
-    onboard: PlugIn | None
+    onboard: PlugIn  # with the absolute path of a Python file, or the name of a plug-in
     planar: bool = False  # whether it stays on the ground
     guard: RobotLimits = DEFAULT_LIMITS
     hull: float | None = None  # radius about the base [m]; None: that of the model
@@ -195,45 +182,35 @@ def find_robot(name: str) -> RobotFiles:
     Raise a BadInputError if its `robot.yaml` is invalid.
     """
     if name.endswith(".xml"):
-        return RobotFiles(Path(name), None, guard=OF_GENERAL)
+        return RobotFiles(Path(name), PlugIn(name=GENERAL), guard=OF_GENERAL)
     folder = Path(name) if shipped.is_path(name) else shipped.FOLDERS["robot"] / name
     file = folder / shipped.ROBOT_FILE
     label = str(file) if shipped.is_path(name) else f"{name}/{shipped.ROBOT_FILE}"
     document = read_document(file, label)
     robot = validate(document, RobotFile, label)
     onboard = _absolute(robot.onboard, folder)
-    found = [*_missing_files(robot, folder), *_misplaced(robot.planar, onboard.name)]
-    raise_problems(document, found, label)
+    raise_problems(document, list(_misplaced(robot.planar, onboard.name)), label)
     stop = robot.guard.stop or ("brake" if robot.planar else "land")
     usual = OF_GENERAL if onboard.name == GENERAL else DEFAULT_LIMITS
     given = robot.guard.model_dump(exclude_unset=True)
     limits = usual.model_copy(update={**given, "stop": stop})
     tunings = {key: tuning.model_extra or {} for key, tuning in robot.tunings.items()}
     responses = {key: each.response for key, each in robot.tunings.items() if each.response}
-    model = folder / robot.model
-    motion = robot.motion and str((folder / robot.motion).resolve())
-    files = RobotFiles(model, onboard, robot.planar, limits, robot.hull_m)
-    return replace(
-        files,
+    return RobotFiles(
+        folder / robot.model,
+        onboard,
+        robot.planar,
+        limits,
+        robot.hull_m,
         hull_points=robot.hull_points and str((folder / robot.hull_points).resolve()),
         tunings=tunings,
         response=robot.response,
         responses=responses,
-        motion=motion,
+        motion=robot.motion and str((folder / robot.motion).resolve()),
         probe=robot.probe,
         sensors=robot.sensors,
         heading=robot.heading or ("velocity" if robot.planar else "free"),
     )
-
-
-def _missing_files(robot: RobotFile, folder: Path) -> list[ConfigProblem]:
-    """List the Python files that `robot.yaml` in `folder` names, and that do not exist."""
-    named = {"motion": robot.motion, "hull_points": robot.hull_points}
-    return [
-        ConfigProblem((key,), name, "there is no such file")
-        for key, name in named.items()
-        if name is not None and not (folder / name).is_file()
-    ]
 
 
 def _misplaced(planar: bool, onboard: str) -> Iterator[ConfigProblem]:
@@ -260,8 +237,7 @@ def parameters(robot: RobotFiles, world: World) -> dict[str, Any]:
             text = unknown_name_text(what, world.tuning, known)
             raise BadInputError(f"{text}; leave world.tuning out, or set null, for no tuning")
         tuning = robot.tunings[world.tuning]
-    published = {} if robot.onboard is None else robot.onboard.model_extra or {}
-    return {**published, **tuning, **(world.onboard.model_extra or {})}
+    return {**(robot.onboard.model_extra or {}), **tuning, **(world.onboard.model_extra or {})}
 
 
 def _absolute(choice: str | PlugIn, folder: Path) -> PlugIn:
@@ -315,7 +291,6 @@ def files_of(name: str) -> list[Path]:
     if name.endswith(".xml"):
         return [Path(name)]
     robot = find_robot(name)
-    onboard = robot.onboard.name if robot.onboard else ""
-    named = onboard, robot.motion, robot.hull_points
+    named = robot.onboard.name, robot.motion, robot.hull_points
     own = [Path(file) for file in named if file and is_path(file)]
     return [Path(name) / shipped.ROBOT_FILE, robot.model, *own]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.util import find_spec
 
 from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import World
@@ -13,19 +14,25 @@ from cloudrc.outside.reuse import reuse
 
 
 def scene_of(world: World) -> Scene:
-    """Read the scene of an experiment; its fence is world.fence_m if this key is given."""
-    key = "scene", world.scene, world.fence_m
-    return reuse(key, lambda: load_scene(world.scene, world.fence_m))
+    """Read the scene of an experiment; its fence is world.fence_m if this key is given.
+
+    Shapes that the scene declares as numbers are read without MuJoCo, all others with MuJoCo. If it
+    is not installed, the others are missing, and the scene still has its `path`.
+    """
+    return reuse(("scene", world.scene, world.fence_m), lambda: _read(world))
+
+
+def _read(world: World) -> Scene:
+    scene = load_scene(world.scene, world.fence_m)
+    if scene.path is None or find_spec("mujoco") is None:
+        return scene
+    from cloudrc.sim.bodies import complete
+
+    return complete(scene)
 
 
 def steered_in(world: World) -> Fence:
     """Return the fence inside which an operator steers; for a planar robot, at its height only."""
-    fence = fence_in(world)
-    if is_planar(world.robot):
-        return replace(fence, ground=scene_of(world).spawn[2])
-    return fence
-
-
-def fence_in(world: World) -> Fence:
-    """Return the fence of an experiment; raise errors as `fence_of` does."""
-    return fence_of(scene_of(world))
+    scene = scene_of(world)
+    fence = fence_of(scene)
+    return replace(fence, ground=scene.spawn[2]) if is_planar(world.robot) else fence

@@ -52,6 +52,8 @@ _ROS_NAME = "[A-Za-z_][A-Za-z0-9_]*"
 RosNamespace = Annotated[str, Field(pattern=f"^(/?{_ROS_NAME}(/{_ROS_NAME})*)?$")]
 """Namespace of ROS 2, such as drone1."""
 NotNegatives = tuple[NotNegative, NotNegative, NotNegative]
+Tilt = Annotated[float, Field(gt=0, le=60)]
+"""Limit of a tilt [deg]. Beyond 78 degrees the guard stops the robot."""
 _Constant = Annotated[float, Field(gt=0, le=30)]
 _DeadTime = Annotated[float, Field(ge=0, le=5)]
 Constants = tuple[_Constant, _Constant, _Constant]

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cloudrc.geometry.clearance import NO_SIZE, Array, Hull, clearance
+from cloudrc.geometry.clearance import NO_SIZE, Array, Spheres, clearance
 from cloudrc.geometry.obstacles import Obstacle
 from cloudrc.messages import NEVER_NS, GuardState
 from cloudrc.metrics.definitions import CHARTED, Echoes, PredictionJudge
@@ -53,12 +53,12 @@ class FlightFeed:
         flown: Number of points added so far to the trail, the line that shows the robot's path.
     """
 
-    def __init__(self, known: Sequence[Obstacle] = (), hull: Hull | None = None) -> None:
+    def __init__(self, known: Sequence[Obstacle] = (), hull: Spheres | None = None) -> None:
         """Begin without a status; measure the clearance of the robot's `hull` from obstacles.
 
         `known` are the obstacles. Without a hull the clearance is infinite.
         """
-        self._obstacles, self._robot = () if hull is None else known, (hull or NO_SIZE).few
+        self._obstacles, self._robot = () if hull is None else known, hull or NO_SIZE
         self._judge, self._echoes = PredictionJudge(), Echoes()
         self.status: RobotStatus | None = None
         self.samples: deque[Sample] = deque()

@@ -29,8 +29,8 @@ from cloudrc.console.steering import Steering, is_drive
 from cloudrc.geometry.clearance import Array
 from cloudrc.messages import ZERO, Quaternion, Vector
 from cloudrc.metrics.definitions import CHARTED
+from cloudrc.robots.shapes import read_shapes
 from cloudrc.text import describe_sensors
-from cloudrc.world.shapes import read_shapes
 
 SLOW_PERIOD = 0.3
 """Time between two updates of the page, except for the moving bodies [s]."""

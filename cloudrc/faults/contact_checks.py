@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from cloudrc.faults.facts import ESTOP, FLOWN, HOLD, LAND, REELS_NS
 from cloudrc.messages import GuardState, Vector
 from cloudrc.records import Contact
-from cloudrc.world.simulator import Simulator
+from cloudrc.sim.simulator import Simulator
 
 if TYPE_CHECKING:
     from cloudrc.faults.invariants import Watch

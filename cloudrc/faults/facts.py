@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 from cloudrc.config.resolved import ResolvedExperiment, ResolvedGuard
 from cloudrc.config.robot import find_robot
-from cloudrc.config.scene import fence_in
+from cloudrc.config.scene import scene_of
+from cloudrc.geometry.obstacles import fence_of
 from cloudrc.messages import GuardState, Vector
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -30,7 +31,7 @@ class Facts(NamedTuple):
     def of(cls, experiment: ResolvedExperiment) -> Facts:
         """Read the facts of an experiment."""
         world = experiment.world
-        robot, fence = find_robot(world.robot), fence_in(world)
+        robot, fence = find_robot(world.robot), fence_of(scene_of(world))
         low, high = fence.low, fence.high
         if robot.planar:
             low, high = (*low[:2], -inf), (*high[:2], inf)

@@ -40,8 +40,8 @@ from cloudrc.faults.motion_checks import MotionChecks
 from cloudrc.faults.order_checks import OrderChecks
 from cloudrc.messages import Command, GuardState, OperatorRequest, Request, Start
 from cloudrc.records import CommandApplied, Record, SessionOpened
-from cloudrc.world.onboard import Commands
-from cloudrc.world.readings import Readings
+from cloudrc.sim.onboard import Commands
+from cloudrc.sim.readings import Readings
 from cloudrc.world.robot import STEP_NS, Robot
 
 TRACK = GuardState.TRACK  # looking up a member of an enum is slow

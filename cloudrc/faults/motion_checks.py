@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from cloudrc.faults.facts import ESTOP, FLOWN, LAND, REELS_NS, TRACK
 from cloudrc.messages import ZERO, GuardState, Vector
+from cloudrc.sim.readings import Readings
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.readings import Readings
 from cloudrc.world.robot import STEP
 
 if TYPE_CHECKING:

@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from cloudrc.geometry.obstacles import Obstacle
 from cloudrc.geometry.scene import Scene, Tube
-from cloudrc.geometry.solids import Solid
 
 Array = NDArray[np.float64]
 
@@ -25,7 +24,6 @@ CLEARANCE_SHOWN = 0.40
 
 _CHUNK = 100  # poses per batch: 100 x 225 points fit in the processor's cache
 _STRIDE = 32  # `least_clearance` begins with every 32nd pose
-_FAR = 0.5  # distance above which a lower bound of the distance is enough [m]
 _ROUNDING = 1e-9  # more than the rounding errors of a bound [m]
 
 
@@ -36,21 +34,28 @@ class Spheres(NamedTuple):
     radii: Array
 
 
-class Hull(NamedTuple):
-    """A robot as spheres."""
-
-    few: Spheres  # for its distance from obstacles
-    dense: Spheres  # for the check of a path: their gaps are smaller than a wall is thick
-
-
-def ball(radius: float) -> Hull:
+def ball(radius: float) -> Spheres:
     """Return the hull of a robot that is inside a ball of `radius` [m] about its base."""
-    spheres = Spheres(np.zeros((1, 3)), np.array([radius]))
-    return Hull(spheres, spheres)
+    return Spheres(np.zeros((1, 3)), np.array([radius]))
 
 
 NO_SIZE = ball(0.0)
 """Hull of a robot whose size is not known."""
+
+
+def rotations(orientations_wxyz: Array) -> Array:
+    """Return the rotation matrices of n orientations, body to world, shape (n, 3, 3).
+
+    Each row of `orientations_wxyz` is a unit quaternion, shape (n, 4).
+    """
+    w, x, y, z = np.moveaxis(orientations_wxyz, -1, 0)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    matrices: Array = np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+    return matrices
 
 
 def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) -> Array:
@@ -60,13 +65,7 @@ def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) ->
     frame, shape (n, 3). Each row of `orientations_wxyz` is a unit quaternion, body to world, shape
     (n, 4).
     """
-    w, x, y, z = np.moveaxis(orientations_wxyz, -1, 0)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    rotation = np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+    rotation = rotations(orientations_wxyz)
     placed: Array = points.positions @ rotation.transpose(0, 2, 1)
     placed += positions[:, None, :]
     return placed
@@ -96,13 +95,11 @@ def clearance_per_obstacle(
     positions: ArrayLike,
     orientations_wxyz: ArrayLike,
     points: Spheres,
-    far: float = _FAR,
 ) -> Array:
     """Compute the robot's distance from each of m obstacles [m], shape (n, m).
 
     The distance is that of the nearest of the robot's `points`; it is negative inside an obstacle.
-    From a solid that is further away than `far` [m], it is a lower bound. `positions` [m] and
-    `orientations_wxyz` (unit quaternions) are as for `place_points`.
+    `positions` [m] and `orientations_wxyz` (unit quaternions) are as for `place_points`.
     """
     at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
     facing = np.asarray(orientations_wxyz, dtype=np.float64).reshape(-1, 4)
@@ -112,27 +109,10 @@ def clearance_per_obstacle(
         placed = place_points(points, at[part], facing[part])
         for index, obstacle in enumerate(obstacles):
             if isinstance(obstacle, Tube):
-                distance = distance_to_tube(obstacle, placed) - points.radii
-                result[part, index] = distance.min(axis=1)
+                distance = distance_to_tube(obstacle, placed)
             else:
-                result[part, index] = _distance_to_solid(obstacle, at[part], placed, points, far)
-    return result
-
-
-def _distance_to_solid(
-    solid: Solid, at: Array, placed: Array, points: Spheres, far: float
-) -> Array:
-    """Compute the robot's distance from a solid at n poses [m], shape (n,).
-
-    `at` are the base's positions, shape (n, 3), `placed` the robot's points, shape (n, k, 3), in
-    [m], world frame. For a robot further away than `far` [m], return a lower bound.
-    """
-    reach = solid.radius + np.linalg.norm(points.positions, axis=1).max() + points.radii.max()
-    result: Array = np.linalg.norm(at - solid.centre, axis=1) - reach
-    near = ~(result > far)  # the radius of a plane is infinite
-    if near.any():
-        distance = solid.distance(placed[near]) - points.radii
-        result[near] = distance.min(axis=1)
+                distance = obstacle.distance(placed)
+            result[part, index] = (distance - points.radii).min(axis=1)
     return result
 
 
@@ -147,7 +127,7 @@ def clearance(
     `positions` [m] have the shape (n, 3), `orientations_wxyz` (unit quaternions, body to world) the
     shape (n, 4). Without obstacles the distance is infinite.
     """
-    distances = clearance_per_obstacle(obstacles, positions, orientations_wxyz, points, np.inf)
+    distances = clearance_per_obstacle(obstacles, positions, orientations_wxyz, points)
     nearest: Array = distances.min(axis=1, initial=np.inf)
     return nearest
 

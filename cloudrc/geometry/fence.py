@@ -26,10 +26,6 @@ switched off [m]. A tilted robot slides up to 0.35 m along the floor before it r
 was measured with `pytest -m "" -k scrapes tests/world`."""
 SPACE = 3.0
 """Distance of the fence from the geoms of a scene that declares no fence [m]."""
-WIDTH_MIN = 1.0
-"""Smallest width of a fence in which a robot can take off, or drive [m]."""
-HEIGHT_MIN = 0.8
-"""Smallest height of a fence in which a robot can take off [m]: both margins, and 0.25 m to fly."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +49,6 @@ class Fence:
         x, y, z = self.high
         highest = z - WALL_MARGIN if self.ground is None else self.ground
         return (x - WALL_MARGIN, y - WALL_MARGIN, highest)
-
-    def contains(self, position: Vector) -> bool:
-        """Return whether a base at `position` [m], world frame, shape (3,), is inside the fence."""
-        sides = zip(self.low, position, self.high, strict=True)
-        return all(low <= value <= high for low, value, high in sides)
 
     def room(self, spawn: Vector) -> float:
         """Return the longest way along x or y from the spawn to where a robot may take off [m]."""

@@ -1,7 +1,4 @@
-"""Check whether a robot can fly to a position: the guard's limits, and obstacles in the way.
-
-The `robot` is represented by spheres that are dense enough to check a path.
-"""
+"""Check whether a robot can fly to a position: the guard's limits, and obstacles in the way."""
 
 from __future__ import annotations
 
@@ -15,12 +12,11 @@ from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.obstacles import Obstacle
 
 CLEARANCE_MIN = 0.04
-"""Smallest distance of the whole robot from an obstacle, at a waypoint and on the way to it [m].
+"""Smallest distance of the robot from an obstacle, at a waypoint and on the way to it [m].
 The value is above 32 mm, the steady error of a hover with the published gains."""
 STEP_MIN = 0.02
 """Shortest step in which a straight way is checked [m]. Near a wall, a check without a
 shortest step would not end."""
-_FAR = 1e3  # [m] limit of coordinates, so that no square overflows
 
 
 def outside_fence(
@@ -33,39 +29,30 @@ def outside_fence(
     walls concern a `planar` robot.
     """
     axes = slice(2 if planar else 3)
-    low, high = np.array(fence.low)[axes], np.array(fence.high)[axes]
-    at = np.clip(positions[:, axes], low - _FAR, high + _FAR)
-    nearest = np.clip(at, fence.inner_low[axes], fence.inner_high[axes])
-    outside: NDArray[np.bool_] = np.linalg.norm(at - nearest, axis=1) > np.asarray(slack) + 1e-9
-    outside |= ~np.all((at >= low) & (at <= high), axis=1)
+    at = positions[:, axes]
+    within = np.clip(at, fence.low[axes], fence.high[axes])
+    beyond = within - np.clip(within, fence.inner_low[axes], fence.inner_high[axes])
+    outside: NDArray[np.bool_] = (at != within).any(axis=1)
+    outside |= np.linalg.norm(beyond, axis=1) > np.asarray(slack) + 1e-9
     return outside
 
 
 def find_overlapped(
-    obstacles: Sequence[Obstacle],
-    robot: Spheres,
-    positions: Array,
-    yaws: Array,
-    least: float = CLEARANCE_MIN,
+    obstacles: Sequence[Obstacle], robot: Spheres, positions: Array, least: float = CLEARANCE_MIN
 ) -> NDArray[np.int64]:
-    """Return for each pose the index of the obstacle that the robot is too near to, shape (n,).
+    """Return for each position the index of the obstacle that the robot is too near to, shape (n,).
 
-    The index is -1 if all obstacles are at least `least` [m] away. `positions` are those of the
-    base [m], world frame, shape (n, 3); `yaws` are the headings of the level robot [rad], shape
-    (n,).
+    The index is -1 if all obstacles are at least `least` [m] away from the level robot. `positions`
+    are those of the base [m], world frame, inside or near the fence, shape (n, 3).
     """
     if not obstacles:
         return np.full(len(positions), -1, dtype=np.int64)
-    distance = _distances(obstacles, robot, np.clip(positions, -_FAR, _FAR), yaws)
+    distance = _distances(obstacles, robot, positions)
     return np.where(distance.min(axis=1) < least, distance.argmin(axis=1), -1)
 
 
 def find_crossed(
-    obstacles: Sequence[Obstacle],
-    robot: Spheres,
-    starts: Array,
-    ends: Array,
-    yaws: Array | float = 0.0,
+    obstacles: Sequence[Obstacle], robot: Spheres, starts: Array, ends: Array
 ) -> NDArray[np.int64]:
     """Find the first obstacle along each of n straight ways to which the robot comes too near.
 
@@ -73,11 +60,9 @@ def find_crossed(
     nearer to an obstacle than `CLEARANCE_MIN` if it leads away from this obstacle.
 
     `starts` and `ends` are positions of the base [m], world frame, inside or near the fence, shape
-    (n, 3); `yaws` are the headings on the ways [rad], shape (n,) or (). Return the index of the
-    obstacle for each way, -1 if there is none, shape (n,).
+    (n, 3). Return the index of the obstacle for each way, -1 if there is none, shape (n,).
     """
     result = np.full(len(starts), -1, dtype=np.int64)
-    facing = np.broadcast_to(yaws, len(starts))
     length = np.linalg.norm(ends - starts, axis=1)
     flown = np.zeros(len(starts))
     least = np.full(len(starts), np.inf)
@@ -85,7 +70,7 @@ def find_crossed(
     while len(flying):
         share = flown[flying] / np.maximum(length[flying], 1e-12)
         at = starts[flying] + share[:, None] * (ends - starts)[flying]
-        distances = _distances(obstacles, robot, at, facing[flying])
+        distances = _distances(obstacles, robot, at)
         nearest = distances.min(axis=1)
         if np.isinf(least).any():  # a way may begin near a wall
             least = np.minimum(CLEARANCE_MIN, nearest - STEP_MIN)
@@ -98,9 +83,7 @@ def find_crossed(
     return result
 
 
-def _distances(
-    obstacles: Sequence[Obstacle], robot: Spheres, positions: Array, yaws: Array
-) -> Array:
-    facing = np.zeros((len(positions), 4))
-    facing[:, 0], facing[:, 3] = np.cos(yaws / 2), np.sin(yaws / 2)
-    return clearance_per_obstacle(obstacles, positions, facing, robot)
+def _distances(obstacles: Sequence[Obstacle], robot: Spheres, positions: Array) -> Array:
+    """Return the distances of the robot with a yaw of 0 from each obstacle [m], shape (n, m)."""
+    level = np.broadcast_to((1.0, 0.0, 0.0, 0.0), (len(positions), 4))
+    return clearance_per_obstacle(obstacles, positions, level, robot)

@@ -60,17 +60,18 @@ class Plate:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """The parts of a scene that its file declares as numbers."""
+    """A scene as numbers: what its file declares, and what MuJoCo has read of its other bodies."""
 
     name: str  # file name without .xml
     tubes: tuple[Tube, ...] = ()  # in the order of the file
     plates: tuple[Plate, ...] = ()  # in the order of the file
     floor: float = 0.0  # z of the floor [m], world frame
     spawn: Vector = SPAWN  # position of the base at the start of a mission [m], world frame
-    path: Path | None = None  # of the file if it may have more bodies; None: this is all it has
-    own_fence: Fence | None = None  # fence that is declared; None: see `obstacles.fence_of`
-    solids: tuple[Solid, ...] = ()  # of a recorded scene without `path`: its other bodies
-    intangible: tuple[str, ...] = ()  # of such a scene: the bodies that the robot flies through
+    path: Path | None = None  # of the file if it has bodies that are still to be read; else None
+    own_fence: Fence | None = None  # declared, or the box around spawn and geoms; None: not known
+    solids: tuple[Solid, ...] = ()  # all that the robot can touch, without the floor
+    bodies: tuple[str, ...] = ()  # names of all bodies with geoms
+    intangible: tuple[str, ...] = ()  # names of those that the robot flies through
 
 
 def is_obstacle(body: str, *, touch: str | None) -> bool:
@@ -143,6 +144,7 @@ def _read(root: ElementTree.Element, path: Path, *, is_shipped: bool) -> Scene:
         _spawn(root),
         None if is_complete else path,
         _fence(_numbers(FENCE, numerics[FENCE], 6)) if FENCE in numerics else None,
+        bodies=(FLOOR, *(shape.name for shape in shapes)),
     )
 
 

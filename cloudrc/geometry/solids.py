@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +41,7 @@ class Solid:
     centre: Array  # [m], world frame, shape (3,)
     axes: Array  # columns: unit vectors along its x, y and z [1], world frame, shape (3, 3)
     size: Array  # [m], shape (3,); without meaning for planes and hulls
-    radius: float  # of a ball around `centre` that contains the solid [m]
     # Of a hull: normals (m, 3) and offsets (m,) [m] of its faces, ends of its edges (k, 2, 3) [m].
-    # A hull of an old recording has no edges: k = 0, and the distance beside an edge is too small.
     faces: tuple[Array, Array, Array] | None = None
 
     def distance(self, points: Array) -> Array:
@@ -132,8 +130,7 @@ def _to_hull(solid: Solid, local: Array) -> Array:
         found = heights.max(axis=1)
         below = some - found[:, None] * normals[highest]
         beside = (found > 0.0) & ((below @ normals.T - offsets).max(axis=1) > _ON_HULL)
-        if len(edges):
-            found[beside] = _to_edges(edges, some[beside])
+        found[beside] = _to_edges(edges, some[beside])
         distance[start : start + rows] = found
     return distance.reshape(local.shape[:-1])
 
@@ -152,8 +149,6 @@ def _to_edges(edges: Array, points: Array) -> Array:
     return distance
 
 
-SHAPES = get_args(Shape)
-"""The shapes that a solid may have."""
 _DISTANCES = {
     "box": _to_box,
     "sphere": _to_sphere,

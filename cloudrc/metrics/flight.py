@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.config.schema import Criteria, MissionConfig
-from cloudrc.errors import BadInputError
-from cloudrc.geometry.clearance import Hull, clearance, least_clearance, tube_index
+from cloudrc.geometry.clearance import Spheres, clearance, least_clearance, tube_index
 from cloudrc.geometry.obstacles import Obstacle, has_surface, obstacles
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
@@ -45,7 +44,7 @@ class Flight:
     criteria: Criteria
     mission: MissionConfig  # with its waypoints or random steps
     scene: Scene  # its tubes and all other obstacles
-    hull: Hull | None = None  # of the robot; None: not known
+    hull: Spheres | None = None  # of the robot; None: not known
     command_rate_hz: int = 100  # cloud.command_rate_hz
 
     @property
@@ -234,19 +233,12 @@ class Flight:
         if self.hull is None or not self.obstacles or not len(self.truth["stamp_ns"]):
             return np.zeros(0)
         poses = self.truth["position"], self.truth["orientation_wxyz"]
-        return clearance(self.obstacles, *poses, self.hull.few)
+        return clearance(self.obstacles, *poses, self.hull)
 
     @cached_property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """All bodies that the robot must not touch, and from which clearances are known.
-
-        If the scene cannot be read, these are its tubes.
-        """
-        try:
-            found = obstacles(self.scene, touch=self.mission.touched)
-            return tuple(each for each in found if has_surface(each))
-        except BadInputError:
-            return self.scene.tubes
+        """All bodies that the robot must not touch, and from which clearances are known."""
+        return tuple(filter(has_surface, obstacles(self.scene, touch=self.mission.touched)))
 
     @cached_property
     def inside(self) -> Array:
@@ -407,7 +399,7 @@ def _least_clearance(flight: Flight, *, inside: bool) -> float | None:
     if flight.hull is None:
         return None
     poses = truth["position"][rows], truth["orientation_wxyz"][rows]
-    found = least_clearance(flight.obstacles, *poses, flight.hull.few)
+    found = least_clearance(flight.obstacles, *poses, flight.hull)
     return finite(found)
 
 

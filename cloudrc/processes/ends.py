@@ -169,7 +169,7 @@ def open_end(settings: EndSettings, name: str) -> tuple[ResolvedExperiment, Iden
         peer = Peer(bind(settings.listen), settings.route)
     attached = dict[str, bytes]()
     if name == "world":
-        from cloudrc.world.shapes import flown_files
+        from cloudrc.robots.shapes import flown_files
 
         attached = flown_files(experiment.world)
     recorder = open_recorder(settings.record, settings.record_max, name, clock, attached)

@@ -19,8 +19,8 @@ from cloudrc.record.ros import definition
 from cloudrc.record.topics import TOPICS, VIEWS
 from cloudrc.report.live_views import LiveViews
 from cloudrc.report.markers import scene_shapes
+from cloudrc.robots.shapes import read_shapes
 from cloudrc.runs.interrupts import interrupt_on_signals
-from cloudrc.world.shapes import read_shapes
 
 if TYPE_CHECKING:
     import foxglove

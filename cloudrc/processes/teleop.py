@@ -112,7 +112,7 @@ def serve_api(settings: TeleopSettings, experiment: ResolvedExperiment, scene: S
     )
     reader = RequestReader(
         scene,
-        hull_of(world.robot).dense,
+        hull_of(world.robot),
         plan,
         experiment.mission.touch,
         planar=robot.planar,

@@ -50,7 +50,7 @@ def flown_shapes(recording: Recording, experiment: ResolvedExperiment) -> Shapes
     if (data := recording.attachments.get(SHAPES_FILE)) is not None:
         return Shapes.from_bytes(data)
     try:
-        from cloudrc.world.shapes import read_shapes
+        from cloudrc.robots.shapes import read_shapes
 
         return read_shapes(experiment.world)
     except MissingPrerequisiteError:

@@ -15,7 +15,7 @@ from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import read, write_atomically
-from cloudrc.geometry.obstacles import has_surface, intangible, known, obstacles
+from cloudrc.geometry.obstacles import has_surface, obstacles
 from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
@@ -106,12 +106,9 @@ def _unknown_clearance(flight: Flight) -> list[str]:
     """Return a note if the report has no clearance from some obstacles of the scene."""
     if flight.hull is None:
         return [f"{UNKNOWN} anything: the size of the robot is not known here."]
-    try:
-        found = obstacles(flight.scene, touch=flight.mission.touched)
-    except BadInputError as error:
-        return [f"{UNKNOWN} all bodies but declared tubes: {error}."]
-    if not known(flight.scene):
+    if flight.scene.path is not None:
         return [f"{UNKNOWN} all bodies but declared tubes: MuJoCo is not installed."]
+    found = obstacles(flight.scene, touch=flight.mission.touched)
     if unknown := sorted({each.name for each in found if not has_surface(each)}):
         return [f"{UNKNOWN} {', '.join(unknown)}: of a height field, only the box around it is."]
     return []
@@ -119,10 +116,7 @@ def _unknown_clearance(flight: Flight) -> list[str]:
 
 def _flown_through(flight: Flight) -> list[str]:
     """Return a note if the scene has bodies that the robot cannot touch."""
-    try:
-        names = intangible(flight.scene)
-    except BadInputError:  # `_unknown_clearance` tells it
-        return []
+    names = flight.scene.intangible
     if not names:
         return []
     return [

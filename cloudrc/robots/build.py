@@ -3,33 +3,27 @@
 from __future__ import annotations
 
 import inspect
-import re
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 from cloudrc import plugins
-from cloudrc.config.overrides import BRAKING, build_plugin, check_plugin, default_parameters
+from cloudrc.config.overrides import BRAKING, build_plugin, default_parameters
 from cloudrc.config.problems import ConfigProblem, ProblemsError
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.config.robot import GENERAL, RobotFiles, find_robot, parameters
+from cloudrc.config.robot import RobotFiles, known_robot, parameters
 from cloudrc.config.scene import scene_of, steered_in
-from cloudrc.config.schema import PlugIn, World
+from cloudrc.config.schema import Plant, PlugIn, World
 from cloudrc.config.shipped import ROBOT_FILE, file_of
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import ZERO, Vector
-from cloudrc.outside import code
 from cloudrc.outside.document import KeyPath
-from cloudrc.outside.values import RESULT, shorten
-from cloudrc.robots.onboard._airframe import thrust_to_weight
+from cloudrc.sim.airframe import thrust_to_weight
+from cloudrc.sim.onboard import Accelerator, Actuators, Direct, Onboard
+from cloudrc.sim.plant import Wind
+from cloudrc.sim.scene import OwnSensor, compile_model, compile_true, find_part, find_sensors
+from cloudrc.sim.simulator import Simulator, rest_height
 from cloudrc.world.accelerated import AcceleratedRobot
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.onboard import Accelerator, Actuators, Commands, Direct, Onboard
-from cloudrc.world.own_sensors import OwnSensor, find_sensors
-from cloudrc.world.plant import Wind
 from cloudrc.world.robot import STEP, Robot
-from cloudrc.world.scene import compile_model, compile_true
-from cloudrc.world.simulator import Simulator, find_site
 from cloudrc.world.watched import WatchedActuators, WatchedOnboard
 
 KIND = "onboard"
@@ -49,8 +43,12 @@ class Parts(NamedTuple):
     plugin: plugins.Found  # file of the onboard controller
     onboard: Onboard
     actuators: Actuators
-    probe: str | None  # site with which the robot touches; None: any part of it touches
     sensors: tuple[OwnSensor, ...]
+
+    @property
+    def obeys_yaw(self) -> bool:
+        """Whether the onboard controller follows a yaw rate."""
+        return bool(getattr(self.onboard, "obeys_yaw", True))
 
 
 def check_robot(world: World, *, turns: bool = False) -> None:
@@ -58,16 +56,12 @@ def check_robot(world: World, *, turns: bool = False) -> None:
 
     With `turns`, it also has to obey a yaw.
     """
-    build_robot(world, ResolvedGuard.model_validate({}))
+    parts = make_parts(world)
+    connect(world, parts, ResolvedGuard.model_validate({}))
     advise(world, ZERO)
-    if turns and not obeys_yaw(world):
+    if turns and not parts.obeys_yaw:
         reason = f"the onboard controller of {world.robot} does not obey a yaw; leave yaw_deg out"
         raise ProblemsError([ConfigProblem(("mission", "waypoints"), "", reason)])
-
-
-def obeys_yaw(world: World) -> bool:
-    """Return whether the onboard controller of a robot follows a yaw rate."""
-    return bool(getattr(_make_parts(world).onboard, "obeys_yaw", True))
 
 
 def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -> Robot:
@@ -76,47 +70,33 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     Raises:
         BadInputError: If the robot does not compile, or if it cannot move as `world` says.
     """
-    model, plugin, onboard, actuators, probe, sensors = _make_parts(world)
-    robot = find_robot(world.robot)
+    return connect(world, make_parts(world), limits, wind)
+
+
+def connect(world: World, parts: Parts, limits: ResolvedGuard, wind: Wind | None = None) -> Robot:
+    """Connect the parts of a robot, guarded by `limits`."""
+    model, plugin, onboard, actuators, sensors = parts
+    robot = known_robot(world.robot)
     guard = Guard(limits, steered_in(world), robot.guard)
     faster = _accelerator(world, plugin)
     make = None if faster is None else faster.make
     if make is not None and plugin.is_shipped:
-        simulator = Simulator(model, actuators, wind, probe, sensors)
+        simulator = Simulator(model, actuators, wind, robot.probe, sensors)
         return make(simulator, onboard, guard)  # type: ignore[no-any-return]
     with plugin.calling("build"):
         if not isinstance(actuators, Direct):
             actuators = WatchedActuators(actuators, model.nu)
-        simulator = Simulator(model, actuators, wind, probe, sensors)
+        simulator = Simulator(model, actuators, wind, robot.probe, sensors)
         if make is None:
             return Robot(simulator, WatchedOnboard(onboard), guard)
     with plugin.calling("accelerator"):
         return AcceleratedRobot(simulator, onboard, guard, make)
 
 
-def controller(robot: RobotFiles, model: Any) -> PlugIn:
-    """Return the onboard controller of a robot, as its `robot.yaml` says.
-
-    A model without `robot.yaml` is flown by the Pelican's controller if the model, a compiled
-    `MjModel`, is enough like the Pelican, and else by `GENERAL`.
-    """
-    if robot.onboard is not None:
-        return robot.onboard
-    from cloudrc.robots.pelican.fit import check_fit
-
-    try:
-        check_fit(model)
-    except BadInputError:
-        return PlugIn(name=GENERAL)
-    pelican = find_robot("pelican").onboard
-    assert pelican is not None
-    return pelican
-
-
 def onboard_values(world: World) -> dict[str, Any]:
     """Return all parameters of the onboard controller with their values, including defaults."""
-    robot, choice = _choose(world)
-    return default_parameters(KIND, choice.name) | parameters(robot, world)
+    robot = known_robot(world.robot)
+    return default_parameters(KIND, robot.onboard.name) | parameters(robot, world)
 
 
 def advise(world: World, gains: Vector) -> tuple[str, ...]:
@@ -125,24 +105,17 @@ def advise(world: World, gains: Vector) -> tuple[str, ...]:
     Its plug-in may have a function `advise(world, values, gains)`; `values` are its parameters.
     `gains` are the cloud's velocities per distance from the setpoint [1/s], 0 if unknown.
     """
-    return _advise(plugins.find(KIND, _choose(world)[1].name), world, gains)
-
-
-def _advise(plugin: plugins.Found, world: World, gains: Vector) -> tuple[str, ...]:
+    plugin = plugins.find(KIND, known_robot(world.robot).onboard.name)
     if plugin.get("advise") is None:
         return ()
     values = onboard_values(world)
     with plugin.calling("advise") as function:
-        advice = function(world, values, gains)
-        texts = () if isinstance(advice, str) else tuple(advice)
-        if isinstance(advice, str) or not all(isinstance(text, str) for text in texts):
-            raise ValueError(f"it returned {shorten(advice)}, not texts; yield each text")
-        return texts
+        return tuple(map(str, function(world, values, gains)))
 
 
 def accelerator(world: World) -> Accelerator | None:
     """Return what can run the usual steps of a robot faster; None if nothing can."""
-    return _accelerator(world, plugins.find(KIND, _choose(world)[1].name))
+    return _accelerator(world, plugins.find(KIND, known_robot(world.robot).onboard.name))
 
 
 def describe_steps(world: World) -> str:
@@ -157,84 +130,64 @@ def _accelerator(world: World, plugin: plugins.Found) -> Accelerator | None:
     if not world.is_nominal or plugin.get("accelerator") is None:
         return None
     with plugin.calling("accelerator") as function:
-        faster = function()
-        if not isinstance(faster, Accelerator | None):
-            raise ValueError(f"it returned {shorten(faster)}, no Accelerator")
-        return faster
+        return function()  # type: ignore[no-any-return]
 
 
-def _choose(world: World) -> tuple[RobotFiles, PlugIn]:
-    """Return a robot and its onboard controller; a robot without `robot.yaml` is compiled."""
-    robot = find_robot(world.robot)
-    model = compile_model(robot.model, file_of(world.scene)) if robot.onboard is None else None
-    return robot, controller(robot, model)
+def make_parts(world: World) -> Parts:
+    """Compile a robot in its scene, and build its onboard controller and its actuators.
 
-
-def _make_parts(world: World) -> Parts:
-    robot, scene = find_robot(world.robot), file_of(world.scene)
+    Raises:
+        BadInputError: If the robot does not compile, or if it cannot move as `world` says.
+    """
+    robot, scene = known_robot(world.robot), file_of(world.scene)
     nominal, where = compile_model(robot.model, scene), f"{robot.model} in {scene}"
-    choice = controller(robot, nominal)
     try:
-        plugin = plugins.find(KIND, choice.name)  # the build below uses the same import of the file
+        # The build below uses the same import of the file.
+        plugin = plugins.find(KIND, robot.onboard.name)
     except BadInputError as error:
         raise ProblemsError([_problem(world, (), str(error))]) from error
-    onboard = _build_onboard(world, where, choice, robot, nominal)
-    true = compile_true(robot.model, scene, nominal, world.plant)
+    onboard = _build_onboard(world, where, robot, nominal)
+    true = _change(world, robot, nominal)
     if not robot.planar:
         _check_lift(world, where, true)
     actuators = _build_actuators(plugin, nominal, parameters(robot, world))
-    _check_onboard(choice.name, onboard, nominal.nu if isinstance(actuators, Direct) else None)
+    is_direct = isinstance(actuators, Direct)
+    with plugin.calling("build"):
+        stopped = WatchedOnboard(onboard).stopped  # has all methods, too
+        if is_direct and len(stopped) != nominal.nu:
+            raise ValueError(f"its stopped has {len(stopped)} numbers, not {nominal.nu}")
     if robot.planar:
-        stopped = onboard.stopped if isinstance(actuators, Direct) else (0.0,) * true.nu
-        _check_rest(world, where, true, stopped)
-    if world.wind.blows and isinstance(actuators, Direct):
-        _refuse_wind(world, plugin)
+        _check_rest(world, where, true, stopped if is_direct else (0.0,) * true.nu)
+    if world.wind.blows and is_direct:
+        reason = (
+            f"{world.robot} has actuators without drag, so wind would not move it; leave the wind "
+            "out, or give them drag (multirotor has the parameter drag_s_per_m)"
+        )
+        raise ProblemsError([ConfigProblem(("world", "wind"), "", reason)])
     try:
-        probe = _find_probe(robot, choice, nominal)
         sensors = find_sensors(nominal, robot.sensors)
-    except BadInputError as error:
+        if robot.probe is not None:
+            find_part(nominal, "site", robot.probe, "probe")
+    except ValueError as error:
         raise BadInputError(f"{world.robot}/{ROBOT_FILE}: {error}") from error
-    return Parts(true, plugin, onboard, actuators, probe, sensors)
+    return Parts(true, plugin, onboard, actuators, sensors)
 
 
-def _find_probe(robot: RobotFiles, choice: PlugIn, model: Any) -> str | None:
-    """Return the site with which a robot touches; None if any part of it touches.
-
-    A model without `robot.yaml` that has the Pelican's controller has its probe, too.
-    """
-    if robot.probe is not None:
-        find_site(model, robot.probe)
-        return robot.probe
-    pelican = find_robot("pelican")
-    if robot.onboard is not None or choice != pelican.onboard:
-        return None
-    with suppress(BadInputError):
-        find_site(model, pelican.probe or "")
-        return pelican.probe
-    return None
-
-
-def _build_onboard(
-    world: World, where: str, choice: PlugIn, robot: RobotFiles, model: Any
-) -> Onboard:
+def _build_onboard(world: World, where: str, robot: RobotFiles, model: Any) -> Onboard:
     """Build an onboard controller for a compiled `MjModel`; errors name the files in `where`."""
-    given = parameters(robot, world)
-    choice = PlugIn.model_validate({**given, "name": choice.name})
-    if found := check_plugin(KIND, choice):
-        by = f" (controller of {world.robot}: {choice.name})"
-        raise ProblemsError([_problem(world, p.path, f"{p._replace(path=())}{by}") for p in found])
+    name = robot.onboard.name
+    choice = PlugIn.model_validate({**parameters(robot, world), "name": name})
     try:
         more = {}
-        if BRAKING in plugins.signature(KIND, choice.name).parameters:
+        if BRAKING in plugins.signature(KIND, name).parameters:
             more = {BRAKING: robot.guard.braking_mps2}
         return build_plugin(KIND, choice, model=model, **more)  # type: ignore[no-any-return]
+    except ProblemsError as error:  # about its parameters
+        found, by = error.problems, f" (controller of {world.robot}: {name})"
+        named = [_problem(world, p.path, f"{p._replace(path=())}{by}") for p in found]
+        raise ProblemsError(named) from error
     except BadInputError as error:
-        named = next((key for key in given if re.search(rf"\b{key}\b", str(error))), None)
-        if named is None:
-            problem = ConfigProblem(("world", "robot"), "", f"{where}: {error}")
-        else:
-            problem = _problem(world, (named,), str(error))
-        raise ProblemsError([problem]) from error
+        raise ProblemsError([ConfigProblem(("world", "robot"), "", f"{where}: {error}")]) from error
 
 
 def _problem(world: World, path: KeyPath, reason: str) -> ConfigProblem:
@@ -245,23 +198,34 @@ def _problem(world: World, path: KeyPath, reason: str) -> ConfigProblem:
     if path and path[0] in (world.onboard.model_extra or {}):
         return ConfigProblem(("world", "onboard", *path), "", reason)
     file = world.robot if world.robot.endswith(".xml") else f"{world.robot}/{ROBOT_FILE}"
-    if path and path[0] in find_robot(world.robot).tunings.get(world.tuning or "", ()):
+    if path and path[0] in known_robot(world.robot).tunings.get(world.tuning or "", ()):
         key, place = "tuning", ("tunings", str(world.tuning), *path)
     else:
         key, place = "robot", ("onboard", *path)
     return ConfigProblem(("world", key), "", f"{file}: {'.'.join(place)}: {reason}")
 
 
-def _check_rest(world: World, where: str, model: Any, stopped: Commands) -> None:
+def _change(world: World, robot: RobotFiles, nominal: Any) -> Any:
+    """Return the model of the true robot, which may differ from the `nominal` one."""
+    factors = world.plant.actuator_factor
+    if world.plant == Plant():
+        return nominal
+    if isinstance(factors, tuple) and len(factors) != nominal.nu:
+        reason = (
+            f"has {len(factors)} factors, but {robot.model} has {nominal.nu} actuators; give as "
+            "many, or one number for all"
+        )
+        raise ProblemsError([ConfigProblem(("world", "plant", "actuator_factor"), "", reason)])
+    return compile_true(robot.model, file_of(world.scene), nominal, world.plant)
+
+
+def _check_rest(world: World, where: str, model: Any, stopped: tuple[float, ...]) -> None:
     """Raise a BadInputError if a planar robot does not stand at the height of the spawn.
 
     Missions have this height, and the robot cannot change it. `model` is the compiled `MjModel`,
     `stopped` the commands of the robot at rest.
     """
-    data = mujoco.MjData(model)
-    data.ctrl[:] = stopped
-    mujoco.mj_step(model, data, round(SETTLING / STEP))
-    base, spawn = float(data.qpos[2]), scene_of(world).spawn[2]
+    base, spawn = rest_height(model, stopped, SETTLING), scene_of(world).spawn[2]
     if abs(base - spawn) <= REST_ERROR_MAX:
         return
     move = f"{abs(base - spawn):.3f} m {'down' if base < spawn else 'up'}"
@@ -278,8 +242,7 @@ def _check_lift(world: World, where: str, model: Any) -> None:
     ratio = thrust_to_weight(model)
     if ratio is None or ratio >= THRUST_TO_WEIGHT_MIN:
         return
-    hint = "give it more thrust or less mass"
-    key = "robot"
+    key, hint = "robot", "give it more thrust or less mass"
     if not world.is_nominal:
         key, where = "plant", ""
         hint = "lower mass_factor or payload_kg, or raise actuator_factor"
@@ -302,29 +265,3 @@ def _build_actuators(plugin: plugins.Found, model: Any, given: dict[str, Any]) -
             raise ValueError(f"{type(actuators).__name__} has no method step()")
         actuators.reset()
         return actuators  # type: ignore[no-any-return]
-
-
-def _check_onboard(name: str, onboard: Onboard, size: int | None) -> None:
-    """Refuse the controller `name` if it lacks a part.
-
-    `size` is the number of commands, None if unknown.
-    """
-    what = f"the onboard controller {name!r} does not hold the contract"
-    with code.calling(what, slow=f"reset() of {name} is still running"):
-        for method in ("reset", "update", "brake"):
-            if not callable(getattr(onboard, method, None)):
-                raise ValueError(f"{type(onboard).__name__} has no method {method}()")
-        stopped = getattr(onboard, "stopped", None) or ()
-        RESULT.row(stopped, len(stopped) if size is None else size, "stopped")
-        onboard.reset()
-
-
-def _refuse_wind(world: World, plugin: plugins.Found) -> None:
-    """Raise the error about a wind that would not move the robot."""
-    text = f"{world.robot} has actuators without drag, so wind would not move it; "
-    if plugin.get("actuators") is not None:
-        with plugin.calling("actuators") as function:
-            known = inspect.signature(function).parameters
-        keys = [f"world.onboard.{name}" for name in list(known)[2:]]
-        text += f"set {' and '.join(keys)} above 0, or "
-    raise ProblemsError([ConfigProblem(("world", "wind"), "", f"{text}leave the wind out")])

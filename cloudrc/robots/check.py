@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from math import atan2, cos, dist, hypot, remainder, sin, tau
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,26 +18,16 @@ from cloudrc.config.problems import ProblemsError
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotFiles, find_robot
 from cloudrc.config.schema import World
-from cloudrc.config.shipped import file_of
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.compiled import reach_of
-from cloudrc.geometry.shapes import Surface
 from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Vector
-from cloudrc.robots.build import (
-    advise,
-    build_robot,
-    check_robot,
-    controller,
-    obeys_yaw,
-    onboard_values,
-)
-from cloudrc.robots.onboard._airframe import thrust_to_weight
+from cloudrc.robots.build import advise, check_robot, connect, make_parts, onboard_values
+from cloudrc.sim.airframe import thrust_to_weight
+from cloudrc.sim.bodies import reach_of
+from cloudrc.sim.scene import ROBOT_PREFIX
 from cloudrc.text import table
 from cloudrc.world.guard.limits import REACTION
 from cloudrc.world.robot import STEP, Robot
-from cloudrc.world.scene import ROBOT_PREFIX, compile_model
-from cloudrc.world.shapes import read_shapes
 from cloudrc.world.watched import OnboardFailedError
 
 SCENE = "empty"
@@ -60,20 +50,6 @@ BRAKING_MAX = 10.0
 """Largest deceleration that the check tells [m/s^2]: guard.braking_mps2 is not larger."""
 UPRIGHT_MIN = 0.2
 """Smallest cosine of the tilt of a robot that has not turned over [1]."""
-DIVERGED = 4
-"""Number of the first of MuJoCo's three warnings about positions, velocities and accelerations."""
-
-
-class CheckFlight(NamedTuple):
-    """What the robot did in the check's flight."""
-
-    drift: float  # largest distance from its place while it hovers or stands [m]
-    speed: float  # commanded speed of the step [m/s]
-    reached: float  # part of this speed at the end of the step [1]
-    braking: float  # least deceleration that explains the braking distance [m/s^2]
-    rest: float  # speed at the end of braking [m/s]
-    turned: float | None  # part of the turn that it did [1]; None: its heading is not free
-    aside: float | None  # part of a velocity to its side [1]; None: its heading is another
 
 
 def check(name: str) -> tuple[dict[str, Any], list[str]]:
@@ -91,32 +67,21 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
         hull_of(name)
     try:
         advise(world, ZERO)
-        body = build_robot(world, ResolvedGuard.model_validate({}))
+        parts = make_parts(world)
+        body = connect(world, parts, ResolvedGuard.model_validate({}))
     except ProblemsError as error:  # no experiment has chosen the robot
         raise BadInputError("; ".join(problem.reason for problem in error.problems)) from error
-    model = compile_model(robot.model, file_of(SCENE))
-    facts = _read_facts(world, robot, model)
+    facts = _read_facts(world, robot, parts.model)
     changes = [*doubts(name), *_judge_tunings(robot, world)]
     try:
         motion = _move(body, robot)
     except OnboardFailedError as error:
         return facts, [*changes, str(error)]
-    facts |= {
-        "drift_m": motion.drift,
-        "step_mps": motion.speed,
-        "step_reached": motion.reached,
-        "braking_measured_mps2": motion.braking,
-        **({} if motion.turned is None else {"turn_reached": motion.turned}),
-        **({} if motion.aside is None else {"side_reached": motion.aside}),
-    }
-    if body.simulator.data.warning.number[DIVERGED : DIVERGED + 3].any():
+    rest = motion.pop("rest")
+    facts |= {key: value for key, value in motion.items() if value is not None}
+    if body.simulator.bad_values():
         return facts, [*changes, "the simulation diverged: check masses and inertias of the model"]
-    return facts, changes + _judge(robot, motion, obeys=obeys_yaw(world))
-
-
-def read_surfaces(name: str) -> tuple[Surface, ...]:
-    """Return the surfaces of a robot, in the frame of its base."""
-    return read_shapes(World.model_validate({"robot": name, "scene": SCENE})).robot
+    return facts, [*changes, *_judge(robot, facts, rest)]
 
 
 def _read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
@@ -133,7 +98,7 @@ def _read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
         **({} if ratio is None else {"thrust_to_weight": ratio, "hover_thrust": 1.0 / ratio}),
         "planar": robot.planar,
         "heading": robot.heading,
-        "onboard": controller(robot, model).name,
+        "onboard": robot.onboard.name,
         "parameters": onboard_values(world),
         "guard": robot.guard.model_dump(),
         "size_m": size,
@@ -154,8 +119,14 @@ def _judge_tunings(robot: RobotFiles, world: World) -> Iterator[str]:
             yield str(error)
 
 
-def _move(body: Robot, robot: RobotFiles) -> CheckFlight:
-    """Let the robot hover or stand, follow a step along x, brake, and turn if it can."""
+def _move(body: Robot, robot: RobotFiles) -> dict[str, Any]:
+    """Let the robot hover or stand, follow a step along x, brake, and turn if it can.
+
+    Return what it did: largest distance from its place at rest [m], commanded speed of the step
+    [m/s], part of it at the end of the step [1], least deceleration that explains the braking
+    distance [m/s^2], speed at the end of braking [m/s], part of the turn and of a velocity to its
+    side [1]; None: its heading is another.
+    """
     climb = (0.0, 0.0, 0.0 if robot.planar else CLIMB)
     body.simulator.reset()
     body.onboard.reset()
@@ -171,16 +142,23 @@ def _move(body: Robot, robot: RobotFiles) -> CheckFlight:
     way = hypot(*np.subtract(body.simulator.readings.position, start)[:2]) - REACTION * before
     braking = min(before * before / (2.0 * max(way, 1e-9)), BRAKING_MAX)
     rest = _speed(body)
-    turned, aside = _turn(body, robot), _follow_aside(body, robot, speed)
-    return CheckFlight(drift, speed, before / speed, braking, rest, turned, aside)
+    return {
+        "drift_m": drift,
+        "step_mps": speed,
+        "step_reached": before / speed,
+        "braking_measured_mps2": braking,
+        "rest": rest,
+        "turn_reached": _turn(body, robot),
+        "side_reached": _follow_aside(body, robot, speed),
+    }
 
 
 def _turn(body: Robot, robot: RobotFiles) -> float | None:
     """Let the robot turn, and return the part of the turn that it did [1].
 
-    None: its heading is not free, or an .xml file alone leaves open what flies it.
+    None: its heading is not free.
     """
-    if robot.heading != "free" or robot.onboard is None:
+    if robot.heading != "free":
         return None
     start = _yaw(body)
     _follow(body, robot, ZERO, ZERO, TURNING, TURN)
@@ -238,47 +216,40 @@ def _yaw(body: Robot) -> float:
     return atan2(axes[1], axes[0])
 
 
-def _judge(robot: RobotFiles, motion: CheckFlight, *, obeys: bool) -> list[str]:
-    """Return what must change because of the robot's motion.
-
-    `obeys` tells whether its onboard controller obeys a yaw.
-    """
-    found, verb = [], "stand" if robot.planar else "hover"
-    if motion.drift > DRIFT_MAX:
-        found.append(f"the robot does not {verb}: it drifts {motion.drift:.2f} m in {STEADY:g} s")
-    if abs(motion.reached - 1.0) > SHORT:
-        found.append(
-            f"the robot reaches {motion.reached:.0%} of a velocity of {motion.speed:g} m/s along x "
-            f"in {FAST:g} s: check the onboard controller, or set guard.speed_max_mps"
+def _judge(robot: RobotFiles, facts: Mapping[str, Any], rest: float) -> Iterator[str]:
+    """Yield what must change because of the motion; `rest` is the robot's last speed [m/s]."""
+    drift, speed, reached = facts["drift_m"], facts["step_mps"], facts["step_reached"]
+    braking, turned = facts["braking_measured_mps2"], facts.get("turn_reached", 1.0)
+    aside = facts.get("side_reached", 1.0)
+    if drift > DRIFT_MAX:
+        verb = "stand" if robot.planar else "hover"
+        yield f"the robot does not {verb}: it drifts {drift:.2f} m in {STEADY:g} s"
+    reaches = "the robot reaches {:.0%} of a velocity of {:g} m/s {} in {:g} s: "
+    if abs(reached - 1.0) > SHORT:
+        yield (
+            reaches.format(reached, speed, "along x", FAST)
+            + "check the onboard controller, or set guard.speed_max_mps"
         )
-        return found
-    if motion.turned is not None and motion.turned < 1.0 - SHORT:
-        share = round(motion.turned, 2) + 0.0  # no -0 %
-        found.append(
-            f"robot.yaml: heading is free, but the robot follows {share:.0%} of a yaw rate "
-            f"of {TURN:g} rad/s: let the onboard controller follow it, or set heading: fixed"
+        return
+    if turned < 1.0 - SHORT:
+        yield (
+            "robot.yaml: heading is free, but the robot follows "
+            f"{max(turned, 0.0):.0%} of a yaw rate of {TURN:g} rad/s: let the onboard "
+            "controller follow it, or set heading: fixed"
         )
-    elif motion.turned is not None and not obeys:
-        found.append(
-            "robot.yaml: heading is free, but the onboard controller does not obey a yaw: delete "
-            "heading, or choose another controller"
+    if abs(aside - 1.0) > SHORT:
+        yield (
+            reaches.format(aside, speed, "to its left", FAST)
+            + "let it turn faster, with diff_drive by turn_rate_max or turn_gain; wheels that skid "
+            "sideways in a turn need a larger turn_gain"
         )
-    if motion.aside is not None and abs(motion.aside - 1.0) > SHORT:
-        share = round(motion.aside, 2) + 0.0  # no -0 %
-        found.append(
-            f"the robot reaches {share:.0%} of a velocity of {motion.speed:g} m/s to its left in "
-            f"{FAST:g} s: let it turn faster, with diff_drive by turn_rate_max or turn_gain; "
-            "wheels that skid sideways in a turn need a larger turn_gain"
-        )
-    if motion.rest > REST:
-        found.append(f"the robot still moves at {motion.rest:.2f} m/s, {STOP:g} s after it brakes")
-    if motion.braking < robot.guard.braking_mps2:
-        fits = int(motion.braking * 10) / 10
-        found.append(
+    if rest > REST:
+        yield f"the robot still moves at {rest:.2f} m/s, {STOP:g} s after it brakes"
+    if braking < robot.guard.braking_mps2:
+        yield (
             f"robot.yaml: guard.braking_mps2 is {robot.guard.braking_mps2:g}, but the robot brakes "
-            f"with {motion.braking:.2f} m/s^2; set it to {fits:g} or less"
+            f"with {braking:.2f} m/s^2; set it to {int(braking * 10) / 10:g} or less"
         )
-    return found
 
 
 def facts_table(facts: Mapping[str, Any]) -> str:

@@ -20,8 +20,8 @@ from cloudrc.errors import CloudrcError
 from cloudrc.records import Record
 from cloudrc.robots.build import describe_steps
 from cloudrc.runs.flight import fly_point
+from cloudrc.sim.simulator import replay
 from cloudrc.text import table
-from cloudrc.world.simulator import replay
 
 STEP = 0.002
 """Time step of the physics [s]."""

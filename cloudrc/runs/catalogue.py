@@ -50,7 +50,7 @@ def _onboard_of_robots() -> dict[str, str]:
     from cloudrc.config.robot import find_robot
 
     controllers = [find_robot(robot).onboard for robot in shipped.names("robot")]
-    files = [each.name for each in controllers if each is not None and plugins.is_path(each.name)]
+    files = [each.name for each in controllers if plugins.is_path(each.name)]
     return {"/".join(Path(file).parts[-2:]): plugins.describe("onboard", file) for file in files}
 
 
@@ -124,6 +124,5 @@ def _of_robots() -> tuple[set[str], list[str]]:
     for robot in map(find_robot, shipped.names("robot")):
         tunings |= robot.tunings.keys()
         with suppress(CloudrcError):  # without MuJoCo, some controllers have no signature
-            assert robot.onboard is not None
             keys |= default_parameters("onboard", robot.onboard.name).keys()
     return {f"world.onboard.{key}" for key in keys}, sorted(tunings)

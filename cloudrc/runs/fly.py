@@ -136,7 +136,7 @@ def _record_virtual(
     `with` block. After the block, this function attaches a copy of the report to mission.mcap.
     """
     from cloudrc.robots.build import describe_steps
-    from cloudrc.world.shapes import flown_files
+    from cloudrc.robots.shapes import flown_files
 
     store, interrupted, see = RecordStore(), False, _interruptible(see)
     lost: ControllerLostError | None = None

@@ -23,7 +23,7 @@ def installed_code(point: ResolvedExperiment) -> dict[str, str]:
     """
     onboard = known_robot(point.world.robot).onboard
     chosen = [(kind, getattr(point.cloud, key).name) for key, kind in KINDS.items()]
-    chosen += [("onboard", onboard.name)] if onboard else []
+    chosen += [("onboard", onboard.name)]
     chosen += [("metrics", name) for name in plugins.installed("metrics")]
     return {f"{kind} {name}": code for kind, name in chosen if (code := plugin_code(kind, name))}
 

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.config import shipped
+from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
 from cloudrc.files import PICTURES, refuse_other_file, write_atomically
-from cloudrc.robots.check import check, facts_table, read_surfaces
+from cloudrc.robots.check import SCENE, check, facts_table
+from cloudrc.robots.shapes import read_shapes
 from cloudrc.runs.requirements import missing, require
 
 PICTURE = "check.png"
@@ -65,5 +67,6 @@ def _draw(name: str, picture: Path | None, kind: str, *, required: bool) -> str:
     require("a picture", ("report",))
     from cloudrc.report.robot_picture import draw_robot
 
-    write_atomically(picture, draw_robot(read_surfaces(name), kind))
+    shapes = read_shapes(World.model_validate({"robot": name, "scene": SCENE}))
+    write_atomically(picture, draw_robot(shapes.robot, kind))
     return f"picture: {picture}"

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cloudrc.geometry.clearance import NO_SIZE, Hull, clearance_per_obstacle
+from cloudrc.geometry.clearance import NO_SIZE, Spheres, clearance_per_obstacle
 from cloudrc.geometry.obstacles import obstacles, surface
 from cloudrc.geometry.placement import find_crossed
 from cloudrc.geometry.scene import Scene
@@ -18,7 +18,7 @@ class KnownObstacles(NamedTuple):
     """The obstacles of a scene, for a robot; the body `touch` that a mission touches is none."""
 
     scene: Scene | None = None  # None: nothing is known about obstacles
-    hull: Hull = NO_SIZE
+    hull: Spheres = NO_SIZE
 
     def crossed(self, seen: RobotStatus, leg: Leg, touch: str | None) -> str:
         """Say which obstacle is on the straight way from the robot to a leg; "" if none is."""
@@ -26,7 +26,7 @@ class KnownObstacles(NamedTuple):
             return ""
         here, there = np.array([seen.position]), np.array([leg.position])
         known = obstacles(self.scene, touch=touch)
-        through = int(find_crossed(known, self.hull.dense, here, there, leg.yaw or 0.0)[0])
+        through = int(find_crossed(known, self.hull, here, there)[0])
         if through < 0:
             return ""
         return (
@@ -45,7 +45,7 @@ class KnownObstacles(NamedTuple):
         if not known:
             return text
         where = [seen.position], [seen.orientation_wxyz]
-        away = clearance_per_obstacle(known, *where, self.hull.few)[0]
+        away = clearance_per_obstacle(known, *where, self.hull)[0]
         return f"{text}, next to {known[away.argmin()].name}"
 
 

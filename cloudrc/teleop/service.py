@@ -7,7 +7,7 @@ from contextlib import suppress
 from math import hypot, inf
 from typing import Any
 
-from cloudrc.geometry.clearance import NO_SIZE, Hull
+from cloudrc.geometry.clearance import NO_SIZE, Spheres
 from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Start, Vector
@@ -69,7 +69,7 @@ class MissionService(MissionRunner):
         book: MissionStore,
         fence: Fence,
         scene: Scene | None = None,
-        hull: Hull = NO_SIZE,
+        hull: Spheres = NO_SIZE,
         units: Mapping[str, str] | None = None,
         *,
         speed_max: float = SPEED_MAX,

@@ -2,7 +2,6 @@
 
     tunnel > guard > onboard > actuators > simulator > readings > sensors > tunnel
 
-`readings` is the interface between the physics and the onboard controller. Only `scene` imports
-MuJoCo. Scenes are MJCF files in the folder `scenes`; a file's name is the name in the
-configuration. Robots are in `cloudrc/robots/`.
+The physics is `cloudrc.sim`. Scenes are MJCF files in the folder `scenes`; a file's name is the
+name in the configuration. Robots are in `cloudrc/robots/`.
 """

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from math import isfinite
 from typing import Any
 
-from cloudrc.geometry.compiled import mujoco
 from cloudrc.outside.code import FAILURES
 from cloudrc.outside.values import shorten
+from cloudrc.sim.engine import mujoco
+from cloudrc.sim.onboard import Onboard
+from cloudrc.sim.simulator import Simulator
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.onboard import Onboard
 from cloudrc.world.robot import STEP_NS, Robot
-from cloudrc.world.simulator import Simulator
 from cloudrc.world.watched import OnboardFailedError, WatchedOnboard, failure_of, where
 
 STEPS = "the accelerator of the onboard controller"

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Protocol
 
 from cloudrc.messages import Command, GuardState, OperatorRequest
+from cloudrc.sim.onboard import Commands, Onboard
+from cloudrc.sim.readings import Readings
+from cloudrc.sim.simulator import Simulator
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.onboard import Commands, Onboard
-from cloudrc.world.readings import Readings
-from cloudrc.world.simulator import Simulator
 from cloudrc.world.watched import OnboardFailedError
 
 STEP_NS = 2_000_000

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cloudrc.config import schema
-from cloudrc.geometry.compiled import mujoco
-from cloudrc.messages import ZERO, Odometry, Quaternion, Vector
+from cloudrc.messages import ZERO, Odometry, Vector
+from cloudrc.sim.simulator import turned
 
 
 class Errors(NamedTuple):
@@ -59,20 +59,10 @@ class Sensors:
         """Return the odometry that cloud gets: the true odometry plus the configured errors."""
         if self._exact:
             return truth
-        turn = self._attitude.add(ZERO, self._turn_rng)
+        turn, orientation = self._attitude.add(ZERO, self._turn_rng), truth.orientation_wxyz
         return truth._replace(
             position=self._position.add(truth.position, self._rng),
             velocity=self._velocity.add(truth.velocity, self._rng),
-            orientation_wxyz=_turned(truth.orientation_wxyz, turn),
+            orientation_wxyz=orientation if turn == ZERO else turned(orientation, turn),
             angular_velocity_body=self._rate.add(truth.angular_velocity_body, self._turn_rng),
         )
-
-
-def _turned(orientation_wxyz: Quaternion, turn: Vector) -> Quaternion:
-    """Turn an orientation by the rotation vector `turn` [rad], body frame, shape (3,)."""
-    if turn == ZERO:
-        return orientation_wxyz
-    quaternion = np.array(orientation_wxyz)
-    mujoco.mju_quatIntegrate(quaternion, np.array(turn), 1.0)
-    w, x, y, z = quaternion.tolist()
-    return (w, x, y, z)

@@ -15,8 +15,8 @@ from cloudrc.errors import describe_error
 from cloudrc.messages import NEVER_NS, Vector
 from cloudrc.outside.code import FAILURES, check_failure, locate, stack_of
 from cloudrc.outside.values import RESULT, InvalidValueError
-from cloudrc.world.onboard import Actuators, Commands, Inputs, Onboard
-from cloudrc.world.readings import Readings
+from cloudrc.sim.onboard import Actuators, Commands, Inputs, Onboard
+from cloudrc.sim.readings import Readings
 
 WHAT, PHYSICS = "the onboard controller", "the actuators of the onboard controller"
 """The watched objects in messages."""

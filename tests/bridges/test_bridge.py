@@ -215,7 +215,7 @@ def test_ros_reads_health_guard_and_frames():
 
 
 def test_markers_move_with_the_robots_frames_and_the_scene_stays():
-    corners, faces = np.eye(3), (np.array([[0, 1, 2]], np.int32),)
+    corners, faces = np.eye(3), np.array([[0, 1, 2]], np.int32)
     bodies = Shapes((Surface("", corners, faces),), (Surface("box", corners, faces),))
     shapes = [*scene_shapes(bodies, (), "drone1/"), path_shape("flown", [ZERO, (1.0, 0.0, 0.0)])]
     data = encode_markers(0, shapes)

@@ -168,7 +168,7 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ),
         (
             "world.scene=empty",
-            "--set: world.scene: empty: does not fit: mission.touch.body: board: the scene empty",
+            "--set: world.scene: empty: does not fit: mission.touch.body: board: no body",
         ),
         ("mission.waypoints.2.speed_mps=1", "waypoints.2.speed_mps: 1: is the speed of a carrot;"),
         ("mission=steps mission.carrot.speed_mps=1", "mission.carrot: impossible with steps"),

@@ -19,7 +19,7 @@ def own_robot(tmp_path):
     def make(limits, name="mine"):
         folder = tmp_path / name
         folder.mkdir()
-        (folder / "robot.yaml").write_text(f"{{onboard: multirotor, guard: {limits}}}")
+        (folder / "robot.yaml").write_text(f"{{onboard: multirotor, hull_m: 0.3, guard: {limits}}}")
         return f"world.robot={folder}"
 
     return make

@@ -9,7 +9,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.config.scene import scene_of
 from cloudrc.console.scene import FlightScene, clearance_colours
 from cloudrc.geometry.clearance import CLEARANCE_SHOWN
-from cloudrc.world.shapes import read_shapes
+from cloudrc.robots.shapes import read_shapes
 
 
 @pytest.fixture

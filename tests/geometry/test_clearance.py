@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.hull import hull_of
+from cloudrc.config.hull import hull_of, known_hull
+from cloudrc.config.scene import scene_of
+from cloudrc.config.schema import World
 from cloudrc.geometry.clearance import (
     clearance,
     clearance_per_obstacle,
@@ -21,7 +23,7 @@ from cloudrc.geometry.scene import Tube, load_scene
 
 PIPES = load_scene("pipes")
 TUBES = PIPES.tubes
-FEW, DENSE = hull_of("pelican")
+FEW = hull_of("pelican")
 ALONG_X = Tube("pipe_x", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5.0, 0.662, 0.700)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 
@@ -63,7 +65,7 @@ def test_clearance_is_infinite_in_an_empty_scene():
 
 def test_points_are_those_of_the_plant_and_turn_with_the_robot():
     points = FEW
-    assert (points.positions.shape, len(DENSE.radii)) == ((225, 3), 341)
+    assert points.positions.shape == (225, 3)
     # A third of a turn about (1, 1, 1) takes x to y, y to z, z to x.
     placed = place_points(points, np.zeros((1, 3)), np.array([[0.5, 0.5, 0.5, 0.5]]))[0]
     assert placed == pytest.approx(points.positions[:, [2, 0, 1]])
@@ -102,22 +104,18 @@ def test_the_least_clearance_is_that_of_all_poses_to_the_bit(seed, count, step):
 )
 def test_clearance_is_known_for_every_robot_and_scene(robot, at, expected):
     hull = hull_of(robot)
-    reach = 0.0 if robot == "pelican" else hull.few.radii[0]
-    found = clearance(obstacles(load_scene("pillars"), touch=None), [at], [LEVEL], hull.few)
+    reach = 0.0 if robot == "pelican" else hull.radii[0]
+    found = clearance(obstacles(scene_of(World(scene="pillars")), touch=None), [at], [LEVEL], hull)
     assert found == pytest.approx([expected - reach], abs=0.01)
 
 
-def test_the_ball_of_a_robot_holds_its_geoms(tmp_path):
+def test_the_ball_of_a_robot_holds_its_geoms(tmp_path, monkeypatch):
     (tmp_path / "robot.yaml").write_text("onboard: multirotor")
     (tmp_path / "robot.xml").write_text(
         '<mujoco><worldbody><body><freejoint/><geom type="box" size=".3 .4 .01"/>'
         '<body pos="0 .5 0"><geom type="cylinder" size=".12 .05" euler="90 0 0"/></body>'
         "</body></worldbody></mujoco>"
     )
-    assert hull_of(str(tmp_path)).few.radii == pytest.approx([0.5629], abs=1e-3)
-
-
-def test_robots_of_three_sizes_have_their_hull_without_mujoco(monkeypatch):
+    assert hull_of(str(tmp_path)).radii == pytest.approx([0.5629], abs=1e-3)
     monkeypatch.setattr("cloudrc.config.hull.find_spec", lambda name: None)
-    sizes = [hull_of(name).few.radii[0] for name in ("nano", "rover", "x2")]
-    assert sizes == sorted(sizes)
+    assert known_hull(str(tmp_path)) is None, "its size needs MuJoCo"

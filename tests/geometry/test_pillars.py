@@ -4,15 +4,17 @@ import pytest
 
 import cloudrc
 from cloudrc.config.load import load_experiment
+from cloudrc.config.scene import scene_of
+from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.obstacles import body_names, obstacles
+from cloudrc.geometry.obstacles import obstacles
 from cloudrc.geometry.scene import load_scene
 
 
 def test_all_bodies_of_a_shipped_scene_are_obstacles_also_without_numbers_in_its_file():
-    scene = load_scene("pillars")
+    scene = scene_of(World(scene="pillars"))
     found = {each.name for each in obstacles(scene, touch=None)}
-    assert found == set(body_names(scene)) - {"floor"}
+    assert found == set(scene.bodies) - {"floor"}
     assert {"pillar_1", "pillar_4", "thick_left", "block"} <= found
 
 

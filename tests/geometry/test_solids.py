@@ -6,10 +6,11 @@ import pytest
 from cloudrc.errors import BadInputError
 from cloudrc.geometry import solids
 from cloudrc.geometry.clearance import ball
-from cloudrc.geometry.compiled import mujoco, read_bodies
 from cloudrc.geometry.placement import find_overlapped
-from cloudrc.geometry.scene import SCENES
+from cloudrc.geometry.scene import SCENES, load_scene
 from cloudrc.geometry.solids import Solid
+from cloudrc.sim.bodies import complete
+from cloudrc.sim.engine import mujoco
 
 GEOMS = {
     "box": '<geom type="box" size=".2 .3 .4"/>',
@@ -23,6 +24,10 @@ GEOMS = {
 MESH = '<asset><mesh name="m" vertex="-.2 -.2 0 .3 -.2 0 0 .4 0 0 0 .5 .1 .1 .1"/></asset>'
 PLACE = 'pos="1 2 1.5" euler="20 30 40"'
 CUBE = " ".join(f"{x} {y} {z}" for x in (-0.2, 0.2) for y in (-0.3, 0.3) for z in (-0.4, 0.4))
+
+
+def read_bodies(path):
+    return complete(load_scene(str(path)))
 
 
 def scene(folder, bodies, more=""):
@@ -57,9 +62,6 @@ def test_a_solid_is_as_far_away_as_its_geom(shape, tmp_path):
     outside = true > 0.01
     assert outside.sum() > 50
     assert found[outside] == pytest.approx(true[outside], abs=2e-3)
-    if shape != "plane":
-        centres = np.linalg.norm(points - solid.centre, axis=1)
-        assert (true >= centres - solid.radius - 2e-3)[outside].all()
     assert (found[true < -0.01] < 0).all()
 
 
@@ -70,7 +72,7 @@ def near(size):
 
 
 def solid_of(shape, size, faces=None):
-    return Solid("it", shape, np.zeros(3), np.eye(3), np.array(size), 1.0, faces)
+    return Solid("it", shape, np.zeros(3), np.eye(3), np.array(size), faces)
 
 
 def test_a_box_of_a_mesh_is_as_far_away_as_a_box(tmp_path, monkeypatch):
@@ -93,16 +95,10 @@ def test_a_way_may_pass_the_edge_of_a_mesh_as_near_as_that_of_a_box(geom, away, 
     cube = f'<asset><mesh name="cube" vertex="{CUBE}"/></asset>'
     path = scene(tmp_path, f'<body name="it" pos="0 0 1"><geom {geom}/></body>', cube)
     known = read_bodies(path).solids
-    robot = ball(0.1).dense
+    robot = ball(0.1)
     aside = (0.1 + away) / 2**0.5
     position = np.array([[0.2 + aside, 0.3 + aside, 1.0]])
-    assert find_overlapped(known, robot, position, np.zeros(1)).tolist() == [index]
-
-
-def test_an_ellipsoid_with_equal_axes_is_as_far_away_as_a_sphere():
-    points = near((0.3, 0.3, 0.3))
-    found = solid_of("ellipsoid", (0.3, 0.3, 0.3)).distance(points)
-    assert found == pytest.approx(solid_of("sphere", (0.3, 0, 0)).distance(points), abs=1e-9)
+    assert find_overlapped(known, robot, position).tolist() == [index]
 
 
 @pytest.mark.parametrize("size", [(0.25, 0.25, 0.12), (0.2, 0.3, 0.4), (0.5, 0.02, 0.1)])
@@ -126,7 +122,7 @@ def test_only_what_the_robot_can_touch_is_a_solid(tmp_path):
         '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 .5 .1" elevation="0 0 1 1"/></asset>',
     )
     bodies = read_bodies(path)
-    assert bodies.names == ("floor", "ghost", "other", "half", "hills")
+    assert bodies.bodies == ("floor", "ghost", "other", "half", "hills")
     assert [(solid.name, solid.shape) for solid in bodies.solids] == [
         ("half", "sphere"),
         ("hills", "outline"),
@@ -135,9 +131,9 @@ def test_only_what_the_robot_can_touch_is_a_solid(tmp_path):
 
 def test_a_changed_file_is_read_again(tmp_path):
     path = scene(tmp_path, '<body name="a"><geom size=".1"/></body>')
-    assert read_bodies(path).names == ("floor", "a")
+    assert read_bodies(path).bodies == ("floor", "a")
     scene(tmp_path, '<body name="another"><geom size=".1"/></body>')
-    assert read_bodies(path).names == ("floor", "another")
+    assert read_bodies(path).bodies == ("floor", "another")
     path.unlink()
     with pytest.raises(BadInputError, match=r"mine\.xml: cannot be read"):
         read_bodies(path)
@@ -148,4 +144,4 @@ def test_a_changed_include_is_read_again(tmp_path):
     for name in ("a", "another"):
         body = f'<body name="{name}"><geom size=".1"/></body>'
         (tmp_path / "part.xml").write_text(f"<mujoco>{body}</mujoco>")
-        assert read_bodies(path).names == ("floor", name)
+        assert read_bodies(path).bodies == ("floor", name)

@@ -14,7 +14,7 @@ from cloudrc.record.holes import Hole
 from cloudrc.records import Control
 from cloudrc.report.figures import FIGURES, PRINT_KINDS, draw_all, own_settings
 from cloudrc.report.figures.style import RC, Look, Subject, sampled
-from cloudrc.world.shapes import read_shapes
+from cloudrc.robots.shapes import read_shapes
 from tests.metrics.conftest import ONE_PIPE, OPEN_AIR, SECOND, START, flown
 
 CALM = DirectionConfig(delay_ms=50.0)

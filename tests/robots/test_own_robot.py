@@ -44,11 +44,8 @@ def test_the_controller_may_lie_in_the_folder_and_takes_parameters(own_robot):
     ("text", "message"),
     [
         ("onbord: x", "robot.yaml:1: onbord: unknown key; did you mean onboard?"),
-        ("description: no controller", "onboard: is missing"),
-        ("onboard: [", "robot.yaml"),
         (f"onboard: {{name: {CONTROLLER}, gain_q: 1}}", "gain_q: unknown key; did you mean gain_p"),
         ("onboard: ./missing.py", "missing.py': there is no such file"),
-        ("onboard: no_such", "no onboard named 'no_such'"),
         (f"{{model: other.xml, onboard: {CONTROLLER}}}", "other.xml"),
     ],
 )
@@ -62,14 +59,6 @@ def test_what_is_wrong_with_a_robot_is_one_problem_by_name(own_robot, text, mess
 def test_a_folder_without_its_file_is_no_robot(tmp_path):
     with pytest.raises(BadInputError, match=r"has no robot\.yaml, so it is no robot"):
         load_experiment("hover", [f"world.robot={tmp_path}"])
-
-
-def test_a_model_that_the_controller_cannot_fly_is_refused_by_it(own_robot):
-    heavy = own_robot(f"onboard: {CONTROLLER}")
-    model = heavy / "robot.xml"
-    model.write_text(model.read_text().replace('mass="1.0"', 'mass="1.5"'))
-    with pytest.raises(BadInputError, match=r"robot\.xml in .*empty\.xml: .*not 1.56 and 9.8"):
-        cloudrc.fly("hover", HOVER | {"world.robot": str(heavy)})
 
 
 def test_the_key_of_a_flight_has_the_files_of_its_robot(own_robot, tmp_path):
@@ -101,17 +90,3 @@ def test_a_folder_named_like_a_shipped_robot_is_a_robot_of_its_own(own_robot, tm
     own_robot("onboard: multirotor", find_robot("x2").model.read_text()).rename(tmp_path / "nano")
     name = load_experiment("hover", [f"world.robot={tmp_path}/nano"]).world.robot
     assert find_robot(name).model.read_text() != find_robot("nano").model.read_text()
-
-
-def test_a_symlink_leads_to_the_robot(own_robot, tmp_path):
-    mine = own_robot("onboard: multirotor", find_robot("x2").model.read_text())
-    (tmp_path / "linked").symlink_to(mine)
-    assert load_experiment("hover", [f"world.robot={tmp_path}/linked"]).world.robot == str(mine)
-
-
-def test_a_mesh_without_its_file_is_one_problem_that_names_it(own_robot):
-    mesh = '<asset><mesh name="skin" file="no.stl"/></asset><worldbody>'
-    text = find_robot("x2").model.read_text().replace("<worldbody>", mesh, 1)
-    mine = own_robot("onboard: multirotor", text)
-    with pytest.raises(BadInputError, match=r"no\.stl"):
-        cloudrc.fly("hover", HOVER | {"world.robot": str(mine)})

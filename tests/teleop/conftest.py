@@ -346,7 +346,7 @@ class Running:
         self.alarms, self.complaints, self.log = [], [], []
         self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
         plan = partial(assembly.mission_plan, fence=FENCE)
-        reader = RequestReader(self.scene, PELICAN.dense, plan)
+        reader = RequestReader(self.scene, PELICAN, plan)
         app = create_app(self.bridge, reader, self.complaints.append)
         tokens = None if unix else Tokens(folder, self.complaints.append)
         self.gate = Gate(app, tokens, self.log.append)

@@ -3,12 +3,11 @@
 import numpy as np
 
 from cloudrc.config.robot import find_robot
-from cloudrc.config.schema import Plant
 from cloudrc.config.shipped import file_of
 from cloudrc.robots.pelican.rotors import Rotors
+from cloudrc.sim.scene import compile_model, compile_true
+from cloudrc.sim.simulator import Simulator
 from cloudrc.world.robot import STEP
-from cloudrc.world.scene import compile_model, compile_true
-from cloudrc.world.simulator import Simulator
 
 
 def normalised(quaternion):
@@ -22,7 +21,7 @@ def model_of(robot="pelican", scene="empty", plant=None):
     """Compile a robot in a scene, given by names or paths; `plant` changes the true robot."""
     files = find_robot(robot).model, file_of(scene)
     nominal = compile_model(*files)
-    return compile_true(*files, nominal, plant or Plant())
+    return nominal if plant is None else compile_true(*files, nominal, plant)
 
 
 def simulate(robot="pelican", scene="empty", plant=None):

@@ -199,7 +199,7 @@ def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
 )
 def _impossible(outcome: Outcome) -> None:
     experiment, first = read_experiment("paper"), (0.5, 0.0, 0.8)
-    scene, robot = scene_of(experiment.world), hull_of(experiment.world.robot).dense
+    scene, robot = scene_of(experiment.world), hull_of(experiment.world.robot)
     points: dict[str, Vector] = {
         "1 m behind a wall of the fence": (fence_of(scene).high[0] + 1.0, 0.0, 1.0),
         "far below the floor": (0.0, 0.0, -5.0),

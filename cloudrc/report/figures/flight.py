@@ -15,9 +15,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from cloudrc.geometry.clearance import CLEARANCE_SHOWN
+from cloudrc.geometry.clearance import CLEARANCE_SHOWN, rotations
 from cloudrc.geometry.scene import Tube
-from cloudrc.geometry.shapes import rotation
 from cloudrc.geometry.tubes import rims
 from cloudrc.metrics.flight import Array
 from cloudrc.report.figures.style import (
@@ -205,7 +204,7 @@ def _draw_robot(axes: Axes, subject: Subject, sides: tuple[int, int]) -> None:
     truth = subject.flight.truth
     if not len(truth["stamp_ns"]):
         return
-    position, axes_of = truth["position"][-1], rotation(truth["orientation_wxyz"][-1])
+    position, axes_of = truth["position"][-1], rotations(truth["orientation_wxyz"][-1:])[0]
     for surface in subject.shapes.robot:
         hull = outline(surface.placed(position, axes_of).corners[:, sides])
         axes.add_patch(Polygon(hull, fc=SKY, ec="none", alpha=0.5, zorder=2.5))

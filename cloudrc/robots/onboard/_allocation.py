@@ -11,14 +11,10 @@ from math import inf
 
 import numpy as np
 
-from cloudrc.errors import BadInputError
-from cloudrc.robots.onboard._airframe import Airframe, span
-from cloudrc.world.onboard import Commands
-from cloudrc.world.plant import Array
+from cloudrc.sim.airframe import Airframe, span
+from cloudrc.sim.onboard import Commands
+from cloudrc.sim.plant import Array
 
-TURN_MIN, YAW_MIN = 10.0, 0.2
-"""Smallest angular acceleration about x and y, and about z, that a robot must reach in hover
-[rad/s^2]. With less, it cannot tilt in time to brake, or hardly turns."""
 TINY = 1e-9
 
 
@@ -36,9 +32,9 @@ class Allocation:
     def __init__(self, frame: Airframe, braking: float) -> None:
         """Invert the wrench of `frame`.
 
-        The inverse prefers small controls, relative to their ranges. Raise a BadInputError if the
-        actuators cannot hold the robot in hover, with enough room to turn, and to stop a descent
-        with the deceleration `braking` [m/s^2].
+        The inverse prefers small controls, relative to their ranges. Raise a ValueError if the
+        actuators cannot hold the robot in hover, and stop a descent with the deceleration
+        `braking` [m/s^2].
         """
         width = span(frame)
         wrench = frame.wrench if frame.steers_yaw else frame.wrench[:3]
@@ -53,8 +49,6 @@ class Allocation:
         some = TINY * abs(turns).max(axis=0) + TINY**2  # instead of a division by 0
         reach = (room / np.maximum(abs(turns), some)).min(axis=0)
         self.turn_max, self.yaw_max = float(reach[:2].min()), float(reach[2])
-        _check_turns(self.turn_max, self.yaw_max)
-
         least = np.clip(0.0, frame.low, frame.high)
         self.stopped: Commands = tuple(least.tolist())
         self._columns = list(zip(thrust.tolist(), *turns.T.tolist(), strict=True))
@@ -139,7 +133,7 @@ def _check_hover(frame: Airframe, hover: Array, braking: float) -> float:
         need, least, most = (-value, -high, -low) if value < 0.0 else (value, low, high)
         if need <= least or most <= 0.0:
             rounded = round(float(value), 6) + 0.0
-            raise BadInputError(
+            raise ValueError(
                 f"hover needs a control of {rounded:.3g} from actuator {name}, which has no room "
                 f"on both sides within {low:g} to {high:g}: are its range, its place and all spin "
                 "directions right?"
@@ -147,24 +141,9 @@ def _check_hover(frame: Airframe, hover: Array, braking: float) -> float:
         share = max(share, float(need / most))
     most = frame.gravity / (frame.gravity + braking)
     if share > most:
-        raise BadInputError(
+        raise ValueError(
             f"hover needs {100.0 * share:.0f} % of the thrust; above {100.0 * most:.0f} % a robot "
             f"cannot brake a descent with {braking:g} m/s^2 (guard.braking_mps2): is the mass of "
             f"{frame.mass:g} kg right (kg, not g)?"
         )
-    spin = float(frame.wrench[3] @ hover / frame.inertia[2, 2])
-    if abs(spin) > TINY * frame.gravity:
-        raise BadInputError(
-            f"hover turns the robot about z by {spin:.2g} rad/s^2: balance the spin directions of "
-            "the rotors, which are the signs of the last number of gear"
-        )
     return share
-
-
-def _check_turns(turn_max: float, yaw_max: float) -> None:
-    for reach, least, axes in ((turn_max, TURN_MIN, "x and y"), (yaw_max, YAW_MIN, "z")):
-        if reach < least:
-            raise BadInputError(
-                f"in hover the actuators turn the robot about {axes} by {reach:.2g} rad/s^2 at "
-                f"most, and it needs {least:g}: is the inertia too large, or a range too small?"
-            )

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.robots.onboard._airframe import read_rotors
-from cloudrc.world.onboard import Commands, Inputs
-from cloudrc.world.readings import Readings
+from cloudrc.sim.airframe import read_thrusters
+from cloudrc.sim.onboard import Commands, Inputs
+from cloudrc.sim.readings import Readings
 
 
 class RotorDrag:
@@ -28,7 +28,7 @@ class RotorDrag:
         self._rest: Commands = (0.0,) * model.nu
         # Place of each rotor, its axis, and its drag per control and velocity.
         self._rotors: list[tuple[float, ...]] = []
-        places, forces = read_rotors(model)
+        places, forces = read_thrusters(model)
         for place, force in zip(places, forces, strict=True):
             thrust = float(np.linalg.norm(force))
             axis = force / thrust if thrust else force

@@ -9,18 +9,14 @@ base turns at (v - w y) / r.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import atan2, hypot, inf
-from typing import Any, NamedTuple
-
-import numpy as np
+from math import atan2, hypot
+from typing import Any
 
 from cloudrc.config.schema import Positive
-from cloudrc.errors import BadInputError
-from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import Vector
-from cloudrc.world.onboard import Commands
-from cloudrc.world.readings import Readings
-from cloudrc.world.scene import ROBOT_PREFIX
+from cloudrc.sim.onboard import Commands
+from cloudrc.sim.readings import Readings
+from cloudrc.sim.wheels import Wheel, read_wheels
 
 SLOW = 0.1
 """Below this wanted speed the robot turns towards it more slowly, in proportion, because the
@@ -28,20 +24,6 @@ direction of a speed near zero is noise [m/s]."""
 KEEP_END = 0.2
 """The end that leads changes when the velocity points beyond the side of the robot by an angle with
 this sine. Without this margin, a velocity to the side would make the robot turn to and fro."""
-LEVEL = 0.05
-"""Largest sine of the angle between a wheel's axis and the base's y axis."""
-ROUND = tuple(
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{shape}")) for shape in ("CYLINDER", "SPHERE", "ELLIPSOID")
-)
-"""Shapes whose first size is the radius of a wheel."""
-
-
-class Wheel(NamedTuple):
-    """A driven wheel."""
-
-    y: float  # distance to the left of the base [m]
-    command: float  # value of the actuator per speed of the wheel over the ground [rad/m]
-    speed_max: float  # largest speed over the ground [m/s]
 
 
 class DiffDrive:
@@ -121,54 +103,6 @@ def build(
             of the largest round geom of each wheel.
 
     Raises:
-        BadInputError: If the model has no such wheels.
+        ValueError: If the model has no such wheels.
     """
-    data, base = mujoco.MjData(model), model.jnt_bodyid[0]
-    mujoco.mj_forward(model, data)
-    frame = data.xmat[base].reshape(3, 3)
-    wheels = []
-    for number in range(model.nu):
-        joint = _wheel_joint(model, number)
-        axis = data.xaxis[joint] @ frame
-        place = (data.xanchor[joint] - data.xpos[base]) @ frame
-        if hypot(axis[0], axis[2]) > LEVEL:
-            raise BadInputError(f"the axis of {_name(model, number)} must point along the base's y")
-        radius = wheel_radius_m or _radius(model, number, joint)
-        gear = float(model.actuator_gear[number, 0] * np.sign(axis[1]))
-        most = model.actuator_ctrlrange[number] if model.actuator_ctrllimited[number] else [inf]
-        speed_max = float(np.abs(most).min()) * radius / abs(gear)
-        wheels.append(Wheel(float(place[1]), gear / radius, speed_max))
-    if not min(wheel.y for wheel in wheels) < 0.0 < max(wheel.y for wheel in wheels):
-        raise BadInputError("needs driven wheels on both sides: y above 0 and below 0")
-    return DiffDrive(wheels, turn_gain, turn_rate_max)
-
-
-def _wheel_joint(model: Any, number: int) -> int:
-    """Return the hinge that an actuator turns; raise a BadInputError if it is no wheel's servo."""
-    joint = int(model.actuator_trnid[number, 0])
-    kind = model.actuator_trntype[number]
-    if kind != mujoco.mjtTrn.mjTRN_JOINT or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
-        raise BadInputError(f"{_name(model, number)} must turn the hinge of a wheel")
-    gain, bias = model.actuator_gainprm[number, 0], model.actuator_biasprm[number]
-    if not gain > 0.0 or bias[2] != -gain or np.any(bias[:2]):
-        raise BadInputError(
-            f"{_name(model, number)} must be a velocity servo, in MJCF: <velocity kv=...>"
-        )
-    if model.actuator_gear[number, 0] == 0.0:
-        raise BadInputError(f"{_name(model, number)} has gear 0, so that it turns no wheel")
-    return joint
-
-
-def _radius(model: Any, number: int, joint: int) -> float:
-    body = model.jnt_bodyid[joint]
-    geoms = np.flatnonzero(model.geom_bodyid == body)
-    radii = [model.geom_size[geom, 0] for geom in geoms if model.geom_type[geom] in ROUND]
-    if not radii:
-        raise BadInputError(
-            f"the wheel of {_name(model, number)} has no round geom; set onboard.wheel_radius_m"
-        )
-    return float(max(radii))
-
-
-def _name(model: Any, number: int) -> str:
-    return f"actuator '{model.actuator(number).name.removeprefix(ROBOT_PREFIX) or number}'"
+    return DiffDrive(read_wheels(model, wheel_radius_m), turn_gain, turn_rate_max)

@@ -7,16 +7,16 @@ controller flies a robot of 27 g and one of several kg, with any number and layo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import atan2, hypot, inf, pi, radians, remainder, sqrt, tan
+from math import atan2, hypot, pi, radians, remainder, sqrt, tan
 from typing import Any
 
-from cloudrc.errors import BadInputError
+from cloudrc.config.schema import NotNegative, Tilt
 from cloudrc.messages import ZERO, Vector
-from cloudrc.robots.onboard._airframe import Airframe, read_airframe
 from cloudrc.robots.onboard._allocation import Allocation
 from cloudrc.robots.onboard._drag import RotorDrag
-from cloudrc.world.onboard import Actuators, Commands, Direct
-from cloudrc.world.readings import Readings
+from cloudrc.sim.airframe import Airframe, read_airframe
+from cloudrc.sim.onboard import Actuators, Commands, Direct
+from cloudrc.sim.readings import Readings
 
 VELOCITY_RADPS, ATTITUDE_RADPS, YAW_RADPS = 5.0, 20.0, 4.0
 """Largest default bandwidths of velocity, attitude and yaw [rad/s]."""
@@ -24,8 +24,6 @@ ATTITUDE_MAX_RADPS = 100.0
 """Largest bandwidth of the attitude [rad/s]: a fifth of the rate of the steps."""
 LAG_MAX = 0.05
 """Largest lag of an actuator [s]. With a longer one, the attitude is too slow to brake in time."""
-TILT_MAX_MAX = 60.0
-"""Largest accepted limit of the tilt [deg]. Beyond 78 degrees the guard stops the robot."""
 CLIMB = 2.0
 """Bandwidth of the vertical velocity relative to that of the horizontal velocity [1]. The thrust
 follows at once, the tilt does not."""
@@ -233,8 +231,8 @@ def build(
     velocity_bandwidth_radps: float | None = None,
     attitude_bandwidth_radps: float | None = None,
     yaw_bandwidth_radps: float | None = None,
-    tilt_max_deg: float = 35.0,
-    drag_s_per_m: float = 0.0,
+    tilt_max_deg: Tilt = 35.0,
+    drag_s_per_m: NotNegative = 0.0,
     braking_mps2: float = BRAKING,
 ) -> Multirotor:
     """Make the controller for the compiled `MjModel` of a robot in its scene.
@@ -258,13 +256,13 @@ def build(
             stop a descent with it is refused. It comes from `guard` in robot.yaml.
 
     Raises:
-        BadInputError: If the controller cannot fly the model, or a value does not fit.
+        ValueError: If the controller cannot fly the model, or a value does not fit.
     """
     frame = read_airframe(model, steers_yaw=yaw_bandwidth_radps != 0.0)
     allocation = Allocation(frame, braking_mps2)
     lag = frame.lag or TINY
     if lag > LAG_MAX:
-        raise BadInputError(f"an actuator has a lag (dynprm) of {lag:g} s, above {LAG_MAX:g} s")
+        raise ValueError(f"an actuator has a lag (dynprm) of {lag:g} s, above {LAG_MAX:g} s")
     # At most so fast that turns up to 50 degrees (8/9 rad) end without overshoot although the
     # actuators saturate; and slow enough for the lag of the actuators.
     attitude = min(ATTITUDE_RADPS, 3.0 * sqrt(allocation.turn_max), 0.4 / lag)
@@ -274,7 +272,6 @@ def build(
     velocity = _checked("velocity", velocity_bandwidth_radps, velocity, 0.5 * attitude)
     yaw = min(YAW_RADPS, 2.0 * sqrt(allocation.yaw_max), 0.5 * attitude)
     yaw = _checked("yaw", yaw_bandwidth_radps, yaw, attitude) if frame.steers_yaw else 0.0
-    _check_ranges(tilt_max_deg, drag_s_per_m)
     gains = Gains(velocity, attitude, yaw, radians(tilt_max_deg))
     return Multirotor(frame, allocation, gains, model.opt.timestep, drag_s_per_m)
 
@@ -287,18 +284,11 @@ def actuators(model: Any, dt: float, *, drag_s_per_m: float = 0.0) -> Actuators:
     return RotorDrag(model, drag_s_per_m) if drag_s_per_m else Direct(model.nu)
 
 
-def _check_ranges(tilt_max_deg: float, drag_s_per_m: float) -> None:
-    if not 0.0 < tilt_max_deg <= TILT_MAX_MAX:
-        raise BadInputError(f"tilt_max_deg: {tilt_max_deg:g} is not above 0 and up to 60")
-    if not 0.0 <= drag_s_per_m < inf:
-        raise BadInputError(f"drag_s_per_m: {drag_s_per_m:g} is not 0 or more")
-
-
 def _checked(name: str, wanted: float | None, default: float, most: float) -> float:
     if wanted is None:
         return default
     if not 0.0 < wanted <= most:
-        raise BadInputError(f"{name}_bandwidth_radps: {wanted:g} is not above 0 and up to {most:g}")
+        raise ValueError(f"{name}_bandwidth_radps: {wanted:g} is not above 0 and up to {most:g}")
     return wanted
 
 

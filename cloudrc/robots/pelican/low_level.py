@@ -23,8 +23,8 @@ from cloudrc.robots.pelican.rotors import (
     TORQUE_RATIO,
     RotorSpeeds,
 )
-from cloudrc.world.onboard import Commands
-from cloudrc.world.readings import Readings
+from cloudrc.sim.onboard import Commands
+from cloudrc.sim.readings import Readings
 
 MASS = 1.05
 """Mass that the controller assumes [kg]. Source: docs/reference/plant.md, "Total mass"."""

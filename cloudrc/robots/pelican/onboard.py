@@ -27,7 +27,7 @@ from cloudrc.robots.pelican.low_level import (
     LowLevel,
 )
 from cloudrc.robots.pelican.rotors import Rotors
-from cloudrc.world.onboard import Accelerator
+from cloudrc.sim.onboard import Accelerator
 
 SAG_MAX = 0.05
 """Largest steady error of the position that needs no warning [m]."""
@@ -55,7 +55,7 @@ def build(
         integral_limit_z: Limit of the integrated velocity error in z [m].
 
     Raises:
-        BadInputError: If the model differs too much from the Pelican.
+        ValueError: If the model differs too much from the Pelican.
     """
     check_fit(model)
     return LowLevel(gain_p, gain_i, gain_d, integral_limit_xy, integral_limit_z)

@@ -10,8 +10,8 @@ from __future__ import annotations
 from math import exp
 from typing import TypeAlias
 
-from cloudrc.world.onboard import Commands
-from cloudrc.world.readings import Readings
+from cloudrc.sim.onboard import Commands
+from cloudrc.sim.readings import Readings
 
 THRUST_COEFFICIENT = 9.9865e-6
 """kf: thrust per speed squared [N s^2]."""

@@ -14,8 +14,8 @@ from operator import le
 from cloudrc.geometry.fence import TAKE_OFF_MARGIN, Fence
 from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Cause, Vector
+from cloudrc.sim.readings import Readings
 from cloudrc.world.guard.limits import clamp, limit_length
-from cloudrc.world.readings import Readings
 
 BRAKE_MAX, BRAKE_MIN, BRAKE = 5.5, 1.0, 3.0
 """Largest and smallest deceleration of the velocity reference while a robot with the braking BRAKE

@@ -59,10 +59,10 @@ from cloudrc.messages import (
     Vector,
 )
 from cloudrc.records import GuardChange
+from cloudrc.sim.readings import Readings
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.hold import Descent, Halt, PositionHold, TakeOff
 from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX
-from cloudrc.world.readings import Readings
 
 OVERTURNED_COSINE = 0.2
 """Cosine of the tilt below which the robot counts as turned over, and switches off. Commands

@@ -4,9 +4,9 @@ from math import cos, hypot, pi, sin
 
 import numpy as np
 
-from cloudrc.geometry.compiled import mujoco
 from cloudrc.robots.onboard import multirotor
-from cloudrc.world.readings import Readings
+from cloudrc.sim.engine import mujoco
+from cloudrc.sim.readings import Readings
 
 DT = 0.002
 X = ((1, -1, 1), (1, 1, -1), (-1, 1, 1), (-1, -1, -1))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cloudrc.robots.onboard._airframe import read_airframe
 from cloudrc.robots.onboard._allocation import Allocation
+from cloudrc.sim.airframe import read_airframe
 from tests.robots.onboard.conftest import big, compiled, hexarotor, one_site
 
 GRAVITY = 9.81

@@ -15,7 +15,7 @@ from cloudrc.robots.pelican.low_level import (
     allocate,
     attitude,
 )
-from cloudrc.world.readings import Readings
+from cloudrc.sim.readings import Readings
 from tests.world.conftest import normalised
 
 WEIGHT = 10.3005  # 1.05 kg * 9.81 m/s^2

@@ -17,8 +17,8 @@ import z3
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState
 from cloudrc.robots.pelican.low_level import LowLevel
+from cloudrc.sim.readings import Readings
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.readings import Readings
 from cloudrc.world.robot import Robot
 from tests.fences import FENCE
 from tests.world.conftest import simulate

@@ -7,10 +7,10 @@ import pytest
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Cause, GuardState
+from cloudrc.sim.readings import Readings
 from cloudrc.world.guard.hold import LAND_SPEED, STILL_SPEED
 from cloudrc.world.guard.limits import COMMAND_MAX, ramp_ns
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.readings import Readings
 from tests.fences import FENCE
 from tests.world.guard.conftest import (
     DT,

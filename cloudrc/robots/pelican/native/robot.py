@@ -8,32 +8,27 @@ from __future__ import annotations
 
 import ctypes
 import logging
-from copy import copy
 from functools import cache
-from math import dist, inf
-from pathlib import Path
 from struct import Struct
 from typing import Any
-
-import numpy as np
 
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import find_robot
 from cloudrc.config.shipped import file_of
-from cloudrc.geometry.compiled import mujoco
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Command, Vector
 from cloudrc.robots.pelican import low_level, rotors
 from cloudrc.robots.pelican.low_level import LowLevel
 from cloudrc.robots.pelican.native.library import Library, library
+from cloudrc.sim.memory import boxes_around, contacts_offset, mujoco_library, without_contacts
+from cloudrc.sim.readings import Readings
+from cloudrc.sim.scene import ROBOT_PREFIX, compile_model
+from cloudrc.sim.simulator import CONTACT_CHECK_STEPS, Simulator
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard import state
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.readings import Readings
 from cloudrc.world.robot import STEP, STEP_NS, Robot
-from cloudrc.world.scene import ROBOT_PREFIX, compile_model, is_of_robot
-from cloudrc.world.simulator import CONTACT_CHECK_STEPS, Simulator
 
 _POINTERS = (
     *("mj_step", "model", "free_model", "data", "qpos", "qvel", "ctrl", "applied"),
@@ -42,22 +37,6 @@ _POINTERS = (
 ACCELERATION_MAX = 400.0
 """Limit of the robot's acceleration in the air [m/s^2]. Full thrust gives a robot that is 10 %
 lighter 153 m/s^2, and a spin of 50 rad/s about a centre of mass 3 cm away gives 75 m/s^2."""
-MARGIN = 1e-3
-"""Distance added to every geom with its own margin and gap [m]; it covers rounding errors."""
-HUGE = 1e4
-"""Half the edge of the box that stands for the space below a plane [m]."""
-PAGE = 4096
-"""Smallest size of a page [bytes]: a program may read all bytes of a page, or none."""
-SMALLEST = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
-"""Model with which the offset of `mjData` is searched."""
-MARK = 0x6E636F6E
-"""Number that no other part of `mjData` contains."""
-UNUSED_WITHOUT_CONTACTS = sum(
-    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{part}", 0))  # old versions lack the last two
-    for part in ("CONTACT", "CONSTRAINT", "SENSOR", "SPRING", "DAMPER")
-)
-"""Parts of MuJoCo that do nothing while the robot touches nothing: its usual sensor is a touch
-sensor."""
 _CONSTANTS = {
     rotors: "thrust_coefficient torque_ratio drag_coefficient arm height",
     low_level: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
@@ -104,20 +83,16 @@ def make_state(simulator: Simulator, controller: LowLevel, guard: Guard) -> Step
     limit_xy, limit_z, dt = controller.limits
     arrays = data.qpos, data.qvel, data.ctrl, data.qfrc_applied
     tip_force = data.sensordata[model.sensor(f"{ROBOT_PREFIX}tip").adr[0] :]
-    free_model = copy(model)
-    free_model.opt.disableflags |= UNUSED_WITHOUT_CONTACTS
-    touch = model.sensor_adr[model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH]
-    if not {sensor.address for sensor in simulator.sensors} <= {*touch.tolist()}:
-        free_model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
-    obstacles, radius = _obstacles(model, data)
-    library = _mujoco_library()
+    free_model = without_contacts(model, {sensor.address for sensor in simulator.sensors})
+    obstacles, radius = boxes_around(model, data)
+    library = mujoco_library()
     timer = ctypes.addressof(ctypes.c_void_p.in_dll(library, "mjcb_time"))
     flight = StepState(
         ctypes.cast(library.mj_step, ctypes.c_void_p),
         # MuJoCo has no public name for the addresses.
         *(model._address, free_model._address, data._address),
         *(array.ctypes.data for array in (*arrays, tip_force)),
-        *(data._address + _known_offset(), timer, obstacles.ctypes.data),
+        *(data._address + contacts_offset(), timer, obstacles.ctypes.data),
         *_VALUES.values(),
         *(
             guard.stop_coefficient,
@@ -135,77 +110,6 @@ def make_state(simulator: Simulator, controller: LowLevel, guard: Guard) -> Step
     )
     flight.keep = obstacles, free_model  # else Python frees their memory
     return flight
-
-
-def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
-    """Return a box with rounded edges around each geom of the scene, and the robot's radius [m].
-
-    Each row of the array is a box: centre (3,) [m], axes (9,), half sizes (3,) [m], radius of the
-    edges [m]. The steps in C search for contacts only while a ball with the robot's radius around
-    the base's origin touches a box. If the model has springs or similar forces, the radius is
-    infinite, so that C never leaves out the search.
-    """
-    option, rows, radius, own = model.opt, [], 0.0, is_of_robot(model)
-    other = option.density, option.viscosity, model.nflex, model.npair, model.neq, model.ntendon
-    each = model.dof_frictionloss, model.dof_damping, model.jnt_stiffness, model.body_gravcomp
-    if any(other) or any(values.any() for values in each):
-        radius = inf
-    for geom in range(model.ngeom):
-        size, bound = model.geom_size[geom], model.geom_rbound[geom]
-        place, axes = data.geom_xpos[geom], data.geom_xmat[geom]
-        margin = model.geom_margin[geom] + model.geom_gap[geom]
-        margin = MARGIN + max(margin, option.o_margin)
-        if own[geom]:
-            radius = max(radius, dist(place, data.qpos[:3]) + bound + margin)
-        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
-            rows.append([*place, *axes, *size, margin])
-        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
-            normal = axes.reshape(3, 3)[:, 2]
-            rows.append([*(place - HUGE * normal), *axes, HUGE, HUGE, HUGE, margin])
-        else:
-            rows.append([*place, *axes, 0.0, 0.0, 0.0, bound + margin])
-    return np.array(rows, float), radius
-
-
-def _mujoco_library() -> ctypes.CDLL:
-    """Return MuJoCo's own library, which `import mujoco` has loaded."""
-    folder = Path(mujoco.__file__).parent
-    files = [*folder.glob("libmujoco.so*"), *folder.glob("libmujoco*.dylib")]
-    if len(files) != 1:
-        raise OSError(f"{folder}: has {len(files)} files of MuJoCo's library, not 1")
-    return ctypes.CDLL(str(files[0]))
-
-
-@cache
-def _known_offset() -> int:
-    """Return `_contacts_offset`, which is that of this MuJoCo, and search once only.
-
-    In memory that an earlier `mjData` has used, an old address could end the search too early.
-    """
-    model = mujoco.MjModel.from_xml_string(SMALLEST)
-    return _contacts_offset(mujoco.MjData(model))
-
-
-def _contacts_offset(data: Any) -> int:
-    """Return the offset of the number of contacts in MuJoCo's `mjData` [bytes].
-
-    The offset depends on MuJoCo's version. The function writes MARK to `data.ncon`, searches the
-    memory of `data` for it, and restores the number. The address of `qpos` ends the search; it is
-    in `mjData`, too, so that the search never leaves the memory of `data`.
-    """
-    mark, end = Struct("i").pack(MARK), Struct("P").pack(data.qpos.ctypes.data)
-    place, block, contacts = data._address, b"", data.ncon
-    try:
-        data.ncon = MARK
-        while mark not in block:
-            if end in block:
-                raise OSError("mjData does not contain the number of contacts")
-            place += len(block)
-            block = ctypes.string_at(place, PAGE - place % PAGE)
-    finally:
-        data.ncon = contacts
-    offset: int = place + block.index(mark) - data._address
-    return offset
 
 
 _TRACK = StepState.reference.offset

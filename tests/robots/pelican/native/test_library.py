@@ -6,7 +6,6 @@ import pytest
 
 from cloudrc.robots.pelican.native import library as module
 from cloudrc.robots.pelican.native.library import (
-    FLAGS,
     POD,
     SWITCH,
     built_file,
@@ -112,14 +111,3 @@ def test_a_built_file_beside_the_module_is_used_even_in_a_pod(monkeypatch, tmp_p
     module._load.cache_clear()
     compile_to(built, next(iter(COMPILERS.values())))
     assert module.library().text == "C (built with the package)"
-
-
-def test_another_source_or_flag_is_another_file(monkeypatch, tmp_path):
-    names = {built_file(tmp_path).name}
-    monkeypatch.setattr(module, "FLAGS", (*FLAGS, "-g"))
-    names.add(built_file(tmp_path).name)
-    other = tmp_path / "step.c"
-    other.write_text("/* changed */")
-    monkeypatch.setattr(module, "SOURCE", other)
-    names.add(built_file(tmp_path).name)
-    assert len(names) == 3

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.errors import BadInputError
-from cloudrc.geometry.compiled import mujoco
-from cloudrc.world.plant import Array, Inertia
+from cloudrc.sim.engine import mujoco
+from cloudrc.sim.plant import Array, Inertia
 
 _DYN = mujoco.mjtDyn
 DYNAMICS = list(map(int, (_DYN.mjDYN_NONE, _DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT)))
@@ -23,7 +22,7 @@ HINTS = {
     "torque about x (roll)": "place the actuators on both sides of the centre of mass",
     "torque about y (pitch)": "place the actuators before and behind the centre of mass",
     "force along z (thrust)": "let the actuators push along the base's z axis",
-    "torque about z (yaw)": "neighbouring rotors need opposite spin directions, the signs of "
+    "torque about z (yaw)": "neighbours need opposite spin directions, the signs of "
     "the last number of gear; or leave the yaw alone with yaw_bandwidth_radps: 0",
 }
 """Forces and torques that a controller commands, in the order of the rows of `Airframe.wrench` ->
@@ -49,35 +48,26 @@ class Airframe:
 
 
 def read_airframe(model: Any, *, steers_yaw: bool = True) -> Airframe:
-    """Read a compiled `MjModel`; raise a BadInputError if it is no rigid body with thrusters.
+    """Read a compiled `MjModel`; raise a ValueError if it is no rigid body with thrusters.
 
     Without `steers_yaw`, it need not turn about z.
     """
-    _check_joints(model)
-    names = [_name(model.actuator(number), number) for number in range(model.nu)]
-    if len(names) < len(HINTS):
-        raise BadInputError(
-            f"multirotor needs at least {len(HINTS)} actuators, for the torques about x, y and z "
-            f"and the force along z; the robot has {len(names)}"
+    if model.njnt > 1:
+        raise ValueError(
+            f"{_name(model.joint(1), 1)} is a second joint; multirotor flies one rigid body, so "
+            "nothing else may move: delete the joint"
         )
+    names = [_name(model.actuator(number), number) for number in range(model.nu)]
     for number, name in enumerate(names):
         _check_actuator(model, number, name)
-    if steers_yaw:
-        _check_spins(model, names)
     low, high = np.array([_limits(model, number) for number in range(model.nu)]).T
-    for name, least, most in zip(names, low, high, strict=True):
-        if not least < most:
-            raise BadInputError(
-                f"actuator {name} has no room between {least:g} and {most:g}; "
-                "widen its ctrlrange or forcerange"
-            )
 
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     mass, centre, inertia = _inertia(model, data)
     weight = data.qfrc_bias - data.qfrc_passive
-    if weight[2] <= 0.0 or np.hypot(*weight[:2]) > INDEPENDENT * weight[2]:
-        raise BadInputError("gravity does not point down (-z) in this scene; multirotor needs it")
+    if weight[2] <= 0.0:
+        raise ValueError("gravity does not point down (-z) in this scene; multirotor needs it")
     lags = model.actuator_dynprm[:, 0][model.actuator_dyntype != _DYN.mjDYN_NONE]
     frame = Airframe(
         names=names,
@@ -161,7 +151,7 @@ def _axes(model: Any, data: Any) -> Array:
     return axes
 
 
-def read_rotors(model: Any) -> tuple[Array, Array]:
+def read_thrusters(model: Any) -> tuple[Array, Array]:
     """Return place [m] and force per unit of control [N] of each actuator, shape (n, 3).
 
     Both are in the frame of the base.
@@ -179,35 +169,21 @@ def span(frame: Airframe) -> Array:
     return width if np.isfinite(width).all() else np.ones_like(width)
 
 
-def _check_joints(model: Any) -> None:
-    if not model.njnt or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
-        raise BadInputError("the robot's base has no free joint; multirotor needs <freejoint/>")
-    if model.njnt > 1:
-        raise BadInputError(
-            f"{_name(model.joint(1), 1)} is a second joint; multirotor flies one rigid body, so "
-            "nothing else may move: delete the joint"
-        )
-
-
 def _check_actuator(model: Any, number: int, name: str) -> None:
+    """Refuse an actuator that does not push at a site of the robot by gain times control."""
     site, reference = model.actuator_trnid[number]
-    if model.actuator_trntype[number] != mujoco.mjtTrn.mjTRN_SITE or reference >= 0:
-        raise BadInputError(f"actuator {name} must act at a site, without a refsite")
-    if model.body_rootid[model.site_bodyid[site]] != model.jnt_bodyid[0]:
-        raise BadInputError(f"actuator {name} acts at a site that is not on the robot")
+    at_site = model.actuator_trntype[number] == mujoco.mjtTrn.mjTRN_SITE and reference < 0
+    if not at_site or model.body_rootid[model.site_bodyid[site]] != model.jnt_bodyid[0]:
+        raise ValueError(f"actuator {name} must act at a site of the robot, without a refsite")
     if (
         model.actuator_gaintype[number] != mujoco.mjtGain.mjGAIN_FIXED
         or model.actuator_biastype[number] != mujoco.mjtBias.mjBIAS_NONE
         or model.actuator_gainprm[number, 0] == 0.0
+        or model.actuator_dyntype[number] not in DYNAMICS
     ):
-        raise BadInputError(
+        raise ValueError(
             f"actuator {name} must push by gain times control: use <motor>, or <general> with a "
-            "fixed gain other than 0 and without a bias"
-        )
-    if model.actuator_dyntype[number] not in DYNAMICS:
-        raise BadInputError(
-            f"actuator {name} has a dyntype that multirotor does not know; use none, filter or "
-            "filterexact"
+            "fixed gain other than 0, without a bias, and with dyntype none, filter or filterexact"
         )
 
 
@@ -226,17 +202,6 @@ def _limits(model: Any, number: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _check_spins(model: Any, names: list[str]) -> None:
-    """Refuse a rotor without a torque about its thrust if others have one: a forgotten number."""
-    spins = np.einsum("ij,ij->i", model.actuator_gear[:, :3], model.actuator_gear[:, 3:])
-    missing = [name for name, spin in zip(names, spins, strict=True) if not spin]
-    if missing and spins.any():
-        raise BadInputError(
-            f"actuator {missing[0]} has no spin direction, as others have: the last number of gear "
-            "is the torque about the thrust, positive or negative"
-        )
-
-
 def _check_directions(frame: Airframe) -> None:
     """Refuse a robot whose actuators cannot make each force and torque by itself."""
     known = np.empty((0, len(frame.names)))
@@ -245,7 +210,7 @@ def _check_directions(frame: Airframe) -> None:
         size = np.linalg.norm(row)
         rest = row - row @ np.linalg.pinv(known) @ known
         if not size or np.linalg.norm(rest) <= INDEPENDENT * size:
-            raise BadInputError(f"the actuators cannot make a {direction} by itself: {hint}")
+            raise ValueError(f"the actuators cannot make a {direction} by itself: {hint}")
         known = np.vstack((known, row / size))
 
 

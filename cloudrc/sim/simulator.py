@@ -14,15 +14,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cloudrc.errors import BadInputError
-from cloudrc.geometry.compiled import mujoco
-from cloudrc.messages import ZERO, Odometry, Vector
+from cloudrc.messages import ZERO, Odometry, Quaternion, Vector
 from cloudrc.records import Contact, SensorLabel
-from cloudrc.world.onboard import Actuators, Commands, Inputs
-from cloudrc.world.own_sensors import OwnSensor, find_force
-from cloudrc.world.plant import Wind
-from cloudrc.world.readings import Readings
-from cloudrc.world.scene import ROBOT_PREFIX, bodies_of_geoms
+from cloudrc.sim.engine import mujoco
+from cloudrc.sim.onboard import Actuators, Commands, Inputs
+from cloudrc.sim.plant import Wind
+from cloudrc.sim.readings import Readings
+from cloudrc.sim.scene import OwnSensor, bodies_of_geoms, find_part
 
 TOUCH_GAP = 0.1
 """Shortest time without contact before a contact counts as a new contact [s]."""
@@ -31,6 +29,8 @@ CONTACT_CHECK_STEPS = 5
 check takes as long as a step."""
 
 _mj_step = mujoco.mj_step
+_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{part}")) for part in ("QPOS", "QVEL", "QACC")]
+"""Numbers of MuJoCo's warnings about values that are not finite."""
 _pack_applied = Struct("6d").pack_into
 _unpack_pose, _unpack_twist = Struct("7d").unpack_from, Struct("6d").unpack_from
 _new = tuple.__new__
@@ -70,7 +70,7 @@ class Simulator:
         `sensors` are the robot's own sensors.
 
         Raises:
-            BadInputError: If the model has no such site.
+            ValueError: If the model has no such site.
         """
         self.model = model
         self._wind = wind
@@ -86,8 +86,8 @@ class Simulator:
         self._sensordata: memoryview[float] = memoryview(data.sensordata)
         self.sensors = tuple(sensors)
         self._addresses = [each.address for each in sensors]
-        self._probe = -1 if probe is None else find_site(model, probe)
-        self._force_address = find_force(model, self._probe)
+        self._probe = -1 if probe is None else find_part(model, "site", probe, "probe")
+        self._force_address = _find_force(model, self._probe)
         of_force = (each for each in sensors if each.address == self._force_address)
         self.force_sensor = next((SensorLabel(each.name, each.unit) for each in of_force), None)
         self._probe_offset: Vector = ZERO
@@ -179,6 +179,13 @@ class Simulator:
         """Return what the robot's own sensors show, each in its unit, in the order of `sensors`."""
         return tuple(map(self._sensordata.__getitem__, self._addresses))
 
+    def bad_values(self) -> int:
+        """Return how many positions, velocities and accelerations were not finite.
+
+        MuJoCo replaces them, so the state has none.
+        """
+        return int(self.data.warning.number[_BAD].sum())
+
     def take_contact_force(self) -> tuple[float, float, float] | None:
         """Return the normal force on the probe, its peak and its impulse; None without a sensor.
 
@@ -244,15 +251,11 @@ class Simulator:
             self._last_touch[body, by_probe] = self.steps
 
 
-def find_site(model: Any, name: str) -> int:
-    """Return the number of the robot's site `name`; raise a BadInputError if there is none."""
-    number: int = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, f"{ROBOT_PREFIX}{name}")
-    if number < 0:
-        names = (model.site(each).name for each in range(model.nsite))
-        own = [each.removeprefix(ROBOT_PREFIX) for each in names if each.startswith(ROBOT_PREFIX)]
-        has = ", ".join(filter(None, own)) or "none"
-        raise BadInputError(f"probe: {name}: the robot has no such site; its sites: {has}")
-    return number
+def _find_force(model: Any, site: int) -> int | None:
+    """Return where a touch sensor at a site of the model writes; None if there is none."""
+    at_site = (model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH) & (model.sensor_objid == site)
+    found = np.flatnonzero(at_site)
+    return int(model.sensor_adr[found[0]]) if len(found) else None
 
 
 def _velocity_at(readings: Readings, offset: Vector) -> Vector:
@@ -267,6 +270,28 @@ def _velocity_at(readings: Readings, offset: Vector) -> Vector:
         vy + xy * u + yy * v + zy * w,
         vz + xz * u + yz * v + zz * w,
     )
+
+
+def rest_height(model: Any, commands: Commands, duration: float) -> float:
+    """Return the height of the base after a time under these commands [m], world frame.
+
+    `model` is a compiled `MjModel`, `duration` the time [s].
+    """
+    data = mujoco.MjData(model)
+    data.ctrl[:] = commands
+    mujoco.mj_step(model, data, round(duration / model.opt.timestep))
+    return float(data.qpos[2])
+
+
+def turned(orientation_wxyz: Quaternion, turn: Vector) -> Quaternion:
+    """Turn an orientation by the rotation vector `turn` [rad], body frame, shape (3,).
+
+    `orientation_wxyz` is a unit quaternion, body to world.
+    """
+    quaternion = np.array(orientation_wxyz)
+    mujoco.mju_quatIntegrate(quaternion, np.array(turn), 1.0)
+    w, x, y, z = quaternion.tolist()
+    return (w, x, y, z)
 
 
 def replay(

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from cloudrc.config.schema import World
-from cloudrc.geometry.compiled import mujoco
-from cloudrc.world.scene import compile_model
-from cloudrc.world.shapes import read_shapes, shapes_of
+from cloudrc.robots.shapes import read_shapes
+from cloudrc.sim.engine import mujoco
+from cloudrc.sim.scene import compile_model
+from cloudrc.sim.shapes import shapes_of
 
 SCENE = """<mujoco>
   <option timestep=".002"/>

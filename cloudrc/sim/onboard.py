@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from cloudrc.messages import Vector
-from cloudrc.world.readings import Readings
+from cloudrc.sim.readings import Readings
 
 Commands: TypeAlias = tuple[float, ...]
 """One value for each actuator, in the order of the robot's model, such as speeds [rad/s]."""

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from math import exp, sqrt
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.config import schema
-from cloudrc.world.readings import Readings
+from cloudrc.sim.readings import Readings
+
+if TYPE_CHECKING:
+    from cloudrc.config import schema
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -6,18 +6,23 @@ Both may be a user's own. Whether a controller can fly the robot is the controll
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from math import nan
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from cloudrc.config.problems import ConfigProblem, ProblemsError
-from cloudrc.config.schema import Plant
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.compiled import ROBOT_BITS, compile_error, mujoco, read_scene
 from cloudrc.geometry.scene import FLOOR, WORLD
-from cloudrc.world.plant import Array, Inertia, point_inertia, true_inertia
+from cloudrc.sim.bodies import ROBOT_BITS, read_scene
+from cloudrc.sim.engine import compile_alone, compile_error, mujoco
+from cloudrc.sim.plant import Array, Inertia, point_inertia, true_inertia
+from cloudrc.text import unknown_name_text
+
+if TYPE_CHECKING:
+    from cloudrc.config.robot import SensorConfig
+    from cloudrc.config.schema import Plant
 
 ROBOT_PREFIX = "robot/"
 """Prefix of all names that belong to the robot in a compiled model."""
@@ -31,10 +36,19 @@ NEEDED = {
 fly through walls."""
 MARGIN_MAX = 0.001
 """Largest `margin` and `gap` of a geom [m]: below the accuracy of a clearance."""
+BITS = "give its geoms contype and conaffinity 1 and 1, or 0 and 0 if they are only seen"
 INSIDE_MAX = 0.001
 """Largest depth by which a robot may start inside the floor [m]; the floor pushes it out gently."""
 FUSES_WRONG = tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 11)
 """Whether MuJoCo computes a wrong inertia when it fuses static bodies, as it does up to 3.10."""
+
+
+class OwnSensor(NamedTuple):
+    """A sensor of the robot, which shows one number."""
+
+    name: str  # in `robot.yaml`
+    unit: str  # of its value
+    address: int  # index of its value in MuJoCo's `sensordata`
 
 
 def compile_model(robot: Path, scene: Path) -> Any:
@@ -50,7 +64,8 @@ def compile_model(robot: Path, scene: Path) -> Any:
     if the scene has another time step or contacts that push at a distance.
     """
     model = _compile(robot, scene)
-    _check_names(robot)
+    # Attached to a scene, an element that names a missing one would vanish without a word.
+    compile_alone(robot)
     _check_parts(model, robot, scene)
     if FUSES_WRONG:
         apart = _compile(robot, scene, fuse=False)
@@ -62,23 +77,12 @@ def compile_model(robot: Path, scene: Path) -> Any:
 def compile_true(robot: Path, scene: Path, nominal: Any, plant: Plant) -> Any:
     """Return the model of the true robot, whose mass, inertia and actuators `plant` changes.
 
-    `nominal` is the result of `compile_model` for the same files. Raise a BadInputError if `plant`
-    has factors for another number of actuators.
+    `nominal` is the result of `compile_model` for the same files.
     """
-    if plant == Plant():
-        return nominal
-    factors = plant.actuator_factor
-    if isinstance(factors, tuple) and len(factors) != nominal.nu:
-        reason = (
-            f"has {len(factors)} factors, but {robot} has {nominal.nu} actuators; give as many, or "
-            "one number for all"
-        )
-        path = "world", "plant", "actuator_factor"
-        raise ProblemsError([ConfigProblem(path, "", reason)])
     fuse = not (FUSES_WRONG and _has_joints(nominal))
     model = _compile(robot, scene, true_inertia(plant, _inertia(nominal)), fuse=fuse)
     _scale_moving_parts(model, plant)
-    scale = np.broadcast_to(np.array(factors), (model.nu,))[:, None]
+    scale = np.broadcast_to(np.array(plant.actuator_factor), (model.nu,))[:, None]
     for values in (model.actuator_gainprm, model.actuator_biasprm, model.actuator_forcerange):
         values *= scale  # the force is gain times control plus bias, in this range
     return model
@@ -126,13 +130,14 @@ def _put_on_floor(model: Any) -> None:
     """Raise the start of a robot that reaches further down than the spawn is above the floor."""
     if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
         return
-    bodies, data = bodies_of_geoms(model), mujoco.MjData(model)
+    robot, data = is_of_robot(model), mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_collision(model, data)
     depths = [
         -contact.dist
         for contact in data.contact
-        if {bodies[geom] for geom in contact.geom.tolist()} == {"", FLOOR}
+        if {"" if robot[geom] else body_of(model, geom) for geom in contact.geom.tolist()}
+        == {"", FLOOR}
     ]
     depth = max(depths, default=0.0)
     if depth > INSIDE_MAX:
@@ -147,18 +152,6 @@ def _take_options(robot: Any, scene: Any) -> None:
     robot.memory = scene.memory
 
 
-def _check_names(robot_path: Path) -> None:
-    """Refuse a robot with an element that names another, which the robot's file does not have.
-
-    Attached to a scene, such an element, for example the actuator of a rotor, would vanish without
-    a word.
-    """
-    try:
-        mujoco.MjSpec.from_file(str(robot_path)).compile()
-    except ValueError as error:
-        raise compile_error(str(robot_path), error) from None
-
-
 def is_of_robot(model: Any) -> Any:
     """Return for each geom of a compiled model whether it belongs to the robot, shape (n,)."""
     base = model.jnt_bodyid[0]
@@ -168,9 +161,52 @@ def is_of_robot(model: Any) -> Any:
 def bodies_of_geoms(model: Any) -> list[str]:
     """Return the name of the body of each geom in a compiled model, "" for geoms of the robot."""
     return [
-        "" if is_robot else model.geom(number).name.rpartition("/")[0]
-        for number, is_robot in enumerate(is_of_robot(model))
+        "" if is_robot else body_of(model, number)
+        for number, is_robot in enumerate(is_of_robot(model).tolist())
     ]
+
+
+def body_of(model: Any, geom: int) -> str:
+    """Return the name of the body of a scene to which a geom belongs."""
+    name: str = model.geom(geom).name
+    return name.rpartition("/")[0]
+
+
+def find_part(model: Any, kind: str, name: str, key: str) -> int:
+    """Return the number of the robot's `site` or `sensor` of a name, which `key` gives.
+
+    Raises:
+        ValueError: If the robot has no such part.
+    """
+    number: int = mujoco.mj_name2id(
+        model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), f"{ROBOT_PREFIX}{name}"
+    )
+    if number < 0:
+        parts = (getattr(model, kind)(each).name for each in range(getattr(model, f"n{kind}")))
+        own = [each.removeprefix(ROBOT_PREFIX) for each in parts if each.startswith(ROBOT_PREFIX)]
+        raise ValueError(f"{key}: {unknown_name_text(f'{kind} of the model', name, own)}")
+    return number
+
+
+def find_sensors(model: Any, asked: Mapping[str, SensorConfig]) -> tuple[OwnSensor, ...]:
+    """Return the sensors that `robot.yaml` names, in its order.
+
+    `model` is the compiled `MjModel` of robot and scene.
+
+    Raises:
+        ValueError: If the robot has no such sensor, or if the sensor shows several numbers.
+    """
+    return tuple(
+        OwnSensor(name, each.unit, _address(model, f"sensors.{name}.sensor", each.sensor))
+        for name, each in asked.items()
+    )
+
+
+def _address(model: Any, key: str, name: str) -> int:
+    number = find_part(model, "sensor", name, key)
+    if (count := int(model.sensor_dim[number])) != 1:
+        raise ValueError(f"{key}: {name} shows {count} numbers; name a sensor that shows one")
+    return int(model.sensor_adr[number])
 
 
 def _has_joints(model: Any) -> bool:
@@ -246,28 +282,15 @@ def _check_margins(model: Any, robot_path: Path, scene_path: Path) -> None:
     Before MuJoCo 3.9 a contact pushes from `margin` - `gap`, since then from `margin`. A model
     with neither flies alike in all versions.
     """
-    text = (
-        f"so that contacts do not begin at the surface; remove both, or give at most {MARGIN_MAX}"
-    )
-    touchable = (model.geom_contype | model.geom_conaffinity) > 0
-    for geom in np.flatnonzero(_is_off(model.geom_margin, model.geom_gap) & touchable)[:1]:
+    far = np.maximum(np.abs(model.geom_margin), np.abs(model.geom_gap)) > MARGIN_MAX
+    for geom in np.flatnonzero(far & ((model.geom_contype | model.geom_conaffinity) > 0))[:1]:
         body = bodies_of_geoms(model)[geom]
         where = f"{scene_path}: body {body}" if body else f"{robot_path}: the robot"
-        numbers = f"margin {model.geom_margin[geom]:g} and gap {model.geom_gap[geom]:g}"
-        raise BadInputError(f"{where} has a geom with {numbers}, {text}")
-    if _is_off(model.pair_margin, model.pair_gap).any():
-        raise BadInputError(f"{robot_path} in {scene_path}: a pair has a margin or gap, {text}")
-    is_overriding = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE
-    if is_overriding and abs(model.opt.o_margin) > MARGIN_MAX:
         raise BadInputError(
-            f"{scene_path}: option o_margin is {model.opt.o_margin:g}, so that contacts do not "
-            "begin at the surface; remove it"
+            f"{where} has a geom with margin {model.geom_margin[geom]:g} and gap "
+            f"{model.geom_gap[geom]:g}, so that contacts do not begin at the surface; remove "
+            f"both, or give at most {MARGIN_MAX}"
         )
-
-
-def _is_off(margins: Array, gaps: Array) -> Any:
-    """Return for each geom whether its contacts may begin at a distance from its surface."""
-    return np.maximum(np.abs(margins), np.abs(gaps)) > MARGIN_MAX
 
 
 def _check_bits(model: Any, robot_path: Path, scene_path: Path) -> None:
@@ -275,29 +298,16 @@ def _check_bits(model: Any, robot_path: Path, scene_path: Path) -> None:
 
     These know the scene alone: for them, a robot meets the geoms that have one of ROBOT_BITS.
     """
-    types, affinities = model.geom_contype, model.geom_conaffinity
-    is_robot = is_of_robot(model)
-    meeting = np.flatnonzero(is_robot & ((types | affinities) > 0)).tolist()
+    types, affinities, robot = model.geom_contype, model.geom_conaffinity, is_of_robot(model)
+    expected = ((types | affinities) & ROBOT_BITS) > 0
+    meeting = np.flatnonzero(robot & ((types | affinities) > 0)).tolist()
     if not meeting:
-        raise BadInputError(
-            f"{robot_path}: no geom of the robot can touch anything: their contype and conaffinity "
-            "are 0; let some have 1 and 1"
-        )
+        raise BadInputError(f"{robot_path}: no geom of the robot can touch anything; {BITS}")
     for geom in meeting:
         meets = ((types[geom] & affinities) | (types & affinities[geom])) > 0
-        expected = ((types | affinities) & ROBOT_BITS) > 0
-        for other in np.flatnonzero((meets != expected) & ~is_robot)[:1].tolist():
+        if ((meets != expected) & ~robot).any():
             name = model.geom(geom).name.removeprefix(ROBOT_PREFIX) or geom
             raise BadInputError(
                 f"{robot_path}: geom {name} has contype {types[geom]} and conaffinity "
-                f"{affinities[geom]}, so that it {'meets' if meets[other] else 'never meets'} body "
-                f"{bodies_of_geoms(model)[other]} of {scene_path} (contype {types[other]}, "
-                f"conaffinity {affinities[other]}); give it 1 and 1, or 0 and 0 if it is only seen"
+                f"{affinities[geom]}, which do not fit those of {scene_path}; {BITS}"
             )
-
-
-def rotation(quaternion: Any) -> Any:
-    """Return the rotation matrix of a unit quaternion (wxyz), shape (3, 3)."""
-    axes = np.empty(9)
-    mujoco.mju_quat2Mat(axes, quaternion)
-    return axes.reshape(3, 3)

@@ -7,17 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.config.flown import FLOWN_FILE, FlownWorld
-from cloudrc.config.hull import known_hull
-from cloudrc.config.robot import find_robot, is_planar
-from cloudrc.config.scene import scene_of
-from cloudrc.config.schema import World
-from cloudrc.config.shipped import file_of
 from cloudrc.geometry import shapes
-from cloudrc.geometry.compiled import mujoco
 from cloudrc.geometry.scene import FLOOR
-from cloudrc.geometry.shapes import SHAPES_FILE, Rgba, Shapes, Surface
-from cloudrc.world.scene import bodies_of_geoms, compile_model
+from cloudrc.geometry.shapes import Rgba, Shapes, Surface
+from cloudrc.sim.engine import mujoco
+from cloudrc.sim.scene import bodies_of_geoms
 
 _GEOM = mujoco.mjtGeom
 SHOWN = 3
@@ -27,26 +21,6 @@ UNSET: Rgba = (0.5, 0.5, 0.5, 1.0)
 """Colour of a geom without a colour; then its material has the colour."""
 WIDE = 20.0
 """Half the edge of a plane without a size [m]."""
-
-
-def read_shapes(world: World) -> Shapes:
-    """Compile the robot and its scene, and return their shapes.
-
-    Raises:
-        BadInputError: If robot or scene are missing or unsuitable.
-    """
-    robot = find_robot(world.robot)
-    return shapes_of(compile_model(robot.model, file_of(world.scene)), planar=robot.planar)
-
-
-def flown_files(world: World) -> dict[str, bytes]:
-    """Return what to attach to a recording, name -> content: what a report needs of the world.
-
-    Raises:
-        BadInputError: If robot or scene are missing or unsuitable.
-    """
-    flown = FlownWorld(scene_of(world), known_hull(world.robot), is_planar(world.robot))
-    return {SHAPES_FILE: read_shapes(world).to_bytes(), FLOWN_FILE: flown.to_bytes()}
 
 
 def shapes_of(model: Any, *, planar: bool) -> Shapes:
@@ -131,7 +105,7 @@ def _mesh(model: Any, number: int) -> Surface:
     first, count = model.mesh_vertadr[number], model.mesh_vertnum[number]
     corners = model.mesh_vert[first : first + count].astype(float)
     first, count = model.mesh_faceadr[number], model.mesh_facenum[number]
-    return Surface("", corners, (model.mesh_face[first : first + count].astype(np.int32),))
+    return Surface("", corners, model.mesh_face[first : first + count].astype(np.int32))
 
 
 def _terrain(model: Any, number: int) -> Surface:

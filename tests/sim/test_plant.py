@@ -6,11 +6,10 @@ import pytest
 from cloudrc.config import schema
 from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import Plant
-from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import UPRIGHT, ZERO
-from cloudrc.world.plant import Wind, point_inertia
-from cloudrc.world.readings import Readings
-from cloudrc.world.scene import rotation
+from cloudrc.sim.engine import mujoco
+from cloudrc.sim.plant import Wind, point_inertia
+from cloudrc.sim.readings import Readings
 from tests.world.conftest import model_of, simulate
 
 
@@ -19,7 +18,9 @@ def model(**keys):
 
 
 def inertia(one):
-    axes = rotation(one.body_iquat[1])
+    axes = np.empty(9)
+    mujoco.mju_quat2Mat(axes, one.body_iquat[1])
+    axes = axes.reshape(3, 3)
     return one.body_mass[1], one.body_ipos[1], axes @ np.diag(one.body_inertia[1]) @ axes.T
 
 

@@ -1,0 +1,34 @@
+"""Read the shapes and the numbers of an experiment's robot and scene."""
+
+from __future__ import annotations
+
+from cloudrc.config.flown import FLOWN_FILE, FlownWorld
+from cloudrc.config.hull import known_hull
+from cloudrc.config.robot import known_robot
+from cloudrc.config.scene import scene_of
+from cloudrc.config.schema import World
+from cloudrc.config.shipped import file_of
+from cloudrc.geometry.shapes import SHAPES_FILE, Shapes
+from cloudrc.sim.scene import compile_model
+from cloudrc.sim.shapes import shapes_of
+
+
+def read_shapes(world: World) -> Shapes:
+    """Compile the robot and its scene, and return their shapes.
+
+    Raises:
+        BadInputError: If robot or scene are missing or unsuitable.
+    """
+    robot = known_robot(world.robot)
+    return shapes_of(compile_model(robot.model, file_of(world.scene)), planar=robot.planar)
+
+
+def flown_files(world: World) -> dict[str, bytes]:
+    """Return what to attach to a recording, name -> content: what a report needs of the world.
+
+    Raises:
+        BadInputError: If robot or scene are missing or unsuitable.
+    """
+    planar = known_robot(world.robot).planar
+    flown = FlownWorld(scene_of(world), known_hull(world.robot), planar)
+    return {SHAPES_FILE: read_shapes(world).to_bytes(), FLOWN_FILE: flown.to_bytes()}

@@ -1,0 +1,62 @@
+"""Import MuJoCo, and turn its errors into those of cloudrc."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+from cloudrc.errors import (
+    BadInputError,
+    CloudrcError,
+    MissingPrerequisiteError,
+    OutOfMemoryError,
+    tells_no_memory,
+)
+
+
+def import_mujoco() -> Any:
+    """Import MuJoCo without OpenGL, which a flight does not need.
+
+    With MUJOCO_GL=egl and no libEGL, `import mujoco` fails. MUJOCO_GL is therefore `disable` during
+    the import. Afterwards it has its old value, for a child process that renders.
+    """
+    wanted = os.environ.get("MUJOCO_GL")
+    os.environ["MUJOCO_GL"] = "disable"
+    try:
+        import mujoco
+    except ImportError as error:
+        raise MissingPrerequisiteError(
+            f"the simulator needs MuJoCo ({error}); run: pip install 'cloudrc[world]'"
+        ) from None
+    finally:
+        del os.environ["MUJOCO_GL"]
+        if wanted is not None:
+            os.environ["MUJOCO_GL"] = wanted
+    return mujoco
+
+
+mujoco = import_mujoco()
+# Otherwise MuJoCo writes its warnings to MUJOCO_LOG.TXT in the working directory.
+mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
+
+
+def compile_error(what: object, error: Exception) -> CloudrcError:
+    """Return the error to raise if MuJoCo cannot compile `what` because of `error`.
+
+    MuJoCo reports a lack of memory as an error of the file. It says nothing about the file.
+    """
+    reason = " ".join(str(error).split())
+    if tells_no_memory(reason):
+        text = f"memory ran out: {what} could not be compiled"
+        return OutOfMemoryError(f"{text}; use fewer processes, or free some memory")
+    return BadInputError(f"{what} does not compile: {reason}")
+
+
+def compile_alone(file: Path) -> Any:
+    """Compile an MJCF file by itself; raise a BadInputError if it does not compile."""
+    try:
+        return mujoco.MjSpec.from_file(str(file)).compile()
+    except (ValueError, KeyError) as error:
+        raise compile_error(file, error) from None

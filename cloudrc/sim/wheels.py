@@ -1,0 +1,80 @@
+"""Read the driven wheels of a robot from its compiled MuJoCo model."""
+
+from __future__ import annotations
+
+from math import hypot, inf
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cloudrc.sim.engine import mujoco
+from cloudrc.sim.scene import ROBOT_PREFIX
+
+LEVEL = 0.05
+"""Largest sine of the angle between a wheel's axis and the base's y axis."""
+ROUND = tuple(
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{shape}")) for shape in ("CYLINDER", "SPHERE", "ELLIPSOID")
+)
+"""Shapes whose first size is the radius of a wheel."""
+
+
+class Wheel(NamedTuple):
+    """A driven wheel."""
+
+    y: float  # distance to the left of the base [m]
+    command: float  # value of the actuator per speed of the wheel over the ground [rad/m]
+    speed_max: float  # largest speed over the ground [m/s]
+
+
+def read_wheels(model: Any, radius: float | None) -> list[Wheel]:
+    """Read the wheels of a compiled `MjModel`, in which each actuator is the servo of a wheel.
+
+    `radius` is that of the wheels [m]; None: that of the largest round geom of each wheel.
+
+    Raises:
+        ValueError: If the model has no such wheels.
+    """
+    data, base = mujoco.MjData(model), model.jnt_bodyid[0]
+    mujoco.mj_forward(model, data)
+    frame = data.xmat[base].reshape(3, 3)
+    wheels = []
+    for number in range(model.nu):
+        joint = _wheel_joint(model, number)
+        axis = data.xaxis[joint] @ frame
+        if hypot(axis[0], axis[2]) > LEVEL:
+            raise _refusal(model, number, "its axis must point along the base's y")
+        size = radius or _radius(model, number, joint)
+        gear = float(model.actuator_gear[number, 0] * np.sign(axis[1]))
+        most = model.actuator_ctrlrange[number] if model.actuator_ctrllimited[number] else [inf]
+        speed_max = float(np.abs(most).min()) * size / abs(gear)
+        place = (data.xanchor[joint] - data.xpos[base]) @ frame
+        wheels.append(Wheel(float(place[1]), gear / size, speed_max))
+    if not min(wheel.y for wheel in wheels) < 0.0 < max(wheel.y for wheel in wheels):
+        raise ValueError("needs driven wheels on both sides: y above 0 and below 0")
+    return wheels
+
+
+def _wheel_joint(model: Any, number: int) -> int:
+    """Return the hinge that an actuator turns; raise a ValueError if it is no wheel's servo."""
+    joint = int(model.actuator_trnid[number, 0])
+    kind = model.actuator_trntype[number]
+    if kind != mujoco.mjtTrn.mjTRN_JOINT or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
+        raise _refusal(model, number, "it must turn the hinge of a wheel")
+    gain, bias = model.actuator_gainprm[number, 0], model.actuator_biasprm[number]
+    if not gain > 0.0 or bias[2] != -gain or bias[:2].any() or not model.actuator_gear[number, 0]:
+        raise _refusal(model, number, "it must be a velocity servo, in MJCF: <velocity kv=...>")
+    return joint
+
+
+def _radius(model: Any, number: int, joint: int) -> float:
+    body = model.jnt_bodyid[joint]
+    geoms = np.flatnonzero(model.geom_bodyid == body)
+    radii = [model.geom_size[geom, 0] for geom in geoms if model.geom_type[geom] in ROUND]
+    if not radii:
+        raise _refusal(model, number, "its wheel has no round geom; set onboard.wheel_radius_m")
+    return float(max(radii))
+
+
+def _refusal(model: Any, number: int, reason: str) -> ValueError:
+    name = model.actuator(number).name.removeprefix(ROBOT_PREFIX) or number
+    return ValueError(f"actuator '{name}': {reason}")
