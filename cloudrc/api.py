@@ -12,6 +12,7 @@ docs/python.md describes the API; other modules may change without notice.
 from __future__ import annotations
 
 import json
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +39,7 @@ from cloudrc.runs.requirements import MODES, require
 
 if TYPE_CHECKING:
     from cloudrc.report.document import Assessment
-    from cloudrc.runs.grid import Grid
+    from cloudrc.trials.plan import SweepPlan
 
 
 COUNT = Quantity(ge=1, whole=True)
@@ -248,41 +249,39 @@ def sweep(
             belongs to another sweep.
     """
     require("a sweep", ("world", "record"))
-    from cloudrc.runs.grid import read_grid
+    from cloudrc.trials.plan import read_plan
 
     jobs = _count(jobs, "jobs")
     if isinstance(grid, Mapping):
         with naming("the grid"):
             plain = to_plain(grid)
-        read = read_grid(plain)
+        plan = read_plan(plain)
     else:
-        read = read_grid(Path(grid))
-    for text in advice_on(*read.points):
+        plan = read_plan(Path(grid))
+    for text in advice_on(*plan.points):
         warnings.warn(text, stacklevel=3)
     with TemporaryDirectory(prefix="cloudrc-sweep-") as temporary:
-        return _fly_sweep(read, None if out is None else Path(out), Path(temporary), jobs)
+        return _fly_sweep(plan, None if out is None else Path(out), Path(temporary), jobs)
 
 
-def _fly_sweep(grid: Grid, out: Path | None, temporary: Path, jobs: int) -> SweepTable:
-    from cloudrc.runs import store
-    from cloudrc.runs import sweep as work
+def _fly_sweep(plan: SweepPlan, out: Path | None, temporary: Path, jobs: int) -> SweepTable:
+    from cloudrc.studies import sweep as work
+    from cloudrc.trials.play import run
 
-    with work.open_folder(out or temporary, "sweep") as (folder, warning):
-        if warning:
-            warnings.warn(warning, stacklevel=4)
-        begun = work.begin(grid, folder)
-        flown = work.fly_missing(begun, folder, jobs)
-        rows, stopped = work.keep(flown, folder, grid, None, begun.before)
+    with work.open_folder(out or temporary, "sweep") as folder:
+        rows = work.begin(folder, plan)
+        stopped = run(plan.flights.values(), rows, jobs, in_order=False)
+        flown = work.finish(folder, plan)
     if stopped:
         raise _as_exception(stopped)
-    columns = store.columns_of([rows[key] for key in grid.flights], grid)
-    units = store.read_summary(folder)["units"]
-    numbers = {name for name in grid.axes if {*map(type, columns[name])} <= store.NUMBERS}
+    columns = work.columns_of([flown[key] for key in plan.flights], plan)
+    numbers = {name for name in plan.axes if {*map(type, columns[name])} <= work.NUMBERS}
     arrays = {
         name: np.array(values, dtype=float if name in numbers or None in values else None)
         for name, values in columns.items()
     }
-    return SweepTable(arrays, {name: units[name] for name in arrays if name in units}, out)
+    units = {name: plan.units[name] for name in arrays if name in plan.units}
+    return SweepTable(arrays, units, out)
 
 
 def compare(
@@ -309,17 +308,17 @@ def compare(
     Raises:
         cloudrc.errors.BadInputError: If a setting is invalid, or if no pair has a metric.
     """
-    from cloudrc.runs import compare as pairs
+    from cloudrc.studies import compare as pairs
 
     seeds, jobs = _count(seeds, "seeds"), _count(jobs, "jobs")
     first, second = (pairs.split_settings(x) if isinstance(x, str) else _texts(x) for x in (a, b))
-    sides, units = pairs.load_sides(of, _texts(settings or {}), first, second, numbers)
-    for text in advice_on(*sides):
+    plan = pairs.plan_sides(of, _texts(settings or {}), first, second, seeds, numbers)
+    for text in advice_on(*plan.points):
         warnings.warn(text, stacklevel=3)
-    flown, stopped = pairs.fly_pairs(sides, seeds, jobs)
+    flown, stopped = pairs.fly_pairs(plan, jobs)
     if stopped:
         raise _as_exception(stopped)
-    document = pairs.compare(flown, units, numbers)
+    document = pairs.compare(flown, plan.units, numbers)
     if not document["numbers"]:
         raise BadInputError("no pair has one of the numbers; name another with numbers=[...]")
     name, entry = next(iter(document["numbers"].items()))
@@ -351,13 +350,17 @@ def margin(
     Raises:
         cloudrc.errors.BadInputError: If the key has no range of numbers.
     """
-    from cloudrc.runs.trials import QUESTIONS, Asked, Trials, describe, questions
+    from cloudrc.studies.margin import QUESTIONS, Asked, Margin, describe
+    from cloudrc.studies.search import ValueRange
 
+    for name, value in (("largest", largest), ("resolution", resolution)):
+        if value is not None and not 0.0 < value < math.inf:
+            raise BadInputError(f"{name}: {value} is no finite number above 0")
     seeds = _count(seeds, "seeds")
-    trials = Trials(Asked(key, of, _texts(settings or {}), seeds, largest, resolution))
-    asked = questions(trials)
-    found = {name: trials.search(name) if name in asked else None for name in QUESTIONS}
-    return describe(trials, found)
+    work = Margin(Asked(key, of, _texts(settings or {}), seeds, largest, resolution))
+    found: dict[str, ValueRange | None] = dict.fromkeys(QUESTIONS)
+    found |= {name: work.search(name) for name in work.questions}
+    return describe(work, found)
 
 
 def identify(run: str | Path) -> dict[str, Any]:
@@ -367,8 +370,8 @@ def identify(run: str | Path) -> dict[str, Any]:
     of `time_constant` [s], `dead_time` [s] and `gain`, and their 95 % intervals.
     """
     require("identify", ("record",))
-    from cloudrc.runs.identify import describe
-    from cloudrc.runs.identify import identify as fit
+    from cloudrc.studies.identify import describe
+    from cloudrc.studies.identify import identify as fit
 
     return describe(*fit(Path(run)))
 

@@ -22,7 +22,7 @@ from cloudrc.runs.requirements import MODES, require
 from cloudrc.text import csv_table, latex_table
 
 if TYPE_CHECKING:
-    from cloudrc.runs.compare import Pairs
+    from cloudrc.studies.compare import Pairs
 
 EPILOG = """\
 A and B are one of:
@@ -66,8 +66,8 @@ def execute(options: argparse.Namespace) -> int:
     """Compare A and B, print the result, and return the exit code: 0 if all flights were flown."""
     interrupt_on_signals()
     from cloudrc.cli.progress import Progress
-    from cloudrc.runs.compare import compare, of_sweep
-    from cloudrc.runs.compare_text import as_text, cells
+    from cloudrc.studies.compare import compare, of_sweep
+    from cloudrc.studies.compare_text import as_text, cells
 
     stopped = None
     if options.set and options.sweep:
@@ -104,17 +104,17 @@ def _fly_both(options: argparse.Namespace) -> tuple[Pairs, CloudrcError | None]:
     Return the pairs of flights; and why the work ended early, or None.
     """
     from cloudrc.cli.progress import SweepView
-    from cloudrc.runs.compare import Pairs, fly_pairs, load_sides, split_settings
+    from cloudrc.studies.compare import Pairs, fly_pairs, plan_sides, split_settings
 
     for text in (options.a, options.b):
         if "=" not in text:
             raise BadInputError(f"{text}: is not KEY=VALUE; for a value of a sweep, add --in DIR")
     require("compare", MODES["virtual"])
-    a, b = split_settings(options.a), split_settings(options.b)
-    sides, unit_of = load_sides(options.experiment, options.set, a, b, options.number)
-    warn(*sides)
-    head = f"{sides[0].name}: A and B, each with seeds 1 to {options.seeds}"
-    flights = 2 * options.seeds
-    with closing(SweepView(f"{head}, {flights} flights", flights)) as view:
-        pairs, stopped = fly_pairs(sides, options.seeds, flights, view.see)
-    return Pairs(pairs, unit_of, f"experiment {options.experiment}"), stopped
+    sides = split_settings(options.a), split_settings(options.b)
+    plan = plan_sides(options.experiment, options.set, *sides, options.seeds, options.number)
+    warn(*plan.points)
+    count = len(plan.flights)
+    head = f"{plan.name}: A and B, each with seeds 1 to {options.seeds}, {count} flights"
+    with closing(SweepView(head, count)) as view:
+        pairs, stopped = fly_pairs(plan, count, view.see)
+    return Pairs(pairs, plan.units, f"experiment {options.experiment}"), stopped

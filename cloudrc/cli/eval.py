@@ -25,8 +25,8 @@ from cloudrc.runs.requirements import require
 from cloudrc.text import cells, csv_table, escape, latex_table
 
 if TYPE_CHECKING:
-    from cloudrc.eval.evidence import Row
     from cloudrc.eval.setup import Episode, EvalSetup
+    from cloudrc.trials.rows import Row
 
 EPILOG = """\
 examples:
@@ -158,25 +158,17 @@ def _report(
 
 def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
     """Check the flags, print doubts about the link, and return the evaluation and its episodes."""
-    from cloudrc.eval.setup import (
-        Episode,
-        EvalSetup,
-        check_setup,
-        heavy_loss,
-        link_at,
-        read_compute,
-        read_env_args,
-        read_mapped,
-    )
+    from cloudrc.cli import eval_values as values
+    from cloudrc.eval.setup import Episode, EvalSetup, heavy_loss
 
     executors = list(dict.fromkeys(each.strip() for each in options.executor.split(",")))
     setup = EvalSetup(
         options.env,
         options.policy,
-        read_env_args(options.env_arg),
+        values.read_env_args(options.env_arg),
         options.link,
-        read_compute(options.compute),
-        read_mapped(options.map),
+        *values.read_compute(options.compute),
+        values.read_mapped(options.map),
         options.success_at,
         options.dt,
         options.max_steps,
@@ -184,11 +176,10 @@ def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
         options.answer_within,
         deadline=options.deadline,
     )
-    check_setup(setup)
+    values.check_policy(setup.policy)
     for text in heavy_loss(setup):
         print_line(f"cloudrc: warning: --link {setup.link}: {text}", sys.stderr)
-    for rtt in options.rtt:
-        link_at(setup.link, rtt)
+    values.check_round_trips(setup.link, options.rtt)
     if not all(executors):
         raise BadInputError(f"--executor {options.executor}: a name is missing")
     episodes = [

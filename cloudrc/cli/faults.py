@@ -16,8 +16,8 @@ from cloudrc.cli.parser import add_verbs, number, read_count, whole_number
 from cloudrc.errors import BadInputError
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import require
-from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.text import escape, table
+from cloudrc.trials.workers import map_in_order, take_each
 
 if TYPE_CHECKING:
     from cloudrc.faults.measures import Outcome

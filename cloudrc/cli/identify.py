@@ -33,7 +33,7 @@ def execute(options: argparse.Namespace) -> int:
     """Fit the model, write it to a file, and print it."""
     require("identify", ("record",))
     from cloudrc.cli.progress import Progress
-    from cloudrc.runs.identify import as_text, describe, identify
+    from cloudrc.studies.identify import as_text, describe, identify
 
     out = options.out
     if os.path.lexists(out):

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.compare import flight_arguments
 from cloudrc.cli.output import output_argument, print_result
-from cloudrc.cli.parser import any_number
+from cloudrc.cli.parser import number
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
-    from cloudrc.runs.margin import ValueRange
-    from cloudrc.runs.trials import Trial, Trials
+    from cloudrc.studies.margin import Answer, Margin
+    from cloudrc.studies.search import ValueRange
 
 EPILOG = """\
 examples:
@@ -38,10 +38,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("key", metavar="KEY", help="key of the experiment whose value is a number")
     flight_arguments(parser, seeds=3)
+    above_0 = number(1e-9, 1e12, "units")
     about = "largest value to try (default: 32 times the first, which is the present one)"
-    add("--max", type=any_number, metavar="X", help=about)
+    add("--max", type=above_0, metavar="X", help=about)
     about = "try multiples of R (default: 10 for a key in ms, 1 for whole numbers, else 0.01)"
-    add("--resolution", type=any_number, metavar="R", help=about)
+    add("--resolution", type=above_0, metavar="R", help=about)
     output_argument(parser)
 
 
@@ -50,43 +51,32 @@ def execute(options: argparse.Namespace) -> int:
     interrupt_on_signals()
     require("margin", MODES["virtual"])
     from cloudrc.cli.progress import Progress
-    from cloudrc.runs.margin_text import as_text
-    from cloudrc.runs.trials import QUESTIONS, Asked, Trials, describe, questions
+    from cloudrc.studies.margin import QUESTIONS, Asked, Margin, as_text, describe
 
-    trials = Trials(
-        Asked(
-            options.key,
-            options.experiment,
-            options.set,
-            options.seeds,
-            options.max,
-            options.resolution,
-        )
-    )
-    asked = questions(trials)
-    found: dict[str, ValueRange | None] = {}
+    asked = options.key, options.experiment, options.set, options.seeds
+    margin = Margin(Asked(*asked, options.max, options.resolution))
+    found: dict[str, ValueRange | None] = dict.fromkeys(QUESTIONS)
     with closing(Progress("flies")) as view:
-        for name in QUESTIONS:
-            found[name] = _search(options, trials, name, view.say) if name in asked else None
-        document = describe(trials, found)
-    lines = as_text(document, found, trials).splitlines()
+        for name in margin.questions:
+            found[name] = _search(options, margin, name, view.say)
+        document = describe(margin, found)
+    lines = as_text(document, found, margin).splitlines()
     print_result(options.output, document, "\n".join(["", *map(escape, lines)]))
-    return 0 if document[f"{asked[0]}_up_to"] is not None else 1
+    return 0 if document[f"{margin.questions[0]}_up_to"] is not None else 1
 
 
 def _search(
-    options: argparse.Namespace, trials: Trials, question: str, say: Callable[[str], None]
+    options: argparse.Namespace, margin: Margin, question: str, say: Callable[[str], None]
 ) -> ValueRange:
     """Search the answer to a question, and `say` each value that is tried."""
-    from cloudrc.runs.margin_text import result
-    from cloudrc.runs.stability import SCENE, SMALL
-    from cloudrc.runs.trials import QUESTIONS
+    from cloudrc.studies.margin import QUESTIONS, why
+    from cloudrc.studies.stability import SCENE, SMALL
 
     facts = {"small": SMALL, "scene": SCENE, "experiment": options.experiment}
     text = QUESTIONS[question].format(**facts)
     say(escape(f"{text}, seeds 1 to {options.seeds}"))
 
-    def see(number: int, trial: Trial) -> None:
-        say(escape(f"  {trials.name(number):<26}{result(question, trial)}"))
+    def see(number: int, answer: Answer) -> None:
+        say(escape(f"  {margin.name(number):<26}{why(question, answer)}"))
 
-    return trials.search(question, see)
+    return margin.search(question, see)

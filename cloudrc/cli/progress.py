@@ -38,7 +38,7 @@ from cloudrc.records import (
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
-    from cloudrc.runs.flight import Row
+    from cloudrc.trials.rows import Row
 
 ENDINGS = ("done", "cancelled", "timed_out")
 PERIOD = 10.0

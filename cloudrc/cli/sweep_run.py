@@ -10,7 +10,6 @@ from contextlib import closing, suppress
 from pathlib import Path
 from shlex import quote
 
-from cloudrc import metrics
 from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.mission import TERMINATION_LOG
 from cloudrc.cli.output import (
@@ -25,50 +24,69 @@ from cloudrc.cli.report import print_traceback, summary
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import PICTURES, refuse_other_file, write_atomically
 from cloudrc.metrics.verdict import EXIT_CODES
-from cloudrc.runs import seeds, store, sweep
-from cloudrc.runs.experiment import check_mode, load, refuse_seed
-from cloudrc.runs.flight import Row
+from cloudrc.runs.experiment import check_mode
 from cloudrc.runs.folder import new_folder
-from cloudrc.runs.grid import Grid, SweepPoint, check, read_unchecked, unpack
-from cloudrc.runs.pods import PodSettings, fly_in_pods
 from cloudrc.runs.requirements import MODES, require
-from cloudrc.runs.workers import map_in_order, take_each
+from cloudrc.studies import sweep
+from cloudrc.studies.pods import PodSettings, fly_in_pods
 from cloudrc.text import escape
+from cloudrc.trials import summary as summaries
+from cloudrc.trials.plan import PlannedFlight, SweepPlan, check, draft_of, read_draft, unpack
+from cloudrc.trials.play import keep, play
+from cloudrc.trials.play import run as play_missing
+from cloudrc.trials.rows import Row, Rows
+from cloudrc.trials.workers import map_in_order, take_each
 
 
 def run(options: argparse.Namespace) -> int:
     """Fly the flights of a sweep whose results or recordings are missing; return the exit code."""
     _check_flags(options)
-    grid = _check(options)  # before there is a folder
-    name, (shard, count) = f"sweep-{options.file.stem}", options.shard or (None, 1)
-    with sweep.open_folder(options.out, name, shard, count) as (folder, warning):
-        if warning:
-            print_line(f"cloudrc: warning: {warning}", sys.stderr)
-        return _run_locked(options, grid, folder, shard, count)
+    plan = _check(options)  # before there is a folder
+    with sweep.open_folder(options.out, f"sweep-{options.file.stem}", options.shard) as folder:
+        rows = sweep.begin(folder, plan, options.shard)
+        mine = sweep.flights_of(plan, options.shard)
+        missing = [each for each in mine if each.key not in rows.kept]
+        with closing(SweepView(_head(options, plan, mine, missing), len(missing))) as view:
+            if options.on:
+                stopped = keep(_fly_in_pods(options, plan, missing), rows, view.see)
+            else:
+                stopped = play_missing(missing, rows, options.jobs, view.see, in_order=False)
+            if options.record and not stopped:
+                view.tell("records flights")
+                stopped = sweep.record_missing(
+                    mine, rows.kept, options.record, folder, options.jobs
+                )
+        return _finish(options, plan, folder, mine, stopped)
 
 
-def _run_locked(
-    options: argparse.Namespace, grid: Grid, folder: Path, shard: int | None, count: int
+def _head(
+    options: argparse.Namespace,
+    plan: SweepPlan,
+    mine: Sequence[PlannedFlight],
+    missing: Sequence[PlannedFlight],
+) -> str:
+    """Say what the command flies."""
+    seeds = len(plan.draft.seeds)
+    part = ", shard {} of {}".format(*options.shard) if options.shard else ""
+    head = f"{plan.name}: {len(plan.points)} points x {seeds} seeds{part}: {len(mine)} flights"
+    done = len(mine) - len(missing)
+    return f"{head}, {done} done before" if done else head
+
+
+def _finish(
+    options: argparse.Namespace,
+    plan: SweepPlan,
+    folder: Path,
+    mine: Sequence[PlannedFlight],
+    stopped: CloudrcError | None,
 ) -> int:
-    """Fly what is missing in `folder`, which no other command may fly now; return the exit code."""
-    work = sweep.begin(grid, folder, shard, count, options.record)
-    mine, missing = work.mine, work.missing
-    part = f", shard {shard} of {count}" if shard else ""
-    points = len(grid.point_of) // len(grid.seeds)
-    head = f"{points} points x {len(grid.seeds)} seeds{part}: {len(mine)} flights"
-    head += f", {len(mine) - len(missing)} done before" if len(missing) < len(mine) else ""
-    view = SweepView(f"{grid.name}: {head}", len(missing))
-    with closing(view):
-        if options.on:
-            flown = _fly_in_pods(options, grid, missing)
-        else:
-            flown = sweep.fly_missing(work, folder, options.jobs, options.record)
-        rows, stopped = sweep.keep(flown, folder, grid, shard, work.before, view.see)
+    """Write summary and tables, print the result, and return the exit code."""
     if stopped:
         print_line(f"cloudrc: {stopped}; to continue: {_again(options, folder)}", sys.stderr)
-    name = store.TABLE if len(rows) == len(grid.point_of) else store.SUMMARY
-    text = f"\n{sweep.count_verdicts(rows.values())}\n\n{escape(str(folder / name))}"
-    print_result(options.output, store.read_summary(folder), text)
+    rows = sweep.finish(folder, plan)
+    name = sweep.TABLE if len(rows) == len(plan.flights) else sweep.SUMMARY
+    text = f"\n{summaries.count_verdicts(rows.values())}\n\n{escape(str(folder / name))}"
+    print_result(options.output, sweep.read_summary(folder), text)
     if stopped:
         return stopped.exit_code
     return int(any(rows[each.key]["verdict"] != "success" for each in mine))
@@ -96,29 +114,28 @@ def _check_flags(options: argparse.Namespace) -> None:
         raise BadInputError("--shard needs --out, the folder that all shards share")
 
 
-def _check(options: argparse.Namespace) -> Grid:
+def _check(options: argparse.Namespace) -> SweepPlan:
     """Check all points; print warnings."""
-    unchecked = read_unchecked(options.file, options.max_flights)
-    with closing(Progress(f"checks {unchecked.size}")):
-        grid = check(unchecked)
+    draft = read_draft(options.file, options.max_flights)
+    with closing(Progress(f"checks {draft.size}")):
+        plan = check(draft)
     if options.on:
         from cloudrc.cluster.own_files import check_local_files
 
-        for point in grid.points:
+        for point in plan.points:
             check_local_files(point.model_dump(mode="json"), "or fly without --on")
-    warn(*grid.points)
-    return grid
+    warn(*plan.points)
+    return plan
 
 
 def fly_again(options: argparse.Namespace) -> int:
     """Repeat a flight of a sweep with recording and report; exit with 6 if its records changed."""
     require("a report", MODES["virtual"])
-    row, flight = sweep.find_flight(options.folder, options.key)
-    key = flight.key
-    with closing(Progress(f"flies {key} again")):
-        report = sweep.fly_into(options.folder / key, flight, page=True)
+    row, flight = sweep.find_row(options.folder, options.key)
+    with closing(Progress(f"flies {flight.key} again")):
+        report = sweep.fly_into(options.folder, flight, page=True)
     print_traceback(options, report)
-    print_or_drop(summary(report, options.folder / key))
+    print_or_drop(summary(report, options.folder / flight.key))
     sweep.check_repeated(row, report)
     print_or_drop("\nthe records are those of the sweep", sys.stderr)
     return 0
@@ -127,9 +144,10 @@ def fly_again(options: argparse.Namespace) -> int:
 def print_status(options: argparse.Namespace) -> int:
     """Print how many flights of a sweep are done, and how many succeeded per value of an axis."""
     with closing(Progress(f"reads {options.folder}")):
-        flights, rows, values = sweep.count_successes(options.folder)
-    document = {"flights": flights, "rows": len(rows), "axes": values}
-    print_result(options.output, document, sweep.status_text(flights, rows, values))
+        found = sweep.read_sweep(options.folder)
+        values = sweep.count_successes(found)
+    document = {"flights": found.flights, "rows": len(found.rows), "axes": values}
+    print_result(options.output, document, sweep.status_text(found, values))
     return 0
 
 
@@ -137,18 +155,19 @@ def draw_figure(options: argparse.Namespace) -> int:
     """Draw a sweep and write the figure as PDF, PNG and SVG; print the caption and the paths."""
     require("a figure", ("report",))
     from cloudrc.report.figures.style import Look
-    from cloudrc.runs.figure import draw_sweep
+    from cloudrc.studies.figure import draw_sweep
 
     look = Look(options.width, options.font_size)
     with closing(Progress(f"draws {options.folder}")):
-        rows, units, missing = store.read_flights(options.folder)
-        files, caption = draw_sweep(rows, units, options.number, options.x, options.by, look)
+        found = sweep.read_flights(options.folder)
+        shown = options.number, options.x, options.by
+        files, caption = draw_sweep(found.rows, found.units, *shown, look)
     out = options.out or options.folder / "figure"
     stem = out.stem if out.suffix.removeprefix(".") in files else out.name
     paths = {kind: out.with_name(f"{stem}.{kind}") for kind in files}
     for kind, path in paths.items():
         refuse_other_file(path, PICTURES[kind], flag="--out")
-    print_or_drop(caption + (f" {missing}." if missing else "") + "\n")
+    print_or_drop(caption + (f" {found.missing}." if found.missing else "") + "\n")
     for kind, path in paths.items():
         write_atomically(path, files[kind])
         print_or_drop(escape(str(path)))
@@ -159,14 +178,14 @@ def draw_figure(options: argparse.Namespace) -> int:
 
 
 def _fly_in_pods(
-    options: argparse.Namespace, grid: Grid, flights: Sequence[SweepPoint]
+    options: argparse.Namespace, plan: SweepPlan, flights: Sequence[PlannedFlight]
 ) -> Generator[Row]:
     pods = PodSettings(options.shards, options.image, options.cpu, options.queue)
 
     def tell(text: str) -> None:
         print_line(f"  {text}", sys.stderr)
 
-    return fly_in_pods(release_from_flags(options), pods, grid, flights, tell)
+    return fly_in_pods(release_from_flags(options), pods, plan, flights, tell)
 
 
 def print_rows(options: argparse.Namespace) -> int:
@@ -174,8 +193,14 @@ def print_rows(options: argparse.Namespace) -> int:
 
     If the shard cannot be finished, leave the reason for Kubernetes, which flies the shard again.
     """
+    shard, count = options.shard
+
+    def print_row(row: Row) -> None:
+        print(json.dumps(row, allow_nan=False), flush=True)
+
     try:
-        stopped = _print_rows(options)
+        flights = unpack(options.file)[shard - 1 :: count]
+        stopped = take_each(map_in_order(play, flights, jobs=1), print_row)
     except Exception as error:
         _leave_message(str(error) if isinstance(error, CloudrcError) else describe_error(error))
         raise
@@ -184,16 +209,6 @@ def print_rows(options: argparse.Namespace) -> int:
         _leave_message(str(stopped))
         return stopped.exit_code
     return 0
-
-
-def _print_rows(options: argparse.Namespace) -> CloudrcError | None:
-    shard, count = options.shard
-    flights = unpack(options.file)[shard - 1 :: count]
-
-    def print_row(row: Row) -> None:
-        print(json.dumps(row, allow_nan=False), flush=True)
-
-    return take_each(map_in_order(sweep.fly_row, flights, jobs=1), print_row)
 
 
 def _leave_message(text: str) -> None:
@@ -211,39 +226,36 @@ def fly_seeds(options: argparse.Namespace) -> int:
 
     If Ctrl-C or a killed worker ends the command early, the table shows the finished seeds only.
     """
-    refuse_seed(options.set)
-    experiment = load(options.experiment, options.set)
+    plan = check(draft_of(options.experiment, options.set, options.seeds))
+    (experiment,), count = plan.points, len(plan.flights)
     check_mode(experiment, "virtual")
-    metrics.check(experiment.report.metrics)
     warn(experiment)
-    name = experiment.name
-    folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds", "latest-sweep")
-    grid = seeds.write_grid(folder, options.experiment, options.set, options.seeds)
-    seen, count = list[Row](), len(grid.flights)
-    head = f"{name}: mode virtual, seeds 1 to {options.seeds}, link {experiment.link.profile}"
+    folder = new_folder(options.out, f"{plan.name}-virtual-{count}seeds", "latest-sweep")
+    rows = sweep.begin(folder, plan)
+    head = f"{plan.name}: mode virtual, seeds 1 to {count}, link {experiment.link.profile}"
     make = SeedsView if options.output == "table" else SweepView
-
-    def see(row: Row) -> None:
-        seen.append(row)
-        view.see(row)
-        if not any("traceback" in earlier for earlier in seen[:-1]):
-            print_traceback(options, row)
-
     with closing(make(head, count)) as view:
-        _, stopped = sweep.keep(
-            seeds.fly_seeds(grid), folder, grid, None, store.begin(folder, grid), see
-        )
+        stopped = play_missing(plan.flights.values(), rows, count, view.see)
+    sweep.finish(folder, plan)
+    _print_first_traceback(options, rows)
     if stopped:
-        text = f"\ncloudrc: {stopped}: {len(seen)} of {count} seeds are finished"
+        text = f"\ncloudrc: {stopped}: {len(rows.kept)} of {count} seeds are finished"
         print_or_drop(text, sys.stderr)
+    seen = [*rows.kept.values()]
     document = {
-        **{"experiment": name, "mode": "virtual", "interrupted": bool(stopped)},
+        **{"experiment": plan.name, "mode": "virtual", "interrupted": bool(stopped)},
         "overrides": list(options.set),
-        **seeds.summarise(seen, store.read_summary(folder)["units"]),
+        **summaries.summarise(seen, plan.units),
         "runs": [{key: row[key] for key in ("seed", "verdict", "key", "text")} for row in seen],
     }
-    text = f"\n{seeds.as_table(document, count)}\n\n{folder / store.SUMMARY}"
+    text = f"\n{summaries.as_table(document, count)}\n\n{folder / sweep.SUMMARY}"
     print_result(options.output, document, text)
     if stopped:
         return stopped.exit_code
-    return max(EXIT_CODES[row["verdict"]] for row in seen)
+    return max(EXIT_CODES.get(row["verdict"], 1) for row in seen)
+
+
+def _print_first_traceback(options: argparse.Namespace, rows: Rows) -> None:
+    """With --debug, print the traceback of the first failure of a plug-in."""
+    for row in [each for each in rows.kept.values() if "traceback" in each][:1]:
+        print_traceback(options, row)

@@ -177,16 +177,6 @@ def _is_list(annotation: Any) -> bool:
     return any(get_origin(kind) in (tuple, list, set, frozenset, Sequence) for kind in kinds)
 
 
-def exceeds(model: type[BaseModel], path: KeyPath, value: float) -> bool:
-    """Return whether `value` [any unit] is above the largest that the schema allows at `path`."""
-    bounds = list(_bounds(field_at(model, path)))
-    return any(
-        (isinstance(bound, Le) and value > bound.le)  # type: ignore[operator]
-        or (isinstance(bound, Lt) and value >= bound.lt)  # type: ignore[operator]
-        for bound in bounds
-    )
-
-
 def _limits(field: FieldInfo) -> Iterator[str]:
     """Yield the limits of a field in words, such as ">= 0"."""
     for bound in _bounds(field):

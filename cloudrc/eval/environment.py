@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Iterator, Mapping
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +12,10 @@ import gymnasium
 
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.eval.setup import EvalSetup
-from cloudrc.outside.code import OWN, is_installed
+from cloudrc.outside.code import OWN
 from cloudrc.plugins import is_path
-from cloudrc.runs.grid import everything_of
-from cloudrc.runs.installed import module_code
-from cloudrc.runs.own_files import hash_all, hash_of_module, hashes
+from cloudrc.runs.own_files import hashes
+from cloudrc.trials.fingerprint import code_of, experiment_facts, fingerprint
 
 
 def find_module(setup: EvalSetup) -> str:
@@ -36,27 +33,26 @@ def find_module(setup: EvalSetup) -> str:
 
 
 def environment_code(env: gymnasium.Env[Any, Any], setup: EvalSetup) -> str:
-    """Return the hash of all that is known to decide how the environment of a setup behaves.
+    """Return the fingerprint of all that is known to decide how the environment of a setup behaves.
 
     It is that of the modules of its classes, of the files in its arguments, and of the experiment
     of a testbed's robot.
     """
-    found = dict[str, Any]()
-    for name in sorted(_modules(env, setup)):
-        top = name.partition(".")[0]
-        file = getattr(sys.modules.get(name), "__file__", None)
-        if file is None or top == OWN or top in sys.stdlib_module_names:
-            continue
-        if not is_installed(file):
-            found[name] = hash_of_module(name, Path(file))
-        elif top not in found:
-            found[top] = module_code(top)
+    found: dict[str, Any] = {
+        name: code_of(name) for name in sorted(_modules(env, setup)) if _is_foreign(name)
+    }
     for path in _files_in(dict(setup.env_args)):
         found[path] = hashes(path)
     experiment = getattr(env.unwrapped, "experiment", None)
     if isinstance(experiment, ResolvedExperiment):
-        found["experiment"] = everything_of(experiment, hash_all(experiment)).decode()
-    return sha256(json.dumps(found, sort_keys=True).encode()).hexdigest()
+        found["experiment"] = experiment_facts(experiment)
+    return fingerprint(found)
+
+
+def _is_foreign(name: str) -> bool:
+    """Return whether a module is neither cloudrc's nor Python's."""
+    file = getattr(sys.modules.get(name), "__file__", None)
+    return file is not None and name.partition(".")[0] not in (OWN, *sys.stdlib_module_names)
 
 
 def _modules(env: gymnasium.Env[Any, Any], setup: EvalSetup) -> set[str]:

@@ -21,14 +21,10 @@ from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.eval.environment import environment_code, find_module
 from cloudrc.eval.setup import (
     BARE,
-    FILE,
-    MEASURED,
     SEED,
     Episode,
     EvalSetup,
     link_at,
-    mean_compute,
-    read_times,
 )
 from cloudrc.gym import Networked
 from cloudrc.gym.step import StepTime, find_step
@@ -121,7 +117,7 @@ def _one(given: Any) -> Any:
     return given.reshape(())[()] if isinstance(given, np.ndarray) and given.size == 1 else given
 
 
-def play(episode: Episode, setup: EvalSetup, identity: Mapping[str, Any]) -> dict[str, Any]:
+def play(episode: Episode, setup: EvalSetup, key: str = "") -> dict[str, Any]:
     """Play an episode; return its row. Raise a CloudrcError if policy or environment fail."""
     played = episode
     if episode.is_baseline:
@@ -145,7 +141,7 @@ def play(episode: Episode, setup: EvalSetup, identity: Mapping[str, Any]) -> dic
     }
     judged = {None: "done", True: "success", False: "failure"}
     return {
-        "key": episode.key(identity),
+        "key": key,
         "point": episode.point,
         "seed": episode.seed,
         "verdict": judged[found.success],
@@ -279,9 +275,7 @@ def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask:
     world = _connect(witness, episode, setup, len(chunk), policy)
     witness.digest = sha256()
     observation, info = world.reset(seed=episode.seed)
-    is_measured = isinstance(setup.compute, tuple) and setup.compute[0] == MEASURED
-    if isinstance(setup.compute, tuple) and setup.compute[0] == FILE:
-        times = read_times(str(setup.compute[1]))
+    if times := setup.times:
         world.compute = lambda tick: times[(episode.seed + tick) % len(times)]
     dt = world.dt
     total, steps, stale, ended = 0.0, 0, 0, "limit"
@@ -290,7 +284,7 @@ def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask:
         about = info["cloudrc"]
         if about["asked"] and steps:
             chunk = policy(observation, about.get("prefix", []))
-        if is_measured:
+        if setup.is_measured:
             world.compute = policy.duration
         observation, reward, terminated, truncated, info = world.step(chunk)
         steps, total = steps + 1, total + reward
@@ -320,18 +314,14 @@ def _connect(
 
     The policy has given its first answer.
     """
-    compute: Any = setup.compute
+    compute: Any = setup.mean_compute if setup.times else setup.compute
     sent = setup.observation_bytes
-    if isinstance(compute, tuple) and compute[0] == FILE:
-        compute = mean_compute(compute)
-    elif isinstance(compute, tuple) and compute[0] == MEASURED:
-        compute = policy.duration
     return _Network(
         env,
         link_at(setup.link, episode.rtt_ms),
         episode.seed,
         dt=setup.dt,
-        compute=compute,
+        compute=policy.duration if setup.is_measured else compute,
         answer_within=setup.answer_within,
         chunk=count,
         executor=episode.executor,
@@ -343,13 +333,9 @@ def _connect(
 def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
     """Return whether the task was done in any step so far; None if the info never told."""
     for key in SUCCESS:
-        if info.get(key) is None:
-            continue
-        try:
-            known = _flag_of(info[key], f"info['{key}']") or bool(known)
-        except InvalidValueError as error:
-            text = f"{error}; say with --success-at which return is a success"
-            raise InvalidValueError(text) from None
+        if info.get(key) is not None:
+            name = f"info['{key}'] (see --success-at)"
+            known = _flag_of(info[key], name) or bool(known)
     return known
 
 
@@ -370,7 +356,7 @@ def check_environment(setup: EvalSetup, episodes: list[Episode]) -> CheckedEnvir
     with make_env(setup, 1) as env:
         width_of(env.action_space)
         code = environment_code(env, setup)
-        step = find_step(env, setup.dt, mean_compute(setup.compute))
+        step = find_step(env, setup.dt, setup.mean_compute)
         for executor in dict.fromkeys(each.executor for each in episodes):
             wait = setup.answer_within
             _Network(env, dt=setup.dt, chunk=1, executor=executor, answer_within=wait)

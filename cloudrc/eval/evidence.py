@@ -11,10 +11,10 @@ from statistics import fmean, median
 from typing import Any, TypeAlias
 
 from cloudrc.eval.setup import BASELINE
-from cloudrc.runs.compare import Pair, adjust, compare_number, compare_success
 from cloudrc.statistics import LEVEL, by_chance, exact_interval, median_interval, tail
+from cloudrc.trials.rows import Row
+from cloudrc.trials.summary import Pair, adjust, compare_number, compare_success
 
-Row: TypeAlias = dict[str, Any]
 Groups: TypeAlias = Mapping[str, Mapping[float | None, Sequence[Row]]]
 """Executor -> round trip [ms] -> the rows of this condition."""
 WEIGHTS = {

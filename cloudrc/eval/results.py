@@ -5,22 +5,21 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.eval.episode import play
-from cloudrc.eval.evidence import Row
 from cloudrc.eval.setup import Episode, EvalSetup
 from cloudrc.files import read, write_atomically
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.rounding import format_limit
-from cloudrc.runs.store import append_rows, read_rows
-from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.source import code_hash
 from cloudrc.statistics import LEVEL
 from cloudrc.text import cells, table
+from cloudrc.trials.play import run
+from cloudrc.trials.rows import Row, Rows, read_rows
 
 FILE = "eval.json"
 """File in the folder of an evaluation: what it plays, and the summary of its rows."""
@@ -108,6 +107,18 @@ def _place(policy: str) -> str:
     return policy if "://" in policy else os.path.abspath(policy)
 
 
+class EpisodeTrial(NamedTuple):
+    """An episode of an evaluation."""
+
+    key: str
+    episode: Episode
+    setup: EvalSetup
+
+    def play(self) -> Row:
+        """Play it; return its row."""
+        return play(self.episode, self.setup, self.key)
+
+
 def play_missing(
     folder: Path,
     setup: EvalSetup,
@@ -120,36 +131,19 @@ def play_missing(
     `see` gets the number of episodes that have a row, at the beginning and after each one.
 
     Raises:
-        BadInputError: If the folder has rows of other code, or the environment fails.
+        BadInputError: If the environment fails.
         CloudrcError: If the policy fails; the rows before are kept.
     """
-    identity = setup.identity()
-    rows = read_rows(folder)
-    if other := {row.get("code") for row in rows.values()} - {code_hash()}:
-        raise BadInputError(
-            f"{folder}: has episodes of code {other.pop()}, this is code {code_hash()}; name a new "
-            "folder with --out"
-        )
+    rows, identity = Rows(folder), setup.identity()
     write(folder, setup, {})
     with reuse_results():  # the code of an executor is that of all its episodes
-        keys = [each.key(identity) for each in episodes]
-    missing = [each for each, key in zip(episodes, keys, strict=True) if key not in rows]
+        trials = [EpisodeTrial(each.key(identity), each, setup) for each in episodes]
+    done = count(sum(each.key in rows.kept for each in trials))
+    see(next(done))
     # A server may serve one episode at a time.
     jobs = 1 if setup.is_remote else jobs
-    played = map_in_order(partial(play, setup=setup, identity=identity), missing, jobs)
-    left = len(missing)
-    see(len(episodes) - left)
-    with append_rows(folder, None) as append:
-
-        def take(row: Row) -> None:
-            nonlocal left
-            append(row)
-            rows[row["key"]] = row
-            left -= 1
-            see(len(episodes) - left)
-
-        stopped = take_each(played, take)
-    return [rows[key] for key in keys if key in rows], stopped
+    stopped = run(trials, rows, jobs, lambda row: see(next(done)))
+    return [rows.kept[each.key] for each in trials if each.key in rows.kept], stopped
 
 
 def write(folder: Path, setup: EvalSetup, found: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-import json
-import os
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
-from math import nan
 from pathlib import Path
 from statistics import fmean
 from typing import Any, TypeAlias
 
-from cloudrc.errors import BadInputError
 from cloudrc.gym.step import StepTime
 from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.library import LinkProfile, read_profile
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.traces import read_lines
 from cloudrc.outside.code import sources
-from cloudrc.outside.document import parse_value, read_document
 from cloudrc.outside.reuse import reuse
-from cloudrc.outside.values import ANY
 from cloudrc.plugins import is_path
-from cloudrc.policy.address import check_url
 from cloudrc.policy.observation import Mapped
-from cloudrc.runs.installed import plugin_code
 from cloudrc.runs.own_files import hash_of
+from cloudrc.trials.fingerprint import fingerprint
 
 Compute: TypeAlias = float | tuple[float, float] | tuple[str, str]
 """Time for an answer [s]: constant; or mean and deviation; or (FILE, name) or (MEASURED, "")."""
@@ -38,8 +29,6 @@ BASELINE = "no network"
 """Executor of the episodes without a network: the policy answers each observation in its step."""
 BARE: dict[str, Any] = {"link": "ideal", "compute": 0.0, "observation_bytes": None}
 """What these episodes have in place of the values of the setup."""
-COMPUTE_MAX = 3600.0
-"""Largest time for an answer [s]."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +40,7 @@ class EvalSetup:
     env_args: tuple[tuple[str, Any], ...] = ()
     link: str = "ideal"  # profile, by name or path
     compute: Compute = 0.0
+    times: tuple[float, ...] = ()  # times for answers that a file has [s]
     mapped: tuple[Mapped, ...] = ()  # how an observation becomes the policy's; (): as it is
     success_at: float | None = None  # smallest return of a success [1]; None: what the info says
     dt: float | None = None  # time of a step [s]; None: that of the environment
@@ -75,7 +65,14 @@ class EvalSetup:
     @property
     def is_measured(self) -> bool:
         """Whether the time for an answer is measured."""
-        return isinstance(self.compute, tuple) and self.compute[0] == MEASURED
+        return self.compute == (MEASURED, "")
+
+    @property
+    def mean_compute(self) -> float:
+        """Mean time for an answer [s]; 0 if it is measured."""
+        if isinstance(self.compute, float):
+            return self.compute
+        return 0.0 if self.is_measured else fmean(self.times or [float(self.compute[0])])
 
     def identity(self) -> dict[str, Any]:
         """Return all that the result of an episode depends on, but its condition and seed."""
@@ -83,8 +80,7 @@ class EvalSetup:
         if not self.is_remote:
             told["policy"] = hash_of(sources(Path(self.policy)))
         told["link"] = _code_of_link(read_profile(self.link))
-        if isinstance(self.compute, tuple) and self.compute[0] == FILE:
-            told["compute"] = hash_of([Path(str(self.compute[1]))])
+        told["compute"] = told.pop("times") or self.compute
         return told
 
 
@@ -111,35 +107,17 @@ class Episode:
         if self.is_baseline:
             identity = {**identity, **BARE}
         own = reuse(("executor", self.executor), self._executor_code)
-        text = json.dumps([identity, self.point, own, self.seed], sort_keys=True, default=str)
-        return sha256(text.encode()).hexdigest()[:16]
+        return fingerprint(identity, self.point, own, self.seed)
 
     def _executor_code(self) -> str:
-        if is_path(self.executor):
-            return hash_of(sources(Path(self.executor)))
-        return plugin_code("executors", "newest" if self.is_baseline else self.executor)
+        """Return the hash of an executor's file; one of a package counts by its version."""
+        return hash_of(sources(Path(self.executor))) if is_path(self.executor) else ""
 
 
 def _code_of_link(link: LinkProfile) -> str:
     """Return the hash of a profile with the contents of its files, wherever they are."""
     ways = [replace(way, trace=None, table=None) for way in (link.uplink, link.downlink)]
     return sha256(repr(ways).encode()).hexdigest()
-
-
-def check_setup(setup: EvalSetup) -> None:
-    """Raise a BadInputError if policy or compute file cannot be used."""
-    if setup.is_remote:
-        try:
-            check_url(setup.policy)
-        except ValueError as error:
-            raise BadInputError(f"--policy: {error}") from None
-    elif not is_path(setup.policy) or not Path(setup.policy).is_file():
-        raise BadInputError(
-            f"--policy {setup.policy}: there is no such file; give a Python file, such as "
-            "./expert.py, or the address of a server, such as ws://127.0.0.1:8000"
-        )
-    if isinstance(setup.compute, tuple) and setup.compute[0] == FILE:
-        read_times(str(setup.compute[1]))
 
 
 def link_at(profile: str, rtt_ms: float | None) -> LinkProfile:
@@ -152,11 +130,6 @@ def link_at(profile: str, rtt_ms: float | None) -> LinkProfile:
     if rtt_ms is None:
         return link
     both = link.uplink, link.downlink
-    if any(way.rows or way.changes for way in both):
-        raise BadInputError(
-            f"--rtt: the delays of the profile '{profile}' change over time; leave --rtt out, or "
-            "choose a profile with constant delays"
-        )
     whole = sum(way.delay_ms for way in both)
     share = link.uplink.delay_ms / whole if whole else 0.5
 
@@ -166,90 +139,8 @@ def link_at(profile: str, rtt_ms: float | None) -> LinkProfile:
     return LinkProfile(at(link.uplink, share * rtt_ms), at(link.downlink, (1 - share) * rtt_ms))
 
 
-def read_compute(text: str) -> Compute:
-    """Read the time for an answer: a number [s], "MEAN,DEVIATION" [s], "measured", or a file."""
-    if text == MEASURED:
-        return MEASURED, ""
-    try:
-        numbers = [ANY.read(each) for each in text.split(",")]
-    except ValueError:
-        if os.path.lexists(text):
-            return FILE, text
-        numbers = []
-    if len(numbers) not in (1, 2) or not all(0.0 <= each <= COMPUTE_MAX for each in numbers):
-        raise BadInputError(
-            f"--compute {text}: give the time for an answer: a number of s such as 0.05, "
-            f"MEAN,DEVIATION in s, the path of a file that exists, or '{MEASURED}'"
-        )
-    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
-
-
-def mean_compute(compute: Compute) -> float:
-    """Return the mean time for an answer [s]; 0 if it is measured."""
-    if isinstance(compute, float):
-        return compute
-    kind, value = compute
-    if kind == FILE:
-        return fmean(read_times(str(value)))
-    return 0.0 if kind == MEASURED else float(kind)
-
-
 def heavy_loss(setup: EvalSetup) -> Iterator[str]:
     """Warn of a loss of the link of which 100 times less may be meant."""
     link = read_profile(setup.link)
     yield from describe_heavy_loss(link.uplink, "uplink")
     yield from describe_heavy_loss(link.downlink, "downlink")
-
-
-def read_times(path: str) -> tuple[float, ...]:
-    """Read the times of a file [s]: the last column of a CSV file; a head is skipped."""
-    what, found = f"--compute {path}", list[float]()
-    lines = read_lines(Path(path), what, "give a text file with one time in seconds per line")
-    rows = [(number, line) for number, line in enumerate(lines, start=1) if line.strip()]
-    for number, line in rows:
-        text = line.rpartition(",")[2].strip(' \t"')
-        try:
-            time = ANY.read(text)
-        except ValueError:
-            if number == rows[0][0] and not text.lstrip("+-.")[:1].isdigit():
-                continue  # the head
-            time = nan
-        if not 0.0 <= time <= COMPUTE_MAX:
-            raise BadInputError(f"{what}, line {number}: {text[:40]!r} is no time in seconds")
-        found.append(time)
-    if not found:
-        raise BadInputError(f"{what}: has no times")
-    return tuple(found)
-
-
-def read_env_args(texts: list[str]) -> tuple[tuple[str, Any], ...]:
-    """Read arguments of an environment, given as KEY=VALUE; a value is YAML, also with None."""
-    found = dict[str, Any]()
-    for text in texts:
-        key, equals, value = text.partition("=")
-        if not (equals and key.isidentifier()):
-            raise BadInputError(f"--env-arg {text}: give KEY=VALUE, such as env_name=reach-v3")
-        if value == "None" or value.startswith(("[", "{")):
-            value = re.sub(r"(?<!['\"\w])None(?!['\"\w])", "null", value)
-        found[key] = value if value == SEED else parse_value(value, f"--env-arg {key}")
-    return tuple(sorted(found.items()))
-
-
-def read_mapped(path: Path | None) -> tuple[Mapped, ...]:
-    """Read the map from an environment's observation to that of a policy; () without a file."""
-    if path is None:
-        return ()
-    found, example = list[Mapped](), "observation/state: agent_pos, or prompt: {value: go}"
-    for key, value in read_document(path, path.name).tree.items():
-        if isinstance(value, str) and value:
-            found.append(Mapped(str(key), value))
-        elif isinstance(value, Mapping) and value.keys() == {"value"}:
-            found.append(Mapped(str(key), None, value["value"]))
-        else:
-            raise BadInputError(
-                f"{path}: {key}: give the place in the environment's observation, or a value; for "
-                f"example {example}"
-            )
-    if not found:
-        raise BadInputError(f"{path}: has no keys; for example {example}")
-    return tuple(found)

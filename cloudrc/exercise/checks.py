@@ -2,12 +2,14 @@
 
 The exercise has three parts: estimator, predictor and controller. The reference is cloudrc's own
 plug-ins. A flight that scores one part uses the reference for the other two parts, so that an error
-in one part costs no points of another part. All flights and all points are computed here, in the
-process of the check; the student's functions run in another process (`hand_in`).
+in one part costs no points of another part.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -17,12 +19,12 @@ import numpy as np
 
 from cloudrc import plugins
 from cloudrc.cloud.estimators import DelaySample
-from cloudrc.cloud.loop import ControlLoop
 from cloudrc.config.load import load_experiment
-from cloudrc.errors import describe_error, machine_error, to_one_line
-from cloudrc.exercise.hand_in import FILES, find_method
-from cloudrc.exercise.remote import HandInError, Remote
+from cloudrc.errors import CloudrcError, PlacedError, describe_error
+from cloudrc.exercise.files import FILES
+from cloudrc.exercise.points import POINTS
 from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
+from cloudrc.outside import code
 from cloudrc.outside.values import WHOLE, InvalidValueError
 from cloudrc.runs.flight import fly_in_memory
 
@@ -80,18 +82,16 @@ def _command(
 class Formula(NamedTuple):
     """A test that compares the results of the student's plug-in with those of a correct plug-in."""
 
-    test: str
-    points: int
     measure: Callable[[Callable[..., Any]], Any]
 
-    def score(self, parts: Sequence[str], hand_in: Remote) -> tuple[float, str]:
+    def score(self, parts: Sequence[str], folder: Path) -> tuple[float, str]:
         """Return 1.0 and "right" if the student's results agree with those of the reference.
 
         Otherwise raise an InvalidValueError. `parts` has one entry.
         """
         (part,) = parts
-        reference = partial(plugins.load, f"{part}s", REFERENCES[part])
-        builds = partial(hand_in.build, part), reference
+        names = str(folder / FILES[part]), REFERENCES[part]
+        builds = [partial(plugins.load, f"{part}s", name) for name in names]
         seen, wanted = (np.asarray(self.measure(build), dtype=float) for build in builds)
         if seen.shape == wanted.shape:
             wrong = ~np.isclose(seen, wanted, rtol=0.0, atol=TOLERANCE)
@@ -108,26 +108,17 @@ class Exam(NamedTuple):
     The value `full` or better gives all points, `none` or worse gives 0; linear in between.
     """
 
-    test: str
-    points: int
     experiment: str
     link: str
     metric: str
     full: float  # any unit
     none: float  # any unit
 
-    def score(self, parts: Sequence[str], hand_in: Remote) -> tuple[float, str]:
+    def score(self, parts: Sequence[str], folder: Path) -> tuple[float, str]:
         """Fly with the student's `parts`; return the earned share of points [1], and why."""
-
-        def make_loop(*own: Any, **limits: Any) -> ControlLoop:
-            plug_ins = dict(zip(REFERENCES, own, strict=True))
-            for part in parts:
-                build = partial(hand_in.build, part)
-                plug_ins[part] = build if part == "estimator" else build()
-            return ControlLoop(*plug_ins.values(), **limits)
-
-        experiment = load_experiment(self.experiment, [f"link.profile={self.link}"])
-        found = fly_in_memory(experiment, make_loop)
+        own = [f"cloud.{part}={json.dumps(str(folder / FILES[part]))}" for part in parts]
+        experiment = load_experiment(self.experiment, [f"link.profile={self.link}", *own])
+        found = fly_in_memory(experiment)
         known = found.numbers.get(self.metric)
         value = self.none if known is None else known.value
         share = min(max((value - self.none) / (self.full - self.none), 0.0), 1.0)
@@ -141,51 +132,68 @@ class Exam(NamedTuple):
 
 CHECKS: dict[str, tuple[Formula | Exam, ...]] = {
     "estimator": (
-        Formula("mean", 10, lambda build: _horizons(build, 0.08, 0.14, 0.05, 0.11, 0.2)),
-        Formula("hold time", 5, lambda build: _horizons(build, 0.1, hold=0.04)),
-        Exam("steps", 10, "steps", "paper-p3", "delay_estimate_error_rms", 0.025, 0.06),
+        Formula(lambda build: _horizons(build, 0.08, 0.14, 0.05, 0.11, 0.2)),
+        Formula(lambda build: _horizons(build, 0.1, hold=0.04)),
+        Exam("steps", "paper-p3", "delay_estimate_error_rms", 0.025, 0.06),
     ),
     "predictor": (
-        Formula("position", 6, partial(_predict, select=lambda o: o.position)),
-        Formula("orientation", 5, partial(_predict, select=lambda o: o.orientation_wxyz)),
-        Formula("velocity, stamp", 4, partial(_predict, select=_velocity_and_stamp)),
-        Exam("steps", 10, "steps", "paper-p3", "prediction_error_rms", 0.015, 0.04),
+        Formula(partial(_predict, select=lambda o: o.position)),
+        Formula(partial(_predict, select=lambda o: o.orientation_wxyz)),
+        Formula(partial(_predict, select=_velocity_and_stamp)),
+        Exam("steps", "paper-p3", "prediction_error_rms", 0.015, 0.04),
     ),
     "controller": (
-        Formula("P", 5, partial(_command, sign=True, gain_p=(0.5, 1.0, 2.0))),
-        Formula("I", 4, partial(_command, n=1000, gain_i=(0.25, 0.25, 0.25))),
-        Formula("D", 3, partial(_command, n=9, speed=0.5, gain_d=(0.4, 0.4, 0.4))),
-        Formula("limit", 3, partial(_command, velocity_max=(0.3, 0.4, 0.5))),
-        Exam("steps", 10, "steps", "paper-p3", "iae_mean", 1.8, 4.0),
+        Formula(partial(_command, sign=True, gain_p=(0.5, 1.0, 2.0))),
+        Formula(partial(_command, n=1000, gain_i=(0.25, 0.25, 0.25))),
+        Formula(partial(_command, n=9, speed=0.5, gain_d=(0.4, 0.4, 0.4))),
+        Formula(partial(_command, velocity_max=(0.3, 0.4, 0.5))),
+        Exam("steps", "paper-p3", "iae_mean", 1.8, 4.0),
     ),
     "together": (
-        Exam("paper, paper-p2", 10, "paper", "paper-p2", "waypoints_reached", 7, 0),
-        Exam("paper, satellite", 15, "paper", "satellite", "waypoints_reached", 7, 0),
+        Exam("paper", "paper-p2", "waypoints_reached", 7, 0),
+        Exam("paper", "satellite", "waypoints_reached", 7, 0),
     ),
 }
-"""Part, or all parts together -> its checks; 100 points in total."""
+"""Part, or all parts together -> how each of its tests is scored, in the order of POINTS."""
 
 
-def run(part: str, hand_in: Remote, folder: Path) -> Iterator[dict[str, Any]]:
+def run(part: str, folder: Path) -> Iterator[dict[str, Any]]:
     """Score the tests of a part, or of all "together"; yield a row per test, as it ends.
 
-    `hand_in` calls the functions of the files in `folder`. A test that cannot be scored gives 0.
+    A test that cannot be scored gives 0.
     """
     parts = tuple(FILES) if part == "together" else (part,)
-    for check in CHECKS[part]:
+    for check, points in zip(CHECKS[part], POINTS[part].values(), strict=True):
         try:
-            share, seen = check.score(parts, hand_in)
-        except HandInError as error:
-            share, seen = 0.0, str(error)
-        except Exception as error:  # the answers may be anything
-            if failure := machine_error(error):
-                raise failure from error
-            text = str(error) if isinstance(error, InvalidValueError) else describe_error(error)
-            share, seen = 0.0, f"{find_method(folder, parts[0])}: {text}"
-        yield {
-            "part": part,
-            "test": check.test,
-            "points": round(check.points * min(max(share, 0.0), 1.0), 1),
-            "max_points": check.points,
-            "seen": to_one_line(seen),
-        }
+            share, seen = check.score(parts, folder)
+        except code.FAILURES as error:
+            share, seen = 0.0, _explain(error, folder, parts[0])
+        yield {"points": points * share, "seen": seen}
+
+
+def _explain(error: BaseException, folder: Path, part: str) -> str:
+    """Describe an error; begin with FILE:LINE, the place in the student's files that failed."""
+    while isinstance(error, CloudrcError) and error.__cause__ is not None:
+        error = error.__cause__
+    told = isinstance(error, CloudrcError | InvalidValueError)
+    text = str(error) if told else describe_error(error)
+    trace = traceback.extract_tb(error.__traceback__)
+    places = [(each.filename, each.lineno) for each in trace]
+    if isinstance(error, SyntaxError):
+        places.append((str(error.filename), error.lineno))
+    places = [place for place in places if place[0].startswith(f"{folder}{os.sep}")]
+    if places:
+        text = f"{places[-1][0]}:{places[-1][1]}: {text}"
+    elif not isinstance(error, PlacedError):
+        text = f"{_find_method(folder, part)}: {text}"
+    return text.replace(f"{folder}{os.sep}", "")
+
+
+def _find_method(folder: Path, part: str) -> str:
+    """Return FILE:LINE of the method that gives the result of a part; FILE if there is none."""
+    name, path = FILES[part], folder / FILES[part]
+    if not path.is_file():
+        return name
+    text = path.read_text(errors="replace")
+    before, found, _ = text.partition(f"def {plugins.METHODS[f'{part}s']}(")
+    return f"{name}:{before.count(chr(10)) + 1}" if found else name

@@ -17,7 +17,7 @@ from cloudrc.faults.measures import Outcome
 from cloudrc.faults.scenarios import find
 from cloudrc.faults.schedule import compose, dump
 from cloudrc.faults.trial import INVARIANTS, TrialResult, checked_in
-from cloudrc.runs.workers import map_in_order, take_each
+from cloudrc.trials.workers import map_in_order, take_each
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from cloudrc.records import Record
 
 Column: TypeAlias = NDArray[Any]
 
-BLOCK = 200
+BLOCK = 1000
 """Number of waiting rows of a topic that are converted to columns together."""
 ROTATED = ("nav_msgs/msg/Odometry", "velocity")
 """ROS type and column of a value that a file stores in another frame, and thus rounds."""
@@ -79,8 +79,8 @@ class Table:
 
 def _column(kind: Kind, values: Any) -> Column:
     dtype, shape = _TYPES[kind]
-    if shape and not isinstance(values, np.ndarray):  # asarray takes three times as long
-        values = np.fromiter(chain.from_iterable(values), dtype, len(values) * shape[0])
+    if dtype is not np.object_ and not isinstance(values, np.ndarray):  # asarray takes longer
+        values = np.fromiter(chain.from_iterable(values) if shape else values, dtype)
     column: Column = np.asarray(values, dtype=dtype).reshape(-1, *shape)
     column.flags.writeable = False
     return column

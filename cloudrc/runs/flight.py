@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias
 
 from cloudrc import assembly, metrics, plugins
 from cloudrc.cloud.loop import ControlLoop
-from cloudrc.config.resolved import ResolvedExperiment, absolute_paths
-from cloudrc.errors import MissingPrerequisiteError, describe_error, machine_error
+from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.errors import describe_error, machine_error
 from cloudrc.outside import code
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.record.columns import Recording, RecordStore
@@ -35,20 +34,12 @@ def fly_point(experiment: ResolvedExperiment) -> Row:
     try:
         return measure(experiment)
     except code.FAILURES as error:  # one point that cannot fly must not stop the others
-        if failure := machine_error(error) or _lost_file(experiment):
+        if failure := machine_error(error):
             raise failure from error
         code.check_failure(error, "the flight")
         text = f"{code.place_of(error)}{describe_error(error)}"
         none: Row = {"numbers": {}, "records_sha256": ""}
         return {"verdict": ERROR, "failures": [ERROR], "text": text, **none, "physics_steps": ""}
-
-
-def _lost_file(experiment: ResolvedExperiment) -> MissingPrerequisiteError | None:
-    """Return an error if a file of the experiment, which was there before, cannot be read."""
-    for path in absolute_paths(experiment.model_dump(mode="json")).values():
-        if not os.access(path, os.R_OK):
-            return MissingPrerequisiteError(f"{path}: cannot be read any more")
-    return None
 
 
 def measure(experiment: ResolvedExperiment) -> Row:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.errors import BadInputError
-from cloudrc.runs.lock import claim_folder
 
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
@@ -33,20 +32,18 @@ def new_folder(
     link: str = "latest",
     *,
     flag: str = "--out",
-    is_shared: bool = False,
 ) -> Path:
     """Make the folder of a run: `out`, or the next free `runs/<name>-<n>`.
 
     Without `out`, point the symbolic link `runs/<link>` to the new folder; "" for no link. Raise a
-    BadInputError if `out` exists and is not an empty folder, if another command has just chosen it,
-    or if no folder can be made. `flag` is the flag that gave `out`. With `is_shared`, other shards
-    may choose the folder, too.
+    BadInputError if `out` exists and is not an empty folder, or if no folder can be made. `flag` is
+    the flag that gave `out`.
     """
     try:
         if out is not None:
             with contextlib.suppress(FileExistsError):
                 out.mkdir(parents=True)
-            if not out.is_dir() or not claim_folder(out, is_shared=is_shared):
+            if not out.is_dir() or any(out.iterdir()):
                 raise BadInputError(
                     f"{flag} {out}: already exists; name a new folder, runs are never overwritten"
                 )

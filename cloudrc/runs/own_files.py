@@ -86,15 +86,13 @@ def describe_changes(name: str, experiment: ResolvedExperiment) -> str:
     try:
         flown = json.loads(read(config.with_name(ENVIRONMENT_FILE)))[FILES]
         before = absolute_paths(read_experiment(config, flown=True).model_dump(mode="json"))
-        now = absolute_paths(experiment.model_dump(mode="json"))
-        same = {key for key in flown if key in before and before[key] == now.get(key)}
-    except (OSError, ValueError, LookupError, TypeError, RecursionError, BadInputError):
+    except (OSError, ValueError, LookupError, BadInputError):
         return ""
-    found = {key: each for key, each in hash_files(experiment).items() if key in same}
+    now = absolute_paths(experiment.model_dump(mode="json"))
     changes = [
         f"{key} (then {flown[key]}, now {each})"
-        for key, each in found.items()
-        if each != flown[key]
+        for key, each in hash_files(experiment).items()
+        if key in flown and before.get(key) == now.get(key) and flown[key] != each
     ]
     if not changes:
         return ""

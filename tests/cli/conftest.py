@@ -27,5 +27,5 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def replace_flights(monkeypatch):
     """Return a function that replaces flights by `fly(experiment)`, in this process."""
-    monkeypatch.setattr("cloudrc.runs.workers.usable_cores", lambda: 1)
+    monkeypatch.setattr("cloudrc.trials.workers.usable_cores", lambda: 1)
     return lambda fly: monkeypatch.setattr("cloudrc.runs.flight.fly_point", fly)

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from tests.cli.conftest import SHORT
-from tests.runs.conftest import flown
+from tests.support.sweeps import flown
 
 A, B = "cloud.predictor=last_sample", "cloud.predictor=constant_velocity"
 COMPARE = f"compare {A} {B} "
@@ -85,8 +85,8 @@ def test_the_table_is_also_one_of_csv_or_latex_alone(form, start, fly_with, call
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (f"{A} {A}", "A and B are the same experiment"),
-        (f"seed=1 {B}", "seed: each flight has its own seed; give their number with --seeds"),
+        (f"{A} {A}", "is the same experiment as {'side': 'A'}"),
+        (f"seed=1 {B}", "seed: each flight has its own seed; give the seeds with --seeds"),
         (f"{A} cloud.predicter=kalman", "cloud.predicter"),
         ("link.profile=paper-p1 link.profile=wifi --set link.profile=x", "set twice"),
         ("last_sample nonsense",

@@ -17,7 +17,7 @@ from cloudrc.faults.scenarios import SCENARIOS
 from cloudrc.faults.schedule import FaultEvent, Schedule, dump, load
 from cloudrc.faults.search import run_fault
 from cloudrc.faults.trial import TrialResult
-from cloudrc.runs.workers import WorkerDiedError
+from cloudrc.trials.workers import WorkerDiedError
 
 NUMBERS = (*range(1, 14), 15, 17, *range(20, 26), 27, 28, 40)
 KILLED = WorkerDiedError("a worker was killed")

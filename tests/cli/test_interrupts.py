@@ -17,12 +17,11 @@ from cloudrc.cli import run
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 from cloudrc.runs import fly as flights
-from cloudrc.runs import interrupts, sweep
-from cloudrc.runs.grid import pack, read_grid
-from cloudrc.runs.interrupts import interrupt_on_signals, is_interrupted
-from cloudrc.runs.store import read_rows
-from cloudrc.runs.workers import isolated_start, map_in_order, take_each
-from tests.runs.conftest import write_sweep
+from cloudrc.runs.interrupts import interrupt_on_signals
+from cloudrc.trials.plan import PlannedFlight, pack, read_plan
+from cloudrc.trials.rows import read_rows
+from cloudrc.trials.workers import map_in_order, take_each
+from tests.support.sweeps import write_sweep
 
 __all__ = ["write_sweep"]
 pytestmark = pytest.mark.child
@@ -31,7 +30,7 @@ SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 @pytest.fixture(autouse=True)
 def one_core_and_a_terminal(monkeypatch):
-    monkeypatch.setattr("cloudrc.runs.workers.usable_cores", lambda: 1)
+    monkeypatch.setattr("cloudrc.trials.workers.usable_cores", lambda: 1)
     for number in SIGNALS:  # tests/conftest.py restores them
         signal.signal(number, signal.SIG_DFL)
 
@@ -70,7 +69,7 @@ def convert(flight):
 def test_a_sweep_stores_no_row_after_a_signal_that_a_library_caught(
     fly, write_sweep, monkeypatch, call
 ):
-    monkeypatch.setattr(sweep, "fly_row", lambda flight, **words: fly(flight))
+    monkeypatch.setattr(PlannedFlight, "play", fly)
     error = call("sweep run --out grid", write_sweep(), code=130).err
     assert "cloudrc: interrupted; to continue: " in error
     assert read_rows(Path("grid")) == {}
@@ -80,8 +79,8 @@ def test_a_sweep_stores_no_row_after_a_signal_that_a_library_caught(
 def test_a_pod_prints_no_row_after_a_signal_that_a_library_caught(
     fly, write_sweep, monkeypatch, call, tmp_path
 ):
-    (tmp_path / "flights").write_bytes(pack(read_grid(write_sweep()).flights.values()))
-    monkeypatch.setattr(sweep, "fly_row", fly)
+    (tmp_path / "flights").write_bytes(pack(read_plan(write_sweep()).flights.values()))
+    monkeypatch.setattr(PlannedFlight, "play", fly)
     assert call("sweep rows", tmp_path / "flights", code=130).out == ""
 
 
@@ -151,22 +150,3 @@ def test_a_flight_that_failed_before_its_recording_names_none(monkeypatch, call)
     monkeypatch.setattr(run, "_local_flight", lambda *words, **flags: fly)
     error = call("run hover --mode virtual --out r", code=CloudrcError.exit_code).err
     assert error == "cloudrc: error: the program of --with has ended\n"
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-def test_a_signal_while_workers_start_counts_afterwards(number):
-    interrupt_on_signals()
-    with interrupts.noted_interrupts(), isolated_start():
-        os.kill(os.getpid(), number)
-    assert is_interrupted()
-
-
-@pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_is_only_noted_where_an_exception_would_leave_a_lock_taken(number):
-    interrupts.interrupt_on_signals()
-    with interrupts.noted_interrupts():
-        os.kill(os.getpid(), number)
-        os.kill(os.getpid(), number)
-        assert interrupts.is_interrupted()
-    with pytest.raises(KeyboardInterrupt):
-        interrupts.raise_if_interrupted()

@@ -4,7 +4,6 @@ import json
 
 import pytest
 
-from cloudrc.ages import simulate_ages
 from tests.cli.conftest import SHORT
 
 KEY = "link.uplink.delay_ms"
@@ -25,7 +24,7 @@ def fly_with(replace_flights, monkeypatch):
             return {"stable": True, "left": 0.0, "speed_limited": 0.25 if size == 1.0 else 0.0}
 
         replace_flights(lambda found: {"verdict": "success"} if works(found) else FAILED)
-        monkeypatch.setattr("cloudrc.runs.stability.fly_step", fly_step)
+        monkeypatch.setattr("cloudrc.studies.stability.fly_step", fly_step)
 
     return use
 
@@ -44,7 +43,7 @@ def uplink(limit):
         (f"{KEY} --max 80", lambda found: True, 0,
          "settles up to 80 ms (RTT 150 ms), the largest value tried; raise --max"),
         (f"{KEY} --max 80", lambda found: False, 1,
-         f"no value settles; 10 ms (RTT 80 ms) fails: {LATE}"),
+         f"no value settles; it fails at 10 ms (RTT 80 ms): {LATE}"),
         # The experiment allows no loss above 1: that is no failure of the loop.
         ("link.uplink.loss --resolution 0.3", lambda found: True, 0,
          "settles up to 0.9, the largest value possible: --set: link.uplink.loss: 1.2:"),
@@ -116,26 +115,6 @@ def test_the_limits_of_cloud_and_guard_follow_the_delay(fly_with, call):
     assert seen[70].guard.command_age_max_ms == 400
 
 
-def test_the_limits_are_above_the_computing_times_of_all_seeds(fly_with, call):
-    """The longest age grows 1.3 s with seed 1, 2.1 s with seed 3."""
-    seen = {}
-    fly_with(lambda found: seen.update({found.seed: found}) or True)
-    call(
-        "margin cloud.compute_deviation_ms --max 240 --resolution 240 --seeds 3"
-        " --set link.profile=ideal --set cloud.compute_ms=100"
-    )
-    for seed, found in seen.items():
-        assert max(simulate_ages(found)[0]) * 1e3 < found.guard.command_age_max_ms, seed
-    assert len(seen) == 3
-
-
-def test_limits_of_the_experiment_that_are_long_enough_stay(fly_with, call):
-    seen = {}
-    fly_with(lambda found: seen.update({found.uplink.delay_ms: found}) or True)
-    call(f"margin {KEY} --of fast --max 100 --seeds 1")
-    assert seen[70].guard.command_age_max_ms == 700
-
-
 def test_the_end_of_the_limits_is_no_failure_of_the_loop(fly_with, call):
     """Limits of guard and cloud end at 10 s, so that a longer round trip cannot be flown."""
     fly_with(lambda found: True)
@@ -149,29 +128,16 @@ def test_the_end_of_the_limits_is_no_failure_of_the_loop(fly_with, call):
     ("arguments", "text"),
     [
         ("link.uplink.delay", "unknown key; did you mean delay_ms"),
-        ("link.uplink.delay --max 3", "unknown key; did you mean delay_ms"),
         ("seed", "seed: each flight has its own seed"),
         (f"{KEY} --set seed=2", "seed: each flight has its own seed"),
-        ("link.profile", "is no number; name a key such as"),
-        (
-            "cloud.controller.gain_p",
-            "is a list; name one of its numbers, such as cloud.controller.gain_p.0",
-        ),
-        ("world.odometry_rate_hz", "allows only 20, 25, 50, 100, 125, 250, 500; fly a sweep"),
+        ("link.profile", "is no number; name one such as"),
+        ("cloud.controller.gain_p", "an entry of a list such as cloud.controller.gain_p.0"),
         ("link.uplink.rate_kbit", "has no value now; name the largest one to try with --max"),
         ("cloud.command_rate_hz --resolution 0.3", "cloud.command_rate_hz: 99.9: must be"),
-        (f"{KEY} --max 5 --resolution 10", "--resolution 10 must be above 0, --max 5 not below it"),
-        ("link.uplink.queue_packets --max 0.5", "--max 0.5 must be at least 1"),
-        ("link.both.loss --max 50", "--max 50: link.both.loss must be a number >= 0 and <= 1 (1 %"),
-        ("guard.command_age_max_ms --max 2e4", "--max 20000: guard.command_age_max_ms must be a"),
-        *(
-            (f"{KEY} --resolution {text}", f"--resolution {text} must be a finite number above 0")
-            for text in ("-1", "0", "nan")
-        ),
-        *(
-            (f"{KEY} --max {text}", f"--max {text} must be a finite number above 0")
-            for text in ("nan", "0")
-        ),
+        (f"{KEY} --max 5 --resolution 10", "--max 5: must be at least 10"),
+        ("link.uplink.queue_packets --max 0.5", "--max 0.5: must be at least 1"),
+        (f"{KEY} --resolution 0", "argument --resolution: '0'"),
+        (f"{KEY} --max nan", "argument --max: 'nan'"),
     ],
 )
 def test_a_search_that_cannot_begin_is_refused(arguments, text, refused):

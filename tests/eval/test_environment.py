@@ -6,6 +6,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 
+from cloudrc.cli.eval_values import read_compute
 from cloudrc.cli.main import main
 from cloudrc.eval.environment import environment_code
 from cloudrc.eval.episode import make_env
@@ -80,7 +81,7 @@ def key_of(setup, executor="newest"):
 
 def key_of_all():
     files = (("files", ["scene.txt", {"more": "other.txt"}]),)
-    setup = EvalSetup(ENV, "./law.py", files, "./link.yaml", ("file", "times.csv"))
+    setup = EvalSetup(ENV, "./law.py", files, "./link.yaml", *read_compute("times.csv"))
     return key_of(setup, "./hold.py")
 
 

@@ -145,15 +145,3 @@ def test_a_better_return_of_shorter_episodes_is_told_with_its_condition():
 def test_a_better_return_or_shorter_episodes_alone_are_no_doubt(total, steps):
     world = crash(BASELINE, None, -20, 200) + crash("newest", 0.0, total, steps)
     assert not any("return improves" in each for each in judge(world)["notes"])
-
-
-def test_a_task_that_is_done_sooner_is_no_doubt():
-    world = rows(BASELINE, None, some(20)) + rows("newest", 0.0, some(20))
-    for row in world[20:]:
-        row["numbers"] |= {"return": 600.0, "steps": 100}
-    assert not any("return improves" in each for each in judge(world)["notes"])
-
-
-def test_the_notes_say_how_many_tests_and_intervals_are_wrong_by_chance():
-    """Three intervals of each of two conditions: success, return and steps."""
-    assert "6 tests and intervals at 95 %: about 0.3 " in judge(flight(20))["notes"][-1]

@@ -18,28 +18,12 @@ def law(tmp_path):
 
 def test_the_episodes_without_a_network_are_the_policys_own_whatever_link_and_time(law):
     setup = EvalSetup("CartPole-v1", law, link="lossy", compute=0.3, observation_bytes=90)
-    row = play(Episode(None, BASELINE, 3), setup, {})
+    row = play(Episode(None, BASELINE, 3), setup)
     assert (row["numbers"]["return"], row["records_sha256"]) == bare("CartPole-v1", stand, 3)
     assert row["point"] == {"rtt_ms": None, "executor": BASELINE}
     other = EvalSetup("CartPole-v1", setup.policy)
     for each, kept in ((Episode(None, BASELINE, 3), True), (Episode(None, "newest", 3), False)):
         assert (each.key(setup.identity()) == each.key(other.identity())) is kept
-
-
-def test_a_limit_for_the_age_makes_other_rows(law):
-    keys = {
-        Episode(0.0, "newest", 1).key(EvalSetup("x", law, deadline=limit).identity())
-        for limit in (None, 0.1, 0.2)
-    }
-    assert len(keys) == 3
-
-
-def test_the_row_says_how_the_episode_ended(law):
-    fell, stood, cut = (
-        play(Episode(rtt, "newest", 1), EvalSetup("CartPole-v1", law, max_steps=most), {})
-        for rtt, most in ((300.0, 600), (0.0, 600), (0.0, 7))
-    )
-    assert [row["ended"] for row in (fell, stood, cut)] == ["terminated", "truncated", "limit"]
 
 
 @pytest.mark.parametrize(

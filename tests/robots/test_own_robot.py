@@ -6,7 +6,7 @@ import cloudrc
 from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
-from cloudrc.runs.grid import read_grid
+from cloudrc.trials.plan import read_plan
 from tests.robots.conftest import CONTROLLER
 
 HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
@@ -68,7 +68,7 @@ def test_the_key_of_a_flight_has_the_files_of_its_robot(own_robot, tmp_path):
     sweep.write_text(f"experiment: hover\nset: {{world.robot: {mine}}}\nseeds: 1\n")
     keys = []
     for _ in range(2):
-        keys.append(list(read_grid(sweep).flights))
+        keys.append(list(read_plan(sweep).flights))
         (mine / "own.py").write_text(CLIMBS + "\n# changed\n")
     assert keys[0] != keys[1]
 
@@ -82,7 +82,7 @@ def test_the_key_of_a_flight_has_the_meshes_of_its_robot(own_robot, tmp_path):
     sweep.write_text(f"experiment: hover\nset: {{world.robot: {mine}}}\nseeds: 1\n")
     for more in ("", "v 2 0 0\n"):
         (mine / "skin.obj").write_text(cube + more)
-        keys.append(list(read_grid(sweep).flights))
+        keys.append(list(read_plan(sweep).flights))
     assert keys[0] != keys[1]
 
 

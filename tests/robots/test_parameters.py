@@ -15,7 +15,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.metrics.velocity_loop import identify, series
 from cloudrc.robots.build import check_robot, onboard_values
 from cloudrc.runs.experiment import load
-from cloudrc.runs.grid import read_grid
+from cloudrc.trials.plan import read_plan
 from tests.conftest import nightly
 
 
@@ -159,7 +159,7 @@ def test_what_the_robot_cannot_do_is_refused_before_the_first_flight_of_a_sweep(
     sweep.write_text("experiment: steps\ngrid: {world.plant.mass_factor: [1.0, 1.2, 3.0]}\n"
                      "set: {world.robot: nano}\nseeds: 1\n")  # fmt: skip
     with pytest.raises(BadInputError, match=r"ratio of nano is 0\.76"):
-        read_grid(sweep)
+        read_plan(sweep)
 
 
 def test_a_machine_without_mujoco_leaves_the_check_and_the_advice_to_world():

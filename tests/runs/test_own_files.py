@@ -1,6 +1,5 @@
 """A run is repeated from its config.yaml: files that changed since its flight are named."""
 
-import json
 import shutil
 
 import pytest
@@ -62,13 +61,11 @@ def test_files_that_a_setting_replaces_do_not_count(run, tmp_path):
     assert describe_changes(str(config), load_experiment(config, settings)) == ""
 
 
-@pytest.mark.parametrize(
-    "content", [None, "[", "{}", '{"files": 3}', '{"files": {"world.robot": 1}}']
-)
+@pytest.mark.parametrize("content", [None, "{}"])
 def test_a_run_that_does_not_say_its_files_is_repeated_without_a_word(run, tmp_path, content):
     config, _ = run
     copy = shutil.copy(config, tmp_path / "config.yaml")
     if content is not None:
         (tmp_path / "environment.json").write_text(content)
     text = describe_changes(str(copy), load_experiment(copy))
-    assert text == "" or json.loads(content)["files"] == {"world.robot": 1}
+    assert text == ""

@@ -20,7 +20,7 @@ from cloudrc.report.document import write_json
 from cloudrc.report.figures import FIGURES
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
-from cloudrc.runs.grid import read_grid
+from cloudrc.trials.plan import read_plan
 from tests.record.conftest import cloud_records, world_records, write
 
 
@@ -38,7 +38,7 @@ def no_waiting():
     signal.signal(signal.SIGALRM, before)
 
 
-READERS = (read_experiment, load_profile, read_trace, read_grid, Recording.read)
+READERS = (read_experiment, load_profile, read_trace, read_plan, Recording.read)
 
 
 @pytest.mark.parametrize("read", READERS)

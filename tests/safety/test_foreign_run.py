@@ -14,7 +14,7 @@ from cloudrc.config.schema import PlugIn
 from cloudrc.drivers.machine import interpreter
 from cloudrc.processes import ends
 from cloudrc.runs.links.verify import find_experiment
-from cloudrc.runs.workers import map_in_order
+from cloudrc.trials.workers import map_in_order
 from tests.metrics.conftest import flown
 from tests.record.conftest import write_mission
 
@@ -107,7 +107,7 @@ def test_plug_ins_and_processes_begin_only_where_they_should():
     The survey of a cluster judges whether an installation will fly, so it imports them, too.
     """
     flies = {"runs/experiment.py", "processes/ends.py", "runs/bench.py", "gym/testbed.py"}
-    flies |= {"faults/flight.py", "runs/grid.py", "exercise/checks.py", "cli/session.py"}
+    flies |= {"faults/flight.py", "trials/plan.py", "exercise/checks.py", "cli/session.py"}
     flies |= {"cluster/survey.py"}
     assert modules_with("load_experiment(") == flies | {"config/load.py"}
     assert modules_with("sys.executable") == {"drivers/machine.py"}
@@ -128,7 +128,7 @@ def test_a_worker_imports_nothing_from_the_working_folder(run, trace, spy, monke
     (run / "pickle.py").write_text(spy)
     monkeypatch.chdir(run)
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
-    monkeypatch.setattr("cloudrc.runs.workers.usable_cores", lambda: 2)
+    monkeypatch.setattr("cloudrc.trials.workers.usable_cores", lambda: 2)
     assert list(map_in_order(abs, [-1, -2], 2)) == [1, 2]
     assert not trace.exists()
     assert not os.environ.get("PYTHONSAFEPATH")

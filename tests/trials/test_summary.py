@@ -1,7 +1,7 @@
 """Flights with several seeds are summarised in one table."""
 
-from cloudrc.runs.seeds import as_table, summarise
-from tests.runs.conftest import flown
+from cloudrc.trials.summary import as_table, summarise
+from tests.support.sweeps import flown
 
 
 def test_numbers_may_be_missing_and_failed_plugins_do_not_count():

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cloudrc.runs.margin import ValueRange, grid, search
+from cloudrc.studies.search import ValueRange, grid, search
 
 
 @pytest.mark.parametrize("present", [1, 7, 64, 100])

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from cloudrc.metrics import scale
-from cloudrc.runs.compare import LEFT_OUT
 from cloudrc.statistics import LEVEL, by_chance
+from cloudrc.studies.compare import LEFT_OUT
 from cloudrc.text import FAILED_MARK, FAILED_NOTE, format_number, table
 
 TITLES = (

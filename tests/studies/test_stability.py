@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.runs.stability import fly_step, judge
+from cloudrc.studies.stability import fly_step, judge
 from tests.conftest import nightly
 
 PUBLISHED = (0.8, 0.8, 1.5), (0.0, 0.0, 0.0)

@@ -2,44 +2,35 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
-from statistics import median
 from typing import Any, NamedTuple
 
-from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.metrics import SHIPPED
-from cloudrc.rounding import differences
-from cloudrc.runs import flight, store
-from cloudrc.runs.experiment import load, refuse_seed
-from cloudrc.runs.flight import Row, counts
-from cloudrc.runs.workers import map_in_order, take_each
-from cloudrc.statistics import LEVEL, exact_interval, holm, paired, sign_test
+from cloudrc.runs.flight import counts
+from cloudrc.studies.sweep import read_flights
 from cloudrc.text import unknown_name_text
-
-NUMBERS = (
-    *("prediction_error_rms", "tracking_error_p95", "iae_mean", "settling_time_mean"),
-    *("unsettled_steps", "overshoot_mean", "delay_estimate_error_rms", "min_clearance"),
+from cloudrc.trials.plan import SweepPlan, check, draft_of
+from cloudrc.trials.play import run
+from cloudrc.trials.rows import Row, Rows
+from cloudrc.trials.summary import (
+    NUMBERS,
+    Pair,
+    adjust,
+    compare_number,
+    compare_success,
+    pair,
+    values_of,
 )
-"""Metrics that are compared by default."""
+
 METHOD = (
     "B - A: Hodges-Lehmann estimate, 95 % interval and p of the exact Wilcoxon signed-rank test, "
     "which assumes symmetric differences; p sign: the exact sign test, which does not; "
     "success: Clopper-Pearson intervals, p of the exact McNemar test"
 )
 LEFT_OUT = "a flight that did not end or whose plug-in failed"
-
-
-class Pair(NamedTuple):
-    """Two flights that differ in the compared setting only."""
-
-    label: Mapping[str, Any]  # what both share, such as the seed
-    a: Row
-    b: Row
 
 
 class Pairs(NamedTuple):
@@ -58,52 +49,35 @@ def split_settings(text: str) -> list[str]:
     return re.split(r",(?=[\w.]+=)", text)
 
 
-def load_sides(
+def plan_sides(
     experiment: str,
     common: Sequence[str],
     a: Sequence[str],
     b: Sequence[str],
+    seeds: int,
     names: Sequence[str] = (),
-) -> tuple[tuple[ResolvedExperiment, ResolvedExperiment], dict[str, str]]:
-    """Load an experiment with the settings `a` and with the settings `b`, both after `common`.
+) -> SweepPlan:
+    """SweepPlan the flights of an experiment with the settings `a` and `b`, both after `common`.
 
-    Also return metric -> unit. `names` are metrics that will be compared.
-
-    Raises:
-        BadInputError: If a setting, the seed among them, or a metric is refused, or if the
-            settings give the same experiment.
+    Raise a BadInputError if a setting or one of the metrics `names` is refused, or if both sides
+    are the same experiment.
     """
-    for each in (a, b):
-        refuse_seed([*common, *each])
-    first, second = (load(experiment, [*common, *each]) for each in (a, b))
-    if first == second:
-        raise BadInputError("A and B are the same experiment; change one of them")
-    unit_of = flight.units({*first.report.metrics, *second.report.metrics})
-    check_names(names, unit_of)
-    return (first, second), unit_of
+    plan = check(draft_of(experiment, common, seeds, {"A": a, "B": b}))
+    check_names(names, plan.units)
+    return plan
 
 
 def fly_pairs(
-    sides: Sequence[ResolvedExperiment],
-    seeds: int,
-    jobs: int,
-    see: Callable[[Row], None] = lambda row: None,
+    plan: SweepPlan, jobs: int, see: Callable[[Row], None] = lambda row: None
 ) -> tuple[list[Pair], CloudrcError | None]:
-    """Fly both sides with the seeds 1 to `seeds` in `jobs` processes.
+    """Fly both sides in `jobs` processes; call `see` with each row, whose key is "A" or "B".
 
-    Call `see` with each row; its key is "A" or "B". Return the pairs of flights, and why the work
-    ended early, or None.
+    Return the pairs of flights, and why the work ended early, or None.
     """
-    work = [side.model_copy(update={"seed": n + 1}) for n in range(seeds) for side in sides]
-    flights: list[Row] = []
-
-    def take(row: Row) -> None:
-        flights.append(row)
-        see({"key": "BA"[len(flights) % 2], **row})
-
-    stopped = take_each(map_in_order(flight.fly_point, work, jobs), take)
-    both = zip(flights[::2], flights[1::2], strict=False)
-    return [Pair({"seed": n}, a, b) for n, (a, b) in enumerate(both, start=1)], stopped
+    rows = Rows()
+    flights = sorted(plan.flights.values(), key=lambda each: each.seed)
+    stopped = run(flights, rows, jobs, lambda row: see({**row, "key": row["point"]["side"]}))
+    return pair(rows.kept.values(), "side", "A", "B"), stopped
 
 
 def compare(
@@ -123,14 +97,9 @@ def compare(
         check_names(names, known)
     chosen = names or [name for name in NUMBERS if name in known]
     lacking = {name: _lacking(flown, name) for name in chosen}
-    success, numbers = (
-        compare_success(flown),
-        {
-            name: compare_number(flown, name, units[name])
-            for name in chosen
-            if lacking[name]["left_out"] < len(flown)
-        },
-    )
+    having = [name for name in chosen if lacking[name]["left_out"] < len(flown)]
+    success = compare_success(flown)
+    numbers = {name: compare_number(flown, name, units[name]) for name in having}
     adjust([success, *numbers.values()])
     return {
         "pairs": len(flown),
@@ -147,7 +116,7 @@ def compare(
 
 def _valid(pairs: Sequence[Pair]) -> list[Pair]:
     """Return the pairs of which both flights count; raise a BadInputError if there is none."""
-    valid = [pair for pair in pairs if counts(pair.a) and counts(pair.b)]
+    valid = [each for each in pairs if counts(each.a) and counts(each.b)]
     if not valid:
         bad = [row["text"] for _, *both in pairs for row in both if not counts(row)]
         why = f"each has {LEFT_OUT}: {bad[0]}" if bad else "none was found"
@@ -169,43 +138,6 @@ def _lacking(pairs: Sequence[Pair], name: str) -> dict[str, int]:
     return {"a": a, "b": b, "left_out": sum(map(any, lacks))}
 
 
-def adjust(tests: Sequence[dict[str, Any]]) -> None:
-    """Set Holm's p in the results of `compare_number` and `compare_success`, one family."""
-    ps = [each["p_mcnemar"] if "p_mcnemar" in each else each["p_wilcoxon"] for each in tests]
-    for each, p in zip(tests, holm(ps), strict=True):
-        each["p_holm"] = p
-
-
-def compare_number(pairs: Sequence[Pair], name: str, unit: str) -> dict[str, Any]:
-    """Evaluate a number of pairs of which at least one has it on both sides; return JSON."""
-    known = [pair for pair in pairs if name in pair.a["numbers"] and name in pair.b["numbers"]]
-    both = [(a["numbers"][name], b["numbers"][name]) for _, a, b in known]
-    return {
-        "unit": unit,
-        "a_median": median(a for a, _ in both),
-        "b_median": median(b for _, b in both),
-        **asdict(paired(differences(*zip(*both, strict=True)).tolist())),
-        "a_failed": sum(pair.a["verdict"] != "success" for pair in known),
-        "b_failed": sum(pair.b["verdict"] != "success" for pair in known),
-        "left_out": len(pairs) - len(both),
-    }
-
-
-def compare_success(pairs: Sequence[Pair]) -> dict[str, Any]:
-    """Evaluate the successes of pairs; return JSON."""
-    done = [(a["verdict"] == "success", b["verdict"] == "success") for _, a, b in pairs]
-    count = len(pairs)
-    a, b = (sum(each) for each in zip(*done, strict=True))
-    only_a = sum(a and not b for a, b in done)
-    only_b = b - (a - only_a)
-    p = sign_test(only_a, only_b)
-    return {
-        **{"count": count, "a": a, "a_interval": exact_interval(a, count)},
-        **{"b": b, "b_interval": exact_interval(b, count)},
-        **{"only_a": only_a, "only_b": only_b, "p_mcnemar": p, "decided": p < LEVEL},
-    }
-
-
 def _flight(row: Row, names: Sequence[str]) -> dict[str, Any]:
     numbers = {name: row["numbers"][name] for name in names if name in row["numbers"]}
     return {"verdict": row["verdict"], "numbers": numbers}
@@ -219,14 +151,14 @@ def of_sweep(folder: Path, a: str, b: str) -> Pairs:
     Raises:
         BadInputError: If not exactly one axis has both values, or if `a` and `b` are equal.
     """
-    rows, units, missing = store.read_flights(folder)
-    axes = store.values_of(rows)
+    sweep = read_flights(folder)
+    axes = values_of(sweep.rows)
     axis, first, second = _sides(folder, axes, a, b)
-    what = f"{axis} in {folder}" + (f", of which {missing}" if missing else "")
+    what = f"{axis} in {folder}" + (f", of which {sweep.missing}" if sweep.missing else "")
     if pooled := ", ".join(name for name, each in axes.items() if name != axis and len(each) > 1):
         what += f", over all values of {pooled}; flights with equal seeds depend on each other, "
         what += "so p is too small"
-    return Pairs(_pairs(rows, axis, first, second), units, what)
+    return Pairs(pair(sweep.rows, axis, first, second), sweep.units, what)
 
 
 def _sides(folder: Path, axes: Mapping[str, list[Any]], a: str, b: str) -> tuple[str, Any, Any]:
@@ -247,17 +179,3 @@ def _sides(folder: Path, axes: Mapping[str, list[Any]], a: str, b: str) -> tuple
             f"{folder}: A and B must be two values of one axis, VALUE or AXIS=VALUE; axes: {known}"
         )
     return found[0]
-
-
-def _pairs(rows: Iterable[Row], axis: str, first: Any, second: Any) -> list[Pair]:
-    """Pair the rows that differ only in `axis`: one has the value `first`, the other `second`."""
-    flown: dict[str, dict[Any, Row]] = {}
-    for row in rows:
-        rest = {name: value for name, value in row["point"].items() if name != axis}
-        shared = json.dumps({**rest, "seed": row["seed"]})
-        flown.setdefault(shared, {})[row["point"][axis]] = row
-    return [
-        Pair(json.loads(shared), each[first], each[second])
-        for shared, each in flown.items()
-        if first in each and second in each
-    ]

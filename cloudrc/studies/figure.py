@@ -11,11 +11,12 @@ from cloudrc.errors import BadInputError
 from cloudrc.metrics import scale
 from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.report.figures.style import Look
-from cloudrc.runs.compare import NUMBERS, check_names
-from cloudrc.runs.flight import Row, counts
-from cloudrc.runs.store import values_of
+from cloudrc.runs.flight import counts
 from cloudrc.statistics import exact_interval, median_interval
+from cloudrc.studies.compare import check_names
 from cloudrc.text import unknown_name_text
+from cloudrc.trials.rows import Row
+from cloudrc.trials.summary import NUMBERS, count_successes, values_of
 
 COLUMN = Look(width=3.5)
 """Look of a figure in one column of a page. Source: IEEE conference template."""
@@ -155,7 +156,7 @@ def _metric(name: str, unit: str, groups: Groups, at: Sequence[float]) -> Panel:
 def _rate(point: Sequence[Row]) -> tuple[float, float, float]:
     if not point:
         return nan, nan, nan
-    done = sum(row["verdict"] == "success" for row in point)
+    done = count_successes(point)
     low, high = exact_interval(done, len(point))
     return 100 * done / len(point), 100 * low, 100 * high
 

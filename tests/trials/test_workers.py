@@ -11,7 +11,7 @@ from functools import partial
 import pytest
 
 from cloudrc.errors import BadInputError, DiskFullError
-from cloudrc.runs.workers import map_in_order, take_each
+from cloudrc.trials.workers import map_in_order, take_each
 from tests.conftest import wait_until
 
 KILLED = 5
@@ -20,7 +20,7 @@ KILLED = 5
 
 @pytest.fixture(autouse=True)
 def two_cores_and_a_terminal(monkeypatch):
-    monkeypatch.setattr("cloudrc.runs.workers.usable_cores", lambda: 2)
+    monkeypatch.setattr("cloudrc.trials.workers.usable_cores", lambda: 2)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # as in a terminal; tests/conftest.py restores it
     yield
     assert multiprocessing.active_children() == []
@@ -48,7 +48,7 @@ def _abort(number):
 
 @pytest.mark.parametrize(("pieces", "jobs", "workers"), [(6, 100_000, 2), (1, 9, 0), (6, 1, 0)])
 def test_results_keep_the_order_of_the_work(pieces, jobs, workers, monkeypatch):
-    monkeypatch.setattr("cloudrc.runs.workers.CHUNK", 4)
+    monkeypatch.setattr("cloudrc.trials.workers.WINDOW", 4)
     done = map_in_order(_slow_first, range(pieces), jobs)
     first = next(done)
     assert len(multiprocessing.active_children()) == workers
@@ -72,7 +72,7 @@ def test_results_before_a_worker_was_killed_are_kept(tmp_path):
 
 def test_a_worker_that_crashes_is_told_by_its_signal():
     end = take_each(map_in_order(_abort, range(4), 2), [].append)
-    assert str(end).startswith("a worker crashed (SIGABRT); does a plug-in")
+    assert str(end).startswith("a worker ended itself (exit status -6); does a plug-in")
 
 
 def test_ctrl_c_ends_the_workers_at_once():

@@ -5,10 +5,10 @@ import json
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.runs.compare import of_sweep
-from cloudrc.runs.figure import draw_sweep
-from cloudrc.runs.store import read_flights
-from tests.runs.conftest import flown
+from cloudrc.studies.compare import of_sweep
+from cloudrc.studies.figure import draw_sweep
+from cloudrc.studies.sweep import read_flights
+from tests.support.sweeps import flown
 
 UNITS = {"iae_mean": "m s"}
 AXES = {"delay_ms": [20, 5, 10], "predictor": ["none", "kalman"], "gain": [[1, 2], [3, 4]]}
@@ -34,7 +34,7 @@ def sweep(folder, rows=None):
 def drawn(monkeypatch):
     """Replace drawing; return the arguments of `draw`."""
     kept = []
-    monkeypatch.setattr("cloudrc.runs.figure.draw", lambda *what, look: kept.extend(what) or {})
+    monkeypatch.setattr("cloudrc.studies.figure.draw", lambda *what, look: kept.extend(what) or {})
     return kept
 
 
@@ -55,22 +55,9 @@ def test_names_along_x_keep_the_order_of_the_grid(tmp_path, drawn):
     assert [*drawn[0][0].lines] == ["[1, 2]", "[3, 4]"]
 
 
-def test_lines_prefer_axes_with_names(drawn):
-    draw_sweep([row({"delay": d, "loss": p, "predictor": name}, 1)
-                for d in (1, 2) for p in (0, 1) for name in "ab"], UNITS)  # fmt: skip
-    assert (drawn[1], drawn[3]) == ("delay", "predictor")
-
-
 def row(point, seed, *failures):
     verdict = "failure" if failures else "success"
     return {"point": point, "seed": seed, **flown(verdict, *failures, iae_mean=seed)}
-
-
-def test_a_band_needs_six_values(drawn):
-    draw_sweep([row({"a": a}, seed) for a in (1, 2) for seed in range(1, 6 + a - 1)], UNITS)
-    five, six = drawn[0][0].lines["a"]
-    assert five.low != five.low  # NaN
-    assert (six.low, six.middle, six.high) == (1, 3.5, 6)
 
 
 def test_numbers_of_a_plugin_that_failed_are_not_drawn(drawn):
@@ -147,13 +134,6 @@ def figures(monkeypatch):
     kept = []
     monkeypatch.setattr("cloudrc.report.figures.bands.save", lambda figure, _: kept.append(figure))
     return kept
-
-
-def test_no_two_of_nine_lines_look_the_same(figures):
-    draw_sweep([row({"delay": d, "predictor": str(n)}, 1) for d in (1, 2) for n in range(9)], UNITS)
-    handles, names = figures[0].axes[0].get_legend_handles_labels()
-    looks = {(line.get_color(), line.get_marker()) for line in handles}
-    assert (len(names), len(looks)) == (9, 9)
 
 
 @pytest.mark.parametrize(("ending", "is_slanted"), [("", False), ("_acceleration", True)])

@@ -8,9 +8,8 @@ from typing import NamedTuple
 
 from cloudrc.cluster import batch
 from cloudrc.cluster.client import ClusterError, Release
-from cloudrc.runs import store
-from cloudrc.runs.flight import Row
-from cloudrc.runs.grid import Grid, SweepPoint, pack
+from cloudrc.trials.plan import PlannedFlight, SweepPlan, pack
+from cloudrc.trials.rows import Row, parse_row
 
 
 class PodSettings(NamedTuple):
@@ -25,11 +24,11 @@ class PodSettings(NamedTuple):
 def fly_in_pods(
     release: Release,
     settings: PodSettings,
-    grid: Grid,
-    flights: Sequence[SweepPoint],
+    plan: SweepPlan,
+    flights: Sequence[PlannedFlight],
     tell: Callable[[str], None],
 ) -> Generator[Row]:
-    """Fly flights of a grid on a cluster, and yield each row once.
+    """Fly flights of a plan on a cluster, and yield each row once.
 
     Each pod of a Job flies a share (shard) of the flights and logs their rows. If a pod is deleted
     just after its last flight, its log is lost, but Kubernetes counts its shard as complete.
@@ -39,7 +38,7 @@ def fly_in_pods(
         ClusterError: If a Job fails or yields no row, or if a pod will never run.
     """
     shards, image, cpu, queue = settings
-    every = "".join(grid.flights).encode() + str(shards).encode()
+    every = "".join(plan.flights).encode() + str(shards).encode()
     name = f"sweep-{hashlib.sha256(every).hexdigest()[:12]}"
     missing = {flight.key: flight for flight in flights}
     while missing:
@@ -48,7 +47,7 @@ def fly_in_pods(
         batch.start(release, name, packed, shards, image=image, cpu=cpu, queue=queue)
         tell(f"Job '{name}' {release.where}, {shards} pods; it goes on without this command")
         for line in batch.read_lines(release, name, tell):
-            row = store.parse_row(line)
+            row = parse_row(line)
             if row is not None and missing.pop(row["key"], None) is not None:
                 yield row
         if len(missing) == before:

@@ -8,12 +8,11 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from itertools import chain, islice
 from multiprocessing.process import BaseProcess
-from queue import Empty, SimpleQueue
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -23,11 +22,8 @@ from cloudrc.runs.interrupts import is_interrupted, noted_interrupts, raise_if_i
 
 Work = TypeVar("Work")
 Result = TypeVar("Result")
-CHUNK = 5_000
-"""Number of calls that wait for a worker at once. Before Python 3.11.6, a pool of processes hangs
-with more than 16,384 of them (cpython issue 105829)."""
-
-
+WINDOW = 200
+"""Number of calls that wait for a worker at once."""
 PERIOD = 0.1
 """Longest time between a signal and the end of a wait for a worker [s]."""
 
@@ -82,39 +78,41 @@ def map_in_order(
     no result is yielded, even if `function` has caught the KeyboardInterrupt.
     """
     rest = iter(work)
-    chunk = [*islice(rest, CHUNK)]
-    workers = min(jobs, len(chunk), usable_cores())
+    first = [*islice(rest, WINDOW)]
+    workers, every = min(jobs, len(first), usable_cores()), chain(first, rest)
     if workers <= 1:
-        for result in map(function, chain(chunk, rest)):
+        for result in map(function, every):
             raise_if_interrupted()
             yield result
         return
     with noted_interrupts():
-        yield from _map_in_workers(function, chunk, rest, workers, in_order)
+        yield from _map_in_workers(function, every, workers, in_order)
 
 
 def _map_in_workers(
-    function: Callable[[Work], Result],
-    chunk: list[Work],
-    rest: Iterator[Work],
-    workers: int,
-    in_order: bool,
+    function: Callable[[Work], Result], work: Iterator[Work], workers: int, in_order: bool
 ) -> Generator[Result]:
     # Spawn, do not fork: libraries may have started threads in this process.
     context = multiprocessing.get_context("spawn")
     with isolated_start():  # starts multiprocessing's resource tracker
         pool = ProcessPoolExecutor(workers, context, _start_worker)
-    started = list[BaseProcess]()
+    started, waiting = list[BaseProcess](), list[Future[Result]]()
     try:
-        while chunk:
+        while True:
             with isolated_start():  # submit() starts the workers
-                futures = [pool.submit(function, each) for each in chunk]
-            started = multiprocessing.active_children()
-            for future in _ended(futures, in_order):
+                for each in islice(work, WINDOW - len(waiting)):
+                    waiting.append(pool.submit(function, each))
+            if not waiting:
+                return
+            started = started or multiprocessing.active_children()
+            looked_at = waiting[:1] if in_order else waiting
+            ended = wait(looked_at, PERIOD, return_when=FIRST_COMPLETED).done
+            raise_if_interrupted()
+            for future in ended:
+                waiting.remove(future)
                 result = future.result()
                 raise_if_interrupted()
                 yield result
-            chunk = [*islice(rest, CHUNK)]
     except BrokenProcessPool as error:
         pool.shutdown(cancel_futures=True)  # only then are all exit codes known
         raise WorkerDiedError(_explain_end(started)) from error
@@ -126,42 +124,14 @@ def _map_in_workers(
         pool.shutdown(cancel_futures=True)
 
 
-def _explain_end(workers: Iterable[BaseProcess]) -> str:
-    """Say why a worker process ended during its work."""
-    # The pool ends the other workers by signals, whose exit codes are negative.
+def _explain_end(workers: list[BaseProcess]) -> str:
+    """Say how the worker ended that broke the pool; the pool ended the others by SIGTERM."""
     codes = [worker.exitcode for worker in workers]
-    if own := [code for code in codes if code is not None and code >= 0]:
-        ends = "os._exit(), or sys.exit() in a signal handler"
-        return f"a worker ended itself (exit status {own[0]}); does a plug-in call {ends}?"
-    # Of these codes, only a signal other than SIGTERM is the cause.
     own = [code for code in codes if code not in (None, -signal.SIGTERM, -signal.SIGKILL)]
-    if own:
-        name = signal.Signals(-own[0]).name
-        return f"a worker crashed ({name}); does a plug-in, or a library that it uses, crash?"
-    text = "a worker was killed, perhaps by the kernel because memory ran out"
-    return f"{text}; use fewer processes"
-
-
-def _ended(futures: list[Future[Result]], in_order: bool) -> Iterator[Future[Result]]:
-    """Yield each future once it has ended; raise KeyboardInterrupt soon after a signal."""
-    if in_order:
-        for future in futures:
-            while not wait([future], PERIOD).done:
-                raise_if_interrupted()
-            yield future
-        return
-    ended = SimpleQueue[Future[Result]]()
-    for future in futures:
-        future.add_done_callback(ended.put)
-    left = len(futures)
-    while left:
-        try:
-            future = ended.get(timeout=PERIOD)
-        except Empty:
-            raise_if_interrupted()
-            continue
-        left -= 1
-        yield future
+    if not own:
+        text = "a worker was killed, perhaps by the kernel because memory ran out"
+        return f"{text}; use fewer processes"
+    return f"a worker ended itself (exit status {own[0]}); does a plug-in end or crash its process?"
 
 
 def take_each(

@@ -1,0 +1,121 @@
+"""Read what the flags of `cloudrc eval` give."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from math import nan
+from pathlib import Path
+from typing import Any
+
+from cloudrc.errors import BadInputError
+from cloudrc.eval.setup import FILE, MEASURED, SEED, Compute
+from cloudrc.link.library import read_profile
+from cloudrc.link.traces import read_lines
+from cloudrc.outside.document import parse_value, read_document
+from cloudrc.outside.values import ANY
+from cloudrc.plugins import is_path
+from cloudrc.policy.address import check_url
+from cloudrc.policy.observation import Mapped
+
+COMPUTE_MAX = 3600.0
+"""Largest time for an answer [s]."""
+
+
+def check_policy(policy: str) -> None:
+    """Raise a BadInputError if the policy cannot be used."""
+    if "://" in policy:
+        try:
+            check_url(policy)
+        except ValueError as error:
+            raise BadInputError(f"--policy: {error}") from None
+    elif not is_path(policy) or not Path(policy).is_file():
+        raise BadInputError(
+            f"--policy {policy}: there is no such file; give a Python file, such as "
+            "./expert.py, or the address of a server, such as ws://127.0.0.1:8000"
+        )
+
+
+def check_round_trips(profile: str, round_trips: tuple[float | None, ...]) -> None:
+    """Raise a BadInputError if the link has no constant delays that `round_trips` [ms] replace."""
+    link = read_profile(profile)
+    if round_trips != (None,) and any(
+        way.rows or way.changes for way in (link.uplink, link.downlink)
+    ):
+        raise BadInputError(
+            f"--rtt: the delays of the profile '{profile}' change over time; leave --rtt out, or "
+            "choose a profile with constant delays"
+        )
+
+
+def read_compute(text: str) -> tuple[Compute, tuple[float, ...]]:
+    """Read the time for an answer: a number [s], "MEAN,DEVIATION" [s], "measured", or a file.
+
+    Also return the times that a file has [s].
+    """
+    if text == MEASURED:
+        return (MEASURED, ""), ()
+    try:
+        numbers = [ANY.read(each) for each in text.split(",")]
+    except ValueError:
+        if os.path.lexists(text):
+            return (FILE, text), read_times(text)
+        numbers = []
+    if len(numbers) not in (1, 2) or not all(0.0 <= each <= COMPUTE_MAX for each in numbers):
+        raise BadInputError(
+            f"--compute {text}: give the time for an answer: a number of s such as 0.05, "
+            f"MEAN,DEVIATION in s, the path of a file that exists, or '{MEASURED}'"
+        )
+    return (numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])), ()
+
+
+def read_times(path: str) -> tuple[float, ...]:
+    """Read the times of a file [s]: the last column of a CSV file; a head is skipped."""
+    what, found = f"--compute {path}", list[float]()
+    lines = read_lines(Path(path), what, "give a text file with one time in seconds per line")
+    for number, line in enumerate(lines, start=1):
+        text = line.rpartition(",")[2].strip(' \t"')
+        try:
+            time = ANY.read(text)
+        except ValueError:
+            if number == 1 or not text:
+                continue  # the head, or an empty line
+            time = nan
+        if not 0.0 <= time <= COMPUTE_MAX:
+            raise BadInputError(f"{what}, line {number}: {text[:40]!r} is no time in seconds")
+        found.append(time)
+    if not found:
+        raise BadInputError(f"{what}: has no times")
+    return tuple(found)
+
+
+def read_env_args(texts: list[str]) -> tuple[tuple[str, Any], ...]:
+    """Read arguments of an environment, given as KEY=VALUE; a value is YAML, also with None."""
+    found = dict[str, Any]()
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not (equals and key.isidentifier()):
+            raise BadInputError(f"--env-arg {text}: give KEY=VALUE, such as env_name=reach-v3")
+        value = "null" if value == "None" else value
+        found[key] = value if value == SEED else parse_value(value, f"--env-arg {key}")
+    return tuple(sorted(found.items()))
+
+
+def read_mapped(path: Path | None) -> tuple[Mapped, ...]:
+    """Read the map from an environment's observation to that of a policy; () without a file."""
+    if path is None:
+        return ()
+    found, example = list[Mapped](), "observation/state: agent_pos, or prompt: {value: go}"
+    for key, value in read_document(path, path.name).tree.items():
+        if isinstance(value, str) and value:
+            found.append(Mapped(str(key), value))
+        elif isinstance(value, Mapping) and value.keys() == {"value"}:
+            found.append(Mapped(str(key), None, value["value"]))
+        else:
+            raise BadInputError(
+                f"{path}: {key}: give the place in the environment's observation, or a value; for "
+                f"example {example}"
+            )
+    if not found:
+        raise BadInputError(f"{path}: has no keys; for example {example}")
+    return tuple(found)

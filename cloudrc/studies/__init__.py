@@ -1,0 +1,1 @@
+"""Studies with trials: sweep, compare, margin, identify."""

@@ -1,0 +1,332 @@
+"""Keep a sweep in a folder: rows, summary and tables of its flights.
+
+docs/sweeps.md describes the files.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import logging
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+from cloudrc import files
+from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, to_one_line
+from cloudrc.files import write_atomically
+from cloudrc.outside.document import read_document, write_yaml
+from cloudrc.runs.fly import fly
+from cloudrc.runs.folder import new_folder
+from cloudrc.runs.lock import LOCK, lock_folder
+from cloudrc.source import code_hash
+from cloudrc.text import table
+from cloudrc.trials.fingerprint import experiment_facts
+from cloudrc.trials.plan import PlannedFlight, SweepPlan, find_flight, read_draft
+from cloudrc.trials.rows import Row, Rows, read_rows
+from cloudrc.trials.summary import count_verdicts
+from cloudrc.trials.workers import map_in_order, take_each
+from cloudrc.version import __version__
+
+FILE, SUMMARY = "sweep.yaml", "sweep.json"
+TABLE, PARQUET = "table.csv", "table.parquet"
+NUMBERS = {int, float, type(None)}
+"""Types of the values of an axis of numbers; None is the value null."""
+SUMMARY_MAX = 1 << 26
+"""Largest length of the file SUMMARY [bytes]."""
+NAMED_MAX = 3
+"""Largest number of changed files that an error names."""
+Shard: TypeAlias = tuple[int, int] | None
+"""Number of a part of the flights, from 1, and how many parts there are; None: all flights."""
+
+
+@contextmanager
+def open_folder(out: Path | None, name: str, shard: Shard = None) -> Iterator[Path]:
+    """Lock the folder of a sweep: `out`, or a new one in `runs/` whose name begins with `name`."""
+    if out is not None and shard:
+        out.mkdir(parents=True, exist_ok=True)  # another shard may be faster
+    if out is None or not _is_ours(out):
+        out = new_folder(out, name, "latest-sweep")
+    with lock_folder(out, shard):
+        yield out
+
+
+def _is_ours(folder: Path) -> bool:
+    """Return whether a folder is that of a sweep, or has nothing but what begins one."""
+    names = [path.name for path in folder.iterdir()] if folder.is_dir() else ["none"]
+    return SUMMARY in names or all(name.startswith((LOCK, FILE, f".{FILE}")) for name in names)
+
+
+def flights_of(plan: SweepPlan, shard: Shard = None) -> list[PlannedFlight]:
+    """Return the flights of a shard."""
+    number, count = shard or (1, 1)
+    return [*plan.flights.values()][number - 1 :: count]
+
+
+def begin(folder: Path, plan: SweepPlan, shard: Shard = None) -> Rows:
+    """Write the file and the summary of a sweep into `folder`, which is locked; return its rows.
+
+    Raise a BadInputError if the folder has rows of another sweep or of other code.
+    """
+    rows = Rows(folder, shard and shard[0])
+    if any(not _is_of(plan, row) for row in rows.kept.values()):
+        raise BadInputError(f"--out {folder}: {_why_others(folder, plan, rows)}; name a new folder")
+    path = folder / FILE
+    if not path.exists() or read_document(path, str(path)).tree != plan.draft.file:
+        write_atomically(path, write_yaml(plan.draft.file).encode())
+    _write_summary(folder, plan, rows)
+    if len(rows.kept) < len(plan.flights):  # tables of a smaller grid would look complete
+        for name in (TABLE, PARQUET):
+            (folder / name).unlink(missing_ok=True)
+    return rows
+
+
+def _is_of(plan: SweepPlan, row: Row) -> bool:
+    flight = plan.flights.get(row["key"])
+    return flight is not None and flight.point == row["point"]
+
+
+def _why_others(folder: Path, plan: SweepPlan, rows: Rows) -> str:
+    """Say why a folder has rows that are not in a plan."""
+    if other := {row.get("code") for row in rows.kept.values()} - {code_hash()}:
+        return f"its flights are of code {other.pop()}, this is code {code_hash()}"
+    changed = describe_changes(folder, plan.files)
+    return changed or f"has another sweep, see {FILE}, or a package has changed since"
+
+
+def describe_changes(folder: Path, own_files: Mapping[str, str]) -> str:
+    """Say which of the user's files (path -> hash) have changed since they were flown; "" if none.
+
+    Without a summary, nothing is known.
+    """
+    if not (folder / SUMMARY).exists():
+        return ""
+    before = read_summary(folder)["files"]
+    changed = [path for path, each in own_files.items() if before.get(path, each) != each]
+    changed[NAMED_MAX:] = [f"{len(changed) - NAMED_MAX} more"] if changed[NAMED_MAX:] else []
+    return f"changed since its flights: {', '.join(changed)}" if changed else ""
+
+
+def finish(folder: Path, plan: SweepPlan) -> dict[str, Row]:
+    """Write the summary and, if no flight is missing, the tables; return flight key -> row."""
+    rows = Rows(folder)
+    _write_summary(folder, plan, rows)
+    if rows.kept.keys() == plan.flights.keys():
+        columns = columns_of([rows.kept[key] for key in plan.flights], plan)
+        write_atomically(folder / TABLE, as_csv(columns, plan.units).encode())
+        if find_spec("pyarrow"):
+            parquet, tables = import_module("pyarrow.parquet"), import_module("pyarrow")
+            parquet.write_table(tables.table(columns), folder / PARQUET)
+    return rows.kept
+
+
+def _write_summary(folder: Path, plan: SweepPlan, rows: Rows) -> None:
+    file = plan.draft.file
+    summary = {
+        "schemaVersion": 1,
+        "experiment": plan.name,
+        "cloudrc": __version__,
+        "code": code_hash(),
+        "overrides": [f"{key}={as_text(value)}" for key, value in file.get("set", {}).items()],
+        "axes": plan.axes,
+        "seeds": plan.draft.seeds,
+        "flights": len(plan.flights),
+        "counts": dict(sorted(Counter(row["verdict"] for row in rows.kept.values()).items())),
+        "units": plan.units,
+        "files": plan.files,
+    }
+    write_atomically(folder / SUMMARY, f"{json.dumps(summary, indent=2)}\n".encode())
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """Read the description of a sweep; raise a BadInputError if `folder` is not that of a sweep."""
+    try:
+        found: dict[str, Any] = json.loads(files.read(folder / SUMMARY, SUMMARY_MAX))
+        return {"files": {}, **{key: found[key] for key in ("axes", "flights", "units")}, **found}
+    except (OSError, ValueError, LookupError, TypeError):
+        text = "is not a folder of 'cloudrc sweep run'; name one"
+        raise BadInputError(f"{folder}: {text}") from None
+
+
+def as_csv(columns: Mapping[str, Sequence[Any]], unit_of: Mapping[str, str]) -> str:
+    """Format columns of equal length as CSV; the first line has names, and units in brackets."""
+    head = [f"{name} [{unit_of[name]}]" if name in unit_of else name for name in columns]
+    text = io.StringIO()
+    cells = [head, *zip(*columns.values(), strict=True)]
+    csv.writer(text, lineterminator="\n").writerows(cells)
+    return text.getvalue()
+
+
+def columns_of(rows: list[Row], plan: SweepPlan) -> dict[str, list[Any]]:
+    """Return the columns of a sweep's tables; an axis of numbers and other values becomes text."""
+
+    def column(name: str) -> list[Any]:
+        return [row.get(name, "") for row in rows]
+
+    axes = {axis: _axis_column([row["point"][axis] for row in rows]) for axis in plan.axes}
+    names = sorted({name for row in rows for name in row["numbers"]})
+    return {
+        "key": column("key"),
+        **axes,
+        "seed": column("seed"),
+        "verdict": column("verdict"),
+        "failures": [" ".join(row["failures"]) for row in rows],
+        "code": column("code"),
+        "physics_steps": column("physics_steps"),
+        **{name: [row["numbers"].get(name) for row in rows] for name in names},
+    }
+
+
+def _axis_column(values: list[Any]) -> list[Any]:
+    """Return the column of an axis: texts, truth values, or numbers and None; else all as text."""
+    types = {*map(type, values)}
+    plain = types <= NUMBERS or types in ({str}, {bool})
+    return values if plain else [*map(as_text, values)]
+
+
+def as_text(value: Any) -> str:
+    """Format the value of an axis or a setting."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+# Recordings of flights.
+
+
+def record_missing(
+    flights: Sequence[PlannedFlight], rows: Mapping[str, Row], which: str, folder: Path, jobs: int
+) -> CloudrcError | None:
+    """Fly the "failed" or "all" flights that have no recording again, into folders of their own.
+
+    Return why the work ended early, or None.
+    """
+    wanted = [
+        each
+        for each in flights
+        if rows[each.key]["verdict"] not in ("error", *(("success",) if which == "failed" else ()))
+        and not (folder / each.key / "report.json").is_file()
+    ]
+    flown = map_in_order(partial(fly_into, folder, page=False), wanted, jobs)
+    return take_each(flown, lambda report: None)
+
+
+def fly_into(folder: Path, flight: PlannedFlight, *, page: bool) -> dict[str, Any]:
+    """Fly a flight with a recording into its folder in that of the sweep; return the report."""
+    out = folder / flight.key
+    out.mkdir(exist_ok=True)
+    (out / "environment.json").unlink(missing_ok=True)  # it describes an earlier flight
+    return fly(flight.experiment, "virtual", out, page=page)
+
+
+def find_row(folder: Path, begin: str) -> tuple[Row, PlannedFlight]:
+    """Return the row of a sweep whose key begins like this, and the flight that repeats it.
+
+    Raises:
+        BadInputError: If no row, or more than one, has such a key; or if the flight would be
+            another one, because code or files have changed.
+    """
+    rows = [row for key, row in read_rows(folder).items() if key.startswith(begin)]
+    if len(rows) != 1:
+        text = f"{len(rows)} rows have a key that begins like this; give one key"
+        raise BadInputError(f"{folder}: {begin}: {text}")
+    row = rows[0]
+    flight = find_flight(read_draft(folder / FILE), row["point"], row["seed"])
+    if flight is None or flight.key != row["key"]:
+        why = f"was flown by code {row.get('code')}, this is code {code_hash()}"
+        if row.get("code") == code_hash():
+            why = describe_changes(folder, experiment_facts(flight.resolved)[-1] if flight else {})
+            why = why or "the experiment or an installed plug-in has changed since"
+        raise BadInputError(f"{row['key']}: {why}; fly the sweep again")
+    return row, flight
+
+
+def check_repeated(row: Row, report: Mapping[str, Any]) -> None:
+    """Raise an InvalidRunError if the repeated flight of a row has other records."""
+    if row["records_sha256"] != report["records_sha256"]:
+        why = "other records, though no file of its key has changed: the processor or a package has"
+        raise InvalidRunError(f"{row['key']}: {why}, or a plug-in uses what is in no key")
+
+
+# Reading a sweep that is done, or under way.
+
+
+class Flown(NamedTuple):
+    """The rows of a sweep in the order of its grid."""
+
+    rows: list[Row]
+    units: dict[str, str]  # metric -> unit
+    axes: dict[str, list[Any]]  # axis -> its values
+    flights: int  # number of all flights
+
+    @property
+    def missing(self) -> str:
+        """How many flights are missing, in words; "" if none."""
+        missing = self.flights - len(self.rows)
+        return f"{missing} flights are not done" if missing else ""
+
+
+def read_sweep(folder: Path) -> Flown:
+    """Read the rows of a sweep in the order of its grid.
+
+    Raise a BadInputError if a row has another point than those of the sweep. Warn if the rows are
+    of more than one code, whose difference may be what the rows show.
+    """
+    summary, rows = read_summary(folder), read_rows(folder)
+    codes = {str(row.get("code")) for row in rows.values()}
+    if len(codes) > 1:
+        text = f"{folder}: its flights are of different code: {' and '.join(sorted(codes))}"
+        logging.getLogger("cloudrc").warning("%s", to_one_line(text))
+    axes: dict[str, list[Any]] = summary["axes"]
+
+    def place(row: Row) -> list[int]:
+        return [*(axes[axis].index(row["point"][axis]) for axis in axes), row["seed"]]
+
+    try:
+        ordered = sorted(rows.values(), key=place)
+    except (KeyError, ValueError):
+        text = f"has rows of another grid than that in {SUMMARY}; name the folder of one sweep"
+        raise BadInputError(f"{folder}: {text}") from None
+    unknown = dict.fromkeys((name for row in ordered for name in row["numbers"]), "")
+    return Flown(ordered, {**unknown, **summary["units"]}, axes, summary["flights"])
+
+
+def read_flights(folder: Path) -> Flown:
+    """Read a sweep that has rows; values of axes that are neither numbers nor text become text."""
+    found = read_sweep(folder)
+    if not found.rows:
+        raise BadInputError(f"{folder}: has no rows; run the sweep again with this --out")
+    for row in found.rows:
+        row["point"] = {
+            axis: value if type(value) in (str, int, float) else json.dumps(value)
+            for axis, value in row["point"].items()
+        }
+    return found
+
+
+def count_successes(found: Flown) -> list[dict[str, Any]]:
+    """Return the flights and successes per value of an axis."""
+    counts: list[dict[str, Any]] = []
+    for axis, choices in found.axes.items():
+        for value in choices:
+            own = [row for row in found.rows if row["point"][axis] == value]
+            done = sum(row["verdict"] == "success" for row in own)
+            counts.append({"axis": axis, "value": value, "flights": len(own), "success": done})
+    return counts
+
+
+def status_text(found: Flown, counts: Sequence[Mapping[str, Any]]) -> str:
+    """Format the state of a sweep for people; `counts` are those of `count_successes`."""
+    verdicts = count_verdicts(found.rows)
+    text = f"{len(found.rows)} of {found.flights} flights are done: {verdicts}"
+    if not counts:
+        return text
+    cells = [("axis", "value", "success")]
+    for each in counts:
+        share = f"{each['success']}/{each['flights']}"
+        cells.append((each["axis"], as_text(each["value"]), share))
+    return f"{text}\n\n{table(cells, right=(2,))}"

@@ -1,0 +1,84 @@
+"""Keep the result of each trial as a row: one line of JSON in a file of its folder.
+
+A row has no wall-clock times, so equal trials give equal rows.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from cloudrc import files
+from cloudrc.errors import BadInputError
+
+Row: TypeAlias = dict[str, Any]
+"""Result of a trial: `key`, `point` (axis -> value), `seed`, `verdict`, `failures` (codes), `text`
+(the first failure in words), `numbers` (metric -> value), `records_sha256`, and `code`, the hash of
+cloudrc's own code."""
+FIELDS = {"key", "point", "seed", "verdict", "failures", "text", "numbers", "records_sha256"}
+SIZE_MAX = 1 << 32
+"""Largest file of rows [bytes]: a million flights."""
+
+
+class Rows:
+    """The rows of trials by their keys; with a folder, those that its files have.
+
+    Each shard of the work appends to a file of its own.
+    """
+
+    def __init__(self, folder: Path | None = None, shard: int | None = None) -> None:
+        """Read the rows in `folder`; None: keep them in memory alone."""
+        self.kept: dict[str, Row] = read_rows(folder) if folder else {}
+        self._path = folder and folder / f"rows{f'-{shard}' if shard else ''}.jsonl"
+        if self._path and self._path.exists():
+            _drop_half_a_line(self._path)
+
+    def add(self, row: Row) -> None:
+        """Add a row, unless one of its key is there."""
+        if row["key"] in self.kept:
+            return
+        if self._path:
+            line = json.dumps(row, allow_nan=False) + "\n"
+            try:
+                with self._path.open("ab") as file:
+                    file.write(line.encode())
+            except OSError as error:
+                error.filename = str(self._path)
+                raise
+        self.kept[row["key"]] = row
+
+
+def _drop_half_a_line(path: Path) -> None:
+    """Cut off what a killed command has left at the end."""
+    os.truncate(path, files.read(path, SIZE_MAX).rfind(b"\n") + 1)
+
+
+def read_rows(folder: Path) -> dict[str, Row]:
+    """Read the rows of all files of a folder: key -> row; ignore an unfinished last line.
+
+    Raise a BadInputError if a file cannot be read, or if a line is not a row.
+    """
+    found: dict[str, Row] = {}
+    for path in sorted(folder.glob("rows*.jsonl")):
+        try:
+            *lines, _ = files.read(path, SIZE_MAX).split(b"\n")
+        except (OSError, ValueError) as error:
+            raise BadInputError(f"{path}: cannot be read: {error}; move it away") from error
+        for number, line in enumerate(lines, start=1):
+            row = parse_row(line)
+            if row is None:
+                text = "is not a row; delete this line to play its trial again"
+                raise BadInputError(f"{path}:{number}: {text}")
+            found.setdefault(row["key"], row)
+    return found
+
+
+def parse_row(line: bytes | str) -> Row | None:
+    """Parse a line of JSON as a row; return None if it is not a row."""
+    try:
+        row = json.loads(line)
+    except ValueError:
+        return None
+    return row if isinstance(row, dict) and row.keys() >= FIELDS else None

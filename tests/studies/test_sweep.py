@@ -1,0 +1,135 @@
+"""A folder has one sweep; its tables follow the order of the grid, whatever flew first."""
+
+import csv
+import shutil
+
+import pytest
+
+from cloudrc.errors import BadInputError
+from cloudrc.source import code_hash
+from cloudrc.studies import sweep
+from cloudrc.trials.plan import read_plan
+from tests.support.sweeps import flown
+
+PLUG_IN = {
+    "mine.py": "from helper import build\n",
+    "helper.py": "from cloudrc.cloud.predictors.last_sample import build\n",
+}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """The folder of a sweep."""
+    folder = tmp_path / "sweep"
+    folder.mkdir()
+    return folder
+
+
+def made(plan):
+    """Return the rows of a plan; the last one lacks a number."""
+    numbers = [{"duration": n + 0.1} for n in range(len(plan.flights) - 1)]
+    every = zip(plan.flights.values(), [*numbers, {}], strict=True)
+    return [flight.row(flown(**found)) for flight, found in every]
+
+
+def fly(path, folder, which=slice(None), shard=None):
+    """Fly some of the flights that a folder lacks; return the plan."""
+    plan = read_plan(path)
+    rows = sweep.begin(folder, plan, shard)
+    mine = {each.key for each in sweep.flights_of(plan, shard)}
+    for row in made(plan)[which]:
+        if row["key"] in mine:
+            rows.add(row)
+    sweep.finish(folder, plan)
+    return plan
+
+
+def test_the_table_has_the_order_of_the_grid(write_sweep, tmp_path):
+    path, tables = write_sweep(), []
+    for name, orders, shards in (
+        ("whole", (slice(2), slice(2, 4)), (None, None)),
+        ("shards", (slice(None, None, -1),) * 2, ((2, 2), (1, 2))),
+    ):
+        (tmp_path / name).mkdir()
+        for order, shard in zip(orders, shards, strict=True):
+            assert not (tmp_path / name / "table.csv").exists()
+            plan = fly(path, tmp_path / name, order, shard)
+        tables.append((tmp_path / name / "table.csv").read_bytes())
+    assert tables[0] == tables[1]
+    head, first, *_, last = csv.reader(tables[0].decode().splitlines())
+    names = ["seed", "verdict", "failures", "code", "physics_steps", "duration [s]"]
+    assert head[1:] == [*plan.axes, *names]
+    own = [code_hash(), "Python"]
+    key = next(iter(plan.flights))
+    assert first == [key, "last_sample", "40", "1", "success", "", *own, "0.1"]
+    assert last[1:] == ["constant_velocity", "0", "1", "success", "", *own, ""]
+    summary = sweep.read_summary(tmp_path / "whole")
+    assert (summary["counts"], summary["flights"]) == ({"success": 4}, 4)
+    assert (summary["axes"], summary["seeds"]) == (plan.axes, [1])
+    assert "link.profile=paper-p3" in summary["overrides"]
+
+
+def test_a_folder_holds_one_sweep_that_may_grow(write_sweep, folder):
+    fly(write_sweep(), folder)
+    assert (folder / "table.csv").is_file()
+    more = read_plan(write_sweep(seeds=2))
+    assert len(sweep.begin(folder, more).kept) == 4
+    assert not (folder / "table.csv").exists()  # it has fewer flights than sweep.json says
+    for other in (write_sweep({"link.both.delay_ms": [7]}), write_sweep({}, seeds=2)):
+        with pytest.raises(BadInputError, match=r"has another sweep, see sweep\.yaml.*new folder"):
+            fly(other, folder)
+
+
+def test_the_file_of_the_sweep_may_have_another_place_in_each_shard(write_sweep, folder, tmp_path):
+    path, other = write_sweep(), tmp_path / "other"
+    fly(path, folder, shard=(1, 2))
+    other.mkdir()
+    fly(shutil.copy(path, other / "grid.yaml"), folder, shard=(2, 2))
+    assert (folder / sweep.TABLE).exists()
+
+
+@pytest.mark.parametrize("changed", PLUG_IN)
+@pytest.mark.parametrize("shard", [None, (2, 2)])
+def test_a_file_that_changed_since_its_flights_is_named(
+    write_sweep, folder, tmp_path, changed, shard
+):
+    for name, text in PLUG_IN.items():
+        (tmp_path / name).write_text(text)
+    path = write_sweep({"cloud.predictor": ["./mine.py", "last_sample"]})
+    fly(path, folder, slice(1), shard=shard and (1, 2))
+    with (tmp_path / changed).open("a") as file:
+        file.write("# changed\n")
+    with pytest.raises(BadInputError, match=rf"changed since its flights: {tmp_path / changed};"):
+        fly(path, folder, shard=shard)
+
+
+def test_other_code_flies_nothing_into_the_folder(write_sweep, folder, monkeypatch):
+    """Both hashes are named, so that the user finds the code of the flights."""
+    path = write_sweep()
+    fly(path, folder, slice(1), (1, 2))
+    for place in ("source", "studies.sweep"):
+        monkeypatch.setattr(f"cloudrc.{place}.code_hash", lambda: "0123456789abcdef")
+    said = f"its flights are of code {code_hash()}, this is code 0123456789abcdef"
+    with pytest.raises(BadInputError, match=said):
+        fly(path, folder, shard=(2, 2))
+
+
+def test_rows_of_two_codes_are_told_with_both_hashes(write_sweep, folder, caplog):
+    fly(write_sweep(), folder)
+    assert len(sweep.read_flights(folder).rows) == 4
+    assert caplog.messages == []
+    path = folder / "rows.jsonl"  # copied from elsewhere
+    path.write_text(path.read_text().replace(code_hash(), "0ther", 1))
+    sweep.read_flights(folder)
+    (said,) = caplog.messages
+    assert f"{folder}: its flights are of different code: 0ther and {code_hash()}" in said
+
+
+def test_rows_of_another_grid_and_other_folders_are_refused(write_sweep, folder):
+    with pytest.raises(BadInputError, match="is not a folder of"):
+        sweep.read_sweep(folder)
+    fly(write_sweep(), folder)
+    path = folder / "rows.jsonl"
+    path.write_text(path.read_text().replace('"link.both.delay_ms": 40', '"other": 1'))
+    with pytest.raises(BadInputError, match="has rows of another grid"):
+        sweep.read_sweep(folder)
