@@ -23,7 +23,10 @@ Rgba: TypeAlias = tuple[float, float, float, float]
 
 SHAPES_FILE = "shapes.npz"
 """Name of the attachment of a recording."""
-_UNREADABLE = ValueError, KeyError, IndexError, OSError, EOFError, BadZipFile, zlib.error
+_UNREADABLE = (
+    *(ValueError, TypeError, KeyError, IndexError, AttributeError),
+    *(OSError, EOFError, BadZipFile, zlib.error),
+)
 """What reading a damaged attachment raises."""
 SIDES = 20
 """Number of corners of a circle; a multiple of 4."""
@@ -130,14 +133,19 @@ def _fan(polygons: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def lathe(
-    profile: Sequence[tuple[float, float]], sides: int = SIDES, *, convex: bool = False
+    profile: Sequence[tuple[float, float]],
+    sides: int = SIDES,
+    *,
+    first: float = 0.0,
+    convex: bool = False,
 ) -> Surface:
     """Return what a line makes that turns about the z axis.
 
     `profile` has the points of the line: distance from the axis and height [m], shape (n, 2). With
-    rising heights, the triangles are counter-clockwise for a viewer outside.
+    rising heights, the triangles are counter-clockwise for a viewer outside. `first` is the
+    direction of the first of the `sides` corners of a circle [rad].
     """
-    angle = (2 * np.arange(sides) + 1) * (np.pi / sides)
+    angle = first + np.arange(sides) * (2 * np.pi / sides)
     circle = np.stack([np.cos(angle), np.sin(angle), np.ones(sides)], axis=1)
     corners = np.concatenate([circle * (radius, radius, z) for radius, z in profile])
     here = np.arange(sides, dtype=np.int32)
@@ -149,8 +157,9 @@ def lathe(
 
 def box(half: Any) -> Surface:
     """Return a box with the half edges `half` [m], shape (3,), around the origin."""
-    edge = np.sqrt(2.0)
-    cube = lathe([(0.0, -1.0), (edge, -1.0), (edge, 1.0), (0.0, 1.0)], 4, convex=True)
+    edge, corner = np.sqrt(2.0), np.pi / 4
+    profile = [(0.0, -1.0), (edge, -1.0), (edge, 1.0), (0.0, 1.0)]
+    cube = lathe(profile, 4, first=corner, convex=True)
     return replace(cube, corners=cube.corners * half)
 
 
