@@ -54,7 +54,7 @@ class Route:
         return f"{self.plan.unit} {self.leg + 1} of {len(self.plan.legs)}"
 
     def select(self, begin_ns: int, start: Vector | None = None) -> None:
-        """Make the waypoint the setpoint, as `Aim.select_leg` does."""
+        """Make the waypoint the setpoint from `begin_ns` [ns] on; the way begins at `start` [m]."""
         self._aim.select_leg(self.plan.legs[self.leg], self.leg, begin_ns, start)
 
     def lead(self, seen: RobotStatus, now_ns: int) -> None:

@@ -143,7 +143,7 @@ def test_a_session_needs_no_body_that_a_shipped_mission_touches(folder, monkeypa
     assert "enough" in call("up", code=2).err
     assert "enough" in call("up --set world.scene=empty", code=2).err
     own = call("up --set world.scene=empty --set mission.touch.body=board", code=2).err
-    assert "--set: mission.touch.body: board: the scene empty has no such body" in own
+    assert "--set: mission.touch.body: board: no body of the scene empty named 'board'" in own
 
 
 PYTHON = [sys.executable, "-c"]

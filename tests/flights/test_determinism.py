@@ -133,7 +133,7 @@ ALLOWED = {
     # The kernel stamps datagrams and probes by this clock; only ages of 0 to 50 ms are used.
     *("link/carry/udp.py", "link/verify/probe.py"),
     # Only people read these times.
-    *("drivers/process.py", "link/sidecar.py"),
+    *("drivers/process.py", "link/follow.py"),
 }
 
 

@@ -89,7 +89,7 @@ def test_an_acknowledgement_ends_one_alarm_not_the_next_stop(ends):
     teleop = ends.cloud.teleop
     teleop.outputs.append(ALARM)
     assert states(ends, 1) == [ESTOP]
-    teleop.acknowledge(5 * S)
+    teleop.acknowledge()
     teleop.handle_deadline(5 * S)
     teleop.stop(5 * S)  # the robot still shows the first stop
     assert states(ends, 1)[-1] is ESTOP
