@@ -60,33 +60,37 @@ class Page:
 
     def __init__(
         self,
-        experiment: ResolvedExperiment,
-        feed: FlightFeed,
-        steering: Steering,
         port: int = 0,
         token: Callable[[], str] | None = None,
         origins: Collection[str] = (),
     ) -> None:
-        """Serve a page on this machine only; one browser at a time gets the controls.
+        """Choose where the page will be; `fill` serves it.
+
+        Args:
+            port: TCP port; 0 means any free port.
+            token: Function that returns the page's present token; None makes one.
+            origins: Origins of proxies that may serve the page.
+        """
+        own = token_hex(16)
+        self._wanted_port = port
+        self._access = Access(token or (lambda: own), origins)
+
+    def fill(self, experiment: ResolvedExperiment, feed: FlightFeed, steering: Steering) -> None:
+        """Serve the page on this machine only; one browser at a time gets the controls.
 
         Args:
             experiment: What flies.
             feed: What the page shows.
             steering: Carries out what the page asks for.
-            port: TCP port; 0 means any free port.
-            token: Function that returns the page's present token; None makes one.
-            origins: Origins of proxies that may serve the page.
         """
         self._experiment, self._feed, self._steering = experiment, feed, steering
-        own = token_hex(16)
-        self._access = Access(token or (lambda: own), origins)
         self._acts = acts_of(experiment, steering)
         acts = {name.lower(): partial(self._answer, act) for name, act in self._acts.items()}
         desk = Desk(steering.stop, acts, self._describe_plainly, lambda: self._pilot is not None)
         viser_page = Path(viser.__file__).parent / "client" / "build" / "index.html"
         labels = {code: label for code, (label, _) in KEYS.items()}
         page = scene_page(viser_page.read_text(encoding="utf-8"), labels)
-        self._door = Door(port, self._access, desk, page)
+        self._door = Door(self._wanted_port, self._access, desk, page)
         rich.get_console().quiet = True  # viser prints about itself
         with viser_at(self._door.viser):
             self._server = viser.ViserServer(label="cloudrc", verbose=False)

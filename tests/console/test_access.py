@@ -26,7 +26,8 @@ def served():
             posted.append(path)
 
     flight = load_experiment("hover"), FlightFeed(), Steering(Api())
-    page = Page(*flight, 0, lambda: TOKEN, [PROXY])
+    page = Page(0, lambda: TOKEN, [PROXY])
+    page.fill(*flight)
     yield page, posted
     page.close()
 

@@ -34,7 +34,8 @@ def page(api):
     api.answers["/v1/state"] = {"mission": None, "seen": {"next_step": "start a mission"}}
     steering = Steering(api)
     steering.watch()
-    page = Page(load_experiment("hover"), FlightFeed(), steering)
+    page = Page()
+    page.fill(load_experiment("hover"), FlightFeed(), steering)
     yield page
     page.close()
 
@@ -227,4 +228,4 @@ def test_a_port_in_use_is_an_error(api):
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(OSError, match=f"--port {port}"):
-            Page(load_experiment("hover"), FlightFeed(), Steering(api), port)
+            Page(port).fill(load_experiment("hover"), FlightFeed(), Steering(api))

@@ -63,7 +63,8 @@ def filled(api):
 
         def fill(name):
             feed, steering = FlightFeed(), Steering(api)
-            page = Page(load_experiment(name), feed, steering)
+            page = Page()
+            page.fill(load_experiment(name), feed, steering)
             opened.callback(page.close)
             return page, feed, steering
 
