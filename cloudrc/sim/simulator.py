@@ -29,7 +29,10 @@ CONTACT_CHECK_STEPS = 5
 check takes as long as a step."""
 
 _mj_step = mujoco.mj_step
-_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{part}")) for part in ("QPOS", "QVEL", "QACC")]
+_BAD = [
+    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{part}"))
+    for part in ("QPOS", "QVEL", "QACC", "CTRL")
+]
 """Numbers of MuJoCo's warnings about values that are not finite."""
 _pack_applied = Struct("6d").pack_into
 _unpack_pose, _unpack_twist = Struct("7d").unpack_from, Struct("6d").unpack_from
@@ -180,7 +183,7 @@ class Simulator:
         return tuple(map(self._sensordata.__getitem__, self._addresses))
 
     def bad_values(self) -> int:
-        """Return how many positions, velocities and accelerations were not finite.
+        """Return how many positions, velocities, accelerations and controls were not finite.
 
         MuJoCo replaces them, so the state has none.
         """

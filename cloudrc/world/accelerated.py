@@ -8,7 +8,6 @@ from typing import Any
 
 from cloudrc.outside.code import FAILURES
 from cloudrc.outside.values import shorten
-from cloudrc.sim.engine import mujoco
 from cloudrc.sim.onboard import Onboard
 from cloudrc.sim.simulator import Simulator
 from cloudrc.world.guard.state import Guard
@@ -17,17 +16,6 @@ from cloudrc.world.watched import OnboardFailedError, WatchedOnboard, failure_of
 
 STEPS = "the accelerator of the onboard controller"
 """The watched code in messages."""
-_WARNINGS = mujoco.mjtWarning
-_BAD = [
-    int(kind)
-    for kind in (
-        _WARNINGS.mjWARN_BADQPOS,
-        _WARNINGS.mjWARN_BADQVEL,
-        _WARNINGS.mjWARN_BADQACC,
-        _WARNINGS.mjWARN_BADCTRL,
-    )
-]
-"""MuJoCo's warnings about values that are not finite: it replaces them, so the state has none."""
 
 
 class AcceleratedRobot(Robot):
@@ -54,7 +42,6 @@ class AcceleratedRobot(Robot):
         self._has_failed = False
         data = simulator.data
         self._state: list[memoryview[float]] = [memoryview(data.qpos), memoryview(data.qvel)]
-        self._warnings: memoryview[int] = memoryview(data.warning.number)
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
         """Reset the robot to its spawn, stopped, and record the reason `cause`."""
@@ -69,7 +56,7 @@ class AcceleratedRobot(Robot):
         """Run steps from `tick_ns` up to `until_ns`; return the time of the next step [ns]."""
         if self._has_failed:
             return super().run(tick_ns, until_ns)
-        before = self._bad_values()
+        before = self.simulator.bad_values()
         try:
             ended_ns = self._faster.run(tick_ns, until_ns)
             self._check(ended_ns, until_ns, before)
@@ -81,14 +68,10 @@ class AcceleratedRobot(Robot):
         self._faster.failure = None
         return int(ended_ns)
 
-    def _bad_values(self) -> int:
-        """Return how many values that are not finite MuJoCo has met."""
-        return sum(self._warnings[kind] for kind in _BAD)
-
     def _check(self, ended_ns: Any, until_ns: int, before: int) -> None:
         """Raise an OnboardFailedError if the state or the time of the next step is wrong."""
         wrong = ""
-        if self._bad_values() != before or not isfinite(sum(map(sum, self._state))):
+        if self.simulator.bad_values() != before or not isfinite(sum(map(sum, self._state))):
             wrong = "its values are not finite"
         elif not isinstance(ended_ns, int) or not 0 <= ended_ns - until_ns < STEP_NS:
             wrong = f"run() returned {shorten(ended_ns)}, not the time of the next step"
