@@ -184,7 +184,8 @@ class CloudEndpoint(TunnelEnd):
             self._note_missed(missed, now_ns)
         self._tick_ns += (missed + 1) * self._period_ns
         self._session.follow_keys()
-        self._ask_for_session_if_due(now_ns)
+        if self._session.is_outdated or self._wants_session(now_ns):
+            self._ask_for_session_if_due(now_ns)
         self._follow_teleop(now_ns)
         if self._session.epoch:
             self._send_command_or_alive(now_ns)

@@ -250,11 +250,14 @@ class ControlLoop:
         Raises:
             InvalidValueError: If the estimator's horizon is not a finite number.
         """
-        horizon = RESULT.of(self._estimator.horizon(age), "horizon")
+        horizon = self._estimator.horizon(age)
+        if type(horizon) is not float:
+            horizon = RESULT.of(horizon, "horizon")
         if horizon == 0.0 and self._newest_echo_ns == NEVER_NS:
             horizon = self._expected
         if 0.0 <= horizon <= self._horizon_max:
-            return horizon  # type: ignore[no-any-return]
+            return horizon
+        horizon = RESULT.of(horizon, "horizon")
         self.counts["horizon_clamped"] += 1
         return float(min(max(horizon, 0.0), self._horizon_max))
 

@@ -53,7 +53,13 @@ class PacketQueue:
         arrivals = link.send(epoch, kind, counter, size, now_ns)
         if arrivals and link.corrupts:
             data = link.corrupted(epoch, kind, counter, data)
-        self.put(link, arrivals, data)
+        if len(arrivals) == 1 and self._capacity is None:  # as `put` does, without its call
+            self._sent += 1
+            packets = self._packets
+            heappush(packets, (arrivals[0], self._sent, link, data))
+            self.next_ns = packets[0][0]
+        else:
+            self.put(link, arrivals, data)
 
     def put(self, link: Any, arrivals: Sequence[int], data: Any) -> None:
         """Take the copies of a packet that arrive at `arrivals` [ns]; without any, it is lost.

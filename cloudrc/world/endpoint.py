@@ -103,6 +103,13 @@ class WorldEndpoint(TunnelEnd):
         # none), and speed of the first touch.
         self._mission_id = self._reached = self._obstacles = 0
         self._touch_speed, self._touch = nan, ""
+        self._shows = bool(robot.simulator.sensors)
+        # Number, name and unit of each sensor but that of the contact force, which has a record.
+        self._recorded = [
+            (number, name, unit)
+            for number, (name, unit, _) in enumerate(robot.simulator.sensors)
+            if (name, unit) != robot.simulator.force_sensor
+        ]
 
     @property
     def slip_ns(self) -> int:
@@ -193,8 +200,10 @@ class WorldEndpoint(TunnelEnd):
 
     def _sample(self, now_ns: int) -> None:
         """Record the true state and new guard changes and contacts; send telemetry if it is due."""
+        robot = self.robot
         truth, shown = self._record_state(now_ns)
-        self._record_events(now_ns)
+        if robot.guard.changes or robot.simulator.touches or robot.failure is not None:
+            self._record_events(now_ns)
         if now_ns >= self._odometry_ns:
             self._odometry_ns += self._odometry_period_ns
             if epoch := self._session.epoch:
@@ -209,13 +218,13 @@ class WorldEndpoint(TunnelEnd):
         The values are those of the robot's own sensors, each in its unit.
         """
         simulator, records = self.robot.simulator, self._records
-        truth, shown = simulator.truth(now_ns), simulator.read_sensors()
+        truth = simulator.truth(now_ns)
+        shown = simulator.read_sensors() if self._shows else ()
         records.append(_new(GroundTruth, (now_ns, truth, self.robot.guard.reference)))
         if (force := simulator.take_contact_force()) is not None:
             records.append(_new(ContactForce, (now_ns, *force, simulator.force_sensor)))
-        for (name, unit, _), value in zip(simulator.sensors, shown, strict=True):
-            if (name, unit) != simulator.force_sensor:  # it is in the contact force
-                records.append(_new(SensorRead, (now_ns, name, unit, value)))
+        for number, name, unit in self._recorded:
+            records.append(_new(SensorRead, (now_ns, name, unit, shown[number])))
         return truth, shown
 
     def _record_events(self, now_ns: int) -> None:
