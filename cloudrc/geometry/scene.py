@@ -23,7 +23,6 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import Corners, Fence, order_of
 from cloudrc.geometry.solids import Solid
 from cloudrc.messages import Vector
-from cloudrc.outside.values import ANY
 
 Numerics: TypeAlias = dict[str, str]
 """Name of a `<numeric>` -> its data."""
@@ -188,7 +187,7 @@ def _shape(name: str, data: str) -> Tube | Plate:
 
 def _numbers(name: str, data: str, count: int) -> list[float]:
     try:
-        numbers = [ANY.read(word) for word in data.split()]
+        numbers = [float(word) for word in data.split()]
     except ValueError:
         numbers = []
     if len(numbers) != count or not all(map(math.isfinite, numbers)):

@@ -89,7 +89,7 @@ def calling(
     `slow` is the text to log if the block takes long; "" for none.
     """
     try:
-        with apart(), telling_if_slow(slow) if slow else nullcontext():
+        with redirect_stdout(sys.stderr), telling_if_slow(slow) if slow else nullcontext():
             yield
     except keep:
         raise

@@ -186,7 +186,7 @@ class Document:
         """Return the value at `path`, or None if there is no such value."""
         value: Any = self.tree
         for key in path:
-            value = child(value, key)
+            value = value.get(key) if isinstance(value, dict) else child(value, key)
         return value
 
     def set_value(self, path: KeyPath, value: Any, source: Source) -> None:
