@@ -12,7 +12,6 @@ docs/python.md describes the API; other modules may change without notice.
 from __future__ import annotations
 
 import json
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.config.resolved import ResolvedExperiment, dump
-from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
+from cloudrc.errors import CloudrcError, InterruptedRunError, NothingFlownError
 from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Columns
 from cloudrc.metrics.response import Step, steps
 from cloudrc.metrics.verdict import FlightFailure
-from cloudrc.outside.refusal import naming
+from cloudrc.outside.refusal import check_names, naming
 from cloudrc.outside.values import Quantity, to_plain
 from cloudrc.record.columns import Recording, Table
 from cloudrc.runs.experiment import advice_on, check_mode, load
@@ -42,6 +41,8 @@ if TYPE_CHECKING:
     from cloudrc.trials.plan import SweepPlan
 
 
+SECONDS = Quantity("s", 1.0, 3600.0)
+"""Time to send probes, or to wait for a verdict."""
 COUNT = Quantity(ge=1, whole=True)
 """Number of seeds or processes."""
 
@@ -160,8 +161,7 @@ def fly(
         cloudrc.errors.BadInputError: If a name, key or value is invalid, or if `out` is not empty.
         cloudrc.errors.CloudrcError: If nothing has flown: docs/python.md lists the reasons.
     """
-    if mode not in MODES:
-        raise BadInputError(f"mode {mode!r}: give 'virtual', 'local' or 'cluster'")
+    check_names("mode", [mode], MODES)
     require(f"mode {mode}", MODES[mode])
     seeds = {} if seed is None else {"seed": seed}
     resolved = load(str(experiment), [*_texts(settings or {}), *_texts(seeds)])
@@ -320,7 +320,7 @@ def compare(
         raise _as_exception(stopped)
     document = pairs.compare(flown, plan.units, numbers)
     if not document["numbers"]:
-        raise BadInputError("no pair has one of the numbers; name another with numbers=[...]")
+        raise NothingFlownError("no pair has one of the numbers; name another with numbers=[...]")
     name, entry = next(iter(document["numbers"].items()))
     return Comparison(name, entry["p_wilcoxon"], entry["difference"], document)
 
@@ -354,8 +354,9 @@ def margin(
     from cloudrc.studies.search import ValueRange
 
     for name, value in (("largest", largest), ("resolution", resolution)):
-        if value is not None and not 0.0 < value < math.inf:
-            raise BadInputError(f"{name}: {value} is no finite number above 0")
+        if value is not None:
+            with naming(name):
+                Quantity(gt=0.0).of(value)
     seeds = _count(seeds, "seeds")
     work = Margin(Asked(key, of, _texts(settings or {}), seeds, largest, resolution))
     found: dict[str, ValueRange | None] = dict.fromkeys(QUESTIONS)
@@ -412,12 +413,14 @@ def verify(
     """
     from cloudrc.runs.links import verify as work
 
+    check_names("mode", [mode], ("local", "cluster"))
+    if seconds is not None:
+        with naming("seconds"):
+            SECONDS.of(seconds)
     if mode == "local":
         texts = _texts(settings or {})
         return work.verify(target, texts, shaper=shaper, seconds=seconds)
-    if mode != "cluster":
-        raise BadInputError(f"mode {mode!r}: give 'local' or 'cluster'")
-    limit = work.check_seconds(seconds) or work.RELEASE_TIMEOUT
+    limit = seconds or work.RELEASE_TIMEOUT
     require("mode cluster", ("kube",))
     from cloudrc.cluster.releases import choose_release
 

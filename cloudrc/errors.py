@@ -32,7 +32,7 @@ class PlacedError(ValueError):
 
 
 class NothingFlownError(BadInputError):
-    """No mission was flown in a session, so there is nothing to report."""
+    """Nothing was flown that could be shown, reported or compared."""
 
 
 class MissingPrerequisiteError(CloudrcError):

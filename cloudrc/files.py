@@ -8,7 +8,6 @@ from __future__ import annotations
 import grp
 import os
 import pwd
-import re
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -16,17 +15,8 @@ from io import BufferedReader, FileIO
 from pathlib import Path
 from typing import IO
 
-from cloudrc.errors import BadInputError
-
 SIZE_MAX = 1 << 20
 """Default size limit of a file that is read [bytes]: the size limit of a ConfigMap."""
-PICTURES = {
-    "png": re.compile(rb"\x89PNG\r\n\x1a\n"),
-    "svg": re.compile(rb"(<\?xml[^>]*>\s*)?<(!DOCTYPE )?svg\b"),
-    "pdf": re.compile(rb"%PDF-"),
-}
-"""Kind of a picture -> how its files begin."""
-_TOKEN = re.compile(rb"[!-~]{16,512}")
 
 
 class TooLongError(ValueError):
@@ -131,25 +121,6 @@ def warn_if_readable(path: Path, warn: Callable[[str], None]) -> None:
             )
 
 
-def read_token(path: Path, named: str) -> str:
-    """Read the token of teleop's API from a file.
-
-    If it has none, raise a BadInputError whose text begins with `named` and has no part of the
-    file.
-    """
-    try:
-        token = read(path).strip()
-        reason = "" if _TOKEN.fullmatch(token) else "a token is 16 to 512 visible ASCII characters"
-    except OSError as error:
-        reason = error.strerror or str(error)
-    except ValueError as error:
-        reason = str(error).removeprefix(f"{path}: ")
-    if reason:
-        make = f"(umask 077; openssl rand -hex 32 > {path})"
-        raise BadInputError(f"{named}: {reason}; make one: {make}")
-    return token.decode("ascii")
-
-
 @contextmanager
 def naming(place: Path | str) -> Iterator[None]:
     """Let an OSError that names no file, such as a full disk, name the `place` of the writing."""
@@ -186,21 +157,3 @@ def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
     """Replace a file in one step, with the permissions `mode` minus umask; may raise an OSError."""
     with atomic_file(path, mode) as file:
         file.write(data)
-
-
-def refuse_file(path: Path, flag: str = "-o") -> None:
-    """Raise a BadInputError if writing to `path` would replace a file that is not empty.
-
-    Writing to a device or a pipe replaces nothing. `flag` names another file, for the error.
-    """
-    if path.is_file() and path.stat().st_size:
-        raise BadInputError(f"{path}: already there; name another file with {flag}")
-
-
-def refuse_other_file(path: Path, own: re.Pattern[bytes], flag: str = "-o") -> None:
-    """Do as `refuse_file` for a file that does not begin as files of this kind do (`own`)."""
-    if path.is_file():
-        with path.open("rb") as file:
-            start = file.read(256)
-        if own.match(start) is None:
-            refuse_file(path, flag)

@@ -25,10 +25,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import CloudrcError
 from cloudrc.outside.code import calling, load_file
 from cloudrc.outside.patience import telling_if_slow
-from cloudrc.text import suggest_name, unknown_name_text
+from cloudrc.outside.refusal import check_names, naming
+from cloudrc.outside.values import InvalidValueError
+from cloudrc.text import suggest_name
 
 PACKAGES = {
     "estimators": "cloudrc.cloud.estimators",
@@ -88,12 +90,13 @@ class Found:
     def calling(self, name: str) -> Iterator[Callable[..., Any]]:
         """Give the function `name` to the block, which calls it and reads what it returns.
 
-        A failure in the block is the user's: it becomes a BadInputError with file and line.
+        A failure in the block is the user's, and gets file and line.
         """
         function = self.get(name)
         file = getattr(self._target, "__file__", None) or type(self._target).__name__
-        if function is None:
-            raise BadInputError(f"{file}: has no function {name}(); write one")
+        with naming(file):
+            if function is None:
+                raise InvalidValueError(f"has no function {name}(); write one")
         slow = "" if self.is_shipped else f"{name}() of {file} is still running"
         with calling(f"{file}: {name}() failed", slow=slow):
             yield function
@@ -131,16 +134,15 @@ def signature(kind: str, name: str) -> inspect.Signature:
     build = builder(kind, name)
     with calling(f"{one(kind)} {name!r} has a build() with annotations that cannot be read"):
         found = inspect.signature(build, eval_str=True)
-    if "name" in found.parameters:
-        raise BadInputError(
-            f"{one(kind)} {name!r}: no parameter of build() may be called name, because the key "
-            "name is the plug-in itself; call it something else"
-        )
+    with naming(f"{one(kind)} {name!r}"):
+        if "name" in found.parameters:
+            text = "no parameter of build() may be called name: the key name is the plug-in itself"
+            raise InvalidValueError(f"{text}; call it something else")
     return found
 
 
 def load(kind: str, name: str, /, **parameters: Any) -> Any:
-    """Find a plug-in and build it; raise a BadInputError if it is missing or its `build` fails."""
+    """Find a plug-in and build it."""
     build = builder(kind, name, look=False)
     slow = slow_text(kind, name, f"{name} is still being built")
     with calling(f"{one(kind)} {name!r} cannot be built", slow=slow):
@@ -183,9 +185,13 @@ def find(kind: str, name: str, *, look: bool = True) -> Found:
 
     With `look`, the caller only looks at what the file defines; it neither builds nor measures.
     """
-    if is_path(name) and not Path(name).is_file():
-        near = suggest_name(Path(name).name, _files_beside(Path(name)))
-        raise BadInputError(f"{one(kind)} {name!r}: there is no such file{near}")
+    if is_path(name):
+        with naming(f"{one(kind)} {name!r}"):
+            if not Path(name).is_file():
+                near = suggest_name(Path(name).name, _files_beside(Path(name)))
+                raise InvalidValueError(f"there is no such file{near}")
+    elif name not in _shipped(kind):
+        check_names(one(kind), [name], names(kind))
     with calling(f"{one(kind)} {name!r} cannot be imported"):
         if is_path(name):
             if (module := _module_of(Path(name))) is not None:
@@ -194,10 +200,8 @@ def find(kind: str, name: str, *, look: bool = True) -> Found:
         if name in _shipped(kind):
             return Found(importlib.import_module(f"{PACKAGES[kind]}.{name}"))
         # Last, because the search of all installed packages takes milliseconds.
-        if (entry := _installed(kind).get(name)) is not None:
-            with telling_if_slow(f"{name} is still being imported"):
-                return Found(entry.load())
-    raise BadInputError(unknown_name_text(one(kind), name, names(kind)))
+        with telling_if_slow(f"{name} is still being imported"):
+            return Found(_installed(kind)[name].load())
 
 
 def _files_beside(path: Path) -> list[str]:
@@ -211,22 +215,17 @@ def is_path(name: str) -> bool:
 
 
 def builder(kind: str, name: str, *, look: bool = True) -> Callable[..., Any]:
-    """Return the function `build` of a plug-in, to `look` at it or to call it.
-
-    Raise a BadInputError if there is none.
-    """
+    """Return the function `build` of a plug-in, to `look` at it or to call it."""
     build = find(kind, name, look=look).builder
-    if not callable(build):
-        raise BadInputError(
-            f"{one(kind)} {name!r} has no function build(); write one that returns the plug-in"
-        )
+    with naming(f"{one(kind)} {name!r}"):
+        if not callable(build):
+            raise InvalidValueError("has no function build(); write one that returns the plug-in")
     return build  # type: ignore[no-any-return]
 
 
 @cache
 def _shipped(kind: str) -> list[str]:
-    if kind not in PACKAGES:
-        raise BadInputError(unknown_name_text("kind of plug-in", kind, list(PACKAGES)))
+    check_names("kind of plug-in", [kind], PACKAGES)
     if not PACKAGES[kind]:
         return []
     modules = pkgutil.iter_modules(importlib.import_module(PACKAGES[kind]).__path__)

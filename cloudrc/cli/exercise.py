@@ -14,6 +14,8 @@ from shlex import quote
 
 from cloudrc.cli.output import format_document, print_or_drop, print_result
 from cloudrc.cli.parser import add_verbs
+from cloudrc.errors import BadInputError
+from cloudrc.outside.paths import check_there
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import require
 from cloudrc.text import escape
@@ -40,7 +42,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Write a student's files, or score the files in a folder; return 0 whatever the score."""
-    from cloudrc.exercise.files import check_folder, write_files
+    from cloudrc.exercise.files import write_files
 
     folder: Path = options.folder
     if options.verb == "new":
@@ -49,7 +51,7 @@ def execute(options: argparse.Namespace) -> int:
         print_or_drop(f"fill in {', '.join(names)} in {folder}, then: {command}")
         return 0
     for_gradescope = options.output == "gradescope"
-    check_folder(folder, may_be_empty=for_gradescope)
+    _check_folder(folder, may_be_empty=for_gradescope)
     require("a check", ("world",))
     interrupt_on_signals()
     from cloudrc.cli.progress import Progress
@@ -68,3 +70,20 @@ def execute(options: argparse.Namespace) -> int:
     else:
         print_result(options.output, result, score.as_text(result))
     return 0
+
+
+def _check_folder(folder: Path, *, may_be_empty: bool) -> None:
+    """Check that a folder has files of a student.
+
+    With `may_be_empty` it may have none, so that a hand-in without the files gets 0 points.
+    """
+    from cloudrc.exercise.files import FILES
+
+    if folder.is_file():
+        text = "is a file; if it is an archive, unpack it, and name the folder with the files"
+        raise BadInputError(f"{folder}: {text}")
+    check_there(folder, "'cloudrc class new' makes one")
+    names = FILES.values()
+    if not may_be_empty and not any((folder / name).exists() for name in names):
+        text = f"has none of {', '.join(names)}; name the folder that 'cloudrc class new' made"
+        raise BadInputError(f"{folder}: {text}")

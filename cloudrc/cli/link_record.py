@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from cloudrc.files import refuse_file
+from cloudrc.outside.paths import check_new
 
 EPILOG = """\
 sources:
@@ -50,7 +50,7 @@ def execute(options: argparse.Namespace) -> int:
         way: output.with_stem(f"{output.stem}-{way}") if len(found) > 1 else output for way in found
     }
     for path in paths.values():
-        refuse_file(path)
+        check_new(path)
     for way, packets in found.items():
         print("\n".join(write_trace_file(packets, paths[way], way)))
     return 0

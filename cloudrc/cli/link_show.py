@@ -10,8 +10,8 @@ from pathlib import Path
 
 from cloudrc.cli.output import print_line
 from cloudrc.cli.parser import number, read_seed, settings_from, whole_number
-from cloudrc.errors import BadInputError
-from cloudrc.files import PICTURES, naming, refuse_other_file
+from cloudrc.files import naming
+from cloudrc.outside.paths import check_picture
 from cloudrc.runs.requirements import require
 from cloudrc.text import escape
 
@@ -48,9 +48,7 @@ def execute(options: argparse.Namespace) -> int:
     """Write a picture of a profile; print statistics and, in the last line, the file's path."""
     require("a picture of a link", ("report",))
     output = options.output or Path(f"{Path(options.profile).stem}.png")
-    if output.suffix[1:] not in PICTURES:
-        raise BadInputError(f"-o {output}: not a picture; end its name in .png, .svg or .pdf")
-    refuse_other_file(output, PICTURES[output.suffix[1:]])
+    check_picture(output, "-o")
     from cloudrc.cli.progress import Progress
 
     with closing(Progress(f"reads {options.profile}")) as view:

@@ -76,14 +76,13 @@ def execute(options: argparse.Namespace) -> int:
 def _verify(options: argparse.Namespace, tell: Callable[[str], None]) -> Report:
     from cloudrc.runs.links.verify import (
         RELEASE_TIMEOUT,
-        check_seconds,
         forwarded_pods,
         pods_at,
         verify,
         verify_release,
     )
 
-    limit = check_seconds(options.seconds) or RELEASE_TIMEOUT
+    limit = options.seconds or RELEASE_TIMEOUT
     if options.ends:
         hosts = options.ends.split(",")
         if len(hosts) != 2 or not all(hosts):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import os
 import sys
 from collections.abc import Sequence
@@ -24,6 +25,9 @@ from cloudrc.runs.requirements import name_extra
 from cloudrc.text import escape
 
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
+
+NO_LISTENING = errno.EADDRINUSE, errno.EADDRNOTAVAIL
+"""Error numbers of an address at which a program cannot listen."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -81,7 +85,10 @@ def _explain(error: Exception) -> tuple[str, int]:
         return str(error).rstrip(), error.exit_code  # one line, or one per wrong key
     if isinstance(error, OSError) and error.errno not in (*DISK_FULL, *TOO_MANY_FILES):
         text, remedy = str(error.strerror or error), "'--debug' shows where"
-        if error.filename:
+        if error.filename and error.errno in NO_LISTENING:
+            text = f"{error.filename}: {text}"
+            remedy = "name an address of this machine, and a port that is free"
+        elif error.filename:
             text = f"{error.filename}: {text}"
             remedy = f"check the path, and whether you have access to it ({remedy})"
         return f"{text}; {remedy}", BadInputError.exit_code

@@ -35,10 +35,10 @@ def execute(options: argparse.Namespace) -> int:
     require("a recovery", ("record",))
     from cloudrc.cli.progress import Progress
     from cloudrc.record.columns import Recording
-    from cloudrc.runs.session import refuse_under_way
+    from cloudrc.runs.session import check_ended
 
     source: Path = options.file
-    refuse_under_way(source.resolve().parent)
+    check_ended(source.resolve().parent)
     target = options.to or source.parent / f"{source.stem}.recovered{source.suffix}"
     if os.path.lexists(target):
         raise BadInputError(f"{target}: already there; name another file with --to")

@@ -8,6 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 from cloudrc.cli.output import open_page, print_line
+from cloudrc.outside.paths import check_new
 from cloudrc.runs.requirements import require
 
 EPILOG = """\
@@ -26,6 +27,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Write the page, open it in the browser, and print its path."""
+    if options.out is not None:
+        check_new(options.out, "name another file with --out")
     require("a replay", ("world", "record", "console"))
     from cloudrc.cli.progress import Progress
     from cloudrc.runs.replay import write_replay

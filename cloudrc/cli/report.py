@@ -66,12 +66,12 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.report.figures.style import Look
     from cloudrc.report.folder import read_run
     from cloudrc.report.write import write_report
-    from cloudrc.runs.session import refuse_under_way, restore_mission
+    from cloudrc.runs.session import check_ended, restore_mission
 
     metrics.check(options.metric)
     look = Look(options.width, options.font_size)
     with closing(Progress(f"reads the recording of {options.run}")) as view:
-        refuse_under_way(options.run)
+        check_ended(options.run)
         restore_mission(options.run)
         recording, experiment, run = read_run(options.run)
         # The run may come from somebody else: never execute files that it names.

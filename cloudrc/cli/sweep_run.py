@@ -22,8 +22,9 @@ from cloudrc.cli.parser import FLIGHTS_MAX
 from cloudrc.cli.progress import Progress, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
-from cloudrc.files import PICTURES, refuse_other_file, write_atomically
+from cloudrc.files import write_atomically
 from cloudrc.metrics.verdict import EXIT_CODES
+from cloudrc.outside.paths import check_picture
 from cloudrc.runs.experiment import check_mode
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.requirements import MODES, require
@@ -157,16 +158,21 @@ def draw_figure(options: argparse.Namespace) -> int:
     from cloudrc.report.figures.style import Look
     from cloudrc.studies.figure import draw_sweep
 
+    if options.x is not None and options.x == options.by:
+        raise BadInputError(f"--x and --by are both {options.x}; name two axes, or leave one out")
     look = Look(options.width, options.font_size)
     with closing(Progress(f"draws {options.folder}")):
         found = sweep.read_flights(options.folder)
+        if not any(row["point"] for row in found.rows):
+            text = "this sweep has no axis; give its file a grid, or see its metrics in table.csv"
+            raise BadInputError(f"{options.folder}: {text}")
         shown = options.number, options.x, options.by
         files, caption = draw_sweep(found.rows, found.units, *shown, look)
     out = options.out or options.folder / "figure"
     stem = out.stem if out.suffix.removeprefix(".") in files else out.name
     paths = {kind: out.with_name(f"{stem}.{kind}") for kind in files}
-    for kind, path in paths.items():
-        refuse_other_file(path, PICTURES[kind], flag="--out")
+    for path in paths.values():
+        check_picture(path, "--out")
     print_or_drop(caption + (f" {found.missing}." if found.missing else "") + "\n")
     for kind, path in paths.items():
         write_atomically(path, files[kind])

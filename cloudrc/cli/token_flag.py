@@ -13,7 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cloudrc.cli.output import print_line
-from cloudrc.files import read_token, warn_if_readable
+from cloudrc.files import warn_if_readable
+from cloudrc.outside.paths import read_token
 from cloudrc.teleop.client import VARIABLE
 
 

@@ -16,11 +16,11 @@ from cloudrc.cluster.client import NotFoundError, Release, run
 from cloudrc.cluster.jobs import owner_of
 from cloudrc.cluster.pods import find_deployment
 from cloudrc.config.hull import hull_of
+from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment, local_files
 from cloudrc.config.robot import files_of, find_robot
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import ROBOT_FILE, is_path
-from cloudrc.errors import BadInputError
 from cloudrc.geometry.model_files import model_files
 
 SCENE_FILE = "scene.xml"
@@ -37,14 +37,12 @@ def find_own_files(world: World) -> dict[str, dict[str, Path]]:
     Returns:
         "robot" or "scene" -> key in the ConfigMap -> file. The subfolders of a robot's folder are
         left out, unless the robot needs a file in them.
-
-    Raises:
-        BadInputError: If a ConfigMap cannot hold the files.
     """
     found = dict[str, dict[str, Path]]()
     if world.robot.endswith(".xml"):
         text = f"a cluster takes a folder with {ROBOT_FILE}, not a model alone; write one beside it"
-        raise BadInputError(f"world.robot: {world.robot}: {text}: model: {Path(world.robot).name}")
+        named = f"{text}: model: {Path(world.robot).name}"
+        raise problem_at("world.robot", f"{world.robot}: {named}")
     if is_path(world.robot):
         folder = Path(world.robot)
         found["robot"] = {path.name: path for path in folder.iterdir() if path.is_file()}
@@ -60,34 +58,34 @@ def find_own_files(world: World) -> dict[str, dict[str, Path]]:
 
 
 def _check(key: str, folder: Path, needed: set[Path], files: Mapping[str, Path]) -> None:
-    """Refuse what a ConfigMap cannot hold; `needed` files must be in `folder` itself, or linked."""
+    """Check that a ConfigMap can hold the files; it has those in `folder` alone, or linked."""
     here = {path.resolve() for path in files.values()}
     if elsewhere := sorted({path.resolve() for path in needed} - here):
         text = f"needs {elsewhere[0]}, but a ConfigMap has no folders"
-        raise BadInputError(f"{key}: {text}; put the file into {folder}, {REMEDY}")
+        raise problem_at(key, f"{text}; put the file into {folder}, {REMEDY}")
     if (total := sum(path.stat().st_size for path in files.values())) > SIZE_MAX:
         text = f"has {total} bytes, but a ConfigMap takes {SIZE_MAX} (1 MiB)"
-        raise BadInputError(f"{key}: {folder}: {text}; move what is not needed, {REMEDY}")
+        raise problem_at(key, f"{folder}: {text}; move what is not needed, {REMEDY}")
 
 
 def _check_size(name: str) -> None:
-    """Refuse a robot without a size, because the cloud pod has no MuJoCo to measure the model."""
+    """Check that a robot has a size, because the cloud pod has no MuJoCo to measure the model."""
     robot = find_robot(name)
     if robot.hull is None and robot.hull_points is None:
         radius = float(hull_of(name).radii[0])
         text = f"in a cluster a robot needs its size; add the line hull_m: {radius + 0.0005:.3f}"
-        raise BadInputError(f"world.robot: {Path(name) / ROBOT_FILE}: {text}")
+        raise problem_at("world.robot", f"{Path(name) / ROBOT_FILE}: {text}")
 
 
 def check_local_files(values: Mapping[str, Any], remedy: str) -> None:
-    """Refuse the path of a local file in `values`; `remedy` is the end of the error's text."""
+    """Check that `values` have no path of a local file; `remedy` is the end of the error's text."""
     for key, path in local_files(values).items():
         text = f"the pods do not have this file; build it into an image, {remedy}"
-        raise BadInputError(f"{key}: {path}: {text}")
+        raise problem_at(key, f"{path}: {text}")
 
 
 def check_experiment(experiment: ResolvedExperiment) -> None:
-    """Refuse an experiment that needs files that the cluster cannot get, or that has random steps.
+    """Check that a cluster can get the files of an experiment, and that it has no random steps.
 
     Files of the user's metrics are allowed, because this machine evaluates the metrics. The file of
     the link profile is allowed, because the experiment contains its values.
@@ -97,10 +95,8 @@ def check_experiment(experiment: ResolvedExperiment) -> None:
     flown = experiment.model_dump(mode="json", exclude=sent)
     check_local_files(flown, "or fly with --mode local")
     if experiment.mission.steps is not None:  # the API takes waypoints alone
-        raise BadInputError(
-            "mission.steps: a mission in a cluster has waypoints; fly steps with --mode local "
-            "or --mode virtual"
-        )
+        text = "a mission in a cluster has waypoints; fly steps with --mode local or --mode virtual"
+        raise problem_at("mission.steps", text)
 
 
 def send_own_files(release: Release, found: Mapping[str, Mapping[str, Path]]) -> dict[str, str]:

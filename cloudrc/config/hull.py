@@ -12,6 +12,7 @@ from cloudrc.config.robot import RobotFiles, known_robot
 from cloudrc.config.shipped import ROBOT_FILE
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry.clearance import Spheres, ball
+from cloudrc.outside.refusal import naming
 from cloudrc.outside.reuse import reuse
 from cloudrc.outside.values import RESULT
 
@@ -49,7 +50,9 @@ def doubts(name: str) -> Iterator[str]:
     robot = known_robot(name)
     if robot.hull is None or robot.hull_points is not None:
         return
-    if robot.hull < (reach := reach_of(robot.model)) - TOLERANCE:
+    with naming(f"robot {name}"):
+        reach = reach_of(robot.model)
+    if robot.hull < reach - TOLERANCE:
         text = f"hull_m is {robot.hull:g}, but the geoms reach {reach:.3f} m from the base"
         yield f"{name}/{ROBOT_FILE}: {text}"
 
@@ -66,7 +69,8 @@ def _read_hull(name: str, robot: RobotFiles) -> Spheres:
         )
     from cloudrc.sim.bodies import reach_of
 
-    return ball(reach_of(robot.model))
+    with naming(f"robot {name}"):
+        return ball(reach_of(robot.model))
 
 
 def _spheres(file: plugins.Found) -> Spheres:

@@ -8,10 +8,11 @@ error lists all problems of an experiment, each with its file and line.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from math import inf
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from pydantic import (
@@ -193,6 +194,16 @@ def read_experiment(
     `load_experiment`.
     """
     return load_experiment(name, settings, build=False, flown=flown)
+
+
+def read_attached(attachments: Mapping[str, bytes], recording: str) -> ResolvedExperiment:
+    """Read the experiment that is attached to a recording with this name."""
+    if (data := attachments.get("config.yaml")) is None:
+        raise BadInputError(f"{recording}: its config.yaml is lost; name the folder of the run")
+    with TemporaryDirectory() as folder:
+        config = Path(folder) / "config.yaml"
+        config.write_bytes(data)
+        return read_experiment(config, flown=True)
 
 
 def load_link(file: Path, experiment: Path) -> Profile:

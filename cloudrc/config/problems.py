@@ -227,6 +227,11 @@ class ProblemsError(BadInputError):
         return "; ".join(map(str, self.problems))
 
 
+def problem_at(key: str, reason: str) -> ProblemsError:
+    """Return the error about the value of a key, such as "world.robot"."""
+    return ProblemsError([ConfigProblem(tuple(key.split(".")), "", reason)])
+
+
 def from_pydantic(
     error: ValidationError, model: type[BaseModel], prefix: KeyPath = (), limit: int | None = None
 ) -> list[ConfigProblem]:

@@ -10,6 +10,7 @@ from cloudrc.config.schema import World
 from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.geometry.scene import Scene, load_scene
+from cloudrc.outside.refusal import naming
 from cloudrc.outside.reuse import reuse
 
 
@@ -23,12 +24,13 @@ def scene_of(world: World) -> Scene:
 
 
 def _read(world: World) -> Scene:
-    scene = load_scene(world.scene, world.fence_m)
-    if scene.path is None or find_spec("mujoco") is None:
-        return scene
-    from cloudrc.sim.bodies import complete
+    with naming("world.scene"):
+        scene = load_scene(world.scene, world.fence_m)
+        if scene.path is None or find_spec("mujoco") is None:
+            return scene
+        from cloudrc.sim.bodies import complete
 
-    return complete(scene)
+        return complete(scene)
 
 
 def steered_in(world: World) -> Fence:

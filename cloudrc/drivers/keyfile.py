@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from cloudrc.errors import BadInputError
-from cloudrc.files import read, version, write_atomically
+from cloudrc.errors import CloudrcError
+from cloudrc.files import version, write_atomically
+from cloudrc.outside.paths import read_secret
 from cloudrc.records import Fault
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeyRing, KeySet, parse, write
 
@@ -40,7 +41,7 @@ class KeyFile:
         self._seen = seen
         try:
             keys = read_keys(self._path)
-        except BadInputError as error:
+        except CloudrcError as error:
             return [Fault(now_ns, "key", f"the old keys stay in use: {error}")]
         if keys == before:
             return []
@@ -51,18 +52,8 @@ class KeyFile:
 
 
 def read_keys(path: Path, named: str = "--key ") -> KeySet:
-    """Read a key file; never block, even if the file is a pipe.
-
-    If the file contains no valid key, raise a BadInputError whose text begins with `named` (the
-    command-line flag of `path`) and contains no part of the file.
-    """
-    try:
-        return parse(read(path, SIZE_MAX))
-    except OSError as error:
-        reason = error.strerror or str(error)
-    except ValueError as error:
-        reason = str(error).removeprefix(f"{path}: ")
-    raise BadInputError(f"{named}{path}: {reason}; make one: cloudrc key new FILE")
+    """Read a key file, as `read_secret` does; `named` is the command-line flag of `path`."""
+    return read_secret(path, f"{named}{path}", parse, "cloudrc key new FILE", SIZE_MAX)
 
 
 def make_or_rotate(path: Path) -> KeySet:

@@ -17,7 +17,8 @@ from contextlib import suppress
 from typing import IO, Any, NamedTuple
 
 from cloudrc.drivers.machine import interpreter
-from cloudrc.errors import BadInputError, InvalidRunError, MissingPrerequisiteError
+from cloudrc.errors import InvalidRunError, MissingPrerequisiteError
+from cloudrc.files import naming
 from cloudrc.link.exec import namespace
 from cloudrc.link.exec.holder import END_LIMIT
 
@@ -204,13 +205,8 @@ class Forwarder(socketserver.ThreadingTCPServer):
     def __init__(self, end: ProgramEnd, port: int) -> None:
         """Listen at `port` on 127.0.0.1, on threads of its own."""
         self._end, self._port = end, port
-        try:
+        with naming(f"--expose {port}"):
             super().__init__(("127.0.0.1", port), _Forwarded)
-        except OSError as error:
-            raise BadInputError(
-                f"--expose {port}: cannot listen at 127.0.0.1:{port}:"
-                f" {os.strerror(error.errno or 0)}; end what listens there"
-            ) from None
         threading.Thread(target=self.serve_forever, args=(0.1,), daemon=True).start()
 
     def close(self) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import CloudrcError
 from cloudrc.eval.environment import environment_code, find_module
 from cloudrc.eval.setup import (
     BARE,
@@ -30,6 +30,7 @@ from cloudrc.gym import Networked
 from cloudrc.gym.step import StepTime, find_step
 from cloudrc.gym.values import size_of
 from cloudrc.outside.code import calling
+from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import RESULT, InvalidValueError, shorten, to_arrays, to_boolean
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
@@ -162,7 +163,7 @@ def _ages(name: str, loop: Mapping[str, Any]) -> dict[str, float]:
 
 @contextmanager
 def make_env(setup: EvalSetup, seed: int) -> Iterator[gymnasium.Env[Any, Any]]:
-    """Make the environment of an episode; raise a BadInputError if it fails, also in the block."""
+    """Make the environment of an episode; its failure in the block is the user's."""
     words = {key: seed if value == SEED else value for key, value in setup.env_args}
     what = f"--env {setup.env}"
     with calling(what, keep=CloudrcError, slow=f"{what} is still being made"):
@@ -228,14 +229,14 @@ class _Policy:
 
 
 def width_of(space: spaces.Space[Any]) -> int:
-    """Return the number of values of an action; raise a BadInputError for a space without one."""
+    """Return the number of values of an action; raise an InvalidValueError if it has none."""
     if isinstance(space, spaces.Box | spaces.MultiDiscrete | spaces.MultiBinary):
         return int(np.prod(space.shape))
     if isinstance(space, spaces.Discrete):
         return 1
-    raise BadInputError(
-        f"--env: its actions are {type(space).__name__}, which no policy's chunk has; use an "
-        "environment whose actions are numbers"
+    raise InvalidValueError(
+        f"its actions are {type(space).__name__}, which no policy's chunk has; use an environment "
+        "whose actions are numbers"
     )
 
 
@@ -349,14 +350,13 @@ class CheckedEnvironment(NamedTuple):
 def check_environment(setup: EvalSetup, episodes: list[Episode]) -> CheckedEnvironment:
     """Return what is known about the environment.
 
-    Raise a BadInputError if environment, policy file or executors cannot be used.
-
     The call comes before a folder is made. A server is not asked.
     """
     with make_env(setup, 1) as env:
-        width_of(env.action_space)
+        with naming(f"--env {setup.env}"):
+            width_of(env.action_space)
+            step = find_step(env, setup.dt, setup.mean_compute)
         code = environment_code(env, setup)
-        step = find_step(env, setup.dt, setup.mean_compute)
         for executor in dict.fromkeys(each.executor for each in episodes):
             wait = setup.answer_within
             _Network(env, dt=setup.dt, chunk=1, executor=executor, answer_within=wait)

@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import TypeAlias
 from xml.etree import ElementTree
 
-from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import Corners, Fence, order_of
 from cloudrc.geometry.solids import Solid
 from cloudrc.messages import Vector
+from cloudrc.outside.values import ANY, InvalidValueError
 
 Numerics: TypeAlias = dict[str, str]
 """Name of a `<numeric>` -> its data."""
@@ -84,19 +84,19 @@ def is_obstacle(body: str, *, touch: str | None) -> bool:
 def load_scene(name: str, corners: Corners | None = None) -> Scene:
     """Read a scene by the path of an .xml file, or a shipped scene by its file name without .xml.
 
-    `corners` [m] replace those of the scene's fence. Raise a BadInputError if the file does not
-    exist, or if its numbers do not have the form in the table at the top of this module.
+    `corners` [m] replace those of the scene's fence. Raise an InvalidValueError if the file does
+    not exist, or if its numbers do not have the form in the table at the top of this module.
     """
     is_shipped = not name.endswith(".xml")
     path = SCENES / f"{name}.xml" if is_shipped else Path(name)
     try:
         scene = _read(_parse(path), path, is_shipped=is_shipped)
     except OSError as error:
-        raise BadInputError(f"scene {path.name}: cannot be read: {error.strerror}") from error
+        raise InvalidValueError(f"scene {path.name}: cannot be read: {error.strerror}") from error
     except ElementTree.ParseError as error:
-        raise BadInputError(f"scene {path.name}: not readable as XML: {error}") from error
+        raise InvalidValueError(f"scene {path.name}: not readable as XML: {error}") from error
     except (ValueError, RecursionError) as error:
-        raise BadInputError(f"scene {path.name}: {error}") from None
+        raise InvalidValueError(f"scene {path.name}: {error}") from None
     return replace(scene, own_fence=Fence(*corners)) if corners else scene
 
 

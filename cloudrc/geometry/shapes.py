@@ -16,7 +16,7 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.errors import BadInputError
+from cloudrc.outside.values import InvalidValueError
 
 Array: TypeAlias = NDArray[np.float64]
 Rgba: TypeAlias = tuple[float, float, float, float]
@@ -95,12 +95,12 @@ class Shapes:
 
     @staticmethod
     def from_bytes(data: bytes) -> Shapes:
-        """Read shapes from the content of a file; raise a BadInputError if it is not readable."""
+        """Read shapes from the content of a file; may raise an InvalidValueError."""
         try:
             with np.load(BytesIO(data), allow_pickle=False) as file:
                 return _read({name: file[name] for name in file.files})
         except _UNREADABLE as error:
-            raise BadInputError(f"{SHAPES_FILE} is not readable") from error
+            raise InvalidValueError(f"{SHAPES_FILE} is not readable") from error
 
 
 def _read(file: dict[str, NDArray[Any]]) -> Shapes:

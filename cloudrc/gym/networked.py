@@ -10,7 +10,6 @@ from typing import Any, Unpack
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
-from cloudrc.errors import BadInputError
 from cloudrc.gym.options import (
     Options,
     Profile,
@@ -23,7 +22,8 @@ from cloudrc.gym.options import (
 )
 from cloudrc.gym.step import find_step
 from cloudrc.gym.values import checker, copied
-from cloudrc.outside.values import to_arrays
+from cloudrc.outside.refusal import naming
+from cloudrc.outside.values import InvalidValueError, to_arrays
 
 
 class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -49,6 +49,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     _warns = True
     _left = inf  # steps until a wrapper outside ends the episode
 
+    @naming("Networked")
     def __init__(
         self,
         env: gymnasium.Env[Any, Any],
@@ -85,7 +86,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             cloudrc.errors.BadInputError: If a value cannot be used; the text says what to change.
         """
         if not isinstance(env, gymnasium.Env):
-            raise BadInputError(
+            raise InvalidValueError(
                 f"env is {type(env).__name__}: give an environment of gymnasium, as "
                 "gymnasium.make returns it; for a vector there is NetworkedVector"
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias, TypedDict, cast
@@ -12,14 +12,12 @@ import gymnasium
 from gymnasium.vector.utils import batch_space, iterate
 
 from cloudrc import plugins
-from cloudrc.errors import BadInputError
 from cloudrc.gym.executors import Executor
 from cloudrc.gym.loop import RemoteLoop, Settings
 from cloudrc.gym.values import checker, copied, neutral, size_of
 from cloudrc.link.library import LinkProfile, read_profile
-from cloudrc.outside.refusal import naming
+from cloudrc.outside.refusal import check_names, naming
 from cloudrc.outside.values import InvalidValueError, Quantity
-from cloudrc.text import suggest_name
 
 Profile: TypeAlias = str | Path | Mapping[str, Any] | LinkProfile
 SIZE = Quantity("bytes", 0, 1_000_000_000, whole=True)
@@ -55,22 +53,10 @@ ARGUMENTS = ("env", "link", "seed", "dt", "stream", *Options.__annotations__)
 """Names of the arguments of `Networked` and `NetworkedVector`."""
 
 
-def refuse_unknown(
-    what: str, given: Iterable[str], known: Sequence[str] = ARGUMENTS, more: str = ""
-) -> None:
-    """Raise a BadInputError if one of the `given` names is none of the `known` arguments."""
-    for name in given:
-        if name not in known:
-            near = suggest_name(name, [*known])
-            there = f"there are {', '.join(known)}{more}{near}"
-            raise BadInputError(f"{what} has no argument {name!r}; {there}")
-
-
 def read_options(what: str, given: Options) -> Options:
-    """Read the options of an environment; raise a BadInputError that says what is wrong."""
-    refuse_unknown(what, given)
-    if (hold := given.get("hold", "repeat")) not in ("repeat", "start"):
-        raise BadInputError(f"hold {hold!r}: give 'repeat' or 'start'")
+    """Read the options of the environment `what`."""
+    check_names(f"argument of {what}", given, ARGUMENTS)
+    check_names("hold", [given.get("hold", "repeat")], ("repeat", "start"))
     read = dict(given)
     for name, (quantity, wanted) in COUNTS.items():
         if read.get(name) is not None:
@@ -148,9 +134,9 @@ def compute_times(compute: float | tuple[float, float]) -> tuple[float, float]:
 
 
 def warn(texts: Iterable[str]) -> None:
-    """Warn the caller of the caller."""
+    """Warn who calls the constructor, which has a decorator, that calls this."""
     for text in texts:
-        warnings.warn(text, stacklevel=3)
+        warnings.warn(text, stacklevel=4)
 
 
 def answer_space(
@@ -177,7 +163,7 @@ def describe_answer(chunk: int | None) -> str:
 
 
 def find_executor(name: str | Path, *, chunked: bool) -> tuple[Executor, bool]:
-    """Build an executor by name or path; raise a BadInputError if it does not fit.
+    """Build an executor by name or path.
 
     Also return whether cloudrc ships it, so that its actions need no judge.
     """
@@ -185,14 +171,11 @@ def find_executor(name: str | Path, *, chunked: bool) -> tuple[Executor, bool]:
     if not plugins.is_path(found):
         found = found.replace("-", "_")
     executor = plugins.load("executors", found)
-    if not isinstance(executor, Executor):
-        raise BadInputError(
-            f"executor {found!r}: build() returned {type(executor).__name__}; return an Executor "
-            "of cloudrc.gym.executors"
-        )
-    if executor.needs_chunk and not chunked:
-        raise BadInputError(
-            f"executor {found!r} plays chunks of actions: give chunk=, the number of actions in "
-            "an answer"
-        )
+    with naming(f"executor {found!r}"):
+        if not isinstance(executor, Executor):
+            returned = f"build() returned {type(executor).__name__}"
+            raise InvalidValueError(f"{returned}; return an Executor of cloudrc.gym.executors")
+        if executor.needs_chunk and not chunked:
+            text = "plays chunks of actions: give chunk=, the number of actions in an answer"
+            raise InvalidValueError(text)
     return executor, plugins.find("executors", found).is_shipped

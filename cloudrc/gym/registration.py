@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
 
-from cloudrc.errors import BadInputError
 from cloudrc.gym.networked import Networked
-from cloudrc.gym.options import refuse_unknown
+from cloudrc.gym.options import ARGUMENTS
 from cloudrc.gym.vector import NetworkedVector
+from cloudrc.outside.refusal import check_names, naming
+from cloudrc.outside.values import InvalidValueError
 
 NAME = "cloudrc/Networked-v0"
 IDS: dict[str, dict[str, Any]] = {
@@ -47,7 +49,7 @@ def make(
 
     `env_args` are arguments of the environment, all others those of `Networked`.
     """
-    with _Told(env, networked):
+    with _telling(env, networked):
         inner = gymnasium.make(env, render_mode=render_mode, **(env_args or {}))
     return Networked(inner, **networked)
 
@@ -56,24 +58,18 @@ def make_vec(
     env: str = "", num_envs: int = 1, env_args: Mapping[str, Any] | None = None, **networked: Any
 ) -> NetworkedVector:
     """Make `num_envs` environments `env`, each behind a link of its own."""
-    with _Told(env, networked):
+    with _telling(env, networked):
         inner = gymnasium.make_vec(env, num_envs, **(env_args or {}))
     return NetworkedVector(inner, **networked)
 
 
-class _Told:
-    """Refuse arguments that do not exist; convert gymnasium's error about an environment."""
-
-    def __init__(self, env: str, networked: Iterable[str]) -> None:
-        more = "; those of the environment go into env_args, a mapping"
-        refuse_unknown(NAME, networked, more=more)
-        if not env:
-            raise BadInputError(f"{NAME}: give env=, the name of an environment")
-        self._env = env
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: object, error: BaseException | None, stack: object) -> None:
-        if isinstance(error, gymnasium.error.Error):
-            raise BadInputError(f"env {self._env!r}: {error}") from error
+@contextmanager
+def _telling(env: str, networked: Iterable[str]) -> Iterator[None]:
+    """Check the names of arguments; convert gymnasium's error about the environment `env`."""
+    what = f"argument of {NAME} (those of the environment go into env_args)"
+    check_names(what, networked, ARGUMENTS)
+    with naming(f"env {env!r}"):
+        try:
+            yield
+        except gymnasium.error.Error as error:
+            raise InvalidValueError(str(error)) from error

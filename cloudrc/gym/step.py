@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import gymnasium
 from gymnasium.vector import AsyncVectorEnv, VectorWrapper
 
-from cloudrc.errors import BadInputError
 from cloudrc.gym.options import compute_times
 from cloudrc.outside.values import ANY, InvalidValueError
 
@@ -47,7 +46,7 @@ def find_step(
     """Return the time of a step of an environment, or of the first of a vector, unless `given` [s].
 
     What tells control is preferred to `dt` and `tau`, and these to the rate of a film. `compute` is
-    the time for an answer [s], or its mean and its deviation. Raise a BadInputError if nothing
+    the time for an answer [s], or its mean and its deviation. Raise an InvalidValueError if nothing
     tells the time of a step, or if what tells it may mean a part of a step.
     """
     *wrappers, bare = _layers(env)
@@ -55,7 +54,7 @@ def find_step(
     if given is None:
         time, source = _own_step(wrappers, bare, told)
     elif isnan(time := _seconds("dt", given)):
-        raise BadInputError(f"the environment has the time step {given!r}; {WAY}")
+        raise InvalidValueError(f"the environment has the time step {given!r}; {WAY}")
     else:
         source = "given"
     found, (mean, _) = list[str](), compute_times(compute)
@@ -76,20 +75,22 @@ def find_step(
 def _own_step(wrappers: list[Any], bare: Any, told: Mapping[str, float]) -> tuple[float, str]:
     """Return the time of a step that an environment tells [s], and by which name."""
     if isinstance(bare, AsyncVectorEnv):
-        raise BadInputError(f"environments in other processes do not tell their time step; {WAY}")
+        raise InvalidValueError(
+            f"environments in other processes do not tell their time step; {WAY}"
+        )
     who = type(bare.unwrapped).__name__
     for each in filter(_repeats, wrappers):
-        raise BadInputError(f"a step of {type(each).__name__} is several steps of {who}; {WAY}")
+        raise InvalidValueError(f"a step of {type(each).__name__} is several steps of {who}; {WAY}")
     name, time = next(iter(told.items()), ("", nan))
     if isnan(time):
-        raise BadInputError(f"the environment {who} has no time step; {WAY}")
+        raise InvalidValueError(f"the environment {who} has no time step; {WAY}")
     own, frames = told.get("dt", nan), told.get("render_fps", nan) / time
     longer = [each for each in CONTROL if abs(told.get(each, nan) / own - 1.0) > DIFFERENCE]
     if name in ("dt", "tau") and frames > 1.5 and abs(remainder(frames, 1.0)) < FRAME_ROUNDING:
         longer.append("render_fps")
     if longer:
         all_told = ", ".join(f"{name} says {time:.4g} s" for name, time in told.items())
-        raise BadInputError(f"{who}: {all_told}; {WAY}; it may be {told[longer[0]]:.4g}")
+        raise InvalidValueError(f"{who}: {all_told}; {WAY}; it may be {told[longer[0]]:.4g}")
     return time, f"{name} of {who}" + ", a film's rate" * (name == "render_fps")
 
 

@@ -24,9 +24,8 @@ from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Link
 from cloudrc.drivers.virtual import VirtualRun
-from cloudrc.errors import BadInputError
-from cloudrc.gym.options import refuse_unknown
 from cloudrc.messages import Datagram, Odometry, Setpoint
+from cloudrc.outside.refusal import check_names, naming
 from cloudrc.outside.values import RESULT, InvalidValueError
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Run
@@ -149,15 +148,17 @@ class RobotEnv(gymnasium.Env[Any, Any]):
             robot: Name of a shipped robot, or path; None: that of the experiment.
             settings: Further changes, as with `--set`: key -> value. The link is always ideal.
             render_mode: None; a flight is drawn by its report.
-            unknown: Is refused, with the nearest name.
+            unknown: Is an error, with the nearest name.
         """
-        refuse_unknown("RobotEnv", unknown, ("experiment", "robot", "settings", "render_mode"))
+        known = "experiment", "robot", "settings", "render_mode"
+        check_names("argument of RobotEnv", unknown, known)
         require("a robot of the testbed as an environment", SIM)
         for key in settings or {}:
-            if key.partition(".")[0] == "link":
-                raise BadInputError(f"{key}: the network is that of the wrapper Networked")
-            if key in OWN:
-                raise BadInputError(f"{key}: the policy stands in its place; leave it out")
+            with naming(key):
+                if key.partition(".")[0] == "link":
+                    raise InvalidValueError("the network is that of the wrapper Networked")
+                if key in OWN:
+                    raise InvalidValueError("the policy stands in its place; leave it out")
         texts = {**(settings or {}), **OWN, **({"world.robot": robot} if robot else {})}
         self.render_mode = render_mode
         loaded = load_experiment(
@@ -207,15 +208,13 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         return observation, -distance, ended, late, info
 
     def _numbers_of(self, action: Any) -> tuple[float, ...]:
-        try:
+        with naming("action", ", ".join(self._parts)):
             return RESULT.row(action, len(self._parts))
-        except InvalidValueError as error:
-            raise BadInputError(f"action {error}: {', '.join(self._parts)}") from None
 
     def __getstate__(self) -> object:
-        """Return the state for a copy; refuse it in flight, whose tunnel has keys in C objects."""
+        """Return the state for a copy; none in flight, whose tunnel has keys in C objects."""
         if self.flight is not None:
-            raise BadInputError(
+            raise TypeError(
                 "a flight of the testbed cannot be copied; reset another environment with the same "
                 "seed and give it the same actions: it flies the same path"
             )

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from cloudrc.errors import BadInputError
-from cloudrc.outside.values import RESULT, shorten, to_arrays
+from cloudrc.outside.refusal import naming
+from cloudrc.outside.values import RESULT, InvalidValueError, shorten, to_arrays
 
 _PLAIN = (int, float, bool, str, np.generic, type(None))
 
@@ -56,14 +56,14 @@ def neutral(space: spaces.Space[Any]) -> Any:
         return {key: neutral(each) for key, each in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
         return tuple(neutral(each) for each in space.spaces)
-    raise BadInputError(
+    raise InvalidValueError(
         f"{type(space).__name__} has no neutral action; give start=, the action before the first "
         "answer"
     )
 
 
 def checker(space: spaces.Space[Any], what: str) -> Callable[[Any], None]:
-    """Return a function that raises a BadInputError if an action is none of the space.
+    """Return a function that raises an error if an action is none of the space.
 
     It does not look at the bounds of a `Box`: the environment decides about them, and many clip.
     `what` says in words what an action is.
@@ -73,13 +73,13 @@ def checker(space: spaces.Space[Any], what: str) -> Callable[[Any], None]:
 
 # A function of this module and no closure: an environment that has it can be pickled.
 def _check(space: spaces.Space[Any], what: str, action: Any) -> None:
-    try:
-        _judge(space, action)
-    except (TypeError, ValueError) as error:
-        shape = getattr(action, "shape", None)
-        given = shorten(action) + (f" of shape {shape}" if shape is not None else "")
-        why = f" ({error})" if str(error) else ""
-        raise BadInputError(f"the action is {given}{why}; give {what}, in {space}") from None
+    with naming("the action", f"{what}, in {space}"):
+        try:
+            _judge(space, action)
+        except (TypeError, ValueError) as error:
+            shape = getattr(action, "shape", None)
+            given = shorten(action) + (f" of shape {shape}" if shape is not None else "")
+            raise InvalidValueError(f"it is {given}" + f" ({error})" * bool(str(error))) from None
 
 
 def _judge(space: spaces.Space[Any], action: Any) -> None:

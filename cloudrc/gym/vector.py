@@ -9,7 +9,6 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 
-from cloudrc.errors import BadInputError
 from cloudrc.gym.options import (
     Options,
     Profile,
@@ -21,7 +20,8 @@ from cloudrc.gym.options import (
 )
 from cloudrc.gym.step import find_step
 from cloudrc.gym.values import checker, copied
-from cloudrc.outside.values import to_arrays
+from cloudrc.outside.refusal import naming
+from cloudrc.outside.values import InvalidValueError, to_arrays
 
 if TYPE_CHECKING:
     _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]
@@ -37,6 +37,7 @@ class NetworkedVector(_Wrapper):
     understood; a new episode of one robot begins with an idle link.
     """
 
+    @naming("NetworkedVector")
     def __init__(
         self,
         env: VectorEnv[Any, Any, Any],
@@ -52,7 +53,7 @@ class NetworkedVector(_Wrapper):
         `dt` is the time of a step [s].
         """
         if not isinstance(env, VectorEnv):
-            raise BadInputError(
+            raise InvalidValueError(
                 f"env is {type(env).__name__}: give a vector environment of gymnasium, as "
                 "gymnasium.make_vec returns it; for a single one there is Networked"
             )
@@ -150,7 +151,7 @@ def _autoreset_mode(env: VectorEnv[Any, Any, Any]) -> AutoresetMode:
     if isinstance(mode, AutoresetMode):
         return mode
     known = ", ".join(f"AutoresetMode.{each.name}" for each in AutoresetMode)
-    raise BadInputError(
+    raise InvalidValueError(
         f"the vector environment does not say when it resets a robot: its metadata has "
         f"autoreset_mode {mode!r}; set it to one of {known}"
     )

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.record.columns import Recording
 
 Array: TypeAlias = NDArray[np.float64]
@@ -44,15 +44,15 @@ class Fit(NamedTuple):
     share: float  # share of the variance of the velocity that the model explains [1]
 
 
-def series(recording: Recording, name: str) -> tuple[Array, Array]:
+def series(recording: Recording) -> tuple[Array, Array]:
     """Return the commanded and the measured velocity [m/s], one sample per `DT`, shape (n, 3) each.
 
     The samples are from the longest phase with the guard in TRACK, without its take-off. A phase
-    ends where messages are lost. `name` is the recording's name in error messages.
+    ends where messages are lost.
     """
     for topic in (INPUT, OUTPUT, "/guard"):
         if not len(recording[topic]):
-            raise BadInputError(f"{name}: has no {topic}; name the recording of a whole flight")
+            raise InvalidValueError(f"has no {topic}; name the recording of a whole flight")
     source, sink = recording[INPUT], recording[OUTPUT]
     begins_ns, states = _states(recording)
     ends_ns = np.append(begins_ns[1:], sink["stamp_ns"][-1])
@@ -63,8 +63,8 @@ def series(recording: Recording, name: str) -> tuple[Array, Array]:
     if end_ns - start_ns < DURATION_MIN * 1e9:
         flown = max(0, end_ns - start_ns) * 1e-9
         where = " without lost messages" if recording.holes else ""
-        raise BadInputError(
-            f"{name}: {flown:.4g} s of flight under commands after the take-off{where}, and the "
+        raise InvalidValueError(
+            f"{flown:.4g} s of flight under commands after the take-off{where}, and the "
             f"fit needs {DURATION_MIN:g} s; record a longer flight"
         )
     at_ns = np.arange(start_ns, end_ns, int(DT * 1e9))
@@ -89,20 +89,19 @@ def _states(recording: Recording) -> tuple[Array, Array]:
     return stamps_ns, states
 
 
-def identify(given: Array, measured: Array, name: str) -> Fit:
+def identify(given: Array, measured: Array) -> Fit:
     """Fit the model of the velocity loop to the velocities along one axis, one sample per DT.
 
     Args:
         given: Input velocities [m/s], shape (n,).
         measured: Output velocities [m/s], shape (n,).
-        name: Name of the axis in error messages.
 
     Raises:
-        BadInputError: If the input does not excite the axis, or if the model does not fit.
+        InvalidValueError: If the input does not excite the axis, or if the model does not fit.
     """
     if given.std() < DEVIATION_MIN:
-        raise BadInputError(
-            f"{name}: the commanded velocity hardly changes (standard deviation {given.std():.2g} "
+        raise InvalidValueError(
+            f"the commanded velocity hardly changes (standard deviation {given.std():.2g} "
             f"m/s, below {DEVIATION_MIN:g}); record a flight with more steps, as 'cloudrc run "
             "steps --mode virtual --set mission.steps.count=40'"
         )
@@ -128,8 +127,8 @@ def identify(given: Array, measured: Array, name: str) -> Fit:
     error, slopes = residuals(theta), _slopes(residuals, theta)
     share = 1.0 - error.var() / measured.var()
     if share < SHARE_MIN:
-        raise BadInputError(
-            f"{name}: a first-order model explains {share:.0%} of the velocity, below "
+        raise InvalidValueError(
+            f"a first-order model explains {share:.0%} of the velocity, below "
             f"{SHARE_MIN:.0%}; record a flight in free air, without HOLD and without contact"
         )
     blocks = np.array_split(slopes * error[:, None], BLOCKS)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 from cloudrc.errors import BadInputError
 from cloudrc.outside.values import InvalidValueError
+from cloudrc.text import unknown_name_text
 
 
 @contextmanager
@@ -20,3 +21,14 @@ def naming(place: str, wanted: str = "") -> Iterator[None]:
     except InvalidValueError as error:
         hint = f"; give {wanted}" if wanted else ""
         raise BadInputError(f"{place}: {error}{hint}") from None
+
+
+def check_names(what: str, names: Iterable[str], known: Iterable[str], place: str = "") -> None:
+    """Raise a BadInputError if one of the `names` is none of the `known`; it suggests the nearest.
+
+    `what` says what the names are those of, `place` precedes the error's text, as "--flag: ".
+    """
+    there = [*known]
+    for name in names:
+        if name not in there:
+            raise BadInputError(f"{place}{unknown_name_text(what, name, there)}")

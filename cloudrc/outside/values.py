@@ -32,7 +32,7 @@ _WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
 
 
 class InvalidValueError(ValueError):
-    """A value from outside is none of its quantity; the text has the value and what is valid."""
+    """What comes from outside cannot be used; the text says what it is, and what is valid."""
 
 
 @dataclass(frozen=True)

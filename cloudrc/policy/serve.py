@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import hmac
 import logging
-import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +16,8 @@ from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from cloudrc.errors import BadInputError, describe_error
+from cloudrc.errors import describe_error
+from cloudrc.files import naming
 from cloudrc.outside.code import apart
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.codec import MESSAGE_MAX, WireError, pack, unpack
@@ -63,7 +63,7 @@ class PolicyServer:
             self._thread.shutdown(wait=False, cancel_futures=True)
 
     async def _open(self, host: str, port: int) -> Server:
-        try:
+        with naming(f"{host}, port {port}"):
             return await serve(
                 self._handle,
                 host,
@@ -75,12 +75,6 @@ class PolicyServer:
                 process_request=self._check_request,
                 logger=_quiet,
             )
-        except OSError as error:
-            number = error.errno or 0  # negative for a host that nobody knows
-            why = os.strerror(number) if number > 0 else str(error)
-            text = f"cannot listen at {host}, port {port}: {why}"
-            text += "; give an address of this machine with --host, a free port with --port"
-            raise BadInputError(text) from None
 
     async def _call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function of the policy in its thread."""

@@ -20,7 +20,6 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.errors import BadInputError
 from cloudrc.record.content import Content
 from cloudrc.record.content import Message as Message  # callers take it from here, too
 from cloudrc.record.topics import ADDED, BY_SOURCE, TOPICS, Kind, Topic
@@ -90,8 +89,8 @@ def _column(kind: Kind, values: Any) -> Column:
 class Recording(Content):
     """The tables of a flight by topic, and what else a file contains.
 
-    A topic is decoded when its table is read for the first time. This raises a BadInputError if a
-    message of the topic is not readable.
+    A topic is decoded when its table is read for the first time. A message that
+    is not readable is an error then.
     """
 
     records: RecordStore | None = None  # in place of messages
@@ -107,14 +106,14 @@ class Recording(Content):
         return Recording(records=store)
 
     @staticmethod
-    def read(path: Path) -> Recording:
+    def read(path: Path, *, whole: bool = False) -> Recording:
         """Read an MCAP file up to its end or to its first damaged part.
 
-        Raise a BadInputError if nothing in the file can be read.
+        With `whole`, damage is an error, as is a file of which nothing can be read.
         """
         from cloudrc.record.reader import read
 
-        return Recording.of(read(path))
+        return Recording.of(read(path, whole=whole))
 
     @staticmethod
     def of(content: Content) -> Recording:
@@ -179,14 +178,9 @@ class Recording(Content):
         messages = [data for name, _, data in self.messages if name == topic]
         if not messages:
             return Table(TOPICS[topic], ())
-        from cloudrc.record.ros import decode
+        from cloudrc.record.reader import decode_all
 
-        try:
-            rows = [decode(TOPICS[topic], data) for data in messages]
-        except Exception as error:  # rosbags may raise anything on malformed bytes
-            raise BadInputError(
-                f"{self.source}: a message on {topic} is not readable; use the original file"
-            ) from error
+        rows = decode_all(TOPICS[topic], messages, f"{self.source}: a message on {topic}")
         return Table(TOPICS[topic], zip(*rows, strict=True))
 
 

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from shlex import quote
 from typing import TypeAlias
 
-from cloudrc.errors import BadInputError
 from cloudrc.record.holes import Hole
 
 Message: TypeAlias = tuple[str, int, bytes]
@@ -28,14 +25,6 @@ class Content:
     holes: tuple[Hole, ...] = ()  # times in which messages are lost
     remarks: tuple[str, ...] = ()  # what was ignored or sorted; "The recording" precedes each
     unread: int = 0  # number of bytes of the file that are cut off or behind its damage
-
-    def refuse_damaged(self, path: Path) -> None:
-        """Raise a BadInputError if the file is torn, damaged or changed; `path` is the file."""
-        if self.lacking:
-            raise BadInputError(
-                f"{path}: {self.lacking}; to copy what is readable: cloudrc recover"
-                f" {quote(str(path))}"
-            )
 
     @property
     def note(self) -> str:

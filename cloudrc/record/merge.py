@@ -24,7 +24,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.errors import BadInputError
+from cloudrc.errors import CloudrcError
 from cloudrc.record.columns import Recording, Table, datagrams, join
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, union
 from cloudrc.record.topics import TOPICS
@@ -123,14 +123,14 @@ def merge(world: Path, cloud: Path) -> Recording:
     """Merge the files of world and cloud, complete or torn, into one mission on world's clock.
 
     If one file cannot be read, the result contains only the other file, on that file's own clock,
-    and a note. Raise a BadInputError if neither file can be read.
+    and a note. It is an error if neither file can be read.
     """
     found: dict[str, Recording] = {}
     failures = []
     for end, path in (("world", world), ("cloud", cloud)):
         try:
             found[end] = Recording.read(path)
-        except BadInputError as error:
+        except CloudrcError as error:
             failures.append(error)
     if not found:
         raise failures[0]

@@ -11,10 +11,11 @@ import json
 import os
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from io import BufferedReader
 from itertools import pairwise
 from pathlib import Path
+from shlex import quote
 from typing import IO, Any
 
 from mcap import records as mcap
@@ -26,8 +27,8 @@ from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file
 from cloudrc.record.content import Content
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, of_metadata, union
-from cloudrc.record.ros import is_known
-from cloudrc.record.topics import TOPICS, VIEWS
+from cloudrc.record.ros import decode, is_known
+from cloudrc.record.topics import TOPICS, VIEWS, Row, Topic
 from cloudrc.record.writer import CLOCK, COUNTS, MISSING
 
 LISTED_MAX = 3
@@ -198,11 +199,12 @@ class _Reader:
                 yield f"messages were removed or added: it holds {_list_some(wrong)}"
 
 
-def read(path: Path) -> Content:
+def read(path: Path, *, whole: bool = False) -> Content:
     """Read an MCAP file up to its end or to its first damage.
 
     Raises:
-        BadInputError: If the file cannot be read or is not MCAP.
+        BadInputError: If the file cannot be read or is not MCAP; with `whole`, also if it is torn,
+            damaged or changed.
         NothingReadableError: If it holds no message that can be read.
     """
     try:
@@ -221,7 +223,19 @@ def read(path: Path) -> Content:
             text = next(known, "is not an MCAP file; name a recording (.mcap)")
             raise BadInputError(f"{path}: {text}")
         file.seek(0)
-        return _Reader(path, file).read()
+        content = _Reader(path, file).read()
+    if whole and content.lacking:
+        copy = f"to copy what is readable: cloudrc recover {quote(str(path))}"
+        raise BadInputError(f"{path}: {content.lacking}; {copy}")
+    return content
+
+
+def decode_all(topic: Topic, messages: Iterable[bytes], what: str) -> list[Row]:
+    """Decode messages of a topic; `what` begins the text of the error about an unreadable one."""
+    try:
+        return [decode(topic, data) for data in messages]
+    except Exception as error:  # rosbags may raise anything on malformed bytes
+        raise BadInputError(f"{what} is not readable; use the original file") from error
 
 
 def _stored_counts(content: Content) -> Counter[str]:

@@ -10,6 +10,7 @@ from cloudrc.config.scene import scene_of
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.geometry.shapes import SHAPES_FILE, Shapes
 from cloudrc.metrics import Flight
+from cloudrc.outside.refusal import naming
 from cloudrc.record.columns import Recording
 
 
@@ -26,10 +27,6 @@ def flown_world(recording: Recording, experiment: ResolvedExperiment) -> FlownWo
 
     They are those that the recording contains. A recording of an older version, and a recording in
     memory, has none; then they are those of the files that the experiment names.
-
-    Raises:
-        BadInputError: If the numbers in the recording are not readable or, in a recording without
-            them, if the files are missing or unsuitable.
     """
     if (data := recording.attachments.get(FLOWN_FILE)) is not None:
         return FlownWorld.from_bytes(data)
@@ -42,13 +39,10 @@ def flown_shapes(recording: Recording, experiment: ResolvedExperiment) -> Shapes
 
     They are those that the recording contains. A recording of an older version has none; then they
     are those of the files that the experiment names, or none without MuJoCo.
-
-    Raises:
-        BadInputError: If the shapes in the recording are not readable or, in a recording without
-            shapes, if the files are missing or unsuitable.
     """
     if (data := recording.attachments.get(SHAPES_FILE)) is not None:
-        return Shapes.from_bytes(data)
+        with naming("the recording"):
+            return Shapes.from_bytes(data)
     try:
         from cloudrc.robots.shapes import read_shapes
 

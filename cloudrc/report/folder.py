@@ -20,6 +20,7 @@ from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import BadInputError
 from cloudrc.files import read
 from cloudrc.outside.document import parse_yaml
+from cloudrc.outside.paths import check_there
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
 from cloudrc.record.reader import NothingReadableError
@@ -40,8 +41,7 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     the folder has no experiment, or no recording that is sufficient for a report.
     """
     config, merged = folder / "config.yaml", folder / "mission.mcap"
-    if not config.is_file():
-        raise BadInputError(f"{folder}: has no config.yaml; name the folder of a run")
+    check_there(config, "name the folder of a run")
     experiment = read_experiment(config, flown=True)
     before = _read_merged(folder)
     recording = before or merge(folder / "world.mcap", folder / "cloud.mcap")
@@ -62,7 +62,7 @@ def _read_merged(folder: Path) -> Recording | None:
     ends = [(folder / f"{end}.mcap").is_file() for end in ("world", "cloud")]
     if not (folder / "mission.mcap").exists():
         if not any(ends):
-            raise BadInputError(f"{folder}: has no mission.mcap; name the folder of a run")
+            check_there(folder / "mission.mcap", "name the folder of a run")
         return None
     try:
         recording = Recording.read(folder / "mission.mcap")

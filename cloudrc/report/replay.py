@@ -16,7 +16,7 @@ import viser
 
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.console.scene import FlightScene
-from cloudrc.errors import BadInputError
+from cloudrc.errors import NothingFlownError
 from cloudrc.metrics import Flight
 from cloudrc.metrics.mission import reported
 from cloudrc.report.flown import flown_shapes
@@ -30,13 +30,9 @@ STALE = 0.5
 
 
 def write_section(flight: Flight, experiment: ResolvedExperiment) -> str:
-    """Return the replay of a flight as a section of an HTML page.
-
-    Raises:
-        BadInputError: If the robot never flew, or if its model or scene cannot be read.
-    """
+    """Return the replay of a flight as a section of an HTML page."""
     if not len(flight.truth["stamp_ns"]):
-        raise BadInputError("the robot never flew")
+        raise NothingFlownError("the robot never flew, so there is no replay")
     rich.get_console().quiet = True  # else viser prints its address
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     try:

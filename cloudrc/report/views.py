@@ -32,11 +32,7 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
 def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]:
-    """Convert a recording to messages that viewers such as Foxglove can show.
-
-    Raises:
-        BadInputError: If the scene of the experiment cannot be read.
-    """
+    """Convert a recording to messages that viewers such as Foxglove can show."""
     flight, truth = flight_of(recording, experiment), recording["/ground_truth"]
     if not len(truth):
         return []

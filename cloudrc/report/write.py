@@ -216,7 +216,7 @@ def _draw(
 
 def _write_figures(folder: Path, pictures: Iterable[Picture]) -> None:
     if folder.is_symlink():  # in a run from somebody else, the link may point anywhere
-        raise BadInputError(f"{folder}: is a symbolic link; remove it")
+        folder.unlink()
     folder.mkdir(exist_ok=True)
     for picture in pictures:
         for kind, content in picture.files.items():

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from cloudrc import plugins
 from cloudrc.config.overrides import BRAKING, build_plugin, default_parameters
-from cloudrc.config.problems import ConfigProblem, ProblemsError
+from cloudrc.config.problems import ConfigProblem, ProblemsError, problem_at
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotFiles, known_robot, parameters
 from cloudrc.config.scene import scene_of, steered_in
@@ -16,6 +16,7 @@ from cloudrc.config.shipped import ROBOT_FILE, file_of
 from cloudrc.errors import BadInputError
 from cloudrc.messages import ZERO, Vector
 from cloudrc.outside.document import KeyPath
+from cloudrc.outside.refusal import naming
 from cloudrc.sim.airframe import thrust_to_weight
 from cloudrc.sim.onboard import Accelerator, Actuators, Direct, Onboard
 from cloudrc.sim.plant import Wind
@@ -52,24 +53,17 @@ class Parts(NamedTuple):
 
 
 def check_robot(world: World, *, turns: bool = False) -> None:
-    """Raise a BadInputError if the robot does not compile, or if it cannot move as `world` says.
-
-    With `turns`, it also has to obey a yaw.
-    """
+    """Check that the robot compiles and can move as `world` says, and with `turns` obeys a yaw."""
     parts = make_parts(world)
     connect(world, parts, ResolvedGuard.model_validate({}))
     advise(world, ZERO)
     if turns and not parts.obeys_yaw:
         reason = f"the onboard controller of {world.robot} does not obey a yaw; leave yaw_deg out"
-        raise ProblemsError([ConfigProblem(("mission", "waypoints"), "", reason)])
+        raise problem_at("mission.waypoints", reason)
 
 
 def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -> Robot:
-    """Build the robot that flies or drives in a scene, guarded by `limits`.
-
-    Raises:
-        BadInputError: If the robot does not compile, or if it cannot move as `world` says.
-    """
+    """Build the robot that flies or drives in a scene, guarded by `limits`."""
     return connect(world, make_parts(world), limits, wind)
 
 
@@ -134,13 +128,11 @@ def _accelerator(world: World, plugin: plugins.Found) -> Accelerator | None:
 
 
 def make_parts(world: World) -> Parts:
-    """Compile a robot in its scene, and build its onboard controller and its actuators.
-
-    Raises:
-        BadInputError: If the robot does not compile, or if it cannot move as `world` says.
-    """
+    """Compile a robot in its scene, and build its onboard controller and its actuators."""
     robot, scene = known_robot(world.robot), file_of(world.scene)
-    nominal, where = compile_model(robot.model, scene), f"{robot.model} in {scene}"
+    where = f"{robot.model} in {scene}"
+    with naming(f"robot {world.robot}"):
+        nominal = compile_model(robot.model, scene)
     try:
         # The build below uses the same import of the file.
         plugin = plugins.find(KIND, robot.onboard.name)
@@ -164,13 +156,11 @@ def make_parts(world: World) -> Parts:
             f"{world.robot} has actuators without drag, so wind would not move it; leave the wind "
             "out, or give them drag (multirotor has the parameter drag_s_per_m)"
         )
-        raise ProblemsError([ConfigProblem(("world", "wind"), "", reason)])
-    try:
+        raise problem_at("world.wind", reason)
+    with naming(f"{world.robot}/{ROBOT_FILE}"):
         sensors = find_sensors(nominal, robot.sensors)
         if robot.probe is not None:
             find_part(nominal, "site", robot.probe, "probe")
-    except ValueError as error:
-        raise BadInputError(f"{world.robot}/{ROBOT_FILE}: {error}") from error
     return Parts(true, plugin, onboard, actuators, sensors)
 
 
@@ -188,7 +178,7 @@ def _build_onboard(world: World, where: str, robot: RobotFiles, model: Any) -> O
         named = [_problem(world, p.path, f"{p._replace(path=())}{by}") for p in found]
         raise ProblemsError(named) from error
     except BadInputError as error:
-        raise ProblemsError([ConfigProblem(("world", "robot"), "", f"{where}: {error}")]) from error
+        raise problem_at("world.robot", f"{where}: {error}") from error
 
 
 def _problem(world: World, path: KeyPath, reason: str) -> ConfigProblem:
@@ -216,12 +206,13 @@ def _change(world: World, robot: RobotFiles, nominal: Any) -> Any:
             f"has {len(factors)} factors, but {robot.model} has {nominal.nu} actuators; give as "
             "many, or one number for all"
         )
-        raise ProblemsError([ConfigProblem(("world", "plant", "actuator_factor"), "", reason)])
-    return compile_true(robot.model, file_of(world.scene), nominal, world.plant)
+        raise problem_at("world.plant.actuator_factor", reason)
+    with naming(f"robot {world.robot}"):
+        return compile_true(robot.model, file_of(world.scene), nominal, world.plant)
 
 
 def _check_rest(world: World, where: str, model: Any, stopped: tuple[float, ...]) -> None:
-    """Raise a BadInputError if a planar robot does not stand at the height of the spawn.
+    """Check that a planar robot stands at the height of the spawn.
 
     Missions have this height, and the robot cannot change it. `model` is the compiled `MjModel`,
     `stopped` the commands of the robot at rest.
@@ -239,7 +230,7 @@ def _check_rest(world: World, where: str, model: Any, stopped: tuple[float, ...]
 
 
 def _check_lift(world: World, where: str, model: Any) -> None:
-    """Raise a BadInputError if the true robot, a compiled `MjModel`, cannot lift off safely."""
+    """Check that the true robot, a compiled `MjModel`, can lift off safely."""
     ratio = thrust_to_weight(model)
     if ratio is None or ratio >= THRUST_TO_WEIGHT_MIN:
         return

@@ -9,26 +9,20 @@ from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of
 from cloudrc.geometry.shapes import SHAPES_FILE, Shapes
+from cloudrc.outside.refusal import naming
 from cloudrc.sim.scene import compile_model
 from cloudrc.sim.shapes import shapes_of
 
 
 def read_shapes(world: World) -> Shapes:
-    """Compile the robot and its scene, and return their shapes.
-
-    Raises:
-        BadInputError: If robot or scene are missing or unsuitable.
-    """
+    """Compile the robot and its scene, and return their shapes."""
     robot = known_robot(world.robot)
-    return shapes_of(compile_model(robot.model, file_of(world.scene)), planar=robot.planar)
+    with naming(f"robot {world.robot}"):
+        return shapes_of(compile_model(robot.model, file_of(world.scene)), planar=robot.planar)
 
 
 def flown_files(world: World) -> dict[str, bytes]:
-    """Return what to attach to a recording, name -> content: what a report needs of the world.
-
-    Raises:
-        BadInputError: If robot or scene are missing or unsuitable.
-    """
+    """Return what to attach to a recording, name -> content: what a report needs of the world."""
     planar = known_robot(world.robot).planar
     flown = FlownWorld(scene_of(world), known_hull(world.robot), planar)
     return {SHAPES_FILE: read_shapes(world).to_bytes(), FLOWN_FILE: flown.to_bytes()}

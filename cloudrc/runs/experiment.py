@@ -8,9 +8,10 @@ from contextlib import suppress
 from cloudrc import metrics
 from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import OUTSIDE, ROS2, parse_settings
+from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.schema import Parameters, World
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.outside.reuse import reuse
 from cloudrc.runs.requirements import require
 from cloudrc.warnings import advise
@@ -29,31 +30,27 @@ def load(name: str, overrides: Iterable[str], seed: int | None = None) -> Resolv
     return experiment
 
 
-def refuse_seed(texts: Iterable[str]) -> None:
-    """Raise a BadInputError if one of the settings `texts` (KEY=VALUE) sets the seed.
+def check_no_seed(texts: Iterable[str]) -> None:
+    """Check that none of the settings `texts` (KEY=VALUE) sets the seed.
 
     Work with several seeds replaces the seed in every flight.
     """
     if ("seed",) in parse_settings(texts):
-        raise BadInputError("seed: each flight has its own seed; give their number with --seeds")
+        raise problem_at("seed", "each flight has its own seed; give their number with --seeds")
 
 
 def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
-    """Raise a BadInputError if an experiment cannot fly in a mode, before a folder is made.
+    """Check that an experiment can fly in a mode, before a folder is made.
 
     `mode` is "virtual", "local" or "cluster".
     """
     if mode != "virtual" and (experiment.cloud.clock_offset_s or experiment.cloud.clock_drift_ppm):
-        raise BadInputError(
-            "cloud.clock_offset_s and cloud.clock_drift_ppm act in virtual time only, elsewhere "
-            "the machine's clock counts; use --mode virtual, or leave them out"
-        )
+        text = "acts, as clock_drift_ppm, in virtual time only; use --mode virtual, or leave it out"
+        raise problem_at("cloud.clock_offset_s", text)
     if (controller := experiment.cloud.controller.name) in OUTSIDE:
         if mode == "cluster":
-            raise BadInputError(
-                f"cloud.controller {controller} flies on this machine only; use --mode virtual "
-                "or local"
-            )
+            text = f"{controller} flies on this machine only; use --mode virtual or local"
+            raise problem_at("cloud.controller", text)
         require("a remote controller", ("policy",))
         if controller == ROS2:
             from cloudrc.bridges.ros2 import require_ros
@@ -65,9 +62,7 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
 
 
 def check_world(world: World, *, turns: bool = False) -> None:
-    """Raise a BadInputError if the robot cannot move in its scene as `world` says.
-
-    With `turns`, it also has to obey a yaw.
+    """Check that the robot can move in its scene as `world` says, and with `turns` obeys a yaw.
 
     The shipped robots can in the shipped scenes, if nothing is changed. Without MuJoCo, such as on
     a machine that only starts flights in a cluster, world checks it.

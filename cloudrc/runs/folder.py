@@ -8,7 +8,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.errors import BadInputError
+from cloudrc.outside.paths import make_folder
 
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
@@ -20,7 +20,7 @@ RUNS = Path("runs")
 def run_folder(experiment: ResolvedExperiment, mode: str, out: Path | None) -> Path:
     """Make the folder of a run, as `new_folder` does; `mode` is a mode, or "session".
 
-    The pods of a cluster may refuse to fly, so that `runs/latest` points to their run only later.
+    The pods of a cluster may not fly, so that `runs/latest` points to their run only later.
     """
     name = f"{experiment.name}-{mode}-seed{experiment.seed}"
     return new_folder(out, name, "" if mode == "cluster" else "latest")
@@ -35,29 +35,18 @@ def new_folder(
 ) -> Path:
     """Make the folder of a run: `out`, or the next free `runs/<name>-<n>`.
 
-    Without `out`, point the symbolic link `runs/<link>` to the new folder; "" for no link. Raise a
-    BadInputError if `out` exists and is not an empty folder, or if no folder can be made. `flag` is
-    the flag that gave `out`.
+    Without `out`, point the symbolic link `runs/<link>` to the new folder; "" for no link.
+    `flag` is the flag that gave `out`, which must be new or empty.
     """
-    try:
-        if out is not None:
-            with contextlib.suppress(FileExistsError):
-                out.mkdir(parents=True)
-            if not out.is_dir() or any(out.iterdir()):
-                raise BadInputError(
-                    f"{flag} {out}: already exists; name a new folder, runs are never overwritten"
-                )
-            return out
-        RUNS.mkdir(exist_ok=True)
-        for n in itertools.count(1):
-            folder = RUNS / f"{name.replace(':', '-')}-{n}"  # some systems refuse a colon
-            with contextlib.suppress(FileExistsError):  # another process may make it first
-                folder.mkdir()
-                break
-    except OSError as error:
-        where = f"{flag} {out}" if out else f"{RUNS}/ in the working folder"
-        text = f"{where}: cannot be made: {error.strerror}; name a writable folder with --out"
-        raise BadInputError(text) from error
+    if out is not None:
+        make_folder(out, f"{flag} ")
+        return out
+    RUNS.mkdir(exist_ok=True)
+    for n in itertools.count(1):
+        folder = RUNS / f"{name.replace(':', '-')}-{n}"  # some file systems have no colon
+        with contextlib.suppress(FileExistsError):  # another process may make it first
+            folder.mkdir()
+            break
     if link:
         point_to(folder, link)
     return folder

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from cloudrc.config import shipped
-from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
+from cloudrc.outside.paths import make_folder
 
 MODEL_OF = "x2"
 """Shipped robot whose model the new robot gets."""
@@ -41,20 +41,14 @@ def test_the_robot_hovers():
 
 
 def write_robot(folder: Path) -> list[str]:
-    """Write the files of a new robot into `folder`; return their names.
-
-    Raises:
-        BadInputError: If `folder` has files, or is a file.
-    """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise BadInputError(f"{folder}: exists and is not empty; name another folder")
+    """Write the files of a new robot into a new `folder`; return their names."""
+    make_folder(folder)
     model = (shipped.FOLDERS["robot"] / MODEL_OF / "robot.xml").read_text(encoding="utf-8")
     files = {
         shipped.ROBOT_FILE: DESCRIPTION,
         "robot.xml": model.replace(f'model="{MODEL_OF}"', 'model="my_robot"'),
         "test_robot.py": TEST,
     }
-    folder.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
         write_atomically(folder / name, text.encode())
     return list(files)

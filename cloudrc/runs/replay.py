@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
-from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
 from cloudrc.report.attached import read_flight
 from cloudrc.report.flown import flight_of
 from cloudrc.report.replay import write_page
-from cloudrc.runs.session import refuse_under_way
+from cloudrc.runs.session import check_ended
 
 
 def write_replay(run: Path, out: Path | None = None) -> Path:
     """Write the replay of a run, the folder or its MCAP file, and return the path of the page.
 
-    By default the page is replay.html beside the recording, and replaces an earlier one. Raise a
-    BadInputError if the file `out` exists, or if there is nothing to show.
+    By default the page is replay.html beside the recording, and replaces an earlier one.
     """
-    if out is not None and os.path.lexists(out):
-        raise BadInputError(f"{out}: already there; name another file with --out")
-    refuse_under_way(run if run.is_dir() else run.parent)
+    check_ended(run if run.is_dir() else run.parent)
     recording, experiment = read_flight(run)
-    try:
-        page = write_page(flight_of(recording, experiment), experiment)
-        path = out or (run if run.is_dir() else run.parent) / "replay.html"
-        write_atomically(path, page.encode())
-    except BadInputError as error:
-        raise BadInputError(f"{run}: no replay: {error}") from error
+    page = write_page(flight_of(recording, experiment), experiment)
+    path = out or (run if run.is_dir() else run.parent) / "replay.html"
+    write_atomically(path, page.encode())
     return path

@@ -8,8 +8,8 @@ from typing import Any
 
 from cloudrc.config import shipped
 from cloudrc.config.schema import World
-from cloudrc.errors import BadInputError
-from cloudrc.files import PICTURES, refuse_other_file, write_atomically
+from cloudrc.files import write_atomically
+from cloudrc.outside.paths import check_picture
 from cloudrc.robots.check import SCENE, check, facts_table
 from cloudrc.robots.shapes import read_shapes
 from cloudrc.runs.requirements import missing, require
@@ -27,17 +27,14 @@ def check_robot(given: str, picture: Path | None = None) -> tuple[dict[str, Any]
 
     Returns:
         The result as values for JSON; and a note about the picture, "" without one.
-
-    Raises:
-        BadInputError: If the robot does not compile or does not hold the contract, or if the
-            picture's kind is unknown or its file belongs to somebody else.
     """
     is_own = Path(given).is_dir() and (given not in shipped.names("robot") or "/" in given)
     name = shipped.model_path("robot", f"{Path(given).resolve()}" if is_own else given, Path.cwd())
     place = picture or (Path(name) / PICTURE if is_own else None)
-    kind = _kind_of(place)
+    if place is not None:
+        check_picture(place, "--picture")
     facts, changes = check(name)
-    note = _draw(name, place, kind, required=picture is not None)
+    note = _draw(name, place, required=picture is not None)
     return {"robot": given, "ok": not changes, "changes": changes, "facts": facts}, note
 
 
@@ -47,18 +44,7 @@ def as_text(document: Mapping[str, Any], note: str) -> str:
     return "\n".join([facts_table(document["facts"]), "", *lines, *([note] if note else [])])
 
 
-def _kind_of(picture: Path | None) -> str:
-    if picture is None:
-        return ""
-    kind = picture.suffix.removeprefix(".")
-    if kind not in PICTURES:
-        known = ", ".join(f".{each}" for each in PICTURES)
-        raise BadInputError(f"--picture {picture}: no kind of picture; use one of {known}")
-    refuse_other_file(picture, PICTURES[kind], flag="--picture")
-    return kind
-
-
-def _draw(name: str, picture: Path | None, kind: str, *, required: bool) -> str:
+def _draw(name: str, picture: Path | None, *, required: bool) -> str:
     """Write the picture of a robot; return a note about it."""
     if picture is None:
         return ""
@@ -68,5 +54,5 @@ def _draw(name: str, picture: Path | None, kind: str, *, required: bool) -> str:
     from cloudrc.report.robot_picture import draw_robot
 
     shapes = read_shapes(World.model_validate({"robot": name, "scene": SCENE}))
-    write_atomically(picture, draw_robot(shapes.robot, kind))
+    write_atomically(picture, draw_robot(shapes.robot, picture.suffix[1:]))
     return f"picture: {picture}"

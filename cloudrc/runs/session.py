@@ -64,7 +64,7 @@ def read_last_mission(folder: Path) -> tuple[Recording, ResolvedExperiment, bool
     return recording, experiment, not last.ended
 
 
-def refuse_under_way(folder: Path) -> None:
+def check_ended(folder: Path) -> None:
     """Raise a BadInputError if the flight whose files are in a folder has not ended."""
     if folder.resolve() not in under_way() and not is_open(folder / "mission.mcap"):
         return
@@ -76,7 +76,7 @@ def refuse_under_way(folder: Path) -> None:
 def restore_mission(folder: Path) -> None:
     """Write the mission.mcap of a session that was killed before it wrote this file."""
     if (folder / JOURNAL_FILE).is_file() and not (folder / "mission.mcap").exists():
-        refuse_under_way(folder)
+        check_ended(folder)
         recording, _, interrupted = read_last_mission(folder)
         recording.metadata |= Run("local", "relay", interrupted).metadata
         recording.write(folder / "mission.mcap", attachments(folder))

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import SPACE, Fence
 from cloudrc.geometry.model_files import model_files
 from cloudrc.geometry.scene import FLOOR, WORLD, Scene
 from cloudrc.geometry.solids import Array, Shape, Solid
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.sim.engine import compile_alone, compile_error, mujoco
 
 _GEOM = mujoco.mjtGeom
@@ -39,20 +39,20 @@ def read_scene(path: Path) -> Any:
     A body without a name belongs to the body around it. In the worldbody, such bodies are numbered.
 
     Raises:
-        BadInputError: If the scene lacks a part or has a joint.
+        InvalidValueError: If the scene lacks a part or has a joint.
         ValueError: If MuJoCo cannot read the file.
     """
     spec = mujoco.MjSpec.from_file(str(path))
     spawn = spec.frame("spawn")
     if spawn is None or spawn.parent.name != WORLD or spawn.frame is not None:
-        raise BadInputError(f"{path}: needs a frame named spawn directly in its worldbody")
+        raise InvalidValueError(f"{path}: needs a frame named spawn directly in its worldbody")
     if spec.body(FLOOR) is None:
-        raise BadInputError(
+        raise InvalidValueError(
             f"{path}: needs a body named floor that has the ground; all other bodies are obstacles"
         )
     _name_geoms(spec.worldbody)
     for joint in spec.joints:
-        raise BadInputError(
+        raise InvalidValueError(
             f"{path}: body {joint.parent.name or 'without a name'} has a joint; nothing but the "
             "robot may move: delete the joint"
         )
@@ -79,13 +79,13 @@ def complete(scene: Scene) -> Scene:
     and ceiling, it ends below at the ground under the spawn.
 
     Raises:
-        BadInputError: If the file cannot be flown in.
+        InvalidValueError: If the file cannot be flown in.
     """
     assert scene.path is not None
     try:
         states = [(str(file), file.stat()) for file in model_files(scene.path)]
     except OSError as error:
-        raise BadInputError(f"{scene.path}: cannot be read: {error.strerror}") from None
+        raise InvalidValueError(f"{scene.path}: cannot be read: {error.strerror}") from None
     version = [(file, state.st_mtime_ns, state.st_size) for file, state in states]
     names, solids, fence = _read_bodies(scene.path, *version)
     tangible = {FLOOR, *(solid.name for solid in solids)}
@@ -173,7 +173,7 @@ def _faces(model: Any, mesh: int) -> tuple[Array, Array, Array]:
 def reach_of(robot: Path) -> float:
     """Return the radius of the smallest ball about the base that holds a robot's geoms [m].
 
-    Raise a BadInputError if the robot does not compile.
+    Raise an InvalidValueError if the robot does not compile.
     """
     model = compile_alone(robot)
     if not model.njnt:  # no robot, as `sim.scene` says

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.errors import (
-    BadInputError,
-    CloudrcError,
     MissingPrerequisiteError,
     OutOfMemoryError,
     tells_no_memory,
 )
+from cloudrc.outside.values import InvalidValueError
 
 
 def import_mujoco() -> Any:
@@ -42,7 +41,7 @@ mujoco = import_mujoco()
 mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
 
 
-def compile_error(what: object, error: Exception) -> CloudrcError:
+def compile_error(what: object, error: Exception) -> Exception:
     """Return the error to raise if MuJoCo cannot compile `what` because of `error`.
 
     MuJoCo reports a lack of memory as an error of the file. It says nothing about the file.
@@ -51,11 +50,11 @@ def compile_error(what: object, error: Exception) -> CloudrcError:
     if tells_no_memory(reason):
         text = f"memory ran out: {what} could not be compiled"
         return OutOfMemoryError(f"{text}; use fewer processes, or free some memory")
-    return BadInputError(f"{what} does not compile: {reason}")
+    return InvalidValueError(f"{what} does not compile: {reason}")
 
 
 def compile_alone(file: Path) -> Any:
-    """Compile an MJCF file by itself; raise a BadInputError if it does not compile."""
+    """Compile an MJCF file by itself; raise an InvalidValueError if it does not compile."""
     try:
         return mujoco.MjSpec.from_file(str(file)).compile()
     except (ValueError, KeyError) as error:

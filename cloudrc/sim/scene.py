@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import FLOOR, WORLD
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.sim.bodies import ROBOT_BITS, read_scene
 from cloudrc.sim.engine import compile_alone, compile_error, mujoco
 from cloudrc.sim.plant import Array, Inertia, point_inertia, true_inertia
@@ -59,7 +59,7 @@ def compile_model(robot: Path, scene: Path) -> Any:
     `robot` and `scene` are MJCF files. In the result, names of the robot begin with `robot/`. The
     robot may have joints of its own, such as those of wheels; its free joint comes first. Static
     bodies are fused, so that a step takes half the time. Fused bodies lose their names; therefore
-    each geom of the scene gets the name BODY/NUMBER. Raise a BadInputError if a file is
+    each geom of the scene gets the name BODY/NUMBER. Raise an InvalidValueError if a file is
     missing or does not compile, if the robot has no free base or no actuator or touches nothing, or
     if the scene has another time step or contacts that push at a distance.
     """
@@ -184,7 +184,7 @@ def find_part(model: Any, kind: str, name: str, key: str) -> int:
     if number < 0:
         parts = (getattr(model, kind)(each).name for each in range(getattr(model, f"n{kind}")))
         own = [each.removeprefix(ROBOT_PREFIX) for each in parts if each.startswith(ROBOT_PREFIX)]
-        raise ValueError(f"{key}: {unknown_name_text(f'{kind} of the model', name, own)}")
+        raise InvalidValueError(f"{key}: {unknown_name_text(f'{kind} of the model', name, own)}")
     return number
 
 
@@ -205,7 +205,9 @@ def find_sensors(model: Any, asked: Mapping[str, SensorConfig]) -> tuple[OwnSens
 def _address(model: Any, key: str, name: str) -> int:
     number = find_part(model, "sensor", name, key)
     if (count := int(model.sensor_dim[number])) != 1:
-        raise ValueError(f"{key}: {name} shows {count} numbers; name a sensor that shows one")
+        raise InvalidValueError(
+            f"{key}: {name} shows {count} numbers; name a sensor that shows one"
+        )
     return int(model.sensor_adr[number])
 
 
@@ -257,19 +259,19 @@ def _check_parts(model: Any, robot_path: Path, scene_path: Path) -> None:
     base = mujoco.mjtJoint.mjJNT_FREE
     joints = model.jnt_type.tolist()
     if joints[:1] != [base] or joints.count(base) != 1:
-        raise BadInputError(
+        raise InvalidValueError(
             f"{robot_path} in {scene_path}: the robot's base must have a freejoint, "
             "and nothing else may move freely"
         )
     off = [flag for flag, bit in NEEDED.items() if model.opt.disableflags & bit]
     if off:
-        raise BadInputError(
+        raise InvalidValueError(
             f"{scene_path}: option flag {off[0]} is disabled, which a flight needs; remove it"
         )
     if not model.nu:
-        raise BadInputError(f"{robot_path}: has no actuator, so that no controller can move it")
+        raise InvalidValueError(f"{robot_path}: has no actuator, so that no controller can move it")
     if model.opt.timestep != TIMESTEP:
-        raise BadInputError(
+        raise InvalidValueError(
             f"{scene_path}: option timestep is {model.opt.timestep}, not {TIMESTEP}"
         )
     _check_margins(model, robot_path, scene_path)
@@ -286,7 +288,7 @@ def _check_margins(model: Any, robot_path: Path, scene_path: Path) -> None:
     for geom in np.flatnonzero(far & ((model.geom_contype | model.geom_conaffinity) > 0))[:1]:
         body = bodies_of_geoms(model)[geom]
         where = f"{scene_path}: body {body}" if body else f"{robot_path}: the robot"
-        raise BadInputError(
+        raise InvalidValueError(
             f"{where} has a geom with margin {model.geom_margin[geom]:g} and gap "
             f"{model.geom_gap[geom]:g}, so that contacts do not begin at the surface; remove "
             f"both, or give at most {MARGIN_MAX}"
@@ -302,12 +304,12 @@ def _check_bits(model: Any, robot_path: Path, scene_path: Path) -> None:
     expected = ((types | affinities) & ROBOT_BITS) > 0
     meeting = np.flatnonzero(robot & ((types | affinities) > 0)).tolist()
     if not meeting:
-        raise BadInputError(f"{robot_path}: no geom of the robot can touch anything; {BITS}")
+        raise InvalidValueError(f"{robot_path}: no geom of the robot can touch anything; {BITS}")
     for geom in meeting:
         meets = ((types[geom] & affinities) | (types & affinities[geom])) > 0
         if ((meets != expected) & ~robot).any():
             name = model.geom(geom).name.removeprefix(ROBOT_PREFIX) or geom
-            raise BadInputError(
+            raise InvalidValueError(
                 f"{robot_path}: geom {name} has contype {types[geom]} and conaffinity "
                 f"{affinities[geom]}, which do not fit those of {scene_path}; {BITS}"
             )

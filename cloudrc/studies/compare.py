@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import CloudrcError, NothingFlownError
 from cloudrc.metrics import SHIPPED
+from cloudrc.outside.refusal import check_names, naming
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.runs.flight import counts
 from cloudrc.studies.sweep import read_flights
-from cloudrc.text import unknown_name_text
 from cloudrc.trials.plan import SweepPlan, check, draft_of
 from cloudrc.trials.play import run
 from cloudrc.trials.rows import Row, Rows
@@ -57,13 +58,9 @@ def plan_sides(
     seeds: int,
     names: Sequence[str] = (),
 ) -> SweepPlan:
-    """SweepPlan the flights of an experiment with the settings `a` and `b`, both after `common`.
-
-    Raise a BadInputError if a setting or one of the metrics `names` is refused, or if both sides
-    are the same experiment.
-    """
+    """SweepPlan the flights of an experiment with the settings `a` and `b`, both after `common`."""
     plan = check(draft_of(experiment, common, seeds, {"A": a, "B": b}))
-    check_names(names, plan.units)
+    _check_numbers(names, plan.units)
     return plan
 
 
@@ -87,14 +84,11 @@ def compare(
 
     A pair is left out if one of its flights did not end or had a plug-in that failed. Where one
     flight of a pair lacks a metric, the pair is left out for this metric. `units`: metric -> unit.
-
-    Raises:
-        BadInputError: If all pairs are left out, or if no flight can have a metric of `names`.
     """
     flown = _valid(pairs)
     known = {n for _, a, b in flown for n in a["numbers"].keys() | b["numbers"].keys()}
     if not {*names} <= {*units, *SHIPPED}:
-        check_names(names, known)
+        _check_numbers(names, known)
     chosen = names or [name for name in NUMBERS if name in known]
     lacking = {name: _lacking(flown, name) for name in chosen}
     having = [name for name in chosen if lacking[name]["left_out"] < len(flown)]
@@ -115,20 +109,17 @@ def compare(
 
 
 def _valid(pairs: Sequence[Pair]) -> list[Pair]:
-    """Return the pairs of which both flights count; raise a BadInputError if there is none."""
+    """Return the pairs of which both flights count; there has to be one."""
     valid = [each for each in pairs if counts(each.a) and counts(each.b)]
     if not valid:
         bad = [row["text"] for _, *both in pairs for row in both if not counts(row)]
         why = f"each has {LEFT_OUT}: {bad[0]}" if bad else "none was found"
-        raise BadInputError(f"no pair of flights to compare: {why}")
+        raise NothingFlownError(f"no pair of flights to compare: {why}")
     return valid
 
 
-def check_names(names: Iterable[str], known: Collection[str]) -> None:
-    """Raise a BadInputError if one of the `names` that the user gave is no `known` metric."""
-    for name in names:
-        if name not in known:
-            raise BadInputError(f"--number: {unknown_name_text('number', name, sorted(known))}")
+def _check_numbers(names: Iterable[str], known: Iterable[str]) -> None:
+    check_names("number", names, sorted(known), "--number: ")
 
 
 def _lacking(pairs: Sequence[Pair], name: str) -> dict[str, int]:
@@ -147,13 +138,11 @@ def of_sweep(folder: Path, a: str, b: str) -> Pairs:
     """Pair the rows of a sweep that differ only in one axis: one has the value `a`, the other `b`.
 
     `a` and `b` are texts: VALUE or AXIS=VALUE.
-
-    Raises:
-        BadInputError: If not exactly one axis has both values, or if `a` and `b` are equal.
     """
     sweep = read_flights(folder)
     axes = values_of(sweep.rows)
-    axis, first, second = _sides(folder, axes, a, b)
+    with naming(str(folder)):
+        axis, first, second = _sides(axes, a, b)
     what = f"{axis} in {folder}" + (f", of which {sweep.missing}" if sweep.missing else "")
     if pooled := ", ".join(name for name, each in axes.items() if name != axis and len(each) > 1):
         what += f", over all values of {pooled}; flights with equal seeds depend on each other, "
@@ -161,11 +150,8 @@ def of_sweep(folder: Path, a: str, b: str) -> Pairs:
     return Pairs(pair(sweep.rows, axis, first, second), sweep.units, what)
 
 
-def _sides(folder: Path, axes: Mapping[str, list[Any]], a: str, b: str) -> tuple[str, Any, Any]:
-    """Find the axis that has both values, of which `a` and `b` are the texts; return it and them.
-
-    Raise a BadInputError if there is no such axis, or more than one.
-    """
+def _sides(axes: Mapping[str, list[Any]], a: str, b: str) -> tuple[str, Any, Any]:
+    """Find the one axis that has both values, of which `a` and `b` are the texts."""
 
     def values(text: str) -> list[tuple[str, Any]]:
         every = [(axis, value) for axis, each in axes.items() for value in each]
@@ -175,7 +161,7 @@ def _sides(folder: Path, axes: Mapping[str, list[Any]], a: str, b: str) -> tuple
     if len(found) != 1 or found[0][1] == found[0][2]:
         listed = [f"{axis}: {', '.join(map(str, each))}" for axis, each in axes.items()]
         known = "; ".join(listed) or "none"
-        raise BadInputError(
-            f"{folder}: A and B must be two values of one axis, VALUE or AXIS=VALUE; axes: {known}"
+        raise InvalidValueError(
+            f"A and B must be two values of one axis, VALUE or AXIS=VALUE; axes: {known}"
         )
     return found[0]

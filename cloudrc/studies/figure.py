@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import nan
 from statistics import median
 from typing import Any, NamedTuple
 
-from cloudrc.errors import BadInputError
 from cloudrc.metrics import scale
+from cloudrc.outside.refusal import check_names
 from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.report.figures.style import Look
 from cloudrc.runs.flight import counts
 from cloudrc.statistics import exact_interval, median_interval
-from cloudrc.studies.compare import check_names
-from cloudrc.text import unknown_name_text
 from cloudrc.trials.rows import Row
 from cloudrc.trials.summary import NUMBERS, count_successes, values_of
 
@@ -73,9 +71,9 @@ def draw_sweep(
 
 
 def _shown(rows: Sequence[Row], names: Sequence[str]) -> Sequence[str]:
-    """Return the metrics to show; raise a BadInputError if no flight has one of the `names`."""
+    """Return the metrics to show, of which some flight has each."""
     known = sorted({name for row in rows if counts(row) for name in row["numbers"]})
-    check_names(names, known)
+    check_names("number", names, known, "--number: ")
     return names or [name for name in NUMBERS if name in known][:SHOWN]
 
 
@@ -99,19 +97,13 @@ def _choose(rows: Sequence[Row], x: str | None, by: str | None) -> _Axes:
     `x` and `by` are the user's choices of these two, or None.
     """
     values = values_of(rows)
-    if not values:
-        raise BadInputError(
-            "this sweep has no axis; give its file a grid, or see its metrics in table.csv"
-        )
-    x, by = _known_axis(x, values), _known_axis(by, values)
+    check_names("axis", filter(None, (x, by)), values)
     free = [axis for axis in values if len(values[axis]) > 1 and axis != by] or list(values)
     # Axes with names come first: a median of two predictors says less than one of two delays.
     names_first = sorted(free, key=lambda axis: _is_numeric(values[axis]))
     x = x or next((axis for axis in free if _is_numeric(values[axis])), free[0])
-    if x == by:
-        raise BadInputError(f"--x and --by are both {x}; name two axes, or leave one out")
-    by = by or next((axis for axis in names_first if axis != x), None)
-    return _Axes(values, x, by)
+    lines = [by] if by else names_first
+    return _Axes(values, x, next((axis for axis in lines if axis != x), None))
 
 
 def _grouped(rows: Sequence[Row], axes: _Axes, along: Sequence[Any]) -> Groups:
@@ -124,13 +116,6 @@ def _grouped(rows: Sequence[Row], axes: _Axes, along: Sequence[Any]) -> Groups:
 
 def _with(rows: Sequence[Row], axis: str, value: Any) -> list[Row]:
     return [row for row in rows if row["point"][axis] == value]
-
-
-def _known_axis(axis: str | None, known: Iterable[str]) -> str | None:
-    """Return the axis that the user gave; raise an error if there is none of this name."""
-    if axis is not None and axis not in known:
-        raise BadInputError(unknown_name_text("axis", axis, sorted(known)))
-    return axis
 
 
 def _is_numeric(values: Sequence[Any]) -> bool:

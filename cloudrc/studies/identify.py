@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from cloudrc.config.load import read_experiment
-from cloudrc.errors import BadInputError
 from cloudrc.metrics import velocity_loop
 from cloudrc.metrics.velocity_loop import DT, INPUT, OUTPUT, Fit
+from cloudrc.outside.refusal import naming
 from cloudrc.record.columns import Recording
 from cloudrc.report.flown import flown_world
-from cloudrc.runs.session import refuse_under_way
+from cloudrc.runs.session import check_ended
 from cloudrc.text import table
 
 NAMES = ("time_constant", "dead_time", "gain")
@@ -25,21 +25,17 @@ def identify(run: Path) -> tuple[list[Fit], float, str]:
     """Fit a model per axis to a run, the folder or its MCAP file.
 
     Also return its duration [s], and the key of robot.yaml to which the model belongs.
-
-    Raise a BadInputError if there is no recording, if the flight has not ended, or if the recording
-    does not excite an axis.
     """
     path = run / "mission.mcap" if run.is_dir() else run
-    refuse_under_way(path.parent)
-    recording = Recording.read(path)
-    recording.refuse_damaged(path)
-    given, measured = velocity_loop.series(recording, str(path))
+    check_ended(path.parent)
+    recording = Recording.read(path, whole=True)
     planar, tuning = _flown(recording, path.parent)
-    axes = "xy" if planar else "xyz"
-    fits = [
-        velocity_loop.identify(given[:, axis], measured[:, axis], f"{path}: {name}")
-        for axis, name in enumerate(axes)
-    ]
+    fits = []
+    with naming(str(path)):
+        given, measured = velocity_loop.series(recording)
+    for axis, name in enumerate("xy" if planar else "xyz"):
+        with naming(f"{path}: {name}"):
+            fits.append(velocity_loop.identify(given[:, axis], measured[:, axis]))
     if len(fits) < 3:
         fits.append(_still(fits[0]))
     return fits, len(given) * DT, f"tunings.{tuning}.response" if tuning else "response"
@@ -47,11 +43,10 @@ def identify(run: Path) -> tuple[list[Fit], float, str]:
 
 def _flown(recording: Recording, folder: Path) -> tuple[bool, str | None]:
     """Return whether the robot of a run stays on the ground, and its tuning, if a file says so."""
-    try:
-        experiment = read_experiment(folder / "config.yaml", flown=True)
-        return flown_world(recording, experiment).planar, experiment.world.tuning
-    except BadInputError:
+    if not (config := folder / "config.yaml").exists():
         return False, None
+    experiment = read_experiment(config, flown=True)
+    return flown_world(recording, experiment).planar, experiment.world.tuning
 
 
 def _still(fit: Fit) -> Fit:

@@ -14,7 +14,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.outside.document import child
 from cloudrc.robots.build import onboard_values
 from cloudrc.runs import flight
-from cloudrc.runs.experiment import check_world, load, refuse_seed
+from cloudrc.runs.experiment import check_no_seed, check_world, load
 from cloudrc.studies import stability
 from cloudrc.studies.search import ValueRange, bisect, search
 from cloudrc.studies.stability import LARGE
@@ -64,7 +64,7 @@ class Margin:
     def __init__(self, asked: Asked) -> None:
         """Read the present value and the range of the search; refuse a key that has no range."""
         self.asked = asked
-        refuse_seed([*asked.settings, f"{asked.key}=0"])
+        check_no_seed([*asked.settings, f"{asked.key}=0"])
         now = present_value(load(asked.experiment, asked.settings), asked.key)
         first = asked.max if now is None else now
         if first is None:

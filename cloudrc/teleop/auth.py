@@ -19,7 +19,8 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cloudrc.errors import BadInputError, to_one_line
-from cloudrc.files import read_token, warn_if_readable
+from cloudrc.files import warn_if_readable
+from cloudrc.outside.paths import read_token
 
 OPERATOR, READER = "operator", "reader"
 """Roles of callers; the token of a role is in a file with the name of the role."""

@@ -9,10 +9,10 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers import local
-from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
 from cloudrc.metrics.velocity_loop import DT, identify, series
 from cloudrc.outside.document import parse_yaml
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.record.columns import Recording
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import GroundTruth, GuardChange
@@ -46,7 +46,7 @@ def test_a_model_is_recovered_within_its_interval():
         rng = np.random.default_rng(seed)
         given = steps(rng)
         measured = respond(given, *TRUE) + correlated(rng, len(given), 0.03)
-        fit = identify(given, measured, "x")
+        fit = identify(given, measured)
         inside.append(np.abs(fit.values - TRUE) <= fit.half_widths)
         assert fit.values == pytest.approx(TRUE, abs=0.08)
         assert np.all(fit.half_widths < 0.15)
@@ -57,14 +57,14 @@ def test_a_model_is_recovered_within_its_interval():
 @pytest.mark.parametrize(
     ("measured", "said"),
     [
-        (np.full(3000, 0.5), "m: y: the commanded velocity hardly changes"),
-        (steps(np.random.default_rng(2)), r"m: y: a first-order model explains -?\d+% of"),
+        (np.full(3000, 0.5), "the commanded velocity hardly changes"),
+        (steps(np.random.default_rng(2)), r"a first-order model explains -?\d+% of"),
     ],
 )
 def test_an_axis_that_does_not_follow_a_model_is_refused(measured, said):
     given = measured if "hardly" in said else steps(np.random.default_rng(1))
-    with pytest.raises(BadInputError, match=said):
-        identify(given, measured, "m: y")
+    with pytest.raises(InvalidValueError, match=said):
+        identify(given, measured)
 
 
 def records(seconds=30.0, track_s=(1.0, None)):
@@ -84,20 +84,20 @@ def records(seconds=30.0, track_s=(1.0, None)):
 
 
 def test_only_the_flight_under_commands_counts():
-    given, measured = series(Recording.from_records(records(track_s=(1.0, 28.0))), "m")
+    given, measured = series(Recording.from_records(records(track_s=(1.0, 28.0))))
     assert given.shape == measured.shape == (2500, 3)
 
 
 @pytest.mark.parametrize(
     ("recording", "text"),
     [
-        ([], "m: has no /reference; name the recording of a whole flight"),
-        (records(track_s=(1.0, 15.0)), "m: 12 s of flight under commands after.*needs 20 s"),
+        ([], "has no /reference; name the recording of a whole flight"),
+        (records(track_s=(1.0, 15.0)), "12 s of flight under commands after.*needs 20 s"),
     ],
 )
 def test_a_recording_that_is_not_enough_is_refused(recording, text):
-    with pytest.raises(BadInputError, match=text):
-        series(Recording.from_records(recording), "m")
+    with pytest.raises(InvalidValueError, match=text):
+        series(Recording.from_records(recording))
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.cli import mission as command
-from cloudrc.files import read_token
+from cloudrc.outside.paths import read_token
 from cloudrc.teleop.client import Api
 from tests.conftest import wait_until
 from tests.teleop.conftest import A, B, running

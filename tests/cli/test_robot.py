@@ -92,7 +92,7 @@ def test_a_folder_with_files_stays_as_it_is(mine, capsys):
     before = (mine / "robot.yaml").read_text()
     for path in (mine, mine / "robot.yaml"):
         assert main(["new", "robot", str(path)]) == 2
-        assert "exists and is not empty" in capsys.readouterr().err
+        assert "already exists; name a new folder" in capsys.readouterr().err
     assert (mine / "robot.yaml").read_text() == before
 
 

@@ -5,9 +5,9 @@ from unittest.mock import Mock
 
 import pytest
 
-from cloudrc.drivers import keyfile
 from cloudrc.drivers.keyfile import PERIOD_NS, KeyFile, read_keys
 from cloudrc.errors import BadInputError
+from cloudrc.outside import paths
 from cloudrc.tunnel.keys import Key, KeySet, write
 
 FIRST, SECOND = Key(b"1" * 32), Key(b"2" * 32)
@@ -73,7 +73,7 @@ def test_a_wrong_file_leaves_the_keys_and_is_told_once(wrong, path, keys, monkey
             put(path, wrong if isinstance(wrong, bytes) else b"2" * 32)
         if wrong == "barred":
             denied = PermissionError(13, "Permission denied")
-            patch.setattr(keyfile, "read", Mock(side_effect=denied))
+            patch.setattr(paths, "read", Mock(side_effect=denied))
         (said,) = keys.follow(PERIOD_NS)
         assert said.text.startswith(f"the old keys stay in use: --key {path}: ")
         assert keys.follow(2 * PERIOD_NS) == []

@@ -2,8 +2,8 @@
 
 import pytest
 
-from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import Plate, load_scene
+from cloudrc.outside.values import InvalidValueError
 
 
 def test_a_shipped_scene_is_read():
@@ -62,7 +62,7 @@ def test_spawn_and_numbers_of_included_files_count(tmp_path):
     ],
 )
 def test_bad_numbers_are_named(tmp_path, numbers, reason):
-    with pytest.raises(BadInputError, match=r"scene mine\.xml: .*" + reason):
+    with pytest.raises(InvalidValueError, match=r"scene mine\.xml: .*" + reason):
         load_scene(scene_file(tmp_path, numbers, '<body name="pipe_1"/><body name="board"/>'))
-    with pytest.raises(BadInputError, match="spawn: data must be 3 numbers: '1 2'"):
+    with pytest.raises(InvalidValueError, match="spawn: data must be 3 numbers: '1 2'"):
         load_scene(scene_file(tmp_path, "", '<frame name="spawn" pos="1 2"/>'))

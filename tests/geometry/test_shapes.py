@@ -5,12 +5,12 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-from cloudrc.errors import BadInputError
 from cloudrc.geometry import shapes
 from cloudrc.geometry.clearance import rotations
 from cloudrc.geometry.scene import Tube
 from cloudrc.geometry.shapes import Shapes, Surface
 from cloudrc.geometry.tubes import rims, wall
+from cloudrc.outside.values import InvalidValueError
 
 BODIES = {
     "box": (shapes.box((1.0, 2.0, 3.0)), 48.0),
@@ -63,7 +63,7 @@ def test_a_damaged_file_is_refused_and_nothing_else_is_raised():
     for each in broken:
         try:
             Shapes.from_bytes(each)
-        except BadInputError:
+        except InvalidValueError:
             refused += 1
     assert refused > 3
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from cloudrc.errors import BadInputError
 from cloudrc.geometry import solids
 from cloudrc.geometry.clearance import ball
 from cloudrc.geometry.placement import find_overlapped
 from cloudrc.geometry.scene import SCENES, load_scene
 from cloudrc.geometry.solids import Solid
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.sim.bodies import complete
 from cloudrc.sim.engine import mujoco
 
@@ -135,7 +135,7 @@ def test_a_changed_file_is_read_again(tmp_path):
     scene(tmp_path, '<body name="another"><geom size=".1"/></body>')
     assert read_bodies(path).bodies == ("floor", "another")
     path.unlink()
-    with pytest.raises(BadInputError, match=r"mine\.xml: cannot be read"):
+    with pytest.raises(InvalidValueError, match=r"mine\.xml: cannot be read"):
         read_bodies(path)
 
 

@@ -318,8 +318,8 @@ def test_importing_the_wrapper_takes_no_heavy_package_along():
         ({"compute": (0.1, 0.1, 0.1)}, "not 2 numbers"),
         ({"answer_within": 0.02}, r"0.02, not a number >= 0 and <= 0.01 \[s\]; give how long"),
         ({"executor": "newst"}, "no executor named 'newst'.*did you mean newest"),
-        ({"executor": "prefix"}, "executor 'prefix' plays chunks of actions: give chunk="),
-        ({"hold": "zero"}, "hold 'zero': give 'repeat' or 'start'"),
+        ({"executor": "prefix"}, "executor 'prefix': plays chunks of actions: give chunk="),
+        ({"hold": "zero"}, "no hold named 'zero'; available: repeat, start"),
         ({"start": np.zeros(3)}, r"of shape \(3,\); give as start= an action"),
         ({"dt": 0.0}, "the time step 0.0; give dt="),
         ({"stream": 3}, "stream 3"),
@@ -363,7 +363,7 @@ def test_only_an_action_of_the_space_reaches_the_world(space, chunk, action, is_
     if is_one:
         env.step(action)
         return
-    with pytest.raises(BadInputError, match="the action is") as caught:
+    with pytest.raises(BadInputError, match="the action: it is") as caught:
         env.step(action)
     assert "\n" not in str(caught.value)
     assert env.unwrapped.executed == []
@@ -426,22 +426,28 @@ def test_a_time_limit_outside_leaves_the_summary_in_the_last_step(make):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: Networked(Counter(), chunk_size=8), "^Networked .*'chunk_size'.* mean chunk"),
-        (lambda: Networked(Counter(), delay=40), "^Networked has no argument 'delay'; there are"),
+        (
+            lambda: Networked(Counter(), chunk_size=8),
+            "argument of Networked .*'chunk_size'.* mean chunk",
+        ),
+        (lambda: Networked(Counter(), delay=40), "argument of Networked named 'delay'; available"),
         (
             lambda: NetworkedVector(SyncVectorEnv([Counter]), sead=1),
-            "^NetworkedVector .*'sead'.* did you mean seed",
+            "argument of NetworkedVector .*'sead'.* did you mean seed",
         ),
         (
             lambda: gymnasium.make("cloudrc/Networked-v0", env="Pendulum-v1", g=9.0),
-            "^cloudrc/Networked-v0 has no argument 'g'.* go into env_args",
+            "argument of cloudrc/Networked-v0 .* go into env_args.* 'g'",
         ),
         (
             lambda: gymnasium.make_vec("cloudrc/Networked-v0", 2, env="Pendulum-v1", exekutor="x"),
-            "^cloudrc/Networked-v0 .*'exekutor'.* did you mean executor",
+            "argument of cloudrc/Networked-v0 .*'exekutor'.* did you mean executor",
         ),
-        (lambda: gymnasium.make("cloudrc/Networked-v0", link="lte"), "give env="),
-        (lambda: gymnasium.make("cloudrc/Steps-v0", robbot="x2"), "^RobotEnv .* mean robot"),
+        (lambda: gymnasium.make("cloudrc/Networked-v0", link="lte"), "env ''"),
+        (
+            lambda: gymnasium.make("cloudrc/Steps-v0", robbot="x2"),
+            "argument of RobotEnv .* mean robot",
+        ),
     ],
 )
 def test_an_unknown_argument_names_the_class_and_the_nearest(call, words):

@@ -90,7 +90,7 @@ def test_an_action_of_a_robot_on_the_ground_has_no_vertical_velocity():
     env = gymnasium.make("cloudrc/Steps-v0", experiment="pillars").unwrapped
     assert env.action_space.shape == (3,)
     env.reset(seed=1)
-    with pytest.raises(BadInputError, match="not 3 numbers: vx, vy, yaw rate"):
+    with pytest.raises(BadInputError, match="not 3 numbers; give vx, vy, yaw rate"):
         env.step(np.array([0.5, 0.0, 0.3, 0.0]))
 
 
@@ -109,7 +109,7 @@ def test_a_seed_selects_the_steps_and_a_flight_can_be_repeated():
 def test_a_flight_is_not_copied_and_another_environment_flies_the_same():
     env = copy.deepcopy(gymnasium.make("cloudrc/Steps-v0"))
     env.reset(seed=1)
-    with pytest.raises(BadInputError, match="cannot be copied; reset another environment"):
+    with pytest.raises(TypeError, match="cannot be copied; reset another environment"):
         copy.deepcopy(Networked(env))
 
 
@@ -128,5 +128,5 @@ def test_what_a_robot_cannot_fly_is_refused():
     env.reset(seed=1)
     wrong = [True, False, False, False], ["0.1", 0, 0, 0], [1e31, 0, 0, 0], [[0], 1]
     for action in (np.zeros(3), np.array([np.nan, 0, 0, 0]), None, np.ones(4) > 0, *wrong):
-        with pytest.raises(BadInputError, match=r"^action .*: vx, vy, vz, yaw rate$"):
+        with pytest.raises(BadInputError, match=r"^action.*; give vx, vy, vz, yaw rate$"):
             env.step(action)

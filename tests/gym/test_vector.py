@@ -110,7 +110,7 @@ def test_what_does_not_fit_a_vector_is_refused_in_one_line():
     ready.reset()
     with pytest.raises(BadInputError, match="for each of 2 robots a chunk of 3 actions"):
         ready.step(np.zeros((2, 1)))
-    with pytest.raises(BadInputError, match="the action is None"):
+    with pytest.raises(BadInputError, match="the action: it is None"):
         ready.step(None)
 
 

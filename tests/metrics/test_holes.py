@@ -193,7 +193,7 @@ def test_the_velocity_loop_is_fitted_to_the_longest_time_without_a_hole(spans, s
         each._replace(stamp_ns=at(0) + (each.stamp_ns - at(0)) * 4) for each in log.world
     ]
     assert last < max(each.stamp_ns for each in log.world)
-    given, _ = series(lossy(log, *spans).recording, "flight")
+    given, _ = series(lossy(log, *spans).recording)
     assert len(given) * 0.01 == pytest.approx(seconds, abs=0.3)
 
 

@@ -278,7 +278,7 @@ def test_damage_is_told_with_its_place_and_the_tool_that_reads_on(path):
     found = re.fullmatch(r"damaged at byte (\d+): .*: mcap recover", Recording.read(path).note)
     assert at < int(found[1]) <= CHUNKS[1][0]
     with pytest.raises(BadInputError, match=r"mcap recover; .*: cloudrc recover .*x\.mcap$"):
-        Recording.read(path).refuse_damaged(path)
+        Recording.read(path, whole=True)
 
 
 def test_damage_that_only_the_checksum_of_all_data_shows_may_be_anywhere(path):

@@ -199,5 +199,5 @@ def test_the_recordings_are_merged_if_they_are_not_yet(run):
 def test_a_folder_without_a_run_is_refused(run):
     for name in ("mission.mcap", "config.yaml"):
         (run / name).unlink()
-        with pytest.raises(BadInputError, match=f"has no {name}"):
+        with pytest.raises(BadInputError, match=f"{name}: no such file"):
             read_run(run)

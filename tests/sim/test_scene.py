@@ -15,6 +15,7 @@ from cloudrc.config.schema import Plant, World
 from cloudrc.config.shipped import file_of, names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError, OutOfMemoryError
 from cloudrc.geometry.scene import load_scene
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.robots.build import check_robot
 from cloudrc.robots.pelican.rotors import STOPPED
 from cloudrc.sim.bodies import complete
@@ -178,7 +179,7 @@ def test_a_robot_meets_what_the_path_check_says_or_is_refused(
     assert bits in robot.read_text()
     pole = POLE.format(*pole_bits)
     scene.write_text(FILES["scene"].read_text().replace("</worldbody>", f"{pole}</worldbody>"))
-    expected = pytest.raises(BadInputError, match=message) if message else nullcontext()
+    expected = pytest.raises(InvalidValueError, match=message) if message else nullcontext()
     with expected:
         model_of(str(robot), str(scene))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import socket
 import time
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from typing import Any
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.drivers.realtime import Address, show_address
 from cloudrc.errors import BadInputError
+from cloudrc.files import naming
 from cloudrc.link.carry.punctual import settle
 from cloudrc.link.carry.tcp.medium import Medium
 from cloudrc.link.carry.tcp.relay import StreamRelay
@@ -86,21 +86,14 @@ def refuse_unsupported(profile: DirectionProfile, name: str) -> None:
 
 def _listen(where: Address) -> socket.socket:
     family = socket.AF_INET6 if ":" in where[0] else socket.AF_INET
-    try:
+    with naming(f"--listen {show_address(where)}"):
         return socket.create_server(where, family=family, backlog=WAITING)
-    except OSError as error:
-        raise BadInputError(
-            f"--listen {show_address(where)}: {os.strerror(error.errno or 0)};"
-            " name an address of this machine and a port that is free"
-        ) from None
 
 
 def _find(to: Address) -> tuple[int, tuple[str, int]]:
     """Look up the server's address, IPv4 if it has one; return its family, host and port."""
-    try:
+    with naming(f"--to {show_address(to)}"):
         found = socket.getaddrinfo(*to, type=socket.SOCK_STREAM)
-    except (OSError, UnicodeError) as error:
-        raise BadInputError(f"--to {show_address(to)}: {error}; name a host and a port") from None
     # A server rarely listens at ::1 alone, but localhost often names it first.
     family, _, _, _, address = min(found, key=lambda one: one[0] != socket.AF_INET)
     return int(family), (str(address[0]), int(address[1]))

@@ -12,7 +12,6 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING
 
-from cloudrc.errors import BadInputError
 from cloudrc.files import naming
 from cloudrc.link.streams import numbers
 from cloudrc.link.trace_logs import (
@@ -26,6 +25,7 @@ from cloudrc.link.trace_logs import (
     trace_of,
 )
 from cloudrc.link.traces import read_lines, write_trace
+from cloudrc.outside.paths import check_there
 from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
@@ -46,12 +46,11 @@ class LogSettings:
 def read_packets(source: Path, settings: LogSettings) -> dict[Direction, Packets]:
     """Read the delays in a source; return direction -> packets."""
     only = settings.direction
-    if not (source.is_dir() or source.is_file()):
-        raise BadInputError(f"{source}: no such file or folder; name a run, a log or a CSV file")
+    check_there(source, "name a run, a log or a CSV file")
     if not _is_run(source):
         return {only or "uplink": _from_log(source, settings)}
     if settings.halve_rtt:
-        raise BadInputError(f"{source}: a run has one-way delays; leave out --halve-rtt")
+        raise Log(str(source)).error("a run has one-way delays; leave out --halve-rtt")
     require("a trace of a run", ("record",))
     recording = _recording(source)
     ways: tuple[Direction, ...] = (only,) if only else DIRECTIONS
@@ -79,18 +78,16 @@ def _from_log(path: Path, settings: LogSettings) -> Packets:
 def _recording(path: Path) -> Recording:
     from cloudrc.record.columns import Recording
     from cloudrc.record.holes import SOMEWHERE
-    from cloudrc.runs.session import refuse_under_way
+    from cloudrc.runs.session import check_ended
 
     file = path / "mission.mcap" if path.is_dir() else path
-    refuse_under_way(file.parent)
-    if not file.is_file():
-        raise BadInputError(f"{path}: has no mission.mcap; name the folder of a run, or a file")
-    recording = Recording.read(file)
-    recording.refuse_damaged(file)
+    check_ended(file.parent)
+    check_there(file, "name the folder of a run, or a file")
+    recording = Recording.read(file, whole=True)
     if SOMEWHERE in recording.holes:
-        raise BadInputError(
-            f"{file}: {recording.note}: nobody knows when, so what the link has lost is not known; "
-            "give the original file"
+        raise Log(str(file)).error(
+            f"{recording.note}: nobody knows when, so what the link has lost is not known; give "
+            "the original file"
         )
     return recording
 
@@ -98,8 +95,7 @@ def _recording(path: Path) -> Recording:
 def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     """Compute one-way delays by matching the records of sent and of arrived datagrams.
 
-    If a datagram arrived twice, the shorter delay counts. Raise a BadInputError that names `path`
-    if the recording has no one-way delays.
+    If a datagram arrived twice, the shorter delay counts. `path` is the name of the recording.
     """
     from cloudrc.metrics.link import SENT, transit_ns
 
@@ -114,7 +110,7 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     rows = list(_columns(sent, "stamp_ns", "epoch", "counter"))
     longest_ns = transit_ns(recording, direction)
     known = _outside_holes(rows, recording.holes, longest_ns, log)
-    # The link did not lose what the receiver refused before its session was open, and what may
+    # The link did not lose what arrived before the receiver's session was open, and what may
     # still arrive after the end. All datagrams of these times are left out, also those that
     # arrived: if they alone remained, the trace would lose too few.
     latest_first = reversed(list(_columns(arrivals, "epoch", "counter")))

@@ -40,6 +40,7 @@ from cloudrc.link.verify.causes import (
 )
 from cloudrc.link.verify.judge import Flow, Judgement, Measurement, look_twice, verdict_of
 from cloudrc.link.verify.probe import PROBE, plan_probes
+from cloudrc.outside.refusal import check_names
 from cloudrc.runs.links.under_test import LOOPBACK, WAYS, Way, inside, measure, run_link
 from cloudrc.text import Paint, escape, plain, table
 from cloudrc.tunnel.codec import SIZES, TELEMETRY_SIZES, Kind
@@ -74,9 +75,8 @@ def find_experiment(target: str, settings: Sequence[str]) -> ResolvedExperiment:
         keys = set(shipped.read("profile", target, Path.cwd()).tree)
         is_profile = keys.isdisjoint(Experiment.model_fields.keys() - Profile.model_fields.keys())
         target = str(Path.cwd() / target)
-    elif target not in (*experiments, *profiles):
-        names = ", ".join([*profiles, *experiments])
-        raise BadInputError(f"no profile or experiment named '{target}'; available: {names}")
+    else:
+        check_names("profile or experiment", [target], [*profiles, *experiments])
     if not is_profile:
         return read_experiment(target, settings)
     return read_experiment(DEFAULT, [f"link.profile={target}", *settings])
@@ -102,7 +102,7 @@ def verify(
         tell: Receives each step, in words.
     """
     experiment = find_experiment(target, settings)
-    plans, found = make_plans(experiment, check_seconds(seconds), shaper), dict[str, Findings]()
+    plans, found = make_plans(experiment, seconds, shaper), dict[str, Findings]()
     longest = max(plan.sent[-1] for plan in plans.values())
     for look in ("sending probes", "measuring again what is off"):
         with run_link(experiment, shaper) as ways:
@@ -118,21 +118,10 @@ def verify(
     return report
 
 
-def check_seconds(seconds: float | None) -> float | None:
-    """Return `seconds` [s]; raise a BadInputError if it is too short or too long."""
-    if seconds is not None and not 1.0 <= seconds <= 3600.0:
-        raise BadInputError(f"--seconds {seconds:g}: give a number from 1 to 3600")
-    return seconds
-
-
 def make_plans(
     experiment: ResolvedExperiment, seconds: float | None, shaper: str
 ) -> dict[str, Measurement]:
-    """Plan probes in both directions for `seconds` [s] (None: as long as needed).
-
-    Raises:
-        BadInputError: If netem cannot realise the profile; the text names the direction.
-    """
+    """Plan probes in both directions for `seconds` [s] (None: as long as needed)."""
     plans, netem = {}, shaper == "netem"
     sensors = known_robot(experiment.world.robot).sensors
     sizes = SIZES | {int(Kind.TELEMETRY): TELEMETRY_SIZES[len(sensors)]}

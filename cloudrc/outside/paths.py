@@ -1,0 +1,94 @@
+"""Paths that a user names: results never replace what is there, and secrets are read whole."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from cloudrc.errors import BadInputError
+from cloudrc.files import SIZE_MAX, read
+
+PICTURES = {
+    "png": re.compile(rb"\x89PNG\r\n\x1a\n"),
+    "svg": re.compile(rb"(<\?xml[^>]*>\s*)?<(!DOCTYPE )?svg\b"),
+    "pdf": re.compile(rb"%PDF-"),
+}
+"""Kind of a picture -> how its files begin."""
+_TOKEN = re.compile(rb"[!-~]{16,512}")
+_Secret = TypeVar("_Secret")
+
+
+def check_new(path: Path, remedy: str = "name another file with -o") -> None:
+    """Raise a BadInputError if writing to `path` would replace a file that is not empty.
+
+    Writing to a device or a pipe replaces nothing.
+    """
+    if path.is_file() and path.stat().st_size:
+        raise BadInputError(f"{path}: already there; {remedy}")
+
+
+def check_picture(path: Path, flag: str) -> None:
+    """Check that `path` is new or a picture, and that its name has the ending of a picture."""
+    own = PICTURES.get(path.suffix[1:])
+    if own is None:
+        known = ", ".join(f".{each}" for each in PICTURES)
+        raise BadInputError(f"{flag} {path}: no kind of picture; use one of {known}")
+    if path.is_file():
+        with path.open("rb") as file:
+            start = file.read(256)
+        if own.match(start) is None:
+            check_new(path, f"name another file with {flag}")
+
+
+def make_folder(folder: Path, named: str = "") -> None:
+    """Make a folder for results; `named` precedes its path in errors, as the flag that gave it.
+
+    Raise a BadInputError if it exists and is not an empty folder, or if it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        is_used = any(folder.iterdir())
+    except FileExistsError:
+        is_used = True
+    except OSError as error:
+        text = f"cannot be made: {error.strerror}; name a writable folder"
+        raise BadInputError(f"{named}{folder}: {text}") from error
+    if is_used:
+        text = "already exists; name a new folder, nothing is overwritten"
+        raise BadInputError(f"{named}{folder}: {text}")
+
+
+def check_there(path: Path, remedy: str, what: str = "no such file or folder") -> None:
+    """Raise a BadInputError if nothing is at `path`."""
+    if not path.exists():
+        raise BadInputError(f"{path}: {what}; {remedy}")
+
+
+def read_secret(
+    path: Path, named: str, parse: Callable[[bytes], _Secret], make: str, size_max: int = SIZE_MAX
+) -> _Secret:
+    """Read a file with a secret; never block, even if the file is a pipe.
+
+    If `parse` raises a ValueError about its content, raise a BadInputError that contains no part of
+    the file: `named` and the reason. `make` is the command that makes such a file.
+    """
+    try:
+        return parse(read(path, size_max))
+    except OSError as error:
+        reason = error.strerror or str(error)
+    except ValueError as error:
+        reason = str(error).removeprefix(f"{path}: ")
+    raise BadInputError(f"{named}: {reason}; make one: {make}")
+
+
+def read_token(path: Path, named: str) -> str:
+    """Read the token of teleop's API from a file, as `read_secret` does."""
+    return read_secret(path, named, _parse_token, f"(umask 077; openssl rand -hex 32 > {path})")
+
+
+def _parse_token(data: bytes) -> str:
+    if _TOKEN.fullmatch(data.strip()):
+        return data.strip().decode("ascii")
+    raise ValueError("a token is 16 to 512 visible ASCII characters")
