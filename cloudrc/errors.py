@@ -132,10 +132,5 @@ def to_one_line(text: str | None) -> str:
 def describe_error(error: BaseException) -> str:
     """Describe an exception in one line: its type and its message."""
     name = type(error).__name__
-    try:
-        text = to_one_line(f"{name}: {error}")
-    except KeyboardInterrupt:
-        raise
-    except BaseException:  # the exception's __str__ may raise, too
-        text = to_one_line(name)
+    text = to_one_line(f"{name}: {error}")
     return f"{text} (sys.exit() was called)" if isinstance(error, SystemExit) else text

@@ -6,6 +6,7 @@ Reading never blocks. Writing replaces the file in one step.
 from __future__ import annotations
 
 import grp
+import json
 import os
 import pwd
 import stat
@@ -13,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader, FileIO
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 SIZE_MAX = 1 << 20
 """Default size limit of a file that is read [bytes]: the size limit of a ConfigMap."""
@@ -46,6 +47,14 @@ def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
     if long or len(data) > size_max:
         raise TooLongError(f"{path}: longer than {size_max} bytes")
     return data
+
+
+def read_json(path: Path, size_max: int = SIZE_MAX) -> dict[str, Any]:
+    """Read a file with a JSON object; {} if there is none that can be read."""
+    with suppress(OSError, ValueError, RecursionError):
+        document = json.loads(read(path, size_max))
+        return document if isinstance(document, dict) else {}
+    return {}
 
 
 def open_file(path: Path) -> FileIO:
@@ -111,7 +120,7 @@ def warn_if_readable(path: Path, warn: Callable[[str], None]) -> None:
     If another user owns the file, its group may read it: Kubernetes gives the files of a Secret to
     root, and lets the pod's group read them.
     """
-    with suppress(OSError):  # a missing file is reported by its reader
+    if path.exists():  # else its reader reports it
         status = path.stat()
         group = stat.S_IRGRP if status.st_uid == os.geteuid() else 0
         masks = {"read": stat.S_IROTH | group, "changed": stat.S_IWOTH | stat.S_IWGRP}

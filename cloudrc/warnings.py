@@ -7,12 +7,11 @@ prevents the flight.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from importlib.util import find_spec
 from itertools import pairwise
 from math import ceil, dist, floor
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.rounding import exceeds, format_limit
 
@@ -215,14 +214,13 @@ def _balance(experiment: ResolvedExperiment) -> Iterator[str]:
 
     Without MuJoCo there are none, because the controller's plug-in may need it.
     """
-    if experiment.world.is_nominal:
+    if experiment.world.is_nominal or find_spec("mujoco") is None:
         return
     controller = experiment.cloud.controller
     gains = (controller.model_extra or {})["gain_p"] if controller.name == "pid" else (0.0, 0, 0.0)
-    with suppress(MissingPrerequisiteError):
-        from cloudrc.robots.build import advise as advise_on_robot
+    from cloudrc.robots.build import advise as advise_on_robot
 
-        yield from advise_on_robot(experiment.world, gains)
+    yield from advise_on_robot(experiment.world, gains)
 
 
 def _long_link(

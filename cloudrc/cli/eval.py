@@ -17,7 +17,7 @@ from cloudrc.cli.output import (
     print_result,
 )
 from cloudrc.cli.parser import COUNT_MAX, number, read_count
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.lock import lock_folder
@@ -123,7 +123,7 @@ def execute(options: argparse.Namespace) -> int:
         view.say(escape(f"{setup.env}: {len(episodes)} episodes, step {checked.step}"))
         try:
             rows, stopped = results.play_missing(folder, setup, episodes, options.jobs, view.count)
-        except Exception:
+        except CloudrcError:
             if results.is_begun(folder):
                 print_line(
                     f"the rows are kept; the same call with --out {folder} goes on", sys.stderr

@@ -11,13 +11,12 @@ import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
 from cloudrc.cli.cluster_flags import flown_release, release_arguments, timeout_argument
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
-from cloudrc.cli.output import output_argument, print_line, print_result
+from cloudrc.cli.output import leave_message, output_argument, print_line, print_result
 from cloudrc.cli.parser import add_verbs, number
 from cloudrc.cli.token_flag import given_token, token_argument
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
@@ -37,7 +36,6 @@ from cloudrc.teleop.telling import (
     describe_stay,
     missions_table,
 )
-from cloudrc.text import escape
 
 if TYPE_CHECKING:
     from cloudrc.cluster.client import Release
@@ -76,8 +74,6 @@ LEASE = 60.0
 TERMINATED = 143
 """Exit code of `mission fly` after SIGTERM. Kubernetes then starts a new pod, because the Job
 ignores this code."""
-TERMINATION_LOG = Path("/dev/termination-log")
-"""File in a pod for the pod's last message, which `kubectl describe` shows after the pod's end."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -181,7 +177,7 @@ def _fly(options: argparse.Namespace, api: Api) -> int:
         raise
     text = describe_verdict(verdict)
     print_line(text)
-    _write_last_words(text)
+    leave_message(text)
     return int(verdict["exit_code"])
 
 
@@ -189,14 +185,8 @@ def _leave(number: int, frame: FrameType | None) -> NoReturn:
     """End this process at once; an exception could get lost where libraries catch it."""
     text = "this watcher of the mission is stopped; the mission goes on if a new one follows it"
     os.write(sys.stdout.fileno(), f"{text}\n".encode())  # `print` may be interrupted itself
-    _write_last_words(text)
+    leave_message(text)
     os._exit(TERMINATED)
-
-
-def _write_last_words(text: str) -> None:
-    if TERMINATION_LOG.exists():
-        with suppress(OSError):
-            TERMINATION_LOG.write_text(f"{escape(text)}\n", encoding="utf-8")
 
 
 def _say(api: Api, text: str) -> None:

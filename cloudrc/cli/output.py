@@ -9,6 +9,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from cloudrc.errors import DISK_FULL
@@ -24,6 +25,8 @@ TABLE = "table"
 """Form of the output that is for people."""
 TABLES = ("csv", "latex")
 """Further forms of a command whose result is a table."""
+TERMINATION_LOG = Path("/dev/termination-log")
+"""File in a pod for the pod's last message, which `kubectl describe` shows after the pod's end."""
 STDOUT = "the output (stdout)"
 """Place of the output in errors."""
 
@@ -72,9 +75,9 @@ def reserve_stdout() -> Iterator[None]:
     So child processes and C libraries of a plug-in do not write into a document.
     """
     with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError, ValueError):  # the stream of a test has no descriptor
+        if (number := _descriptor(sys.stdout)) is not None:
             sys.stdout.flush()
-            kept, number = os.dup(sys.stdout.fileno()), sys.stdout.fileno()
+            kept = os.dup(number)
             os.dup2(sys.stderr.fileno(), number)
             stack.callback(os.close, kept)
             stack.callback(os.dup2, kept, number)
@@ -88,8 +91,9 @@ def reserve_stdout() -> Iterator[None]:
 
 def end_output() -> None:
     """Send what plug-ins print at the end of this process to stderr: the result is complete."""
-    with contextlib.suppress(OSError, ValueError):
-        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    stdout, stderr = _descriptor(sys.stdout), _descriptor(sys.stderr)
+    if stdout is not None and stderr is not None:
+        os.dup2(stderr, stdout)
 
 
 def is_live(stream: TextIO) -> bool:
@@ -109,10 +113,23 @@ def print_or_drop(text: str, stream: TextIO | None = None) -> None:
 
 def discard_output(stream: TextIO) -> None:
     """Redirect a closed stream to /dev/null, so that Python's flush at exit raises no error."""
-    with contextlib.suppress(OSError, ValueError):  # the stream of a test has no descriptor
+    if (number := _descriptor(stream)) is not None:
         null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, stream.fileno())
+        os.dup2(null, number)
         os.close(null)
+
+
+def _descriptor(stream: TextIO) -> int | None:
+    """Return the descriptor of a stream; None for a closed one and for that of a test."""
+    with contextlib.suppress(OSError, ValueError):
+        return stream.fileno()
+    return None
+
+
+def leave_message(text: str) -> None:
+    """Leave one sentence about the end of this pod, which Kubernetes shows with the pod's state."""
+    if TERMINATION_LOG.exists():
+        TERMINATION_LOG.write_text(f"{escape(text)}\n", encoding="utf-8")
 
 
 def open_page(url: str) -> bool:

@@ -6,13 +6,13 @@ import argparse
 import json
 import sys
 from collections.abc import Generator, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 from shlex import quote
 
 from cloudrc.cli.cluster_flags import release_from_flags
-from cloudrc.cli.mission import TERMINATION_LOG
 from cloudrc.cli.output import (
+    leave_message,
     print_line,
     print_or_drop,
     print_result,
@@ -208,20 +208,13 @@ def print_rows(options: argparse.Namespace) -> int:
         flights = unpack(options.file)[shard - 1 :: count]
         stopped = take_each(map_in_order(play, flights, jobs=1), print_row)
     except Exception as error:
-        _leave_message(str(error) if isinstance(error, CloudrcError) else describe_error(error))
+        leave_message(str(error) if isinstance(error, CloudrcError) else describe_error(error))
         raise
     if stopped:
         print_line(f"cloudrc: error: {stopped}", sys.stderr)
-        _leave_message(str(stopped))
+        leave_message(str(stopped))
         return stopped.exit_code
     return 0
-
-
-def _leave_message(text: str) -> None:
-    """Leave one sentence about the end of this pod, which Kubernetes shows with the pod's state."""
-    if TERMINATION_LOG.exists():
-        with suppress(OSError):
-            TERMINATION_LOG.write_text(f"{escape(text)}\n", encoding="utf-8")
 
 
 # `cloudrc run --seeds N`.

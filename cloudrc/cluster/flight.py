@@ -27,7 +27,7 @@ from cloudrc.cluster.jobs import JobGoneError, delete_job, failure_of, follow, j
 from cloudrc.cluster.missions import release_api, settle_mission
 from cloudrc.cluster.own_files import find_own_files, give_to_release, send_own_files
 from cloudrc.errors import CloudrcError, InterruptedRunError, TimedOutError
-from cloudrc.teleop.client import find_mission
+from cloudrc.teleop.client import Api, find_mission
 
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
@@ -157,10 +157,7 @@ def check_can_begin(release: Release) -> None:
                 f"Job '{name}' is under way on release '{release.name}' {release.where}; wait for "
                 f"it, end it: {end} {name}, or fly on a release of your own: --release NAME"
             )
-    mission = None
-    with suppress(CloudrcError), release_api(release) as api:
-        mission = api.get("/v1/state")["mission"]
-    if mission is not None:
+    if mission := _ask(release, lambda api: api.get("/v1/state")["mission"]):
         cancel = _cancel_command(release, mission["id"])
         raise ClusterError(
             f"mission {mission['id']} is under way on release '{release.name}' {release.where}; "
@@ -203,10 +200,17 @@ def follow_job(release: Release, job: str, tell: Tell) -> int:
 
 def cancelling_command(release: Release, job: str) -> str:
     """Return the command that cancels the mission of a Job."""
-    with suppress(CloudrcError), release_api(release) as api:
-        if mission := find_mission(api, job_key(release, job)):
-            return _cancel_command(release, mission["id"])
+    mission = _ask(release, lambda api: find_mission(api, job_key(release, job)))
+    if mission:
+        return _cancel_command(release, mission["id"])
     return f"{release.kubectl} delete job {job}"
+
+
+def _ask(release: Release, ask: Callable[[Api], Any]) -> Any:
+    """Return what the API of a release answers; None if it does not answer."""
+    with suppress(CloudrcError), release_api(release) as api:
+        return ask(api)
+    return None
 
 
 def _cancel_command(release: Release, mission: str) -> str:

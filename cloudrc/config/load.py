@@ -392,7 +392,7 @@ def _remove_derived(document: Document, *, new_profile: bool) -> None:
     plan_max: Any = document.get("guard", "plan_max_s")
     bounds = _bounds(document, [])
     derived["guard", "acceleration_max_mps2"] = bounds.robot.acceleration_max_mps2
-    with suppress(TypeError):  # a value is missing, or no number
+    if isinstance(age_max, int | float) and isinstance(plan_max, int | float):
         derived["guard", "speed_max_mps"] = speed_cap(age_max, plan_max, bounds)
     if new_profile:
         derived |= _implied(_present_profile(document))

@@ -13,6 +13,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from cloudrc.drivers.children import await_or_kill, signal_group
 from cloudrc.errors import ControllerLostError, to_one_line
 from cloudrc.records import CONTROLLER_LOST
 
@@ -112,13 +113,6 @@ def _has_ended(program: subprocess.Popen[bytes]) -> bool:
 
 def _end(program: subprocess.Popen[bytes]) -> None:
     """End the program and its group; its children may outlive it."""
-    _signal(program, signal.SIGTERM)
-    with suppress(subprocess.TimeoutExpired):
-        program.wait(STOP_LIMIT)
-    _signal(program, signal.SIGKILL)
-    program.wait()
-
-
-def _signal(program: subprocess.Popen[bytes], number: int) -> None:
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(program.pid, number)
+    signal_group(program, signal.SIGTERM)
+    await_or_kill(program, STOP_LIMIT)
+    signal_group(program, signal.SIGKILL)

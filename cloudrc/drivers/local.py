@@ -27,6 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, NamedTuple
 
+from cloudrc.drivers.children import await_or_kill
 from cloudrc.drivers.machine import Deadline, interpreter
 from cloudrc.drivers.process import PARENT, READY, from_line
 from cloudrc.drivers.realtime import free_ports
@@ -418,9 +419,7 @@ class LocalRun:
             child.process.terminate()
         deadline = time.monotonic() + STOP_LIMIT
         for child in self._children:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                child.process.wait(max(0.0, deadline - time.monotonic()))
-            child.process.kill()
+            await_or_kill(child.process, max(0.0, deadline - time.monotonic()))
             child.process.communicate()
         self._selector.close()
 

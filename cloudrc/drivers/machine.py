@@ -8,7 +8,6 @@ import sys
 import time
 import uuid
 from collections.abc import Callable
-from contextlib import suppress
 from math import ceil
 from pathlib import Path
 
@@ -41,12 +40,12 @@ def usable_cores() -> int:
     """
     affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1
-    with suppress(OSError, StopIteration):
-        lines = CGROUP.read_text().splitlines()
-        group = CGROUPS / next(line[3:].strip("/") for line in lines if line.startswith("0::"))
-        for folder in (group, *group.parents):
-            with suppress(OSError, ValueError):  # no file here, or "max": no limit
-                quota, period = (folder / "cpu.max").read_text().split()
+    lines = CGROUP.read_text().splitlines() if CGROUP.exists() else []
+    groups = [CGROUPS / line[3:].strip("/") for line in lines if line.startswith("0::")]
+    for group in groups:
+        for file in (folder / "cpu.max" for folder in (group, *group.parents)):
+            quota, period = file.read_text().split() if file.exists() else ("max", "")
+            if quota != "max":
                 cores = min(cores, max(1, ceil(int(quota) / int(period))))
     return cores
 

@@ -13,9 +13,10 @@ import socket
 import socketserver
 import subprocess
 import threading
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import IO, Any, NamedTuple
 
+from cloudrc.drivers.children import await_or_kill
 from cloudrc.drivers.machine import interpreter
 from cloudrc.errors import InvalidRunError, MissingPrerequisiteError
 from cloudrc.files import naming
@@ -71,11 +72,10 @@ class ProgramEnd:
                 env={**os.environ, "PYTHONUNBUFFERED": "1"},
             )
         self._device, self._namespace = -1, ""
-        try:
+        with ExitStack() as stack:
+            stack.callback(self.close)
             hello, (self._device,) = self._read_answer(1)
-        except BaseException:
-            self.close()
-            raise
+            stack.pop_all()
         self.way, self.has_ipv6 = str(hello["way"]), bool(hello["ipv6"])
         self._namespace = str(hello["namespace"])
 
@@ -125,10 +125,7 @@ class ProgramEnd:
     def close(self) -> None:
         """ProgramEnd all processes in the namespace, and the namespace with them."""
         self.hang_up()
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(END_LIMIT + 1.0)
-        self._process.kill()
-        self._process.wait()
+        await_or_kill(self._process, END_LIMIT + 1.0)
         self.hang_up()
         if self._device >= 0:
             os.close(self._device)
@@ -136,10 +133,12 @@ class ProgramEnd:
             output.close()
 
     def _ask(self, descriptors: int = 0, **request: Any) -> tuple[dict[str, Any], list[int]]:
-        with self._lock, suppress(OSError):
-            self._connection.send(json.dumps(request).encode())
-            return self._read_answer(descriptors)
-        raise self._lost()
+        with self._lock:
+            try:
+                self._connection.send(json.dumps(request).encode())
+                return self._read_answer(descriptors)
+            except OSError:
+                raise self._lost() from None
 
     def _read_answer(self, descriptors: int) -> tuple[dict[str, Any], list[int]]:
         """Read an answer that comes with a number of file descriptors."""

@@ -307,7 +307,7 @@ class LinkNotes:
 def _if_readable(read: Callable[[], Sequence[Record]]) -> Sequence[Record]:
     try:
         return read()
-    except Exception:  # a missing or malformed file
+    except (OSError, ValueError):  # a missing or malformed file
         return []
 
 

@@ -18,7 +18,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from cloudrc.drivers.process import from_line, to_line
-from cloudrc.drivers.teleop import bind_datagrams
+from cloudrc.drivers.teleop import bind_datagrams, receive_all
+from cloudrc.link.carry.udp import send_or_lose
 from cloudrc.messages import Telemetry
 from cloudrc.records import Record, TelemetrySent
 
@@ -66,8 +67,7 @@ class RecordSender:
         body = "\n".join(lines)
         for path, before in self._sent.items():
             self._sent[path] = before + len(lines)
-            with suppress(OSError):  # the reader is slow, or has ended
-                self._socket.sendto(f"{before}\n{body}".encode(), str(path))
+            send_or_lose(self._socket, f"{before}\n{body}".encode(), str(path))
 
 
 class RecordReader:
@@ -90,11 +90,8 @@ class RecordReader:
         """Return the records that have arrived; if there are none, wait at most `limit` [s]."""
         if not select.select([self._socket], [], [], limit)[0]:
             self._connect()  # to a new process of cloud
-        found: list[Record] = []
-        with suppress(BlockingIOError, ConnectionResetError):
-            while True:
-                found += self._read(self._socket.recv(DATAGRAM_MAX))
-        return found
+        arrived = receive_all(self._socket, DATAGRAM_MAX)
+        return [record for data in arrived for record in self._read(data)]
 
     def close(self) -> None:
         """Stop to receive."""

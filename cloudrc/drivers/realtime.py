@@ -20,6 +20,7 @@ from pathlib import Path
 from cloudrc.endpoint import Endpoint
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.files import read, version
+from cloudrc.link.carry.udp import send_or_lose
 from cloudrc.records import Lateness, Record
 from cloudrc.tunnel.codec import DATAGRAM_MAX
 
@@ -118,8 +119,7 @@ class Peer:
         """Send datagrams; drop them if the address is unknown or the socket refuses them."""
         if self.address is not None:
             for data in datagrams:
-                with suppress(OSError):
-                    self.socket.sendto(data, self.address)
+                send_or_lose(self.socket, data, self.address)
 
 
 def _reachable(bound: socket.socket, address: Address) -> Address:

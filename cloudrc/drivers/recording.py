@@ -182,11 +182,9 @@ class Recorder:
             except OSError as error:
                 self._end(error)
         taken = 0
-        with contextlib.suppress(IndexError):
-            while taken < BATCH:
-                record = self._queue.popleft()
-                taken += 1
-                self._write(record)
+        while self._queue and taken < BATCH:  # the other thread never empties the queue
+            taken += 1
+            self._write(self._queue.popleft())
         return taken
 
     def _flush(self) -> None:

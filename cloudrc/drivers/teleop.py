@@ -10,8 +10,9 @@ from __future__ import annotations
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,6 +46,13 @@ Make = Callable[[int], None]
 """Function that makes the calls that other threads have queued, at a time [ns], monotonic clock."""
 
 
+def receive_all(one: socket.socket, size_max: int) -> Iterator[bytes]:
+    """Yield the datagrams that have arrived, each of at most `size_max` bytes."""
+    with suppress(BlockingIOError, ConnectionResetError):
+        while True:
+            yield one.recv(size_max)
+
+
 def bind_datagrams(path: Path) -> socket.socket:
     """Open a socket for datagrams at `path`, in place of that of an earlier process."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -73,11 +81,7 @@ class UnixDatagrams:
 
     def receive_data(self) -> list[bytes]:
         """Return the datagrams that have arrived."""
-        arrived: list[bytes] = []
-        with suppress(BlockingIOError):
-            while len(arrived) < DRAIN_MAX:
-                arrived.append(self._socket.recv(self._size_max))
-        return arrived
+        return list(islice(receive_all(self._socket, self._size_max), DRAIN_MAX))
 
     def send_data(self, data: bytes) -> bool:
         """Send a datagram; return whether it was accepted.

@@ -13,10 +13,11 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from cloudrc.drivers.children import signal_group
 from cloudrc.drivers.machine import interpreter
 from cloudrc.errors import to_one_line
 from cloudrc.exercise import hand_in
@@ -86,8 +87,7 @@ class Process:
 
     def close(self) -> None:
         """Kill the process and all others of its session's process group."""
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGKILL)
+        signal_group(self._process, signal.SIGKILL)
         self._process.wait()
         for stream in (self._process.stdin, self._process.stdout):
             if stream is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -205,9 +205,8 @@ def open_recorder(
     from cloudrc.record.writer import McapWriter
 
     kept, size_max = 0, None
-    with suppress(OSError):  # the recorder will meet the same error and report it
-        if path.is_file() and (kept := path.stat().st_size):
-            path.replace(path.with_name(f"{path.stem}.before{path.suffix}"))
+    if path.is_file() and (kept := path.stat().st_size):
+        path.replace(path.with_name(f"{path.stem}.before{path.suffix}"))
     if limit:
         room = round(0.9 * limit)
         size_max = max(room - kept, room // 10)

@@ -6,7 +6,7 @@ It is a second reader of cloud's records, for which cloud never waits.
 from __future__ import annotations
 
 import sys
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,7 +20,7 @@ from cloudrc.record.topics import TOPICS, VIEWS
 from cloudrc.report.live_views import LiveViews
 from cloudrc.report.markers import scene_shapes
 from cloudrc.robots.shapes import read_shapes
-from cloudrc.runs.interrupts import interrupt_on_signals
+from cloudrc.runs.interrupts import interrupt_on_signals, until_interrupted
 
 if TYPE_CHECKING:
     import foxglove
@@ -35,7 +35,7 @@ def main(folder: Path, port: int) -> None:
 
     interrupt_on_signals()
     with ExitStack() as stack:
-        stack.enter_context(suppress(KeyboardInterrupt))
+        stack.enter_context(until_interrupted())
         socket = Path(under_way()[folder].removeprefix("unix:"))
         world = read_experiment(str(folder / "config.yaml")).world
         views = LiveViews(scene_shapes(read_shapes(world), scene_of(world).tubes))

@@ -193,8 +193,7 @@ class McapWriter:
                 if self._stream.write(rest) == len(rest):
                     break
         if self._owned:
-            with suppress(OSError):
-                self._stream.close()
+            self._stream.close()
         return self._open_records
 
     def close(self) -> None:
@@ -232,7 +231,9 @@ class McapWriter:
 
 def is_open(path: Path) -> bool:
     """Return whether a process still writes the recording at `path`."""
-    with suppress(OSError, ValueError), open_file(path) as file:
+    if not path.is_file():
+        return False
+    with open_file(path) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:

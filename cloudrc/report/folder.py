@@ -6,9 +6,7 @@ file, cloudrc writes no report, and the old report stays unchanged.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,7 @@ from pydantic import TypeAdapter
 from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import BadInputError
-from cloudrc.files import read
+from cloudrc.files import read, read_json
 from cloudrc.outside.document import parse_yaml
 from cloudrc.outside.paths import check_there
 from cloudrc.record.columns import Recording
@@ -103,10 +101,7 @@ def _flown(data: bytes, name: str) -> dict[str, Any]:
 
 def _is_of_whole_recording(report: Path) -> bool:
     """Return whether a report.json exists and was made from a complete recording."""
-    with suppress(OSError, ValueError, RecursionError):
-        document = json.loads(read(report, REPORT_BYTES_MAX))
-        return isinstance(document, dict) and document.get("complete") is True
-    return False
+    return read_json(report, REPORT_BYTES_MAX).get("complete") is True
 
 
 def _read_facts(recording: Recording) -> Run:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
-from contextlib import suppress
 from html import escape
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
@@ -14,7 +12,7 @@ import numpy as np
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
-from cloudrc.files import read, write_atomically
+from cloudrc.files import read_json, write_atomically
 from cloudrc.geometry.obstacles import has_surface, obstacles
 from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
@@ -157,9 +155,8 @@ def write_report(
 
 def _environment(path: Path, assessment: Assessment) -> dict[str, Any]:
     """Read from `path` which machine flew; without a valid file, write one for this machine."""
-    with suppress(OSError, ValueError, RecursionError):
-        if not path.is_symlink() and isinstance(known := json.loads(read(path)), dict):
-            return known
+    if not path.is_symlink() and (known := read_json(path)):
+        return known
     run = assessment.run
     document = environment_document(run.physics_steps, assessment.code, run.files)
     write_json(path, document)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 
-from cloudrc.errors import CloudrcError
 from cloudrc.text import Paint, plain, table
 
 PLUGINS = ("estimators", "predictors", "controllers", "onboard", "metrics")
@@ -123,6 +122,6 @@ def _of_robots() -> tuple[set[str], list[str]]:
     keys, tunings = set[str](), set[str]()
     for robot in map(find_robot, shipped.names("robot")):
         tunings |= robot.tunings.keys()
-        with suppress(CloudrcError):  # without MuJoCo, some controllers have no signature
+        if find_spec("mujoco") is not None:  # without it, some controllers have no signature
             keys |= default_parameters("onboard", robot.onboard.name).keys()
     return {f"world.onboard.{key}" for key in keys}, sorted(tunings)

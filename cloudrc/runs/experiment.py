@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from contextlib import suppress
+from importlib.util import find_spec
 
 from cloudrc import metrics
 from cloudrc.config.load import load_experiment
@@ -11,7 +11,6 @@ from cloudrc.config.overrides import OUTSIDE, ROS2, parse_settings
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.schema import Parameters, World
-from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.outside.reuse import reuse
 from cloudrc.runs.requirements import require
 from cloudrc.warnings import advise
@@ -70,11 +69,12 @@ def check_world(world: World, *, turns: bool = False) -> None:
     shipped = not ("/" in world.robot or world.scene.endswith(".xml"))
     if shipped and world.is_nominal and world.tuning is None and world.onboard == Parameters():
         return
-    with suppress(MissingPrerequisiteError):
-        from cloudrc.robots.build import check_robot
+    if find_spec("mujoco") is None:
+        return
+    from cloudrc.robots.build import check_robot
 
-        facts = world.model_dump_json(exclude={"sensors", "odometry_rate_hz"})
-        reuse(("world", facts, turns), lambda: check_robot(world, turns=turns))
+    facts = world.model_dump_json(exclude={"sensors", "odometry_rate_hz"})
+    reuse(("world", facts, turns), lambda: check_robot(world, turns=turns))
 
 
 def advice_on(*experiments: ResolvedExperiment) -> list[str]:

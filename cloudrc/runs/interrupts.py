@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 
@@ -71,3 +71,8 @@ def raise_if_interrupted() -> None:
     """Raise KeyboardInterrupt if a signal has asked this process to end."""
     if _interrupt.asked:
         raise KeyboardInterrupt
+
+
+def until_interrupted() -> suppress:
+    """Run the block, which may be endless, until the user interrupts it; then go on behind it."""
+    return suppress(KeyboardInterrupt)

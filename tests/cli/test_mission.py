@@ -75,7 +75,7 @@ def test_run_follows_to_the_verdict(api, mission):
 def test_fly_under_one_key_flies_once_and_leaves_its_verdict(api, mission, folder, monkeypatch):
     log = folder / "termination-log"
     log.touch()
-    monkeypatch.setattr(command, "TERMINATION_LOG", log)
+    monkeypatch.setattr("cloudrc.cli.output.TERMINATION_LOG", log)
     thread = pilot(api, A)
     end = threading.Thread(target=lambda: (thread.join(), api.post("/v1/missions/m1/cancel")))
     end.start()

@@ -241,7 +241,7 @@ def test_an_error_of_the_machine_ends_a_pod_with_one_sentence(
     """No exit code 2: with all others, Kubernetes flies the shard again."""
     log = tmp_path / "termination-log"
     log.touch()
-    monkeypatch.setattr("cloudrc.cli.sweep_run.TERMINATION_LOG", log)
+    monkeypatch.setattr("cloudrc.cli.output.TERMINATION_LOG", log)
     plan = read_plan(write_sweep(ONE, seeds=[1, 2, 3]))
     (tmp_path / "flights").write_bytes(pack(plan.flights.values()))
     out, error = call("sweep rows", tmp_path / "flights", code=3)
@@ -254,7 +254,7 @@ def test_an_error_of_the_machine_ends_a_pod_with_one_sentence(
 def test_a_pod_with_other_input_says_so_in_one_sentence(tmp_path, call, monkeypatch):
     log = tmp_path / "termination-log"
     log.touch()
-    monkeypatch.setattr("cloudrc.cli.sweep_run.TERMINATION_LOG", log)
+    monkeypatch.setattr("cloudrc.cli.output.TERMINATION_LOG", log)
     (tmp_path / "flights").write_bytes(b"other")
     call("sweep rows", tmp_path / "flights", code=2)
     assert "is not a file of flights" in log.read_text()

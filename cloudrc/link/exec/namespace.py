@@ -96,10 +96,10 @@ def _not_allowed(what: str) -> MissingPrerequisiteError:
         ("user/max_net_namespaces", "0", "10000"),
     )
     for name, bad, good in settings:
-        with suppress(OSError):
-            if Path("/proc/sys", name).read_text(encoding="ascii").strip() == bad:
-                allow = f"as root: sysctl -w {name.replace('/', '.')}={good}"
-                return MissingPrerequisiteError(f"{what}; {allow}; {OTHERWISE}")
+        file = Path("/proc/sys", name)
+        if file.exists() and file.read_text(encoding="ascii").strip() == bad:
+            allow = f"as root: sysctl -w {name.replace('/', '.')}={good}"
+            return MissingPrerequisiteError(f"{what}; {allow}; {OTHERWISE}")
     allow = "run as root; in a container allow --cap-add SYS_ADMIN --cap-add NET_ADMIN"
     return MissingPrerequisiteError(f"{what}; {allow} --device {TUN}; {OTHERWISE}")
 

@@ -17,7 +17,13 @@ from math import ceil, inf
 
 import numpy as np
 
-from cloudrc.link.carry.udp import ANCILLARY_SIZE, DATAGRAM_MAX, Stamps, ask_for_stamps
+from cloudrc.link.carry.udp import (
+    ANCILLARY_SIZE,
+    DATAGRAM_MAX,
+    Stamps,
+    ask_for_stamps,
+    send_or_lose,
+)
 from cloudrc.link.model import HEADER_BYTES
 from cloudrc.link.profile import DirectionProfile, Timeline
 from cloudrc.link.streams import Stream
@@ -96,8 +102,7 @@ class ProbeEnd:
     def send(self, number: int) -> None:
         """Send a probe; a probe that the kernel does not take counts as lost."""
         self._sent_ns[number] = time.time_ns()
-        with suppress(OSError):
-            self.socket.sendto(self.probes[number], self.route)
+        send_or_lose(self.socket, self.probes[number], self.route)
 
     def receive(self, far: socket.socket) -> None:
         """Read a datagram from the other end's socket `far`; record this end's probes."""

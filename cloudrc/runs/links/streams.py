@@ -21,6 +21,7 @@ from cloudrc.link.carry.tcp.relay import StreamRelay
 from cloudrc.link.follow import Loaded
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.state import LinkState
+from cloudrc.runs.interrupts import until_interrupted
 from cloudrc.runs.links.carrier import STEP, CarrySettings, open_live
 
 WAITING = 512  # connections that the kernel keeps until the relay accepts them
@@ -67,7 +68,7 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
 
         live.serve(relay.engine.changes.append, follow, changed)
         settle()
-        with contextlib.suppress(KeyboardInterrupt):
+        with until_interrupted():
             tell(f"{where} leads to {show_address(settings.to)}; link: {live.cause}")
             while True:
                 relay.engine.step(STEP)

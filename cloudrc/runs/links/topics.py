@@ -13,6 +13,7 @@ from cloudrc.bridges.ros2 import require_ros
 from cloudrc.link.carry.engine import Engine
 from cloudrc.link.carry.punctual import ask_for_fifo, settle
 from cloudrc.link.state import LinkState
+from cloudrc.runs.interrupts import until_interrupted
 from cloudrc.runs.links.carrier import STEP, CarriedLink, CarrySettings, open_live
 from cloudrc.runs.links.programs_report import make_link_report, write_report
 from cloudrc.runs.links.verify import Report
@@ -64,7 +65,7 @@ def relay_topic(settings: TopicSettings, tell: Callable[[str], None]) -> Report:
             f"{relay.source} ({relay.kind}) leads to {relay.target}; link: {live.cause}, "
             f"{way}, seed {settings.seed}; QoS {quality}"
         )
-        with contextlib.suppress(KeyboardInterrupt):
+        with until_interrupted():
             _run(link.engine, relay, tell)
         report = {
             **make_link_report(link),
