@@ -6,7 +6,6 @@ from unittest.mock import Mock
 
 import pytest
 
-from cloudrc.cli.faults import SEED_MAX
 from cloudrc.cli.link import VERBS
 from cloudrc.cli.main import INTERNAL, main
 from cloudrc.cli.parser import COMMANDS
@@ -16,17 +15,17 @@ HEAVY = ("numpy", "mujoco", "matplotlib", "pydantic", "yaml", "kubernetes", "ros
 QUIET = f"""
 import sys
 from cloudrc.cli.main import main
-try:
-    main(sys.argv[1:])
-except SystemExit:
-    pass
+for line in sys.argv[1:]:
+    try:
+        main(line.split())
+    except SystemExit:
+        pass
 print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
 """
 
 
-@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
-def test_help_imports_nothing_heavy(command):
-    words = [sys.executable, "-c", QUIET, *command, "--help"]
+def test_help_imports_nothing_heavy():
+    words = [sys.executable, "-c", QUIET, "--help", *(f"{name} --help" for name in COMMANDS)]
     assert subprocess.run(words, capture_output=True, text=True).stderr.strip() == "[]"
 
 
@@ -56,14 +55,8 @@ def test_help_fits_80_columns(command, capsys):
     ("line", "words"),
     [
         ("rnu", "did you mean 'run'"),
-        ("doctor --mode vitual", "did you mean 'virtual'"),
-        ("doctor --nonsense", "--nonsense; see 'cloudrc doctor --help'"),
         ("link show --sed 3", "--sed (did you mean --seed?); see 'cloudrc link show --help'"),
-        ("list predictor", "did you mean 'predictors'"),
-        ("console --config hover", "give --api and --profile"),
-        ("run steps --seeds 2 --set seed=5", "seed: each flight has its own seed"),
         ("bench --repeats 0", "'0', not a whole number >= 1 and <= 10000"),
-        (f"faults search --first {2**63}", f"not a whole number >= 0 and <= {SEED_MAX}"),
     ],
 )
 def test_a_wrong_command_line_is_one_line_of_error(line, words, refused):
@@ -78,7 +71,6 @@ def test_a_wrong_command_line_is_one_line_of_error(line, words, refused):
         (PermissionError(13, "Not allowed", "/x"), 2, "/x: Not allowed; check the path"),
         (OSError(111, "Connection refused"), 2, "error: Connection refused; '--debug' shows"),
         (OSError(24, "Too many open files"), 3, "Too many open files; raise 'ulimit -n'"),
-        (OSError(24, "Too many open files", "/x"), 3, "/x: Too many open files; raise 'ulimit"),
         (OSError(28, "No space left on device"), 3, "disk_full: a file: free some space"),
         (RuntimeError("Could not allocate memory"), 3, "memory ran out (RuntimeError: Could not"),
         (ZeroDivisionError("two\nlines"), INTERNAL, "ZeroDivisionError: two lines"),

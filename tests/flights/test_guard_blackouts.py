@@ -67,9 +67,16 @@ def interrupt(figure, kill, at, *settings, calm=1.0):
 @pytest.mark.parametrize("kill", [False, True], ids=["silent", "killed"])
 @pytest.mark.parametrize("k", [173, *nightly(*sorted({*range(COUNT)} - {173}))])
 def test_without_its_cloud_the_robot_holds_in_a_pipe(k, kill, figure):
-    interrupt(figure, kill, mid_pipe(*SLOW)[k], *SLOW)
-    if not kill:  # without the cap stopping takes a little longer
+    if kill:
+        interrupt(figure, kill, mid_pipe(*SLOW)[k], *SLOW)
+    else:  # without the cap stopping takes a little longer
         interrupt(figure, kill, mid_pipe()[k], calm=1.4)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("k", range(COUNT))
+def test_without_its_cloud_the_slow_robot_holds_in_a_pipe(k, figure):
+    interrupt(figure, False, mid_pipe(*SLOW)[k], *SLOW)
 
 
 def test_a_flight_without_faults_never_meets_the_fence():

