@@ -75,13 +75,7 @@ def test_a_direction_in_which_no_packet_arrives_is_named(settings, words):
     ("settings", "words"),
     [
         (both(45_000, 0), "uplink.delay_ms is 45000 (45 s) and link.downlink.delay_ms is 45000"),
-        (["link.uplink.delay_ms=45000"], "link.uplink.delay_ms is 45000 (45 s): no command"),
         (["link.uplink.rate_kbit=0.05"], "rate_kbit 0.05 is below the 185.6 kbit/s that telemetry"),
-        (["link.downlink.rate_kbit=0.05"], "below the 92.8 kbit/s that the stream of commands"),
-        (
-            ["world.odometry_rate_hz=500", "link.uplink.rate_kbit=900"],
-            "rate_kbit 900 is below the 928 kbit/s that telemetry needs",
-        ),
         (["link.uplink.changes=[{at_s: 3, rate_kbit: 1}]"], "rate_kbit 1 is at times below"),
         (both(6000, 0), "guard.command_age_max_ms is at most 10000"),
     ],
@@ -121,7 +115,6 @@ def test_dwell_times_longer_than_the_mission_are_named(settings, words):
         ("paper", ["guard.speed_max_mps=0.01"], "guard.speed_max_mps is 0.01 m/s, too slow for"),
         ("paper", ["cloud.controller.speed_max=0.0005"], "controller.speed_max is 0.0005 m/s"),
         ("pillars", ["guard.speed_max_mps=0.01"], ""),
-        ("hover", ["guard.speed_max_mps=0.01"], "guard.speed_max_mps is 0.01 m/s, too slow"),
         ("steps", ["guard.speed_max_mps=0.01"], "guard.speed_max_mps is 0.01 m/s, too slow"),
     ],
 )
@@ -172,10 +165,3 @@ def test_setpoints_that_are_faster_than_the_robot_are_named(way, words, tmp_path
     text = " ".join(advise(flown))
     assert ("mission.setpoints" in text) == bool(words)
     assert all(word in text for word in words)
-
-
-def test_setpoints_as_fast_as_the_robot_up_to_rounding_are_no_warning(tmp_path):
-    """Python finds 6.000000000000003 m/s, above the 6 m/s of the guard."""
-    (tmp_path / "d.csv").write_text("time_s,x_m,y_m,z_m\n0,0,0,1\n0.2,1.2,0,1\n0.3,1.8,0,1\n")
-    settings = [f"mission.setpoints={tmp_path / 'd.csv'}", "mission.waypoints=[]"]
-    assert "mission.setpoints" not in " ".join(advise(load_experiment("hover", settings)))

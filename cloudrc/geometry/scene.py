@@ -22,7 +22,7 @@ from xml.etree import ElementTree
 from cloudrc.geometry.fence import Corners, Fence, order_of
 from cloudrc.geometry.solids import Solid
 from cloudrc.messages import Vector
-from cloudrc.outside.values import ANY, InvalidValueError
+from cloudrc.outside.values import InvalidValueError
 
 Numerics: TypeAlias = dict[str, str]
 """Name of a `<numeric>` -> its data."""

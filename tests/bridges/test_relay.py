@@ -182,11 +182,3 @@ def test_topics_that_cannot_be_relayed_end_the_command_with_one_line(capsys, wor
         other.close()
     (error,) = capsys.readouterr().err.splitlines()
     assert text in error
-
-
-def test_a_type_that_this_ros_cannot_load_is_named(capsys, monkeypatch):
-    with robot():
-        monkeypatch.setitem(sys.modules, "geometry_msgs.msg", None)
-        monkeypatch.setattr("cloudrc.runs.links.topics.require_ros", lambda *words: None)
-        assert main(WORDS) == 3
-    assert "source the workspace that has geometry_msgs" in capsys.readouterr().err

@@ -47,12 +47,6 @@ def test_a_ros_for_another_python_is_named(tmp_path, monkeypatch):
         require_ros("a node", "node", "nav_msgs")
 
 
-@pytest.mark.parametrize("namespace", ["9", "a-b"])
-def test_a_namespace_that_ros_refuses_is_bad_input(namespace):
-    with pytest.raises(BadInputError, match="namespace"):
-        load_experiment("paper", [f"cloud.controller={{name: ros2, namespace: '{namespace}'}}"])
-
-
 def test_a_node_neither_plans_nor_flies_in_a_cluster():
     with pytest.raises(BadInputError, match="'ros2' cannot plan"):
         load_experiment("fast", ["cloud.controller=ros2", "cloud.plan_s=0.5"])

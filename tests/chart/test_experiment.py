@@ -98,13 +98,10 @@ def test_a_change_restarts_only_what_it_must():
     ("values", "said"),
     [
         ({"link": {"profile": "wify"}}, "link.profile: no profile 'wify' ships.*choose one of 5g"),
-        ({"mission": {"enabled": True, "plan": "pipe"}}, "no mission 'pipe'.*one of carrot, hover"),
         (
             {"experiment": {"link": {"profile": "./mine.yaml"}}},
             "experiment.link.profile: no profile './mine.yaml'.*profile under link.profile",
         ),
-        ({"experiment": {"mission": "./a.yaml"}}, "experiment.mission: .*write the mission there"),
-        ({"experiment": {"cloud": {"controller": {"name": "a/b.py"}}}}, "controller: 'a/b.py'"),
         (
             {"link": {"profile": "wifi"}, "experiment": {"link": {"uplink": {"trace": "/t.csv"}}}},
             "experiment.link: uplink.trace names '/t.csv', but link.traces has no",

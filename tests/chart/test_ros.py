@@ -26,9 +26,7 @@ def test_the_controller_is_ros2_also_with_a_namespace():
 @pytest.mark.parametrize(
     ("ros", "controller", "said"),
     [
-        ({"enabled": True}, "p", "experiment.cloud.controller is 'p'; leave it out"),
         ({"enabled": True}, {"name": "p"}, "experiment.cloud.controller is 'p'; leave it out"),
-        ({}, "ros2", "set cloud.ros.enabled=true"),
         ({}, NAMED["controller"], "set cloud.ros.enabled=true"),
         ({"enabled": True, "launch": []}, "ros2", "cloud.ros.launch: is empty"),
     ],

@@ -85,15 +85,9 @@ def test_the_table_is_also_one_of_csv_or_latex_alone(form, start, fly_with, call
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (f"{A} {A}", "is the same experiment as {'side': 'A'}"),
         (f"seed=1 {B}", "seed: each flight has its own seed; give the seeds with --seeds"),
-        (f"{A} cloud.predicter=kalman", "cloud.predicter"),
-        ("link.profile=paper-p1 link.profile=wifi --set link.profile=x", "set twice"),
         ("last_sample nonsense",
          "last_sample: is not KEY=VALUE; for a value of a sweep, add --in DIR"),
-        (f"{A} {B} --number iae_men", "--number: no number named 'iae_men'"),
-        ("a b --in nowhere", "nowhere"),
-        ("a b --in nowhere --set seed=1", "--set seed=1: these flights are"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_compared_is_refused(arguments, text, refused):

@@ -20,13 +20,8 @@ def test_the_script_knows_commands_and_options(shell, call):
     [
         (["do"], ["down", "doctor"]),
         (["link", "show", "satel"], ["satellite"]),
-        (["run", "--set", "cloud.controller.gain_p"], ["cloud.controller.gain_p="]),
-        (["run", "--set", "world.onboard.gain_p"], ["world.onboard.gain_p="]),
-        (["run", "--set", "world.onboard.turn_g"], ["world.onboard.turn_gain="]),
         (["run", "--set", "world.tun"], ["world.tuning=fast"]),
         (["link", "set", "uplink.dela"], ["uplink.delay_ms="]),
-        (["run", "--set", "link.both.dela"], ["link.both.delay_ms="]),
-        (["sweep", "sta"], ["status"]),
     ],
 )
 def test_bash_completes_names(words, found, call):

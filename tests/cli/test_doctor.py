@@ -73,11 +73,3 @@ def test_the_extras_are_those_of_pyproject():
         assert all(module in " ".join(declared[extra]) for module in modules), extra
     assert set(requirements.EXTRAS) | {"sim", "all", "dev"} == set(declared)
     assert declared["sim"] == [f"cloudrc[{','.join(requirements.MODES['virtual'])}]"]
-
-
-def test_who_lacks_all_of_the_simulation_is_told_its_one_extra(monkeypatch):
-    monkeypatch.setattr(requirements, "missing", lambda extra: [f"module_of_{extra}"])
-    with pytest.raises(MissingPrerequisiteError, match=r"cloudrc\[sim,api\]"):
-        requirements.require("mode local", requirements.MODES["local"])
-    with pytest.raises(MissingPrerequisiteError, match=r"cloudrc\[record\]"):
-        requirements.require("recover", ["record"])

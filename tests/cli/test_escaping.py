@@ -15,7 +15,7 @@ from cloudrc.record.writer import MISSING, McapWriter
 from cloudrc.records import Fault
 from cloudrc.teleop.client import Api
 from cloudrc.teleop.store import Order
-from cloudrc.text import escape, table
+from cloudrc.text import table
 from tests.cli.conftest import EVIL, SHOWN, assert_harmless
 from tests.record.conftest import world_records
 from tests.teleop.conftest import PLAN, running
@@ -80,11 +80,3 @@ def test_a_missions_name(api, printed, call):
     with pytest.raises(BadInputError) as refused:
         Api(api.url).post("/v1/missions", {EVIL: 2, "waypoints": [{"position_m": [99, 0, 1]}]})
     assert_harmless(str(refused.value))
-
-
-def test_an_id_that_no_mission_can_have(api, refused):
-    for given in ("\x1b[31m", "m1?x", "..", "a/b", "tür", "\udcff", "%"):
-        line = refused(f"mission cancel --api {api.url}", given, code=5)
-        assert line.rstrip().isprintable()
-        shown = {"a/b": "Not Found", "\udcff": "no mission '\ufffd'"}
-        assert shown.get(given, f"no mission '{escape(given)}'") in line

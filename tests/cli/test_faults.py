@@ -53,12 +53,8 @@ def test_the_list_names_every_fault(call):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("", "the following arguments are required: VERB"),
-        ("run F1 --seed 9007199254740992", "argument --seed: '9007199254740992' is not a whole"),
         ("run /dev/null", "/dev/null: cannot be read: not a file; name a YAML file"),
-        ("run cloud-kiled", "no fault 'cloud-kiled'; there are: F1 short-blackout, F2 "),
         ("run cloud-kiled", "; did you mean cloud-killed?"),
-        ("search --minutes nan", "'nan' is not a number of minutes"),
         ("search --store /dev/null/found", "cannot be written"),
     ],
 )

@@ -149,38 +149,6 @@ def test_a_local_run_gets_no_token(tmp_path, monkeypatch, call):
         call("mission estop --api", api.url, code=2)
 
 
-@pytest.mark.parametrize(
-    ("folder", "reason"),
-    [("home", "everybody may write to"), ("file", "File exists")],
-)
-def test_a_command_that_cannot_read_flight_files_says_why(
-    tmp_path, elsewhere, said, monkeypatch, folder, reason
-):
-    (tmp_path / "home").mkdir()
-    (tmp_path / "home").chmod(0o777)
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("HOME", str(tmp_path / folder))
-    monkeypatch.delenv("XDG_RUNTIME_DIR")
-    flights = tmp_path / folder / ".local/state/cloudrc/flights"
-    why = f"flight files in {flights} are not used: {reason}"
-    latest = elsewhere / "runs" / "latest"
-    latest.mkdir(parents=True)
-    with local.announced(latest, "unix:/none.sock", local.SESSION) as unseen:
-        assert reason in unseen
-        for words in (
-            "down --run",
-            "console",
-            "link set uplink.loss=0.1 --run",
-            "mission hold --run",
-        ):
-            assert f"runs/latest: {why}" in said(2, f"{words} runs/latest")
-        assert why in said(3, "down")
-        assert why in said(3, SET)
-        assert why in said(2, "console")
-        (latest / "uplink.log").touch()
-        assert f"runs/latest: {why}" in said(2, SET)
-
-
 def test_link_set_finds_the_only_run(elsewhere, said, monkeypatch):
     here = elsewhere / "runs" / "latest"
     (here / "link").mkdir(parents=True)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.drivers import local
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
 from cloudrc.metrics.velocity_loop import DT, identify, series
 from cloudrc.outside.document import parse_yaml
@@ -91,29 +90,12 @@ def test_only_the_flight_under_commands_counts():
 @pytest.mark.parametrize(
     ("recording", "text"),
     [
-        ([], "has no /reference; name the recording of a whole flight"),
         (records(track_s=(1.0, 15.0)), "12 s of flight under commands after.*needs 20 s"),
     ],
 )
 def test_a_recording_that_is_not_enough_is_refused(recording, text):
     with pytest.raises(InvalidValueError, match=text):
         series(Recording.from_records(recording))
-
-
-@pytest.mark.parametrize(
-    ("journal", "said"),
-    [
-        (True, "the session has not ended; end it: cloudrc down"),
-        (False, "the flight has not ended; wait for its end"),
-    ],
-)
-def test_a_flight_under_way_is_not_read(journal, said, tmp_path, monkeypatch, refused):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    if journal:
-        (tmp_path / local.JOURNAL_FILE).touch()
-    with local.announced(tmp_path, ""):
-        assert f"{tmp_path}: {said}" in refused("identify --out model.yaml", tmp_path)
-    assert "has not ended" not in refused("identify --out model.yaml", tmp_path)
 
 
 def test_a_flight_whose_recording_is_still_written_is_not_read(tmp_path, call, refused):

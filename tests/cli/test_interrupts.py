@@ -13,12 +13,11 @@ from unittest.mock import Mock
 
 import pytest
 
-from cloudrc.cli import run
 from cloudrc.config.load import load_experiment
-from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
+from cloudrc.errors import InterruptedRunError
 from cloudrc.runs import fly as flights
 from cloudrc.runs.interrupts import interrupt_on_signals
-from cloudrc.trials.plan import PlannedFlight, pack, read_plan
+from cloudrc.trials.plan import PlannedFlight
 from cloudrc.trials.rows import read_rows
 from cloudrc.trials.workers import map_in_order, take_each
 from tests.support.sweeps import write_sweep
@@ -75,15 +74,6 @@ def test_a_sweep_stores_no_row_after_a_signal_that_a_library_caught(
     assert read_rows(Path("grid")) == {}
 
 
-@pytest.mark.parametrize("fly", [swallow, convert])
-def test_a_pod_prints_no_row_after_a_signal_that_a_library_caught(
-    fly, write_sweep, monkeypatch, call, tmp_path
-):
-    (tmp_path / "flights").write_bytes(pack(read_plan(write_sweep()).flights.values()))
-    monkeypatch.setattr(PlannedFlight, "play", fly)
-    assert call("sweep rows", tmp_path / "flights", code=130).out == ""
-
-
 def test_results_before_the_signal_are_kept():
     """The second of three calls gets the signal, and returns a result all the same."""
     interrupt_on_signals()
@@ -126,27 +116,3 @@ def test_an_interrupted_flight_says_at_once_that_the_report_takes_time(monkeypat
     monkeypatch.setattr("cloudrc.runs.fly.views", interrupt)
     shown = call("run hover --mode virtual --out r", code=130)
     assert "interrupted: writes the report; Ctrl-C again leaves it out" in shown.out
-
-
-def test_a_signal_that_a_library_turned_into_an_error_of_the_report_interrupts(monkeypatch, call):
-    """Matplotlib turns the exception into a ValueError."""
-
-    def fly(folder):
-        (folder / "mission.mcap").touch()
-        with suppress(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGTERM)
-        raise BadInputError("the recorded values cannot be drawn")
-
-    monkeypatch.setattr(run, "_local_flight", lambda *words, **flags: fly)
-    error = call("run hover --mode virtual --out r", code=130).err
-    assert error == "the recording is in r; to write its report: cloudrc report r\n"
-
-
-def test_a_flight_that_failed_before_its_recording_names_none(monkeypatch, call):
-    def fly(folder):
-        (folder / "with.log").touch()
-        raise CloudrcError("the program of --with has ended")
-
-    monkeypatch.setattr(run, "_local_flight", lambda *words, **flags: fly)
-    error = call("run hover --mode virtual --out r", code=CloudrcError.exit_code).err
-    assert error == "cloudrc: error: the program of --with has ended\n"

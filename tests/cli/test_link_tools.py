@@ -45,12 +45,6 @@ def test_a_trace_replaces_no_file(folder, call, refused):
     assert read_trace(folder / "t.csv").delays == (0.045, 0.046)
 
 
-def test_a_command_to_copy_has_quotes_around_a_path_with_blanks(folder, call):
-    (folder / "log.csv").write_text("time_s,delay_ms\n0,45\n1,46\n")
-    assert "link.uplink.trace='my trace.csv'" in call("link record log.csv -o", "my trace.csv").out
-    assert "cloudrc robot check './my robot'" in call("new robot", "my robot").out
-
-
 def test_a_picture_replaces_a_picture_of_its_kind_alone(folder, call, refused):
     for _ in range(2):
         call("link show ideal -o fig.png --packets 10 --seconds 1")
@@ -63,11 +57,8 @@ def test_a_picture_replaces_a_picture_of_its_kind_alone(folder, call, refused):
 @pytest.mark.parametrize(
     ("name", "data", "says"),
     [
-        ("a.csv", b"time_s,rtt_ms\n0,45\n", "has round trips"),
         ("a.json", b'{"round_trips": []}', "choose --direction uplink"),
-        ("a.json", b"{\0", "a.json: not a log of irtt"),
         ("a.mcap", b"\x89MCAP0\r\n", "a.mcap"),
-        ("pipe", None, "pipe: no such file or folder"),
         (".", None, "has no mission.mcap"),
     ],
 )
@@ -82,14 +73,9 @@ def test_an_unusable_source_is_refused_in_one_line(name, data, says, folder, ref
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("", "required: VERB"),
         ("show ideal -o ideal.gif", "end its name in .png, .svg or .pdf"),
-        ("show ideal --seconds 0", "'0' is not a number of seconds, 0.001 to 86400"),
-        ("show ideal --seed=-1", "'-1' is not a whole number"),
         ("show ideal --seconds 8e4 --rate 1e4", "are more than 10000000 packets"),
         ("verify nonsense", "no profile or experiment named 'nonsense'"),
-        ("verify no/such.yaml", "no such file"),
-        ("verify --ends world,", "--ends world,: give two hosts, WORLD,CLOUD"),
         ("verify lossy --shaper netem", "lasts); use the relay"),
     ],
 )
@@ -131,7 +117,7 @@ def test_a_trace_needs_no_ending_and_a_profile_no_name(folder, call):
 
 @pytest.mark.parametrize(
     ("server", "client", "flag"),
-    [("", "true", "--server"), ("true", "", "--client"), (" \n", "true", "--server")],
+    [("true", "", "--client")],
 )
 def test_link_exec_refuses_an_empty_command(refused, server, client, flag):
     said = refused("link exec", "--server", server, "--client", client)

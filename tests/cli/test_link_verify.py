@@ -1,7 +1,7 @@
 """`cloudrc link verify` of a release, which `helm test` runs, over real HTTP."""
 
 import json
-from contextlib import ExitStack, closing, nullcontext
+from contextlib import ExitStack, closing
 from math import nan
 
 import pytest
@@ -9,7 +9,6 @@ import pytest
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.errors import TimedOutError
-from cloudrc.link.verify.causes import Findings, ShaperFacts
 from cloudrc.records import LinkChecked
 from cloudrc.runs.links import verify
 from cloudrc.runs.links.verify import as_text, find_experiment, verify_release
@@ -131,13 +130,3 @@ def test_a_file_with_any_key_of_an_experiment_is_verified_as_one(key, tmp_path):
     assert find_experiment("./mine.yaml", []).uplink == load_experiment("./mine.yaml").uplink
     (tmp_path / "mine.yaml").write_text("description: mine\nuplink: {delay_ms: 12}\n")
     assert find_experiment("./mine.yaml", []).uplink.delay_ms == 12.0
-
-
-def test_a_loss_that_may_be_meant_in_percent_is_noted(monkeypatch):
-    """Without a packet that arrives, the verdict is undecided and refers to the notes."""
-    monkeypatch.setattr(verify, "run_link", lambda *given: nullcontext({}))
-    silent = Findings([], ShaperFacts("relay"))
-    monkeypatch.setattr(verify, "probe_link", lambda *given: {"uplink": silent, "downlink": silent})
-    said = as_text(verify.verify("ideal", ["link.uplink.loss=1"], seconds=1.0))
-    assert "the uplink loses 100 % of its packets: its loss is a share from 0 to 1" in said
-    assert "the downlink loses" not in said

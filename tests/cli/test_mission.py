@@ -146,15 +146,6 @@ def test_an_api_that_is_not_there_ends_with_4_or_5(call):
         assert out.count("waiting") == waits
 
 
-@pytest.mark.parametrize(
-    "url",
-    ["here", "unix:", "ftp://h:1", "http://me@h:1", "http://[::1", "http://h:x", "http://h/?a"],
-)
-def test_an_invalid_url_of_the_api_is_an_error(url, refused):
-    error = refused(f"mission status --api {url}")
-    assert error.endswith(f"--api {url}: give http://HOST:PORT[/PATH] or unix:PATH\n")
-
-
 def test_a_verb_needs_a_mission_in_the_right_state(api, mission):
     assert "no mission is under way" in mission("status").out
     assert "no mission is under way" in mission("cancel", 2).err

@@ -14,7 +14,7 @@ from cloudrc.cli.output import is_live, paint
 from cloudrc.cli.progress import FlightView, Progress
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import Fault, GuardChange, MissionEvent, TelemetrySent
-from cloudrc.text import format_number, table
+from cloudrc.text import format_number
 from tests.conftest import wait_until
 
 
@@ -28,12 +28,6 @@ def plain_environment(monkeypatch):
     for name in ("CI", "NO_COLOR"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("TERM", "xterm-256color")
-
-
-def test_columns_line_up_and_numbers_are_right_aligned():
-    assert table([("name", "value"), ("a", "1.5"), ("longer", "10.5")], right=[1]) == (
-        "name    value\na         1.5\nlonger   10.5"
-    )
 
 
 def test_numbers_have_four_digits():
@@ -151,7 +145,7 @@ def test_a_stdout_that_the_shell_has_closed_is_no_error(folder):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize("line", ["list -o json", "completion bash"])
+@pytest.mark.parametrize("line", ["list -o json"])
 def test_a_full_disk_is_told(line, folder):
     with open("/dev/full", "w") as full:
         command = [sys.executable, "-m", "cloudrc", *line.split()]

@@ -16,7 +16,6 @@ from cloudrc.drivers.link_monitor import LinkMonitor
 from cloudrc.drivers.realtime import free_ports, show_address
 from cloudrc.errors import ControllerLostError
 from cloudrc.processes import ends
-from cloudrc.processes.ports import ipv4_addresses
 from cloudrc.record.columns import Recording
 from tests.record.conftest import MS, counted, world_records
 
@@ -55,10 +54,6 @@ def taken():
 def test_an_address_in_use_is_reported_with_its_flag(flag, code, said, taken, key, refused):
     line = refused(f"world --config hover {END} {key} {flag} {taken}", code=code)
     assert line.startswith(f"cloudrc: error: {said.format(taken)}")
-
-
-def no_such_name(*asked):
-    raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
 
 def test_an_address_of_ipv6_is_in_brackets(monkeypatch):
@@ -112,15 +107,6 @@ def test_cloud_without_a_supervisor_ends_if_its_controller_is_lost(key, monkeypa
     line = refused(f"cloud --config hover {flags} --teleop teleop", code=5)
     assert line == "cloudrc: error: no node answers\n"
     bound[0].close()  # as at the end of the process
-
-
-def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch):
-    def look_up(name, port, family, kind):
-        return [(family, kind, 17, "", ("::5", 0))] if family == socket.AF_INET6 else no_such_name()
-
-    monkeypatch.setattr(socket, "getaddrinfo", look_up)
-    with pytest.raises(OSError, match="only IPv6 addresses, but a link needs IPv4"):
-        ipv4_addresses("cloud")
 
 
 def test_sizes_are_read_as_in_kubernetes():

@@ -22,12 +22,8 @@ from tests.cli.conftest import FLY, SHORT
     ("line", "words"),
     [
         ("--mode local --seeds 3", "virtual time"),
-        ("--seed 1 --seeds 2", "not allowed with"),
-        ("--seeds 2 --figures", "one flight"),
         ("papper", "paper"),
-        ("--set cloud.predictr=last_sample", "predictor"),
         ("--set report.metrics=./no.py", "no.py': there is no such file"),
-        ("--set nonsense", "key=value"),
     ],
 )
 def test_bad_input_gives_one_line_and_writes_nothing(line, words, folder, refused):
@@ -201,12 +197,6 @@ def test_what_is_there_is_never_overwritten(out, said):
     assert Path("full/precious").read_text() == "data"
 
 
-def test_each_later_failure_has_its_time():
-    failures = [{"text": "touched pipe_2"}, {"text": "too slow", "time": 3.25}]
-    found = {"verdict": "failure", "failures": failures, "numbers": {}}
-    assert "  also: too slow (at 3.25 s)" in summary(found, Path("runs/a")).splitlines()
-
-
 @pytest.mark.parametrize(
     ("found", "goal"),
     [
@@ -223,18 +213,3 @@ def test_a_summary_says_what_the_mission_had_to_do(found, goal):
 def test_a_run_in_real_time_needs_the_extra_of_the_api(monkeypatch, refused):
     monkeypatch.setitem(requirements.EXTRAS, "api", ("fastapi_is_not_here",))
     assert "pip install 'cloudrc[api]'" in refused("run hover --mode local", code=3)
-
-
-def test_a_metric_without_a_value_is_told_on_the_terminal(tmp_path):
-    report = {
-        **{"verdict": "success", "failures": [], "numbers": {}},
-        "notes": [
-            "metric own failed: GeneratorExit: ",
-            "The recording is incomplete: a test.",
-            "No clearance is known from hill.",
-        ],
-    }
-    text = summary(report, tmp_path)
-    assert "metric own failed: GeneratorExit" in text
-    assert "incomplete" in text
-    assert "hill" not in text

@@ -13,7 +13,7 @@ from cloudrc.cloud.estimators.running_mean import RunningMean
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.cloud.predictors.last_sample import LastSample
 from cloudrc.drivers.process import from_line, to_line
-from cloudrc.errors import BadInputError, OutOfMemoryError
+from cloudrc.errors import OutOfMemoryError
 from cloudrc.messages import ZERO
 from tests.cloud.conftest import HERE, MS, Integrating, command, loop, telemetry
 
@@ -202,29 +202,6 @@ def test_ctrl_c_and_a_lack_of_memory_end_the_flight(kind, error, raised):
     with pytest.raises(raised):
         fly()
     assert a_loop.counts == {}
-
-
-@pytest.mark.parametrize("kind", ["predictor", "controller"])
-def test_a_reset_that_fails_before_the_flight_is_refused(kind):
-    plug_in = raises(SystemExit(0))()
-    plug_in.reset = plug_in.update
-    with pytest.raises(
-        BadInputError, match=rf"cloud\.{kind}: its reset\(\) failed: test_loop.py:\d+: SystemExit"
-    ):
-        loop(**{kind: plug_in})
-
-
-def test_a_failing_plug_in_is_reported_in_each_mission():
-    """The report of a later mission in a session then tells why its plug-in failed."""
-    a_loop = loop(predictor=raises(ValueError)())
-    found = []
-    for k in range(4):
-        a_loop.observe(telemetry(100 + 10 * k, 1000 + 10 * k), (1090 + 10 * k) * MS)
-        command(a_loop, 1094 + 10 * k)
-        found.append(len(a_loop.take_faults()))
-        if k != 2:
-            a_loop.start_mission()
-    assert found == [1, 0, 1, 0]
 
 
 def test_a_failing_reset_is_reported():

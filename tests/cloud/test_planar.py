@@ -61,9 +61,3 @@ def test_a_program_outside_ends_the_flight_once():
         planar.update(SEEN, GOAL, 0.01)
     assert raised.value.code == "controller_invalid"
     assert planar.update(SEEN, GOAL, 0.01).velocity == ZERO
-
-
-def test_a_node_of_ros_without_a_namespace_is_called_by_the_name_of_its_controller():
-    planar = Planar(Outside("", 60.0), "ros2", "the robot rover")
-    with pytest.raises(ControllerLostError, match=r"^ros2: its velocity in z"):
-        planar.update(SEEN, GOAL, 0.01)

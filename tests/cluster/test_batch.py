@@ -106,17 +106,6 @@ def test_the_first_pod_that_refuses_the_flights_ends_the_job(started, api, relea
     assert api.jobs() == []
 
 
-def test_a_quota_that_refuses_the_pods_is_told_with_a_remedy(started, api, release):
-    uid = api.get("jobs", "sweep-1")["metadata"]["uid"]
-    refusal = 'pods "sweep-1-0" is forbidden: exceeded quota: small, requested: requests.cpu=1'
-    api.put("events", {
-        "metadata": {"name": "refused"}, "involvedObject": {"uid": uid},
-        "reason": "FailedCreate", "message": refusal,
-    })  # fmt: skip
-    with pytest.raises(ClusterError, match=r"exceeded quota: small.*such as --cpu 500m, or with f"):
-        lines(release)
-
-
 def test_pods_may_wait_for_a_node_but_not_for_an_image(started, api, release):
     waits = {"type": "PodScheduled", "status": "False", "message": "0/1 nodes: Insufficient cpu"}
     add_pod(api, "a", "Pending", conditions=[waits])

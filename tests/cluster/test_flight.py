@@ -8,7 +8,6 @@ from unittest.mock import Mock
 
 import pytest
 
-import cloudrc
 from cloudrc.cluster import flight, pods
 from cloudrc.cluster.client import ClusterError, connect
 from cloudrc.cluster.jobs import run_job
@@ -164,17 +163,6 @@ def test_a_broken_connection_loses_logs_but_no_report(ready, call, monkeypatch):
     assert json.loads(captured.out)["shaper"] == "relay"
     assert "without the world pod's logs: no way to the pod" in captured.err
     assert "no way to the pod; trying again" in captured.err
-
-
-def test_a_program_gets_the_result_of_a_flight_on_a_cluster(ready, tmp_path, capfd):
-    record(tmp_path, flown(), torn=False)
-    ends(ready)
-    result = cloudrc.fly(NAME, {SETTING.partition("=")[0]: 1.0}, mode="cluster", out="out")
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert (result.verdict, report["mode"]) == ("invalid", "cluster")  # recorded in virtual time
-    assert result.numbers == {name: each["value"] for name, each in report["numbers"].items()}
-    assert len(result["/odometry"]) > 100
-    assert capfd.readouterr() == ("", "")
 
 
 def test_an_interrupted_flight_cancels_and_reports_its_mission(

@@ -69,16 +69,6 @@ def test_follow_ends_when_the_pod_cannot_run(running, release):
         follow(release, "first", print)
 
 
-def test_a_job_that_cannot_be_made_leaves_nothing(running, release):
-    running.refuse["POST", "configmaps"] = 403, 'User "me" cannot create configmaps'
-    with pytest.raises(ClusterError, match="can-i create configmaps"):
-        run_job(release, MISSION, name="first")
-    running.refuse["POST", "jobs"] = 403, "jobs.batch is forbidden"
-    with pytest.raises(ClusterError, match=r"cannot create jobs .* is forbidden"):
-        run_job(release, MISSION)
-    assert running.jobs() == []
-
-
 def test_a_job_is_deleted_and_its_end_is_awaited(running, release, monkeypatch):
     run_job(release, MISSION, name="two")
     delete_job(release, "two")

@@ -8,7 +8,6 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.cluster import flight
-from cloudrc.cluster.client import NoAnswerError
 from cloudrc.drivers import local
 from cloudrc.runs.missions import read_mission
 from tests.cluster.conftest import TOKEN, missions_of, pod, terminated
@@ -66,11 +65,6 @@ def test_the_other_verbs_go_to_the_api_of_the_release(running, teleop, call, ref
     assert "secrets" in refused("mission list", code=5)
 
 
-UNKNOWN = "cloud.predictor: no predictor named 'nosuch'; available: kalman"
-CRASHES = terminated(2, f"cloudrc: error: {UNKNOWN}\n")
-SILENT = {"mission": None, "queue": [], "seen": None, "cloud_age_s": None}
-
-
 def test_run_waits_until_the_release_is_ready(lands, call):
     """`helm install` does not wait for the pods."""
     lands.put("pods", pod("cloud-1", "cloud", ready=False, phase="Pending"))
@@ -88,15 +82,6 @@ def test_an_interrupted_run_says_that_the_job_continues(running, call, monkeypat
     said = call("mission run one.yaml", code=130).err
     (job,) = running.jobs()
     assert f"kubectl --namespace=demo delete job {job['metadata']['name']}\n" in said
-
-
-def test_a_run_that_loses_the_api_server_says_that_the_job_continues(running, call, monkeypatch):
-    lost = NoAnswerError("cannot list pods: the API server does not answer")
-    monkeypatch.setattr(flight, "follow", Mock(side_effect=lost))
-    said = call("mission run one.yaml", code=5).err
-    (job,) = running.jobs()
-    assert "the API server does not answer; Job" in said
-    assert said.endswith(f"kubectl --namespace=demo logs --follow job/{job['metadata']['name']}\n")
 
 
 def forget_jobs(api):

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from cloudrc.cluster.own_files import SIZE_MAX, find_own_files, send_own_files
+from cloudrc.cluster.own_files import find_own_files, send_own_files
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import FOLDERS
 from cloudrc.errors import BadInputError
@@ -57,15 +57,6 @@ def test_a_mesh_beside_the_model_is_sent_and_one_in_a_folder_refused(robot):
     said = refused(robot)
     assert f"{robot}/meshes/arm.stl" in said
     assert "no folders" in said
-
-
-def test_a_folder_above_the_limit_is_refused(robot):
-    (robot / "photo.png").write_bytes(bytes(SIZE_MAX))
-    assert f"{SIZE_MAX} (1 MiB)" in refused(robot)
-
-
-def test_a_model_without_robot_yaml_is_refused_with_what_to_write(robot):
-    assert "robot.yaml" in refused(robot / "robot.xml")
 
 
 def test_a_robot_without_a_size_is_refused_with_the_line_to_add(robot):

@@ -10,7 +10,7 @@ from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.pods import list_pods, operator_token, pod_failure
 from cloudrc.errors import TimedOutError
-from tests.cluster.conftest import OUT_OF_MEMORY, TOKEN, deployment, pod, terminated
+from tests.cluster.conftest import OUT_OF_MEMORY, TOKEN, deployment, pod
 
 
 def waiting(reason, message=""):
@@ -25,20 +25,13 @@ def unscheduled(message):
     ("given", "expected"),
     [
         ({"state": waiting("ImagePullBackOff")}, "cloudrc/cloud:0.1.0.*make kind-load"),
-        ({"state": waiting("CreateContainerConfigError", "no 'mine'")}, "cannot be created: no 'm"),
-        (
-            {"state": waiting("CrashLoopBackOff"), "last": terminated(3, "a\nport 9100 is taken")},
-            "ends repeatedly: it ended with exit code 3: port 9100 is taken",
-        ),
         (
             {"state": waiting("CrashLoopBackOff"), "last": OUT_OF_MEMORY},
             r"'cloud' ends repeatedly: it was killed.*raise cloud\.resources\.limits\.memory",
         ),
-        ({"restarts": 5}, "ends repeatedly$"),
         ({"conditions": unscheduled("0/1 nodes: Insufficient cpu")}, "no node takes it.*cpu"),
         ({"state": waiting("ContainerCreating")}, "^$"),
         ({"conditions": unscheduled("pod has unbound immediate volume claims")}, "^$"),
-        ({"restarts": 1}, "^$"),
     ],
 )
 def test_a_failure_of_a_pod_is_explained(api, release, given, expected):
@@ -55,9 +48,7 @@ REFUSED = {"type": "ReplicaFailure", "status": "True", "message": "violates PodS
     ("body", "error", "words"),
     [
         (deployment("cloud", updatedReplicas=0), TimedOutError, "its pod is being created"),
-        (deployment("cloud", observedGeneration=0), TimedOutError, "its pod is being created"),
         (deployment("cloud", conditions=[REFUSED]), ClusterError, "violates PodSecurity"),
-        (pod("world-1", "world", ready=False), TimedOutError, "container world is not ready"),
         (
             pod("world-1", "world", ready=False, state=waiting("ImagePullBackOff")),
             ClusterError,
@@ -85,7 +76,7 @@ def test_a_secret_that_does_not_exist_is_named(running, release):
         wait_ready(release, timeout=1.0)
 
 
-@pytest.mark.parametrize("data", [{}, {"operator": "//4gc2VjcmV0"}])
+@pytest.mark.parametrize("data", [{"operator": "//4gc2VjcmV0"}])
 def test_a_secret_without_a_token_is_named_and_not_shown(running, release, data):
     assert operator_token(release) == TOKEN
     running.get("secrets", "cloudrc-tokens")["data"] = data

@@ -87,9 +87,3 @@ def test_a_release_that_does_not_answer_is_listed(api, call, monkeypatch):
     captured = call("list releases")
     assert captured.out.splitlines()[1].split()[-1] == "?"
     assert "release 'a' in namespace 'demo': gone" in captured.err
-
-
-def test_a_list_without_releases_says_so(api, call, refused):
-    assert "no releases" in call("list releases").out
-    assert "no namespace 'nope'" in refused("list releases -n nope", code=5)
-    assert "are for 'cloudrc list releases'" in refused("list profiles -n demo")

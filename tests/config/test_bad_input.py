@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.config import shipped
 from cloudrc.config.profile import load_profile
 from cloudrc.errors import BadInputError
 from tests.config.conftest import refused
@@ -68,33 +67,15 @@ def test_fifty_problems_at_most_are_listed(mine):
     ("text", "reason"),
     [
         ("seed: 1\nseed: 2", "mine.yaml:2: the key 'seed' is given twice"),
-        ("seed: [", "mine.yaml:"),
-        ("", "mine.yaml: must be a mapping"),
         ("seed: 1\nname: !!python/name:os.system x", "mine.yaml:2: could not determine a constr"),
-        ("{<<: {seed: 1}}", "mine.yaml:1: <<: unknown key; known here: name"),
-        ("{[a]: 1}", "mine.yaml:1: a key must be text"),
-        ("[" * 100_000, "nest"),  # libyaml's own limit and message
+        # libyaml's own limit and message
         ("a: &a [*a]", "mine.yaml:1: nested too deep"),
-        ("a: " + "9" * 5000, "not readable"),
-        (r'name: "a\0b"', "mine.yaml:1: text with the character NUL"),
-        ("mission: 3", "mine.yaml:1: mission: 3: must be text or a mapping"),
-        ("tunnel: {order: newset}", "did you mean newest?"),
-        ("link: {profile: paper-p9}", "link.profile: no profile named 'paper-p9'; available: 5g"),
         ("name: ../../x", "name: '../../x': must be text without slashes"),
         ("mission: ./nowhere.yaml", "mission: no such file:"),
-        ("delay_ms: 3", "did you mean link.uplink.delay_ms?"),
         ("guard: {time_limit_s: 3}", "; did you mean criteria.time_limit_s?"),
-        ("link: wifi", "link: 'wifi': must be a mapping of keys: profile, uplink, downlink"),
-        ("uplink: {delay_ms: 3}", "criteria, report; did you mean link.uplink?"),
-        ("link: {delay_ms: 3}", "downlink; did you mean link.uplink.delay_ms?"),
-        ("link: {changes: []}", "downlink; did you mean link.uplink.changes?"),
-        ("predicter: kalman", "; did you mean cloud.predictor?"),
-        ("zzz: 3", "known here: name, description, seed, mission"),
         ("guard: {speed_max_mps: 7}", "must be at most 6 m/s: above it the robot does not stop"),
         ("mission: {waypoints: []}",
          "mine.yaml:1: mission.waypoints: none given; give at least one, or steps or setpoints"),
-        ("mission: {waypoints: [{position_m: [.nan, 0, 1]}]}", "position_m.0: nan: must be finite"),
-        ("mission: {waypoints: [{position_m: [0, 0, 1, 2]}]}", "at most 3 entries"),
         ("mission: {waypoints: [{tolerance_m: 1}]}",
          "mission.waypoints.0.position_m: is missing; must be a list of 3 numbers [m]"),
         ("mission: {waypoints: [{position_m: [0, 0, 3]}]}",
@@ -111,18 +92,10 @@ def test_an_invalid_file_is_one_line(mine, text, reason):
     assert "\n" not in found
 
 
-@pytest.mark.parametrize("key", ["both", "up", "rtt_ms", "wifi"])
-def test_a_key_that_is_like_no_other_is_told_what_fits_there(mine, key):
-    found = refused_text(mine, f"link: {{{key}: {{delay_ms: 40}}}}")
-    assert found.endswith(f"link.{key}: unknown key; known here: profile, uplink, downlink")
-
-
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("./", "./: cannot be read: "),
         ("nosuch.yaml", "nosuch.yaml; names of shipped experiments: fast, hover"),
-        ("no/papper.yaml", "did you mean paper?"),
         ("latin.yaml", "is not UTF-8 text"),
     ],
 )
@@ -136,23 +109,10 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
     ("text", "reason"),
     [
         ("seed", "--set seed: must be key=value"),
-        ("seed=1 name=x seed=2", "--set seed: is set twice; keep one"),
         (
             "link={'uplink':{'delay_ms':4}} link.both.delay_ms=3",
             "link.uplink.delay_ms: is set twice, also by link; keep one of them",
         ),
-        (
-            "link.uplink.loss=0.1 link.uplink.loss.bad_start=0.1",
-            "is set twice, also by link.uplink.loss;",
-        ),
-        ("link.both={'delay_ms':4} link.uplink.delay_ms=3", "is set twice, also by link.uplink;"),
-        (
-            "mission.waypoints=[{'dwell_s':1}] mission.waypoints.0.dwell_s=2",
-            "dwell_s: is set twice",
-        ),
-        ("a..b=1", "is no key"),
-        ("seed=[", "--set seed"),
-        ("seed=[1],[2]", "--set seed: [1],[2]: text after the value"),
         ("mission.waypoints.9.dwell_s=1", "entries 0 to 6; use one of these, or 7 to append"),
         (
             "mission.waypoints.2.yaw_deg=90",
@@ -170,30 +130,14 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
             "world.scene=empty",
             "--set: world.scene: empty: does not fit: mission.touch.body: board: no body",
         ),
-        ("mission.waypoints.2.speed_mps=1", "waypoints.2.speed_mps: 1: is the speed of a carrot;"),
-        ("mission=steps mission.carrot.speed_mps=1", "mission.carrot: impossible with steps"),
         ("world.robot=./no.xml", "no.xml; names of shipped robots: nano, pelican"),
-        (
-            f"world.robot={shipped.FOLDERS['robot']}/nano/robot.yaml",
-            "robot.yaml: give its folder: ",
-        ),
-        ("world.robot=/x/q", "world.robot: no such folder or .xml file: /x/q"),
         # A limit of the guard cannot be switched off.
         ("guard.command_age_max_ms=true", "--set: guard.command_age_max_ms: "),
-        ("guard.speed_max_mps=1e-320", "--set: guard.speed_max_mps: "),
-        ("guard.hold_max_s=1e-10", "--set: guard.hold_max_s: "),
-        ("world.plant.actuator_factor=0.1", "actuator_factor: 0.1: must be a number >= 0.2"),
         ("world.plant.actuator_factor=[1,9]", "actuator_factor.1: 9: must be a number >= 0.2"),
-        ("world.plant.actuator_factor=[]", "actuator_factor: "),
-        ("world.plant.actuator_factor=x", "actuator_factor: 'x': must be a number >= 0.2"),
-        ("world.onboard=3", "world.onboard: 3: must be a mapping of keys"),
-        ("world.tuning=slow", "no tuning of pelican named 'slow'; available: fast"),
         (
             "world.tuning=none",
             "available: fast; leave world.tuning out, or set null, for no tuning",
         ),
-        ("world.tuning=3", "world.tuning: 3: must be text or null"),
-        ("world.tuning=fast world.robot=x2x", "no robot named 'x2x'"),
         ("cloud.compute_deviation_ms=1", "needs compute_ms"),
     ],
 )
@@ -204,14 +148,9 @@ def test_an_invalid_setting_is_refused(text, reason):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("uplink: {loss: {bad_start: .1, bad_end: 0}}", "uplink.loss: bad_end must be above 0"),
-        ("uplink: {loss: {bad_start: .1}}", "uplink.loss.bad_end: is missing; must be a number"),
-        ("uplink: {jitter_ms: 3, distribution: gauss}", "'normal', 'pareto' or 'table'"),
         ("uplink: {distribution: table}", "uplink: distribution: table needs the key table"),
         ("uplink: {changes: [{at_s: 5}, {at_s: 5}]}", "uplink: at_s of changes must rise"),
         ("uplink: {trace: falling.csv}", "falling.csv, line 3"),
-        ("command_age_max_ms: 1e-9", "command_age_max_ms: 1e-09: must be a number >= 1 and <= 1"),
-        ('uplink: {"<chance>": 3}', "uplink.<chance>: unknown key; "),
     ],
 )
 def test_an_invalid_profile_is_refused_with_the_reason(mine, text, reason):
@@ -227,9 +166,7 @@ def test_an_invalid_profile_is_refused_with_the_reason(mine, text, reason):
 @pytest.mark.parametrize(
     ("rows", "said"),
     [
-        ("", "has 0 rows; give at least two"),
         ("0,0,0,1\n0,0,0,1\n", "line 3: time_s 0 does not rise"),
-        ("0,0,nan,1\n", "line 2: y_m: 'nan', not a finite number"),
         ("0,0,0,1\n1,0,0,9\n", "line 3: z_m is 9; the guard flies from 0.35 to 2.3"),
         (None, "the header is time_s,delay_ms; it must be time_s,x_m,y_m,z_m"),
     ],
@@ -246,9 +183,6 @@ def test_an_invalid_file_of_setpoints_is_one_line(tmp_path, rows, said):
     "lines",
     [
         "#time [ns],x,y,z\n1403636580838555648,0.0,0.0,0.5\n1403636580938555648,0.01,0.0,0.5\n",
-        "# timestamp tx ty tz\n1305031102.17 0.0 0.0 0.5\n1305031102.27 0.01 0.0 0.5\n",
-        "0\t0\t0\t1\n1\t0\t0\t1\n",
-        "0,0;0,0;0,0;1,0\n1,0;0,0;0,0;1,0\n",
         "0, 0, 0, 1\n1, 0, 0, 1\n",
         "0.5\n1\n",
     ],
@@ -263,10 +197,7 @@ def test_a_file_of_setpoints_without_a_header_is_told_so(tmp_path, lines):
     ("key", "name", "own"),
     [
         ("world.robot", "bot2", "bot2/robot.yaml"),
-        ("world.robot", "bot2", "bot2.xml"),
-        ("world.scene", "hall", "hall.xml"),
         ("mission", "round", "round.yaml"),
-        ("link.profile", "sea", "sea.yml"),
     ],
 )
 def test_a_file_of_the_user_without_its_path_is_suggested(tmp_path, monkeypatch, key, name, own):

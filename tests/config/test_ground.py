@@ -35,8 +35,6 @@ def test_a_waypoint_has_two_numbers_or_the_height_of_the_spawn(point):
     [
         (with_points((1, 0), (1, 1, 1)), r"waypoints\.1\.position_m: \[1, 1, 1\]: has a height"),
         (ROVER, "mission.steps: have heights, but the robot stays on the ground"),
-        ([*ROVER, "mission.steps.range_m=[1, 1, 0]"], "third number of centre_m to 0.1"),
-        (with_points((9.1, 0)), r"drive at x -2.8 to 9, y -8.3 to 5.3 \[m\]$"),
         ([*with_points((3.5, 0)), "world.scene=pillars"], "within 0.04 m of pillar_2$"),
     ],
 )
@@ -70,7 +68,7 @@ def test_a_file_of_setpoints_needs_no_height_and_has_no_other_one(tmp_path, head
     assert flight["/ground_truth"]["position"][-1, :2] == pytest.approx((1.0, 0.5), abs=0.2)
 
 
-@pytest.mark.parametrize("robot", ["pelican", "x2"])
+@pytest.mark.parametrize("robot", ["pelican"])
 def test_a_robot_that_flies_is_told_that_its_waypoints_need_a_height(robot):
     where = [f"world.robot={robot}", "world.scene=pillars"]
     with pytest.raises(BadInputError, match=r"\[1, 0, 0\]: a robot that flies needs a height"):

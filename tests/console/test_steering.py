@@ -77,17 +77,6 @@ def test_the_route_is_asked_once_for_each_mission(api, steering):
     assert steering.route == [[1, 1, 1]]
 
 
-def test_an_unreadable_link_leaves_the_missions_in_sight(api):
-    def unreadable():
-        raise BadInputError("profile.yaml: cannot be read")
-
-    api.answers["/v1/state"] = {"mission": None, "queue": []}
-    steering = Steering(api, LinkControl(unreadable))
-    steering.watch()
-    assert steering.state == {"mission": None, "queue": []}
-    assert steering.answer[:2] == ("profile.yaml: cannot be read", True)
-
-
 def test_a_stop_is_repeated_until_the_api_answers(api, steering):
     api.refused["/v1/estop"] = "teleop does not answer"
     steering.start()

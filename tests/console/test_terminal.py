@@ -27,7 +27,6 @@ def test_capital_letters_and_other_keyboards(sent, meant):
         ("h", "h", "ask", ""),
         ("X", "X", "stop", ""),
         ("x", "x", "", "the key 'x' has no meaning; X is the emergency stop"),
-        (curses.KEY_F1, curses.KEY_F1, "", "the key 'KEY_F(1)' has no meaning"),
         (curses.KEY_RESIZE, curses.KEY_RESIZE, "", ""),
     ],
 )
@@ -44,7 +43,3 @@ def test_a_key_is_obeyed_or_named(key, sent, done, note, monkeypatch):
     assert _obey(key, sent, steering).startswith(note)
     assert bool(note) == bool(_obey(key, sent, steering))
     assert set(called) == ({done} if done else set())
-
-
-def test_without_a_terminal_drive_says_so(refused):
-    assert "needs a terminal" in refused("mission drive --api unix:nowhere")

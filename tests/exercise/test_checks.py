@@ -48,13 +48,6 @@ def test_a_stub_scores_nothing_and_the_solution_all(part, folder, points):
             "delay_estimator.py:14: ",
         ),
         ("predictor", "p + v *", "p - v *", ["position", "steps"], "predictor.py:7: gives [0.95"),
-        (
-            "predictor",
-            "round(horizon * 1e9)",
-            "horizon * 1e9",
-            ALL["predictor"][2:],
-            "its stamp is 1",
-        ),
         ("predictor", "horizon):", "horizon)", ALL["predictor"], "predictor.py:7: SyntaxError: "),
         (
             "predictor",
@@ -98,10 +91,7 @@ FORGERIES = {
     "no JSON": (b"right, 100 of 100\n", [0, 0, 0, 0]),
     "more than there are": (b'{"points": 1e6, "seen": "x"}\n' * 4, [6, 5, 4, 10]),
     "no numbers": (b'{"points": NaN, "seen": "x"}\n' * 4, [0, 0, 0, 0]),
-    "one row": (b'{"points": -1, "seen": "x"}\n', [0, 0, 0, 0]),
-    "a huge integer": (b'{"points": ' + b"1" * 4_000 + b', "seen": ""}\n', [0, 0, 0, 0]),
     "no end": (b"1" * 70_000, [0, 0, 0, 0]),
-    "deep": (b"[" * 60_000 + b"\n", [0, 0, 0, 0]),
 }
 
 
@@ -141,8 +131,6 @@ def test_a_file_of_the_hand_in_is_found_by_its_name_from_everywhere(tmp_path, mo
 
 CHILDREN = {
     "subprocess": "subprocess.Popen(SLEEP)",
-    "shell": "subprocess.Popen(['sh', '-c', ' '.join(SLEEP) + ' & wait'])",
-    "fork": "os.fork() or os.execvp(SLEEP[0], SLEEP)",
     "a fork of a fork": "os.fork() or (os.fork() or os.execvp(SLEEP[0], SLEEP)) and os._exit(0)",
     "a fork, and the end": "os.fork() and os._exit(0)\nos.execvp(SLEEP[0], SLEEP)",
 }

@@ -68,12 +68,6 @@ def test_requests_that_arm_nothing_are_always_passed_on(ends):
     assert (say(ends, start), say(ends, stop)) == ([], [Kind.OPERATOR])
 
 
-def test_an_early_alarm_keeps_the_robot_on_the_ground():
-    ends = join()
-    ends.cloud.teleop.outputs.append(ALARM)
-    assert states(ends, 3) == [ESTOP]
-
-
 @pytest.mark.promise("emergency-stop-gets-through")
 @pytest.mark.parametrize("seed", range(1, 6))
 def test_a_link_that_loses_most_loses_no_alarm(seed):

@@ -1,7 +1,5 @@
 """All files of which a robot or a scene consists are found."""
 
-import struct
-
 import pytest
 
 from cloudrc.geometry.model_files import model_files
@@ -20,7 +18,6 @@ def mjcf(inner):
 
 
 CORNERS = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
-HILLS = struct.pack("2i4f", 2, 2, 0, 1, 0, 1)
 
 
 @pytest.mark.parametrize(
@@ -37,14 +34,6 @@ def test_a_mesh_is_found_where_mujoco_reads_it(tmp_path, compiler, name, mesh):
     file = place(tmp_path, "sub/m.obj" if mesh.startswith("sub") else name, CORNERS)
     asset = f'<compiler {compiler}/><asset><mesh name="m" file="{mesh}"/></asset>'
     scene = place(tmp_path, "scene.xml", mjcf(asset))
-    mujoco.MjModel.from_xml_path(str(scene))
-    assert model_files(scene) == sorted([scene, file])
-
-
-def test_a_height_field_of_the_mesh_folder_is_found(tmp_path):
-    file = place(tmp_path, "shapes/h.bin", HILLS)
-    asset = '<asset><hfield name="h" file="h.bin" size="1 1 1 1"/></asset>'
-    scene = place(tmp_path, "scene.xml", mjcf(f'<compiler meshdir="shapes"/>{asset}'))
     mujoco.MjModel.from_xml_path(str(scene))
     assert model_files(scene) == sorted([scene, file])
 

@@ -148,10 +148,7 @@ def own_scene(tmp_path):
         (POST, [(0, 0, 1), (2.4, 0, 1)], "from waypoint 0 leads through post, or within 0.04 m"),
         (POST, [(0, 0, 1), (1.2, 0.3, 1)], "would be within 0.04 m of post"),
         (POST, [(0, 0, 1), (0, 2, 1), (2.4, 2, 1), (2.4, 0, 1)], ""),
-        (POST.replace('name="post" ', ""), [(2.4, 0, 1)], "through unnamed body 1, or within"),
-        (f'<body name="hall">{POST}</body>', [(0, 0, 1), (2.4, 0, 1)], "through post, or within"),
         (POST.replace("<geom", '<geom contype="0" conaffinity="0"'), [(2.4, 0, 1)], ""),
-        (POST.replace('"post"', '"board"'), [(0, 0, 1), (2.4, 0, 1)], "through board, or within"),
     ],
 )
 def test_every_body_of_a_scene_of_ones_own_is_in_the_way(own_scene, bodies, waypoints, reason):

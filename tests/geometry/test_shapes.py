@@ -1,7 +1,5 @@
 """Surfaces of robot and scene: closed, turned outwards, and the same after a file."""
 
-from io import BytesIO
-
 import numpy as np
 import pytest
 
@@ -66,18 +64,6 @@ def test_a_damaged_file_is_refused_and_nothing_else_is_raised():
         except InvalidValueError:
             refused += 1
     assert refused > 3
-
-
-def test_polygons_of_an_earlier_version_are_read():
-    with np.load(BytesIO(some().to_bytes())) as file:
-        parts = {name: file[name] for name in file.files}
-    quads, triangle = np.array([[0, 1, 2, 2]]), np.array([[0, 1, 2]])
-    parts |= {"bodies": np.array(["block"]), "rgba": np.ones((1, 4)), "sizes": [[3, 2]]}
-    parts |= {"convex": [True], "corners": np.eye(3), "faces": [(1, 4), (1, 3)]}
-    parts["indices"] = np.concatenate([quads.ravel(), triangle.ravel()])
-    np.savez_compressed(file := BytesIO(), **parts)
-    (block,) = Shapes.from_bytes(file.getvalue()).scene
-    assert block.triangles.tolist() == [[0, 1, 2], [0, 2, 2], [0, 1, 2]]
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])

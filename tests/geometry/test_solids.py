@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 from cloudrc.geometry import solids
-from cloudrc.geometry.clearance import ball
-from cloudrc.geometry.placement import find_overlapped
 from cloudrc.geometry.scene import SCENES, load_scene
 from cloudrc.geometry.solids import Solid
 from cloudrc.outside.values import InvalidValueError
@@ -89,18 +87,6 @@ def test_a_box_of_a_mesh_is_as_far_away_as_a_box(tmp_path, monkeypatch):
     assert mesh.distance(np.ones((4, 2, 3))).shape == (4, 2)
 
 
-@pytest.mark.parametrize("geom", ['type="mesh" mesh="cube"', 'type="box" size=".2 .3 .4"'])
-@pytest.mark.parametrize(("away", "index"), [(0.05, -1), (0.03, 0)])
-def test_a_way_may_pass_the_edge_of_a_mesh_as_near_as_that_of_a_box(geom, away, index, tmp_path):
-    cube = f'<asset><mesh name="cube" vertex="{CUBE}"/></asset>'
-    path = scene(tmp_path, f'<body name="it" pos="0 0 1"><geom {geom}/></body>', cube)
-    known = read_bodies(path).solids
-    robot = ball(0.1)
-    aside = (0.1 + away) / 2**0.5
-    position = np.array([[0.2 + aside, 0.3 + aside, 1.0]])
-    assert find_overlapped(known, robot, position).tolist() == [index]
-
-
 @pytest.mark.parametrize("size", [(0.25, 0.25, 0.12), (0.2, 0.3, 0.4), (0.5, 0.02, 0.1)])
 def test_an_ellipsoid_is_as_far_away_as_the_nearest_of_its_points(size):
     polar, round_ = np.meshgrid(np.linspace(0, np.pi, 201), np.linspace(0, 2 * np.pi, 401))
@@ -137,11 +123,3 @@ def test_a_changed_file_is_read_again(tmp_path):
     path.unlink()
     with pytest.raises(InvalidValueError, match=r"mine\.xml: cannot be read"):
         read_bodies(path)
-
-
-def test_a_changed_include_is_read_again(tmp_path):
-    path = scene(tmp_path, '<include file="part.xml"/>')
-    for name in ("a", "another"):
-        body = f'<body name="{name}"><geom size=".1"/></body>'
-        (tmp_path / "part.xml").write_text(f"<mujoco>{body}</mujoco>")
-        assert read_bodies(path).bodies == ("floor", name)

@@ -1,6 +1,5 @@
 """How a robot executes chunks of actions that arrive late."""
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -83,13 +82,6 @@ def test_the_age_of_a_mean_is_the_weighted_mean_of_the_ages():
     )
 
 
-def test_the_ensemble_refuses_actions_without_a_mean():
-    env = Networked(gymnasium.make("CartPole-v1"), chunk=4, executor="ensemble")
-    env.reset()
-    with pytest.raises(ValueError, match="floating-point"):
-        env.step([0, 1, 0, 1])
-
-
 def test_the_policy_learns_the_actions_before_its_answer():
     env = Networked(Counter(), both_ways(15, 20), chunk=8, executor="prefix", start="answer")
     observation, info = env.reset()
@@ -145,8 +137,7 @@ def test_an_executor_of_ones_own_is_found_by_its_path(tmp_path):
 @pytest.mark.parametrize(
     ("body", "error", "words"),
     [
-        ("return numpy.array([numpy.nan])", BadInputError, "the action: it is"),
-        ("return numpy.zeros(2)", BadInputError, r"of shape \(2,\)"),
+        ("return numpy.array([numpy.nan])", BadInputError, "the action is"),
         ("self.basis = tick + 1; return [0]", ValueError, "its basis is 1, not"),
         ("1 / 0", ZeroDivisionError, "division"),
     ],

@@ -80,12 +80,6 @@ def test_the_numbers_have_the_experiments_own_metrics_and_a_failing_one_is_a_war
     assert "odd" not in info["numbers"]
 
 
-def test_an_own_metric_without_a_file_is_refused(tmp_path):
-    settings = {"report.metrics": [str(tmp_path / "missing.py")]}
-    with pytest.raises(BadInputError, match=r"metric '.*missing\.py': there is no such file"):
-        gymnasium.make("cloudrc/Steps-v0", settings=settings)
-
-
 def test_an_action_of_a_robot_on_the_ground_has_no_vertical_velocity():
     env = gymnasium.make("cloudrc/Steps-v0", experiment="pillars").unwrapped
     assert env.action_space.shape == (3,)

@@ -68,15 +68,6 @@ def test_a_robot_of_a_vector_flies_as_alone_with_its_stream(mode):
         ended = bool(ends[0])
 
 
-def test_robots_share_no_network():
-    env = NetworkedVector(SyncVectorEnv([Counter] * 3), LINK, 1)
-    env.reset()
-    lost = [env.step(np.zeros((3, 1), np.float32))[4]["cloudrc"]["lost_uplink"] for _ in range(200)]
-    first, second, third = np.array(lost).T
-    assert not np.array_equal(first, second)
-    assert not np.array_equal(second, third)
-
-
 def test_chunks_and_spaces_of_every_kind():
     env = NetworkedVector(SyncVectorEnv([Mixed] * 2), LINK, chunk=3, executor="time_indexed")
     bare = SyncVectorEnv([Mixed] * 2)
@@ -112,14 +103,6 @@ def test_what_does_not_fit_a_vector_is_refused_in_one_line():
         ready.step(np.zeros((2, 1)))
     with pytest.raises(BadInputError, match="the action: it is None"):
         ready.step(None)
-
-
-def test_single_environments_and_vectors_have_a_wrapper_each():
-    with pytest.raises(BadInputError, match="for a single one there is Networked"):
-        NetworkedVector(Counter())
-    for other in (SyncVectorEnv([Counter]), "CartPole-v1", None):
-        with pytest.raises(BadInputError, match="for a vector there is NetworkedVector"):
-            Networked(other)
 
 
 def test_environments_in_other_processes_need_a_time_step():

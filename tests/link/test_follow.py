@@ -131,7 +131,6 @@ def test_a_change_can_contain_a_trace(pod):
 @pytest.mark.parametrize(
     "text",
     [
-        '{"profile.yaml": 1}',
         '{"profile.yaml": "", "../route": "1.2.3.4:5"}',
         '{"profile.yaml": "uplink: {delay_ms: -1}"}',
     ],

@@ -144,20 +144,9 @@ def test_a_mapping_is_read_as_a_file_and_has_the_plain_classes(tmp_path):
     ("profile", "words"),
     [
         ("let", "no profile named 'let'.*did you mean lte"),
-        ("./none.yaml", "no such file"),
         ({"uplink": {"delay": 40}}, "uplink.delay: unknown key; did you mean delay_ms"),
-        ({"uplink": {"loss": 5}}, "uplink.loss: 5: must be a number >= 0 and <= 1"),
-        ({"uplink": {"delay_ms": float("nan")}}, "its uplink.delay_ms is nan"),
-        ({"uplink": {"loss": {"bad_start": 0.1}}}, "uplink.loss.bad_end: is missing"),
-        (
-            {"uplink": {"changes": {}, "distribution": "gauss"}},
-            "uplink.changes: dict: must be a li",
-        ),
         ({"uplink": {"distribution": "table"}}, "uplink: distribution: table needs the key table"),
-        ({"uplink": {"delay_ms": object()}}, "its uplink.delay_ms is object"),
-        ({"uplink": {"trace": "none.csv"}}, "none.csv"),
         (70, "not int"),
-        (None, "not NoneType"),
     ],
 )
 def test_a_profile_that_cannot_be_used_is_refused_in_one_line(profile, words):
@@ -181,14 +170,6 @@ def test_a_packet_that_cannot_be_sent_is_refused(name, packet, word):
     with pytest.raises(BadInputError, match=rf"^{word}, not a whole number >= 0"):
         up.send(*packet)
     assert up.send(0, 0, 1, 0) == cloudrc.link.open(name, 1)[0].send(0, 0, 1, 0)
-
-
-def test_a_table_that_cannot_be_made_is_refused():
-    up, _ = cloudrc.link.open("lte", 1)
-    with pytest.raises(BadInputError, match=r"^count: 3\.0, not a whole number >= 0"):
-        up.table(3.0, 0.01)
-    with pytest.raises(BadInputError, match=r"^period: nan, not a number .* \[s\]; give the time"):
-        up.table(3, float("nan"))
 
 
 def test_the_examples_of_the_page_run(tmp_path, capsys):

@@ -79,13 +79,8 @@ def test_round_trips_are_halved_only_on_request():
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("time,delay_ms\n99.5,45", "has 0 columns time"),
-        ("time_s,delay_ms,rtt_ms\n0,45,90", "has 2 columns delay"),
         ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms: 'fast', not a finite number"),
         ("time_s,delay_ms\n0,45\n1,-3", "arrived 3 ms before it was sent: the two clocks differ;"),
-        ("time_s,delay_ms,loss_percent\n0,45,2", "column loss_percent is not read; call it loss"),
-        ("time_s,delay_ms", "no packet has a delay"),
-        ("sent_ms,delay_ms\n" + "1.7212E+12,20\n" * 50, "49 of 50 packets have the same time"),
         ("time_s,delay_ms\n98,4\n99,4\n100,4\n0,4\n1,4", "at packet 4 the times go back by 100 s"),
     ],
 )
@@ -218,31 +213,10 @@ def test_ping_counts_on_after_65535():
     assert packets.notes == ("1 out of order, sorted",)
 
 
-FIVE = [reply(number, number / 5) for number in range(1, 6)]
-
-
-@pytest.mark.parametrize(
-    ("lines", "says"),
-    [
-        ([HEAD], "has no replies"),
-        ([HEAD, *FIVE, HEAD], "more than one session of ping"),
-        (
-            [reply(n, 50.0 + n - 10.0 * (n > 5)) for n in range(1, 12)],
-            "at packet 6 the times go back by 9 s: .* a step of the clock",
-        ),
-    ],
-)
-def test_a_ping_that_cannot_be_used_is_refused(lines, says):
-    with pytest.raises(BadInputError, match=f"^x: [^\\n]*(?:{says})"):
-        ping(*lines)
-
-
 @pytest.mark.parametrize(
     "line",
     [
         reply(1, 1.0)[11:],
-        "[1700000000.5] 64 octets de 192.0.2.7 : icmp_seq=1 ttl=53 temps=20,1 ms",
-        "[1700000000.5] PING h (192.0.2.7): 56 data bytes",
         "Antwort von 192.0.2.7: Bytes=32 Zeit<1ms TTL=57",
     ],
 )

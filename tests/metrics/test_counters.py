@@ -25,9 +25,7 @@ def counted(totals):
         ({15.0: 7, 16.0: 8}, 8),  # it was 0 before its first record
         ({10.5: 10, 11.5: 10}, 5),  # and began to rise a second before it
         ({10.0: 5, 12.0: 7, 13.0: 3, 20.0: 4}, 6),  # its process restarts
-        ({9.0: 5}, 0),
         ({21.0: 6, 22.0: 8}, 0),
-        ({10.0: 5, 20.0: 9}, 4),
         ({}, None),
     ],
 )
@@ -42,7 +40,6 @@ def test_only_what_a_counter_rose_in_the_flight_counts(totals, expected):
         ({10.2: 50, 10.21: 51, 19.6: 990}, 1000),  # two records beside each other say little
         ({9.0: 0, 21.0: 1200}, 1000),
         ({15.0: 3}, None),
-        ({15.0: 3, 15.0 + 1e-12: 4}, None),
     ],
 )
 def test_a_steady_counter_rises_before_and_after_its_records_too(totals, expected):

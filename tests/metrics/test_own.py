@@ -88,13 +88,9 @@ def test_a_later_report_measures_a_file_only_if_named(folder, monkeypatch):
 @pytest.mark.parametrize(
     ("names", "text", "reason"),
     [
-        (["no.py"], "", "there is no such file"),
         (["bad.py"], "def measure(flight): ...", "needs a text UNIT"),
-        (["bad.py"], "import nowhere", "cannot be imported: bad.py:1: ModuleNotFoundError"),
-        (["bad.py"], "import sys; sys.exit(0)", "cannot be imported: bad.py:1: SystemExit: 0"),
         (["duration.py"], OVERSHOOT, "duration is a metric already; rename the file"),
         (["bad.py", "mine/../bad.py"], OVERSHOOT, "2 metrics are named bad"),
-        (["overshoot"], "", "no metric named 'overshoot'; available: age_at_"),
     ],
 )
 def test_an_invalid_metric_is_refused_in_one_line(folder, refused, names, text, reason):
@@ -140,9 +136,7 @@ def test_a_metric_that_changes_its_arrays_changes_no_other_number(folder):
     assert flight.truth["position"].max() < 100.0  # also for verdict and figures
 
 
-@pytest.mark.parametrize(
-    ("name", "why"), [("raises", "RuntimeError: no such column"), ("exits", "SystemExit: 0")]
-)
+@pytest.mark.parametrize(("name", "why"), [("raises", "RuntimeError: no such column")])
 def test_a_row_tells_that_a_metric_failed(name, why):
     row = fly_point(load_experiment("steps", [*KEYS, f"report.metrics=[mine/{name}.py]"]))
     assert (row["verdict"], name in row["numbers"]) == ("success", False)

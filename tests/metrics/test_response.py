@@ -118,14 +118,6 @@ def test_the_end_of_a_moving_setpoint_is_judged_but_is_no_step():
     assert "unstable" in judged(ended)
 
 
-def test_a_step_over_two_rows_of_a_file_is_a_step():
-    def ramp(t):
-        return min(max(t - 2.0, 0.0) / 0.06, 1.0), 0.0, 1.0
-
-    (step,) = steps(flight(lambda t: second_order(0.5)(t - 2.0), ramp))
-    assert step.start == pytest.approx(2.08)
-
-
 def test_random_steps_must_settle_and_null_switches_it_off():
     far = second_order(0.5), lambda t: (1.3, 0.0, 1.0)
     mission = MissionConfig(steps=Steps(count=1))
@@ -159,24 +151,6 @@ def test_a_step_whose_end_was_not_flown_has_neither_settled_nor_failed_to(ending
     assert "not_settled" not in judged(cut)
     assert [SHIPPED["unsettled_steps"].measure(each) for each in (done, cut)] == [1.0, 0.0]
     assert json.dumps([step.cut for step in responses(cut)]) == "[false, true]"
-
-
-def test_timed_out_comes_before_a_step_that_did_not_settle():
-    log = flown(second_order(0.7))
-    log.change(
-        Control, lambda n, c: c._replace(setpoint=(2.0 if c.stamp_ns < at(8.5) else 1, 0, 1))
-    )
-    log.change(MissionEvent, lambda n, e: e._replace(event="timed_out") if e.event == "done" else e)
-    assert [*judged(log.flight(mission=MissionConfig(steps=Steps(count=2))))][:2] == [
-        "timed_out",
-        "not_settled",
-    ]
-
-
-def test_an_error_at_the_edge_of_the_band_is_settled():
-    """In floating point 1 - 0.95 is above 0.05."""
-    (step,) = steps(flight(lambda t: (0.0 if t < 2.0 else 0.95, 0.0, 1.0)))
-    assert step.settling_time == pytest.approx(2.0, abs=0.02)
 
 
 def test_steps_that_do_not_settle_are_counted_beside_the_mean():

@@ -80,20 +80,6 @@ def test_the_other_dialects_of_numpy_are_read(write, array):
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({b"type": "|O", b"kind": b"O"}, "arrays of type object are refused"),
-        ({b"type": [["a", "<f4"]], b"kind": b"V"}, "is no type of an array"),
-        ({b"shape": [3]}, "has 8 bytes, not 12"),
-    ],
-)
-def test_an_array_of_msgpack_numpy_is_checked_as_any(change, words):
-    form = in_msgpack_numpy(np.zeros(2, "<f4")) | change
-    with pytest.raises(WireError, match=words):
-        unpack(msgpack.packb({"a": form}))
-
-
-@pytest.mark.parametrize(
     "value",
     [np.array([{}], object), np.ones(2, complex), object(), 1 << 70],
     ids=lambda value: type(value).__name__,
@@ -112,11 +98,8 @@ def array(**change):
     ("change", "text"),
     [
         ({"dtype": "|O"}, "refused"),
-        ({"dtype": "no type"}, "no type"),
         ({"shape": [3]}, "8 bytes, not 12"),
-        ({"shape": [-2]}, "shape"),
         ({"shape": [1] * 40}, "shape"),
-        ({"data": "text"}, "bytes"),
     ],
 )
 def test_a_wrong_array_is_refused(change, text):

@@ -100,15 +100,12 @@ def after(count, last):
     ("last", "code", "text"),
     [
         (actions(np.nan), "controller_invalid", "not a finite number"),
-        (actions(True), "controller_invalid", r"value at \[0, 0\] is bool np.True_"),
-        (actions(0.0, (4,)), "controller_invalid", r"shape \(4,\), not \(H, 4\)"),
         (b"\x81\xa6action\x01", "controller_invalid", "no key 'actions'"),
-        (b"\x91\x01", "controller_invalid", "cannot be read"),
         ("Traceback\nValueError: no", "controller_invalid", "ValueError: no"),
         (lambda link: link.close(1011), "controller_silent", "closed the connection"),
         (lambda link: link.socket.shutdown(socket.SHUT_RDWR), "controller_silent", "ended before"),
     ],
-    ids=range(8),
+    ids=range(5),
 )
 def test_a_wrong_answer_in_flight_ends_it_with_one_line_and_a_recording(tmp_path, last, code, text):
     error, report = lost(after(20, last), tmp_path)
@@ -130,12 +127,6 @@ def test_nobody_listening_ends_a_flight_before_it_begins(tmp_path, free_port):
         fly(experiment(url), "virtual", tmp_path, page=False)
     assert raised.value.code == "controller_silent"
     assert not (tmp_path / "report.json").exists()
-
-
-@pytest.mark.parametrize("url", ["127.0.0.1:8000", "http://h:1"])
-def test_a_wrong_address_is_refused_when_the_experiment_is_read(url):
-    with pytest.raises(BadInputError, match=r"cloud\.controller\.url: .*ws://127"):
-        experiment(url)
 
 
 def test_a_remote_controller_makes_no_plans_and_flies_here_only():

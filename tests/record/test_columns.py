@@ -4,7 +4,6 @@ import hashlib
 import struct
 from operator import attrgetter
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,19 +12,6 @@ from cloudrc import records as rec
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.record.topics import ADDED, TOPICS
 from tests.record.conftest import MS, any_record, assert_equal, cloud_records, world_records, write
-
-
-def test_a_topic_without_rows_is_an_empty_table_of_its_types():
-    shapes = {"vector": (0, 3), "quaternion": (0, 4)}
-    types = {"bool": np.bool_, "int": np.int64, "string": np.object_}
-    recording = Recording.from_records([])
-    for name, topic in TOPICS.items():
-        table = recording[name]
-        assert table.names == ("stamp_ns", *(field.name for field in topic.fields))
-        assert len(table) == len(table["stamp_ns"]) == 0
-        for field in topic.fields:
-            assert table[field.name].shape == shapes.get(field.kind, (0,))
-            assert table[field.name].dtype == types.get(field.kind, np.float64), field
 
 
 def test_the_error_for_an_unknown_name_lists_known_names():

@@ -13,13 +13,12 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
-from cloudrc.drivers import local
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole
 from cloudrc.record.ros import definition
 from cloudrc.record.writer import McapWriter
-from tests.record.conftest import assert_equal, rewrite, world_records, write
+from tests.record.conftest import assert_equal, rewrite, world_records
 
 RECORDS = world_records(160)
 
@@ -96,13 +95,10 @@ def test_a_lost_index_loses_nothing(path, cut):
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (bytes(100), "is empty"),
         (WHOLE[:5], "is empty"),
         (WHOLE[:8] + b"\xff" * 40, "holds no readable message: cut short"),
         (flipped(FIRST), r"holds no readable message: damaged at byte \d+"),
-        (b"#ROSBAG V2.0\n", "is a ROS 1 bag, not an MCAP file"),
         (b"SQLite format 3\0", r"is an SQLite file, not MCAP; .*ros2 bag convert"),
-        (b"PK\x03\x04 and so on", "is not an MCAP file"),
     ],
 )
 def test_a_file_without_a_message_is_named(path, refused, data, reason):
@@ -138,13 +134,12 @@ def test_an_unusual_layout_is_read(whole, path, options):
     ("options", "said"),
     [
         ({"keep": lambda c, m: c.topic != "/guard"}, "it holds 0 of 1 on /guard$"),
-        ({"keep": lambda c, m: m.log_time < 10**9}, r"it holds .*, .*, .* and 7 more topics$"),
         ({"rename": lambda t: f"/r2{t}"}, "it holds 0 of"),
         ({"rename": lambda t: t.replace("/odometry", "/ground_truth")}, "/odometry, 320 of 160 on"),
         ({"metadata": False}, "the metadata of cloudrc, which names the clock, is not there$"),
         ({"shuffle": lambda all: all.extend(all[:4])}, "messages were removed or added: it holds "),
     ],
-    ids=["topic", "half", "renamed", "joined", "metadata", "doubled"],
+    ids=["topic", "renamed", "joined", "metadata", "doubled"],
 )
 def test_changes_by_another_program_are_noted(whole, path, options, said):
     recording = Recording.read(rewrite(whole, path, **options))
@@ -183,7 +178,6 @@ ARRIVAL = definition(OURS)
         ("/uplink_delay", OURS, ARRIVAL.replace("bool used", "int8 used"), "layout"),
         ("/uplink_delay", "cloudrc_msgs/msg/Pid", definition("cloudrc_msgs/msg/Pid"), "layout"),
         ("/camera", OURS, ARRIVAL, ""),
-        ("/camera", "", "", ""),
     ],
 )
 def test_foreign_topics_are_not_read_as_topics_of_cloudrc(path, topic, name, text, said):
@@ -295,22 +289,6 @@ def test_bytes_behind_the_end_are_left_out_and_told(path, rest):
     recording = Recording.read(path)
     assert (recording.messages, recording.note) == (MESSAGES, "")
     assert recording.remarks == (f"had {len(rest)} bytes behind its end, which were left out",)
-
-
-def test_a_recording_without_messages_is_not_copied(path, refused):
-    write(path, [])
-    assert "holds no readable message: none is in it; nothing" in refused("recover", path)
-    assert not path.with_name("x.recovered.mcap").exists()
-
-
-def test_a_recording_of_a_session_in_flight_is_not_copied(path, monkeypatch, refused):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(path.parent))
-    path.write_bytes(WHOLE[: CHUNKS[0][1] + 100])
-    (path.parent / local.JOURNAL_FILE).touch()
-    with local.announced(path.parent, ""):
-        said = refused("recover", path)
-    assert f"{path.parent}: the session has not ended; end it: cloudrc down" in said
-    assert sorted(path.parent.glob("*.mcap")) == [path]
 
 
 def test_the_command_says_what_is_copied_and_missing(path, call, refused):

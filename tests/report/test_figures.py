@@ -9,11 +9,10 @@ from matplotlib.collections import LineCollection
 
 from cloudrc.config.load import load_experiment
 from cloudrc.config.profile import DirectionConfig
-from cloudrc.geometry.shapes import Shapes, box
 from cloudrc.record.holes import Hole
 from cloudrc.records import Control
 from cloudrc.report.figures import FIGURES, PRINT_KINDS, draw_all, own_settings
-from cloudrc.report.figures.style import RC, Look, Subject, sampled
+from cloudrc.report.figures.style import RC, Look, Subject
 from cloudrc.robots.shapes import read_shapes
 from tests.metrics.conftest import ONE_PIPE, OPEN_AIR, SECOND, START, flown
 
@@ -70,11 +69,6 @@ def longest(name, subject):
             is_path = isinstance(each, LineCollection) and each.get_array() is not None
             found += each.get_segments() if is_path else []
     return max(np.nanmax(np.abs(np.diff(points[:, 0])), initial=0.0) for points in found)
-
-
-def test_a_sampled_path_has_both_sides_of_a_hole():
-    assert sampled(12, np.array([7])).tolist() == [0, 5, 6, 7, 10, 11]
-    assert len(sampled(0, np.zeros(0, int))) == 0
 
 
 @pytest.mark.parametrize(("width", "panels"), [(3.5, 3), (7.16, 4)])
@@ -144,16 +138,3 @@ def test_a_tube_is_an_outline_from_above_and_from_the_side():
     for axes in figure.axes[:2]:
         (patch,) = axes.patches
         assert np.ptp(patch.get_xy(), axis=0) == pytest.approx((5.0, 1.4))
-
-
-def test_what_is_above_the_robot_is_an_outline():
-    roof = replace(box((5.0, 5.0, 0.1)), body="roof").placed((5.0, 0.0, 4.0), np.eye(3))
-    block = replace(box((0.5, 0.5, 0.5)), body="block").placed((5.0, 2.0, 0.5), np.eye(3))
-    subject = replace(subject_of(flown()), shapes=Shapes(scene=(roof, block)))
-    with own_settings(Look()):
-        figure = FIGURES["flight"][0](subject)
-    widths = {
-        round(float(np.ptp(each.get_xy()[:, 0]))): each.get_facecolor()[3]
-        for each in figure.axes[0].patches
-    }
-    assert widths == {10: 0.0, 5: 0.7, 1: 0.7}

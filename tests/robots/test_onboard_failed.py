@@ -106,11 +106,7 @@ def fly(own, tmp_path):
     ("what", "shown"),
     [
         ("return (float('nan'), *commands[1:])", "its result at [0] is nan, not a finite number"),
-        ("return commands[1:]", "not 4 numbers, own.py:15 in update"),
-        ("return None", "its result is None"),
-        ("return (1e300, *commands[1:])", "its result at [0] is 1e+300"),
         ("raise KeyError('gyro')", "KeyError: 'gyro', own.py:19 in update"),
-        ("raise SystemExit(0)", "sys.exit() was called"),
     ],
 )
 def test_a_controller_that_fails_in_flight_ends_it_with_onboard_failed(fly, what, shown):
@@ -158,10 +154,7 @@ def test_physics_of_actuators_that_fails_in_flight_is_onboard_failed_too(fly, wh
     ("what", "shown"),
     [
         ("1 / 0", "ZeroDivisionError: division by zero, own.py:14 in run"),
-        ("raise SystemExit(0)", "sys.exit() was called"),
-        ("return None", "run() returned None, not the time of the next step, own.py:"),
         ("data.qvel[0] = float('nan')", "its values are not finite, own.py:"),
-        ("self.simulator.step((float('nan'),) * 4)", "its values are not finite"),
     ],
 )
 def test_an_accelerator_that_fails_in_flight_ends_it_with_onboard_failed(
@@ -184,24 +177,9 @@ def test_an_accelerator_that_holds_the_contract_flies_as_without_it(fly):
     )
 
 
-def test_both_may_fail_in_the_same_step(fly):
-    both = FAILS.replace("{what}", "return ()") + ACTUATORS.replace("{what}", "commands[0] / 0")
-    assert fly(both).failures[0].code == "onboard_failed"
-
-
-def test_a_reset_that_fails_is_told_once(fly):
-    source = FAILS.replace("{what}", "pass").replace(
-        "self.law.reset()", "self.calls = self.calls or -1; 1 / (self.calls < 0)"
-    )
-    flight = fly(source)  # at the spawn the counter is -1, later the reset divides by zero
-    assert flight.verdict in ("success", "failure")
-    assert list(flight["/fault"]["code"]).count("onboard_failed") <= 1
-
-
 @pytest.mark.parametrize(
     ("old", "new", "shown"),
     [
-        ("law.stopped", "(0.0,) * 3", "its stopped has 3 numbers, not 4"),
         ("def brake", "def halt", "'Fails' object has no attribute 'brake'"),
     ],
 )
@@ -218,22 +196,7 @@ def test_actuators_that_cannot_be_made_are_refused_before_the_flight(fly):
         fly(FAILS.replace("{what}", "pass") + "\ndef actuators(model, dt):\n    return 1 / 0\n")
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "shown"),
-    [
-        ("def step", "def move", "actuators() failed: Push has no method step()"),
-        ("self.steps = 0\n", "self.steps = 0\n        1 / Push.made; Push.made = 0\n", "own.py:"),
-    ],
-)
-def test_actuators_that_cannot_work_are_refused_before_the_flight(fly, old, new, shown):
-    source = FAILS.replace("{what}", "pass") + ACTUATORS.replace("{what}", "pass")
-    source = source.replace("class Push:", "class Push:\n    made = 1\n")
-    with pytest.raises(BadInputError) as error:
-        fly(source.replace(old, new))
-    assert shown in str(error.value)
-
-
-@pytest.mark.parametrize("make", ["3", "lambda *given: 3", "lambda *given: given[9]"])
+@pytest.mark.parametrize("make", ["3", "lambda *given: 3"])
 def test_an_accelerator_that_makes_no_robot_is_refused_before_the_flight(fly, make):
     with pytest.raises(BadInputError, match=r"own\.py: accelerator\(\) failed: "):
         fly(FASTER.replace("{what}", "pass").replace("(Faster", f"({make}"))

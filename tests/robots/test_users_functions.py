@@ -6,7 +6,6 @@ from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.robots.build import accelerator, advise, check_robot
 from cloudrc.robots.check import check
-from tests.robots.conftest import CONTROLLER
 
 SPHERES = """
 def few():
@@ -20,7 +19,6 @@ FUNCTIONS = {
     "actuators": "own.py",
 }
 """Function of a robot's files that cloudrc calls -> its file; `build` has tests of its own."""
-MAKE = "from cloudrc.sim.onboard import Accelerator as A; return A"
 
 
 @pytest.fixture
@@ -66,11 +64,7 @@ def test_a_failure_of_any_function_is_one_error_with_file_and_line(failing, func
     ("function", "body", "reason"),
     [
         ("few", "return [[0, 0, 0, 1], [0, 0]]", "not a finite number"),
-        ("few", "return [0, 0, 0, 0.3]", "it returned shape (4,)"),
-        ("few", "import numpy; return numpy.zeros((0, 4))", "it returned shape (0, 4)"),
         ("few", "return [[0, 0, 0, float('nan')]]", "at [0, 3] is nan, not a finite number"),
-        ("accelerator", f"{MAKE}(3, '')", "'int' object is not callable"),
-        ("advise", "return None", "TypeError"),
     ],
 )
 def test_what_a_function_returns_is_checked_before_the_flight(failing, function, body, reason):
@@ -78,13 +72,6 @@ def test_what_a_function_returns_is_checked_before_the_flight(failing, function,
     for text in refusals(mine):
         assert f"{mine / FUNCTIONS[function]}:" in text
         assert reason in text
-
-
-def test_a_file_of_spheres_without_a_function_is_refused(own_robot):
-    mine = own_robot(f"onboard: {CONTROLLER}\nhull_points: ./hull.py")
-    (mine / "hull.py").write_text("")
-    for text in refusals(mine):
-        assert text.endswith("hull.py: has no function few(); write one")
 
 
 def test_a_robot_whose_functions_hold_the_contract_is_accepted(failing, capsys):

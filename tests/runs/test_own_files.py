@@ -59,13 +59,3 @@ def test_files_that_a_setting_replaces_do_not_count(run, tmp_path):
     (tmp_path / "other.py").write_text(PREDICTOR + "# other\n")
     settings = ["world.robot=rover", f"cloud.predictor={tmp_path / 'other.py'}"]
     assert describe_changes(str(config), load_experiment(config, settings)) == ""
-
-
-@pytest.mark.parametrize("content", [None, "{}"])
-def test_a_run_that_does_not_say_its_files_is_repeated_without_a_word(run, tmp_path, content):
-    config, _ = run
-    copy = shutil.copy(config, tmp_path / "config.yaml")
-    if content is not None:
-        (tmp_path / "environment.json").write_text(content)
-    text = describe_changes(str(copy), load_experiment(copy))
-    assert text == ""

@@ -37,7 +37,6 @@ def idle():
 @pytest.mark.parametrize(
     ("tokens", "said"),
     [
-        ({}, "operator: No such file or directory; make one: "),
         ({"operator": "short"}, "operator: a token is 16 to 512 visible"),
         ({"operator": "o" * 16, "reader": "o" * 16 + "\n"}, "both roles have the same token"),
         ({"operator": None}, "operator: not a file; make one"),  # and is not awaited

@@ -110,13 +110,3 @@ def test_it_starts_again_from_the_robot_after_a_silence():
     flight.epoch += 1
     flight.step((1.0, 0.0, 1.0))
     assert flight.setpoints[-1].motion == Motion((1.0, 0.0, 1.0), flight.now_ns, 2.0, 2.0)
-
-
-def test_it_leads_a_robot_off_the_ground_at_once():
-    flight = Flight()
-    flight.step()
-    flight.operate("start", Plan(TWO.legs))
-    for _ in range(20):
-        flight.guard = GuardState.GROUND
-        flight.step()
-    assert reference(flight).position[0] > 0.0

@@ -48,12 +48,9 @@ def test_a_status_comes_back_from_its_line(known):
     "data",
     [
         b"",
-        b'["Nobody", []]',
         b'["RobotStatus", [1, [0, 0, 1], 7, 1]]',
-        b'["Setpoint", [["a", 0, 0], 0, 0]]',
         b'["OperatorRequest", [1, 9, 0]]',
         b"[" * 5000,
-        b"\xff\xfe",
         encode(Fault(0, "x", "y")),
     ],
 )

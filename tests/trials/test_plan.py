@@ -99,17 +99,11 @@ def test_relative_paths_start_at_the_file(write_sweep, tmp_path, monkeypatch):
     ("keys", "reason"),
     [
         ({"grid": {"link.both.delayms": [1]}}, "link.uplink.delayms: unknown key; did you mean"),
-        ({"grid": {"link.both.delay_ms": [1, -3]}}, "link.downlink.delay_ms: -3: must be a number"),
         ({"grid": {"link.both.delay_ms": []}}, "grid.link.both.delay_ms: must be a list of values"),
-        ({"grid": {"gains": {"low": 3}}}, "grid.gains: must be a list of values, or names"),
-        ({"grid": {"cloud.predictor": ["last_sampl"]}}, "did you mean last_sample?"),
-        ({"grid": {"world.onboard.tilt": [1, 2]}}, "world.onboard.tilt: unknown key; known here"),
         ({"grid": {"world.plant.payload_kg": [0, 9]}}, "world.plant: the thrust-to-weight ratio"),
         ({"set": {"seed": 1}}, "seed: each flight has its own seed"),
         ({"grid": {"duration": {"one": {}}}}, "grid.duration: is the name of another column"),
-        ({"seeds": 0}, "seeds: 0: must be a number of seeds, 1 to 10000, or a list of different"),
         ({"seeds": [1, 1]}, "seeds: [1, 1]: must be"),
-        ({"gird": {}}, "gird: unknown key; did you mean grid?"),
     ],
 )
 def test_a_problem_is_refused_at_its_place(write_sweep, keys, reason):
@@ -127,11 +121,6 @@ def test_the_file_of_the_page_is_a_sweep(tmp_path):
     (tmp_path / "grid.yaml").write_text(re.search(r"```yaml\n(.*?)```", page, re.DOTALL)[1])
     sweep = read_plan(tmp_path / "grid.yaml")
     assert (len(sweep.points), len(sweep.flights)) == (12, 240)
-
-
-def test_equal_points_are_refused(write_sweep):
-    with pytest.raises(BadInputError, match=r"5\.0} is the same experiment as"):
-        read_plan(write_sweep({"guard.hold_max_s": [5, 5.0]}))
 
 
 @pytest.fixture

@@ -216,22 +216,3 @@ def test_link_set_acts_on_an_open_connection(relayed, tmp_path, monkeypatch):
             done = subprocess.run([*words, "uplink.reorder=0.1"], capture_output=True, text=True)
             assert (done.returncode, done.stderr.count("\n")) == (2, 2)
             assert "link exec" in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("flags", "said"),
-    [
-        ("--to 127.0.0.1:1 --set uplink.corrupt=0.1", "uplink.corrupt: TCP hands bytes on once"),
-        ("--to no-such-host.invalid:1", "name a host and a port"),
-    ],
-)
-def test_bad_input_is_one_line(refused, flags, said):
-    (port,) = free_ports(1)
-    assert said in refused(f"relay tcp --listen 127.0.0.1:{port} {flags}")
-
-
-def test_a_port_in_use_is_named(refused):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        text = refused(f"relay tcp --listen 127.0.0.1:{port} --to 127.0.0.1:1")
-    assert f"--listen 127.0.0.1:{port}: Address already in use" in text

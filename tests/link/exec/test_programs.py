@@ -151,11 +151,6 @@ def test_a_server_that_no_client_can_reach_ends_the_command(folder):
     assert out == "[client] at once\n"
 
 
-def test_a_client_that_names_its_own_machine_gets_a_note(folder):
-    _, error = run(client="curl -s http://localhost:8000/", code=7)
-    assert "write {server} for its address" in error
-
-
 def two_sample_distance(one, other):
     """Return the Kolmogorov-Smirnov distance of two samples, and its limit at p = .01."""
     points = np.sort(np.concatenate([one, other]))

@@ -32,20 +32,6 @@ def test_the_drag_of_robot_yaml_reaches_the_rotors(own_robot):
 
 
 @pytest.mark.parametrize(
-    ("keys", "message"),
-    [
-        ("drag: 0.1", "drag: unknown key; did you mean drag_s_per_m?"),
-        ("tilt_max_deg: steep", "tilt_max_deg"),
-        ("tilt_max_deg: 90", "robot.yaml: onboard.tilt_max_deg: 90: must be"),
-    ],
-)
-def test_a_wrong_parameter_is_refused_by_its_name(own_robot, keys, message):
-    mine = own_robot(f"onboard: {{name: multirotor, {keys}}}", MODEL)
-    with pytest.raises(BadInputError, match=message):
-        cloudrc.fly("hover", HOVER | {"world.robot": str(mine)})
-
-
-@pytest.mark.parametrize(
     ("text", "settings", "message"),
     [
         ("onboard: Multirotor", {}, "robot.yaml: onboard: no onboard named 'Multirotor'"),
@@ -53,11 +39,6 @@ def test_a_wrong_parameter_is_refused_by_its_name(own_robot, keys, message):
             "onboard: multirotor\ntunings: {fast: {drag: 0.1}}",
             {"world.tuning": "fast"},
             "robot.yaml: tunings.fast.drag: unknown key",
-        ),
-        (
-            "onboard: multirotor",
-            {"world.onboard.tilt_max_deg": -3},
-            "^world.onboard.tilt_max_deg: -3: must be",
         ),
     ],
 )

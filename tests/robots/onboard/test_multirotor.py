@@ -44,9 +44,7 @@ PLANTS = {
         big().replace('diaginertia=".03 .025 .05"', 'fullinertia=".03 .025 .05 .006 .005 -.004"'),
     )
     * 2,
-    "controls up to 1": (robot(x_layout(0.14, 0.17, 0.02, 1.0, more='gainprm="8"'), **BARE),) * 2,
     "unlimited": (big().replace('ctrllimited="true"', 'ctrllimited="false"'),) * 2,
-    "turned at the spawn": (big().replace('pos="0 0 2"', 'pos="0 0 2" euler="0 0 70"'),) * 2,
     "a second body": (big(base='<body pos="0 0 .1"><geom size=".02" mass=".3"/></body>'),) * 2,
 }
 

@@ -39,9 +39,3 @@ def test_air_that_mujoco_simulates_is_refused_by_the_scenes_option(tmp_path):
     scene = changed(tmp_path, EMPTY, "<option ", '<option density="1.2" ')
     with pytest.raises(ValueError, match=r"the scene has the option density"):
         check_fit(compile_model(PELICAN, scene))
-
-
-def test_other_gravity_is_refused(tmp_path):
-    scene = changed(tmp_path, EMPTY, "-9.8066", "-1.62")
-    with pytest.raises(ValueError, match=r"not 1.06 and 1.62"):
-        check_fit(compile_model(PELICAN, scene))

@@ -94,14 +94,6 @@ def test_a_file_that_others_may_write_is_compiled_anew(where, monkeypatch, cache
 
 
 @pytest.mark.skipif(not COMPILERS, reason="no compiler here")
-def test_nothing_is_compiled_into_the_working_directory(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
-    assert "set XDG_CACHE_HOME" in module.library().text
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.skipif(not COMPILERS, reason="no compiler here")
 def test_a_built_file_beside_the_module_is_used_even_in_a_pod(monkeypatch, tmp_path):
     built = built_file(tmp_path)
     monkeypatch.setattr(module, "built_file", lambda *given: built)
