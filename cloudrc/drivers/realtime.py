@@ -20,7 +20,7 @@ from pathlib import Path
 from cloudrc.endpoint import Endpoint
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.files import read, version
-from cloudrc.link.carry.udp import send_or_lose
+from cloudrc.link.carry.datagrams import send_or_lose
 from cloudrc.records import Lateness, Record
 from cloudrc.tunnel.codec import DATAGRAM_MAX
 

@@ -182,10 +182,9 @@ def test_debug_shows_the_lines_of_a_metric_that_fails(how, folder, call):
 @pytest.mark.parametrize(
     ("out", "said"),
     [
-        (None, r"^runs/ in the working folder.*with --out$"),
         (Path("runs/x"), r"^--out runs/x: .*name a writable folder"),
-        (Path("runs"), "never overwritten"),
-        (Path("full"), "never overwritten"),
+        (Path("runs"), "nothing is overwritten"),
+        (Path("full"), "nothing is overwritten"),
     ],
 )
 def test_what_is_there_is_never_overwritten(out, said):

@@ -37,12 +37,6 @@ _RECENT = 10  # number of calls of `Relay.counts` over which its percentiles are
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
 
 
-def send_or_lose(one: socket.socket, data: bytes, to: Address | str) -> None:
-    """Send a datagram; it is lost if nobody receives it, or if the kernel does not take it."""
-    with suppress(OSError):
-        one.sendto(data, to)
-
-
 def ask_for_stamps(one: socket.socket) -> None:
     """Ask the kernel for the arrival times and the number of dropped datagrams of a socket."""
     for option in (_SO_RXQ_OVFL, _SO_TIMESTAMPNS) if sys.platform == "linux" else ():

@@ -17,12 +17,12 @@ from math import ceil, inf
 
 import numpy as np
 
+from cloudrc.link.carry.datagrams import send_or_lose
 from cloudrc.link.carry.udp import (
     ANCILLARY_SIZE,
     DATAGRAM_MAX,
     Stamps,
     ask_for_stamps,
-    send_or_lose,
 )
 from cloudrc.link.model import HEADER_BYTES
 from cloudrc.link.profile import DirectionProfile, Timeline
