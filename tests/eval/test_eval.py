@@ -22,6 +22,7 @@ from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.eval.episode import as_actions, play, width_of
 from cloudrc.eval.setup import Episode, EvalSetup, link_at
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.policy.actions import PolicyAnswerError
 from cloudrc.policy.observation import Mapped, observe
 from tests.policy.conftest import serving, stock_like
@@ -247,7 +248,7 @@ def test_a_wrong_value_of_an_environment_is_no_success(law, monkeypatch, told, w
 
 
 def test_spaces_without_numbers_are_refused_and_whole_numbers_are_integers():
-    with pytest.raises(BadInputError, match="Dict"):
+    with pytest.raises(InvalidValueError, match="Dict"):
         width_of(gymnasium.spaces.Dict({}))
     discrete = gymnasium.spaces.Discrete(3)
     assert as_actions(np.array([[1.0], [2.0]]), discrete).tolist() == [1, 2]
