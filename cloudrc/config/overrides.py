@@ -23,13 +23,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, create_model
 
 from cloudrc import plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.problems import ConfigProblem, ProblemsError
 from cloudrc.config.robot import RobotFacts, facts, find_robot, known_robot, parameters
-from cloudrc.config.schema import Cloud, Experiment, PlugIn, Steps, World
+from cloudrc.config.schema import Cloud, Experiment, PlanTime, PlugIn, Steps, World
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.outside import code
@@ -345,8 +345,9 @@ def _complete(
 
 def _plans_ahead(document: Document) -> bool:
     """Return whether cloud sends plans; a `cloud.plan_s` that is no valid one is refused later."""
-    plan = document.get("cloud", "plan_s")
-    return isinstance(plan, int | float) and plan > 0
+    with suppress(ValidationError):
+        return TypeAdapter(PlanTime).validate_python(document.get("cloud", "plan_s")) > 0
+    return False
 
 
 def _parameters_of(kind: str, name: str) -> type[BaseModel]:
