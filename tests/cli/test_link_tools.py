@@ -59,7 +59,7 @@ def test_a_picture_replaces_a_picture_of_its_kind_alone(folder, call, refused):
     [
         ("a.json", b'{"round_trips": []}', "choose --direction uplink"),
         ("a.mcap", b"\x89MCAP0\r\n", "a.mcap"),
-        (".", None, "has no mission.mcap"),
+        (".", None, "no such file or folder"),
     ],
 )
 def test_an_unusable_source_is_refused_in_one_line(name, data, says, folder, refused):
@@ -73,7 +73,7 @@ def test_an_unusable_source_is_refused_in_one_line(name, data, says, folder, ref
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("show ideal -o ideal.gif", "end its name in .png, .svg or .pdf"),
+        ("show ideal -o ideal.gif", "no kind of picture"),
         ("show ideal --seconds 8e4 --rate 1e4", "are more than 10000000 packets"),
         ("verify nonsense", "no profile or experiment named 'nonsense'"),
         ("verify lossy --shaper netem", "lasts); use the relay"),

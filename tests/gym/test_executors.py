@@ -137,7 +137,7 @@ def test_an_executor_of_ones_own_is_found_by_its_path(tmp_path):
 @pytest.mark.parametrize(
     ("body", "error", "words"),
     [
-        ("return numpy.array([numpy.nan])", BadInputError, "the action is"),
+        ("return numpy.array([numpy.nan])", BadInputError, "the action: it is"),
         ("self.basis = tick + 1; return [0]", ValueError, "its basis is 1, not"),
         ("1 / 0", ZeroDivisionError, "division"),
     ],
