@@ -176,6 +176,6 @@ def find_executor(name: str | Path, *, chunked: bool) -> tuple[Executor, bool]:
             returned = f"build() returned {type(executor).__name__}"
             raise InvalidValueError(f"{returned}; return an Executor of cloudrc.gym.executors")
         if executor.needs_chunk and not chunked:
-            text = "plays chunks of actions: give chunk=, the number of actions in an answer"
+            text = "it plays chunks of actions; give chunk=, the number of actions in an answer"
             raise InvalidValueError(text)
     return executor, plugins.find("executors", found).is_shipped

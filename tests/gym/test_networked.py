@@ -295,7 +295,7 @@ def test_importing_the_wrapper_takes_no_heavy_package_along():
     [
         ({"link": "let"}, "no profile named 'let'.*did you mean lte"),
         ({"answer_within": 0.02}, r"0.02, not a number >= 0 and <= 0.01 \[s\]; give how long"),
-        ({"executor": "prefix"}, "executor 'prefix': plays chunks of actions: give chunk="),
+        ({"executor": "prefix"}, "executor 'prefix': it plays chunks of actions; give chunk="),
     ],
 )
 def test_an_argument_that_cannot_be_used_is_refused_in_one_line(options, words):
@@ -388,7 +388,10 @@ def test_a_time_limit_outside_leaves_the_summary_in_the_last_step(make):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: Networked(Counter(), chunk_size=8), "argument of Networked named 'chunk_size'.* mean chunk"),
+        (
+            lambda: Networked(Counter(), chunk_size=8),
+            "argument of Networked named .chunk_size.*mean chunk",
+        ),
         (
             lambda: gymnasium.make("cloudrc/Networked-v0", env="Pendulum-v1", g=9.0),
             "argument of cloudrc/Networked-v0 .* go into env_args.* 'g'",

@@ -50,7 +50,7 @@ def test_the_experiment_fast_flies_other_robots_faster(robot):
         keys = {"world.robot": robot, "world.tuning": tuning, "link.profile": "ideal"}
         found = cloudrc.fly("steps", keys)
         given, measured = series(found.recording)
-        axes = [identify(given[:, axis], measured[:, axis], "") for axis in (0, 2)]
+        axes = [identify(given[:, axis], measured[:, axis]) for axis in (0, 2)]
         fits.append([fit.values[0] + fit.values[1] for fit in axes])  # 63 % of a step is done
     assert all(fast < usual for usual, fast in zip(*fits, strict=True))
 
