@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from cloudrc import source
 from cloudrc.errors import CloudrcError
 from cloudrc.eval.environment import environment_code, find_module
 from cloudrc.eval.setup import (
@@ -36,7 +37,6 @@ from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
 from cloudrc.policy.observation import observe
 from cloudrc.rounding import exceeds
-from cloudrc.source import code_hash
 
 SUCCESS = ("success", "is_success")
 """Keys of an environment's info that tell whether the task is done; one true value is enough."""
@@ -151,7 +151,7 @@ def play(episode: Episode, setup: EvalSetup, key: str = "") -> dict[str, Any]:
         "ended": found.ended,
         "numbers": {k: v for k, v in numbers.items() if v is not None and isfinite(v)},
         "records_sha256": found.records_sha256 if setup.is_repeatable else "",
-        "code": code_hash(),
+        "code": source.code_hash(),
     }
 
 

@@ -8,20 +8,20 @@ from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from typing import Any
 
+from cloudrc import source
 from cloudrc.eval.setup import EvalSetup
 from cloudrc.link.library import read_profile
 from cloudrc.report.document import versions
-from cloudrc.source import code_hash
 from cloudrc.version import __version__
 
 LIBRARIES = ("gymnasium", "numpy", "torch", "jax", "mujoco", "pybullet", "pymunk", "Box2D")
 """Packages that may decide what an environment and a policy do; those that are loaded are named."""
 CITE = (
     f'The cloudrc authors, "cloudrc: a testbed for robots that are controlled from the cloud", '
-    f"version {__version__} (code {code_hash()}), after A. S. Seisa, V. N. Sankaranarayanan, "
-    'G. Damigos, S. G. Satpute and G. Nikolakopoulos, "Cloud-Assisted Remote Control for Aerial '
-    'Robots: From Theory to Proof-of-Concept Implementation", CCGridW 2025, '
-    "https://arxiv.org/abs/2509.04095."
+    f"version {__version__} (code {source.code_hash()}), after A. S. Seisa, "
+    "V. N. Sankaranarayanan, G. Damigos, S. G. Satpute and G. Nikolakopoulos, "
+    '"Cloud-Assisted Remote Control for Aerial Robots: From Theory to Proof-of-Concept '
+    'Implementation", CCGridW 2025, https://arxiv.org/abs/2509.04095.'
 )
 
 

@@ -9,13 +9,13 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cloudrc import source
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.eval.episode import play
 from cloudrc.eval.setup import Episode, EvalSetup
 from cloudrc.files import read, write_atomically
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.rounding import format_limit
-from cloudrc.source import code_hash
 from cloudrc.statistics import LEVEL
 from cloudrc.text import cells, table
 from cloudrc.trials.play import run
@@ -157,7 +157,7 @@ def write(folder: Path, setup: EvalSetup, found: Mapping[str, Any]) -> dict[str,
         "compute": setup.compute,
         "step": setup.step and setup.step._asdict(),
         "repeatable": setup.is_repeatable,
-        "code": code_hash(),
+        "code": source.code_hash(),
         "identity": setup.identity(),
         **found,
     }
@@ -172,7 +172,7 @@ def read_versus(folder: Path, setup: EvalSetup, episodes: Sequence[Episode]) -> 
     """
     had = _read(folder, "--versus")
     before = {**had["identity"], "code": had["code"]}
-    now = {**json.loads(json.dumps(setup.identity())), "code": code_hash()}
+    now = {**json.loads(json.dumps(setup.identity())), "code": source.code_hash()}
     if other := [name for name in PAIRED if before.get(name) != now[name]]:
         raise BadInputError(f"--versus {folder}: differs in {', '.join(other)}; evaluate it again")
     rows = read_rows(folder)

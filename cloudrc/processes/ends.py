@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc import assembly
+from cloudrc import assembly, source
 from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.cloud.controllers.ros2 import RosController
 from cloudrc.config.load import load_experiment, read_experiment
@@ -33,7 +33,6 @@ from cloudrc.outside.code import apart
 from cloudrc.processes.ports import listening, open_exporter, warn
 from cloudrc.records import Fault
 from cloudrc.runs.requirements import require
-from cloudrc.source import code_hash
 from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES, Kind
 from cloudrc.tunnel.end import Identity
 
@@ -218,7 +217,7 @@ def open_recorder(
             clock=clock,
             clock_id=clock_id.hex(),
             wall_offset_ns=offset_ns,
-            code=code_hash(),
+            code=source.code_hash(),
             index=False,
         )
         for name, data in (attached or {}).items():

@@ -14,7 +14,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from cloudrc import assembly
+from cloudrc import assembly, source
 from cloudrc.config.overrides import OUTSIDE, REMOTE
 from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.drivers.companion import companion
@@ -31,7 +31,6 @@ from cloudrc.report.write import attachments, write_report
 from cloudrc.runs.interrupts import raise_if_interrupted
 from cloudrc.runs.own_files import hash_files
 from cloudrc.runs.session import read_last_mission
-from cloudrc.source import code_hash
 
 See: TypeAlias = Callable[[list[Record]], None]
 """Function that gets records during the flight."""
@@ -141,7 +140,7 @@ def _record_virtual(
     store, interrupted, see = RecordStore(), False, _interruptible(see)
     lost: ControllerLostError | None = None
     # Record during the flight, so that the recording is kept if the run or its report fails.
-    with McapWriter(folder / "mission.mcap", clock="world", code=code_hash()) as writer:
+    with McapWriter(folder / "mission.mcap", clock="world", code=source.code_hash()) as writer:
         at_start = attachments(folder)  # the experiment, also for a copy that is cut short
         at_start |= flown_files(experiment.world)
         for name, data in at_start.items():
@@ -165,7 +164,9 @@ def _record_virtual(
             notes = (*assembly.virtual_notes(experiment), *([str(lost)] if lost else ()))
             run = Run("virtual", "virtual", interrupted, notes, steps)
             writer.note(run.metadata)
-            recording = Recording(records=store, metadata={CODE: code_hash()}, attachments=at_start)
+            recording = Recording(
+                records=store, metadata={CODE: source.code_hash()}, attachments=at_start
+            )
             writer.write_views(views(recording, experiment))
             yield recording, experiment, run
         finally:

@@ -18,14 +18,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from cloudrc import files
+from cloudrc import files, source
 from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, to_one_line
 from cloudrc.files import write_atomically
 from cloudrc.outside.document import read_document, write_yaml
 from cloudrc.runs.fly import fly
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.lock import LOCK, lock_folder
-from cloudrc.source import code_hash
 from cloudrc.text import table
 from cloudrc.trials.fingerprint import experiment_facts
 from cloudrc.trials.plan import PlannedFlight, SweepPlan, find_flight, read_draft
@@ -94,8 +93,8 @@ def _is_of(plan: SweepPlan, row: Row) -> bool:
 
 def _why_others(folder: Path, plan: SweepPlan, rows: Rows) -> str:
     """Say why a folder has rows that are not in a plan."""
-    if other := {row.get("code") for row in rows.kept.values()} - {code_hash()}:
-        return f"its flights are of code {other.pop()}, this is code {code_hash()}"
+    if other := {row.get("code") for row in rows.kept.values()} - {source.code_hash()}:
+        return f"its flights are of code {other.pop()}, this is code {source.code_hash()}"
     changed = describe_changes(folder, plan.files)
     return changed or f"has another sweep, see {FILE}, or a package has changed since"
 
@@ -132,7 +131,7 @@ def _write_summary(folder: Path, plan: SweepPlan, rows: Rows) -> None:
         "schemaVersion": 1,
         "experiment": plan.name,
         "cloudrc": __version__,
-        "code": code_hash(),
+        "code": source.code_hash(),
         "overrides": [f"{key}={as_text(value)}" for key, value in file.get("set", {}).items()],
         "axes": plan.axes,
         "seeds": plan.draft.seeds,
@@ -237,8 +236,8 @@ def find_row(folder: Path, begin: str) -> tuple[Row, PlannedFlight]:
     row = rows[0]
     flight = find_flight(read_draft(folder / FILE), row["point"], row["seed"])
     if flight is None or flight.key != row["key"]:
-        why = f"was flown by code {row.get('code')}, this is code {code_hash()}"
-        if row.get("code") == code_hash():
+        why = f"was flown by code {row.get('code')}, this is code {source.code_hash()}"
+        if row.get("code") == source.code_hash():
             why = describe_changes(folder, experiment_facts(flight.resolved)[-1] if flight else {})
             why = why or "the experiment or an installed plug-in has changed since"
         raise BadInputError(f"{row['key']}: {why}; fly the sweep again")

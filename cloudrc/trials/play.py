@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable
 from typing import Protocol
 
+from cloudrc import source
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.source import code_hash
 from cloudrc.trials.rows import Row, Rows
 from cloudrc.trials.workers import map_in_order, take_each
 
@@ -50,7 +50,7 @@ def keep(
     """Add rows as they come; return why they ended early, or None."""
 
     def take(row: Row) -> None:
-        if row["code"] != code_hash():
+        if row["code"] != source.code_hash():
             raise BadInputError("the code of cloudrc has changed meanwhile; begin again")
         rows.add(row)
         see(row)

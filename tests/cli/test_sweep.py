@@ -125,8 +125,7 @@ def test_a_row_flies_again_to_the_same_hash(write_sweep, call):
 def test_a_row_of_other_code_is_not_flown_again(write_sweep, call, monkeypatch):
     call("sweep run --out grid", write_sweep(ONE))
     (row,) = rows("grid")
-    for place in ("source.code_hash", "studies.sweep.code_hash"):
-        monkeypatch.setattr(f"cloudrc.{place}", lambda: "0123456789abcdef")
+    monkeypatch.setattr("cloudrc.source.code_hash", lambda: "0123456789abcdef")
     error = call("sweep fly grid", row["key"], code=2).err
     assert f"flown by code {row['code']}, this is code 0123456789abcdef" in error
     call("sweep status grid")

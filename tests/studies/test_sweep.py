@@ -5,8 +5,8 @@ import shutil
 
 import pytest
 
+from cloudrc import source
 from cloudrc.errors import BadInputError
-from cloudrc.source import code_hash
 from cloudrc.studies import sweep
 from cloudrc.trials.plan import read_plan
 from tests.support.sweeps import flown
@@ -59,7 +59,7 @@ def test_the_table_has_the_order_of_the_grid(write_sweep, tmp_path):
     head, first, *_, last = csv.reader(tables[0].decode().splitlines())
     names = ["seed", "verdict", "failures", "code", "physics_steps", "duration [s]"]
     assert head[1:] == [*plan.axes, *names]
-    own = [code_hash(), "Python"]
+    own = [source.code_hash(), "Python"]
     key = next(iter(plan.flights))
     assert first == [key, "last_sample", "40", "1", "success", "", *own, "0.1"]
     assert last[1:] == ["constant_velocity", "0", "1", "success", "", *own, ""]
@@ -107,9 +107,8 @@ def test_other_code_flies_nothing_into_the_folder(write_sweep, folder, monkeypat
     """Both hashes are named, so that the user finds the code of the flights."""
     path = write_sweep()
     fly(path, folder, slice(1), (1, 2))
-    for place in ("source", "studies.sweep"):
-        monkeypatch.setattr(f"cloudrc.{place}.code_hash", lambda: "0123456789abcdef")
-    said = f"its flights are of code {code_hash()}, this is code 0123456789abcdef"
+    said = f"its flights are of code {source.code_hash()}, this is code 0123456789abcdef"
+    monkeypatch.setattr("cloudrc.source.code_hash", lambda: "0123456789abcdef")
     with pytest.raises(BadInputError, match=said):
         fly(path, folder, shard=(2, 2))
 
@@ -119,10 +118,10 @@ def test_rows_of_two_codes_are_told_with_both_hashes(write_sweep, folder, caplog
     assert len(sweep.read_flights(folder).rows) == 4
     assert caplog.messages == []
     path = folder / "rows.jsonl"  # copied from elsewhere
-    path.write_text(path.read_text().replace(code_hash(), "0ther", 1))
+    path.write_text(path.read_text().replace(source.code_hash(), "other", 1))
     sweep.read_flights(folder)
     (said,) = caplog.messages
-    assert f"{folder}: its flights are of different code: 0ther and {code_hash()}" in said
+    assert f"{folder}: its flights are of different code: {source.code_hash()} and other" in said
 
 
 def test_rows_of_another_grid_and_other_folders_are_refused(write_sweep, folder):

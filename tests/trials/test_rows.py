@@ -62,7 +62,7 @@ CODE = ""
 
 
 def test_only_what_is_missing_is_played(monkeypatch):
-    monkeypatch.setattr("cloudrc.trials.play.code_hash", lambda: CODE)
+    monkeypatch.setattr("cloudrc.source.code_hash", lambda: CODE)
     rows, seen = Rows(), []
     rows.add(MADE[1])
     assert run([Counted(n) for n in range(3)], rows, 1, seen.append) is None
