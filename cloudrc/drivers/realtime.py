@@ -56,6 +56,10 @@ def split_address(text: str) -> Address:
         raise ValueError(f"'{text}' is not HOST:PORT")
     if (":" in bare) == (bare == host):
         raise ValueError(f"'{text}': put an IPv6 address in brackets, [::1]:7400")
+    try:
+        bare.encode("idna")
+    except UnicodeError:  # an empty label, or one that is too long
+        raise ValueError(f"'{text}' has no name of a host") from None
     return bare, int(port)
 
 

@@ -61,6 +61,8 @@ def test_an_address_of_ipv6_is_in_brackets(monkeypatch):
         assert show_address(read_address(text)) == text
     with pytest.raises(argparse.ArgumentTypeError, match=r"put an IPv6 address in brackets"):
         read_address("::1:7400")
+    with pytest.raises(argparse.ArgumentTypeError, match=r"'a\.\.b:5' has no name of a host"):
+        read_address("a..b:5")
     monkeypatch.setattr(socket, "socket", Mock(side_effect=OSError("Address family")))
     assert read_address("[::]:7400") == ("0.0.0.0", 7400), "on a machine without IPv6"
 
