@@ -128,7 +128,7 @@ def _descriptor(stream: TextIO) -> int | None:
 
 def leave_message(text: str) -> None:
     """Leave one sentence about the end of this pod, which Kubernetes shows with the pod's state."""
-    if TERMINATION_LOG.exists():
+    if os.access(TERMINATION_LOG, os.W_OK):
         TERMINATION_LOG.write_text(f"{escape(text)}\n", encoding="utf-8")
 
 

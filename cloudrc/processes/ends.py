@@ -23,7 +23,7 @@ from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
 from cloudrc.drivers.readers import RecordSender
 from cloudrc.drivers.realtime import Address, Peer, bind
 from cloudrc.drivers.teleop import RemoteTeleop, UnixDatagrams, UnixPeer
-from cloudrc.errors import ControllerLostError
+from cloudrc.errors import BadInputError, ControllerLostError
 from cloudrc.files import warn_if_readable
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import SIZE_MAX, link_profile
@@ -134,7 +134,8 @@ def run_remote(config: Path, folder: Path, stop: StopSignal, *, watched: bool) -
 
     feed = Feed.on_stdout(watched=watched)
     controller = assembly.build_controller(load_experiment(str(config)))
-    assert isinstance(controller, OutsideController)  # only such a run starts this process
+    if not isinstance(controller, OutsideController):
+        raise BadInputError(f"{config}: cloud.controller is neither remote nor ros2")
     other, own = sockets_of(folder)
     with closing(UnixDatagrams(own, other, DATAGRAM_MAX)) as peer:
         if isinstance(controller, RosController):
