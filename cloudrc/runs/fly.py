@@ -139,10 +139,10 @@ def _record_virtual(
 
     store, interrupted, see = RecordStore(), False, _interruptible(see)
     lost: ControllerLostError | None = None
-    # Record during the flight, so that the recording is kept if the run or its report fails.
-    with McapWriter(folder / "mission.mcap", clock="world", code=source.code_hash()) as writer:
-        at_start = attachments(folder)  # the experiment, also for a copy that is cut short
-        at_start |= flown_files(experiment.world)
+    code = source.code_hash()
+    # The recording is kept if the run or its report fails; a copy cut short has the experiment.
+    with McapWriter(folder / "mission.mcap", clock="world", code=code) as writer:
+        at_start = attachments(folder) | flown_files(experiment.world)
         for name, data in at_start.items():
             writer.attach(name, data)
 
@@ -164,9 +164,7 @@ def _record_virtual(
             notes = (*assembly.virtual_notes(experiment), *([str(lost)] if lost else ()))
             run = Run("virtual", "virtual", interrupted, notes, steps)
             writer.note(run.metadata)
-            recording = Recording(
-                records=store, metadata={CODE: source.code_hash()}, attachments=at_start
-            )
+            recording = Recording(records=store, metadata={CODE: code}, attachments=at_start)
             writer.write_views(views(recording, experiment))
             yield recording, experiment, run
         finally:
