@@ -120,7 +120,8 @@ def _draw(screen: curses.window, texts: Sequence[str]) -> None:
     height, width = screen.getmaxyx()
     lines = [part for text in texts for part in wrap(text, width - 1) or [""]]
     for row, line in enumerate(lines[:height]):
-        screen.addnstr(row, 0, line, width - 1, curses.A_BOLD if row == 0 else 0)
+        with suppress(curses.error):  # the window was made smaller
+            screen.addnstr(row, 0, line, width - 1, curses.A_BOLD if row == 0 else 0)
     screen.refresh()
 
 
