@@ -228,7 +228,9 @@ def _shipped(kind: str) -> list[str]:
     check_names("kind of plug-in", [kind], PACKAGES)
     if not PACKAGES[kind]:
         return []
-    modules = pkgutil.iter_modules(importlib.import_module(PACKAGES[kind]).__path__)
+    # Not the package itself: that of executors imports gymnasium, which an image does not have.
+    folder = Path(__file__).parent.joinpath(*PACKAGES[kind].split(".")[1:])
+    modules = pkgutil.iter_modules([str(folder)])
     return [module.name for module in modules if not module.name.startswith("_")]
 
 

@@ -4,6 +4,7 @@ import logging
 import sys
 import traceback
 from importlib.metadata import EntryPoint
+from unittest.mock import Mock
 
 import pytest
 
@@ -243,3 +244,9 @@ def test_a_build_that_takes_long_is_named(share, monkeypatch, how):
     with found.calling("build") as build:
         build()
     assert f"build() of {share} is still running" in told.told[0]
+
+
+def test_names_of_plugins_need_no_package_of_their_kind(monkeypatch):
+    """The images have no gymnasium, which the package of the executors imports."""
+    monkeypatch.setattr(plugins.importlib, "import_module", Mock(side_effect=ImportError))
+    assert "broker" in plugins._shipped.__wrapped__("executors")
