@@ -40,6 +40,8 @@ STILL_MAX = 5.0
 """Time without a record after which the control loop counts as stopped [s]. A running loop makes at
 least one record per second."""
 CGROUP = Path("/sys/fs/cgroup")
+CPU_COUNTS = ("cpu.stat", "cpu/cpu.stat", "cpu,cpuacct/cpu.stat")
+"""Files below `CGROUP` that may contain a container's CPU counts: one for cgroup v2, two for v1."""
 
 
 class Answer(NamedTuple):
@@ -109,20 +111,24 @@ class _Handler(BaseHTTPRequestHandler):
 def read_throttling(root: Path = CGROUP) -> Readings:
     """Read how much the CPU limit has throttled this container; {} outside a container.
 
-    Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us).
+    Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us) and
+    Documentation/scheduler/sched-bwc.rst (throttled_time of version 1, in ns).
     """
-    try:
-        words = (line.split() for line in (root / "cpu.stat").read_text().splitlines())
-    except OSError:
-        return {}
-    counts = {key: int(number) for key, number in words}
-    if "nr_periods" not in counts:
-        return {}
-    return {
-        "cloudrc_cpu_periods_total": samples(counts["nr_periods"]),
-        "cloudrc_cpu_throttled_periods_total": samples(counts["nr_throttled"]),
-        "cloudrc_cpu_throttled_seconds_total": samples(counts["throttled_usec"] * 1e-6),
-    }
+    for name in CPU_COUNTS:
+        try:
+            words = (line.split() for line in (root / name).read_text().splitlines())
+        except OSError:
+            continue
+        counts = {key: int(number) for key, number in words}
+        if "nr_periods" in counts:
+            stopped = counts.get("throttled_usec", 0) * 1e-6
+            stopped += counts.get("throttled_time", 0) * 1e-9
+            return {
+                "cloudrc_cpu_periods_total": samples(counts["nr_periods"]),
+                "cloudrc_cpu_throttled_periods_total": samples(counts["nr_throttled"]),
+                "cloudrc_cpu_throttled_seconds_total": samples(stopped),
+            }
+    return {}
 
 
 class Exporter:
