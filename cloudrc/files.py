@@ -131,7 +131,7 @@ def warn_if_readable(path: Path, warn: Callable[[str], None]) -> None:
 
 
 @contextmanager
-def naming(place: Path | str) -> Iterator[None]:
+def at_place(place: Path | str) -> Iterator[None]:
     """Let an OSError that names no file, such as a full disk, name the `place` of the writing."""
     try:
         yield

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 from cloudrc.cli.output import STDOUT
 from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.files import naming
+from cloudrc.files import at_place
 
 EPILOG = """\
 installation:
@@ -51,7 +51,7 @@ def execute(options: argparse.Namespace) -> int:
     for action in _actions(parser):
         name = " of ".join([str(action.metavar), *action.option_strings])
         action.choices = words.get(name) or words.get(str(action.metavar)) or action.choices
-    with naming(STDOUT):
+    with at_place(STDOUT):
         print(shtab.complete(parser, options.shell))
     return 0
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cloudrc.cli.output import print_line
 from cloudrc.cli.parser import number, read_seed, settings_from, whole_number
-from cloudrc.files import naming
+from cloudrc.files import at_place
 from cloudrc.outside.paths import check_picture
 from cloudrc.runs.requirements import require
 from cloudrc.text import escape
@@ -53,7 +53,7 @@ def execute(options: argparse.Namespace) -> int:
 
     with closing(Progress(f"reads {options.profile}")) as view:
         title, text, picture = _drawn(options, output.suffix[1:], view.tell)
-    with naming(output):
+    with at_place(output):
         output.write_bytes(picture)
     print(title)
     print(text)

@@ -19,7 +19,7 @@ from cloudrc.errors import (
     InterruptedRunError,
     machine_error,
 )
-from cloudrc.files import naming
+from cloudrc.files import at_place
 from cloudrc.runs.interrupts import is_interrupted
 from cloudrc.runs.requirements import name_extra
 from cloudrc.text import escape
@@ -75,7 +75,7 @@ def _dispatch(given: Sequence[str]) -> int:
     for_programs = isinstance(form, str) and form != TABLE
     with reserve_stdout() if for_programs else contextlib.nullcontext():
         code: int = options.execute(options)
-        with naming(STDOUT):
+        with at_place(STDOUT):
             sys.stdout.flush()
     return code
 

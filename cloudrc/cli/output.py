@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from cloudrc.errors import DISK_FULL
-from cloudrc.files import naming
+from cloudrc.files import at_place
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def print_result(form: str, document: Mapping[str, Any], text: str, **others: st
     if shown is None:
         shown = format_document({"schemaVersion": 1, **document}, form)
     try:
-        with naming(STDOUT):
+        with at_place(STDOUT):
             print(shown, flush=True)
     except OSError as error:
         discard_output(sys.stdout)
@@ -153,7 +153,7 @@ def paint(text: str, colour: str) -> str:
 
 def print_line(line: str, stream: TextIO | None = None) -> None:
     """Print a line with unprintable characters escaped (default: on stdout), and flush at once."""
-    with naming(STDOUT):  # if stderr fails, nobody reads the error
+    with at_place(STDOUT):  # if stderr fails, nobody reads the error
         print(escape(line), file=stream, flush=True)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from cloudrc.errors import BadInputError
-from cloudrc.outside.values import ANY, InvalidValueError, Quantity
+from cloudrc.outside.values import InvalidValueError, Quantity
 from cloudrc.version import __version__
 
 GROUPS: dict[str, dict[str, str]] = {
@@ -138,9 +138,6 @@ def whole_number(low: int, high: int) -> NumberFlag:
 
 
 read_count, read_seed = whole_number(1, COUNT_MAX), whole_number(0, 2**53 - 1)
-
-
-any_number = NumberFlag(ANY)
 
 
 def number(low: float, high: float, unit: str) -> NumberFlag:

@@ -31,7 +31,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from cloudrc.console.access import PARAMETER, Access
 from cloudrc.drivers.local import socket_folder
 from cloudrc.errors import CloudrcError
-from cloudrc.files import naming
+from cloudrc.files import at_place
 
 PAGES_MAX = 50
 """Largest number of pages that have the scene; each further one gets the plain page."""
@@ -112,7 +112,7 @@ class Door(uvicorn.Server):
             desk: Functions of the console.
             scene: HTML of the page with the scene.
         """
-        with naming(f"--port {port}"):
+        with at_place(f"--port {port}"):
             opened = socket.create_server(("127.0.0.1", port), backlog=512)
         # The new socket names its protocol: only then does asyncio disable Nagle's algorithm.
         self._socket = socket.socket(fileno=opened.detach())

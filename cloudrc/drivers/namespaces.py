@@ -19,7 +19,7 @@ from typing import IO, Any, NamedTuple
 from cloudrc.drivers.children import await_or_kill
 from cloudrc.drivers.machine import interpreter
 from cloudrc.errors import InvalidRunError, MissingPrerequisiteError
-from cloudrc.files import naming
+from cloudrc.files import at_place
 from cloudrc.link.exec import namespace
 from cloudrc.link.exec.holder import END_LIMIT
 
@@ -204,7 +204,7 @@ class Forwarder(socketserver.ThreadingTCPServer):
     def __init__(self, end: ProgramEnd, port: int) -> None:
         """Listen at `port` on 127.0.0.1, on threads of its own."""
         self._end, self._port = end, port
-        with naming(f"--expose {port}"):
+        with at_place(f"--expose {port}"):
             super().__init__(("127.0.0.1", port), _Forwarded)
         threading.Thread(target=self.serve_forever, args=(0.1,), daemon=True).start()
 

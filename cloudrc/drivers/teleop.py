@@ -16,7 +16,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.files import naming
+from cloudrc.files import at_place
 from cloudrc.messages import OperatorRequest, Request, Setpoint
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop.wire import Message, Output, RobotStatus, decode, encode
@@ -59,7 +59,7 @@ def bind_datagrams(path: Path) -> socket.socket:
     path.unlink(missing_ok=True)
     datagrams = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     datagrams.setblocking(False)
-    with naming(path):
+    with at_place(path):
         datagrams.bind(str(path))
     return datagrams
 

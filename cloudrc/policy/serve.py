@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from cloudrc.errors import describe_error
-from cloudrc.files import naming
+from cloudrc.files import at_place
 from cloudrc.outside.code import apart
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.codec import MESSAGE_MAX, WireError, pack, unpack
@@ -63,7 +63,7 @@ class PolicyServer:
             self._thread.shutdown(wait=False, cancel_futures=True)
 
     async def _open(self, host: str, port: int) -> Server:
-        with naming(f"{host}, port {port}"):
+        with at_place(f"{host}, port {port}"):
             return await serve(
                 self._handle,
                 host,

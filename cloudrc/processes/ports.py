@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.config.resolved import ResolvedExperiment, fingerprint
 from cloudrc.drivers.realtime import Address, show_address
-from cloudrc.files import naming
+from cloudrc.files import at_place
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def warn_if_exposed(listen: Address) -> None:
 def listening(flag: str, listen: Address) -> Iterator[None]:
     """Warn if other machines can reach `listen`; an OSError names it and its `flag`."""
     warn_if_exposed(listen)
-    with naming(f"{flag} {show_address(listen)}"):
+    with at_place(f"{flag} {show_address(listen)}"):
         yield
 
 

@@ -25,7 +25,7 @@ from starlette.requests import ClientDisconnect
 
 from cloudrc.config.section import Section
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.files import naming
+from cloudrc.files import at_place
 from cloudrc.teleop import models
 from cloudrc.teleop.auth import BEARER, REFUSED, Gate
 from cloudrc.teleop.refusals import ConflictError, UnavailableError, UnknownMissionError
@@ -473,7 +473,7 @@ def _bind(address: Address) -> tuple[socket.socket, str]:
             address.unlink()
         unix = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         os.fchmod(unix.fileno(), 0o600)  # Linux gives the file the mode of the socket
-        with naming(f"--api unix:{address}"):
+        with at_place(f"--api unix:{address}"):
             unix.bind(str(address))
         unix.listen()
         return unix, f"unix:{address}"
@@ -481,7 +481,7 @@ def _bind(address: Address) -> tuple[socket.socket, str]:
     is_6 = ":" in host
     url = f"http://[{host}]" if is_6 else f"http://{host}"
     family = socket.AF_INET6 if is_6 else socket.AF_INET
-    with naming(f"--api {url}:{port}"):
+    with at_place(f"--api {url}:{port}"):
         server = socket.create_server((host, port), family=family, dualstack_ipv6=is_6)
     # The new socket names its protocol: only then does asyncio disable Nagle's algorithm.
     named = socket.socket(fileno=server.detach())

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.files import naming
+from cloudrc.files import at_place
 from cloudrc.link.carry.log import LOGGED_MAX
 from cloudrc.link.verify.causes import LATE, Findings, ShaperFacts, in_unit
 from cloudrc.link.verify.packets import judge_packets, recording
@@ -89,11 +89,11 @@ def _facts(link: CarriedLink, name: str, late: float) -> ShaperFacts:
 def write_report(folder: Path, report: Report, link: CarriedLink) -> None:
     """Write link.json, and a recording of the packets of each direction."""
     path = folder / "link.json"
-    with naming(path):
+    with at_place(path):
         path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     for name, way in link.ways.items():
         path = folder / f"{name}.csv"
-        with naming(path), path.open("w", encoding="utf-8") as file:
+        with at_place(path), path.open("w", encoding="utf-8") as file:
             if way.received > LOGGED_MAX:
                 file.write(f"# the first {LOGGED_MAX} of {way.received} packets\n")
             origin_ns = way.log.sent[0] if len(way.log) else 0

@@ -14,7 +14,7 @@ from typing import Any
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.drivers.realtime import Address, show_address
 from cloudrc.errors import BadInputError
-from cloudrc.files import naming
+from cloudrc.files import at_place
 from cloudrc.link.carry.punctual import settle
 from cloudrc.link.carry.tcp.medium import Medium
 from cloudrc.link.carry.tcp.relay import StreamRelay
@@ -87,13 +87,13 @@ def refuse_unsupported(profile: DirectionProfile, name: str) -> None:
 
 def _listen(where: Address) -> socket.socket:
     family = socket.AF_INET6 if ":" in where[0] else socket.AF_INET
-    with naming(f"--listen {show_address(where)}"):
+    with at_place(f"--listen {show_address(where)}"):
         return socket.create_server(where, family=family, backlog=WAITING)
 
 
 def _find(to: Address) -> tuple[int, tuple[str, int]]:
     """Look up the server's address, IPv4 if it has one; return its family, host and port."""
-    with naming(f"--to {show_address(to)}"):
+    with at_place(f"--to {show_address(to)}"):
         found = socket.getaddrinfo(*to, type=socket.SOCK_STREAM)
     # A server rarely listens at ::1 alone, but localhost often names it first.
     family, _, _, _, address = min(found, key=lambda one: one[0] != socket.AF_INET)

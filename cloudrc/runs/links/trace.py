@@ -12,7 +12,7 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING
 
-from cloudrc.files import naming
+from cloudrc.files import at_place
 from cloudrc.link.streams import numbers
 from cloudrc.link.trace_logs import (
     Direction,
@@ -168,7 +168,7 @@ def _columns(table: Table, *names: str) -> Iterator[tuple[float, ...]]:
 
 def write_trace_file(packets: Packets, path: Path, direction: Direction) -> list[str]:
     """Write packets as a trace; describe it, and how a profile can use it, in lines."""
-    with naming(path):
+    with at_place(path):
         path.write_text(write_trace(trace_of(packets)), encoding="utf-8")
     found, count = numbers(packets), len(packets.delays)
     mean, deviation = found.mean * 1e3, found.deviation * 1e3
