@@ -138,7 +138,7 @@ def test_a_wrong_number_of_seeds_or_processes_is_named(wrong):
         (lambda: cloudrc.margin("link.both.delay_ms", seeds=wrong), "seeds"),
         (lambda: cloudrc.sweep(GRID, jobs=wrong), "jobs"),
     ):
-        with pytest.raises(BadInputError, match=rf"^{name}: .*, not a whole number >= 1$"):
+        with pytest.raises(BadInputError, match=rf"^{name}: .* is not a whole number >= 1$"):
             call()
 
 
@@ -245,7 +245,7 @@ def test_a_link_is_verified(capfd):
 @pytest.mark.parametrize(
     ("given", "text"),
     [
-        ({"seconds": 0.5}, "not a number >= 1 and <= 3600"),
+        ({"seconds": 0.5}, "is not a number >= 1 and <= 3600"),
         ({"mode": "virtual"}, "no mode named"),
     ],
 )

@@ -77,7 +77,7 @@ class Quantity:
                 return values  # the usual case
         found = self.array(values, name)
         if found.shape != (count,):
-            raise InvalidValueError(f"{_named(name)}{shorten(values)}, not {count} numbers")
+            raise InvalidValueError(f"{_named(name, values)} not {count} numbers")
         return tuple(map(float, found.tolist()))
 
     def array(self, values: Any, name: str = "") -> NDArray[Any]:
@@ -116,7 +116,7 @@ class Quantity:
                 return number.numerator
             if not self.whole and abs(number) < _FLOAT_MAX:
                 return float(number)
-        raise InvalidValueError(f"{_named(name)}{shorten(given)}, not {self}")
+        raise InvalidValueError(f"{_named(name, given)} not {self}")
 
     def __str__(self) -> str:
         """Say which numbers are valid, such as "a number >= 0 and <= 1 [s]"."""
@@ -153,7 +153,7 @@ def to_boolean(value: Any, name: str = "") -> bool:
     plain = plain_of(value)
     if isinstance(plain, bool | float | Rational) and plain in (0, 1):
         return bool(plain)
-    raise InvalidValueError(f"{_named(name)}{shorten(value)}, not true or false")
+    raise InvalidValueError(f"{_named(name, value)} not true or false")
 
 
 def plain_of(value: Any) -> Any:
@@ -229,8 +229,9 @@ def _leaves_of(values: Any, place: tuple[int, ...] = ()) -> Iterator[tuple[Seque
             yield (*place, *inside), each
 
 
-def _named(name: str) -> str:
-    return f"its {name} is " if name else ""
+def _named(name: str, value: Any) -> str:
+    """Begin a sentence that ends with what the value is not."""
+    return f"its {name} is {shorten(value)}," if name else f"{shorten(value)} is"
 
 
 def _at(place: Sequence[int], name: str) -> str:

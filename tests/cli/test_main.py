@@ -56,7 +56,7 @@ def test_help_fits_80_columns(command, capsys):
     [
         ("rnu", "did you mean 'run'"),
         ("link show --sed 3", "--sed (did you mean --seed?); see 'cloudrc link show --help'"),
-        ("bench --repeats 0", "'0', not a whole number >= 1 and <= 10000"),
+        ("bench --repeats 0", "'0' is not a whole number >= 1 and <= 10000"),
     ],
 )
 def test_a_wrong_command_line_is_one_line_of_error(line, words, refused):

@@ -294,7 +294,7 @@ def test_importing_the_wrapper_takes_no_heavy_package_along():
     ("options", "words"),
     [
         ({"link": "let"}, "no profile named 'let'.*did you mean lte"),
-        ({"answer_within": 0.02}, r"0.02, not a number >= 0 and <= 0.01 \[s\]; give how long"),
+        ({"answer_within": 0.02}, r"0.02 is not a number >= 0 and <= 0.01 \[s\]; give how long"),
         ({"executor": "prefix"}, "executor 'prefix': it plays chunks of actions; give chunk="),
     ],
 )

@@ -167,7 +167,7 @@ def test_a_profile_that_cannot_be_used_is_refused_in_one_line(profile, words):
 )
 def test_a_packet_that_cannot_be_sent_is_refused(name, packet, word):
     up, _ = cloudrc.link.open(name, 1)
-    with pytest.raises(BadInputError, match=rf"^{word}, not a whole number >= 0"):
+    with pytest.raises(BadInputError, match=rf"^{word} is not a whole number >= 0"):
         up.send(*packet)
     assert up.send(0, 0, 1, 0) == cloudrc.link.open(name, 1)[0].send(0, 0, 1, 0)
 

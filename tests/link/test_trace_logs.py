@@ -79,7 +79,7 @@ def test_round_trips_are_halved_only_on_request():
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms: 'fast', not a finite number"),
+        ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms: 'fast' is not a finite number"),
         ("time_s,delay_ms\n0,45\n1,-3", "arrived 3 ms before it was sent: the two clocks differ;"),
         ("time_s,delay_ms\n98,4\n99,4\n100,4\n0,4\n1,4", "at packet 4 the times go back by 100 s"),
     ],

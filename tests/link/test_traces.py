@@ -33,8 +33,8 @@ def test_a_trace_is_read_into_si(tmp_path, data, times, delays, losses):
     [
         ("0,45\n1,46", "the header is 0,45; it must be time_s,delay_ms"),
         (f"{HEAD}\n1,45\n1,45", "line 3: time_s 1 does not come after 1; sort"),
-        (f"{HEAD}\n0,-1", "line 2: delay_ms: '-1', not a number >= 0"),
-        (f"{HEAD},loss\n0,45,1.2", "line 2: loss: '1.2', not a number >= 0 and <= 1"),
+        (f"{HEAD}\n0,-1", "line 2: delay_ms: '-1' is not a number >= 0"),
+        (f"{HEAD},loss\n0,45,1.2", "line 2: loss: '1.2' is not a number >= 0 and <= 1"),
     ],
 )
 def test_an_invalid_trace_is_refused(text, says):

@@ -32,7 +32,7 @@ def test_a_number_has_the_type_of_its_quantity():
 
 
 def test_the_error_says_what_is_valid():
-    with pytest.raises(InvalidValueError, match=r"^'7', not a number > 0 and <= 5 \[s\]$"):
+    with pytest.raises(InvalidValueError, match=r"^'7' is not a number > 0 and <= 5 \[s\]$"):
         Quantity("s", gt=0, le=5).read("7")
     with pytest.raises(InvalidValueError, match=r"^its age is 7, not a whole number <= 5$"):
         Quantity(le=5, whole=True).of(7, "age")
