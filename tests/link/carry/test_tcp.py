@@ -100,8 +100,8 @@ SHORT = ("--link", "paper-p3", "--set", "uplink.delay_ms=20", "--set", "downlink
 def test_bytes_turns_and_a_half_close_cross_the_link(relayed):
     with server(echo) as port:
         relay = relayed(port, *SHORT)
+        began = time.monotonic()  # the relay opens its side as soon as it has this one
         with relay.connect() as client:
-            began = time.monotonic()
             client.sendall(b"hello")
             assert client.recv(100) == b"hello"
             first = time.monotonic() - began
