@@ -6,7 +6,6 @@ import argparse
 import shlex
 import sys
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -99,7 +98,7 @@ def execute(options: argparse.Namespace) -> int:
     require("an evaluation", needed)
     from cloudrc.cli.progress import Progress
     from cloudrc.eval import results
-    from cloudrc.eval.episode import check_environment, follows_seed
+    from cloudrc.eval.episode import check_environment
     from cloudrc.eval.setup import BASELINE, Episode
 
     setup, episodes = _read(options)
@@ -108,19 +107,15 @@ def execute(options: argparse.Namespace) -> int:
     if goes_on:
         results.refuse_other(folder, setup)
     with closing(Progress(f"makes the environment {setup.env}")):
-        checked = check_environment(setup, episodes)
-        seeded = follows_seed(setup)
-    for text in checked.step.doubts:
-        print_line(f"cloudrc: warning: --{text}", sys.stderr)
-    setup = replace(setup, follows_seed=seeded, env_code=checked.code, step=checked.step)
-    if not seeded:
+        setup = check_environment(setup, episodes)
+    if not setup.follows_seed:
         print_line(f"cloudrc: warning: --env {setup.env}: {results.SEEDLESS}", sys.stderr)
     episodes = [*(Episode(None, BASELINE, n + 1) for n in range(options.seeds)), *episodes]
     before = results.read_versus(options.versus, setup, episodes) if options.versus else []
     if not goes_on:
         folder = new_folder(folder, f"eval-{Path(setup.env).name}", "latest-eval")
     with lock_folder(folder), closing(Progress("plays episodes", len(episodes))) as view:
-        view.say(escape(f"{setup.env}: {len(episodes)} episodes, step {checked.step}"))
+        view.say(escape(f"{setup.env}: {len(episodes)} episodes, step {setup.step}"))
         try:
             rows, stopped = results.play_missing(folder, setup, episodes, options.jobs, view.count)
         except CloudrcError:
@@ -157,9 +152,9 @@ def _report(
 
 
 def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
-    """Check the flags, print doubts about the link, and return the evaluation and its episodes."""
+    """Check the flags; return the evaluation and its episodes."""
     from cloudrc.cli import eval_values as values
-    from cloudrc.eval.setup import Episode, EvalSetup, heavy_loss
+    from cloudrc.eval.setup import Episode, EvalSetup
 
     executors = list(dict.fromkeys(each.strip() for each in options.executor.split(",")))
     setup = EvalSetup(
@@ -177,8 +172,6 @@ def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
         deadline=options.deadline,
     )
     values.check_policy(setup.policy)
-    for text in heavy_loss(setup):
-        print_line(f"cloudrc: warning: --link {setup.link}: {text}", sys.stderr)
     values.check_round_trips(setup.link, options.rtt)
     if not all(executors):
         raise BadInputError(f"--executor {options.executor}: a name is missing")

@@ -60,13 +60,9 @@ def _modules(env: gymnasium.Env[Any, Any], setup: EvalSetup) -> set[str]:
 
     The packages that contain them are also modules.
     """
-    module, colon, _ = find_module(setup).partition(":")
-    names = {module} if colon else set[str]()
     entry: Any = getattr(env.spec, "entry_point", None)
-    names.add(
-        entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "")
-    )
-    layer: gymnasium.Env[Any, Any] = env
+    made = entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "")
+    names, layer = {find_module(setup).rpartition(":")[0], made}, env
     while isinstance(layer, gymnasium.Wrapper):
         names |= {each.__module__ for each in type(layer).__mro__}
         layer = layer.env

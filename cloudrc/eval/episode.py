@@ -10,7 +10,7 @@ from functools import cache
 from hashlib import sha256
 from math import isfinite
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -20,15 +20,9 @@ from numpy.typing import NDArray
 from cloudrc import source
 from cloudrc.errors import CloudrcError
 from cloudrc.eval.environment import environment_code, find_module
-from cloudrc.eval.setup import (
-    BARE,
-    SEED,
-    Episode,
-    EvalSetup,
-    link_at,
-)
+from cloudrc.eval.setup import BARE, SEED, Episode, EvalSetup, link_at
 from cloudrc.gym import Networked
-from cloudrc.gym.step import StepTime, find_step
+from cloudrc.gym.step import find_step
 from cloudrc.gym.values import size_of
 from cloudrc.outside.code import calling
 from cloudrc.outside.refusal import naming
@@ -42,25 +36,6 @@ SUCCESS = ("success", "is_success")
 """Keys of an environment's info that tell whether the task is done; one true value is enough."""
 Ask = Callable[[dict[str, Any]], Any]
 """Function that returns a policy's answer to its observation."""
-
-
-class Played(NamedTuple):
-    """What happened in an episode."""
-
-    total: float  # sum of the rewards [1]
-    steps: int
-    ended: str  # "terminated" or "truncated" by the environment, or "limit": by the longest episode
-    success: bool | None  # None: the environment does not tell
-    stale: int  # steps in which the robot had no action of an answer
-    jumps: list[float]  # change of the action from one answer to the next, at each change [1]
-    loop: dict[str, Any]  # summary of the loop
-    records_sha256: str
-
-
-class _Network(Networked):
-    """An environment behind a link, about which the command has warned."""
-
-    _warns = False
 
 
 class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -82,7 +57,10 @@ class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.action = action
         observation, given, terminated, truncated, info = self.env.step(action)
         reward = _reward_of(given)
-        ends = _flag_of(terminated, "terminated"), _flag_of(truncated, "truncated")
+        ends = [
+            to_boolean(_one(each), name)
+            for each, name in ((terminated, "terminated"), (truncated, "truncated"))
+        ]
         if not isinstance(info, Mapping):
             raise InvalidValueError(f"its info is {shorten(info)}, which is no mapping")
         self._note(action, observation, reward)
@@ -107,11 +85,6 @@ def _reward_of(given: Any) -> float:
     return reward
 
 
-def _flag_of(given: Any, name: str) -> bool:
-    """Return a truth value of a step; raise a ValueError for a wrong value."""
-    return to_boolean(_one(given), name)
-
-
 def _one(given: Any) -> Any:
     """Return the value of an array of one, as environments that are made for vectors give it."""
     given = to_arrays(given)
@@ -124,41 +97,32 @@ def play(episode: Episode, setup: EvalSetup, key: str = "") -> dict[str, Any]:
     if episode.is_baseline:
         setup, played = replace(setup, **BARE), replace(episode, executor="newest")
     with make_env(setup, episode.seed) as env, asking(setup) as ask:
-        found = _play(played, setup, env, ask)
-    up, down = found.loop["uplink"], found.loop["downlink"]
-    numbers = {
-        "return": found.total,
-        "steps": found.steps,
-        "success": None if found.success is None else int(found.success),
-        "stale_share": found.stale / found.steps,
-        "loop_age": found.loop["loop_age"],
-        **_ages("observation_age", found.loop),
-        **_ages("action_age", found.loop),
-        "late_share": found.loop["late_share"],
-        "seam_jump": fmean(found.jumps) if found.jumps else None,
-        **{f"{name}_uplink": up[name] for name in ("delay_asked", "delay_measured")},
-        **{f"{name}_downlink": down[name] for name in ("delay_asked", "delay_measured")},
-        **{"loss_uplink": up["loss_measured"], "loss_downlink": down["loss_measured"]},
-    }
+        ended, success, digest, numbers = _play(played, setup, env, ask)
     judged = {None: "done", True: "success", False: "failure"}
     return {
         "key": key,
         "point": episode.point,
         "seed": episode.seed,
-        "verdict": judged[found.success],
+        "verdict": judged[success],
         "failures": [],
         "text": "",
-        "ended": found.ended,
+        "ended": ended,
         "numbers": {k: v for k, v in numbers.items() if v is not None and isfinite(v)},
-        "records_sha256": found.records_sha256 if setup.is_repeatable else "",
+        "records_sha256": digest if setup.is_repeatable else "",
         "code": source.code_hash(),
     }
 
 
-def _ages(name: str, loop: Mapping[str, Any]) -> dict[str, float]:
-    """Return mean and 99th percentile of an age [s], and of how many steps they are."""
-    mean, p99, steps = (loop[f"{name}_{part}"] for part in ("mean", "p99", "of"))
-    return {name: mean, f"{name}_p99": p99, f"{name}_of": steps}
+def _numbers_of(loop: Mapping[str, Any]) -> dict[str, float]:
+    """Return what a row tells about the loop: ages [s], delays [s] and losses."""
+    found = {"loop_age": loop["loop_age"]}
+    for name in ("observation_age", "action_age"):
+        parts = {name: "mean", f"{name}_p99": "p99", f"{name}_of": "of"}
+        found |= {key: loop[f"{name}_{part}"] for key, part in parts.items()}
+    found["late_share"] = loop["late_share"]
+    for way in ("uplink", "downlink"):
+        found |= {f"{name}_{way}": loop[way][name] for name in ("delay_asked", "delay_measured")}
+    return {**found, **{f"loss_{w}": loop[w]["loss_measured"] for w in ("uplink", "downlink")}}
 
 
 @contextmanager
@@ -223,7 +187,7 @@ class _Policy:
             if self._count not in (None, len(actions)):
                 raise PolicyAnswerError(f"a chunk of {len(actions)} actions after {self._count}")
             self._count = len(actions)
-            return _in_range(as_actions(actions, self._space), self._space)
+            return as_actions(actions, self._space)
         except PolicyAnswerError as error:
             raise PolicyFailedError(f"policy '{self._setup.policy}': {error}") from None
 
@@ -243,7 +207,9 @@ def width_of(space: spaces.Space[Any]) -> int:
 def as_actions(actions: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
     """Return a chunk, shape (H, A), as the space's actions have it.
 
-    Raise a PolicyAnswerError if the space's type cannot hold a value, as .5 among integers.
+    Raise a PolicyAnswerError if the space's type cannot hold a value, as .5 among integers, or for
+    a choice that the space has not. A value outside of a `Box` is the environment's to judge: many
+    clip it.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         held = actions.astype(space.dtype)
@@ -254,31 +220,41 @@ def as_actions(actions: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
             f"the action {value:g} does not fit the type {held.dtype} of {space}"
         )
     shaped: NDArray[Any] = held.reshape(len(held), *(space.shape or ()))
+    for action in shaped:
+        if not (isinstance(space, spaces.Box) or space.contains(action)):
+            raise PolicyAnswerError(f"the action {action} is none of {space}")
     return shaped
 
 
-def _in_range(actions: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
-    """Return a chunk of actions; raise a PolicyAnswerError for one outside of the space.
+def _play(
+    episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask: Ask
+) -> tuple[str, bool | None, str, dict[str, float | None]]:
+    """Play an episode.
 
-    A value outside of a `Box` is the environment's to judge: many clip it.
+    Return what ended it: "terminated" or "truncated" by the environment, or "limit", by the longest
+    episode; whether it succeeded, None if the environment does not tell; the hash of what the world
+    did; and the numbers.
     """
-    if not isinstance(space, spaces.Box):
-        for action in actions:
-            if not space.contains(action):
-                raise PolicyAnswerError(f"the action {action} is none of {space}")
-    return actions
-
-
-def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask: Ask) -> Played:
     witness, policy = _Witness(env), _Policy(ask, setup, env.action_space)
     observation, _ = witness.reset(seed=episode.seed)
     chunk = policy(observation, [])  # the first answer, whose size the link has to know
-    world = _connect(witness, episode, setup, len(chunk), policy)
+    sent = setup.observation_bytes
+    world = Networked(
+        witness,
+        link_at(setup.link, episode.rtt_ms),
+        episode.seed,
+        dt=setup.dt,
+        compute=policy.duration if setup.is_measured else setup.compute_times,
+        answer_within=setup.answer_within,
+        chunk=len(chunk),
+        executor=episode.executor,
+        observation_bytes=policy.size if sent is None else sent,
+        start="answer",  # a robot does nothing before its policy has answered
+    )
     witness.digest = sha256()
     observation, info = world.reset(seed=episode.seed)
     if times := setup.times:
         world.compute = lambda tick: times[(episode.seed + tick) % len(times)]
-    dt = world.dt
     total, steps, stale, ended = 0.0, 0, 0, "limit"
     jumps, before, basis, success = list[float](), None, -1.0, None
     while steps < setup.max_steps and ended == "limit":
@@ -292,7 +268,7 @@ def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask:
         about = info["cloudrc"]
         stale += about["held"]
         if isfinite(about["action_age"]) and not about["held"]:
-            now = steps - 1 - about["action_age"] / dt
+            now = steps - 1 - about["action_age"] / world.dt
             if before is not None and abs(now - basis) > 1e-6:
                 jump = np.subtract(witness.action, before, dtype=float)  # they may be booleans
                 jumps.append(float(np.linalg.norm(jump)))
@@ -304,31 +280,15 @@ def _play(episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask:
             ended = "terminated" if terminated else "truncated"
     if setup.success_at is not None:
         success = not exceeds(setup.success_at, total)
-    loop, played = world.summary(setup.deadline), witness.digest.hexdigest()
-    return Played(total, steps, ended, success, stale, jumps, loop, played)
-
-
-def _connect(
-    env: gymnasium.Env[Any, Any], episode: Episode, setup: EvalSetup, count: int, policy: _Policy
-) -> Networked:
-    """Put the link between environment and policy, whose chunks have `count` actions.
-
-    The policy has given its first answer.
-    """
-    compute: Any = setup.mean_compute if setup.times else setup.compute
-    sent = setup.observation_bytes
-    return _Network(
-        env,
-        link_at(setup.link, episode.rtt_ms),
-        episode.seed,
-        dt=setup.dt,
-        compute=policy.duration if setup.is_measured else compute,
-        answer_within=setup.answer_within,
-        chunk=count,
-        executor=episode.executor,
-        observation_bytes=policy.size if sent is None else sent,
-        start="answer",  # a robot does nothing before its policy has answered
-    )
+    numbers = {
+        "return": total,
+        "steps": steps,
+        "success": None if success is None else int(success),
+        "stale_share": stale / steps,
+        "seam_jump": fmean(jumps) if jumps else None,
+        **_numbers_of(world.summary(setup.deadline)),
+    }
+    return ended, success, witness.digest.hexdigest(), numbers
 
 
 def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
@@ -336,41 +296,32 @@ def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
     for key in SUCCESS:
         if info.get(key) is not None:
             name = f"info['{key}'] (see --success-at)"
-            known = _flag_of(info[key], name) or bool(known)
+            known = to_boolean(_one(info[key]), name) or bool(known)
     return known
 
 
-class CheckedEnvironment(NamedTuple):
-    """What is known about an environment that can be used."""
-
-    step: StepTime
-    code: str  # hash of its code and files
-
-
-def check_environment(setup: EvalSetup, episodes: list[Episode]) -> CheckedEnvironment:
-    """Return what is known about the environment.
+def check_environment(setup: EvalSetup, episodes: list[Episode]) -> EvalSetup:
+    """Return the setup with what is known about the environment; check policy and executors.
 
     The call comes before a folder is made. A server is not asked.
     """
     with make_env(setup, 1) as env:
         with naming(f"--env {setup.env}"):
             width_of(env.action_space)
-            step = find_step(env, setup.dt, setup.mean_compute)
+            step = find_step(env, setup.dt)
         code = environment_code(env, setup)
         for executor in dict.fromkeys(each.executor for each in episodes):
             wait = setup.answer_within
-            _Network(env, dt=setup.dt, chunk=1, executor=executor, answer_within=wait)
+            Networked(env, dt=setup.dt, chunk=1, executor=executor, answer_within=wait)
     if not setup.is_remote:
         _load(setup.policy)
-    return CheckedEnvironment(step, code)
+    digests = {_first_observation(setup) for _ in range(2)}
+    return replace(setup, follows_seed=len(digests) == 1, env_code=code, step=step)
 
 
-def follows_seed(setup: EvalSetup) -> bool:
-    """Return whether two environments begin equally with the same seed."""
-    digests = list[str]()
-    for _ in range(2):
-        with make_env(setup, 1) as env:
-            witness = _Witness(env)
-            witness.reset(seed=1)
-            digests.append(witness.digest.hexdigest())
-    return digests[0] == digests[1]
+def _first_observation(setup: EvalSetup) -> str:
+    """Return the hash of the observation with which an environment begins the seed 1."""
+    with make_env(setup, 1) as env:
+        witness = _Witness(env)
+        witness.reset(seed=1)
+        return witness.digest.hexdigest()

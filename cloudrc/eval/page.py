@@ -27,20 +27,14 @@ CAPTION = (
     "they meet the same environments and networks. A condition without any answer has no age: "
     "it is in the table alone."
 )
+AGE = "age of the observation behind an action"
 PANELS = (
     ("success", "%", "success", "success_low", "success_high"),
     ("return", "", "return", "return_low", "return_high"),
     ("length of an episode", "steps", "steps", "steps_low", "steps_high"),
     ("episodes that the environment terminated", "%", "terminated_share", "", ""),
     ("steps without a new action", "%", "stale_share", "", ""),
-    *(
-        (
-            "age of the observation behind an action",
-            "ms",
-            *["action_age_ms"] * 2,
-            "action_age_p99_ms",
-        ),
-    ),
+    (AGE, "ms", "action_age_ms", "action_age_ms", "action_age_p99_ms"),
 )
 """Title and unit; keys of an outcome: value, and its interval if there is one."""
 MEASURED_TIME = (
@@ -85,12 +79,13 @@ def write_page(folder: Path, setup: EvalSetup, document: Mapping[str, Any]) -> P
     svg = pictures["svg"].decode()
     count = document["outcomes"][0]["episodes"]
     made = {key: document[key] for key in ("date", "versions", "compute", "link", "profile")}
+    warnings = [MEASURED_TIME] * setup.is_measured + [SEEDLESS] * (not setup.follows_seed)
     page = TEMPLATE.substitute(
         title=escape(f"{setup.env}: {Path(setup.policy).name} over {setup.link}"),
         facts=escape(
             f"{count} episodes per condition; step {setup.step}; success: {document['success']}."
         ),
-        warning=_paragraphs(_warnings(setup), ' class="warning"'),
+        warning=_paragraphs(warnings, ' class="warning"'),
         figure=svg[svg.index("<svg") :],
         caption=CAPTION,
         table=_table(cells(document["outcomes"], COLUMNS)),
@@ -110,14 +105,8 @@ def _paragraphs(texts: Sequence[str], kind: str = "") -> str:
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
     lines = ["".join(f"<td>{escape(each)}</td>" for each in row) for row in rows]
-    return "".join(f"<tr>{line}</tr>" for line in lines).replace(
-        "td>", "th>", 2 * len(rows[0]) if rows else 0
-    )
-
-
-def _warnings(setup: EvalSetup) -> list[str]:
-    found = [(setup.is_measured, MEASURED_TIME), (not setup.follows_seed, SEEDLESS)]
-    return [text for applies, text in found if applies]
+    lines[:1] = [line.replace("td>", "th>") for line in lines[:1]]
+    return "".join(f"<tr>{line}</tr>" for line in lines)
 
 
 def draw_outcomes(outcomes: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:

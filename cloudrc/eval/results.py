@@ -80,27 +80,20 @@ def refuse_other(folder: Path, setup: EvalSetup) -> None:
     A policy is another one if its file has another place: of a file that has changed, the episodes
     are missing.
     """
-    had = _read(folder, "--out")
-    words = [had["env"], *(f"{key}={value}" for key, value in had["env_args"].items())]
-    same = had["env_args"] == json.loads(json.dumps(dict(setup.env_args)))
-    same = same and had["env"] == setup.env and _place(had["policy"]) == _place(setup.policy)
-    if not same:
-        raise BadInputError(
-            f"--out {folder}: has the episodes of {' '.join(words)} with {had['policy']}; name a "
-            "new folder"
-        )
+    had, now = _read(folder, "--out"), setup.identity()
+    same = all(had["identity"][name] == now[name] for name in ("env", "env_args"))
+    if not same or _place(had["policy"]) != _place(setup.policy):
+        text = f"has the episodes of {had['env']} with {had['policy']}"
+        raise BadInputError(f"--out {folder}: {text}, or of other arguments; name a new folder")
 
 
 def _read(folder: Path, flag: str) -> dict[str, Any]:
     """Return the content of the file of an evaluation."""
     try:
         found: dict[str, Any] = json.loads(read(folder / FILE))
-        found["env_args"].items(), found["identity"].items()
-    except (KeyError, TypeError, ValueError, AttributeError):
-        raise BadInputError(
-            f"{flag} {folder}: its {FILE} is of no evaluation; name a new folder"
-        ) from None
-    return found
+        return found if found["identity"]["env"] else {}
+    except (LookupError, TypeError, ValueError):
+        raise BadInputError(f"{flag} {folder}: its {FILE} is of no evaluation") from None
 
 
 def _place(policy: str) -> str:
@@ -172,7 +165,7 @@ def read_versus(folder: Path, setup: EvalSetup, episodes: Sequence[Episode]) -> 
     """
     had = _read(folder, "--versus")
     before = {**had["identity"], "code": had["code"]}
-    now = {**json.loads(json.dumps(setup.identity())), "code": source.code_hash()}
+    now = {**setup.identity(), "code": source.code_hash()}
     if other := [name for name in PAIRED if before.get(name) != now[name]]:
         raise BadInputError(f"--versus {folder}: differs in {', '.join(other)}; evaluate it again")
     rows = read_rows(folder)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -10,7 +11,6 @@ from statistics import fmean
 from typing import Any, TypeAlias
 
 from cloudrc.gym.step import StepTime
-from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.library import LinkProfile, read_profile
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.outside.code import sources
@@ -68,20 +68,18 @@ class EvalSetup:
         return self.compute == (MEASURED, "")
 
     @property
-    def mean_compute(self) -> float:
-        """Mean time for an answer [s]; 0 if it is measured."""
-        if isinstance(self.compute, float):
-            return self.compute
-        return 0.0 if self.is_measured else fmean(self.times or [float(self.compute[0])])
+    def compute_times(self) -> Any:
+        """Time for an answer, or its mean and its deviation [s], unless it is measured."""
+        return fmean(self.times) if self.times else self.compute
 
     def identity(self) -> dict[str, Any]:
-        """Return all that the result of an episode depends on, but its condition and seed."""
+        """Return all that the result of an episode depends on, but its condition and seed: JSON."""
         told = asdict(self)
         if not self.is_remote:
             told["policy"] = hash_of(sources(Path(self.policy)))
         told["link"] = _code_of_link(read_profile(self.link))
         told["compute"] = told.pop("times") or self.compute
-        return told
+        return json.loads(json.dumps(told))  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True)
@@ -137,10 +135,3 @@ def link_at(profile: str, rtt_ms: float | None) -> LinkProfile:
         return replace(way, delay_ms=delay, jitter_ms=min(way.jitter_ms, delay))
 
     return LinkProfile(at(link.uplink, share * rtt_ms), at(link.downlink, (1 - share) * rtt_ms))
-
-
-def heavy_loss(setup: EvalSetup) -> Iterator[str]:
-    """Warn of a loss of the link of which 100 times less may be meant."""
-    link = read_profile(setup.link)
-    yield from describe_heavy_loss(link.uplink, "uplink")
-    yield from describe_heavy_loss(link.downlink, "downlink")

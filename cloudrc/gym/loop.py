@@ -134,7 +134,6 @@ class RemoteLoop:
         self._down = Lane(OneWay(link.downlink, seed, False, stream=stream), settings.action_bytes)
         self._stream, self._episode = stream, -1
         self._within_ns = round(settings.answer_within * 1e9)
-        self._late: int | None = None
         self.compute: float | Callable[[int], float] | None = None
         self.seen: list[Any] = [None, {}]
 
@@ -161,13 +160,11 @@ class RemoteLoop:
 
     def _ticks_late(self) -> int:
         """Return the expected age of the loop [ticks]."""
-        if self._late is None:
-            settings, link = self._settings, self._settings.link
-            up, _ = expected(link.uplink, settings.dt, settings.observation_bytes)
-            down, _ = expected(link.downlink, settings.dt, settings.action_bytes)
-            late = np.nan_to_num(up + down) + settings.compute[0] - settings.answer_within
-            self._late = max(0, ceil(late / settings.dt - 1e-6))
-        return self._late
+        settings, link = self._settings, self._settings.link
+        up, _ = expected(link.uplink, settings.dt, settings.observation_bytes)
+        down, _ = expected(link.downlink, settings.dt, settings.action_bytes)
+        late = float(np.nan_to_num(up + down)) + settings.compute[0] - settings.answer_within
+        return max(0, ceil(late / settings.dt - 1e-6))
 
     def act(self, actions: tuple[Any, ...]) -> Any:
         """Take the policy's answer, if it is asked; return the action that the robot executes."""

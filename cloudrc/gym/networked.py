@@ -14,16 +14,14 @@ from cloudrc.gym.options import (
     Options,
     Profile,
     answer_space,
-    compute_times,
     connect,
     describe_answer,
     read_options,
-    warn,
 )
 from cloudrc.gym.step import find_step
 from cloudrc.gym.values import checker, copied
 from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import InvalidValueError, to_arrays
+from cloudrc.outside.values import to_arrays
 
 
 class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -46,7 +44,6 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             judges the episode, not for the policy.
     """
 
-    _warns = True
     _left = inf  # steps until a wrapper outside ends the episode
 
     @naming("Networked")
@@ -85,18 +82,12 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         Raises:
             cloudrc.errors.BadInputError: If a value cannot be used; the text says what to change.
         """
-        if not isinstance(env, gymnasium.Env):
-            raise InvalidValueError(
-                f"env is {type(env).__name__}: give an environment of gymnasium, as "
-                "gymnasium.make returns it; for a vector there is NetworkedVector"
-            )
         options = read_options("Networked", options)
         RecordConstructorArgs.__init__(self, link=link, seed=seed, dt=dt, stream=stream, **options)
         gymnasium.Wrapper.__init__(self, env)
-        self.dt, _, doubts = find_step(env, dt, options.get("compute", 0.0))
-        both, chunk = (env.observation_space, env.action_space), options.get("chunk")
-        (self._loop,) = connect(both, self.dt, link, seed, (stream,), **options)
-        warn(doubts if self._warns else [])
+        self.dt, _ = find_step(env, dt)
+        both, chunk = (env.observation_space, env.action_space), options["chunk"]
+        (self._loop,) = connect(both, self.dt, link, seed, (stream,), options)
         self.action_space, self._split = answer_space(env.action_space, chunk)
         self._check = checker(self.action_space, describe_answer(chunk))
         self.world_info: dict[str, Any] = {}
@@ -111,8 +102,6 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     @compute.setter
     def compute(self, time: float | Callable[[int], float] | None) -> None:
-        if time is not None and not callable(time):
-            time, _ = compute_times((time, 0.0))
         self._loop.compute = time
 
     def summary(self, deadline: float | None = None) -> dict[str, Any]:

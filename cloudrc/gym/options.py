@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -49,17 +48,21 @@ class Options(TypedDict, total=False):
     action_bytes: int | None
 
 
-ARGUMENTS = ("env", "link", "seed", "dt", "stream", *Options.__annotations__)
+DEFAULTS: Options = {
+    **{"compute": 0.0, "answer_within": None, "chunk": None, "executor": "newest"},
+    **{"hold": "repeat", "start": None, "observation_bytes": None, "action_bytes": None},
+}
+ARGUMENTS = ("env", "link", "seed", "dt", "stream", *DEFAULTS)
 """Names of the arguments of `Networked` and `NetworkedVector`."""
 
 
 def read_options(what: str, given: Options) -> Options:
-    """Read the options of the environment `what`."""
+    """Read the options of the environment `what`; those that are not given have their defaults."""
     check_names(f"argument of {what}", given, ARGUMENTS)
-    check_names("hold", [given.get("hold", "repeat")], ("repeat", "start"))
-    read = dict(given)
+    read: dict[str, Any] = {**DEFAULTS, **given}
+    check_names("hold", [read["hold"]], ("repeat", "start"))
     for name, (quantity, wanted) in COUNTS.items():
-        if read.get(name) is not None:
+        if read[name] is not None:
             with naming(name, f"None, or {wanted}"):
                 read[name] = quantity.of(read[name])
     return cast(Options, read)
@@ -71,46 +74,36 @@ def connect(
     link: Profile,
     seed: int,
     streams: Iterable[str],
-    *,
-    compute: float | tuple[float, float] = 0.0,
-    answer_within: float | None = None,
-    chunk: int | None = None,
-    executor: str | Path = "newest",
-    hold: str = "repeat",
-    start: Any = None,
-    observation_bytes: int | None = None,
-    action_bytes: int | None = None,
+    options: Options,
 ) -> list[RemoteLoop]:
     """Connect a robot of each of the `streams` with its policy.
 
-    `spaces` are those of an observation and of an action; `dt` is the time of a step [s],
-    `answer_within` how long a robot waits in it for an answer [s].
+    `spaces` are those of an observation and of an action; `dt` is the time of a step [s]. All
+    `options` are there, as `read_options` returns them.
     """
     observations, actions = spaces
+    start, chunk = options["start"], options["chunk"]
+    size, answer = options["observation_bytes"], options["action_bytes"]
     waits = isinstance(start, str) and start == ANSWER
     if start is None or waits:
         start = neutral(actions)
     else:
         checker(actions, f"as start= an action, or {ANSWER!r}")(start)
-    if observation_bytes is None:
-        observation_bytes = size_of(observations.sample())
-    if action_bytes is None:
-        action_bytes = size_of(start) * (chunk or 1)
     settings = Settings(
         link=read_profile(link),
         seed=seed,
         dt=dt,
-        answer_within=_read_wait(answer_within, dt),
-        compute=compute_times(compute),
-        repeats=hold == "repeat",
+        answer_within=_read_wait(options["answer_within"], dt),
+        compute=compute_times(options["compute"]),
+        repeats=options["hold"] == "repeat",
         start=copied(start),
         waits=waits,
-        observation_bytes=observation_bytes,
-        action_bytes=action_bytes,
+        observation_bytes=size_of(observations.sample()) if size is None else size,
+        action_bytes=size_of(start) * (chunk or 1) if answer is None else answer,
     )
     check, loops = checker(actions, "one action, or None"), list[RemoteLoop]()
     for stream in streams:
-        own, is_ours = find_executor(executor, chunked=chunk is not None)
+        own, is_ours = find_executor(options["executor"], chunked=chunk is not None)
         loops.append(RemoteLoop(settings, own, stream, judge=None if is_ours else check))
     return loops
 
@@ -133,28 +126,17 @@ def compute_times(compute: float | tuple[float, float]) -> tuple[float, float]:
     return mean, deviation
 
 
-def warn(texts: Iterable[str]) -> None:
-    """Warn who calls the constructor, which has a decorator, that calls this."""
-    for text in texts:
-        warnings.warn(text, stacklevel=4)
-
-
 def answer_space(
     space: gymnasium.Space[Any], chunk: int | None
 ) -> tuple[gymnasium.Space[Any], Callable[[Any], tuple[Any, ...]]]:
     """Return the space of an answer, and a function that copies an answer into its actions."""
-    if chunk is None:
-        return space, _one
-    batched = batch_space(space, chunk)
-    return batched, partial(_each, batched)
+    batched = space if chunk is None else batch_space(space, chunk)
+    return batched, partial(_split, None if chunk is None else batched)
 
 
-def _one(action: Any) -> tuple[Any, ...]:
-    return (copied(action),)
-
-
-def _each(space: gymnasium.Space[Any], answer: Any) -> tuple[Any, ...]:
-    return tuple(iterate(space, copied(answer)))
+def _split(batched: gymnasium.Space[Any] | None, answer: Any) -> tuple[Any, ...]:
+    answer = copied(answer)
+    return (answer,) if batched is None else tuple(iterate(batched, answer))
 
 
 def describe_answer(chunk: int | None) -> str:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 
 from cloudrc.gym.networked import Networked
-from cloudrc.gym.options import ARGUMENTS
 from cloudrc.gym.vector import NetworkedVector
-from cloudrc.outside.refusal import check_names, naming
-from cloudrc.outside.values import InvalidValueError
 
 NAME = "cloudrc/Networked-v0"
 IDS: dict[str, dict[str, Any]] = {
@@ -49,8 +45,7 @@ def make(
 
     `env_args` are arguments of the environment, all others those of `Networked`.
     """
-    with _telling(env, networked):
-        inner = gymnasium.make(env, render_mode=render_mode, **(env_args or {}))
+    inner = gymnasium.make(env, render_mode=render_mode, **(env_args or {}))
     return Networked(inner, **networked)
 
 
@@ -58,18 +53,5 @@ def make_vec(
     env: str = "", num_envs: int = 1, env_args: Mapping[str, Any] | None = None, **networked: Any
 ) -> NetworkedVector:
     """Make `num_envs` environments `env`, each behind a link of its own."""
-    with _telling(env, networked):
-        inner = gymnasium.make_vec(env, num_envs, **(env_args or {}))
+    inner = gymnasium.make_vec(env, num_envs, **(env_args or {}))
     return NetworkedVector(inner, **networked)
-
-
-@contextmanager
-def _telling(env: str, networked: Iterable[str]) -> Iterator[None]:
-    """Check the names of arguments; convert gymnasium's error about the environment `env`."""
-    what = f"argument of {NAME} (those of the environment go into env_args)"
-    check_names(what, networked, ARGUMENTS)
-    with naming(f"env {env!r}"):
-        try:
-            yield
-        except gymnasium.error.Error as error:
-            raise InvalidValueError(str(error)) from error

@@ -21,12 +21,13 @@ from cloudrc.assembly import assemble, build_links, flight_limit
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.config.load import load_experiment
+from cloudrc.config.problems import problem_at
 from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Link
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.messages import Datagram, Odometry, Setpoint
-from cloudrc.outside.refusal import check_names, naming
-from cloudrc.outside.values import RESULT, InvalidValueError
+from cloudrc.outside.refusal import naming
+from cloudrc.outside.values import RESULT
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
@@ -139,7 +140,6 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         robot: str | None = None,
         settings: Mapping[str, Any] | None = None,
         render_mode: str | None = None,
-        **unknown: Any,
     ) -> None:
         """Load an experiment by name or path.
 
@@ -148,17 +148,11 @@ class RobotEnv(gymnasium.Env[Any, Any]):
             robot: Name of a shipped robot, or path; None: that of the experiment.
             settings: Further changes, as with `--set`: key -> value. The link is always ideal.
             render_mode: None; a flight is drawn by its report.
-            unknown: Is an error, with the nearest name.
         """
-        known = "experiment", "robot", "settings", "render_mode"
-        check_names("argument of RobotEnv", unknown, known)
         require("a robot of the testbed as an environment", SIM)
         for key in settings or {}:
-            with naming(key):
-                if key.partition(".")[0] == "link":
-                    raise InvalidValueError("the network is that of the wrapper Networked")
-                if key in OWN:
-                    raise InvalidValueError("the policy stands in its place; leave it out")
+            if key in OWN or key.startswith("link"):
+                raise problem_at(key, "is the affair of Networked and the policy; leave it out")
         texts = {**(settings or {}), **OWN, **({"world.robot": robot} if robot else {})}
         self.render_mode = render_mode
         loaded = load_experiment(
@@ -210,15 +204,6 @@ class RobotEnv(gymnasium.Env[Any, Any]):
     def _numbers_of(self, action: Any) -> tuple[float, ...]:
         with naming("action", ", ".join(self._parts)):
             return RESULT.row(action, len(self._parts))
-
-    def __getstate__(self) -> object:
-        """Return the state for a copy; none in flight, whose tunnel has keys in C objects."""
-        if self.flight is not None:
-            raise TypeError(
-                "a flight of the testbed cannot be copied; reset another environment with the same "
-                "seed and give it the same actions: it flies the same path"
-            )
-        return super().__getstate__()
 
     def _observe(self, flight: _Flight) -> tuple[Any, float]:
         """Return the observation, and the distance from the setpoint [m]."""

@@ -16,12 +16,11 @@ from cloudrc.gym.options import (
     connect,
     describe_answer,
     read_options,
-    warn,
 )
 from cloudrc.gym.step import find_step
 from cloudrc.gym.values import checker, copied
 from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import InvalidValueError, to_arrays
+from cloudrc.outside.values import to_arrays
 
 if TYPE_CHECKING:
     _Wrapper = VectorWrapper[Any, Any, Any, Any, Any]
@@ -52,24 +51,18 @@ class NetworkedVector(_Wrapper):
 
         `dt` is the time of a step [s].
         """
-        if not isinstance(env, VectorEnv):
-            raise InvalidValueError(
-                f"env is {type(env).__name__}: give a vector environment of gymnasium, as "
-                "gymnasium.make_vec returns it; for a single one there is Networked"
-            )
         options = read_options("NetworkedVector", options)
         super().__init__(env)
-        space, chunk = env.single_action_space, options.get("chunk")
+        space, chunk = env.single_action_space, options["chunk"]
         names = [f"{stream}/{robot}" for robot in range(env.num_envs)]
         both = env.single_observation_space, space
-        time, _, doubts = find_step(env, dt, options.get("compute", 0.0))
-        self._loops = connect(both, time, link, seed, names, **options)
-        warn(doubts)
+        time, _ = find_step(env, dt)
+        self._loops = connect(both, time, link, seed, names, options)
         self.single_action_space, self._split = answer_space(space, chunk)
         self.action_space = batch_space(self.single_action_space, env.num_envs)
         words = f"for each of {env.num_envs} robots {describe_answer(chunk)}"
         self._check = checker(self.action_space, words)
-        self._mode = _autoreset_mode(env)
+        self._mode = AutoresetMode(env.metadata["autoreset_mode"])
         self._ended = np.zeros(env.num_envs, dtype=bool)
 
     def reset(
@@ -144,17 +137,6 @@ def _batch(space: Any, values: Sequence[Any]) -> Any:
     """Return the values of all robots, each of `space`, as the vector environment has them."""
     made: Any = create_empty_array(space, len(values))
     return concatenate(space, values, made)
-
-
-def _autoreset_mode(env: VectorEnv[Any, Any, Any]) -> AutoresetMode:
-    mode = (env.metadata or {}).get("autoreset_mode")
-    if isinstance(mode, AutoresetMode):
-        return mode
-    known = ", ".join(f"AutoresetMode.{each.name}" for each in AutoresetMode)
-    raise InvalidValueError(
-        f"the vector environment does not say when it resets a robot: its metadata has "
-        f"autoreset_mode {mode!r}; set it to one of {known}"
-    )
 
 
 def _part(infos: Mapping[str, Any], n: int) -> dict[str, Any]:

@@ -25,7 +25,7 @@ def test_a_folder_takes_no_episodes_of_another_environment_or_policy(tmp_path, c
     for line in OTHER:
         words = line.format(law=path, other=other).split()
         assert main(["eval", *words, "--seeds", "1", "--out", str(out)]) == 2
-        said = f"--out {out}: has the episodes of CartPole-v1 with {path}; name a new folder"
+        said = f"--out {out}: has the episodes of CartPole-v1 with {path}, or of other arguments"
         assert said in capsys.readouterr().err
         assert {each.name: each.read_bytes() for each in out.iterdir()} == before
     assert main([*first.split(), "--rtt", "10", "--link", "lte", "--executor", "broker"]) == 0
@@ -33,11 +33,11 @@ def test_a_folder_takes_no_episodes_of_another_environment_or_policy(tmp_path, c
     assert len(rows) == 3  # that without a network is the same
 
 
-@pytest.mark.parametrize("content", ["{}", "x", '{"env": "CartPole-v1", "env_args": 1}'])
+@pytest.mark.parametrize("content", ["x", '{"env": "CartPole-v1", "identity": 1}'])
 def test_a_file_that_is_not_of_an_evaluation_is_kept(content, tmp_path, capsys):
     (tmp_path / "law.py").write_text(LAW)
     (tmp_path / "eval.json").write_text(content)
     line = f"eval --env CartPole-v1 --policy {tmp_path}/law.py --seeds 1 --out {tmp_path}"
     assert main(line.split()) == 2
-    assert "its eval.json is of no evaluation; name a new folder" in capsys.readouterr().err
+    assert "its eval.json is of no evaluation" in capsys.readouterr().err
     assert (tmp_path / "eval.json").read_text() == content

@@ -7,17 +7,11 @@ import pytest
 from cloudrc.eval.episode import play
 from cloudrc.eval.page import draw_outcomes
 from cloudrc.eval.setup import BASELINE, Episode, EvalSetup
-from tests.eval.test_eval import LAW, bare, run, stand
-
-
-@pytest.fixture
-def law(tmp_path):
-    (tmp_path / "law.py").write_text(LAW)
-    return str(tmp_path / "law.py")
+from tests.eval.test_eval import bare, run, stand
 
 
 def test_the_episodes_without_a_network_are_the_policys_own_whatever_link_and_time(law):
-    setup = EvalSetup("CartPole-v1", law, link="lossy", compute=0.3, observation_bytes=90)
+    setup = EvalSetup("CartPole-v1", law(), link="lossy", compute=0.3, observation_bytes=90)
     row = play(Episode(None, BASELINE, 3), setup)
     assert (row["numbers"]["return"], row["records_sha256"]) == bare("CartPole-v1", stand, 3)
     assert row["point"] == {"rtt_ms": None, "executor": BASELINE}
@@ -31,7 +25,9 @@ def test_the_episodes_without_a_network_are_the_policys_own_whatever_link_and_ti
     [("csv", "rtt_ms,executor,episodes,return,steps,"), ("latex", "\\begin{tabular}{lrrr")],
 )
 def test_the_table_is_also_one_of_csv_or_latex_alone(law, tmp_path, capsys, form, start):
-    assert run("--policy", law, "--seeds", 1, "--rtt", 0, "--out", tmp_path / "e", "-o", form) == 0
+    assert (
+        run("--policy", law(), "--seeds", 1, "--rtt", 0, "--out", tmp_path / "e", "-o", form) == 0
+    )
     out = capsys.readouterr().out
     assert out.startswith(start)
     assert "no network" in out
@@ -41,7 +37,7 @@ def test_two_policies_are_compared_in_pairs_and_other_conditions_are_refused(law
     words = ["--seeds", 6, "--rtt", 0, "--success-at", 500]
     (tmp_path / "left.py").write_text("def infer(o):\n    return {'actions': [[0]]}\n")
     assert run("--policy", tmp_path / "left.py", "--out", tmp_path / "a", *words) == 0
-    versus = ["--policy", law, "--versus", tmp_path / "a"]
+    versus = ["--policy", law(), "--versus", tmp_path / "a"]
     assert run(*versus, "--out", tmp_path / "b", *words) == 0
     document = json.loads((tmp_path / "b" / "eval.json").read_text())
     _, test = document["tests"]
@@ -59,7 +55,7 @@ def test_two_policies_are_compared_in_pairs_and_other_conditions_are_refused(law
 def test_the_page_has_figure_tests_notes_and_how_it_was_made(law, tmp_path, capsys):
     out, words = (
         tmp_path / "e",
-        ["--policy", law, "--seeds", 2, "--rtt", "200,0", "--deadline", 0.1],
+        ["--policy", law(), "--seeds", 2, "--rtt", "200,0", "--deadline", 0.1],
     )
     assert run(*words, "--out", out, "--executor", "newest,time-indexed") == 0
     document, page = (

@@ -368,12 +368,6 @@ def test_every_episode_equals_the_simulation(setup):
     compare(setup, range(2), 60)
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("setup", [*SETUPS, *OTHER_STARTS], ids=named)
-def test_twenty_whole_episodes_equal_the_simulation(setup):
-    compare(setup, range(20), 500 if setup.name == "CartPole-v1" else 200)
-
-
 # The rule of step() -----------------------------------------------------------------------------
 
 

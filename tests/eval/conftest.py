@@ -1,0 +1,25 @@
+"""The file of a policy, which holds the pole of CartPole if a test gives no other."""
+
+import pytest
+
+LAW = """
+import numpy as np
+
+def decide(x, speed, angle, turn):
+    return int(10.0 * angle + 2.0 * turn + 0.1 * x + 0.3 * speed > 0.0)
+
+def infer(observation):
+    return {"actions": [[decide(*observation["observation/state"])]] * 2}
+"""
+
+
+@pytest.fixture
+def law(tmp_path):
+    """Write the file of a policy; return its path."""
+
+    def write(source=LAW):
+        path = tmp_path / "law.py"
+        path.write_text(source)
+        return str(path)
+
+    return write
