@@ -12,22 +12,21 @@ from typing import Any
 
 from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.cluster.jobs import (
+    JobReader,
     create_job,
     delete_job,
     failure_of,
     find_job,
     read_example,
-    read_log,
 )
-from cloudrc.cluster.pods import UNSCHEDULED
 from cloudrc.errors import BadInputError, to_one_line
 
 COMPONENT = "sweep"
 """Label `component` of the Jobs and pods of sweeps, and name of their container."""
 FILE = "flights.json.gz"
 """Key in the ConfigMap under which the flights are stored."""
-QUOTA = "then repeat the command with a smaller request, such as --cpu 500m, or with fewer --shards"
-"""What a user can do if the namespace's quota does not allow the pods."""
+REMEDY = "repeat the command, perhaps with a smaller request, --cpu 500m, or with fewer --shards"
+"""What a user can do if the cluster does not run the pods."""
 OUT_OF_MEMORY = (
     "it used more memory than the limit of its container (OOMKilled); "
     "fly shorter missions, or without --on"
@@ -95,18 +94,10 @@ def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iter
         failures.append(f"a pod failed with exit code {state.exit_code}: {words}")
         return failures[-1]
 
-    remedy = (
-        f"if no other pod frees it: {release.kubectl} delete job {name}, and repeat the command "
-        "with a smaller request, such as --cpu 500m, or with fewer --shards"
-    )
-
-    def tell_all(text: str) -> None:
-        tell(f"{text}; {remedy}" if UNSCHEDULED in text else text)
-
     try:
-        yield from read_log(release, name, tell_all, describe_end)
+        yield from JobReader(release, name, tell, describe_end).read()
     except ClusterError as error:
-        raise (ClusterError(f"{error}; {QUOTA}") if "quota" in str(error) else error) from None
+        raise ClusterError(f"{error}; {REMEDY}") from None
     if ending := failure_of(release.request("get", "jobs", name=name)):
         see = f"see: {release.kubectl} describe job {name}; then repeat the command"
         causes = [f"Job '{name}' failed: {ending}", *failures[-1:], see]

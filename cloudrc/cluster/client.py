@@ -177,13 +177,12 @@ def connect(
             "a cluster: kind create cluster --config kind-config.yaml"
         ) from error
     if context is not None:
-        contexts_by_name = {each["name"]: each for each in known}
-        if context not in contexts_by_name:
-            raise MissingPrerequisiteError(
-                f"no context '{context}' in the kubeconfig; known: "
-                f"{', '.join(sorted(contexts_by_name)) or 'none'}; choose with --context"
-            )
-        current = contexts_by_name[context]
+        by_name = {each["name"]: each for each in known}
+        if context not in by_name:
+            names = ", ".join(sorted(by_name))
+            text = f"no context '{context}' in the kubeconfig; known: {names}"
+            raise MissingPrerequisiteError(text)
+        current = by_name[context]
     inherited = (current or {}).get("context", {}).get("namespace")
     return Release(context, namespace or inherited or "default", release)
 
@@ -206,10 +205,9 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
         kind = NotFoundError if error.status == 404 else ClusterError
         raise kind(f"cannot {doing} {where}: {_refusal(error, doing)}") from error
     except (HTTPError, OSError) as error:
-        raise NoAnswerError(
-            f"cannot {doing} {where}: the API server does not answer ({_root(error)}); "
-            "is the cluster up? ask it: kubectl cluster-info"
-        ) from error
+        why = str(getattr(error, "reason", error)).rpartition(": ")[2]  # after repeated attempts
+        text = f"cannot {doing} {where}: the API server does not answer ({why})"
+        raise NoAnswerError(f"{text}; is the cluster up? ask it: kubectl cluster-info") from error
     except ConfigException as error:  # such as a missing certificate file
         raise ClusterError(f"cannot {doing} {where}: {str(error).partition(chr(10))[0]}") from error
 
@@ -219,19 +217,11 @@ def _refusal(error: Any, doing: str) -> str:
         message = json.loads(error.body)["message"]
     except (ValueError, KeyError, TypeError):
         message = error.reason or f"the API server answered {error.status}"
-    message = " ".join(str(message).split())
-    if error.status == 401 or "system:anonymous" in message:
+    if error.status == 401:
         return "the API server does not know you; log in to the cluster again"
+    message = " ".join(str(message).split())
     is_of_user = " cannot " in message  # not of the object, such as a quota
     return message + f"; check your permission: kubectl auth can-i {doing}" * is_of_user
-
-
-def _root(error: BaseException) -> str:
-    """Return the text of the innermost cause; the outer exceptions report repeated attempts."""
-    reason = getattr(error, "reason", None)
-    if isinstance(reason, BaseException):
-        return _root(reason)
-    return str(error).strip().partition("\n")[0].rpartition(": ")[2] or type(error).__name__
 
 
 def program(name: str) -> str:
@@ -296,7 +286,4 @@ def chart_folder(package: Path = PACKAGE) -> Path:
     for place in places:
         if (place / "Chart.yaml").is_file():
             return place
-    raise MissingPrerequisiteError(
-        f"the Helm chart is in neither of {places[0]} and {places[1]}; install cloudrc again: "
-        "pip install --force-reinstall cloudrc"
-    )
+    raise MissingPrerequisiteError(f"the Helm chart is not in {places[0]}; install cloudrc again")

@@ -172,7 +172,6 @@ def begin_job(
 
     After `helm install` without --wait, the release needs some seconds: wait at most `timeout` [s].
     """
-    pods.find_deployment(release, "cloud")
     wait_ready(release, timeout=timeout, tell=tell)
     job = run_job(release, mission, queue=queue)
     tell(f"Job {job} on release '{release.name}' in namespace '{release.namespace}'")

@@ -189,7 +189,7 @@ def failure_of(job: Any) -> str | None:
 
 
 class JobGoneError(ClusterError):
-    """Report that a Job does not follow its mission: it was deleted or suspended, or has failed."""
+    """Report that a Job does not follow its mission: it was deleted, or has failed."""
 
     def __init__(self, why: str, key: str) -> None:
         """Store the Job's UID as `key`: it is the key of the Job's mission."""
@@ -205,7 +205,7 @@ def follow(release: Release, name: str, write: Callable[[str], None]) -> Ended:
 
     Raises:
         ClusterError: If the Job's pod cannot run; the message names the cause.
-        JobGoneError: If the Job was deleted or suspended, or has ended without a verdict.
+        JobGoneError: If the Job was deleted, or has ended without a verdict.
     """
     states, watch = list[Any](), ReleaseWatch(release)
 
@@ -221,20 +221,6 @@ def follow(release: Release, name: str, write: Callable[[str], None]) -> Ended:
     if not states or states[-1].exit_code in KILLED_WATCHER:
         raise JobGoneError(f"its Job has ended without a verdict: {cause}", reader.key)
     return Ended(states[-1].exit_code, to_one_line(states[-1].message) or cause)
-
-
-def read_log(
-    release: Release, name: str, tell: Callable[[str], None], see_end: Callable[[Any], str | None]
-) -> Iterator[str]:
-    """Yield each different line of the logs of a Job's pods, until the Job has ended.
-
-    The parameters are those of `JobReader`. Raise a ClusterError if a pod will never run, or if the
-    Job is deleted.
-    """
-    try:
-        yield from JobReader(release, name, tell, see_end).read()
-    except JobGoneError:
-        raise ClusterError(f"Job '{name}' was deleted; repeat the command") from None
 
 
 class JobReader:
@@ -270,7 +256,7 @@ class JobReader:
             selector = f"{UID_LABEL}={self.key}"
             pods = self._release.request("list", "pods", label_selector=selector)
             pods.sort(key=lambda pod: str(pod.metadata.creation_timestamp))
-            self._check_suspended(pods)
+            self._tell_once("waiting: the Job is suspended" if self.job.spec.suspend else "")
             self._tell_once("" if has_ended else _why_waiting(self._release, self.job, pods))
             for pod in pods:
                 yield from self._read_pod(pod)
@@ -290,18 +276,6 @@ class JobReader:
         self.key = self.job.metadata.uid
         if self.job.metadata.deletion_timestamp is not None:
             raise JobGoneError("its Job was deleted", self.key)
-
-    def _check_suspended(self, pods: list[Any]) -> None:
-        """Raise a JobGoneError if a mission's Job is suspended in flight.
-
-        A queue, such as Kueue, may suspend a new Job, and the Job of a sweep at any time.
-        """
-        if not self.job.spec.suspend:
-            return
-        is_mission = self.job.metadata.labels[COMPONENT_LABEL] == COMPONENT
-        if is_mission and (pods or self._read):
-            raise JobGoneError("its Job was suspended", self.key)
-        self._tell_once("waiting: the Job is suspended")
 
     def _read_pod(self, pod: Any) -> Iterator[str]:
         """Yield the new lines of a pod's log; tell how the pod has ended."""

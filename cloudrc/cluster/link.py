@@ -145,7 +145,12 @@ def send(
         answers = list(pool.map(lambda pod: _answer_of(release, pod, request, number), at))
     failed = [answer for answer in answers if isinstance(answer, CloudrcError)]
     states = [answer for answer in answers if isinstance(answer, LinkState)]
-    _raise_refused(states, failed, number)
+    refused = [state for state in states if state.refused == number]
+    if refused:
+        said = [f"the {each.direction} is unchanged: {each.refusal}" for each in refused]
+        said += [f"the {each.direction} has the change" for each in states if each not in refused]
+        said += [*map(str, failed), "the ConfigMap is unchanged"]
+        raise BadInputError("; ".join(said))
     return Sent(edit, files, states, failed)
 
 
@@ -165,15 +170,6 @@ def _answer_of(release: Release, pod: str, request: bytes, number: str) -> LinkS
     )
 
 
-def _raise_refused(states: list[LinkState], failed: list[CloudrcError], number: str) -> None:
-    """Raise a BadInputError if a direction has refused the change."""
-    if refused := [state for state in states if state.refused == number]:
-        said = [f"the {state.direction} is unchanged: {state.refusal}" for state in refused]
-        said += [f"the {s.direction} has the change" for s in states if s not in refused]
-        kept = "the ConfigMap is unchanged, and restarted pods take it"
-        raise BadInputError("; ".join([*said, *map(str, failed), kept]))
-
-
 def keep(release: Release, link: LinkParts, sent: Sent) -> None:
     """Write a change to the ConfigMap, from which restarted pods read it.
 
@@ -182,13 +178,11 @@ def keep(release: Release, link: LinkParts, sent: Sent) -> None:
     said = list(map(str, sent.failed))
     words = ["patch", "configmap", link.name, "--type=merge", "--patch-file=/dev/stdin"]
     try:
-        data = json.dumps({"data": sent.files})
-        run("kubectl", [*release.flags, *words], given=data)
+        run("kubectl", [*release.flags, *words], given=json.dumps({"data": sent.files}))
     except CloudrcError as error:
-        said.append(f"the ConfigMap is unchanged: {error}")
-        said += [f"the {s.direction} has the change until its pod is replaced" for s in sent.states]
-        raise ClusterError("; ".join(said)) from None
-    if sent.failed:
+        text = f"the ConfigMap is unchanged, so that restarted pods lose the change: {error}"
+        raise ClusterError("; ".join([*said, text])) from None
+    if said:
         said.append("the ConfigMap has the change, and the pods apply it within 2 minutes")
         raise type(sent.failed[0])("; ".join(said))
 

@@ -71,20 +71,15 @@ def list_pods(release: Release, component: str) -> list[Any]:
 def find_pod(release: Release, component: str) -> Any:
     """Find the newest running pod of a component; else raise a ClusterError with the cause."""
     pods = list_pods(release, component)
-    if not pods:
-        name = find_deployment(release, component).metadata.name
-        raise ClusterError(
-            f"release '{release.name}' {release.where} has no {component} pod now: it is replaced, "
-            f"or cannot be made; see: {release.kubectl} describe deployment {name}"
-        )
-    running = [pod for pod in pods if pod.status.phase == "Running"]
-    if not running:
-        why = pod_failure(pods[0]) or f"it is {pods[0].status.phase}"
-        raise ClusterError(
-            f"the {component} pod of release '{release.name}' does not run: {why}; "
-            f"see: {release.kubectl} describe pod {pods[0].metadata.name}"
-        )
-    return running[0]
+    for pod in pods:
+        if pod.status.phase == "Running":
+            return pod
+    name = find_deployment(release, component).metadata.name
+    why = (pod_failure(pods[0]) or f"it is {pods[0].status.phase}") if pods else "there is none"
+    raise ClusterError(
+        f"the {component} pod of release '{release.name}' {release.where} does not run: {why}; "
+        f"see: {release.kubectl} describe deployment {name}"
+    )
 
 
 def find_deployment(release: Release, component: str) -> Any:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,16 +34,6 @@ class Place(NamedTuple):
     name: str
 
 
-def find_releases(release: Release, *, everywhere: bool) -> list[Place]:
-    """List the releases in the namespace of `release`, or in all namespaces, sorted.
-
-    Raise a ClusterError if the user may not list Deployments there.
-    """
-    verb = "list all" if everywhere else "list"
-    found = release.request(verb, "deployments", label_selector=SELECTOR)
-    return sorted(map(_place, found))
-
-
 def look(release: Release, *, everywhere: bool) -> list[dict[str, str]]:
     """Describe the releases in the namespace of `release`, or in all namespaces.
 
@@ -55,7 +43,7 @@ def look(release: Release, *, everywhere: bool) -> list[dict[str, str]]:
     deployments = release.request(verb, "deployments", **chosen)
     files = defaultdict[Place, dict[str, str]](dict)
     for each in release.request(verb, "configmaps", **chosen):
-        if is_of_experiment(each.metadata.labels):
+        if each.metadata.labels.get(COMPONENT) in ("experiment", "link"):
             files[_place(each)] |= each.data or {}
     waits = defaultdict[Place, list[str]](list)
     for each in deployments:
@@ -92,7 +80,10 @@ def _link(files: dict[str, str]) -> str:
     from cloudrc.config.load import load_link
     from cloudrc.config.profile import DIRECTIONS
 
-    with as_files(files) as folder:
+    with TemporaryDirectory(prefix="cloudrc-") as name:
+        folder = Path(name)  # the files as the pods see them
+        for key, text in {"experiment.yaml": "{}", "profile.yaml": "{}", **files}.items():
+            (folder / key).write_text(text, encoding="utf-8")
         try:
             link = load_link(folder / "profile.yaml", folder / "experiment.yaml")
         except BadInputError:
@@ -100,21 +91,6 @@ def _link(files: dict[str, str]) -> str:
     values = link.model_dump(mode="json", exclude_defaults=True)
     texts = [_way(values.get(way, {})) for way in DIRECTIONS]
     return texts[0] if texts[0] == texts[1] else " / ".join(texts)
-
-
-def is_of_experiment(labels: Mapping[str, str]) -> bool:
-    """Return whether a ConfigMap with these labels has files of the experiment or of the link."""
-    return labels.get(COMPONENT) in ("experiment", "link")
-
-
-@contextmanager
-def as_files(files: Mapping[str, str]) -> Iterator[Path]:
-    """Yield a folder with the files of experiment and link, as the pods see them."""
-    with TemporaryDirectory(prefix="cloudrc-") as name:
-        folder = Path(name)
-        for key, text in {"experiment.yaml": "{}", "profile.yaml": "{}", **files}.items():
-            (folder / key).write_text(text, encoding="utf-8")
-        yield folder
 
 
 def _way(way: dict[str, Any]) -> str:
@@ -130,12 +106,13 @@ def only_release(release: Release) -> Release:
         BadInputError: If the namespace has several releases.
         ClusterError: If the namespace does not exist, or has no release.
     """
-    places = find_releases(release, everywhere=False)
-    if len(places) == 1:
-        return replace(release, name=places[0].name)
-    if places:
-        raise several_releases(release, [place.name for place in places])
-    raise no_release(release, f"no release {release.where}")
+    found = release.request("list", "deployments", label_selector=SELECTOR)
+    names = [_place(each).name for each in found]
+    if len(names) > 1:
+        raise several_releases(release, names)
+    if not names:
+        raise no_release(release, f"no release {release.where}")
+    return replace(release, name=names[0])
 
 
 def choose_release(
@@ -160,22 +137,14 @@ def several_releases(release: Release, names: list[str]) -> BadInputError:
 
 
 def no_release(release: Release, what: str = "") -> ClusterError:
-    """Return the error that a release does not exist; it names those that exist.
+    """Return the error that a release does not exist.
 
     `what` is the beginning of its text, by default "no release 'NAME' in namespace ...".
     """
     what = what or f"no release '{release.name}' {release.where}"
-    try:
-        places = find_releases(release, everywhere=True)
-    except ClusterError:  # no right to list all namespaces
-        places = []
-    if places:
-        known = ", ".join(f"'{place.name}' in namespace '{place.namespace}'" for place in places)
-        return ClusterError(f"{what}; there are: {known}; name one: --release NAME -n NAMESPACE")
-    flags = " ".join(release.helm_flags)
     return ClusterError(
-        f"{what}; install it: helm install {release.name} charts/cloudrc {flags}, "
-        "or name another: --release NAME -n NAMESPACE"
+        f"{what}; see all: helm list --all-namespaces; name one: --release NAME -n NAMESPACE, or "
+        "install it: helm install"
     )
 
 

@@ -1,4 +1,4 @@
-"""Survey a cluster before an install: permissions, experiment, admission, quota, nodes, images.
+"""Survey a cluster before an install: permissions, admission, quota, nodes, images.
 
 The pods of the chart are sent to the API server as a dry run, so that Pod Security, LimitRanges and
 quotas judge them themselves. A small pod on each node, which is deleted again, shows whether the
@@ -25,8 +25,7 @@ from cloudrc.cluster.client import (
     run,
 )
 from cloudrc.cluster.pods import pod_failure
-from cloudrc.cluster.releases import as_files, is_of_experiment
-from cloudrc.errors import CloudrcError, to_one_line
+from cloudrc.errors import to_one_line
 
 NEEDED = {
     "": "pods services configmaps secrets serviceaccounts persistentvolumeclaims",
@@ -82,24 +81,22 @@ def survey(release: Release, values: Sequence[str] = ()) -> Iterator[Finding]:
     yield (allowed := permissions(release))
     if allowed.state != "ok":
         return
-    rendered = render_chart(release, values)
-    yield experiment(rendered)
-    pods = pods_of_chart(rendered)
+    pods = pods_of_chart(render_chart(release, values))
     for component, spec in pods.items():
-        try:
-            yield admission(release, component, spec)
-        except NotFoundError as error:
-            fix = f"make the namespace: kubectl create namespace {release.namespace}"
-            yield Finding("namespace", "missing", to_one_line(str(error)), fix)
-            return
+        yield admission(release, component, spec)
     yield from quotas(release, pods)
     yield from nodes(release, pods)
 
 
 def permissions(release: Release) -> Finding:
     """Ask the API server what the user may do in the namespace."""
+    needed = [
+        (group, verb, kind)
+        for group, kinds in NEEDED.items()
+        for kind, verb in product(kinds.split(), VERBS)
+    ]
     denied = []
-    for group, verb, kind in (*ALSO, *_needs()):
+    for group, verb, kind in (*ALSO, *needed):
         resource, _, subresource = kind.partition("/")
         asked = {"namespace": release.namespace, "group": group, "verb": verb}
         asked |= {"resource": resource, "subresource": subresource}
@@ -112,43 +109,11 @@ def permissions(release: Release) -> Finding:
     return Finding("permissions", "ok", f"enough {release.where}")
 
 
-def _needs() -> Iterator[tuple[str, str, str]]:
-    """Yield API group, verb and kind of each permission that an install needs."""
-    for group, kinds in NEEDED.items():
-        for kind, verb in product(kinds.split(), VERBS):
-            yield group, verb, kind
-
-
 def render_chart(release: Release, values: Sequence[str]) -> list[Any]:
     """Render the objects of the chart as `helm install` would."""
     arguments = ["template", release.name, str(chart_folder()), *release.helm_flags]
     arguments += ["--dry-run=server", *values]
     return [thing for thing in yaml.safe_load_all(run("helm", arguments)) if thing]
-
-
-def experiment(rendered: list[Any]) -> Finding:
-    """Read experiment and link of the chart's objects, as the pods do, with their plug-ins.
-
-    A robot or scene whose files are only in the cluster is not compared with the mission.
-    """
-    from cloudrc.config.load import load_experiment, load_link
-
-    files = dict[str, str]()
-    for thing in rendered:
-        if thing["kind"] == "ConfigMap" and is_of_experiment(thing["metadata"]["labels"]):
-            files |= thing["data"]
-    world = (yaml.safe_load(files.get("experiment.yaml", "")) or {}).get("world", {})
-    with as_files(files) as folder:
-        path = folder / "experiment.yaml"
-        away = any(str(world.get(kind)).startswith("/") for kind in ("robot", "scene"))
-        try:
-            load_experiment(path, flown=away)
-            load_link(folder / "profile.yaml", path)
-        except CloudrcError as error:
-            text = to_one_line(str(error).replace(f"{folder}/", ""))
-            fix = "correct the values; if your image has the plug-in, install its package here, too"
-            return Finding("experiment", "missing", text, fix)
-    return Finding("experiment", "ok", "its values and plug-ins are valid")
 
 
 def pods_of_chart(rendered: list[Any]) -> dict[str, dict[str, Any]]:
@@ -164,21 +129,16 @@ def pods_of_chart(rendered: list[Any]) -> dict[str, dict[str, Any]]:
 
 
 def admission(release: Release, component: str, spec: dict[str, Any]) -> Finding:
-    """Send a pod of the chart as a dry run: nothing is created.
-
-    Raise a NotFoundError if the namespace does not exist.
-    """
+    """Send a pod of the chart as a dry run: nothing is created."""
     name = f"{component} pod"
     try:
         create_pod(release, component, spec, dry_run="All")
-    except NotFoundError:
-        raise
+    except NotFoundError as error:
+        fix = f"make the namespace: kubectl create namespace {release.namespace}"
+        return Finding(name, "missing", to_one_line(str(error)), fix)
     except ClusterError as error:
-        text = to_one_line(str(error))
-        fix = "set these values at install"
-        if "PodSecurity" in text:
-            fix = "--set link.mode=relay, which Pod Security 'restricted' admits"
-        return Finding(name, "missing", text, fix)
+        fix = "set other values, such as link.mode=relay, which Pod Security 'restricted' admits"
+        return Finding(name, "missing", to_one_line(str(error)), fix)
     return Finding(name, "ok", "is admitted: Pod Security, LimitRanges and quota agree")
 
 

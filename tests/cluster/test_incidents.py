@@ -99,7 +99,6 @@ def time_out(api):
     ("action", "words"),
     [
         (delete, "its Job was deleted"),
-        (suspend, "its Job was suspended"),
         (time_out, "its Job has ended without a verdict: DeadlineExceeded: too long"),
     ],
 )

@@ -7,7 +7,6 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.cluster.client import ClusterError
-from cloudrc.cluster.pods import find_deployment
 from cloudrc.cluster.releases import only_release
 from cloudrc.errors import BadInputError
 from tests.cluster.conftest import deployment, labels
@@ -20,25 +19,14 @@ def put(api, name, namespace="demo"):
     api.put("deployments", body)
 
 
-def test_the_only_release_is_used_whatever_its_name(api, release):
-    put(api, "drone-7")
-    assert only_release(release).name == "drone-7"
-
-
-def test_of_several_releases_none_is_guessed(api, release):
-    for name in ("cloudrc", "alpha"):
-        put(api, name)
+def test_the_only_release_is_used_whatever_its_name_and_of_several_none(api, release):
+    with pytest.raises(ClusterError, match=r"^no release in namespace 'demo'; see all: helm"):
+        only_release(release)
+    put(api, "alpha")
+    assert only_release(release).name == "alpha"
+    put(api, "cloudrc")
     with pytest.raises(BadInputError, match=r"'demo': alpha, cloudrc; name one: --release NAME"):
         only_release(release)
-
-
-@pytest.mark.parametrize("find", [only_release, lambda release: find_deployment(release, "cloud")])
-def test_the_releases_that_exist_are_named(api, release, find):
-    with pytest.raises(ClusterError, match=r"^no release .*in namespace 'demo'; install it: helm"):
-        find(release)
-    put(api, "robot", "lab")
-    with pytest.raises(ClusterError, match=r"there are: 'robot' in namespace 'lab'; name one"):
-        find(release)
 
 
 def release_in(api, name, namespace, *, ready, robot="", profile="uplink: {delay_ms: 40}"):

@@ -45,7 +45,7 @@ def found(release):
 def test_a_cluster_that_is_fit_has_no_problem_and_keeps_no_pod(cluster, release):
     cluster.nodes = ["one", "two"]
     seen = found(release)
-    checks = ["permissions", "experiment", "world pod", "cloud pod", "node one", "node two"]
+    checks = ["permissions", "world pod", "cloud pod", "node one", "node two"]
     assert list(seen) == checks
     assert {one.state for one in seen.values()} == {"ok"}
     assert seen["node two"].found == "has the images"
@@ -59,41 +59,6 @@ def test_a_node_without_an_image_is_told(cluster, release):
     seen = found(release)["node one"]
     assert seen.state == "missing"
     assert "the image i of container 'world' is not on the node" in seen.found
-
-
-FILES = """\
-apiVersion: v1
-kind: ConfigMap
-metadata: {name: x, labels: {app.kubernetes.io/component: COMPONENT}}
-data:
-  NAME: |
-    TEXT
----
-"""
-
-
-@pytest.mark.parametrize(
-    ("experiment", "profile", "words"),
-    [
-        ("cloud: {predictor: nosuch}", "{}", "no predictor named 'nosuch'"),
-        ("seed: 1", "uplink: {delay_ms: 0, trace: none.csv}", "none.csv"),
-        ("world: {robot: /etc/cloudrc-robot/mine}", "{}", ""),
-        ("link: {profile: lte}", "profile: satellite", ""),
-    ],
-)
-def test_experiment_and_link_are_read_as_the_pods_read_them(
-    cluster, release, pretend, experiment, profile, words
-):
-    files = (("experiment", "experiment.yaml", experiment), ("link", "profile.yaml", profile))
-    rendered = "".join(CHART.replace("COMPONENT", each) for each in ("world", "cloud"))
-    for component, name, text in files:
-        made = FILES.replace("COMPONENT", component).replace("NAME", name)
-        rendered += made.replace("TEXT", text)
-    pretend("helm", f"cat <<'END'\n{rendered}END")
-    seen = found(release)["experiment"]
-    assert seen.state == ("missing" if words else "ok")
-    assert words in seen.found
-    assert "/tmp" not in seen.found
 
 
 def test_missing_permissions_end_the_survey(cluster, release):
