@@ -350,8 +350,7 @@ def margin(
     Raises:
         cloudrc.errors.BadInputError: If the key has no range of numbers.
     """
-    from cloudrc.studies.margin import QUESTIONS, Asked, Margin, describe
-    from cloudrc.studies.search import ValueRange
+    from cloudrc.studies.margin import Asked, Margin, describe
 
     for name, value in (("largest", largest), ("resolution", resolution)):
         if value is not None:
@@ -359,9 +358,9 @@ def margin(
                 Quantity(gt=0.0).of(value)
     seeds = _count(seeds, "seeds")
     work = Margin(Asked(key, of, _texts(settings or {}), seeds, largest, resolution))
-    found: dict[str, ValueRange | None] = dict.fromkeys(QUESTIONS)
-    found |= {name: work.search(name) for name in work.questions}
-    return describe(work, found)
+    for question in work.questions:
+        work.search(question)
+    return describe(work)
 
 
 def identify(run: str | Path) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from cloudrc.text import escape
 
 if TYPE_CHECKING:
     from cloudrc.studies.margin import Answer, Margin
-    from cloudrc.studies.search import ValueRange
 
 EPILOG = """\
 examples:
@@ -51,23 +50,22 @@ def execute(options: argparse.Namespace) -> int:
     interrupt_on_signals()
     require("margin", MODES["virtual"])
     from cloudrc.cli.progress import Progress
-    from cloudrc.studies.margin import QUESTIONS, Asked, Margin, as_text, describe
+    from cloudrc.studies.margin import Asked, Margin, as_text, describe
 
     asked = options.key, options.experiment, options.set, options.seeds
     margin = Margin(Asked(*asked, options.max, options.resolution))
-    found: dict[str, ValueRange | None] = dict.fromkeys(QUESTIONS)
     with closing(Progress("flies")) as view:
         for name in margin.questions:
-            found[name] = _search(options, margin, name, view.say)
-        document = describe(margin, found)
-    lines = as_text(document, found, margin).splitlines()
+            _search(options, margin, name, view.say)
+        document = describe(margin)
+    lines = as_text(document, margin).splitlines()
     print_result(options.output, document, "\n".join(["", *map(escape, lines)]))
     return 0 if document[f"{margin.questions[0]}_up_to"] is not None else 1
 
 
 def _search(
     options: argparse.Namespace, margin: Margin, question: str, say: Callable[[str], None]
-) -> ValueRange:
+) -> None:
     """Search the answer to a question, and `say` each value that is tried."""
     from cloudrc.studies.margin import QUESTIONS, why
     from cloudrc.studies.stability import SCENE, SMALL
@@ -79,4 +77,4 @@ def _search(
     def see(number: int, answer: Answer) -> None:
         say(escape(f"  {margin.name(number):<26}{why(question, answer)}"))
 
-    return margin.search(question, see)
+    margin.search(question, see)

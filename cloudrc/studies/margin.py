@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
+from functools import cache
 from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc.ages import simulate_ages
@@ -58,6 +59,9 @@ class Margin:
         present: The number of the first value: the value divided by `size`.
         bottom: Number of the smallest value that is tried.
         top: Number of the largest value that is tried.
+        found: Question -> the range of values in which the answer is yes; None if it is not asked.
+        experiment: Function from a number to the experiment with this value, or None and why there
+            is none.
         top_why: Why no larger value is tried, in words.
     """
 
@@ -80,8 +84,9 @@ class Margin:
             top = math.floor(asked.max / self.size + 1e-9)
             if top < 1:
                 raise BadInputError(f"--max {asked.max:g}: must be at least {self.size:g}")
+        self.found: dict[str, ValueRange | None] = dict.fromkeys(QUESTIONS)
         self._done: dict[tuple[str, int], Answer] = {}
-        self._ready: dict[int, tuple[ResolvedExperiment | None, str]] = {}
+        self.experiment = cache(self._prepare)
         self._find_range(top)
 
     def _number(self, value: float) -> int:
@@ -113,13 +118,8 @@ class Margin:
         """Return the value of a number; None for None."""
         return None if number is None else round(number * self.size, 9)
 
-    def experiment(self, number: int) -> tuple[ResolvedExperiment | None, str]:
-        """Return the experiment with a value, and limits that fit; or why there is none."""
-        if number not in self._ready:
-            self._ready[number] = self._prepare(number)
-        return self._ready[number]
-
     def _prepare(self, number: int) -> tuple[ResolvedExperiment | None, str]:
+        """Return the experiment with a value, and limits that fit; or why there is none."""
         asked = self.asked
         settings = [*asked.settings, f"{asked.key}={self.value(number):.12g}"]
         try:
@@ -132,25 +132,26 @@ class Margin:
             given.append("guard.command_age_max_ms")
         more, needed = limits(experiment, given, asked.seeds)
         if needed > LIMIT_MAX and "guard.command_age_max_ms" not in given:
-            age = f"a command would be {needed:g} s old"
-            age = age if needed < math.inf else "no command arrives within 20 s"
-            return None, f"{age}, and guard.command_age_max_ms ends at {LIMIT_MAX:g} s"
+            text = f"commands are {needed:g} s old, and guard.command_age_max_ms ends at"
+            return None, f"{text} {LIMIT_MAX:g} s"
         return (load(asked.experiment, [*settings, *more]) if more else experiment), ""
 
     def search(
         self, question: str, see: Callable[[int, Answer], None] = lambda number, answer: None
-    ) -> ValueRange:
-        """Find the range of values in which the answer to a question is yes.
+    ) -> None:
+        """Find the range of values in which the answer to a question is yes: an entry of `found`.
 
         Call `see` with the number of each value that is tried, and the answer.
         """
 
         def works(number: int) -> bool:
-            answer = self._ask(question, number)
+            if (question, number) not in self._done:
+                self._done[question, number] = self._ask(question, number)
+            answer = self._done[question, number]
             see(number, answer)
             return bool(answer[question])
 
-        return search(works, self.present, self.bottom, self.top)
+        self.found[question] = search(works, self.present, self.bottom, self.top)
 
     def answer(self, question: str, number: int) -> Answer:
         """Return the answer for a value that has been tried."""
@@ -161,18 +162,14 @@ class Margin:
         return [self._done[key] for key in sorted(self._done) if key[0] == question]
 
     def _ask(self, question: str, number: int) -> Answer:
-        if (question, number) not in self._done:
-            experiment, why = self.experiment(number)
-            answer: Answer = {"value": self.value(number), question: experiment is not None}
-            if experiment is None:
-                answer |= {"code": "refused", "text": why}
-            else:
-                if (rtt := self._round_trip(experiment)) is not None:
-                    answer["rtt_ms"] = rtt
-                answer["speed_max_mps"] = experiment.guard.speed_max_mps
-                answer |= self._fly(experiment, question)
-            self._done[question, number] = answer
-        return self._done[question, number]
+        experiment, why = self.experiment(number)
+        answer: Answer = {"value": self.value(number)}
+        if experiment is None:
+            return answer | {question: False, "code": "refused", "text": why}
+        if (rtt := self._round_trip(experiment)) is not None:
+            answer["rtt_ms"] = rtt
+        answer["speed_max_mps"] = experiment.guard.speed_max_mps
+        return answer | self._fly(experiment, question)
 
     def _fly(self, experiment: ResolvedExperiment, question: str) -> Answer:
         """Fly one seed after the other, until an answer is no; return what is new."""
@@ -283,8 +280,8 @@ def limits(
     return raised, needed
 
 
-def describe(margin: Margin, found: Mapping[str, ValueRange | None]) -> dict[str, Any]:
-    """Return the result as values for JSON; `found`: question -> range, or None if not asked."""
+def describe(margin: Margin) -> dict[str, Any]:
+    """Return the result as values for JSON."""
     asked = margin.asked
     document: dict[str, Any] = {
         **{"key": asked.key, "experiment": asked.experiment},
@@ -292,7 +289,7 @@ def describe(margin: Margin, found: Mapping[str, ValueRange | None]) -> dict[str
         **{"smallest": margin.value(margin.bottom), "largest": margin.value(margin.top)},
         "largest_why": margin.top_why,
     }
-    for name, each in found.items():
+    for name, each in margin.found.items():
         document |= _entries(name, each, margin)
     if large := margin.large_step(document["stable_up_to"]):
         document["large_step"] = large
@@ -300,7 +297,7 @@ def describe(margin: Margin, found: Mapping[str, ValueRange | None]) -> dict[str
 
 
 def _entries(name: str, found: ValueRange | None, margin: Margin) -> dict[str, Any]:
-    """Return the part of the document about one question; `found` is None if it is not asked."""
+    """Return the part of the document about one question."""
     if found is None:
         return {f"{name}_up_to": None, f"{name}_trials": []}
     elsewhere = [[margin.value(a), margin.value(b)] for a, b in found.elsewhere]
@@ -317,11 +314,9 @@ def _entries(name: str, found: ValueRange | None, margin: Margin) -> dict[str, A
 # The result in words.
 
 
-def as_text(
-    document: Mapping[str, Any], found: Mapping[str, ValueRange | None], margin: Margin
-) -> str:
-    """Format the result `document` of `margin`, and the ranges found for each question."""
-    lines = [_in_words(name, each, margin) for name, each in found.items()]
+def as_text(document: Mapping[str, Any], margin: Margin) -> str:
+    """Format the result of `describe`, and the ranges found for each question."""
+    lines = [_in_words(name, each, margin) for name, each in margin.found.items()]
     if "large_step" in document:
         lines.insert(1, _large(document["large_step"]))
     return "\n".join(lines)

@@ -72,7 +72,6 @@ class Track(NamedTuple):
     positions: Array  # true position of the base [m], world frame, shape (n, 3)
     step_ns: int  # time of the step [ns], world's clock
     speed_limited: float  # share of the commands after the step that the speed cap shortened [1]
-    fault: str  # first failure of a plug-in, in words; "" if there was none
     problem: tuple[str, str] | None  # code and text of why the response is not known
 
 
@@ -104,8 +103,6 @@ def _fly_step(experiment: ResolvedExperiment, size: float) -> Answer:
     if problem := stepped.problem or still.problem:
         return {"stable": False, "code": problem[0], "text": problem[1]}
     answer = judge(response(stepped, still, step), stepped.step_ns, window, size)
-    if stepped.fault and not answer["stable"]:
-        answer |= {"code": "plugin_failed", "text": stepped.fault}
     return answer | {"speed_limited": stepped.speed_limited}
 
 
@@ -156,25 +153,9 @@ def _track(recording: Recording) -> Track:
     reached = mission["stamp_ns"][mission["event"] == "reached"]
     step_ns = int(reached[0]) if len(reached) else 0
     commands = int((recording["/cmd_vel"]["stamp_ns"] > step_ns).sum())
-    faults = recording["/fault"]
-    texts = [
-        text
-        for code, text in zip(faults["code"], faults["text"], strict=True)
-        if code.endswith("_failed")
-    ]
-    return Track(
-        truth["stamp_ns"],
-        truth["position"],
-        step_ns,
-        _limited(recording, step_ns) / max(commands, 1),
-        texts[0] if texts else "",
-        _problem(recording, step_ns),
-    )
-
-
-def _limited(recording: Recording, since_ns: int) -> float:
-    """Return how many commands after `since_ns` [ns] the guard's speed cap shortened."""
-    return growth(recording, "limited_speed", (since_ns, END_NS)) or 0.0
+    limited = (growth(recording, "limited_speed", (step_ns, END_NS)) or 0.0) / max(commands, 1)
+    problem = _problem(recording, step_ns)
+    return Track(truth["stamp_ns"], truth["position"], step_ns, limited, problem)
 
 
 def _problem(recording: Recording, step_ns: int) -> tuple[str, str] | None:
@@ -184,13 +165,9 @@ def _problem(recording: Recording, step_ns: int) -> tuple[str, str] | None:
     guard, mission = recording["/guard"], recording["/mission"]
     if not (guard["state"] == GuardState.TRACK).any():
         return "not_started", NOT_STARTED
-    if not len(mission["event"]) or mission["event"][-1] != "done":
-        code, text = (
-            ("not_ended", "")
-            if not len(mission["event"])
-            else (mission["event"][-1], mission["text"][-1])
-        )
-        return str(code), f"the flight ended early: {text or guard['cause'][-1]}"
+    events, texts = ["not_ended", *mission["event"]], ["", *mission["text"]]
+    if events[-1] != "done":
+        return events[-1], f"the flight ended early: {texts[-1] or guard['cause'][-1]}"
     end_ns = int(mission["stamp_ns"][-1])
     begins = np.clip(guard["stamp_ns"], step_ns, end_ns)
     lasts = np.diff(begins, append=end_ns)

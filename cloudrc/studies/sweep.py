@@ -5,8 +5,6 @@ docs/sweeps.md describes the files.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import logging
 from collections import Counter
@@ -18,16 +16,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from cloudrc import files, source
+from cloudrc import source
 from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, to_one_line
 from cloudrc.files import write_atomically
 from cloudrc.outside.document import read_document, write_yaml
 from cloudrc.runs.fly import fly
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.lock import LOCK, lock_folder
-from cloudrc.text import table
-from cloudrc.trials.fingerprint import experiment_facts
-from cloudrc.trials.plan import PlannedFlight, SweepPlan, find_flight, read_draft
+from cloudrc.text import csv_table, table
+from cloudrc.trials.plan import PlannedFlight, SweepPlan, read_plan
 from cloudrc.trials.rows import Row, Rows, read_rows
 from cloudrc.trials.summary import count_verdicts
 from cloudrc.trials.workers import map_in_order, take_each
@@ -37,10 +34,6 @@ FILE, SUMMARY = "sweep.yaml", "sweep.json"
 TABLE, PARQUET = "table.csv", "table.parquet"
 NUMBERS = {int, float, type(None)}
 """Types of the values of an axis of numbers; None is the value null."""
-SUMMARY_MAX = 1 << 26
-"""Largest length of the file SUMMARY [bytes]."""
-NAMED_MAX = 3
-"""Largest number of changed files that an error names."""
 Shard: TypeAlias = tuple[int, int] | None
 """Number of a part of the flights, from 1, and how many parts there are; None: all flights."""
 
@@ -104,11 +97,8 @@ def describe_changes(folder: Path, own_files: Mapping[str, str]) -> str:
 
     Without a summary, nothing is known.
     """
-    if not (folder / SUMMARY).exists():
-        return ""
-    before = read_summary(folder)["files"]
+    before = read_summary(folder)["files"] if (folder / SUMMARY).exists() else {}
     changed = [path for path, each in own_files.items() if before.get(path, each) != each]
-    changed[NAMED_MAX:] = [f"{len(changed) - NAMED_MAX} more"] if changed[NAMED_MAX:] else []
     return f"changed since its flights: {', '.join(changed)}" if changed else ""
 
 
@@ -146,8 +136,8 @@ def _write_summary(folder: Path, plan: SweepPlan, rows: Rows) -> None:
 def read_summary(folder: Path) -> dict[str, Any]:
     """Read the description of a sweep; raise a BadInputError if `folder` is not that of a sweep."""
     try:
-        found: dict[str, Any] = json.loads(files.read(folder / SUMMARY, SUMMARY_MAX))
-        return {"files": {}, **{key: found[key] for key in ("axes", "flights", "units")}, **found}
+        found: dict[str, Any] = json.loads((folder / SUMMARY).read_bytes())
+        return {**{key: found[key] for key in ("axes", "flights", "units", "files")}, **found}
     except (OSError, ValueError, LookupError, TypeError):
         text = "is not a folder of 'cloudrc sweep run'; name one"
         raise BadInputError(f"{folder}: {text}") from None
@@ -156,10 +146,8 @@ def read_summary(folder: Path) -> dict[str, Any]:
 def as_csv(columns: Mapping[str, Sequence[Any]], unit_of: Mapping[str, str]) -> str:
     """Format columns of equal length as CSV; the first line has names, and units in brackets."""
     head = [f"{name} [{unit_of[name]}]" if name in unit_of else name for name in columns]
-    text = io.StringIO()
-    cells = [head, *zip(*columns.values(), strict=True)]
-    csv.writer(text, lineterminator="\n").writerows(cells)
-    return text.getvalue()
+    rows = zip(*columns.values(), strict=True)
+    return csv_table([dict(zip(head, row, strict=True)) for row in rows]) + "\n"
 
 
 def columns_of(rows: list[Row], plan: SweepPlan) -> dict[str, list[Any]]:
@@ -229,17 +217,16 @@ def find_row(folder: Path, begin: str) -> tuple[Row, PlannedFlight]:
         BadInputError: If no row, or more than one, has such a key; or if the flight would be
             another one, because code or files have changed.
     """
-    rows = [row for key, row in read_rows(folder).items() if key.startswith(begin)]
-    if len(rows) != 1:
-        text = f"{len(rows)} rows have a key that begins like this; give one key"
+    rows = Rows(folder)
+    found = [row for key, row in rows.kept.items() if key.startswith(begin)]
+    if len(found) != 1:
+        text = f"{len(found)} rows have a key that begins like this; give one key"
         raise BadInputError(f"{folder}: {begin}: {text}")
-    row = rows[0]
-    flight = find_flight(read_draft(folder / FILE), row["point"], row["seed"])
-    if flight is None or flight.key != row["key"]:
-        why = f"was flown by code {row.get('code')}, this is code {source.code_hash()}"
-        if row.get("code") == source.code_hash():
-            why = describe_changes(folder, experiment_facts(flight.resolved)[-1] if flight else {})
-            why = why or "the experiment or an installed plug-in has changed since"
+    (row,) = found
+    plan = read_plan(folder / FILE)
+    flight = plan.flights.get(row["key"])
+    if flight is None:
+        why = _why_others(folder, plan, rows)
         raise BadInputError(f"{row['key']}: {why}; fly the sweep again")
     return row, flight
 

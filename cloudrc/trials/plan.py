@@ -192,15 +192,6 @@ def check(draft: Draft) -> SweepPlan:
     return SweepPlan(draft, points, flights, flight.units(own_metrics), own_files)
 
 
-def find_flight(draft: Draft, point: Mapping[str, Any], seed: int) -> PlannedFlight | None:
-    """Return one flight of a draft, without checking the others; None if there is none."""
-    for each, entries in draft.points():
-        if each == point and seed in draft.seeds:
-            resolved = draft.resolve(entries)
-            return PlannedFlight(fingerprint(experiment_facts(resolved)), each, seed, resolved)
-    return None
-
-
 def draft_of(
     experiment: str,
     settings: Iterable[str],

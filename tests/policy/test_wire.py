@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 import urllib.request
-from contextlib import suppress
 
 import msgpack
 import numpy as np
@@ -14,11 +13,9 @@ import pytest
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import connect
 
-from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.policy.client import PolicyClient, PolicyServerError, SilentServerError
 from cloudrc.policy.load import LoadedPolicy
-from tests.conftest import wait_until
 from tests.policy.conftest import actions, serving, stock_like
 
 STATE = {"state": np.arange(3.0)}
@@ -251,55 +248,3 @@ def infer(observation):
         words = [python, "-c", STOCK, url.rpartition(":")[2]]
         done = subprocess.run(words, capture_output=True, text=True)
     assert done.stdout == "passed\n", done.stderr
-
-
-STOCK_SERVER = """
-import sys
-import numpy as np
-from openpi_client.base_policy import BasePolicy
-from openpi_server import WebsocketPolicyServer
-
-class Policy(BasePolicy):
-    def infer(self, obs):
-        assert obs["image"].dtype == np.uint8 and obs["image"].shape == (224, 224, 3)
-        return {"actions": np.tile(obs["state"], (2, 1)), "prompt": obs["prompt"]}
-
-    def reset(self):
-        pass
-
-WebsocketPolicyServer(Policy(), "127.0.0.1", int(sys.argv[1]), {"robot": "arm"}).serve_forever()
-"""
-
-
-def listens(port):
-    with suppress(OSError), socket.create_connection(("127.0.0.1", port)):
-        return True
-    return False
-
-
-@pytest.mark.full
-def test_our_client_asks_the_stock_server_of_openpi(stock):
-    """The package's server is the file of openpi's repository, byte by byte."""
-    (port,) = free_ports(1)
-    words = [stock("openpi-server==0.1.0", "openpi-client==0.1.2"), "-c", STOCK_SERVER, str(port)]
-    server = subprocess.Popen(words, stderr=subprocess.DEVNULL)
-    observation = {
-        "image": np.full((224, 224, 3), 7, np.uint8),
-        "state": np.arange(3, dtype="f4"),
-        "prompt": "go",
-    }
-    try:
-        wait_until(lambda: listens(port), 30.0)
-        with PolicyClient(f"ws://127.0.0.1:{port}") as client:
-            assert client.metadata == {"robot": "arm"}
-            for _ in range(2):
-                answer = client.infer(observation)
-                assert answer["actions"].tolist() == [[0, 1, 2]] * 2
-                assert answer["prompt"] == "go"
-            with pytest.raises(PolicyServerError, match="KeyError"):
-                client.infer({})
-        with PolicyClient(f"ws://127.0.0.1:{port}") as client:  # the server goes on
-            assert client.infer(observation)["prompt"] == "go"
-    finally:
-        server.terminate()
-        server.wait()

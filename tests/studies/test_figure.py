@@ -24,7 +24,7 @@ def sweep(folder, rows=None):
         for n, (d, p, g, seed) in enumerate(points)
     ]
     folder.mkdir()
-    summary = {"axes": AXES, "units": UNITS, "flights": 24}
+    summary = {"axes": AXES, "units": UNITS, "flights": 24, "files": {}}
     (folder / "sweep.json").write_text(json.dumps(summary))
     (folder / "rows.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines[:rows]))
     return folder

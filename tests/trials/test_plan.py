@@ -14,7 +14,7 @@ from cloudrc.config import load, overrides, scene
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import SCENES
 from cloudrc.outside import document
-from cloudrc.trials.plan import find_flight, pack, read_draft, read_plan, unpack
+from cloudrc.trials.plan import pack, read_plan, unpack
 from tests.support.sweeps import SHORT
 
 
@@ -138,13 +138,6 @@ def test_the_flights_are_the_same_in_a_pod(flights, tmp_path, some):
     assert unpack(tmp_path / "flights") == flights[some]
 
 
-def test_flights_of_other_code_are_refused(flights, tmp_path, monkeypatch):
-    (tmp_path / "flights").write_bytes(pack(flights))
-    monkeypatch.setattr("cloudrc.source.code_hash", lambda: "0123456789abcdef")
-    with pytest.raises(BadInputError, match=r"come from other code .*0123456789abcdef"):
-        unpack(tmp_path / "flights")
-
-
 def test_what_points_share_is_read_and_checked_once(write_sweep, tmp_path, monkeypatch):
     """A sweep of 2,000 points took 25 s: each point parsed files, and flew its mission in mind."""
     counts = Counter()
@@ -163,16 +156,6 @@ def test_what_points_share_is_read_and_checked_once(write_sweep, tmp_path, monke
     assert len(sweep.points) == 40
     # The sweep, the experiment, the mission, the profile and the robot; three plug-ins.
     assert counts == {"parse_yaml": 5, "check_mission": 1, "load_scene": 1, "parameter_model": 3}
-
-
-def test_one_flight_is_read_without_the_others(write_sweep):
-    path = write_sweep(seeds=2)
-    draft, flights = read_draft(path), read_plan(path).flights
-    for flight in flights.values():
-        assert find_flight(draft, flight.point, flight.seed) == flight
-    point = next(iter(flights.values())).point
-    for other, seed in ((point, 3), ({}, 1), (point | {"cloud.predictor": "kalman"}, 1)):
-        assert find_flight(draft, other, seed) is None
 
 
 OTHER = gzip.compress(b'{"points": [[{}, {}]]}', mtime=0)
