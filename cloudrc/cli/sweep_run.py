@@ -29,7 +29,7 @@ from cloudrc.runs.experiment import check_mode
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.studies import sweep
-from cloudrc.studies.pods import PodSettings, fly_in_pods
+from cloudrc.studies.pods import fly_in_pods
 from cloudrc.text import escape
 from cloudrc.trials import summary as summaries
 from cloudrc.trials.plan import PlannedFlight, SweepPlan, check, draft_of, read_draft, unpack
@@ -186,6 +186,8 @@ def draw_figure(options: argparse.Namespace) -> int:
 def _fly_in_pods(
     options: argparse.Namespace, plan: SweepPlan, flights: Sequence[PlannedFlight]
 ) -> Generator[Row]:
+    from cloudrc.cluster.batch import PodSettings
+
     pods = PodSettings(options.shards, options.image, options.cpu, options.queue)
 
     def tell(text: str) -> None:

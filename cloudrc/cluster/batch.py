@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.cluster.jobs import (
@@ -34,26 +34,25 @@ OUT_OF_MEMORY = (
 """How a pod has ended whose flight needs too much memory."""
 
 
-def start(
-    release: Release,
-    name: str,
-    flights: bytes,
-    shards: int,
-    *,
-    image: str | None,
-    cpu: str,
-    queue: str | None,
-) -> None:
-    """Create the Job `name` with `shards` pods that fly `flights`.
+class PodSettings(NamedTuple):
+    """The pods that a sweep asks for."""
 
-    A failed Job of this name is replaced; a Job that runs or is complete stays as it is. `flights`
-    is a file made by `sweep.plan.pack`, `image` an image with the simulator (None: the image of the
-    chart's example), `cpu` the CPU request of a pod, and `queue` a queue of Kueue. The Job belongs
-    to no Helm release.
+    shards: int  # number of pods
+    image: str | None  # with the simulator; None: that of the chart's example
+    cpu: str  # CPU request of a pod, such as "500m"
+    queue: str | None = None  # of Kueue
+
+
+def start(release: Release, name: str, flights: bytes, settings: PodSettings) -> None:
+    """Create the Job `name` whose pods fly `flights`, a file made by `trials.plan.pack`.
+
+    A failed Job of this name is replaced; a Job that runs or is complete stays as it is. The Job
+    belongs to no Helm release.
 
     Raises:
         ClusterError: If the cluster refuses the Job, for example because the sweep is too large.
     """
+    shards, image, cpu, queue = settings
     if (earlier := find_job(release, name)) is not None:
         if not failure_of(earlier):  # flies, or is complete
             return

@@ -74,15 +74,14 @@ class Release:
     namespace: str | None  # None (with kubectl only): that of the context
     name: str  # of the Helm release
 
+    def __str__(self) -> str:
+        return f"release '{self.name}' {self.where}"
+
     @property
     def where(self) -> str:
         """Namespace and context as a phrase for messages."""
-        return f"in namespace '{self.namespace}'{self.of_context}"
-
-    @property
-    def of_context(self) -> str:
-        """Context as the end of a phrase for messages; "" for the current one."""
-        return f" of context '{self.context}'" if self.context else ""
+        context = f" of context '{self.context}'" if self.context else ""
+        return f"in namespace '{self.namespace}'{context}"
 
     @property
     def flags(self) -> list[str]:
@@ -140,7 +139,7 @@ class Release:
         scope, where = {"namespace": self.namespace}, self.where
         method = f"{'read' if verb == 'get' else verb}_namespaced_{noun}"
         if verb == "list all":
-            scope, where = {}, f"in all namespaces{self.of_context}"
+            scope, where = {}, "in all namespaces"
             method = f"list_{noun}_for_all_namespaces"
         elif kind in ("namespaces", "nodes", "selfsubjectaccessreviews"):
             scope, method = {}, method.replace("_namespaced", "")

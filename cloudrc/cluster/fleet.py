@@ -9,7 +9,7 @@ from functools import partial
 
 from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.cluster.missions import release_api
-from cloudrc.cluster.releases import look, namespace_exists, no_release
+from cloudrc.cluster.releases import look
 from cloudrc.errors import CloudrcError
 from cloudrc.text import table
 
@@ -25,7 +25,7 @@ def list_releases(
     """Describe the releases in the namespace of `here`, or in all namespaces.
 
     `tell` receives a note if only that namespace may be listed, and why a mission is not known.
-    Raise a ClusterError if the releases may not be listed, or if the namespace does not exist.
+    Raise a ClusterError if the releases may not be listed,.
     """
     try:
         found = look(here, everywhere=everywhere)
@@ -34,8 +34,6 @@ def list_releases(
             raise
         tell(f"only the releases {here.where}: {error}")
         found = look(here, everywhere=False)
-    if not (found or everywhere or namespace_exists(here)):
-        raise no_release(here, f"no namespace '{here.namespace}'{here.of_context}")
     places = [replace(here, namespace=each["namespace"], name=each["name"]) for each in found]
     with ThreadPoolExecutor(AT_ONCE) as pool:
         missions = pool.map(partial(_mission_of, tell=tell), places)
@@ -56,7 +54,7 @@ def _mission_of(release: Release, tell: Callable[[str], None]) -> str:
         with release_api(release) as api:
             mission = api.get("/v1/state")["mission"]
     except CloudrcError as error:
-        tell(f"release '{release.name}' {release.where}: {error}")
+        tell(f"{release}: {error}")
         return UNKNOWN
     if mission is None:
         return "-"

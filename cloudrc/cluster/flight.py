@@ -97,7 +97,7 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
             raise ClusterError(f"{fatal}; {see}")
         if now > until:
             raise TimedOutError(
-                f"release '{release.name}' is not ready after {timeout:g} s: {words}; "
+                f"{release} is not ready after {timeout:g} s: {words}; "
                 f"{see}, or wait longer: --timeout"
             )
         if not fatal and words != last:  # what is fatal becomes an error
@@ -150,18 +150,17 @@ def check_can_begin(release: Release) -> None:
     """
     for name in ("helm", "kubectl"):
         program(name)
+    busy, end = "", ""
     for job in release.find("jobs", "mission"):
         if failure_of(job) is None:
-            name, end = job.metadata.name, f"{release.kubectl} delete job"
-            raise ClusterError(
-                f"Job '{name}' is under way on release '{release.name}' {release.where}; wait for "
-                f"it, end it: {end} {name}, or fly on a release of your own: --release NAME"
-            )
-    if mission := _ask(release, lambda api: api.get("/v1/state")["mission"]):
-        cancel = _cancel_command(release, mission["id"])
+            name = job.metadata.name
+            busy, end = f"Job '{name}'", f"{release.kubectl} delete job {name}"
+    if not busy and (mission := _ask(release, lambda api: api.get("/v1/state")["mission"])):
+        busy, end = f"mission {mission['id']}", _cancel_command(release, mission["id"])
+    if busy:
         raise ClusterError(
-            f"mission {mission['id']} is under way on release '{release.name}' {release.where}; "
-            f"wait for it, end it: {cancel}, or fly on a release of your own: --release NAME"
+            f"{busy} is under way on {release}; wait for it, end it: {end}, or fly on a release of "
+            "your own: --release NAME"
         )
 
 
@@ -174,7 +173,7 @@ def begin_job(
     """
     wait_ready(release, timeout=timeout, tell=tell)
     job = run_job(release, mission, queue=queue)
-    tell(f"Job {job} on release '{release.name}' in namespace '{release.namespace}'")
+    tell(f"Job {job} on {release}")
     return job
 
 
@@ -248,7 +247,7 @@ def fly_in_cluster(
         install(release, chart_values(experiment, current_values(release), own), timeout, tell)
         give_to_release(release, own)
         took = time.monotonic() - began
-        tell(f"release '{release.name}' {release.where} is ready after {took:.0f} s")
+        tell(f"{release} is ready after {took:.0f} s")
         interrupted = not _fly(experiment, release, tell)
     except (CloudrcError, KeyboardInterrupt):
         folder.rmdir()  # nothing has flown

@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, run
-from cloudrc.cluster.releases import INSTANCE, several_releases
+from cloudrc.cluster.releases import INSTANCE, no_release, several_releases
 from cloudrc.config.link_edit import Edit, edit_profile
 from cloudrc.config.load import load_link
 from cloudrc.config.profile import DIRECTIONS, FILE_READERS
@@ -67,13 +67,10 @@ def read_link(release: Release) -> LinkParts:
         raise several_releases(release, list(names))
     release = replace(release, name=next(iter(names), release.name))
     if not maps:
-        raise ClusterError(
-            f"release '{release.name}' has no link to change; is it a release of cloudrc? see: "
-            "helm list --all-namespaces"
-        )
+        raise no_release(release)
     pods = _running_pods(found)
     if not pods.keys() >= set(COMPONENTS):
-        raise ClusterError(f"a pod of release '{release.name}' {release.where} does not run")
+        raise ClusterError(f"a pod of {release} does not run")
     experiments = [each["data"] for each in found if EXPERIMENT in each.get("data", {})]
     files = {EXPERIMENT: "{}", **(experiments[0] if experiments else {}), **maps[0]["data"]}
     return LinkParts(release.name, maps[0]["metadata"]["name"], files, pods)

@@ -18,10 +18,9 @@ def release_api(release: Release, token: Callable[[], str] | None = None) -> Ite
     `token` returns the API's token; by default it comes from the release's Secret.
     """
     known = operator_token(release) if token is None else ""
-    place = f"release '{release.name}' {release.where}"
     pod = find_pod(release, "cloud").metadata.name
     with forwarded(release, pod, [API_PORT]) as ports:
-        yield Api(f"http://127.0.0.1:{ports[API_PORT]}", token or (lambda: known), place)
+        yield Api(f"http://127.0.0.1:{ports[API_PORT]}", token or (lambda: known), str(release))
 
 
 def settle_mission(release: Release, key: str, why: str) -> tuple[str, int]:

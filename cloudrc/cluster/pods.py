@@ -77,7 +77,7 @@ def find_pod(release: Release, component: str) -> Any:
     name = find_deployment(release, component).metadata.name
     why = (pod_failure(pods[0]) or f"it is {pods[0].status.phase}") if pods else "there is none"
     raise ClusterError(
-        f"the {component} pod of release '{release.name}' {release.where} does not run: {why}; "
+        f"the {component} pod of {release} does not run: {why}; "
         f"see: {release.kubectl} describe deployment {name}"
     )
 
@@ -217,7 +217,7 @@ def follow_page(release: Release, port: int, tell: Callable[[str], None]) -> Ite
     pod = find_pod(release, "cloud")
     if CONSOLE not in {container.name for container in pod.spec.containers}:
         raise ClusterError(
-            f"release '{release.name}' {release.where} has no console; add it: helm upgrade "
+            f"{release} has no console; add it: helm upgrade "
             f"{release.name} charts/cloudrc {' '.join(release.helm_flags)} --reuse-values "
             "--set console.enabled=true"
         )

@@ -13,7 +13,6 @@ import yaml
 from cloudrc.cluster.client import (
     DEFAULT_RELEASE,
     ClusterError,
-    NotFoundError,
     Release,
     connect,
 )
@@ -141,19 +140,8 @@ def no_release(release: Release, what: str = "") -> ClusterError:
 
     `what` is the beginning of its text, by default "no release 'NAME' in namespace ...".
     """
-    what = what or f"no release '{release.name}' {release.where}"
+    what = what or f"no {release}"
     return ClusterError(
         f"{what}; see all: helm list --all-namespaces; name one: --release NAME -n NAMESPACE, or "
         "install it: helm install"
     )
-
-
-def namespace_exists(release: Release) -> bool:
-    """Return False if the namespace certainly does not exist; many users may not ask for it."""
-    try:
-        release.request("get", "namespaces", name=release.namespace)
-    except NotFoundError:
-        return False
-    except ClusterError:
-        pass
-    return True

@@ -191,7 +191,7 @@ class Exporter:
         pages = {"/metrics": self._page, "/healthz": self._liveness, "/readyz": self._readiness}
         end, link = self._live.end, self._live.link
         if end is not None:
-            pages["/link.json"] = lambda: Answer(200, end.check.text(), "application/json")
+            pages["/link.json"] = lambda: Answer(200, end.link_text(), "application/json")
         if link is not None:
             pages["/link.json"] = lambda: Answer(200, link.tell(), "application/json")
         try:

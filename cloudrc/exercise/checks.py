@@ -185,15 +185,5 @@ def _explain(error: BaseException, folder: Path, part: str) -> str:
     if places:
         text = f"{places[-1][0]}:{places[-1][1]}: {text}"
     elif not isinstance(error, PlacedError):
-        text = f"{_find_method(folder, part)}: {text}"
+        text = f"{FILES[part]}: {text}"
     return text.replace(f"{folder}{os.sep}", "")
-
-
-def _find_method(folder: Path, part: str) -> str:
-    """Return FILE:LINE of the method that gives the result of a part; FILE if there is none."""
-    name, path = FILES[part], folder / FILES[part]
-    if not path.is_file():
-        return name
-    text = path.read_text(errors="replace")
-    before, found, _ = text.partition(f"def {plugins.METHODS[f'{part}s']}(")
-    return f"{name}:{before.count(chr(10)) + 1}" if found else name

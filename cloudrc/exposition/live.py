@@ -54,37 +54,6 @@ ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total"
 """Metrics that only relay or only netem has; without a count they are left out."""
 
 
-class LinkVerdict:
-    """Newest verdict on whether the link's direction to this process matches its profile."""
-
-    def __init__(self, direction: str, values: Values) -> None:
-        """Set the direction, "uplink" or "downlink"; before a check the verdict is "open"."""
-        self._direction, self._values = direction, values
-        self._newest: tuple[LinkChecked, ...] = ()
-
-    def _on_linkchecked(self, record: LinkChecked) -> None:
-        """Store the verdict on one quantity, and drop verdicts of earlier checks."""
-        newest = [one for one in self._newest if one.stamp_ns == record.stamp_ns]
-        self._newest = (*newest, record)  # a new tuple: another thread may read the old one
-        believed = {"ok": 1.0, "off": 0.0}.get(self.verdict, nan)
-        self._values["cloudrc_link_believed"] = {self._direction: believed}
-
-    @property
-    def verdict(self) -> str:
-        """Verdict on the link: "ok", "off" (not as in its profile), "open" (not decided yet)."""
-        verdicts = {record.verdict for record in self._newest} - {"told"}
-        return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"
-
-    def text(self) -> str:
-        """Return the content of /link.json: the verdict on the link, and a row per quantity."""
-        rows = [record._asdict() for record in self._newest]
-        for row in rows:  # fields that are equal in all rows
-            del row["stamp_ns"], row["uplink"]
-        known = [{key: value for key, value in row.items() if value == value} for row in rows]
-        document = {"direction": self._direction, "verdict": self.verdict, "rows": known}
-        return json.dumps(document, indent=2) + "\n"
-
-
 CLOCK_SET = "wall_clock"
 """Fault code for a step of the wall clock."""
 SILENCE_NS = 2_000_000_000
@@ -105,7 +74,7 @@ class End:
         for name in ("expected", "lost", "reordered"):
             values[f"cloudrc_datagrams_{name}_total"] = {self._incoming: 0}
         values["cloudrc_session_epoch"] = 0
-        self.check = LinkVerdict(self._incoming, values)
+        self._checked: tuple[LinkChecked, ...] = ()  # the newest verdict on each quantity
         self._opened_ns = NEVER_NS
         self._arrival_ns = self._woke_ns = self._deadline_ns = NEVER_NS
         self._silent = True  # whether no telemetry or command has arrived in this session
@@ -116,6 +85,28 @@ class End:
     def has_peer(self) -> bool:
         """Whether a session began or a new datagram of the peer arrived in the last 2 s."""
         return self._opened_ns != NEVER_NS and self._woke_ns - self._arrival_ns < SILENCE_NS
+
+    @property
+    def link_verdict(self) -> str:
+        """Verdict on the incoming link: "ok", "off" (not as in its profile), "open" (undecided)."""
+        verdicts = {record.verdict for record in self._checked} - {"told"}
+        return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"
+
+    def link_text(self) -> str:
+        """Return the content of /link.json: the verdict on the link, and a row per quantity."""
+        rows = [record._asdict() for record in self._checked]
+        for row in rows:  # fields that are equal in all rows
+            del row["stamp_ns"], row["uplink"]
+        known = [{key: value for key, value in row.items() if value == value} for row in rows]
+        document = {"direction": self._incoming, "verdict": self.link_verdict, "rows": known}
+        return json.dumps(document, indent=2) + "\n"
+
+    def _on_linkchecked(self, record: LinkChecked) -> None:
+        """Store the verdict on one quantity, and drop verdicts of earlier checks."""
+        newest = [one for one in self._checked if one.stamp_ns == record.stamp_ns]
+        self._checked = (*newest, record)  # a new tuple: another thread may read the old one
+        believed = {"ok": 1.0, "off": 0.0}.get(self.link_verdict, nan)
+        self._values["cloudrc_link_believed"] = {self._incoming: believed}
 
     def _observe(self, name: str, seconds: float) -> None:
         self._values[f"cloudrc_{name}_seconds"].observe(seconds)
@@ -376,14 +367,13 @@ def _places(metrics: Iterable[LiveMetric], values: Values) -> dict[str, list[tup
     return places
 
 
-def _handlers(*parts: Any) -> dict[type, Callable[[Any], None]]:
-    """Map classes of records to methods: `_on_NAME` of a part handles those of the class NAME."""
-    return {
-        kind: getattr(part, name)
-        for part in parts
-        for kind in get_args(Record)
-        if hasattr(part, name := f"_on_{kind.__name__.lower()}")
-    }
+PARTS = {
+    table.WORLD: WorldEnd,
+    table.CLOUD: CloudEnd,
+    table.TELEOP: MissionMetrics,
+    table.LINK: LinkMetrics,
+}
+"""Role of a process -> what handles its records: method `_on_NAME` those of the class NAME."""
 
 
 class LiveMetrics:
@@ -395,12 +385,14 @@ class LiveMetrics:
         metrics = [metric for metric in of_role(role) if metric.roles != table.ROLES]
         # It has a key per metric from now on: another thread may read it at any time.
         self._values = values = {metric.name: _beginning(metric) for metric in metrics}
-        ends: dict[str, type[WorldEnd | CloudEnd]] = {table.WORLD: WorldEnd, table.CLOUD: CloudEnd}
-        self.end: End | None = ends[role](values) if role in ends else None
-        self.link = LinkMetrics(values) if role == table.LINK else None
-        mission = MissionMetrics(values) if role == table.TELEOP else None
+        part = PARTS[role](values)
+        self.end = part if isinstance(part, End) else None
+        self.link = part if isinstance(part, LinkMetrics) else None
         self._places = _places(metrics, values)
-        self._handlers = _handlers(self, self.end, self.end and self.end.check, mission)
+        self._handlers: dict[type, Callable[[Any], None]] = {Counted: self._on_counted}
+        for kind in get_args(Record):
+            if handle := getattr(part, f"_on_{kind.__name__.lower()}", None):
+                self._handlers[kind] = handle
         self._gauges = defaultdict[type, list[tuple[str, Callable[[Any], Any]]]](list)
         for quantity in QUANTITIES:
             if (name := quantity.live.partition("[")[0]) in values:

@@ -13,15 +13,9 @@ from gymnasium import spaces
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import RESULT, InvalidValueError, shorten, to_arrays
 
-_PLAIN = (int, float, bool, str, np.generic, type(None))
-
 
 def copied(value: Any) -> Any:
     """Return a copy that no one else changes."""
-    if type(value) is np.ndarray:
-        return value.copy()
-    if isinstance(value, _PLAIN):
-        return value
     if type(value) is dict:
         return {key: copied(each) for key, each in value.items()}
     if type(value) is tuple:

@@ -4,21 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Generator, Sequence
-from typing import NamedTuple
 
 from cloudrc.cluster import batch
+from cloudrc.cluster.batch import PodSettings
 from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.trials.plan import PlannedFlight, SweepPlan, pack
 from cloudrc.trials.rows import Row, parse_row
-
-
-class PodSettings(NamedTuple):
-    """The pods that a sweep asks for."""
-
-    shards: int  # number of pods
-    image: str | None  # with the simulator; None: that of the chart's example
-    cpu: str  # CPU request of a pod, such as "500m"
-    queue: str | None = None  # of Kueue
 
 
 def fly_in_pods(
@@ -37,15 +28,14 @@ def fly_in_pods(
     Raises:
         ClusterError: If a Job fails or yields no row, or if a pod will never run.
     """
-    shards, image, cpu, queue = settings
-    every = "".join(plan.flights).encode() + str(shards).encode()
+    every = "".join(plan.flights).encode() + str(settings.shards).encode()
     name = f"sweep-{hashlib.sha256(every).hexdigest()[:12]}"
     missing = {flight.key: flight for flight in flights}
     while missing:
         before = len(missing)
-        packed = pack(missing.values())
-        batch.start(release, name, packed, shards, image=image, cpu=cpu, queue=queue)
-        tell(f"Job '{name}' {release.where}, {shards} pods; it goes on without this command")
+        batch.start(release, name, pack(missing.values()), settings)
+        where = f"{release.where}, {settings.shards} pods"
+        tell(f"Job '{name}' {where}; it goes on without this command")
         for line in batch.read_lines(release, name, tell):
             row = parse_row(line)
             if row is not None and missing.pop(row["key"], None) is not None:

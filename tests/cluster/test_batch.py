@@ -7,17 +7,18 @@ import pytest
 
 from cloudrc import __version__
 from cloudrc.cluster import batch
+from cloudrc.cluster.batch import PodSettings
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import UID_LABEL
 from cloudrc.errors import BadInputError
 from tests.cluster.conftest import pod, terminated
 
-WORDS = {"image": "my/world:1", "cpu": "1", "queue": None}
+PODS = PodSettings(4, "my/world:1", "1")
 
 
 @pytest.fixture
 def started(api, release):
-    batch.start(release, "sweep-1", b"flights", 4, **WORDS)
+    batch.start(release, "sweep-1", b"flights", PODS)
     return api
 
 
@@ -48,7 +49,7 @@ def test_the_job_flies_each_index_with_its_flights(started, api, release):
     ]
     wanted = "sweep rows /flights/flights.json.gz --shard={}/4\n"
     assert [each.stdout for each in said] == [wanted.format(1), wanted.format(4)]
-    batch.start(release, "sweep-2", b"flights", 4, **{**WORDS, "image": None, "queue": "lab"})
+    batch.start(release, "sweep-2", b"flights", PODS._replace(image=None, queue="lab"))
     queued = api.get("jobs", "sweep-2")
     (container,) = queued["spec"]["template"]["spec"]["containers"]
     assert container["image"] == f"cloudrc/world:{__version__}", "the image of the chart's example"
@@ -59,10 +60,10 @@ def test_the_job_flies_each_index_with_its_flights(started, api, release):
 
 def test_a_running_job_is_kept_and_a_failed_job_is_replaced(started, api, release):
     first = api.get("jobs", "sweep-1")["metadata"]["uid"]
-    batch.start(release, "sweep-1", b"flights", 4, **WORDS)
+    batch.start(release, "sweep-1", b"flights", PODS)
     assert api.get("jobs", "sweep-1")["metadata"]["uid"] == first
     api.end("sweep-1", "Failed", reason="FailedIndexes", message="two")
-    batch.start(release, "sweep-1", b"flights", 4, **WORDS)
+    batch.start(release, "sweep-1", b"flights", PODS)
     assert api.get("jobs", "sweep-1")["metadata"]["uid"] != first
 
 
@@ -110,7 +111,7 @@ def test_pods_may_wait_for_a_node_but_not_for_an_image(started, api, release):
     add_pod(api, "a", "Pending", conditions=[waits])
     api.at_look(2, lambda: api.end("sweep-1", "Complete"))
     assert lines(release)[1] == ["waiting: no node takes it: 0/1 nodes: Insufficient cpu"]
-    batch.start(release, "sweep-1", b"flights", 4, **WORDS)
+    batch.start(release, "sweep-1", b"flights", PODS)
     add_pod(api, "b", "Pending", state={"waiting": {"reason": "ImagePullBackOff"}})
     with pytest.raises(ClusterError, match="cannot start"):
         lines(release)

@@ -45,9 +45,9 @@ def test_a_stub_scores_nothing_and_the_solution_all(part, folder, points):
             "return self.mean",
             "return 'x'",
             ALL["estimator"],
-            "delay_estimator.py:14: ",
+            "delay_estimator.py: ",
         ),
-        ("predictor", "p + v *", "p - v *", ["position", "steps"], "predictor.py:7: gives [0.95"),
+        ("predictor", "p + v *", "p - v *", ["position", "steps"], "predictor.py: gives [0.95"),
         ("predictor", "horizon):", "horizon)", ALL["predictor"], "predictor.py:7: SyntaxError: "),
         (
             "predictor",
@@ -56,8 +56,8 @@ def test_a_stub_scores_nothing_and_the_solution_all(part, folder, points):
             ALL["predictor"],
             "predictor.py: ValueError: build() returned StudentPredictor, which has no method",
         ),
-        ("controller", "np.subtract(", "-np.subtract(", ["P", "steps"], "controller.py:17: gives"),
-        ("controller", "np.clip(u, -limit, limit)", "u[:2]", ALL["controller"], "controller.py:17"),
+        ("controller", "np.subtract(", "-np.subtract(", ["P", "steps"], "controller.py: gives"),
+        ("controller", "np.clip(u, -limit, limit)", "u[:2]", ALL["controller"], "controller.py: "),
     ],
 )
 def test_an_error_costs_the_points_that_it_concerns(part, right, wrong, lost, said, tmp_path):

@@ -269,6 +269,6 @@ def test_the_newest_verdict_on_the_link_is_exposed():
         live.see([LinkChecked(stamp_ns, True, "mean", 0.04, math.nan, 0.03, 0.05, verdict, 900)])
         found = None if believed is None else {("uplink",): believed}
         assert live.read().get("cloudrc_link_believed") == found
-    document = json.loads(live.end.check.text())
+    document = json.loads(live.end.link_text())
     assert (document["verdict"], len(document["rows"])) == ("off", 2)
     assert "measured" not in document["rows"][0], "an unknown value is left out"
