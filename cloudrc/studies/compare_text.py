@@ -25,6 +25,7 @@ def as_text(document: Mapping[str, Any]) -> str:
         )
         for side in "ab"
     ]
+    failed = (each["a_failed"] or each["b_failed"] for each in document["numbers"].values())
     lines = [
         *(f"{side.upper()}: {document[side]}" for side in "ab"),
         f"of {document['of']}; pairs: {document['pairs']}"
@@ -35,7 +36,7 @@ def as_text(document: Mapping[str, Any]) -> str:
         f"p Holm = {success['p_holm']:.2g}",
         document["method"],
         by_chance(1 + len(document["numbers"])),
-        *([FAILED_NOTE] if any(_failed(entry) for entry in document["numbers"].values()) else []),
+        *([FAILED_NOTE] if any(failed) else []),
         *("", _answer(document)),
     ]
     return "\n".join(lines)
@@ -67,14 +68,6 @@ def lacking_text(entry: tuple[str, Mapping[str, int]]) -> str:
     return f"{who} {'have' if 'and' in who else 'has'} no {name}: {pairs} left out"
 
 
-def _failed(entry: Mapping[str, Any]) -> str:
-    """Return in words how many flights behind a number failed; "" if none did."""
-    failed = [
-        f"{entry[f'{side}_failed']} of {side.upper()}'s" for side in "ab" if entry[f"{side}_failed"]
-    ]
-    return f"{' and '.join(failed)} {entry['count']} flights failed" if failed else ""
-
-
 def _scaled(entry: Mapping[str, Any]) -> tuple[float, str]:
     return scale(entry["unit"], max(abs(entry["a_median"]), abs(entry["b_median"])))
 
@@ -101,7 +94,7 @@ def _answer(document: Mapping[str, Any]) -> str:
     p, count = f"p = {entry['p_wilcoxon']:.2g}", entry["count"]
     if not entry["decided"]:
         return (
-            f"{text}Undecided: {name} after {count} pairs, {p}; {_needed(entry)}.{_cautions(entry)}"
+            f"{text}Undecided: {name} after {count} pairs, {p}; {_needed(entry)}.{_caution(entry)}"
         )
     sign, word = (1, "higher") if entry["difference"] > 0 else (-1, "lower")
     factor, unit = _scaled(entry)
@@ -111,18 +104,15 @@ def _answer(document: Mapping[str, Any]) -> str:
     )
     return (
         f"{text}B has a {word} {name}: by {size}{unit and ' '}{unit} ({low} .. {high}), {p}, "
-        f"in {entry[word]} of {count} pairs.{_cautions(entry)}"
+        f"in {entry[word]} of {count} pairs.{_caution(entry)}"
     )
 
 
-def _cautions(entry: Mapping[str, Any]) -> str:
-    """Say what weakens the answer about a metric, each in a sentence after a space."""
-    text = ""
+def _caution(entry: Mapping[str, Any]) -> str:
+    """Say in a sentence, after a space, if the sign test does not confirm the answer."""
     if entry["decided"] and entry["p_sign"] >= LEVEL:
-        text += (
+        return (
             " This holds if the differences are symmetric; the sign test, which does not assume "
             f"it, does not confirm it (p = {entry['p_sign']:.2g})."
         )
-    if failed := _failed(entry):
-        text += f" {failed}, and their numbers count."
-    return text
+    return ""
