@@ -8,7 +8,7 @@ from cloudrc.cluster import jobs
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import delete_job, follow, run_job
 from cloudrc.errors import TimedOutError
-from tests.cluster.conftest import MISSION, TOKEN, terminated
+from tests.cluster.conftest import MISSION, TOKEN
 
 
 def pod_of(api, name):
@@ -32,28 +32,6 @@ def test_a_job_posts_the_mission_to_its_release(running, release):
     assert TOKEN not in str(job)
     run_job(release, MISSION, name="patient", queue=True)
     assert "--queue" in pod_of(running, "patient")["containers"][0]["args"]
-
-
-def test_follow_writes_each_line_once_and_returns_the_verdict(running, release):
-    run_job(release, MISSION, name="first")
-
-    def fly():
-        running.start_pod("first")
-        running.logs["first-x"] = "waypoint 1 of 2 reached\n"
-
-    def land():
-        running.start_pod("first", state=terminated(1, "the\nverdict"))
-        statuses = running.get("pods", "first-x")["status"]["containerStatuses"]
-        statuses.append({**statuses[0], "name": "mesh", "state": terminated(0, "bye")})
-        running.logs["first-x"] = "waypoint 1 of 2 reached\nwaypoint 2 of 2 reached\n"
-        running.end("first", "Failed")
-
-    running.at_look(2, fly)
-    running.at_look(5, land)
-    lines: list[str] = []
-    ended = follow(release, "first", lines.append)
-    assert lines == ["waypoint 1 of 2 reached", "waypoint 2 of 2 reached"]
-    assert ended == (1, "the verdict")
 
 
 def test_follow_ends_when_the_pod_cannot_run(running, release):

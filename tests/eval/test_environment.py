@@ -7,7 +7,6 @@ import gymnasium
 import pytest
 
 from cloudrc.cli.eval_values import read_compute
-from cloudrc.cli.main import main
 from cloudrc.eval.environment import environment_code
 from cloudrc.eval.episode import make_env
 from cloudrc.eval.setup import Episode, EvalSetup
@@ -115,11 +114,3 @@ def test_an_episode_of_a_robot_depends_on_the_files_of_its_experiment(tmp_path, 
     changed = {"mine.yaml": "guard: {speed_max_mps: 0.3}\n", "point.yaml": "description: hold\n"}
     (tmp_path / name).write_text(files[name] + changed.get(name, "# more\n"))
     assert key_of(setup) != before
-
-
-def test_a_folder_with_episodes_of_changed_files_gets_new_ones(folder):
-    words = ["eval", "--env", ENV, "--policy", "./law.py", "--seeds", "1", "--jobs", "1"]
-    for count in (2, 4):  # that without a network, too
-        assert main([*words, "--out", "out"]) == 0
-        assert len((folder / "out" / "rows.jsonl").read_text().splitlines()) == count
-        (folder / "libs/rewards.py").write_text("REWARD = 0.05\n")

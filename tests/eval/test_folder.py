@@ -1,7 +1,5 @@
 """Which folders an evaluation goes on with."""
 
-import pytest
-
 from cloudrc.cli.main import main
 
 LAW = "def infer(observation):\n    return {'actions': [[0]]}\n"
@@ -31,13 +29,3 @@ def test_a_folder_takes_no_episodes_of_another_environment_or_policy(tmp_path, c
     assert main([*first.split(), "--rtt", "10", "--link", "lte", "--executor", "broker"]) == 0
     rows = (out / "rows.jsonl").read_text().splitlines()
     assert len(rows) == 3  # that without a network is the same
-
-
-@pytest.mark.parametrize("content", ["x", '{"env": "CartPole-v1", "identity": 1}'])
-def test_a_file_that_is_not_of_an_evaluation_is_kept(content, tmp_path, capsys):
-    (tmp_path / "law.py").write_text(LAW)
-    (tmp_path / "eval.json").write_text(content)
-    line = f"eval --env CartPole-v1 --policy {tmp_path}/law.py --seeds 1 --out {tmp_path}"
-    assert main(line.split()) == 2
-    assert "its eval.json is of no evaluation" in capsys.readouterr().err
-    assert (tmp_path / "eval.json").read_text() == content

@@ -5,7 +5,6 @@ import json
 import pytest
 
 from cloudrc.eval.episode import play
-from cloudrc.eval.page import draw_outcomes
 from cloudrc.eval.setup import BASELINE, Episode, EvalSetup
 from tests.eval.test_eval import bare, run, stand
 
@@ -73,25 +72,3 @@ def test_the_page_has_figure_tests_notes_and_how_it_was_made(law, tmp_path, caps
         assert text in page
     assert [each["rtt_ms"] for each in document["tests"]] == [0.0, 200.0]
     assert [each["rtt_ms"] for each in document["outcomes"]] == [None, *[0.0, 200.0] * 2]
-
-
-def test_the_figure_has_the_baseline_in_each_panel_and_the_age_of_the_loop_along_x(monkeypatch):
-    kept = []
-    monkeypatch.setattr("cloudrc.report.figures.bands.save", lambda figure, _: kept.append(figure))
-    common = {"return": 1.0, "steps": 9.0, "stale_share": 0.5, "terminated_share": 0.0}
-    conditions = {BASELINE: (None, 0.0), "newest": (50.0, 71.0), "broker": (50.0, 90.0)}
-    draw_outcomes(
-        [
-            {"executor": name, "rtt_ms": rtt, "loop_age_ms": age, "action_age_ms": age, **common}
-            for name, (rtt, age) in conditions.items()
-        ]
-    )
-    assert kept[0].axes[-1].get_xlabel() == "age of the loop (ms)"
-    assert [axes.get_title("left") for axes in kept[0].axes][:2] == [
-        "(a) return",
-        "(b) length of an episode (steps)",
-    ]
-    for axes, value in zip(kept[0].axes, (1.0, 9.0, 0.0, 50.0, 0.0), strict=True):
-        lines = {line.get_label(): line for line in axes.get_lines()}
-        assert set(lines["no network"].get_ydata()) == {value}
-        assert list(lines["broker"].get_xdata()) == [90.0]

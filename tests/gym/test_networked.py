@@ -103,19 +103,6 @@ def test_without_an_answer_the_robot_repeats_its_action_or_executes_start():
     assert again == [1, 2, 9, 9, 5, 6]
 
 
-def test_ages_count_from_the_first_observation_that_has_crossed_the_link():
-    env = Networked(Counter(limit=30), both_ways(20, 30), start="answer")
-    env.reset()
-    for tick in range(30):
-        info = env.step(np.full(1, tick, np.float32))[4]
-    found = info["cloudrc"]["episode"]
-    assert (found["observation_age_mean"], found["observation_age_of"]) == (pytest.approx(0.02), 28)
-    assert (found["action_age_mean"], found["action_age_of"]) == (pytest.approx(0.05), 24)
-    assert found["loop_age"] == found["action_age_p99"] == pytest.approx(0.05)
-    assert env.summary(0.05)["late_share"] == 0.0
-    assert env.summary(0.049)["late_share"] == 1.0
-
-
 def test_the_end_of_an_episode_is_told_at_once_with_asked_against_measured():
     env = Networked(Counter(limit=400), SHAKY, 1)
     env.reset()

@@ -122,18 +122,3 @@ def test_values_of_an_axis_are_paired_over_the_others(tmp_path):
 def test_values_that_make_no_pairs_are_refused(sides, tmp_path):
     with pytest.raises(BadInputError, match=r"must be two values of one axis.*delay_ms: 20, 5"):
         of_sweep(sweep(tmp_path / "s"), *sides)
-
-
-@pytest.fixture
-def figures(monkeypatch):
-    """Keep the figures that are drawn instead of saving them."""
-    kept = []
-    monkeypatch.setattr("cloudrc.report.figures.bands.save", lambda figure, _: kept.append(figure))
-    return kept
-
-
-@pytest.mark.parametrize(("ending", "is_slanted"), [("", False), ("_acceleration", True)])
-def test_names_along_x_are_slanted_if_they_would_lie_over_each_other(figures, ending, is_slanted):
-    draw_sweep([row({"predictor": f"p{n}{ending}"}, 1) for n in range(7)], UNITS)
-    turns = {label.get_rotation() for label in figures[0].axes[-1].get_xticklabels()}
-    assert [turn > 0 for turn in turns] == [is_slanted]
