@@ -371,7 +371,7 @@ def _run_job(options: argparse.Namespace) -> int:
 
     job = begin_job(release, mission, print_line, options.timeout, queue=options.queue)
     try:
-        return follow_job(release, job, print_line)
+        return follow_job(release, job, print_line).exit_code
     except KeyboardInterrupt:
         remedy = cancelling_command(release, job)
         print_line(f"Job {job} is still running; cancel its mission: {remedy}", sys.stderr)

@@ -23,7 +23,15 @@ from cloudrc.cluster.client import (
     program,
     run,
 )
-from cloudrc.cluster.jobs import JobGoneError, delete_job, failure_of, follow, job_key, run_job
+from cloudrc.cluster.jobs import (
+    Ended,
+    JobGoneError,
+    delete_job,
+    failure_of,
+    follow,
+    job_key,
+    run_job,
+)
 from cloudrc.cluster.missions import release_api, settle_mission
 from cloudrc.cluster.own_files import find_own_files, give_to_release, send_own_files
 from cloudrc.errors import CloudrcError, InterruptedRunError, TimedOutError
@@ -38,8 +46,8 @@ Tell = Callable[[str], None]
 
 LOOK_PERIOD = 1.0
 """Time between two requests for the state of the pods [s]."""
-FAILURE_TIME = 5.0
-"""Time for which a pod's failure must last before it is reported [s]: at first, Kubernetes may not
+FAILED_LOOKS = 5
+"""Number of looks in a row at which a pod fails before it is reported: at first, Kubernetes may not
 yet have made all objects that the pod needs."""
 MISSING = ("not found", "non-existent")
 """Words of Kubernetes about a volume, such as a Secret, that somebody has to make."""
@@ -86,16 +94,15 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
     """
     selector = f"app.kubernetes.io/instance={release.name}"
     see = f"see: {release.kubectl} describe pods -l {selector}"
-    until, failing_since, last = time.monotonic() + timeout, None, ""
+    until, failed, last = time.monotonic() + timeout, 0, ""
     while True:
         words, fatal = _why_not_ready(release)
         if not words:
             return
-        now = time.monotonic()
-        failing_since = (failing_since or now) if fatal else None
-        if failing_since is not None and now - failing_since >= FAILURE_TIME:
+        failed = failed + 1 if fatal else 0
+        if failed > FAILED_LOOKS:
             raise ClusterError(f"{fatal}; {see}")
-        if now > until:
+        if time.monotonic() > until:
             raise TimedOutError(
                 f"{release} is not ready after {timeout:g} s: {words}; "
                 f"{see}, or wait longer: --timeout"
@@ -108,10 +115,12 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
 
 def _why_not_ready(release: Release) -> tuple[str, str]:
     """Say why the pods of a release are not ready, and why they will never be; "" if not so."""
-    states = {each: _state(release, each) for each in COMPONENTS}
-    words = "; ".join(f"{component}: {why}" for component, (why, _) in states.items() if why)
-    never = [f"the {each} pod cannot run: {why}" for each, (why, bad) in states.items() if bad]
-    return words, "; ".join(never)
+    words, never = list[str](), list[str]()
+    for component in COMPONENTS:
+        why, is_fatal = _state(release, component)
+        words += [f"{component}: {why}"] * bool(why)
+        never += [f"the {component} pod cannot run: {why}"] * is_fatal
+    return "; ".join(words), "; ".join(never)
 
 
 def _state(release: Release, component: str) -> tuple[str, bool]:
@@ -177,8 +186,8 @@ def begin_job(
     return job
 
 
-def follow_job(release: Release, job: str, tell: Tell) -> int:
-    """Follow the Job of a mission to its end, and return the exit code of the verdict.
+def follow_job(release: Release, job: str, tell: Tell) -> Ended:
+    """Follow the Job of a mission to its end, and return how it has ended.
 
     If the Job no longer follows its mission, cancel the mission.
 
@@ -186,11 +195,11 @@ def follow_job(release: Release, job: str, tell: Tell) -> int:
         NoAnswerError: If the API server no longer answers; the Job goes on.
     """
     try:
-        return follow(release, job, tell).exit_code
+        return follow(release, job, tell)
     except JobGoneError as gone:
-        words, code = settle_mission(release, gone.key, str(gone))
-        tell(words)
-        return code
+        ended = settle_mission(release, gone.key, str(gone))
+        tell(ended.message)
+        return ended
     except NoAnswerError as error:
         log = f"{release.kubectl} logs --follow job/{job}"
         raise NoAnswerError(f"{error}; Job {job} goes on without this command: {log}") from None
@@ -283,23 +292,19 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> bool:
     job = run_job(release, {"name": experiment.name, "time_limit_s": limit, **mission})
     tell(f"Job {job} flies {experiment.name}")
     try:
-        ended = follow(release, job, tell)
-    except JobGoneError as gone:
-        words, code = settle_mission(release, gone.key, str(gone))
-        tell(words)
-        return code != InterruptedRunError.exit_code
+        ended = follow_job(release, job, tell)
     except KeyboardInterrupt:
         tell("cancelling the mission")
         try:
             # The pod of a deleted Job does not cancel: teleop would fly on for the mission's lease.
-            tell(settle_mission(release, job_key(release, job), "interrupted")[0])
+            tell(settle_mission(release, job_key(release, job), "interrupted").message)
             delete_job(release, job)
         except CloudrcError as error:
             tell(f"cannot cancel: {error}")
         return False
     if ended.exit_code not in FLOWN:
         raise ClusterError(f"Job {job} did not fly its mission: {ended.message}")
-    return True
+    return ended.exit_code != InterruptedRunError.exit_code
 
 
 def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Recording:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from cloudrc.cluster.client import Release
+from cloudrc.cluster.jobs import Ended
 from cloudrc.cluster.pods import API_PORT, find_pod, forwarded, operator_token
 from cloudrc.errors import CloudrcError, InterruptedRunError
 from cloudrc.teleop.client import Api, describe_mission, find_mission, mission_path
@@ -23,22 +24,20 @@ def release_api(release: Release, token: Callable[[], str] | None = None) -> Ite
         yield Api(f"http://127.0.0.1:{ports[API_PORT]}", token or (lambda: known), str(release))
 
 
-def settle_mission(release: Release, key: str, why: str) -> tuple[str, int]:
+def settle_mission(release: Release, key: str, why: str) -> Ended:
     """Cancel the mission of a Job that no longer follows it, if the mission has not ended.
 
-    `key` is the mission's key, `why` the reason. Return a sentence about the mission, and the exit
-    code of its verdict.
+    `key` is the mission's key, `why` the reason. Return how the mission has ended.
     """
-    interrupted = InterruptedRunError.exit_code
+    text = f"no mission has begun: {why}"
     try:
         with release_api(release) as api:
             mission = find_mission(api, key)
-            if mission is None:
-                return f"no mission has begun: {why}", interrupted
-            if mission["verdict"] is None:
+            if mission is not None and mission["verdict"] is not None:
+                return Ended(int(mission["verdict"]["exit_code"]), describe_mission(mission))
+            if mission is not None:
                 api.post(f"{mission_path(mission['id'])}/cancel")
-                return f"mission {mission['id']} is cancelled: {why}", interrupted
-            return describe_mission(mission), int(mission["verdict"]["exit_code"])
+                text = f"mission {mission['id']} is cancelled: {why}"
     except CloudrcError as error:
         text = f"{why}; the mission ends with its lease, because it cannot be cancelled: {error}"
-        return text, interrupted
+    return Ended(InterruptedRunError.exit_code, text)

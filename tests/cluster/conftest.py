@@ -272,7 +272,7 @@ def api(tmp_path, monkeypatch):
     monkeypatch.setattr(jobs, "LOOK_PERIOD", 0.01)
     monkeypatch.setattr(client, "RETRIES", {**client.RETRIES, "backoff_factor": 0.01})
     monkeypatch.setattr(flight, "LOOK_PERIOD", 0.01)
-    monkeypatch.setattr(flight, "FAILURE_TIME", 0.0)
+    monkeypatch.setattr(flight, "FAILED_LOOKS", 0)
     yield server
     server.close()
 
