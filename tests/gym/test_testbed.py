@@ -78,14 +78,6 @@ def test_the_numbers_have_the_experiments_own_metrics_and_a_failing_one_is_a_war
     assert "odd" not in info["numbers"]
 
 
-def test_an_action_of_a_robot_on_the_ground_has_no_vertical_velocity():
-    env = gymnasium.make("cloudrc/Steps-v0", experiment="pillars").unwrapped
-    assert env.action_space.shape == (3,)
-    env.reset(seed=1)
-    with pytest.raises(BadInputError, match="not 3 numbers; give vx, vy, yaw rate"):
-        env.step(np.array([0.5, 0.0, 0.3, 0.0]))
-
-
 def test_a_seed_selects_the_steps_and_a_flight_can_be_repeated():
     env = gymnasium.make("cloudrc/Steps-v0")
 

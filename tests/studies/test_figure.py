@@ -67,17 +67,6 @@ def test_numbers_of_a_plugin_that_failed_are_not_drawn(drawn):
     assert [point.middle for point in success.lines["a"]] == [50, 100]
 
 
-def test_a_figure_replaces_a_figure_but_no_other_file(tmp_path, call, refused):
-    folder = sweep(tmp_path / "s")
-    for _ in range(2):
-        call("sweep figure", folder, "--out", tmp_path / "one")
-    (tmp_path / "one.svg").write_text("mine")
-    (tmp_path / "one.pdf").unlink()
-    said = refused("sweep figure", folder, "--out", tmp_path / "one")
-    assert "one.svg: already there; name another file with --out" in said
-    assert not (tmp_path / "one.pdf").exists()
-
-
 def test_a_figure_is_three_files_whose_text_is_text(tmp_path, call):
     folder = sweep(tmp_path / "s")
     out = call("sweep figure", folder, "--out", tmp_path / "one.png").out

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cloudrc.studies.search import ValueRange, grid, search
+from cloudrc.studies.search import ValueRange, search
 
 
 @pytest.mark.parametrize("present", [1, 7, 64, 100])
@@ -22,8 +22,3 @@ def test_a_search_without_border_says_so():
 def test_the_range_around_the_present_value_is_searched_and_others_are_told():
     found = search(lambda number: number in range(5, 31) or number >= 60, 12, 1, 100)
     assert found == ValueRange(5, 30, 4, 31, [(96, 100)])
-
-
-def test_the_grid_doubles_and_halves_the_present_value():
-    assert grid(12, 2, 100) == [2, 3, 6, 12, 24, 48, 96, 100]
-    assert grid(1, 1, 1) == [1]

@@ -1,7 +1,6 @@
 """A folder has one sweep; its tables follow the order of the grid, whatever flew first."""
 
 import csv
-import shutil
 
 import pytest
 
@@ -78,14 +77,6 @@ def test_a_folder_holds_one_sweep_that_may_grow(write_sweep, folder):
     for other in (write_sweep({"link.both.delay_ms": [7]}), write_sweep({}, seeds=2)):
         with pytest.raises(BadInputError, match=r"has another sweep, see sweep\.yaml.*new folder"):
             fly(other, folder)
-
-
-def test_the_file_of_the_sweep_may_have_another_place_in_each_shard(write_sweep, folder, tmp_path):
-    path, other = write_sweep(), tmp_path / "other"
-    fly(path, folder, shard=(1, 2))
-    other.mkdir()
-    fly(shutil.copy(path, other / "grid.yaml"), folder, shard=(2, 2))
-    assert (folder / sweep.TABLE).exists()
 
 
 @pytest.mark.parametrize("changed", PLUG_IN)

@@ -3,7 +3,6 @@
 A file of flights gives the same flights in a pod that has none of the user's files.
 """
 
-import gzip
 import re
 from collections import Counter
 from pathlib import Path
@@ -156,13 +155,3 @@ def test_what_points_share_is_read_and_checked_once(write_sweep, tmp_path, monke
     assert len(sweep.points) == 40
     # The sweep, the experiment, the mission, the profile and the robot; three plug-ins.
     assert counts == {"parse_yaml": 5, "check_mission": 1, "load_scene": 1, "parameter_model": 3}
-
-
-OTHER = gzip.compress(b'{"points": [[{}, {}]]}', mtime=0)
-
-
-@pytest.mark.parametrize("content", [b"", b"no gzip", OTHER], ids=["empty", "text", "other"])
-def test_another_file_is_refused(content, tmp_path):
-    (tmp_path / "flights").write_bytes(content)
-    with pytest.raises(BadInputError, match="is not a file of flights of this version"):
-        unpack(tmp_path / "flights")

@@ -5,13 +5,13 @@ This is what a client does that asks only when its chunk is used up.
 
 from __future__ import annotations
 
-from typing import Any
-
-from cloudrc.gym.executors import Chunk, Executor
+from cloudrc.gym.executors.newest import Newest
 
 
-class Broker(Executor):
+class Broker(Newest):
     """One observation leaves per chunk. If no answer comes, the robot asks again."""
+
+    needs_chunk = True
 
     def __init__(self, patience: float) -> None:
         """Wait for `patience` [s] before asking again."""
@@ -19,7 +19,7 @@ class Broker(Executor):
 
     def begin(self, ticks_late: int, period_ns: int) -> None:
         """Forget the last episode; the observation of tick 0 is the first question."""
-        self._chunk, self._start = Chunk(-1, ()), 0
+        super().begin(ticks_late, period_ns)
         self._asked, self._waits = 0, self._patience * 1e9 / period_ns
 
     def asks(self, tick: int) -> bool:
@@ -30,17 +30,6 @@ class Broker(Executor):
             self._asked = tick
             return True
         return False
-
-    def receive(self, chunk: Chunk, tick: int) -> None:
-        """Play the answer from now on, if it is new."""
-        if chunk.basis > self._chunk.basis:
-            self._chunk, self._start = chunk, tick
-
-    def action(self, tick: int) -> Any:
-        """Return the next action of the chunk."""
-        self.basis, actions = self._chunk
-        place = tick - self._start
-        return actions[place] if place < len(actions) else None
 
 
 def build(patience: float = 1.0) -> Broker:
