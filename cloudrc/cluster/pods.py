@@ -131,8 +131,8 @@ def describe_end(container: str, ended: Any) -> str:
     try:
         name = signal.Signals(code - KILLED).name
     except ValueError:
-        _, marked, error = (ended.message or "").rpartition("cloudrc: error: ")
-        words = to_one_line(error if marked else error.strip().rpartition("\n")[2])
+        error = (ended.message or "").rpartition("cloudrc: error: ")[2]
+        words = to_one_line(error.strip().rpartition("\n")[2])
         return f"ended with exit code {code}" + (f": {words}" if words else "")
     return f"was ended by {name} (exit code {code})"
 

@@ -245,11 +245,9 @@ def _metrics() -> Iterator[LiveMetric]:
                 each: _LABELS.get(f"{name} {each}") or _LABELS[each]
                 for each in re.findall(r"\w+", names)
             }
-            kind, buckets = MetricKind.GAUGE, _BUCKETS.get(name, ())
-            if buckets:
-                kind = MetricKind.HISTOGRAM
-            elif name.endswith("_total"):
-                kind = MetricKind.COUNTER
+            buckets = _BUCKETS.get(name, ())
+            kind = MetricKind.COUNTER if name.endswith("_total") else MetricKind.GAUGE
+            kind = MetricKind.HISTOGRAM if buckets else kind
             one_line = " ".join(meaning.split())
             yield LiveMetric(name, kind, one_line, tuple(roles.split()), labels, buckets, count)
     for quantity in QUANTITIES:

@@ -34,12 +34,16 @@ def fly_point(experiment: ResolvedExperiment) -> Row:
     try:
         return measure(experiment)
     except code.FAILURES as error:  # one point that cannot fly must not stop the others
-        if failure := machine_error(error):
-            raise failure from error
-        code.check_failure(error, "the flight")
-        text = f"{code.place_of(error)}{describe_error(error)}"
-        none: Row = {"numbers": {}, "records_sha256": ""}
-        return {"verdict": ERROR, "failures": [ERROR], "text": text, **none, "physics_steps": ""}
+        none: Row = {"numbers": {}, "records_sha256": "", "physics_steps": ""}
+        return {"verdict": ERROR, "failures": [ERROR], "text": explain(error), **none}
+
+
+def explain(error: BaseException) -> str:
+    """Say why a flight has raised an exception; raise it if the machine failed, not the flight."""
+    if failure := machine_error(error):
+        raise failure from error
+    code.check_failure(error, "the flight")
+    return f"{code.place_of(error)}{describe_error(error)}"
 
 
 def measure(experiment: ResolvedExperiment) -> Row:

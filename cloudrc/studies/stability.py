@@ -22,7 +22,6 @@ from cloudrc.ages import simulate_ages
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
-from cloudrc.errors import describe_error, machine_error
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
 from cloudrc.metrics.counters import growth
@@ -31,6 +30,7 @@ from cloudrc.outside import code
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.record.holes import END_NS
 from cloudrc.records import Control, Counted, Fault, GroundTruth, GuardChange, MissionEvent, Record
+from cloudrc.runs.flight import explain
 
 Array: TypeAlias = NDArray[np.float64]
 SCENE = "empty"
@@ -84,11 +84,7 @@ def fly_step(experiment: ResolvedExperiment, size: float = SMALL) -> Answer:
     try:
         return _fly_step(experiment, size)
     except code.FAILURES as error:  # a value that cannot fly must not stop the search
-        if failure := machine_error(error):
-            raise failure from error
-        code.check_failure(error, "the flight")
-        text = f"{code.place_of(error)}{describe_error(error)}"
-        return {"stable": False, "code": "error", "text": text}
+        return {"stable": False, "code": "error", "text": explain(error)}
 
 
 def _fly_step(experiment: ResolvedExperiment, size: float) -> Answer:

@@ -12,7 +12,6 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from itertools import chain, islice
-from multiprocessing.process import BaseProcess
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -96,7 +95,7 @@ def _map_in_workers(
     context = multiprocessing.get_context("spawn")
     with isolated_start():  # starts multiprocessing's resource tracker
         pool = ProcessPoolExecutor(workers, context, _start_worker)
-    started, waiting = list[BaseProcess](), list[Future[Result]]()
+    waiting = list[Future[Result]]()
     try:
         while True:
             with isolated_start():  # submit() starts the workers
@@ -104,7 +103,6 @@ def _map_in_workers(
                     waiting.append(pool.submit(function, each))
             if not waiting:
                 return
-            started = started or multiprocessing.active_children()
             looked_at = waiting[:1] if in_order else waiting
             ended = wait(looked_at, PERIOD, return_when=FIRST_COMPLETED).done
             raise_if_interrupted()
@@ -114,24 +112,14 @@ def _map_in_workers(
                 raise_if_interrupted()
                 yield result
     except BrokenProcessPool as error:
-        pool.shutdown(cancel_futures=True)  # only then are all exit codes known
-        raise WorkerDiedError(_explain_end(started)) from error
+        text = "a worker has died: it was killed, as where memory ran out, or a plug-in ended it"
+        raise WorkerDiedError(f"{text}; use fewer processes") from error
     except BaseException:  # Ctrl-C, or the caller has closed the generator
         for worker in multiprocessing.active_children():
             worker.kill()
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _explain_end(workers: list[BaseProcess]) -> str:
-    """Say how the worker ended that broke the pool; the pool ended the others by SIGTERM."""
-    codes = [worker.exitcode for worker in workers]
-    own = [code for code in codes if code not in (None, -signal.SIGTERM, -signal.SIGKILL)]
-    if not own:
-        text = "a worker was killed, perhaps by the kernel because memory ran out"
-        return f"{text}; use fewer processes"
-    return f"a worker ended itself (exit status {own[0]}); does a plug-in end or crash its process?"
 
 
 def take_each(

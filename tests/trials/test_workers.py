@@ -40,10 +40,6 @@ def _exit(number):
     sys.exit(0)
 
 
-def _abort(number):
-    os.abort()
-
-
 @pytest.mark.parametrize(("pieces", "jobs", "workers"), [(6, 100_000, 2), (1, 9, 0), (6, 1, 0)])
 def test_results_keep_the_order_of_the_work(pieces, jobs, workers, monkeypatch):
     monkeypatch.setattr("cloudrc.trials.workers.WINDOW", 4)
@@ -63,14 +59,9 @@ def test_results_before_a_worker_was_killed_are_kept(tmp_path):
         (tmp_path / str(number)).touch()
 
     end = take_each(map_in_order(partial(_kill_at_five, tmp_path), range(9), 2), take)
-    text = "a worker was killed, perhaps by the kernel because memory ran out; use fewer processes"
-    assert (str(end), end.exit_code) == (text, 6)
+    assert end.exit_code == 6
+    assert str(end).startswith("a worker has died")
     assert results == list(range(KILLED))
-
-
-def test_a_worker_that_crashes_is_told_by_its_signal():
-    end = take_each(map_in_order(_abort, range(4), 2), [].append)
-    assert str(end).startswith("a worker ended itself (exit status -6); does a plug-in")
 
 
 def test_ctrl_c_ends_the_workers_at_once():
