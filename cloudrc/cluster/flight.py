@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -215,9 +214,11 @@ def cancelling_command(release: Release, job: str) -> str:
 
 def _ask(release: Release, ask: Callable[[Api], Any]) -> Any:
     """Return what the API of a release answers; None if it does not answer."""
-    with suppress(CloudrcError), release_api(release) as api:
-        return ask(api)
-    return None
+    try:
+        with release_api(release) as api:
+            return ask(api)
+    except CloudrcError:
+        return None
 
 
 def _cancel_command(release: Release, mission: str) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -108,8 +107,10 @@ def send_own_files(release: Release, found: Mapping[str, Mapping[str, Path]]) ->
     if names:
         _make_namespace(release)
     for kind, name in names.items():
-        with suppress(NotFoundError):
+        try:
             release.request("delete", "configmaps", name=name)
+        except NotFoundError:
+            pass  # it is the first
         metadata = {"name": name, "labels": release.labels(kind)}
         body = {"metadata": metadata, "binaryData": _encode(found[kind])}
         release.request("create", "configmaps", body=body)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from math import isnan, nan, remainder
 from typing import Any, NamedTuple
 
@@ -91,11 +90,12 @@ def _told(env: Any) -> dict[str, float]:
 
 def _seconds(name: str, value: Any) -> float:
     """Return the time [s] that a value means; NaN if it means none."""
-    with suppress(InvalidValueError, ZeroDivisionError):
+    try:
         number = ANY.of(value)
         number = number if name in TIMES else 1.0 / number
-        return number if 0.0 < number <= 3600.0 else nan
-    return nan
+    except (InvalidValueError, ZeroDivisionError):
+        return nan
+    return number if 0.0 < number <= 3600.0 else nan
 
 
 def _repeats(wrapper: Any) -> bool:
