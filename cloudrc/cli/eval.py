@@ -17,6 +17,7 @@ from cloudrc.cli.output import (
 )
 from cloudrc.cli.parser import COUNT_MAX, number, read_count
 from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.outside.refusal import naming
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.lock import lock_folder
@@ -105,13 +106,17 @@ def execute(options: argparse.Namespace) -> int:
     folder = options.out
     goes_on = folder is not None and results.is_begun(folder)
     if goes_on:
-        results.refuse_other(folder, setup)
+        with naming(f"--out {folder}"):
+            results.check_folder(folder, setup)
     with closing(Progress(f"makes the environment {setup.env}")):
         setup = check_environment(setup, episodes)
     if not setup.follows_seed:
         print_line(f"cloudrc: warning: --env {setup.env}: {results.SEEDLESS}", sys.stderr)
     episodes = [*(Episode(None, BASELINE, n + 1) for n in range(options.seeds)), *episodes]
-    before = results.read_versus(options.versus, setup, episodes) if options.versus else []
+    before = []
+    if options.versus:
+        with naming(f"--versus {options.versus}"):
+            before = results.read_versus(options.versus, setup, episodes)
     if not goes_on:
         folder = new_folder(folder, f"eval-{Path(setup.env).name}", "latest-eval")
     with lock_folder(folder), closing(Progress("plays episodes", len(episodes))) as view:

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cloudrc import source
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import CloudrcError
 from cloudrc.eval.episode import play
 from cloudrc.eval.setup import Episode, EvalSetup
 from cloudrc.files import read, write_atomically
 from cloudrc.outside.reuse import reuse_results
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.rounding import format_limit
 from cloudrc.statistics import LEVEL
 from cloudrc.text import cells, table
@@ -74,26 +75,26 @@ def is_begun(folder: Path) -> bool:
     return (folder / FILE).is_file()
 
 
-def refuse_other(folder: Path, setup: EvalSetup) -> None:
-    """Raise a BadInputError if a folder has the evaluation of another environment or policy.
+def check_folder(folder: Path, setup: EvalSetup) -> None:
+    """Raise an error if a folder has the evaluation of another environment or policy.
 
     A policy is another one if its file has another place: of a file that has changed, the episodes
     are missing.
     """
-    had, now = _read(folder, "--out"), setup.identity()
+    had, now = _read(folder), setup.identity()
     same = all(had["identity"][name] == now[name] for name in ("env", "env_args"))
     if not same or _place(had["policy"]) != _place(setup.policy):
         text = f"has the episodes of {had['env']} with {had['policy']}"
-        raise BadInputError(f"--out {folder}: {text}, or of other arguments; name a new folder")
+        raise InvalidValueError(f"{text}, or of other arguments; name a new folder")
 
 
-def _read(folder: Path, flag: str) -> dict[str, Any]:
+def _read(folder: Path) -> dict[str, Any]:
     """Return the content of the file of an evaluation."""
     try:
         found: dict[str, Any] = json.loads(read(folder / FILE))
         return found if found["identity"]["env"] else {}
     except (LookupError, TypeError, ValueError):
-        raise BadInputError(f"{flag} {folder}: its {FILE} is of no evaluation") from None
+        raise InvalidValueError(f"its {FILE} is of no evaluation") from None
 
 
 def _place(policy: str) -> str:
@@ -124,8 +125,7 @@ def play_missing(
     `see` gets the number of episodes that have a row, at the beginning and after each one.
 
     Raises:
-        BadInputError: If the environment fails.
-        CloudrcError: If the policy fails; the rows before are kept.
+        CloudrcError: If environment or policy fail; the rows before are kept.
     """
     rows, identity = Rows(folder), setup.identity()
     write(folder, setup, {})
@@ -161,13 +161,13 @@ def write(folder: Path, setup: EvalSetup, found: Mapping[str, Any]) -> dict[str,
 def read_versus(folder: Path, setup: EvalSetup, episodes: Sequence[Episode]) -> list[Row]:
     """Return the rows of the same episodes in the folder of another policy's evaluation.
 
-    Raise a BadInputError if more differs than the policy and its time for an answer.
+    Raise an error if more differs than the policy and its time for an answer.
     """
-    had = _read(folder, "--versus")
+    had = _read(folder)
     before = {**had["identity"], "code": had["code"]}
     now = {**setup.identity(), "code": source.code_hash()}
     if other := [name for name in PAIRED if before.get(name) != now[name]]:
-        raise BadInputError(f"--versus {folder}: differs in {', '.join(other)}; evaluate it again")
+        raise InvalidValueError(f"differs in {', '.join(other)}; evaluate it again")
     rows = read_rows(folder)
     return [rows[key] for each in episodes if (key := each.key(had["identity"])) in rows]
 

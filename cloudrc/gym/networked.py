@@ -80,7 +80,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             stream: Name of the robot; robots with one seed and two names share no random numbers.
 
         Raises:
-            cloudrc.errors.BadInputError: If a value cannot be used; the text says what to change.
+            cloudrc.errors.CloudrcError: If a value cannot be used; the text says what to change.
         """
         options = read_options("Networked", options)
         RecordConstructorArgs.__init__(self, link=link, seed=seed, dt=dt, stream=stream, **options)

@@ -45,7 +45,7 @@ def unpack(data: bytes) -> dict[Any, Any]:
     """Unpack a map; raise a WireError for anything else."""
     try:
         message = msgpack.unpackb(
-            data, object_hook=_from_map, ext_hook=_refuse_extension, strict_map_key=False
+            data, object_hook=_from_map, ext_hook=_no_extension, strict_map_key=False
         )
     except WireError:
         raise
@@ -113,9 +113,9 @@ def _read_dtype(name: Any) -> np.dtype[Any]:
     except (TypeError, ValueError, SyntaxError):
         raise WireError(f"{shorten(name)} is no type of an array") from None
     if dtype.kind not in KINDS or not dtype.itemsize:
-        raise WireError(f"arrays of type {dtype} are refused; send numbers")
+        raise WireError(f"arrays of type {dtype} are not carried; send numbers")
     return dtype
 
 
-def _refuse_extension(code: int, data: bytes) -> Any:
+def _no_extension(code: int, data: bytes) -> Any:
     raise WireError(f"the extension {code} of msgpack, with {len(data)} bytes")

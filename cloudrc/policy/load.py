@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import CloudrcError
 from cloudrc.outside.code import FAILURES, calling, check_failure, locate, stack_of
-from cloudrc.plugins import find, is_path
+from cloudrc.outside.values import InvalidValueError
+from cloudrc.plugins import find
 
 
 class PolicyFailedError(CloudrcError):
@@ -31,8 +32,6 @@ class LoadedPolicy:
     def __init__(self, name: str) -> None:
         """Load the file `name`, which has `infer` itself or a `build()` that returns a policy."""
         self.name = name
-        if not is_path(name):
-            raise BadInputError(f"policy '{name}': name a Python file, such as ./{name}.py")
         policy = find("policies", name, look=False)
         build, infer = policy.get("build"), policy.get("infer")
         what = f"policy '{name}' cannot be built"
@@ -41,12 +40,12 @@ class LoadedPolicy:
             read = partial(_attribute, build()) if is_built else policy.get
             infer, reset, metadata = read("infer"), read("reset"), read("metadata")
             self.metadata: dict[str, Any] = dict(metadata) if isinstance(metadata, Mapping) else {}
+            if not callable(infer):
+                raise InvalidValueError(
+                    "it has no function infer(observation); write one that returns "
+                    '{"actions": array of shape (H, A)}'
+                )
         self._infer = infer
-        if not callable(infer):
-            raise BadInputError(
-                f"policy '{name}' has no function infer(observation); write one that returns "
-                '{"actions": array of shape (H, A)}'
-            )
         self._reset: Callable[[], Any] | None = reset if callable(reset) else None
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from cloudrc.errors import BadInputError
+from cloudrc.outside.values import InvalidValueError
 
 STATE = "observation/state"
 """Key of an observation that is no map."""
@@ -36,6 +36,6 @@ def _part(observation: Any, path: str) -> Any:
     for name in [] if path == WHOLE else path.split("."):
         if not isinstance(found, Mapping) or name not in found:
             has = f"; there are {', '.join(map(str, found))}" if isinstance(found, Mapping) else ""
-            raise BadInputError(f"--map: the environment's observation has no '{path}'{has}")
+            raise InvalidValueError(f"--map: the environment's observation has no '{path}'{has}")
         found = found[name]
     return found

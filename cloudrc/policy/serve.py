@@ -29,7 +29,7 @@ FAILED = 1011
 CLOSE_LIMIT = 1.0
 """Time for which a server waits for a client's end of a connection [s]."""
 _quiet = logging.Logger("cloudrc.policy")
-"""Log of the library, which writes the stack of every refused connection."""
+"""Log of the library, which writes the stack of every connection that fails."""
 _quiet.addHandler(logging.NullHandler())
 
 

@@ -52,7 +52,7 @@ def draw_sweep(
         The figure as PDF, PNG and SVG by suffix; and its caption.
 
     Raises:
-        BadInputError: If the sweep lacks an axis or a metric.
+        CloudrcError: If the sweep lacks an axis or a metric.
     """
     shown = _shown(rows, names)
     axes = _choose(rows, x, by)

@@ -9,9 +9,10 @@ from functools import cache
 from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc.ages import simulate_ages
+from cloudrc.config.problems import problem_at
 from cloudrc.config.profile import COMMAND_AGE_MS
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.errors import BadInputError
+from cloudrc.errors import CloudrcError
 from cloudrc.outside.document import child
 from cloudrc.robots.build import onboard_values
 from cloudrc.runs import flight
@@ -66,16 +67,14 @@ class Margin:
     """
 
     def __init__(self, asked: Asked) -> None:
-        """Read the present value and the range of the search; refuse a key that has no range."""
+        """Read the present value and the range of the search."""
         self.asked = asked
         check_no_seed([*asked.settings, f"{asked.key}=0"])
         now = present_value(load(asked.experiment, asked.settings), asked.key)
         first = asked.max if now is None else now
         if first is None:
             load(asked.experiment, [*asked.settings, f"{asked.key}=1"])  # names an unknown key
-            raise BadInputError(
-                f"{asked.key}: has no value now; name the largest one to try with --max"
-            )
+            raise problem_at(asked.key, "has no value now; name the largest one to try with --max")
         self.size = asked.resolution or _resolution(asked, now)
         # Without a value the key has no effect, as a large value has: begin there.
         self.present = self._number(first)
@@ -83,7 +82,7 @@ class Margin:
         if asked.max is not None:
             top = math.floor(asked.max / self.size + 1e-9)
             if top < 1:
-                raise BadInputError(f"--max {asked.max:g}: must be at least {self.size:g}")
+                raise problem_at("--max", f"{asked.max:g}: must be at least {self.size:g}")
         self.found: dict[str, ValueRange | None] = dict.fromkeys(QUESTIONS)
         self._done: dict[tuple[str, int], Answer] = {}
         self.experiment = cache(self._prepare)
@@ -100,7 +99,7 @@ class Margin:
 
         self.present = min(self.present, top)
         if not allowed(self.present):
-            raise BadInputError(self.experiment(self.present)[1])
+            raise problem_at(self.asked.key, self.experiment(self.present)[1])
         self.top, self.bottom = top, 1
         self.top_why = "the largest value tried; raise --max"
         if not allowed(top):
@@ -125,7 +124,7 @@ class Margin:
         try:
             experiment = load(asked.experiment, settings)
             check_world(experiment.world, turns=experiment.mission.turns)
-        except BadInputError as error:
+        except CloudrcError as error:
             return None, str(error)
         given = [text.partition("=")[0].strip() for text in settings]
         if asked.key == "guard.speed_max_mps":  # a longer limit would lower the largest speed
@@ -232,7 +231,7 @@ def _ask_settles(experiment: ResolvedExperiment) -> Answer:
 def present_value(experiment: ResolvedExperiment, key: str) -> int | float | None:
     """Return the present value of a key; None if it is null or does not exist.
 
-    Raise a BadInputError if the value is no number.
+    Raise an error if the value is no number.
     """
     # The uplink's key stands for a key of both directions of the link.
     names = key.replace("link.both.", "link.uplink.").split(".")
@@ -243,10 +242,8 @@ def present_value(experiment: ResolvedExperiment, key: str) -> int | float | Non
         value = child(value, name)
     if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
         return value
-    raise BadInputError(
-        f"{key}: is no number; name one such as link.both.delay_ms, or an entry of a list such as "
-        "cloud.controller.gain_p.0"
-    )
+    text = "is no number; name one such as link.both.delay_ms, or an entry of a list such as"
+    raise problem_at(key, f"{text} cloud.controller.gain_p.0")
 
 
 def limits(

@@ -130,7 +130,7 @@ def test_the_end_of_the_limits_is_no_failure_of_the_loop(fly_with, call):
         (f"{KEY} --set seed=2", "seed: each flight has its own seed"),
         ("link.profile", "is no number; name one such as"),
         ("link.uplink.rate_kbit", "has no value now; name the largest one to try with --max"),
-        (f"{KEY} --max 5 --resolution 10", "--max 5: must be at least 10"),
+        (f"{KEY} --max 5 --resolution 10", "--max: 5: must be at least 10"),
     ],
 )
 def test_a_search_that_cannot_begin_is_refused(arguments, text, refused):

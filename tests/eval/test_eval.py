@@ -212,7 +212,7 @@ def test_the_map_makes_the_policys_observation(tmp_path):
     path.write_text("observation/state: robot.pose\nprompt: {value: go}\nall: .\n")
     mapped, seen = read_mapped(path), {"robot": {"pose": [1.0]}}
     assert observe(seen, mapped) == {"observation/state": [1.0], "prompt": "go", "all": seen}
-    with pytest.raises(BadInputError, match=r"no 'eye\.left'; there are robot"):
+    with pytest.raises(InvalidValueError, match=r"no 'eye\.left'; there are robot"):
         observe(seen, [Mapped("x", "eye.left")])
     for wrong in ("x: 3\n", "{}\n", "x: {path: y}\n"):
         path.write_text(wrong)
