@@ -16,6 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
+from cloudrc.drivers.children import await_or_kill
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError, TimedOutError
 
 DEFAULT_RELEASE = "cloudrc"
@@ -268,11 +269,7 @@ def last_words(stderr: bytes) -> str:
 def end_process(process: subprocess.Popen[Any]) -> None:
     """End a program by SIGTERM, and by SIGKILL after `STOP_LIMIT`."""
     process.terminate()
-    try:
-        process.wait(STOP_LIMIT)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+    await_or_kill(process, STOP_LIMIT)
 
 
 def chart_folder(package: Path = PACKAGE) -> Path:

@@ -127,7 +127,7 @@ def test_a_row_of_other_code_is_not_flown_again(write_sweep, call, monkeypatch):
     (row,) = rows("grid")
     monkeypatch.setattr("cloudrc.source.code_hash", lambda: "0123456789abcdef")
     error = call("sweep fly grid", row["key"], code=2).err
-    assert f"flown by code {row['code']}, this is code 0123456789abcdef" in error
+    assert f"of code {row['code']}, this is code 0123456789abcdef" in error
     call("sweep status grid")
 
 

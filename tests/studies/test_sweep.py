@@ -43,26 +43,19 @@ def fly(path, folder, which=slice(None), shard=None):
     return plan
 
 
-def test_the_table_has_the_order_of_the_grid(write_sweep, tmp_path):
-    path, tables = write_sweep(), []
-    for name, orders, shards in (
-        ("whole", (slice(2), slice(2, 4)), (None, None)),
-        ("shards", (slice(None, None, -1),) * 2, ((2, 2), (1, 2))),
-    ):
-        (tmp_path / name).mkdir()
-        for order, shard in zip(orders, shards, strict=True):
-            assert not (tmp_path / name / "table.csv").exists()
-            plan = fly(path, tmp_path / name, order, shard)
-        tables.append((tmp_path / name / "table.csv").read_bytes())
-    assert tables[0] == tables[1]
-    head, first, *_, last = csv.reader(tables[0].decode().splitlines())
+def test_the_table_has_the_order_of_the_grid(write_sweep, folder):
+    path = write_sweep()
+    for shard in ((2, 2), (1, 2)):
+        assert not (folder / "table.csv").exists()
+        plan = fly(path, folder, slice(None, None, -1), shard)
+    head, first, *_, last = csv.reader((folder / "table.csv").read_text().splitlines())
     names = ["seed", "verdict", "failures", "code", "physics_steps", "duration [s]"]
     assert head[1:] == [*plan.axes, *names]
     own = [source.code_hash(), "Python"]
     key = next(iter(plan.flights))
     assert first == [key, "last_sample", "40", "1", "success", "", *own, "0.1"]
     assert last[1:] == ["constant_velocity", "0", "1", "success", "", *own, ""]
-    summary = sweep.read_summary(tmp_path / "whole")
+    summary = sweep.read_summary(folder)
     assert (summary["counts"], summary["flights"]) == ({"success": 4}, 4)
     assert (summary["axes"], summary["seeds"]) == (plan.axes, [1])
     assert "link.profile=paper-p3" in summary["overrides"]
