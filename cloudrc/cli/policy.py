@@ -62,8 +62,11 @@ def execute(options: argparse.Namespace) -> int:
 
 def _serve(options: argparse.Namespace) -> int:
     require("a policy's server", ("policy",))
+    import asyncio
+
     from cloudrc.drivers.realtime import show_address
-    from cloudrc.policy.serve import serve_policy
+    from cloudrc.outside.code import apart
+    from cloudrc.policy.serve import PolicyServer
     from cloudrc.processes.ports import warn_if_exposed
 
     interrupt_on_signals()
@@ -74,12 +77,10 @@ def _serve(options: argparse.Namespace) -> int:
         url = f"ws://{show_address((host, port))}"
         print_line(f"policy {options.policy}: {url}", stdout)  # a policy's own output is elsewhere
 
-    serve_policy(
-        options.policy,
-        host,
-        options.port,
-        ready=ready,
-        tell=lambda text: print_line(f"cloudrc: {text}", sys.stderr),
-        key=os.environ.get(KEY_VARIABLE, ""),
-    )
+    def tell(text: str) -> None:
+        print_line(f"cloudrc: {text}", sys.stderr)
+
+    server = PolicyServer(options.policy, tell, os.environ.get(KEY_VARIABLE, ""))
+    with apart():
+        asyncio.run(server.run(host, options.port, ready))
     return 0

@@ -18,7 +18,6 @@ from websockets.http11 import Request, Response
 
 from cloudrc.errors import describe_error
 from cloudrc.files import at_place
-from cloudrc.outside.code import apart
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.codec import MESSAGE_MAX, WireError, pack, unpack
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
@@ -51,7 +50,7 @@ class PolicyServer:
         self._episode: AbstractAsyncContextManager[Any] = nullcontext()
 
     async def run(self, host: str, port: int, ready: Callable[[int], None]) -> None:
-        """Serve until this task is cancelled; `ready` is called with the port."""
+        """Serve until this task is cancelled; port 0: any free one. `ready` gets the port."""
         try:
             self._policy = await self._call(LoadedPolicy, self._name)
             if self._policy.has_state:
@@ -125,26 +124,3 @@ class PolicyServer:
                 timing["prev_total_ms"] = 1e3 * total
             await connection.send(pack({**answer, "actions": actions, "server_timing": timing}))
             total = time.perf_counter() - start
-
-
-def serve_policy(
-    name: str,
-    host: str,
-    port: int,
-    *,
-    ready: Callable[[int], None],
-    tell: Callable[[str], None],
-    key: str = "",
-) -> None:
-    """Serve the policy of the file `name` until this process is interrupted.
-
-    Args:
-        name: Path of the file.
-        host: Address to listen at.
-        port: TCP port; 0: any free port.
-        ready: Is called with the port once clients can connect.
-        tell: Gets lines for the log.
-        key: API key that clients must send; "" for none.
-    """
-    with apart():
-        asyncio.run(PolicyServer(name, tell, key).run(host, port, ready))

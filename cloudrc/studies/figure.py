@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from math import nan
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 
 from cloudrc.metrics import scale
 from cloudrc.outside.refusal import check_names
@@ -54,20 +54,21 @@ def draw_sweep(
     Raises:
         CloudrcError: If the sweep lacks an axis or a metric.
     """
-    shown = _shown(rows, names)
-    axes = _choose(rows, x, by)
-    is_numeric = _is_numeric(axes.values[axes.x])
-    along = sorted(axes.values[axes.x]) if is_numeric else axes.values[axes.x]
+    shown, values = _shown(rows, names), values_of(rows)
+    x, by = _choose(values, x, by)
+    is_numeric = _is_numeric(values[x])
+    along = sorted(values[x]) if is_numeric else values[x]
     at = along if is_numeric else range(len(along))
-    groups = _grouped(rows, axes, along)
+    lines = {x: rows} if by is None else {str(each): _with(rows, by, each) for each in values[by]}
+    groups = {name: [_with(line, x, each) for each in along] for name, line in lines.items()}
     panels = [_metric(name, units[name], groups, at) for name in shown]
     if any(row["verdict"] != "success" for row in rows):
         panels.append(Panel("success", "%", _lines(groups, at, _rate)))
-    caption = CAPTION
-    if axes.pooled:
-        caption += f" Each point pools all values of {', '.join(axes.pooled)}."
-    ticks = [] if is_numeric else list(map(str, along))
-    return draw(panels, axes.x, ticks, axes.by, look=look), caption
+    pooled = [axis for axis, each in values.items() if len(each) > 1 and axis not in (x, by)]
+    more = f" Each point pools all values of {', '.join(pooled)}." if pooled else ""
+    return draw(
+        panels, x, [] if is_numeric else list(map(str, along)), by, look=look
+    ), CAPTION + more
 
 
 def _shown(rows: Sequence[Row], names: Sequence[str]) -> Sequence[str]:
@@ -77,41 +78,20 @@ def _shown(rows: Sequence[Row], names: Sequence[str]) -> Sequence[str]:
     return names or [name for name in NUMBERS if name in known][:SHOWN]
 
 
-class _Axes(NamedTuple):
-    """The axes of a sweep, and their roles in the figure."""
+def _choose(
+    values: Mapping[str, list[Any]], x: str | None, by: str | None
+) -> tuple[str, str | None]:
+    """Choose the figure's x axis and the axis with one line per value; None if no axis is left.
 
-    values: dict[str, list[Any]]  # axis -> its values
-    x: str
-    by: str | None  # axis with one line per value; None if no axis is left
-
-    @property
-    def pooled(self) -> list[str]:
-        """The other axes with more than one value, of which each point has all."""
-        values, shown = self.values, (self.x, self.by)
-        return [axis for axis in values if len(values[axis]) > 1 and axis not in shown]
-
-
-def _choose(rows: Sequence[Row], x: str | None, by: str | None) -> _Axes:
-    """Choose the figure's x axis and the axis with one line per value.
-
-    `x` and `by` are the user's choices of these two, or None.
+    `values` are those of each axis, `x` and `by` the user's choices of these two, or None.
     """
-    values = values_of(rows)
     check_names("axis", filter(None, (x, by)), values)
     free = [axis for axis in values if len(values[axis]) > 1 and axis != by] or list(values)
     # Axes with names come first: a median of two predictors says less than one of two delays.
     names_first = sorted(free, key=lambda axis: _is_numeric(values[axis]))
     x = x or next((axis for axis in free if _is_numeric(values[axis])), free[0])
     lines = [by] if by else names_first
-    return _Axes(values, x, next((axis for axis in lines if axis != x), None))
-
-
-def _grouped(rows: Sequence[Row], axes: _Axes, along: Sequence[Any]) -> Groups:
-    """Group the flights by line and, within a line, by their value on the x axis."""
-    lines = {axes.x: rows}
-    if axes.by is not None:
-        lines = {str(value): _with(rows, axes.by, value) for value in axes.values[axes.by]}
-    return {name: [_with(line, axes.x, at) for at in along] for name, line in lines.items()}
+    return x, next((axis for axis in lines if axis != x), None)
 
 
 def _with(rows: Sequence[Row], axis: str, value: Any) -> list[Row]:
