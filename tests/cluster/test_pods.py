@@ -30,7 +30,6 @@ def unscheduled(message):
             r"'cloud' ends repeatedly: it was killed.*raise cloud\.resources\.limits\.memory",
         ),
         ({"conditions": unscheduled("0/1 nodes: Insufficient cpu")}, "no node takes it.*cpu"),
-        ({"state": waiting("ContainerCreating")}, "^$"),
         ({"conditions": unscheduled("pod has unbound immediate volume claims")}, "^$"),
     ],
 )

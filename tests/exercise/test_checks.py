@@ -46,7 +46,6 @@ def test_a_stub_scores_nothing_and_the_solution_all(part, folder, points):
             ALL["estimator"],
             "delay_estimator.py: ",
         ),
-        ("predictor", "p + v *", "p - v *", ["position", "steps"], "predictor.py: gives [0.95"),
         ("predictor", "horizon):", "horizon)", ALL["predictor"], "predictor.py:7: SyntaxError: "),
         (
             "predictor",

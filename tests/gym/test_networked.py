@@ -171,7 +171,7 @@ def test_an_argument_that_cannot_be_used_is_refused_in_one_line(options, words):
     assert "\n" not in str(caught.value)
 
 
-BOX, TWO = spaces.Box(-1, 1, (1,)), spaces.Discrete(2)
+BOX = spaces.Box(-1, 1, (1,))
 
 
 @pytest.mark.parametrize(
@@ -180,9 +180,7 @@ BOX, TWO = spaces.Box(-1, 1, (1,)), spaces.Discrete(2)
         (BOX, None, np.array([5.0]), True),
         (BOX, None, np.array([np.nan]), False),
         (BOX, 4, np.zeros((3, 1)), False),
-        (TWO, None, 2, False),
         (spaces.MultiBinary(2), None, np.array([True, False]), True),
-        (spaces.Dict(a=BOX), None, {"a": [np.nan]}, False),
     ],
 )
 def test_only_an_action_of_the_space_reaches_the_world(space, chunk, action, is_one):

@@ -23,9 +23,7 @@ def telling(fps=None, **told):
         ({"step_dt": 0.02, "dt": 0.02, "fps": 25}, 0.02, "step_dt"),
         ({"dt": 0.01, "control_hz": 10}, 0.1, "control_hz"),
         ({"config": {"policy_frequency": 1, "simulation_frequency": 15}, "fps": 15}, 1.0, "policy"),
-        ({"config": {"dt": 5.0, "tau": 0.005}, "fps": 20}, 0.05, "render_fps"),
         ({"dt": 0.05, "fps": 30}, 0.05, "dt"),
-        ({"tau": 0.02, "fps": 50}, 0.02, "tau"),
         ({"fps": 4}, 0.25, "render_fps of Told, a film's rate"),
     ],
 )

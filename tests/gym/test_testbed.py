@@ -19,12 +19,6 @@ SHORT = {"mission": {"steps": {"count": 2}}}
     [
         ("cloudrc/Steps-v0", {"settings": SHORT}, "steps", SHORT),
         ("cloudrc/Pipes-v0", {}, "paper", {}),
-        (
-            "cloudrc/Steps-v0",
-            {"robot": "x2", "settings": SHORT},
-            "steps",
-            {"world.robot": "x2"} | SHORT,
-        ),
         ("cloudrc/Steps-v0", {"experiment": "pillars"}, "pillars", {}),
     ],
 )
@@ -103,7 +97,6 @@ def test_what_a_robot_cannot_fly_is_refused():
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(4))
     env.reset(seed=1)
-    wrong = [True, False, False, False], ["0.1", 0, 0, 0], [1e31, 0, 0, 0], [[0], 1]
-    for action in (np.zeros(3), np.array([np.nan, 0, 0, 0]), None, np.ones(4) > 0, *wrong):
+    for action in (np.zeros(3), np.array([np.nan, 0, 0, 0]), None, np.ones(4) > 0):
         with pytest.raises(BadInputError, match=r"^action.*; give vx, vy, vz, yaw rate$"):
             env.step(action)

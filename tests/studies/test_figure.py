@@ -79,7 +79,6 @@ def test_a_figure_is_three_files_whose_text_is_text(tmp_path, call):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [(["--x", "delay"], "no axis named 'delay'"),
-     (["--number", "iea"], "no number named 'iea'"),
      (["--x", "gain", "--by", "gain"], "--x and --by are both gain; name two axes")],
 )  # fmt: skip
 def test_a_figure_of_unknown_names_is_refused(arguments, text, tmp_path, refused):
