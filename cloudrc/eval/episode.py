@@ -26,7 +26,7 @@ from cloudrc.gym.step import find_step
 from cloudrc.gym.values import size_of
 from cloudrc.outside.code import calling
 from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import RESULT, InvalidValueError, shorten, to_arrays, to_boolean
+from cloudrc.outside.values import RESULT, InvalidValueError, to_arrays, to_boolean
 from cloudrc.policy.actions import PolicyAnswerError, read_actions
 from cloudrc.policy.load import LoadedPolicy, PolicyFailedError
 from cloudrc.policy.observation import observe
@@ -61,8 +61,6 @@ class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
             to_boolean(_one(each), name)
             for each, name in ((terminated, "terminated"), (truncated, "truncated"))
         ]
-        if not isinstance(info, Mapping):
-            raise InvalidValueError(f"its info is {shorten(info)}, which is no mapping")
         self._note(action, observation, reward)
         return observation, reward, *ends, dict(info)
 
@@ -79,10 +77,8 @@ class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
 def _reward_of(given: Any) -> float:
     """Return the reward of a step, which may be a boolean; raise a ValueError for a wrong value."""
     given = _one(given)
-    reward = float(given) if isinstance(given, bool | np.bool_) else RESULT.of(given, "reward")
-    if not isfinite(reward):
-        raise InvalidValueError(f"its reward is {reward}")
-    return reward
+    is_boolean = isinstance(given, bool | np.bool_)
+    return float(given) if is_boolean else RESULT.of(given, "reward")
 
 
 def _one(given: Any) -> Any:

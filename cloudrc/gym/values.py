@@ -71,9 +71,8 @@ def _check(space: spaces.Space[Any], what: str, action: Any) -> None:
         try:
             _judge(space, action)
         except (TypeError, ValueError) as error:
-            shape = getattr(action, "shape", None)
-            given = shorten(action) + (f" of shape {shape}" if shape is not None else "")
-            raise InvalidValueError(f"it is {given}" + f" ({error})" * bool(str(error))) from None
+            why = f" ({error})" * bool(str(error))
+            raise InvalidValueError(f"it is {shorten(action)}{why}") from None
 
 
 def _judge(space: spaces.Space[Any], action: Any) -> None:

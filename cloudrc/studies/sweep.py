@@ -67,7 +67,8 @@ def begin(folder: Path, plan: SweepPlan, shard: Shard = None) -> Rows:
     Raise a BadInputError if the folder has rows of another sweep or of other code.
     """
     rows = Rows(folder, shard and shard[0])
-    if any(not _is_of(plan, row) for row in rows.kept.values()):
+    points = {key: flight.point for key, flight in plan.flights.items()}
+    if any(points.get(key) != row["point"] for key, row in rows.kept.items()):
         raise BadInputError(f"--out {folder}: {_why_others(folder, plan, rows)}; name a new folder")
     path = folder / FILE
     if not path.exists() or read_document(path, str(path)).tree != plan.draft.file:
@@ -77,11 +78,6 @@ def begin(folder: Path, plan: SweepPlan, shard: Shard = None) -> Rows:
         for name in (TABLE, PARQUET):
             (folder / name).unlink(missing_ok=True)
     return rows
-
-
-def _is_of(plan: SweepPlan, row: Row) -> bool:
-    flight = plan.flights.get(row["key"])
-    return flight is not None and flight.point == row["point"]
 
 
 def _why_others(folder: Path, plan: SweepPlan, rows: Rows) -> str:

@@ -33,7 +33,8 @@ class Rows:
         self.kept: dict[str, Row] = read_rows(folder) if folder else {}
         self._path = folder and folder / f"rows{f'-{shard}' if shard else ''}.jsonl"
         if self._path and self._path.exists():
-            _drop_half_a_line(self._path)
+            # A killed command has left half a line at the end.
+            os.truncate(self._path, files.read(self._path, SIZE_MAX).rfind(b"\n") + 1)
 
     def add(self, row: Row) -> None:
         """Add a row, unless one of its key is there."""
@@ -41,18 +42,9 @@ class Rows:
             return
         if self._path:
             line = json.dumps(row, allow_nan=False) + "\n"
-            try:
-                with self._path.open("ab") as file:
-                    file.write(line.encode())
-            except OSError as error:
-                error.filename = str(self._path)
-                raise
+            with files.at_place(self._path), self._path.open("ab") as file:
+                file.write(line.encode())
         self.kept[row["key"]] = row
-
-
-def _drop_half_a_line(path: Path) -> None:
-    """Cut off what a killed command has left at the end."""
-    os.truncate(path, files.read(path, SIZE_MAX).rfind(b"\n") + 1)
 
 
 def read_rows(folder: Path) -> dict[str, Row]:
