@@ -72,12 +72,7 @@ def test_a_constrained_part_is_throttled_yet_keeps_real_time(constrained, note, 
     assert (code, report["verdict"]) == (0, "success"), report
     numbers = {key: entry["value"] for key, entry in report["numbers"].items()}
     stopped = throttled(component)
-    note(
-        f"{name}: throttled {stopped:.2f} s (unconstrained: {plain:.2f} s),"
-        f" lateness p99 {numbers[f'{component}_lateness_p99'] * 1e3:.1f} ms,"
-        f" prediction error {numbers['prediction_error_rms'] * 1e3:.1f} mm,"
-        f" real-time factor {numbers['real_time_factor']:.3f}"
-    )
+    note(f"{name}: throttled {stopped:.2f} s (unconstrained: {plain:.2f} s)")
     assert stopped > RATIO_MIN * plain
     assert stopped > 0
     assert numbers["real_time_factor"] >= 0.95

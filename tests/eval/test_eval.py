@@ -267,13 +267,8 @@ def test_an_evaluation_has_a_table_a_page_and_rows_and_continues(law, tmp_path, 
     assert (near["successes"], near["episodes"], far["successes"]) == (3, 3, 0)
     assert near["success_low"] == pytest.approx(0.292, abs=0.001)
     assert (bare["executor"], bare["rtt_ms"], bare["success"]) == ("no network", None, 1.0)
-    assert (near["truncated"], far["terminated"], far["limit"]) == (3, 3, 0)
     assert document["versions"]["gymnasium"] == gymnasium.__version__
     assert document["command"].startswith("cloudrc eval --env CartPole-v1")
-    page = (tmp_path / "e" / "report.html").read_text()
-    assert "<svg" in page
-    assert "3/3" in page
-    assert "http://www.w3.org" not in page.replace("http://www.w3.org/", "")
 
 
 def after(count, last):
