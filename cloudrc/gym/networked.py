@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
-from math import inf
 from typing import Any, Unpack
 
 import gymnasium
@@ -43,8 +41,6 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         world_info: The environment's own info of the last step, without any delay: for whoever
             judges the episode, not for the policy.
     """
-
-    _left = inf  # steps until a wrapper outside ends the episode
 
     @naming("Networked")
     def __init__(
@@ -118,7 +114,6 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Begin an episode; the policy has the first observation at once."""
         observation, self.world_info = self.env.reset(seed=seed, options=options)
         self._loop.begin(seed, observation, self.world_info)
-        self._left = _outer_limit()
         return self._seen()
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -130,25 +125,10 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         observation, reward, terminated, truncated, self.world_info = self.env.step(executed)
         loop.observe(observation, self.world_info)
         seen, info = self._seen()
-        self._left -= 1
-        if terminated or truncated or self._left <= 0:
+        if terminated or truncated:
             info["cloudrc"]["episode"] = loop.summary()
         return seen, reward, terminated, truncated, info
 
     def _seen(self) -> tuple[Any, dict[str, Any]]:
         observation, info = self._loop.seen
         return copied(observation), {**info, "cloudrc": self._loop.told()}
-
-
-def _outer_limit() -> float:
-    """Return after how many steps a `TimeLimit` outside of an environment ends an episode.
-
-    A wrapper does not know those outside, but they call its `reset`.
-    """
-    least, frame = inf, sys._getframe().f_back
-    while frame is not None:
-        if frame.f_code.co_name == "reset":
-            outer = frame.f_locals.get("self")
-            least = min(least, getattr(outer, "_max_episode_steps", None) or inf)
-        frame = frame.f_back
-    return least

@@ -11,7 +11,6 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
-from gymnasium.wrappers import TimeLimit
 
 from cloudrc.errors import BadInputError
 from cloudrc.gym import Networked, NetworkedVector
@@ -228,23 +227,6 @@ def test_a_step_or_a_summary_before_the_first_reset_is_refused():
         Networked(Counter()).step(np.zeros(1, np.float32))
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"reset\(\) before summary"):
         Networked(Counter()).summary()
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: gymnasium.make("cloudrc/Networked-v0", env="Pendulum-v1", max_episode_steps=5),
-        lambda: TimeLimit(TimeLimit(Networked(Counter()), 5), 7),
-    ],
-)
-def test_a_time_limit_outside_leaves_the_summary_in_the_last_step(make):
-    env = make()
-    for _ in range(2):
-        env.reset(seed=1)
-        steps = [env.step(np.zeros(1, np.float32)) for _ in range(5)]
-        assert steps[-1][3]
-        assert ["episode" in info["cloudrc"] for *_, info in steps] == [False] * 4 + [True]
-        assert steps[-1][4]["cloudrc"]["episode"] == env.get_wrapper_attr("summary")()
 
 
 def test_an_unknown_argument_names_the_class_and_the_nearest():
