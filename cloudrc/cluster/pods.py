@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import os
 import re
-import signal
 import subprocess
 import tempfile
 import time
@@ -32,8 +31,6 @@ VALUES = {
     "bridge": "ros",
 }
 """Container -> section of the chart's values with its resources, if it has another name."""
-KILLED = 128
-"""Exit code of a process that a signal ended, without the number of the signal."""
 UNSCHEDULED = "no node takes it"
 """Beginning of the text about a pod that waits for a node."""
 RESTARTS_MAX = 2
@@ -127,14 +124,9 @@ def describe_end(container: str, ended: Any) -> str:
     if ended.reason == "OOMKilled":
         key = f"{VALUES.get(container, container)}.resources.limits.memory"
         return f"was killed, because it used more memory than its limit: raise {key}"
-    code = ended.exit_code
-    try:
-        name = signal.Signals(code - KILLED).name
-    except ValueError:
-        error = (ended.message or "").rpartition("cloudrc: error: ")[2]
-        words = to_one_line(error.strip().rpartition("\n")[2])
-        return f"ended with exit code {code}" + (f": {words}" if words else "")
-    return f"was ended by {name} (exit code {code})"
+    error = (ended.message or "").rpartition("cloudrc: error: ")[2]
+    words = to_one_line(error.strip().rpartition("\n")[2])
+    return f"ended with exit code {ended.exit_code}" + (f": {words}" if words else "")
 
 
 def events_of(release: Release, thing: Any, reason: str) -> list[str]:

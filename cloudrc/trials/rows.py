@@ -50,14 +50,11 @@ class Rows:
 def read_rows(folder: Path) -> dict[str, Row]:
     """Read the rows of all files of a folder: key -> row; ignore an unfinished last line.
 
-    Raise a BadInputError if a file cannot be read, or if a line is not a row.
+    Raise a BadInputError if a line is not a row.
     """
     found: dict[str, Row] = {}
     for path in sorted(folder.glob("rows*.jsonl")):
-        try:
-            *lines, _ = files.read(path, SIZE_MAX).split(b"\n")
-        except (OSError, ValueError) as error:
-            raise BadInputError(f"{path}: cannot be read: {error}; move it away") from error
+        *lines, _ = files.read(path, SIZE_MAX).split(b"\n")
         for number, line in enumerate(lines, start=1):
             row = parse_row(line)
             if row is None:

@@ -39,12 +39,6 @@ def test_a_line_that_is_no_row_is_named(tmp_path):
     assert parse_row(json.dumps(MADE[0])) == MADE[0]
 
 
-def test_what_is_no_file_of_rows_is_named(tmp_path):
-    (tmp_path / "rows.jsonl").mkdir()
-    with pytest.raises(BadInputError, match=r"rows\.jsonl: cannot be read"):
-        read_rows(tmp_path)
-
-
 class Counted:
     """A trial that counts how often it is played."""
 
