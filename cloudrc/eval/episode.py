@@ -234,19 +234,7 @@ def _play(
     witness, policy = _Witness(env), _Policy(ask, setup, env.action_space)
     observation, _ = witness.reset(seed=episode.seed)
     chunk = policy(observation, [])  # the first answer, whose size the link has to know
-    sent = setup.observation_bytes
-    world = Networked(
-        witness,
-        link_at(setup.link, episode.rtt_ms),
-        episode.seed,
-        dt=setup.dt,
-        compute=policy.duration if setup.is_measured else setup.compute_times,
-        answer_within=setup.answer_within,
-        chunk=len(chunk),
-        executor=episode.executor,
-        observation_bytes=policy.size if sent is None else sent,
-        start="answer",  # a robot does nothing before its policy has answered
-    )
+    world = _connect(witness, episode, setup, policy, len(chunk))
     witness.digest = sha256()
     observation, info = world.reset(seed=episode.seed)
     if times := setup.times:
@@ -285,6 +273,25 @@ def _play(
         **_numbers_of(world.summary(setup.deadline)),
     }
     return ended, success, witness.digest.hexdigest(), numbers
+
+
+def _connect(
+    env: gymnasium.Env[Any, Any], episode: Episode, setup: EvalSetup, policy: _Policy, count: int
+) -> Networked:
+    """Put the link between environment and policy, which has answered with `count` actions."""
+    sent = setup.observation_bytes
+    return Networked(
+        env,
+        link_at(setup.link, episode.rtt_ms),
+        episode.seed,
+        dt=setup.dt,
+        compute=policy.duration if setup.is_measured else setup.compute_times,
+        answer_within=setup.answer_within,
+        chunk=count,
+        executor=episode.executor,
+        observation_bytes=policy.size if sent is None else sent,
+        start="answer",  # a robot does nothing before its policy has answered
+    )
 
 
 def _success(known: bool | None, info: Mapping[str, Any]) -> bool | None:
