@@ -225,11 +225,10 @@ def as_actions(actions: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
 def _play(
     episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask: Ask
 ) -> tuple[str, bool | None, str, dict[str, float | None]]:
-    """Play an episode.
+    """Play an episode; return how it ended, whether it succeeded, its hash and its numbers.
 
-    Return what ended it: "terminated" or "truncated" by the environment, or "limit", by the longest
-    episode; whether it succeeded, None if the environment does not tell; the hash of what the world
-    did; and the numbers.
+    It ends "terminated" or "truncated" by the environment, or by its "limit". The success is None
+    if the environment does not tell.
     """
     witness, policy = _Witness(env), _Policy(ask, setup, env.action_space)
     observation, _ = witness.reset(seed=episode.seed)
