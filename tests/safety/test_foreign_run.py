@@ -102,13 +102,9 @@ def modules_with(text):
 
 
 def test_plug_ins_and_processes_begin_only_where_they_should():
-    """All code that does not fly uses `read_experiment`, which imports no plug-in.
-
-    The survey of a cluster judges whether an installation will fly, so it imports them, too.
-    """
+    """All code that does not fly uses `read_experiment`, which imports no plug-in."""
     flies = {"runs/experiment.py", "processes/ends.py", "runs/bench.py", "gym/testbed.py"}
     flies |= {"faults/flight.py", "trials/plan.py", "exercise/checks.py", "cli/session.py"}
-    flies |= {"cluster/survey.py"}
     assert modules_with("load_experiment(") == flies | {"config/load.py"}
     assert modules_with("sys.executable") == {"drivers/machine.py"}
 
