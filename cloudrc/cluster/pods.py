@@ -228,12 +228,22 @@ def follow_page(release: Release, port: int, tell: Callable[[str], None]) -> Ite
                 end_process(process)
 
 
-def fetch_recording(release: Release, component: str, target: Path) -> None:
-    """Copy the recording of "world" or "cloud" from its pod to the file `target`."""
+def fetch_recording(
+    release: Release, component: str, target: Path, *, previous: bool = False
+) -> None:
+    """Copy the recording of "world" or "cloud" from its pod to a file.
+
+    Args:
+        release: The release.
+        component: "world" or "cloud", the name of both pod and container.
+        target: File to write.
+        previous: Whether to copy the recording from before the container's last restart.
+    """
     pod = find_pod(release, component).metadata.name
-    arguments = [*release.flags, "exec", pod, f"--container={component}"]
+    path = f"{DATA}/{component}{'.before' if previous else ''}.mcap"
+    arguments = [*release.flags, "exec", pod, f"--container={component}", "--", "cat", path]
     with target.open("wb") as file:
-        run("kubectl", [*arguments, "--", "cat", f"{DATA}/{component}.mcap"], stdout=file)
+        run("kubectl", arguments, stdout=file)
 
 
 def fetch_logs(release: Release, component: str) -> dict[str, str]:

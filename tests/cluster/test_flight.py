@@ -65,7 +65,8 @@ def ready(running, teleop, pretend, tmp_path, monkeypatch):
     )
     pretend(
         "kubectl",
-        f'case "$*" in *patch*) echo $* >> {tmp_path}/patched ;;'
+        f'case "$*" in *exec*before*) cat {tmp_path}/left ;;'
+        f" *patch*) echo $* >> {tmp_path}/patched ;;"
         f" *exec*world*) cat {tmp_path}/world.mcap ;;"
         f" *exec*cloud*) cat {tmp_path}/cloud.mcap ;; *) {teleop.forwards()} ;; esac",
     )
@@ -131,6 +132,19 @@ def test_a_refused_mission_leaves_no_run(ready, tmp_path, call):
     assert "did not fly its mission: mission m-1 is under way" in said
     assert "what was recorded" not in said
     assert list((tmp_path / "runs").glob("*")) == []
+
+
+@pytest.mark.parametrize("left", ["", "before\n"])
+def test_the_recording_from_before_a_restart_is_copied(ready, tmp_path, call, left):
+    (key,) = [key for key in ready.objects if key[0] == "pods" and "world" in key[1]]
+    ready.objects[key]["status"]["containerStatuses"][0]["restartCount"] = 1
+    ends(ready)
+    if left:
+        (tmp_path / "left").write_text(left)
+    assert "world was restarted" in call(LINE, code=6).err
+    found = (tmp_path / "runs" / "latest").glob("*.before.mcap")
+    wanted = {"world.before.mcap": left} if left else {}
+    assert {path.name: path.read_text() for path in found} == wanted
 
 
 def test_a_broken_connection_loses_logs_but_no_report(ready, call, monkeypatch):
