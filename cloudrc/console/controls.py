@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from math import inf
 from typing import Any
 
@@ -19,7 +20,7 @@ from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import is_planar
 from cloudrc.config.scene import scene_of
 from cloudrc.console.feed import FlightFeed
-from cloudrc.console.steering import SLIDERS, Steering
+from cloudrc.console.steering import SLIDERS, Answer, Steering
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.messages import Vector
 
@@ -38,25 +39,19 @@ TOUCHED = 2.0
 """Time after a move of a slider for which no slider follows the link [s]."""
 
 
-def acts_of(experiment: ResolvedExperiment, steering: Steering) -> dict[str, Callable[[], object]]:
-    """Return the label of each button of a mission, and what it does."""
+def acts_of(experiment: ResolvedExperiment, steering: Steering) -> dict[str, Callable[[], Answer]]:
+    """Return the name of each button of a mission, and what it does."""
 
-    def start() -> None:
+    def start() -> Answer:
         mission = experiment.mission
         if mission.steps is not None:
             text = "start: random steps are for 'cloudrc run'; send waypoints instead"
-            steering.say(text, is_refusal=True)
-            return
+            return steering.say(text, is_refusal=True)
         order = mission.model_dump(mode="json", exclude={"steps"}, exclude_none=True)
-        steering.start_mission({**order, "name": experiment.name})
+        return steering.start_mission({**order, "name": experiment.name})
 
-    return {
-        "Start": start,
-        "Hold": lambda: steering.ask("holding", "/v1/hold"),
-        "Resume": steering.resume,
-        "Cancel": steering.cancel,
-        "Acknowledge": lambda: steering.ask("acknowledged", "/v1/acknowledge"),
-    }
+    verbs = "hold", "resume", "cancel", "acknowledge"
+    return {"start": start, **{verb: partial(steering.act, verb) for verb in verbs}}
 
 
 class TargetPlace:
@@ -98,7 +93,7 @@ class Controls:
     def __init__(
         self,
         client: viser.ClientHandle,
-        acts: dict[str, Callable[[], object]],
+        acts: dict[str, Callable[[], Answer]],
         steering: Steering,
         place: TargetPlace,
     ) -> None:
@@ -135,14 +130,14 @@ class Controls:
                 if abs(slider.value - shown) > 1e-6:
                     slider.value = shown
 
-    def _add_mission(self, gui: viser.GuiApi, acts: dict[str, Callable[[], object]]) -> None:
-        names = list(acts)
+    def _add_mission(self, gui: viser.GuiApi, acts: dict[str, Callable[[], Answer]]) -> None:
+        names = [name.title() for name in acts]
         for label, some in (("Mission", names[:3]), (" ", names[3:])):
             group = gui.add_button_group(label, some)
 
             @group.on_click
             def _(event: Any) -> None:
-                acts[event.target.value]()
+                acts[event.target.value.lower()]()
 
     def _add_target(self, client: viser.ClientHandle) -> tuple[Any, Any]:
         """Add a gizmo and number fields for the target position; a change of one updates both."""
@@ -176,8 +171,7 @@ class Controls:
 
         @send.on_click
         def _(_: object) -> None:
-            if self._steering.go_to(numbers.value):
-                self._is_moved = False
+            self._is_moved = self._steering.go_to(numbers.value).is_refusal
 
         return gizmo, numbers
 

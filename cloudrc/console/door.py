@@ -10,7 +10,6 @@ import asyncio
 import html
 import json
 import socket
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from functools import partial
@@ -18,7 +17,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-import uvicorn
 import websockets.asyncio.server
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -29,9 +27,10 @@ from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from cloudrc.console.access import PARAMETER, Access
+from cloudrc.console.steering import Answer
 from cloudrc.drivers.local import socket_folder
-from cloudrc.errors import CloudrcError
 from cloudrc.files import at_place
+from cloudrc.teleop.server import ThreadServer
 
 PAGES_MAX = 50
 """Largest number of pages that have the scene; each further one gets the plain page."""
@@ -43,8 +42,6 @@ MESSAGE_MAX = 1 << 20
 """Size limit of a message from a browser [bytes]."""
 COPIED_MAX = 1 << 16
 """Largest number of bytes that are copied at once."""
-STOP_LIMIT = 1
-"""Time limit for open pages to end with the door [s]."""
 NO_TOKEN = (
     "This address lacks the console's token, or has an old one. "
     "Open the address that 'cloudrc console' has printed."
@@ -68,7 +65,7 @@ class Desk(NamedTuple):
     """What the door needs of the console; it calls these functions in its own threads."""
 
     stop: Callable[[], None]  # switches the robot off, does not wait
-    acts: Mapping[str, Callable[[], str]]  # name of a button -> act, returns the answer in words
+    acts: Mapping[str, Callable[[], Answer]]  # name of a button -> act
     describe: Callable[[], list[str]]  # the state, line by line
     has_pilot: Callable[[], bool]  # whether a page with the scene steers
 
@@ -100,11 +97,11 @@ class _Protocol(H11Protocol):
         self._passing = self._door.pass_on(self.transport, b"\r\n".join([*lines, b"", b""]))
 
 
-class Door(uvicorn.Server):
+class Door(ThreadServer):
     """The console's server at 127.0.0.1."""
 
     def __init__(self, port: int, access: Access, desk: Desk, scene: str) -> None:
-        """Open the port (0: any free one); answer after `open`.
+        """Open the port (0: any free one); answer after `start`.
 
         Args:
             port: TCP port.
@@ -114,9 +111,7 @@ class Door(uvicorn.Server):
         """
         with at_place(f"--port {port}"):
             opened = socket.create_server(("127.0.0.1", port), backlog=512)
-        # The new socket names its protocol: only then does asyncio disable Nagle's algorithm.
-        self._socket = socket.socket(fileno=opened.detach())
-        self.port: int = self._socket.getsockname()[1]
+        self.port: int = opened.getsockname()[1]
         self._folder = TemporaryDirectory(prefix="cloudrc-", dir=socket_folder())
         self.viser = f"{self._folder.name}/viser.sock"  # only this user may enter its folder
         self._access, self._desk, self._scene = access, desk, scene
@@ -128,33 +123,16 @@ class Door(uvicorn.Server):
             ]
         )
         super().__init__(
-            uvicorn.Config(
-                self._check,
-                http=partial(_Protocol, self),  # type: ignore[arg-type]
-                ws="none",
-                interface="asgi3",
-                lifespan="off",
-                log_level="critical",
-                access_log=False,
-                headers=HEADERS,
-                server_header=False,
-                proxy_headers=False,
-                h11_max_incomplete_event_size=HEAD_MAX,
-                timeout_graceful_shutdown=STOP_LIMIT,
-            )
+            self._check,
+            opened,
+            partial(_Protocol, self),
+            headers=HEADERS,
+            h11_max_incomplete_event_size=HEAD_MAX,
         )
-        self._thread = threading.Thread(target=self.run, args=([self._socket],), daemon=True)
 
-    def open(self) -> None:
-        """Begin to answer."""
-        self._thread.start()
-
-    def close(self) -> None:
+    def stop(self) -> None:
         """Stop to answer."""
-        self.should_exit = True
-        if self._thread.is_alive():
-            self._thread.join()
-        self._socket.close()
+        super().stop()
         self._folder.cleanup()
 
     async def _check(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -164,12 +142,9 @@ class Door(uvicorn.Server):
 
     def _refusal(self, request: HTTPConnection) -> Response | None:
         """Return the answer to a request that is not admitted, else None."""
-        try:
-            if not self._access.is_own_page(request):
-                return PlainTextResponse(FOREIGN, 403)
-            return None if self._access.has_token(request) else PlainTextResponse(NO_TOKEN, 403)
-        except CloudrcError as error:  # the file with the token cannot be read now
-            return PlainTextResponse(str(error), 503)
+        if not self._access.is_own_page(request):
+            return PlainTextResponse(FOREIGN, 403)
+        return None if self._access.has_token(request) else PlainTextResponse(NO_TOKEN, 403)
 
     async def _show(self, request: Request) -> Response:
         name = request.path_params["name"]
@@ -214,7 +189,8 @@ class Door(uvicorn.Server):
             return Response(status_code=404)
         if self._desk.has_pilot():
             return PlainTextResponse("another browser steers", 409)
-        return PlainTextResponse(await run_in_threadpool(act))
+        answer = await run_in_threadpool(act)
+        return PlainTextResponse(f"Refused: {answer.text}" if answer.is_refusal else answer.text)
 
     def gives_scene_to(self, request: HTTPConnection) -> bool:
         """Return whether viser may serve a request: an admitted page opens its WebSocket."""

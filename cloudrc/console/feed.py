@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from math import dist, hypot, inf, nan
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -32,16 +32,10 @@ JUMP = 0.5
 """Distance between two poses above which a new trail begins, because the robot was reset [m]."""
 
 
-class Sample(NamedTuple):
-    """The values of all charts at one time; unknown values are NaN."""
-
-    time: float  # of arrival [s], the console's clock
-    uplink: float = nan  # one-way delay [s]
-    downlink: float = nan  # one-way delay [s]
-    estimate: float = nan  # delay by which cloud predicts ahead [s]
-    estimate_error: float = nan  # distance from predicted to measured position [m]
-    speed: float = nan  # [m/s]
-    charted: tuple[float, ...] = (nan,) * len(CHARTED)  # of `CHARTED`, each in its unit
+TIME, UPLINK, DOWNLINK, ESTIMATE, ERROR, SPEED, CHARTED_FROM = range(7)
+"""Rows of `FlightFeed.columns`: time of arrival on the console's clock, one-way delays, delay by
+which cloud predicts ahead [s], distance from predicted to measured position [m], speed [m/s], and
+from there on the values of `CHARTED`, each in its unit."""
 
 
 class FlightFeed:
@@ -49,7 +43,7 @@ class FlightFeed:
 
     Attributes:
         status: The robot's newest status; None before the first.
-        samples: Points of the charts, oldest first.
+        samples: Values of all charts at one time each, oldest first; unknown values are NaN.
         flown: Number of points added so far to the trail, the line that shows the robot's path.
     """
 
@@ -61,7 +55,7 @@ class FlightFeed:
         self._obstacles, self._robot = () if hull is None else known, hull or NO_SIZE
         self._judge, self._echoes = PredictionJudge(), Echoes()
         self.status: RobotStatus | None = None
-        self.samples: deque[Sample] = deque()
+        self.samples: deque[list[float]] = deque()
         self.flown = 0
         # Times of the newest telemetry, control period, judged prediction and echo [s].
         self._heard = self._controlled = self._judged = self._echoed = -inf
@@ -82,7 +76,7 @@ class FlightFeed:
             self._take_control(control, status.uplink_delay, now)
         self._follow(status, last)
         self.samples.append(self._sample(status, now))
-        while self.samples[0].time < now - WINDOW:
+        while self.samples[0][TIME] < now - WINDOW:
             self.samples.popleft()
 
     def silence(self, now: float) -> float:
@@ -107,14 +101,13 @@ class FlightFeed:
         rows = np.array(self._trail, dtype=np.float64).reshape(-1, 4)
         return rows[:, :3], rows[:, 3]
 
-    def columns(self, step: int = 3) -> Array:
-        """Return every `step`-th sample of the charts, shape (values of `Sample`, n).
+    def columns(self) -> Array:
+        """Return every third sample of the charts, shape (values, n).
 
-        The times are relative to the newest returned sample [s]. Unknown values are NaN.
+        The times are relative to the newest returned sample [s].
         """
-        samples = [*self.samples][::step] or [Sample(0.0)]
-        rows = np.array([(*sample[:-1], *sample.charted) for sample in samples], dtype=np.float64)
-        rows[:, 0] -= rows[-1, 0]
+        rows = np.array([*self.samples][::3] or [[0.0] + [nan] * (SPEED + len(CHARTED))])
+        rows[:, TIME] -= rows[-1, TIME]
         return np.ascontiguousarray(rows.T)
 
     def _take_control(self, control: Control, uplink_delay: float, now: float) -> None:
@@ -136,20 +129,18 @@ class FlightFeed:
             self._trail.append((*position, float(near[0])))
             self.flown += 1
 
-    def _sample(self, status: RobotStatus, now: float) -> Sample:
-        uplink, speed = status.uplink_delay, hypot(*status.velocity)
+    def _sample(self, status: RobotStatus, now: float) -> list[float]:
+        sample = [now, *(nan,) * ERROR, hypot(*status.velocity), *(nan,) * len(CHARTED)]
+        sample[UPLINK] = status.uplink_delay
         if (control := self.control(now)) is None:
-            return Sample(now, uplink, speed=speed)
-        judged, echoed = now - self._judged < STALE, now - self._echoed < STALE
-        return Sample(
-            now,
-            uplink,
-            self._downlink if echoed else nan,
-            control.horizon,
-            hypot(*self._judge.error) if judged else nan,
-            speed,
-            tuple(_size(quantity.value(control)) for quantity in CHARTED),
-        )
+            return sample
+        sample[ESTIMATE] = control.horizon
+        if now - self._echoed < STALE:
+            sample[DOWNLINK] = self._downlink
+        if now - self._judged < STALE:
+            sample[ERROR] = hypot(*self._judge.error)
+        sample[CHARTED_FROM:] = [_size(quantity.value(control)) for quantity in CHARTED]
+        return sample
 
 
 def _size(value: Any) -> float:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Collection
-from functools import partial
 from math import inf
 from pathlib import Path
 from secrets import token_hex
@@ -23,13 +22,23 @@ from cloudrc.config.scene import scene_of
 from cloudrc.console.access import PARAMETER, Access
 from cloudrc.console.controls import KEYS, Controls, TargetPlace, acts_of
 from cloudrc.console.door import Desk, Door, scene_page, viser_at
-from cloudrc.console.feed import STALE, FlightFeed
+from cloudrc.console.feed import (
+    CHARTED_FROM,
+    DOWNLINK,
+    ERROR,
+    ESTIMATE,
+    SPEED,
+    STALE,
+    UPLINK,
+    FlightFeed,
+)
 from cloudrc.console.scene import LEGEND, FlightScene
 from cloudrc.console.steering import Steering, is_drive
 from cloudrc.geometry.clearance import Array
 from cloudrc.messages import ZERO, Quaternion, Vector
 from cloudrc.metrics.definitions import CHARTED
 from cloudrc.robots.shapes import read_shapes
+from cloudrc.teleop.client import describe_mission
 from cloudrc.text import describe_sensors
 
 SLOW_PERIOD = 0.3
@@ -42,13 +51,17 @@ ASPECT = (1280 - 2 * PANEL_WIDTH) / 800
 """Width divided by height of the scene between the panels, in a window of 1280 x 800 px."""
 BLUE, RED, GREEN = "#0072b2", "#d55e00", "#009e73"
 CHARTS: dict[str, tuple[float, float, dict[str, tuple[int, str]]]] = {
-    "Delay [ms]": (1e3, 150, {"up": (1, BLUE), "down": (2, RED), "estimate": (3, GREEN)}),
-    "Estimate error [mm]": (1e3, 20, {"error": (4, BLUE)}),
-    "Speed [m/s]": (1.0, 0.5, {"speed": (5, BLUE)}),
+    "Delay [ms]": (
+        1e3,
+        150,
+        {"up": (UPLINK, BLUE), "down": (DOWNLINK, RED), "estimate": (ESTIMATE, GREEN)},
+    ),
+    "Estimate error [mm]": (1e3, 20, {"error": (ERROR, BLUE)}),
+    "Speed [m/s]": (1.0, 0.5, {"speed": (SPEED, BLUE)}),
 }
 """Title of a chart -> factor from SI units, smallest range of its axis, and its curves: name ->
 row of `FlightFeed.columns`, and colour."""
-for _row, _quantity in enumerate(CHARTED, start=6):
+for _row, _quantity in enumerate(CHARTED, start=CHARTED_FROM):
     _title, _factor, _range = _quantity.chart or ("", 1.0, 1.0)
     CHARTS[_title] = _factor, _range, {_title.partition(" [")[0].lower(): (_row, BLUE)}
 BELOW_STOP = '<div style="height: 36px"></div>'
@@ -85,8 +98,7 @@ class Page:
         """
         self._experiment, self._feed, self._steering = experiment, feed, steering
         self._acts = acts_of(experiment, steering)
-        acts = {name.lower(): partial(self._answer, act) for name, act in self._acts.items()}
-        desk = Desk(steering.stop, acts, self._describe_plainly, lambda: self._pilot is not None)
+        desk = Desk(steering.stop, self._acts, self._describe_plainly, self._is_steered)
         viser_page = Path(viser.__file__).parent / "client" / "build" / "index.html"
         labels = {code: label for code, (label, _) in KEYS.items()}
         page = scene_page(viser_page.read_text(encoding="utf-8"), labels)
@@ -105,7 +117,7 @@ class Page:
         self._add_panels(with_legend=bool(scene.tubes))
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._succeed)
-        self._door.open()
+        self._door.start()
 
     @property
     def port(self) -> int:
@@ -148,7 +160,7 @@ class Page:
 
     def close(self) -> None:
         """Stop serving the page."""
-        self._door.close()
+        self._door.stop()
         self._server.stop()
 
     def _add_panels(self, *, with_legend: bool) -> None:
@@ -175,15 +187,15 @@ class Page:
         lines = [
             f"**{feed.status.guard.name}**: {feed.status.cause.words}",
             f"Last command: {'none' if age == inf else f'{age:.2f} s ago'}",
-            f"Mission: {self._describe_mission(now)}",
+            self._describe_mission(now),
         ]
         if shown := describe_sensors((state.get("seen") or {}).get("sensors", ())):
             lines.append(f"Sensors: {shown}")
         if silence > STALE:
             lines[0] = f"**No telemetry for {silence:.1f} s**, last: {lines[0]}"
-        text, is_refusal, at = self._steering.answer
-        if now - at < ANSWER_SHOWN:
-            lines.append(f"**Refused:** {text}" if is_refusal else text)
+        answer = self._steering.answer
+        if now - answer.at < ANSWER_SHOWN:
+            lines.append(f"**Refused:** {answer.text}" if answer.is_refusal else answer.text)
         elif seen := state.get("seen"):
             lines.append(seen["next_step"])
         return "  \n".join(lines).replace("cloudrc mission ", "")  # buttons have the verbs' names
@@ -192,25 +204,17 @@ class Page:
         mission = self._steering.state.get("mission")
         is_free = not mission or mission["by_hand"] or mission["state"] == "held"
         if is_free and self._steering.velocity(now) != ZERO:
-            return "driving"
+            return "driving by hand"
         if is_drive(mission):
-            return "drive, waits for keys"
-        if not mission:
-            return "none"
-        progress = "setpoints of a file"
-        if mission["waypoints"]:
-            progress = f"{len(mission['reached'])} of {mission['waypoints']} waypoints"
-        return f"{mission['name'] or mission['id']}, {mission['state']}, {progress}"
+            return "driving by hand, waits for keys"
+        return describe_mission(mission) if mission else "no mission"
 
     def _describe_plainly(self) -> list[str]:
         """Return the lines of the state, without marks."""
         return self._describe(time.monotonic()).replace("**", "").split("  \n")
 
-    def _answer(self, act: Callable[[], object]) -> str:
-        """Do what a button of the plain page asks for; return the answer in words."""
-        act()
-        text, is_refusal, _ = self._steering.answer
-        return f"Refused: {text}" if is_refusal else text
+    def _is_steered(self) -> bool:
+        return self._pilot is not None
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Give the controls to a new browser if no other browser has them."""

@@ -215,17 +215,13 @@ def _camera(geometry: Scene, waypoints: Sequence[Vector], aspect: float) -> tupl
     """Return the place of the viewer, and the point at which the viewer looks [m], shape (3,).
 
     The viewer looks along +x: the key ↑ moves the robot away from the viewer, the key ← to the
-    viewer's left. The place is the nearest one from which spawn, tubes and waypoints are in sight.
+    viewer's left. A ball around spawn, tubes and waypoints is in sight.
     """
     tubes = [(tube.centre, 0.5 * tube.length * np.array(tube.axis)) for tube in geometry.tubes]
     ends = [centre + sign * half for centre, half in tubes for sign in (-1, 1)]
-    forward = LOOK / np.linalg.norm(LOOK)
-    right = np.cross(forward, (0.0, 0.0, 1.0)) / np.hypot(*forward[:2])
-    axes = np.array([right, np.cross(right, forward), forward])
-    *across, depth = axes @ np.array([geometry.spawn, *ends, *waypoints]).T
-    slope = 0.8 * np.tan(VIEW / 2) * np.array([[aspect], [1.0]])  # with a margin
-    least, most = (across - slope * depth).max(axis=1), (across + slope * depth).min(axis=1)
-    middle = (depth.min() + depth.max()) / 2
-    back = min(((most - least) / (2 * slope[:, 0])).min(), middle - NEAREST)
-    place = (least + most) / 2
-    return np.array([*place, back]) @ axes, np.array([*place, middle]) @ axes
+    points = np.array([geometry.spawn, *ends, *waypoints])
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    radius = np.linalg.norm(points - middle, axis=1).max()
+    slope = np.tan(VIEW / 2) * min(aspect, 1.0)
+    away = max(NEAREST, radius / np.sin(np.arctan(slope)))
+    return middle - away * LOOK / np.linalg.norm(LOOK), middle

@@ -11,10 +11,13 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc.errors import CloudrcError
 from cloudrc.messages import ZERO, Vector
+
+if TYPE_CHECKING:
+    from cloudrc.teleop.client import Api
 
 DRIVE_PERIOD = 0.1
 """Time between two requests of a drive [s], unless one takes longer; each is a heartbeat."""
@@ -31,14 +34,25 @@ SLIDERS: dict[str, tuple[str, float, float, float]] = {
 setting's unit to that of the slider."""
 
 
-class TeleopApi(Protocol):
-    """The API of teleop; both methods raise a CloudrcError with the reason of a refusal."""
+VERBS = {
+    "hold": "holding",
+    "resume": "resumed",
+    "cancel": "cancelled; the robot holds",
+    "acknowledge": "acknowledged: the next mission may fly",
+    "estop": "switching the robot off",
+}
+"""Verb of the operator, as in the path of teleop's API -> words of the answer."""
 
-    def get(self, path: str) -> Any:
-        """Send a GET request and return the decoded answer."""
 
-    def post(self, path: str, body: Mapping[str, Any] | None = None) -> Any:
-        """Send a POST request and return the decoded answer."""
+class Answer(NamedTuple):
+    """Result of a request, for the operator."""
+
+    text: str
+    is_refusal: bool = False  # whether nothing was done
+    at: float = -inf  # time of the answer [s]
+
+
+NOTHING = Answer("")
 
 
 @dataclass(frozen=True)
@@ -63,15 +77,15 @@ class Steering:
     Attributes:
         api: Teleop's API; it keeps no connection open, so that several threads may use it.
         link: Functions that read and change the emulated link.
-        answer: Result of the newest request in words, whether it is a refusal, and its time [s].
+        answer: Result of the newest request.
         state: Newest answer of the API's `GET /v1/state`; {} before the first.
         route: Waypoints of the mission under way [m], shape (n, 3); empty if none.
         conditions: Key of the link, such as "uplink.delay_ms" -> present value, in the key's unit.
     """
 
-    api: TeleopApi
+    api: Api
     link: LinkControl = LinkControl()
-    answer: tuple[str, bool, float] = ("", False, -inf)
+    answer: Answer = NOTHING
     state: dict[str, Any] = field(default_factory=dict)
     route: list[Vector] = field(default_factory=list)
     conditions: dict[str, float] = field(default_factory=dict)
@@ -100,57 +114,60 @@ class Steering:
         """Switch the robot off, and repeat the request until the API answers; return at once."""
         self._stops.set()
 
-    def ask(self, words: str, path: str, body: Mapping[str, Any] | None = None) -> bool:
-        """Post a request to `path` of the API; return whether teleop accepted it.
-
-        The newest answer on the page becomes `words` or, if the request failed, the error.
-        """
+    def ask(self, words: str, path: str, body: Mapping[str, Any] | None = None) -> Answer:
+        """Post a request to `path` of the API; answer `words`, or with the reason of a refusal."""
         try:
             self.api.post(path, body)
         except CloudrcError as error:
-            self.say(str(error), is_refusal=True)
-            return False
-        self.say(words)
-        return True
+            return self.say(str(error), is_refusal=True)
+        return self.say(words)
 
-    def say(self, text: str, *, is_refusal: bool = False) -> None:
-        """Make `text` the newest answer on the page; `is_refusal`: nothing was done."""
-        self.answer = text, is_refusal, time.monotonic()
+    def say(self, text: str, *, is_refusal: bool = False) -> Answer:
+        """Make `text` the newest answer; `is_refusal`: nothing was done."""
+        self.answer = answer = Answer(text, is_refusal, time.monotonic())
+        return answer
 
-    def cancel(self) -> None:
-        """Cancel the mission under way."""
-        if mission := self.state.get("mission"):
-            self.ask("cancelled", f"/v1/missions/{mission['id']}/cancel")
-        else:
-            self.say("cancel: no mission is under way", is_refusal=True)
+    def act(self, verb: str) -> Answer:
+        """Carry out one of `VERBS`; "resume" also ends a drive by hand."""
+        if verb == "cancel":
+            return self._cancel()
+        ends_drive = verb == "resume" and is_drive(self.state.get("mission"))
+        words = "the drive ends, and the robot holds" if ends_drive else VERBS[verb]
+        return self.ask(words, f"/v1/{verb}")
 
-    def resume(self) -> bool:
-        """Continue the held mission, or end a drive; return whether teleop accepted it."""
-        words = "ending the drive" if is_drive(self.state.get("mission")) else "resumed"
-        return self.ask(words, "/v1/resume")
+    def _cancel(self) -> Answer:
+        """Cancel the mission under way, which may have begun after the last look."""
+        try:
+            mission = self.api.get("/v1/state")["mission"]
+        except CloudrcError as error:
+            return self.say(str(error), is_refusal=True)
+        if mission is None:
+            return self.say("no mission is under way", is_refusal=True)
+        return self.ask(VERBS["cancel"], f"/v1/missions/{mission['id']}/cancel")
 
-    def start_mission(self, order: Mapping[str, Any]) -> None:
+    def start_mission(self, order: Mapping[str, Any]) -> Answer:
         """Start a mission; if the user drives the robot by keys, first end this drive."""
         if is_drive(self.state.get("mission")):
-            if not self.resume():
-                return
+            if (resumed := self.act("resume")).is_refusal:
+                return resumed
             order = {**order, "queue": True}  # in case the drive has not ended yet
         back = order.get("start", "spawn") == "spawn"
         words = "starting; the robot is set back to its spawn" if back else "starting"
-        self.ask(words, "/v1/missions", order)
+        return self.ask(words, "/v1/missions", order)
 
-    def go_to(self, position: Sequence[float], yaw_deg: float | None = None) -> bool:
+    def go_to(self, position: Sequence[float], yaw_deg: float | None = None) -> Answer:
         """Hold the present mission, if one is under way, then ask the robot to go to a position.
 
         `position` [m] has two numbers for a robot that stays on the ground; `yaw_deg` is the yaw
-        there [deg], None for any. Return whether teleop has accepted the requests.
+        there [deg], None for any.
         """
-        place = [round(float(value), 3) for value in position]
         mission = self.state.get("mission") or {"state": ""}
-        if mission["state"] in ("starting", "flying") and not self.ask("hold", "/v1/hold"):
-            return False
-        words = f"going to ({', '.join(f'{value:g}' for value in place)})"
+        if mission["state"] in ("starting", "flying"):
+            if (held := self.act("hold")).is_refusal:
+                return held
+        place = [round(float(value), 3) for value in position]
         yaw = {} if yaw_deg is None else {"yaw_deg": round(yaw_deg, 1)}
+        words = f"going to ({', '.join(f'{value:g}' for value in place)})"
         return self.ask(words, "/v1/goto", {"position_m": place, **yaw})
 
     def hold_key(self, key: str, velocity: Vector, lasts: float) -> None:
@@ -183,20 +200,17 @@ class Steering:
 
     def watch(self) -> None:
         """Query the state of missions and link once, and store it."""
+        state, profile = dict[str, Any](), dict[str, Any]()
         try:
-            self.state = self.api.get("/v1/state")
-            mission = (self.state["mission"] or {"id": ""})["id"]
+            state = self.api.get("/v1/state")
+            mission = (state["mission"] or {"id": ""})["id"]
             if mission and mission != self._mission:
                 self.route = self.api.get(f"/v1/missions/{mission}")["route_m"]
             self._mission = mission
-        except CloudrcError as error:
-            self.state = {}
-            self.say(str(error), is_refusal=True)
-        profile: Mapping[str, Any] = {}
-        try:
-            profile = self.link.read()
+            profile = {**self.link.read()}
         except CloudrcError as error:
             self.say(str(error), is_refusal=True)
+        self.state = state
         self.conditions = {
             f"{way}.{name}": float(value)
             for way in ("uplink", "downlink")
@@ -206,10 +220,10 @@ class Steering:
 
     def _stop_loop(self) -> None:
         while self._stops.wait():
-            if self.ask("switching the robot off", "/v1/estop"):
-                self._stops.clear()
-            else:
+            if self.act("estop").is_refusal:
                 time.sleep(STOP_PERIOD)
+            else:
+                self._stops.clear()
 
     def _drive_loop(self) -> None:
         """Send the velocity while a key is held, and once more when the last key is released."""

@@ -10,14 +10,12 @@ import asyncio
 import json
 import os
 import socket
-import threading
 from collections import deque
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
-import uvicorn
 from fastapi import APIRouter, Depends, FastAPI, Header, HTTPException, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.concurrency import run_in_threadpool
@@ -29,6 +27,7 @@ from cloudrc.files import at_place
 from cloudrc.teleop import models
 from cloudrc.teleop.auth import BEARER, REFUSED, Gate
 from cloudrc.teleop.refusals import ConflictError, UnavailableError, UnknownMissionError
+from cloudrc.teleop.server import ThreadServer
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import Event, MissionRecord
 from cloudrc.teleop.wire import RobotStatus, write_line
@@ -44,8 +43,6 @@ ANSWER_LIMIT = 2.0
 """Time limit for the mission service to answer [s]."""
 BODY_MAX = 256 * 1024
 """Longest body of a request [bytes]."""
-STOP_LIMIT = 1
-"""Time limit for open requests to end when the server stops [s]."""
 STATUSES = {BadInputError: 422, ConflictError: 409, UnknownMissionError: 404, UnavailableError: 503}
 """Class of an error -> HTTP status of the answer."""
 REASONS = {
@@ -423,48 +420,27 @@ async def stream_robot(request: Request, bridge: Bridged) -> StreamingResponse:
     return StreamingResponse(stream(), media_type="application/jsonl", headers=headers)
 
 
-class ApiServer(uvicorn.Server):
+class ApiServer(ThreadServer):
     """Serve the API in a separate thread, from `start` to `stop`."""
 
     def __init__(self, gate: Gate, bridge: Bridge, address: Address) -> None:
         """Bind the address; with port 0 the kernel chooses a port."""
         if gate.tokens is None and not isinstance(address, Path):
             raise ValueError("in a network, the gate needs tokens")
-        super().__init__(
-            uvicorn.Config(
-                gate,
-                http="h11",
-                ws="none",
-                lifespan="off",
-                log_level="critical",  # a flood does not fill the log
-                access_log=False,  # the gate's log has the commands
-                server_header=False,
-                proxy_headers=False,  # the log has the true address
-                # No limit_concurrency: uvicorn would refuse an emergency stop, too.
-                timeout_graceful_shutdown=STOP_LIMIT,
-            )
-        )
-        self.gate, self.bridge = gate, bridge
         # The URL is "http://HOST:PORT", or "unix:PATH" for a Unix socket.
-        self._socket, self.url = _bind(address)
-        # A daemon, so that a client that hangs cannot keep the process from ending.
-        self._thread = threading.Thread(target=self.run, args=([self._socket],), daemon=True)
+        opened, self.url = _bind(address)
+        super().__init__(gate, opened)
+        self.gate, self.bridge = gate, bridge
 
     @property
     def counts(self) -> dict[str, int]:
         """Counts by name: requests with each outcome."""
         return {f"api_{name}": count for name, count in self.gate.counts.items()}
 
-    def start(self) -> None:
-        """Start to serve the API, in a thread of its own."""
-        self._thread.start()
-
     def stop(self) -> None:
         """Answer the open requests, end the streams, and stop the server."""
         self.bridge.closed = "teleop ends"
-        self.should_exit = True
-        self._thread.join(STOP_LIMIT)
-        self._socket.close()
+        super().stop()
 
 
 def _bind(address: Address) -> tuple[socket.socket, str]:
@@ -483,6 +459,4 @@ def _bind(address: Address) -> tuple[socket.socket, str]:
     family = socket.AF_INET6 if is_6 else socket.AF_INET
     with at_place(f"--api {url}:{port}"):
         server = socket.create_server((host, port), family=family, dualstack_ipv6=is_6)
-    # The new socket names its protocol: only then does asyncio disable Nagle's algorithm.
-    named = socket.socket(fileno=server.detach())
-    return named, f"{url}:{named.getsockname()[1]}"
+    return server, f"{url}:{server.getsockname()[1]}"

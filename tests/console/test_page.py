@@ -231,15 +231,18 @@ def test_the_first_view_shows_the_whole_mission(filled):
 
 
 @pytest.mark.parametrize(
-    ("waypoints", "shown"), [(7, "0 of 7 waypoints"), (0, "setpoints of a file")]
+    ("waypoints", "shown"), [(7, "waypoint 1 of 7"), (0, "setpoints of a file")]
 )
 def test_the_state_tells_what_the_mission_follows(filled, waypoints, shown):
     page, feed, steering = filled("hover")
     mission = {"id": "m1", "name": "tour", "by_hand": False, "state": "flying", "reached": []}
-    steering.state = {"mission": mission | {"waypoints": waypoints}, "seen": {"next_step": ""}}
+    steering.state = {
+        "mission": mission | {"waypoints": waypoints, "waypoint": 0, "verdict": None},
+        "seen": {"next_step": ""},
+    }
     feed.take(status(0.1), 1.0)
     page.update(1.0)
-    assert f"Mission: tour, flying, {shown}" in page._status.content
+    assert f"mission m1 (tour): flying, {shown}" in page._status.content
 
 
 def test_controls_of_a_browser_that_left_do_not_end_the_console(filled):

@@ -65,7 +65,7 @@ def test_a_start_ends_a_drive_that_waits_for_keys(api, steering):
     steering.state = {"mission": None}
     steering.start_mission({"waypoints": []})
     assert api.posted == [("/v1/missions", {"waypoints": []})]
-    assert "set back to its spawn" in steering.answer[0]
+    assert "set back to its spawn" in steering.answer.text
 
 
 def test_the_route_is_asked_once_for_each_mission(api, steering):
@@ -83,7 +83,7 @@ def test_a_stop_is_repeated_until_the_api_answers(api, steering):
     steering.stop()
     wait_until(lambda: len(api.posted) >= 3)
     api.refused.clear()
-    wait_until(lambda: steering.answer[0] == "switching the robot off")
+    wait_until(lambda: steering.answer.text == "switching the robot off")
     count = len(api.posted)
     time.sleep(0.5)
     assert len(api.posted) == count
@@ -107,7 +107,7 @@ def test_a_slow_link_gets_the_newest_value_of_each_slider(steering):
     steering.set_link("downlink.loss", 0.25)
     go.set()
     wait_until(lambda: len(applied) == 2)
-    wait_until(lambda: steering.answer[0].endswith("uplink.delay_ms=40 requested"))
+    wait_until(lambda: steering.answer.text.endswith("uplink.delay_ms=40 requested"))
     assert applied == [["uplink.delay_ms=10"], ["downlink.loss=0.25", "uplink.delay_ms=40"]]
     steering.set_link("uplink.loss", 2)
-    wait_until(lambda: steering.answer[0] == "link: loss: must be at most 1")
+    wait_until(lambda: steering.answer.text == "link: loss: must be at most 1")

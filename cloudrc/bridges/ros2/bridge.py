@@ -27,8 +27,8 @@ from visualization_msgs.msg import MarkerArray
 
 from cloudrc.bridges.ros2.health import FlightHealth
 from cloudrc.bridges.ros2.own_node import LINGERS, NEWEST, QUEUED, OwnNode
-from cloudrc.bridges.ros2.requests import SERVICES, RosRequests
-from cloudrc.console.steering import Steering
+from cloudrc.bridges.ros2.requests import RosRequests
+from cloudrc.console.steering import VERBS, Steering
 from cloudrc.drivers.readers import RecordReader
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Telemetry, Vector
 from cloudrc.record.live import (
@@ -110,7 +110,7 @@ class RosBridge(OwnNode):
         self.node.create_subscription(
             PoseStamped, "goal_pose", self._go_to, NEWEST, callback_group=self._group
         )
-        for name in SERVICES:
+        for name in VERBS:
             self.node.create_service(
                 Trigger, f"cloudrc/{name}", self._server(name), callback_group=self._group
             )

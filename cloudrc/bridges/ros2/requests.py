@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from math import cos, degrees, hypot, inf, isfinite, sin
 from typing import NamedTuple
 
 from cloudrc.console.steering import Steering
-from cloudrc.errors import CloudrcError
 from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import ZERO, Quaternion, Vector
 from cloudrc.record.live import BASE, WORLD
@@ -23,14 +22,6 @@ HEIGHT = 1.0
 """Least height of a goal that has none [m]."""
 SAID_AGAIN = 5.0
 """Time after which the same words are said again [s]."""
-SERVICES: Mapping[str, tuple[str, str]] = {
-    "hold": ("/v1/hold", "holding"),
-    "resume": ("/v1/resume", "resumed"),
-    "cancel": ("", "cancelled; the robot holds"),
-    "estop": ("/v1/estop", "emergency stop: sent, and repeated until the robot is switched off"),
-    "acknowledge": ("/v1/acknowledge", "acknowledged: the next mission may fly"),
-}
-"""Service -> path in teleop's API, and words of the answer; `cancel` names a mission there."""
 OBSERVES = (
     "this bridge only observes; start it without --observe, in the cluster with ros.steer=true"
 )
@@ -78,26 +69,14 @@ class RosRequests:
         self._said: dict[str, float] = {}
 
     def serve(self, name: str) -> tuple[bool, str]:
-        """Carry out a service of `SERVICES`; return whether teleop accepted it, and words."""
+        """Carry out a verb of the operator; return whether teleop accepted it, and words."""
         if self._observes:
             self._tell(f"{name}: {OBSERVES}")
             return False, OBSERVES
-        path, words = SERVICES[name]
-        api = self._steering.api
-        try:
-            if name == "cancel":
-                mission = api.get("/v1/state")["mission"]
-                if mission is None:
-                    return False, "no mission is under way"
-                path = f"/v1/missions/{mission['id']}/cancel"
-            answer = api.post(path)
-        except CloudrcError as error:
-            if name == "estop":
-                self._steering.stop()  # asks again until teleop answers
-            return False, str(error)
-        if name == "resume" and answer["by_hand"]:
-            return True, "the drive ends, and the robot holds"
-        return True, words
+        answer = self._steering.act(name)
+        if answer.is_refusal and name == "estop":
+            self._steering.stop()  # asks again until teleop answers
+        return not answer.is_refusal, answer.text
 
     def go_to(self, frame: str, position: Sequence[float], wxyz: Quaternion) -> None:
         """Let the robot go to a pose: `position` [m] and orientation `wxyz` [1] in `frame`."""
@@ -107,8 +86,8 @@ class RosRequests:
         if z == 0.0:  # RViz clicks on the ground
             z = max(self.position[2], HEIGHT)
         place = (x, y) if self._robot.planar else (x, y, z)
-        self._steering.go_to(place, _yaw_deg(wxyz) if self._robot.turns else None)
-        self._tell(self._steering.answer[0])
+        answer = self._steering.go_to(place, _yaw_deg(wxyz) if self._robot.turns else None)
+        self._tell(answer.text)
 
     def drive(self, frame: str, linear: Sequence[float], yaw_rate: float) -> None:
         """Drive with a velocity in `frame`; an empty frame is that of the base.
