@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cloudrc import assembly, source
 from cloudrc.cloud.controllers.remote import OutsideController
@@ -23,7 +23,7 @@ from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
 from cloudrc.drivers.readers import RecordSender
 from cloudrc.drivers.realtime import Address, Peer, bind
 from cloudrc.drivers.teleop import RemoteTeleop, UnixDatagrams, UnixPeer
-from cloudrc.errors import BadInputError, ControllerLostError
+from cloudrc.errors import BadInputError
 from cloudrc.files import warn_if_readable
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import SIZE_MAX, link_profile
@@ -98,14 +98,11 @@ def run_cloud(
             return cloud.guard is GuardState.TRACK
 
         ends = GracefulStop(stop, lambda: not flies(), FORWARD_LIMIT_NS)
-
-        def lost() -> ControllerLostError | None:
-            return None if settings.feed else cloud.lost  # a supervisor ends the flight itself
-
+        is_watched = settings.feed  # then the supervisor ends a flight without its controller
         with apart():
-            end.run(cloud, lambda: ends() or lost() is not None, flies)
-        if error := lost():
-            raise error
+            end.run(cloud, lambda: ends() or bool(cloud.lost and not is_watched), flies)
+        if cloud.lost and not is_watched:
+            raise cloud.lost
 
 
 @contextmanager
@@ -118,8 +115,7 @@ def _remote_link(experiment: ResolvedExperiment, folder: Path) -> Iterator[Remot
     require("a remote controller", ("policy",))
     from cloudrc.drivers.remote import DATAGRAM_MAX, RemoteLink, sockets_of
 
-    own, other = sockets_of(folder)
-    with closing(UnixDatagrams(own, other, DATAGRAM_MAX)) as peer:
+    with closing(UnixDatagrams(*sockets_of(folder), DATAGRAM_MAX)) as peer:
         period = 1.0 / experiment.cloud.command_rate_hz
         yield RemoteLink(peer, period, controller.start_limit)
 
@@ -144,9 +140,9 @@ def run_remote(config: Path, folder: Path, stop: StopSignal, *, watched: bool) -
             def tell(text: str) -> None:
                 feed.tell([Fault(time.monotonic_ns(), "controller_unstamped", text)])
 
-            RosDriver(peer, controller.place, tell).run(feed.alive_while(stop))
-            return
-        driver = RemoteDriver(peer, controller.place, controller.start_limit)
+            driver: Any = RosDriver(peer, controller.place, tell)
+        else:
+            driver = RemoteDriver(peer, controller.place, controller.start_limit)
         driver.run(feed.alive_while(stop))
 
 

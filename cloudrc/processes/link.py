@@ -2,7 +2,7 @@
 
 PUT /link on the Unix socket of --control changes the link. GET /link.json on the metrics port
 returns the state of the shaper and the netem qdiscs of this pod or machine. The process calls tc
-and ip for this answer, at most once a second.
+and ip for this answer.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 from cloudrc.config.load import load_link, read_experiment
 from cloudrc.drivers.link_control import ControlServer
@@ -41,9 +41,6 @@ from cloudrc.link.sidecar import Machine, Sidecar
 from cloudrc.link.traces import link_profile
 from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, warn
 from cloudrc.tunnel.codec import peek
-
-if TYPE_CHECKING:
-    pass
 
 RELEASED_PERIOD = 1.0
 """Time between two updates of the file with the lateness of datagrams [s]."""
@@ -131,8 +128,8 @@ def make_profile_loader(direction: str, experiment: Path) -> Load:
 
 
 def _machine(settings: LinkSettings, seed: int, programs: Programs, tables: Path) -> Machine:
-
     clock, wait = time.monotonic_ns, time.sleep
+    netem = partial(Netem, programs, clock=clock, wait=wait, tables=tables, log=log)
 
     def relay(profile: DirectionProfile, origin_ns: int) -> Relay:
         settle()
@@ -142,13 +139,9 @@ def _machine(settings: LinkSettings, seed: int, programs: Programs, tables: Path
         with listening("--listen", settings.listen):
             return Relay(settings.listen, direction, peek, settings.end)
 
-    def netem(profile: DirectionProfile, origin_ns: int) -> Netem:
-
-        return Netem(
-            programs, profile, origin_ns=origin_ns, clock=clock, wait=wait, tables=tables, log=log
-        )
-
-    return Machine(relay, netem, clock, wait, log)
+    return Machine(
+        relay, lambda profile, origin_ns: netem(profile, origin_ns=origin_ns), clock, wait, log
+    )
 
 
 def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None:
@@ -161,16 +154,7 @@ def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None
 
 
 def status_page(sidecar: Sidecar) -> str:
-    """Return the state of a sidecar as JSON. Any thread may call this function."""
+    """Return the state of a sidecar, and of this pod's netem qdiscs, as JSON, in any thread."""
     peer, state = sidecar.peer, sidecar.state
-    netems = _find_netems(peer[0], int(time.monotonic())) if peer else {}
+    netems = find_netems(run_tool, peer[0]) if peer else {}
     return json.dumps((asdict(state) if state else {}) | netems) + "\n"
-
-
-@lru_cache(maxsize=1)
-def _find_netems(host: str, second: int) -> dict[str, Any]:
-    """Find the netem qdiscs of this pod.
-
-    `second` is the present time [s]. It is an argument so that the cache searches once per second.
-    """
-    return find_netems(run_tool, host)

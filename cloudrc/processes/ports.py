@@ -6,7 +6,7 @@ import os
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from cloudrc.config.resolved import ResolvedExperiment, fingerprint
@@ -29,23 +29,10 @@ def warn(text: str, process: str = "") -> None:
 def ipv4_addresses(name: str) -> list[str]:
     """Return the IPv4 addresses of a host name; relay and netem shape IPv4 only.
 
-    Raise an OSError if there is none; its text tells whether the name has IPv6 addresses.
+    Raise an OSError if there is none.
     """
     try:
-        return _addresses(name, socket.AF_INET)
-    except OSError as error:
-        with suppress(OSError):
-            _addresses(name, socket.AF_INET6)
-            error.strerror = (
-                "it has only IPv6 addresses, but a link needs IPv4; in a cluster with both "
-                "families set ipFamilyPolicy=PreferDualStack"
-            )
-        raise
-
-
-def _addresses(name: str, family: int) -> list[str]:
-    try:
-        found = socket.getaddrinfo(name, None, family, socket.SOCK_DGRAM)
+        found = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_DGRAM)
     except UnicodeError as error:  # an empty label, or one that is too long
         raise OSError(f"not a name: {error}") from error
     return [str(entry[4][0]) for entry in found]

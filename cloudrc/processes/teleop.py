@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 from cloudrc import assembly
 from cloudrc.config.hull import hull_of
 from cloudrc.config.load import read_experiment
-from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import known_robot
 from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.drivers.link_news import LinkNews
@@ -24,7 +23,6 @@ from cloudrc.drivers.process import Feed, GracefulStop, StopSignal
 from cloudrc.drivers.realtime import Address
 from cloudrc.drivers.teleop import TeleopLoop, UnixPeer
 from cloudrc.files import write_atomically
-from cloudrc.geometry.scene import Scene
 from cloudrc.processes.ports import open_exporter, warn, warn_if_exposed
 from cloudrc.records import Counted, Fault, Record
 from cloudrc.teleop.api import ApiServer, Bridge, create_app
@@ -66,61 +64,50 @@ def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
     """Run teleop until `stop` or, with `start`, until the mission has ended."""
     experiment = read_experiment(str(settings.config))
     exporter = open_exporter("teleop", experiment, settings.metrics)
-    with ExitStack() as opened:
-        scene = scene_of(experiment.world)
-        server = serve_api(settings, experiment, scene)
-        opened.callback(server.stop)
-        book = _open_store(settings.journal, stop, server.bridge)
-        if book is not None:  # None: stopped while another teleop process locked the journal
-            opened.callback(book.close)
-            world = experiment.world
-            hull, sensors = hull_of(world.robot), known_robot(world.robot).sensors
-            units = {name: each.unit for name, each in sensors.items()}
-            limit = experiment.guard.speed_max_mps
-            service = MissionService(book, steered_in(world), scene, hull, units, speed_max=limit)
-            if settings.start:
-                touch = experiment.mission.touch
-                order = Order(assembly.build_plan(experiment), experiment.name, touch=touch)
-                service.create(order, time.monotonic_ns())
-            pause = GracefulStop(
-                stop,
-                lambda: service.settled,
-                PAUSE_LIMIT_NS,
-                lambda: service.pause(time.monotonic_ns()),
-            )
-            _fly(
-                settings,
-                service,
-                server,
-                exporter,
-                lambda: pause() or (settings.start and service.over),
-            )
-
-
-def serve_api(settings: TeleopSettings, experiment: ResolvedExperiment, scene: Scene) -> ApiServer:
-    """Start the API; until the mission service runs, the API answers that teleop is starting."""
-    if not isinstance(settings.api, Path):
-        warn_if_exposed(settings.api)
-    bridge = Bridge()
     world = experiment.world
-    robot = known_robot(world.robot)
+    scene, hull, robot = scene_of(world), hull_of(world.robot), known_robot(world.robot)
     plan = partial(
         assembly.mission_plan,
         fence=steered_in(world),
         speed_max=experiment.guard.speed_max_mps,
         turn_rate_max=experiment.guard.yaw_rate_max_radps,
     )
-    reader = RequestReader(
-        scene,
-        hull_of(world.robot),
-        plan,
-        experiment.mission.touch,
-        planar=robot.planar,
-        heading=robot.heading,
-    )
+    touch = experiment.mission.touch
+    reader = RequestReader(scene, hull, plan, touch, robot.planar, robot.heading)
+    with ExitStack() as opened:
+        server = _serve_api(settings, reader)
+        opened.callback(server.stop)
+        book = _open_store(settings.journal, stop, server.bridge)
+        if book is None:  # stopped while another teleop process locked the journal
+            return
+        opened.callback(book.close)
+        units = {name: each.unit for name, each in robot.sensors.items()}
+        limit = experiment.guard.speed_max_mps
+        service = MissionService(book, steered_in(world), scene, hull, units, speed_max=limit)
+        if settings.start:
+            order = Order(assembly.build_plan(experiment), experiment.name, touch=touch)
+            service.create(order, time.monotonic_ns())
+        pause = GracefulStop(
+            stop,
+            lambda: service.settled,
+            PAUSE_LIMIT_NS,
+            lambda: service.pause(time.monotonic_ns()),
+        )
+
+        def over() -> bool:
+            return pause() or (settings.start and service.over)
+
+        _fly(settings, service, server, exporter, over)
+
+
+def _serve_api(settings: TeleopSettings, reader: RequestReader) -> ApiServer:
+    """Start the API; until the mission service runs, the API answers that teleop is starting."""
+    if not isinstance(settings.api, Path):
+        warn_if_exposed(settings.api)
+    bridge = Bridge()
     tokens = Tokens(settings.tokens, log_line) if settings.tokens else None
-    app = create_app(bridge, reader, log_line)
-    server = ApiServer(Gate(app, tokens, log_line), bridge, settings.api)
+    gate = Gate(create_app(bridge, reader, log_line), tokens, log_line)
+    server = ApiServer(gate, bridge, settings.api)
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     files = FILES_MAX if hard == resource.RLIM_INFINITY else min(FILES_MAX, hard)
     resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))
@@ -173,16 +160,15 @@ def _open_store(path: Path | None, stop: Callable[[], bool], bridge: Bridge) -> 
 
     Wait while another teleop process locks the file; return None if `stop()` becomes true first.
     """
-    salt, reported = os.urandom(16), False
+    salt = os.urandom(16)
     if path is None:
         return MissionStore(connect(), salt)
     while not stop():
         try:
             return open_store(path, salt)
         except StoreLockedError as error:
-            if not reported:
+            if bridge.closed != str(error):
                 log_line(str(error))
                 bridge.close(str(error))
-            reported = True
             time.sleep(LOCK_PERIOD)
     return None

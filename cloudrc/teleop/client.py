@@ -35,11 +35,6 @@ FOREIGN = (
     " the path of a proxy: --api http://HOST:PORT/PATH"
 )
 """What to do if the answer is not from teleop."""
-SOCKET_GONE = (
-    "its socket file is gone; if the flight goes on, stop it with Ctrl-C in its terminal "
-    "or, if it is a session, with 'cloudrc down'"
-)
-"""Says how to stop a robot whose API nobody can reach any more."""
 ALL_MET = "every waypoint reached, every criterion met"
 """Says what a robot has done in a mission of waypoints that succeeded."""
 UNIX = "unix:"
@@ -110,25 +105,19 @@ class Api:
 
         `limit` is the longest wait for the server [s].
         """
-        headers, token = {"Content-Type": "application/json"}, self._token()
-        if token:
-            headers["Authorization"] = f"Bearer {token}"
+        token = self._token()
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
         with closing(self._connection(limit)) as connection:
             try:
                 connection.request(method, self._prefix + path, body, headers)
                 answer = connection.getresponse()
-                if not 200 <= answer.status < 300:
+                is_page = answer.headers.get_content_type() == "text/html"
+                if is_page or not 200 <= answer.status < 300:
                     raise _refusal(answer, self.place, with_token=bool(token))
-                if answer.headers.get_content_type() == "text/html":
-                    answer.close()
-                    raise ApiError(f"{self.url} answers with a page: {FOREIGN}")
                 yield answer
             except (OSError, ValueError, http.client.HTTPException) as error:
-                text = f"the API at {self.url} does not answer"
-                if isinstance(error, FileNotFoundError):  # the flight is over, or goes on without
-                    raise UnreachableError(f"{text}: {SOCKET_GONE}") from None
                 why = getattr(error, "strerror", None) or error
-                raise UnreachableError(f"{text} ({why})") from None
+                raise UnreachableError(f"the API at {self.url} does not answer ({why})") from None
 
     def _ask(self, method: str, path: str, body: bytes | None) -> Any:
         with self._answer(method, path, body, REQUEST_TIMEOUT) as answer:
@@ -143,9 +132,9 @@ class Api:
             "http": http.client.HTTPConnection,
             "https": http.client.HTTPSConnection,
         }
-        if not parts.hostname or parts.port == 0 or parts.username or parts.query:
+        if not parts.hostname:
             raise ValueError(self.url)
-        self._prefix = quote(parts.path, safe="/%")
+        self._prefix = parts.path
         kind = kinds[parts.scheme]
         # Without a port, http.client would read one from an IPv6 address.
         return kind(parts.hostname, parts.port or kind.default_port, timeout=limit)

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from cloudrc.messages import GuardState
 from cloudrc.metrics.verdict import FlightFailure
 from cloudrc.teleop.wire import RobotStatus
+from cloudrc.text import describe_point
 
 SILENCE = 1.0
 """Age above which telemetry, or the last message from cloud, is too old [s]."""
@@ -18,14 +19,19 @@ HOLD_TOLD = 0.5
 
 
 class Interruption:
-    """Times of one kind of interruption in a mission."""
+    """Times of one kind of interruption in a mission.
+
+    Attributes:
+        since: Beginning of the present interruption [s]; None without one.
+        total: Duration of all told interruptions that have ended [s].
+    """
 
     def __init__(self, shortest: float) -> None:
         """Tell interruptions that last for `shortest` [s] or longer."""
         self._shortest = shortest
-        self.since: float | None = None  # beginning of the present interruption [s]; None: none
-        self.is_told = False  # whether the present interruption lasts long enough to be told
-        self._first, self._total = 0.0, 0.0  # of the told ones: beginning of the first; sum [s]
+        self.since: float | None = None
+        self.total = 0.0
+        self._is_told = False  # whether the present interruption lasts long enough to be told
 
     def lasts(self, since: float, time: float) -> bool:
         """Return whether the interruption has become long enough at `time` [s].
@@ -33,25 +39,17 @@ class Interruption:
         It has begun at `since` [s], unless one lasts already.
         """
         self.since = since if self.since is None else self.since
-        if self.is_told or time - self.since < self._shortest:
+        if self._is_told or time - self.since < self._shortest:
             return False
-        self._first = self._first if self._total else self.since
-        self.is_told = True
+        self._is_told = True
         return True
 
     def end(self, time: float) -> float:
         """End the interruption at `time` [s]; return its duration [s], or 0 if it was not told."""
-        lasted = time - self.since if self.is_told and self.since is not None else 0.0
-        self.since, self.is_told = None, False
-        self._total += lasted
+        lasted = time - self.since if self._is_told and self.since is not None else 0.0
+        self.since, self._is_told = None, False
+        self.total += lasted
         return lasted
-
-    def summary(self, time: float) -> str:
-        """Return when the told interruptions were, up to `time` [s]; "" for none."""
-        if self.is_told and not self._total:
-            return f"since {self.since:.2f} s"
-        total = self._total + (time - self.since if self.is_told and self.since is not None else 0)
-        return f"for {total:.1f} s in all, first from {self._first:.2f} s" if total else ""
 
 
 class Interruptions:
@@ -72,8 +70,7 @@ class Interruptions:
         if seen.guard is not GuardState.HOLD or not flies:
             if lasted := self._hold.end(time):
                 yield "hold_over", f"{guard} at {time:.2f} s, after {lasted:.1f} s in HOLD"
-            return
-        if self._hold.lasts(time, time):
+        elif self._hold.lasts(time, time):
             yield "guard_holds", f"{guard} since {self._hold.since:.2f} s ({seen.cause.words})"
 
     def wait(
@@ -88,15 +85,20 @@ class Interruptions:
             why = "teleop does not hear cloud" if cloud_is_silent else "cloud hears nothing"
             text = f"no telemetry since {self._silence.since:.2f} s ({why})"
             if seen is not None:
-                place = ", ".join(f"{value:.2f}" for value in seen.position)
-                text += f"; last seen at ({place}) m, with the guard in {seen.guard.name}"
+                place = describe_point(seen.position)
+                text += f"; last seen at {place} m, with the guard in {seen.guard.name}"
             yield "no_telemetry", text
 
     def failures(self, time: float) -> tuple[FlightFailure, ...]:
         """Return the interruptions of a mission that ends at `time` [s] and is not done."""
-        found = []
-        if when := self._silence.summary(time):
-            found.append(FlightFailure("no_telemetry", f"no telemetry {when}"))
-        if when := self._hold.summary(time):
-            found.append(FlightFailure("guard_held", f"the guard was in HOLD {when}"))
-        return tuple(found)
+        kinds = {
+            "no_telemetry": (self._silence, "no telemetry"),
+            "guard_held": (self._hold, "the guard was in HOLD"),
+        }
+        for kind, _ in kinds.values():
+            kind.end(time)
+        return tuple(
+            FlightFailure(code, f"{text} for {kind.total:.1f} s in all")
+            for code, (kind, text) in kinds.items()
+            if kind.total
+        )

@@ -198,7 +198,7 @@ class MissionFlight:
                 text = f"the robot has not started within {limit:g} s (time_limit_s)"
                 text += "; is the link up?"
             self.end(now_ns, "timed_out", text)
-        elif self.state == FLYING and (text := self.route.timeout(self._aim.seen)):
+        elif self.state == FLYING and (text := self.route.timeout()):
             self.end(now_ns, "leg_timed_out", text)
         if self.state == FLYING and self.plan.track:
             self._aim.follow(self.plan.track, self.route.leg, self._began_ns, now_ns)

@@ -1,4 +1,4 @@
-"""Find the obstacles that are in the way of a robot, or that it touches."""
+"""Find the obstacles that are in the way of a robot."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cloudrc.geometry.clearance import NO_SIZE, Spheres, clearance_per_obstacle
+from cloudrc.geometry.clearance import NO_SIZE, Spheres
 from cloudrc.geometry.obstacles import obstacles, surface
 from cloudrc.geometry.placement import find_crossed
 from cloudrc.geometry.scene import Scene
-from cloudrc.messages import Vector
 from cloudrc.teleop.wire import Leg, RobotStatus
+from cloudrc.text import describe_point
 
 
 class KnownObstacles(NamedTuple):
@@ -30,24 +30,7 @@ class KnownObstacles(NamedTuple):
         if through < 0:
             return ""
         return (
-            f"the straight way from where the robot is, {_place(seen.position)}, to "
-            f"{_place(leg.position)} leads through {surface(known[through])}; "
+            f"the straight way from where the robot is, {describe_point(seen.position)}, to "
+            f"{describe_point(leg.position)} leads through {surface(known[through])}; "
             "go round it first, by another target"
         )
-
-    def describe_contact(self, seen: RobotStatus, touch: str | None) -> str:
-        """Say where a robot that touches an obstacle is.
-
-        Telemetry counts contacts, but does not name the bodies. The text names the nearest one.
-        """
-        known = obstacles(self.scene, touch=touch) if self.scene else ()
-        text = f"{_place(seen.position)} m"
-        if not known:
-            return text
-        where = [seen.position], [seen.orientation_wxyz]
-        away = clearance_per_obstacle(known, *where, self.hull)[0]
-        return f"{text}, next to {known[away.argmin()].name}"
-
-
-def _place(position: Vector) -> str:
-    return f"[{', '.join(f'{value:.2f}' for value in position)}]"

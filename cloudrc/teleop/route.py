@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from math import degrees
-
-from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import NEVER_NS, GuardState, Vector
 from cloudrc.teleop.aim import Aim
 from cloudrc.teleop.wire import Leg, Plan, RobotStatus
@@ -113,13 +110,9 @@ class Route:
             leaves_ns = now_ns
         return leaves_ns, start
 
-    def timeout(self, seen: RobotStatus | None) -> str:
+    def timeout(self) -> str:
         """Say that the robot has flown too long to the waypoint; "" if it has not."""
         leg = self.plan.legs[self.leg]
         if self._flown_ns * 1e-9 < leg.time_limit:
             return ""
-        text = f"{self.name} not reached in {leg.time_limit:g} s (its time_limit_s)"
-        if seen is None or leg.yaw is None or leg.has(seen) or not leg.is_at(seen.position):
-            return text
-        left = degrees(abs(turn_to(leg.yaw, seen.orientation_wxyz)))
-        return f"{text}: the robot is there, but its yaw is {left:.0f} deg away"
+        return f"{self.name} not reached in {leg.time_limit:g} s (its time_limit_s)"

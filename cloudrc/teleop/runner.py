@@ -16,11 +16,11 @@ from cloudrc.metrics.verdict import Ending, Observations, finite_or_none, judge
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop.interruptions import SILENCE, Interruptions
 from cloudrc.teleop.mission import MissionFlight, Teleop
-from cloudrc.teleop.obstacles import KnownObstacles
 from cloudrc.teleop.refusals import ConflictError
 from cloudrc.teleop.store import MissionRecord, MissionStore
 from cloudrc.teleop.view import RobotView
 from cloudrc.teleop.wire import FLYING, HELD, QUEUED, Output, RobotStatus
+from cloudrc.text import describe_point
 
 _, TRACK, HOLD, LAND, ESTOP = GuardState
 LATCHED, AIRBORNE = (LAND, ESTOP), (TRACK, HOLD, LAND)
@@ -39,9 +39,7 @@ class MissionRunner:
         ends: Whether this process ends; the next process flies the queue.
     """
 
-    def __init__(
-        self, book: MissionStore, fence: Fence, obstacles: KnownObstacles, units: Mapping[str, str]
-    ) -> None:
+    def __init__(self, book: MissionStore, fence: Fence, units: Mapping[str, str]) -> None:
         """Begin with the missions in the store `book`, in a scene with `fence`.
 
         `units` are the names of the robot's own sensors and their units.
@@ -49,7 +47,7 @@ class MissionRunner:
         self.book, self.ends = book, False
         self.current: MissionRecord | None = None
         self._teleop, self._fence = Teleop(fence, book.has_ended), fence
-        self._obstacles, self._view = obstacles, RobotView(units)
+        self._view = RobotView(units)
         self._outputs: list[Output | Fault] = []
         self._setpoint_ns = 0  # time of the next copy of the setpoint
         self._began_ns = 0  # when this process began to fly the present mission
@@ -208,8 +206,7 @@ class MissionRunner:
         time, touched = self._flight.elapsed(now_ns), mission.order.touched
         first = known.first_contact
         if seen.obstacle_contacts and not first:
-            place = self._obstacles.describe_contact(seen, touched)
-            first = f"at {time:.2f} s, {place}"
+            first = f"at {time:.2f} s, {describe_point(seen.position)} m"
         mission.witness = replace(
             known,
             obstacle_contacts=seen.obstacle_contacts,

@@ -12,7 +12,6 @@ from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Start, Vector
 from cloudrc.metrics.verdict import FlightFailure, FlightVerdict
-from cloudrc.records import BY_HAND
 from cloudrc.teleop.carrot import HEARTBEAT_NS, SPEED_MAX
 from cloudrc.teleop.obstacles import KnownObstacles
 from cloudrc.teleop.refusals import ConflictError, UnavailableError
@@ -23,10 +22,6 @@ from cloudrc.teleop.wire import HELD, Leg, Plan
 
 DRIVE_LIMIT = 3600.0
 """Time limit of a mission that begins with a request to drive [s]."""
-QUEUE_MAX = 16
-"""Largest number of missions that wait while another mission flies."""
-STEERED = ("held", *BY_HAND)
-"""Events of a held mission that tell who steers the robot."""
 CANCELLED = "mission cancelled"
 
 
@@ -81,8 +76,8 @@ class MissionService(MissionRunner):
         (None: no sensors). `speed_max` is the guard's speed limit [m/s]: a drive by hand is not
         faster, and never faster than `SPEED_MAX`.
         """
-        super().__init__(book, fence, KnownObstacles(scene, hull), units or {})
-        self._hand = Hand(speed_max)
+        super().__init__(book, fence, units or {})
+        self._obstacles, self._hand = KnownObstacles(scene, hull), Hand(speed_max)
         self._renewed_ns: dict[str, int] = {}  # mission's id -> time of its watcher's last word
 
     def create(self, order: Order, now_ns: int) -> tuple[MissionRecord, bool]:
@@ -100,8 +95,6 @@ class MissionService(MissionRunner):
         waiting = self.book.open()
         if waiting and not order.queue:
             raise _busy(waiting[0], "cancel it first, or queue the new one")
-        if len(waiting) > QUEUE_MAX:
-            raise ConflictError(f"{QUEUE_MAX} missions wait already; cancel one", waiting[0].id)
         self._check_can_fly()
         if order.plan.start is Start.HERE and not waiting and not order.plan.by_hand:
             self._check_way(order.plan.legs[0], order)
@@ -237,13 +230,10 @@ class MissionService(MissionRunner):
 
     def _steered_state(self, now_ns: int) -> str | None:
         """Return the state of the mission under way; DRIVEN while somebody drives the robot."""
-        mission = self.current
-        if mission is None or mission.state != HELD:
-            return mission.state if mission else None
-        by_hand = (e["event"] for e in reversed(mission.events) if e["event"] in STEERED)
-        last = next(by_hand, "")
-        back = last == "operator_lost" and self._hand.is_there(now_ns)
-        return DRIVEN if last == "driving" or back else HELD
+        if self.current is None:
+            return None
+        is_driven = self._hand.is_there(now_ns) and not self._hand.has_to_let_go
+        return DRIVEN if self.current.state == HELD and is_driven else self.current.state
 
     def _check_can_fly(self) -> None:
         if self.ends:

@@ -53,7 +53,7 @@ PAGE = "<!DOCTYPE html><title>Please log in</title>"
 @pytest.mark.parametrize(
     ("answer", "said"),
     [
-        ((200, "text/html; charset=utf-8", PAGE, {}), "answers with a page: a proxy or"),
+        ((200, "text/html; charset=utf-8", PAGE, {}), "200 OK: a proxy or"),
         ((302, "text/html", "", {"Location": "https://sso/x"}), "302 Found: a proxy or"),
     ],
 )

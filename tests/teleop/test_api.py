@@ -318,5 +318,5 @@ def test_a_socket_file_is_for_its_owner_and_needs_no_token(tmp_path):
         assert client.post("/v1/missions", A_MISSION)["id"] == "m1"
         (line,) = api.logged()
         assert line.startswith("local local POST /v1/missions: 201 m1")
-    with pytest.raises(UnreachableError, match=r"unix:/.*: its socket file is gone"):
+    with pytest.raises(UnreachableError, match="No such file"):
         Api(f"unix:{tmp_path}/none").get("/v1/state")

@@ -9,11 +9,9 @@ import pytest
 from cloudrc.config.schema import Touch
 from cloudrc.drivers.teleop import STALL_NS, TeleopLoop
 from cloudrc.exposition.table import MISSION_OUTCOMES
-from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Cause, GuardState, Setpoint, Start
 from cloudrc.teleop.api import Bridge
 from cloudrc.teleop.refusals import ConflictError
-from cloudrc.teleop.service import QUEUE_MAX
 from cloudrc.teleop.store import Order
 from cloudrc.teleop.view import NO_CLOUD, NOT_HEARD
 from cloudrc.teleop.wire import ENDED, STATES, Leg, Plan
@@ -189,11 +187,11 @@ def test_an_event_says_what_happened_once(script, said):
 @pytest.mark.parametrize(
     ("script", "codes", "words"),
     [
-        ("deaf 60", ["timed_out", "no_telemetry"], "no telemetry since 0.04 s"),
+        ("deaf 60", ["timed_out", "no_telemetry"], "no telemetry for 60.0 s in all"),
         ("deaf 20 link 5 deaf 10 link 30", ["timed_out", "no_telemetry"],
-         "no telemetry for 30.0 s in all, first from 0.04 s"),
+         "no telemetry for 30.0 s in all"),
         ("HOLD 60", ["timed_out", "guard_held"], "the guard was in HOLD for 3.0 s in all"),
-        ("deaf 2 link 1 HOLD 2 LAND 0.1", ["guard_stopped", "no_telemetry", "guard_held"], "first"),
+        ("deaf 2 link 1 HOLD 2 LAND 0.1", ["guard_stopped", "no_telemetry", "guard_held"], ""),
         ("deaf 5 link B C 0.1", [], ""),
     ],
 )  # fmt: skip
@@ -264,13 +262,6 @@ def test_a_restarted_teleop_gives_a_watcher_its_full_lease_again():
     assert state(flight) == "cancelled"
 
 
-def test_the_queue_of_missions_is_bounded():
-    flight, _ = service_flying()
-    play(flight, "queue " * QUEUE_MAX)
-    with pytest.raises(ConflictError, match=f"{QUEUE_MAX} missions wait already"):
-        flight.create(queue=True)
-
-
 @pytest.mark.parametrize(
     ("seen", "codes", "exit_code"),
     [
@@ -299,8 +290,7 @@ def test_what_the_robot_touched_decides(seen, codes, exit_code, restarted):
 
 
 def test_the_operator_learns_when_and_where_the_robot_touched_an_obstacle_first():
-    """Telemetry counts contacts without names; the nearest obstacle is named."""
-    flight = ServiceFlight(load_scene("pipes"))
+    flight = ServiceFlight()
     mission_id = flight.create()
     flight.step(seconds=0.05)
     flight.obstacle_contacts = 1
@@ -308,7 +298,7 @@ def test_the_operator_learns_when_and_where_the_robot_touched_an_obstacle_first(
     flight.obstacle_contacts = 2
     flight.step(position=(3.0, -6.4, 0.7), seconds=0.05)
     flight.teleop.cancel(mission_id, flight.now_ns)
-    first = r"the robot touched an obstacle at 0.0\d s, \[0.10, 2.00, 0.70\] m, next to pipe_1"
+    first = r"the robot touched an obstacle at 0.0\d s, \(0.10, 2.00, 0.70\) m"
     view = flight.view(mission_id)
     told = [each["text"] for each in view["events"] if each["event"] == "obstacle_touched"]
     assert re.fullmatch(first, told[0])
