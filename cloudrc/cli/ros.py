@@ -106,8 +106,8 @@ def _in_pod(options: argparse.Namespace) -> _Flight:
 
 def _open(stack: ExitStack, options: argparse.Namespace, flight: _Flight) -> tuple[Any, Any]:
     """Open the bridge and the reader of cloud's records; `stack` closes them."""
-    from cloudrc.bridges.ros2.bridge import RosBridge, Surroundings
-    from cloudrc.bridges.ros2.requests import BridgedRobot, RosRequests
+    from cloudrc.bridges.ros2.bridge import RosBridge
+    from cloudrc.bridges.ros2.requests import RosRequests
     from cloudrc.config.load import read_experiment
     from cloudrc.config.robot import find_robot
     from cloudrc.config.scene import scene_of
@@ -121,7 +121,6 @@ def _open(stack: ExitStack, options: argparse.Namespace, flight: _Flight) -> tup
     name = options.namespace.strip("/")
     prefix = f"{name}/" if name else ""
     shapes = scene_shapes(read_shapes(world), scene_of(world).tubes, prefix)
-    surroundings = Surroundings(prefix, encode_markers(0, shapes))
 
     def tell(text: str) -> None:
         print_line(f"ros: {text}")
@@ -129,12 +128,13 @@ def _open(stack: ExitStack, options: argparse.Namespace, flight: _Flight) -> tup
     steering = Steering(flight.api)
     requests = RosRequests(
         steering,
-        BridgedRobot(robot.planar, robot.heading == "free"),
         tell,
+        planar=robot.planar,
+        turns=robot.heading == "free",
         prefix=prefix,
         observes=options.observe or not flight.has_api,
     )
-    bridge = RosBridge(name, surroundings, steering, requests, tell)
+    bridge = RosBridge(name, prefix, encode_markers(0, shapes), steering, requests, tell)
     stack.callback(bridge.close)
     reader = RecordReader(flight.records)
     stack.callback(reader.close)

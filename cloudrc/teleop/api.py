@@ -22,11 +22,11 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from cloudrc.config.section import Section
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import CloudrcError
 from cloudrc.files import at_place
 from cloudrc.teleop import models
 from cloudrc.teleop.auth import BEARER, REFUSED, Gate
-from cloudrc.teleop.refusals import ConflictError, UnavailableError, UnknownMissionError
+from cloudrc.teleop.refusals import ConflictError, UnavailableError
 from cloudrc.teleop.server import ThreadServer
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import Event, MissionRecord
@@ -43,8 +43,6 @@ ANSWER_LIMIT = 2.0
 """Time limit for the mission service to answer [s]."""
 BODY_MAX = 256 * 1024
 """Longest body of a request [bytes]."""
-STATUSES = {BadInputError: 422, ConflictError: 409, UnknownMissionError: 404, UnavailableError: 503}
-"""Class of an error -> HTTP status of the answer."""
 REASONS = {
     **{status: text for status, (_, text) in REFUSED.items()},
     404: "There is no such mission",
@@ -67,6 +65,8 @@ Every request needs a token: `Authorization: Bearer TOKEN`. A reader's token may
 operator's token may also command. `POST /v1/estop` switches the robot off at once. Teleop serves
 `POST /v1/estop` and `POST /v1/hold` even while it refuses other requests as too many.
 """
+UNKEPT = {"Cache-Control": "no-store"}
+"""Headers of a stream."""
 STARTING = "teleop is starting"
 Call: TypeAlias = Callable[[MissionService, int], Any]
 """Call of the mission service: takes the service and the time [ns], and returns the answer."""
@@ -186,7 +186,7 @@ def create_app(
 
     @app.exception_handler(CloudrcError)
     async def refuse(request: Request, error: CloudrcError) -> JSONResponse:
-        status = next((code for kind, code in STATUSES.items() if isinstance(error, kind)), 500)
+        status = getattr(error, "status", 500)
         body: dict[str, Any] = {"detail": str(error)}
         if isinstance(error, models.RefusedError):
             body["problems"] = [models.as_json(problem) for problem in error.problems]
@@ -267,11 +267,9 @@ async def fly_mission(body: Body, bridge: Bridged, request: Request, response: R
 @router.get("/missions", response_model=models.MissionList)
 async def list_missions(bridge: Bridged) -> Any:
     """List all missions, oldest first."""
-
-    def call(service: MissionService, now_ns: int) -> list[dict[str, Any]]:
-        return [mission.summary() for mission in service.book.missions.values()]
-
-    return {"missions": await bridge.ask(call)}
+    return await bridge.ask(
+        lambda service, now_ns: {"missions": [m.summary() for m in service.book.missions.values()]}
+    )
 
 
 @router.get("/missions/{id}", response_model=models.MissionView)
@@ -366,7 +364,7 @@ async def stream_events(
     The stream ends when the client leaves, its token becomes invalid, or teleop ends. A browser
     that connects again sends the number of its last event as the header Last-Event-ID.
     """
-    await bridge.ask(lambda service, now_ns: None)  # raises an error if teleop cannot answer
+    await bridge.ask(MissionService.state)  # raises an error if teleop cannot answer
     number = max(after, last_event_id)
 
     def call(service: MissionService, now_ns: int) -> list[Event]:
@@ -390,8 +388,7 @@ async def stream_events(
                 yield ": alive\n\n"
             await asyncio.sleep(LOOK_PERIOD)
 
-    headers = {"Cache-Control": "no-store"}
-    return StreamingResponse(stream(), media_type="text/event-stream", headers=headers)
+    return StreamingResponse(stream(), media_type="text/event-stream", headers=UNKEPT)
 
 
 @router.get(
@@ -408,7 +405,7 @@ async def stream_robot(request: Request, bridge: Bridged) -> StreamingResponse:
     The stream ends when the client leaves or reads nothing for 30 s, its token becomes invalid, or
     teleop ends.
     """
-    await bridge.ask(lambda service, now_ns: None)  # raises an error if teleop cannot answer
+    await bridge.ask(MissionService.state)  # raises an error if teleop cannot answer
 
     async def stream() -> AsyncIterator[bytes]:
         while not bridge.closed and await request.scope["caller"]() is not None:
@@ -416,8 +413,7 @@ async def stream_robot(request: Request, bridge: Bridged) -> StreamingResponse:
                 yield write_line(bridge.seen)
                 await asyncio.sleep(ROBOT_PERIOD)
 
-    headers = {"Cache-Control": "no-store"}
-    return StreamingResponse(stream(), media_type="application/jsonl", headers=headers)
+    return StreamingResponse(stream(), media_type="application/jsonl", headers=UNKEPT)
 
 
 class ApiServer(ThreadServer):

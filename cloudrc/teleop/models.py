@@ -50,42 +50,44 @@ Text = Annotated[str, Field(max_length=200)]
 class MissionRequest(Section):
     """Order to fly a mission."""
 
-    name: Text = Field("", description="Shown to people")
-    description: str = Field("", description="One line, not kept")
-    start: Literal["spawn", "here"] = Field("spawn", description="Where the mission starts")
-    time_limit_s: TimeLimit | None = Field(
-        None, description="With all holds [s]; default: 3 times the expected time, at least 60 s"
-    )
-    waypoints: tuple[Waypoint, ...] = Field((), max_length=MAX_WAYPOINTS, description="In order")
-    carrot: Carrot | None = Field(None, description="How the setpoint moves; null: it jumps")
-    judged_by: JudgedBy = Field(
-        "measured", description="Position by which waypoints count as reached"
-    )
-    touch: Touch | None = Field(None, description="What the robot has to touch; null: nothing")
-    key: Text = Field("", description="Teleop makes one mission for each key")
-    queue: bool = Field(False, description="Wait for the mission under way, if there is one")
-    lease_s: Annotated[float, Field(ge=LEASE_MIN, le=LEASE_MAX)] | None = Field(
-        None,
-        description="Cancel the mission if nobody renews it for this time [s]; null: it needs no "
-        "watcher",
-    )
+    name: Text = ""
+    """Shown to people"""
+    description: str = ""
+    """One line, not kept"""
+    start: Literal["spawn", "here"] = "spawn"
+    """Where the mission starts"""
+    time_limit_s: TimeLimit | None = None
+    """With all holds [s]; default: 3 times the expected time, at least 60 s"""
+    waypoints: tuple[Waypoint, ...] = Field((), max_length=MAX_WAYPOINTS)
+    """In order"""
+    carrot: Carrot | None = None
+    """How the setpoint moves; null: it jumps"""
+    judged_by: JudgedBy = "measured"
+    """Position by which waypoints count as reached"""
+    touch: Touch | None = None
+    """What the robot has to touch; null: nothing"""
+    key: Text = ""
+    """Teleop makes one mission for each key"""
+    queue: bool = False
+    """Wait for the mission under way, if there is one"""
+    lease_s: Annotated[float, Field(ge=LEASE_MIN, le=LEASE_MAX)] | None = None
+    """Cancel the mission if nobody renews it for this time [s]; null: it needs no watcher"""
 
 
 class GoToRequest(Section):
     """Order to fly to a point."""
 
-    position_m: Place = Field(description="Base position [m], world frame")
-    yaw_deg: Yaw | None = Field(
-        None, description="Heading there [deg], for a robot that obeys a yaw; null: any"
-    )
+    position_m: Place
+    """Base position [m], world frame"""
+    yaw_deg: Yaw | None = None
+    """Heading there [deg], for a robot that obeys a yaw; null: any"""
 
 
 class DriveRequest(Section):
     """Order to move the setpoint by hand."""
 
-    velocity_mps: tuple[Finite, Finite, Finite] = Field(
-        description="Velocity of the setpoint [m/s], world frame; above 1.5 m/s it is scaled down"
-    )
+    velocity_mps: tuple[Finite, Finite, Finite]
+    """Velocity of the setpoint [m/s], world frame; above 1.5 m/s it is scaled down"""
 
 
 EXAMPLES: dict[type[Section], dict[str, Any]] = {
@@ -103,150 +105,201 @@ EXAMPLES: dict[type[Section], dict[str, Any]] = {
 }
 
 
-def _field(text: str) -> Any:
-    return Field(description=text)
-
-
 class _Answer(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 class Reached(_Answer):
     """A waypoint that the robot has reached, and when."""
 
-    waypoint: int = _field("Index of the waypoint, from 0")
-    time_s: float = _field("Time since the mission began [s]")
+    waypoint: int
+    """Index of the waypoint, from 0"""
+    time_s: float
+    """Time since the mission began [s]"""
 
 
 class Failure(_Answer):
     """A rule that the mission has broken."""
 
-    code: str = _field("One word, for programs")
-    text: str = _field("Reason in words")
+    code: str
+    """One word, for programs"""
+    text: str
+    """Reason in words"""
 
 
 class Verdict(_Answer):
     """Result of a mission that has ended."""
 
-    outcome: Literal["success", "failure", "invalid", "interrupted"] = _field("As in report.json")
-    exit_code: int = _field("Exit code of a Job that flies the mission: 0, 1, 6 or 130")
-    failures: list[Failure] = _field("Every rule that the mission has broken")
+    outcome: Literal["success", "failure", "invalid", "interrupted"]
+    """As in report.json"""
+    exit_code: int
+    """Exit code of a Job that flies the mission: 0, 1, 6 or 130"""
+    failures: list[Failure]
+    """Every rule that the mission has broken"""
 
 
 class Event(_Answer):
     """An event of a mission."""
 
-    id: int = _field("Number of the event; all missions share one count")
-    mission: str = _field("Id of the mission")
-    event: str = _field(
-        "queued, starting, started, reached, held, resumed, goto, driving, operator_lost, "
-        "restarted, new_session, no_telemetry, telemetry_again, guard_holds, hold_over, "
-        "link_changed, touched, obstacle_touched, paused; at the end done, cancelled, "
+    id: int
+    """Number of the event; all missions share one count"""
+    mission: str
+    """Id of the mission"""
+    event: str = Field(
+        description="queued, starting, started, reached, held, resumed, goto, driving, "
+        "operator_lost, restarted, new_session, no_telemetry, telemetry_again, guard_holds, "
+        "hold_over, link_changed, touched, obstacle_touched, paused; at the end done, cancelled, "
         f"{', '.join(FAILURES)}"
     )
-    waypoint: int = _field("Index of the waypoint, from 0")
-    text: str = _field("Event in words")
-    time_s: float = _field("Time since the mission began [s]")
+    waypoint: int
+    """Index of the waypoint, from 0"""
+    text: str
+    """Event in words"""
+    time_s: float
+    """Time since the mission began [s]"""
 
 
 class MissionSummary(_Answer):
     """A mission, without its events."""
 
-    id: str = _field("Id, given by teleop")
-    name: str = _field("Name in the order")
-    key: str = _field("Key in the order")
+    id: str
+    """Id, given by teleop"""
+    name: str
+    """Name in the order"""
+    key: str
+    """Key in the order"""
     state: Literal["queued", "starting", "flying", "held", "done", "failed", "cancelled"]
-    by_hand: bool = _field("Whether an operator drives the robot by hand")
-    waypoint: int = _field("Index of the waypoint to which the robot flies, from 0")
-    waypoints: int = _field("Number of waypoints; 0: the mission follows a file of setpoints")
-    reached: list[Reached] = _field("The reached waypoints")
-    verdict: Verdict | None = _field("Null until the mission has ended")
+    by_hand: bool
+    """Whether an operator drives the robot by hand"""
+    waypoint: int
+    """Index of the waypoint to which the robot flies, from 0"""
+    waypoints: int
+    """Number of waypoints; 0: the mission follows a file of setpoints"""
+    reached: list[Reached]
+    """The reached waypoints"""
+    verdict: Verdict | None
+    """Null until the mission has ended"""
 
 
 class MissionView(MissionSummary):
     """A mission with its events."""
 
-    route_m: list[tuple[float, float, float]] = _field("The waypoints [m], world frame")
-    events: list[Event] = Field(max_length=SHOWN, description="The newest events, oldest first")
-    events_left_out: int = _field("Number of older events")
+    route_m: list[tuple[float, float, float]]
+    """The waypoints [m], world frame"""
+    events: list[Event] = Field(max_length=SHOWN)
+    """The newest events, oldest first"""
+    events_left_out: int
+    """Number of older events"""
 
 
 class MissionList(_Answer):
     """All known missions."""
 
-    missions: list[MissionSummary] = _field("Oldest first")
+    missions: list[MissionSummary]
+    """Oldest first"""
 
 
 class SensorView(_Answer):
     """One of the robot's own sensors."""
 
-    name: str = _field("Name in robot.yaml")
-    value: float | None = _field("What it shows, in its unit; null if that is no number")
-    unit: str = _field("Unit in robot.yaml")
+    name: str
+    """Name in robot.yaml"""
+    value: float | None
+    """What it shows, in its unit; null if that is no number"""
+    unit: str
+    """Unit in robot.yaml"""
 
 
 class Seen(_Answer):
     """The newest telemetry."""
 
-    age_s: float = _field("Time since the telemetry arrived [s]")
-    epoch: int = _field("Number of the session between cloud and world")
-    world: str = _field("Identifies world's process")
-    position_m: list[float | None] = _field("Measured position of the base [m], world frame")
-    guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"] = _field("State of the guard")
-    cause: str = _field("Why the guard is in this state; after a landing, why the robot landed")
-    guard_for_s: float | None = _field("Time in this guard state [s]; null if `age_s` is above 1 s")
-    next_step: str = _field("What the robot does next, or what the operator has to do")
-    obstacle_contacts: int = _field("Number of contacts with obstacles in the mission")
-    touch_speed_mps: float | None = _field(
-        "Speed of the first touch of what the mission has to touch [m/s]"
-    )
-    sensors: list[SensorView] = _field("The robot's own sensors, in the order of robot.yaml")
-    horizon_s: float | None = _field("Prediction horizon of cloud's last command [s]")
-    rtt_s: float | None = _field("Last round trip, without the waiting time at the robot [s]")
-    loop_delay_s: float | None = _field("Last round trip, with the waiting time at the robot [s]")
+    age_s: float
+    """Time since the telemetry arrived [s]"""
+    epoch: int
+    """Number of the session between cloud and world"""
+    world: str
+    """Identifies world's process"""
+    position_m: list[float | None]
+    """Measured position of the base [m], world frame"""
+    guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"]
+    """State of the guard"""
+    cause: str
+    """Why the guard is in this state; after a landing, why the robot landed"""
+    guard_for_s: float | None
+    """Time in this guard state [s]; null if `age_s` is above 1 s"""
+    next_step: str
+    """What the robot does next, or what the operator has to do"""
+    obstacle_contacts: int
+    """Number of contacts with obstacles in the mission"""
+    touch_speed_mps: float | None
+    """Speed of the first touch of what the mission has to touch [m/s]"""
+    sensors: list[SensorView]
+    """The robot's own sensors, in the order of robot.yaml"""
+    horizon_s: float | None
+    """Prediction horizon of cloud's last command [s]"""
+    rtt_s: float | None
+    """Last round trip, without the waiting time at the robot [s]"""
+    loop_delay_s: float | None
+    """Last round trip, with the waiting time at the robot [s]"""
 
 
 class StateView(_Answer):
     """The present state of missions and robot."""
 
-    mission: MissionSummary | None = _field("The mission under way")
-    queue: list[str] = _field("Ids of the missions that wait")
-    cloud_age_s: float | None = _field("Age of the last message of cloud [s]; null before one")
-    seen: Seen | None = _field("Null before the first telemetry")
+    mission: MissionSummary | None
+    """The mission under way"""
+    queue: list[str]
+    """Ids of the missions that wait"""
+    cloud_age_s: float | None
+    """Age of the last message of cloud [s]; null before one"""
+    seen: Seen | None
+    """Null before the first telemetry"""
 
 
 class Stopped(_Answer):
     """Answer to a command for an emergency stop; the robot may not have received the stop yet."""
 
-    id: str | None = _field("The mission that was under way and has failed")
-    state: Literal["stopping"] = _field("Lasts until the robot's guard is in ESTOP")
+    id: str | None
+    """The mission that was under way and has failed"""
+    state: Literal["stopping"]
+    """Lasts until the robot's guard is in ESTOP"""
 
 
 class Acknowledged(_Answer):
     """Answer to an acknowledgement, which the robot may not have received yet."""
 
-    state: Literal["acknowledged"] = _field("A mission can fly once the robot stands still")
+    state: Literal["acknowledged"]
+    """A mission can fly once the robot stands still"""
 
 
 class Problem(_Answer):
     """One invalid value in a request."""
 
-    path: str = _field("Keys down to the value, joined by dots")
-    index: int | None = _field("Index of the waypoint with the problem; null without a waypoint")
-    value: str = _field("Value in words; empty if missing")
-    reason: str = _field("Rule for the value, and remedy")
+    path: str
+    """Keys down to the value, joined by dots"""
+    index: int | None
+    """Index of the waypoint with the problem; null without a waypoint"""
+    value: str
+    """Value in words; empty if missing"""
+    reason: str
+    """Rule for the value, and remedy"""
 
 
 class Refusal(_Answer):
     """Reason why a request is refused."""
 
-    detail: str = _field("Reason in words")
-    id: str | None = Field(None, description="The mission that is in the way")
-    problems: list[Problem] | None = Field(None, description="Every value that cannot be used")
+    detail: str
+    """Reason in words"""
+    id: str | None = None
+    """The mission that is in the way"""
+    problems: list[Problem] | None = None
+    """Every value that cannot be used"""
 
 
 class RefusedError(BadInputError):
     """Report that a request is not valid; `problems` lists all reasons."""
+
+    status = 422  # of the answer
 
     def __init__(self, problems: list[ConfigProblem]) -> None:
         super().__init__("; ".join(map(str, problems[:3])))

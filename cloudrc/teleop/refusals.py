@@ -8,9 +8,13 @@ from cloudrc.errors import CloudrcError
 class UnknownMissionError(CloudrcError):
     """Report that no mission has this id."""
 
+    status = 404  # of the API's answer
+
 
 class UnavailableError(CloudrcError):
     """Report that teleop cannot act now, for example because the disk is full."""
+
+    status = 503
 
 
 class ConflictError(CloudrcError):
@@ -19,7 +23,7 @@ class ConflictError(CloudrcError):
     `mission` is the id of the mission that blocks the request; "" if no mission blocks it.
     """
 
-    exit_code = 5
+    exit_code, status = 5, 409
 
     def __init__(self, text: str, mission: str = "") -> None:
         super().__init__(text)

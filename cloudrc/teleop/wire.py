@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from math import dist, isinf, nan, radians
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_json
@@ -51,13 +51,9 @@ class Leg:
     acceleration: float = 1.0  # of the setpoint [m/s^2]
     yaw_tolerance: float = radians(YAW_TOLERANCE_DEG)  # largest error of `yaw` when reached [rad]
 
-    def is_at(self, position: Vector) -> bool:
-        """Return whether a position [m] is within the tolerance."""
-        return not exceeds(dist(position, self.position), self.tolerance)
-
     def has(self, seen: RobotStatus) -> bool:
         """Return whether a robot is at the waypoint, and has its heading, if it has one."""
-        if not self.is_at(seen.position):
+        if exceeds(dist(seen.position, self.position), self.tolerance):
             return False
         if self.yaw is None:
             return True
@@ -142,6 +138,8 @@ Output: TypeAlias = Setpoint | OperatorRequest | MissionEvent
 Message: TypeAlias = RobotStatus | Output
 ALARM = OperatorRequest(0, Request.ESTOP)
 """Emergency stop without a number. Cloud adds the number, so every part of teleop can send this."""
+NO_STATUS = b"null\n"
+"""Line of the stream of statuses before the first telemetry."""
 _STATUS = TypeAdapter(RobotStatus)
 _KINDS: dict[str, TypeAdapter[Message]] = {
     kind.__name__: TypeAdapter(kind)
@@ -166,22 +164,16 @@ def decode(data: bytes) -> Message:
 def write_line(status: RobotStatus | None) -> bytes:
     """Encode a status as a line of JSON with the fields' names; unknown numbers become null."""
     if status is None:
-        return b"null\n"
+        return NO_STATUS
     control = status.control and status.control._asdict()
     return to_json({**status._asdict(), "control": control}, inf_nan_mode="null") + b"\n"
 
 
 def read_line(line: bytes) -> RobotStatus | None:
     """Decode a line of `write_line`; raise ValueError if it is malformed."""
-
-    def with_nan(part: dict[str, Any]) -> dict[str, Any]:
-        known = {key: value for key, value in part.items() if value is not None or key == "control"}
-        lists = {
-            key: [nan if each is None else each for each in value]
-            for key, value in known.items()
-            if isinstance(value, list)
-        }
-        return dict.fromkeys(part, nan) | known | lists
-
-    tree = json.loads(line, object_hook=with_nan)
-    return None if tree is None else _STATUS.validate_python(tree)
+    if line == NO_STATUS:
+        return None
+    tree = json.loads(line.replace(b"null", b"NaN"))  # a null is an unknown number, or no command
+    if isinstance(tree["control"], float):
+        tree["control"] = None
+    return _STATUS.validate_python(tree)

@@ -7,7 +7,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from cloudrc.bridges.ros2.health import FlightHealth
-from cloudrc.bridges.ros2.requests import BridgedRobot, RosRequests
+from cloudrc.bridges.ros2.requests import RosRequests
 from cloudrc.cli.main import main
 from cloudrc.console.steering import Steering
 from cloudrc.geometry.shapes import Shapes, Surface
@@ -45,8 +45,8 @@ class Asking:
         self.said = []
         self.api = FakeApi()
         self.steering = Steering(self.api)
-        robot = BridgedRobot(planar, turns)
-        self.requests = RosRequests(self.steering, robot, self.said.append, **options)
+        options |= {"planar": planar, "turns": turns}
+        self.requests = RosRequests(self.steering, self.said.append, **options)
 
     def velocity(self, now=0.0):
         self.requests.pass_on()

@@ -59,32 +59,25 @@ def names(page):
 def foreign_origins(port):
     own = f"http://127.0.0.1:{port}"
     return [
-        *("https://example.org", f"http://example.org:{port}", "null", "", "*", "file://"),
-        *(f"https://127.0.0.1:{port}", "http://127.0.0.1", f"{own}0", f"{own}/", f"{own},{own}"),
-        *(f"HTTP://127.0.0.1:{port}", f"127.0.0.1:{port}", f"http://user@127.0.0.1:{port}"),
-        *(f"{own}@example.org", f"http://127.0.0.1.example.org:{port}", f"http://127.1:{port}"),
-        *(f"http://2130706433:{port}", f"http://0.0.0.0:{port}", f"http://[::1]:{port}"),
-        *(f"http://localhost:{port}", f"http://x.localhost:{port}", f"http://127.0.0.1:0{port}"),
-        *("http://hub.example.org", f"{PROXY}:443", f"{PROXY}/", "https://HUB.example.org"),
+        *("https://example.org", "null", "", f"https://127.0.0.1:{port}", "http://127.0.0.1"),
+        *(f"{own}0", f"{own}/", f"{own},{own}", f"HTTP://127.0.0.1:{port}", f"{own}@example.org"),
+        *(f"http://127.0.0.1.example.org:{port}", f"http://[::1]:{port}"),
+        *(f"http://localhost:{port}", "http://hub.example.org", f"{PROXY}:443"),
         *("https://x.hub.example.org", "https://hub.example.org.evil.example"),
     ]
 
 
 def foreign_hosts(port):
     return [
-        *("example.org", f"example.org:{port}", "", " ", f":{port}", "*", f"127.0.0.1.:{port}"),
-        *(f"LOCALHOST:{port}", f"x.localhost:{port}", f"127.0.0.1.example.org:{port}"),
-        *(f"user@127.0.0.1:{port}", f"127.0.0.1:{port}@example.org", f"127.0.0.1:{port}/"),
-        *(f"127.1:{port}", f"127.0.0.2:{port}", f"0.0.0.0:{port}", f"[::1]:{port}"),
-        *(f"127.0.0.1:{port},example.org", "127.0.0.1:", "127.0.0.1:x", "127.0.0.1:123456"),
-        *("hub.example.org:8000", "x.hub.example.org", "hub.example.org.", "HUB.example.org"),
+        *("example.org", "", f"127.0.0.1.:{port}", f"LOCALHOST:{port}", f"0.0.0.0:{port}"),
+        *(f"127.0.0.1.example.org:{port}", f"127.0.0.1:{port}@example.org", "127.0.0.1:x"),
+        *(f"127.0.0.1:{port},example.org", "hub.example.org:8000", "x.hub.example.org"),
     ]
 
 
 WRONG_TOKENS = [
-    *("", "x", "null", "*", TOKEN[:-1], f"{TOKEN}0", TOKEN.upper(), TOKEN[::-1], "0" * 12_000),
-    *(f" {TOKEN}", f"{TOKEN}%20", f"%30{TOKEN[1:]}", f"{TOKEN};", f"{TOKEN}&token=x"),
-    *(f"x&token={TOKEN}", f"token={TOKEN}", f"{TOKEN}/", f"\xe9{TOKEN}"),
+    *("", "x", TOKEN[:-1], f"{TOKEN}0", TOKEN.upper(), "0" * 12_000, f" {TOKEN}", f"{TOKEN}%20"),
+    *(f"%30{TOKEN[1:]}", f"{TOKEN};", f"x&token={TOKEN}", f"{TOKEN}/", f"\xe9{TOKEN}"),
 ]
 
 
@@ -121,27 +114,20 @@ def test_no_foreign_origin_host_or_token_connects(served):
     ]
     shapes += [
         ([host, origin], ""),
-        ([host, origin, "Cookie: "], ""),
         ([host, origin, f"Cookie: cloudrc-000000000000={TOKEN}"], ""),  # of another console
-        ([host, origin, f"Cookie: cloudrc={TOKEN}; token={TOKEN}; {name.upper()}={TOKEN}"], ""),
+        ([host, origin, f"Cookie: token={TOKEN}; {name.upper()}={TOKEN}"], ""),
         ([host, origin, f"Cookie: {name}={TOKEN}; {name}=x"], ""),
         ([host, origin, f"Cookie: {name}={TOKEN}", f"Cookie: {name}=x"], ""),
         ([host, origin, f"Authorization: token {TOKEN}", f"X-Token: {TOKEN}"], ""),
-        ([host, origin], f"?TOKEN={TOKEN}&Token={TOKEN}"),
-        ([host, origin], f"?x?token={TOKEN}"),
-        ([host, origin], f"token={TOKEN}"),
+        ([host, origin], f"?TOKEN={TOKEN}"),
         ([cookie, origin], ""),  # no host
-        ([cookie, host, host], ""),
         ([cookie, host, "Host: example.org"], ""),
         ([cookie, "Host: example.org", host], ""),
-        ([cookie, host, origin, origin], ""),
         ([cookie, host, origin, "Origin: https://example.org"], ""),
         ([cookie, host, "Origin: https://example.org", origin], ""),
         ([cookie, host, f"Origin: http://{own}", " https://example.org"], ""),  # folded
-        ([cookie, host, "Origin : https://example.org"], ""),
         ([cookie, "Host: example.org", f"X-Forwarded-Host: {own}", f"Forwarded: host={own}"], ""),
         ([cookie, "Host: hub.example.org", f"Origin: http://{own}"], ""),
-        ([cookie, "Host: hub.example.org", "Origin: http://hub.example.org"], ""),
     ]
     accepted = [shape for shape in shapes if {*both_doors(page, *shape)} & {101, 200, 202, 303}]
     assert not accepted

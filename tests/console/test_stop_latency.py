@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -22,12 +22,8 @@ from tests.console.conftest import acknowledge, session_with_console
 pytestmark = [pytest.mark.process, pytest.mark.alone, pytest.mark.full]
 CLICKS = int(os.environ.get("CLOUDRC_STOP_CLICKS", "200"))
 """Clicks on the ground in each row; a tenth of them in flight."""
-ROWS = {
-    # name -> pages with the scene, plain pages, a busy process per core, bound of p99 [s]
-    "idle": (0, 0, False, 0.150),
-    "20 clients, busy processors": (20, 0, True, 0.400),
-    "200 clients": (50, 150, False, 0.400),
-}
+ROWS = {"idle": (0, 0.150), "busy processors": (os.cpu_count(), 0.400)}
+"""Name -> number of busy processes, and bound of p99 [s]."""
 CLICK = """() => {
   const at = performance.timeOrigin + performance.now();
   document.querySelector('#stop button').click();
@@ -60,27 +56,15 @@ def session(tmp_path_factory):
 
 
 @contextmanager
-def child(*words, **kinds):
-    process = subprocess.Popen([sys.executable, *words], **kinds)
+def load(count):
+    """Keep processors busy."""
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
     try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-@contextmanager
-def load(address, scenes, plains, is_busy):
-    """Open pages that read, and keep all processors busy."""
-    with ExitStack() as stack:
-        if scenes + plains:
-            words = ("-m", "tests.console.readers", address, str(scenes), str(plains))
-            readers = stack.enter_context(child(*words, stdout=subprocess.PIPE, text=True))
-            assert readers.stdout.readline() == "ready\n"
-        for _ in range(os.cpu_count() if is_busy else 0):
-            stack.enter_context(child("-c", "while True: pass"))
-        time.sleep(3.0)
         yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
 
 
 def land(api, watch):
@@ -101,12 +85,12 @@ def fly(api, watch):
 @pytest.mark.parametrize("name", ROWS)
 def test_stop_is_quick_on_the_ground_and_in_flight(name, session, browse, figure):
     api, watch, address = session
-    scenes, plains, is_busy, bound = ROWS[name]
+    count, bound = ROWS[name]
     page = browse(address.replace("/?", "/plain?"))
-    with load(address, scenes, plains, is_busy):
-        for where, count in (("on the ground", CLICKS), ("in flight", max(1, CLICKS // 10))):
+    with load(count):
+        for where, clicks in (("on the ground", CLICKS), ("in flight", max(1, CLICKS // 10))):
             took = []
-            for _ in range(count):
+            for _ in range(clicks):
                 if where == "in flight":
                     fly(api, watch)
                 at = page.evaluate(CLICK) * 1e-3
@@ -114,6 +98,6 @@ def test_stop_is_quick_on_the_ground_and_in_flight(name, session, browse, figure
                 took.append(watch.since - at)
                 land(api, watch)
             middle, worst = np.percentile(took, [50, 99])
-            print(f"STOP, {name}, {where}: p50 {middle:.3f} s, p99 {worst:.3f} s, {count} clicks")
-            figure(f"STOP, {name}, {where}: p50", middle, "<=", bound, "s", count=count)
-            figure(f"STOP, {name}, {where}: p99", worst, "<=", bound, "s", count=count)
+            print(f"STOP, {name}, {where}: p50 {middle:.3f} s, p99 {worst:.3f} s, {clicks} clicks")
+            figure(f"STOP, {name}, {where}: p50", middle, "<=", bound, "s", count=clicks)
+            figure(f"STOP, {name}, {where}: p99", worst, "<=", bound, "s", count=clicks)

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Collection
 from importlib.util import find_spec
 from math import dist
-from typing import Any, NamedTuple
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
@@ -26,7 +26,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from cloudrc.bridges.ros2.health import FlightHealth
-from cloudrc.bridges.ros2.own_node import LINGERS, NEWEST, QUEUED, OwnNode
+from cloudrc.bridges.ros2.own_node import NEWEST, QUEUED, OwnNode
 from cloudrc.bridges.ros2.requests import RosRequests
 from cloudrc.console.steering import VERBS, Steering
 from cloudrc.drivers.readers import RecordReader
@@ -69,28 +69,26 @@ def load_messages() -> None:
         check_for_type_support(kind)
 
 
-class Surroundings(NamedTuple):
-    """What the bridge draws, and of which it publishes frames."""
-
-    prefix: str  # of the robot's frames, such as "drone1/"
-    scene: bytes  # markers of robot and scene, a visualization_msgs/MarkerArray
-
-
 class RosBridge(OwnNode):
     """The node of a flight."""
 
     def __init__(
         self,
         namespace: str,
-        surroundings: Surroundings,
+        prefix: str,
+        scene: bytes,
         steering: Steering,
         requests: RosRequests,
         tell: Callable[[str], None],
     ) -> None:
-        """Open the node below `namespace`; `tell` gets words for the user."""
+        """Open the node below `namespace`; `tell` gets words for the user.
+
+        `prefix` is that of the robot's frames, such as "drone1/"; `scene` has the markers of robot
+        and scene, a visualization_msgs/MarkerArray.
+        """
         super().__init__("cloudrc_bridge", namespace)
         self._robot = namespace.strip("/")
-        self._prefix, self._markers = surroundings
+        self._prefix, self._markers = prefix, scene
         self._steering, self._requests = steering, requests
         self._health = FlightHealth()
         self._guard: GuardState | None = None
@@ -116,7 +114,6 @@ class RosBridge(OwnNode):
             )
         self._ended = False
         self._listener = threading.Thread(target=self._listen, daemon=True)
-        self._tell, self._told_others = tell, False
         tell(f"{self._odometry.topic_name} and more topics in {self.domain}")
 
     def run(self, reader: RecordReader, has_ended: Callable[[], bool]) -> None:
@@ -200,14 +197,6 @@ class RosBridge(OwnNode):
             shapes = [path_shape("flown", flown), path_shape("route", route, GOAL)]
             self._path.publish(encode_markers(0, shapes))
         self._follow_type()
-        self._look_for_others()
-
-    def _look_for_others(self) -> None:
-        """Say it once if another node publishes the odometry, too: nobody could tell them apart."""
-        topic = self._odometry.topic_name
-        if not self._told_others and self.node.count_publishers(topic) > 1:
-            self._told_others = True
-            self._tell(f"another node publishes {topic}: end one, or give --namespace; {LINGERS}")
 
     def _take_commands(self) -> None:
         self._commands = self.node.create_subscription(

@@ -117,20 +117,15 @@ class RosNode(OwnNode):
         return int(stamp_ns)
 
     def publish_again(self, seen: dict[str, Any], stamp_ns: int) -> None:
-        """Publish an observation with the stamp `stamp_ns` [ns]; the estimate comes last.
-
-        A topic that nobody needs to answer is published only if somebody hears it.
-        """
-        if self._clock is not None and self._clock.get_subscription_count():
+        """Publish an observation with the stamp `stamp_ns` [ns]; the estimate comes last."""
+        if self._clock is not None:
             self._clock.publish(encode_clock(seen["now_ns"]))
         measured = seen["measured"]
-        is_new = measured and measured[0] != self._measured_ns
-        if is_new and self._odometry.get_subscription_count():
+        if measured and measured[0] != self._measured_ns:
             self._measured_ns = measured[0]
             self._odometry.publish(encode_odometry(*measured))
         for name, span in self._spans.items():
-            if span.get_subscription_count():
-                span.publish(encode_span(stamp_ns, seen[name]))
+            span.publish(encode_span(stamp_ns, seen[name]))
         self._setpoint.publish(
             encode_pose(stamp_ns, seen["setpoint/position"], seen["setpoint/yaw"])
         )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from math import cos, degrees, hypot, inf, isfinite, sin
-from typing import NamedTuple
 
 from cloudrc.console.steering import Steering
 from cloudrc.geometry.vectors import turn_to
@@ -27,13 +26,6 @@ OBSERVES = (
 )
 
 
-class BridgedRobot(NamedTuple):
-    """What the bridge has to know of a robot."""
-
-    planar: bool  # whether it stays on the ground
-    turns: bool  # whether it obeys a yaw
-
-
 class RosRequests:
     """Passes the requests of nodes on to teleop; says in one line what it does not take.
 
@@ -45,9 +37,10 @@ class RosRequests:
     def __init__(
         self,
         steering: Steering,
-        robot: BridgedRobot,
         tell: Callable[[str], None],
         *,
+        planar: bool,
+        turns: bool,
         prefix: str = "",
         observes: bool = False,
     ) -> None:
@@ -55,18 +48,20 @@ class RosRequests:
 
         Args:
             steering: Sends requests to teleop.
-            robot: The robot.
             tell: Gets words for the user.
+            planar: Whether the robot stays on the ground.
+            turns: Whether it obeys a yaw.
             prefix: Prefix of the robot's frames.
             observes: Whether to take no request.
         """
-        self._steering, self._robot, self._tell_user = steering, robot, tell
+        self._steering, self._tell_user = steering, tell
+        self._planar, self._turns = planar, turns
         self._base, self._observes = prefix + BASE, observes
         self.position: Vector = ZERO
         self.yaw = 0.0
         self._wanted: tuple[Vector, float] | None = None  # velocity, and end of its time [s]
         self._passed = -inf  # time at which the newest velocity was passed on [s]
-        self._said: dict[str, float] = {}
+        self._said: dict[str, float] = {}  # words -> when they were said last [s]
 
     def serve(self, name: str) -> tuple[bool, str]:
         """Carry out a verb of the operator; return whether teleop accepted it, and words."""
@@ -85,8 +80,8 @@ class RosRequests:
             return
         if z == 0.0:  # RViz clicks on the ground
             z = max(self.position[2], HEIGHT)
-        place = (x, y) if self._robot.planar else (x, y, z)
-        answer = self._steering.go_to(place, _yaw_deg(wxyz) if self._robot.turns else None)
+        place = (x, y) if self._planar else (x, y, z)
+        answer = self._steering.go_to(place, _yaw_deg(wxyz) if self._turns else None)
         self._tell(answer.text)
 
     def drive(self, frame: str, linear: Sequence[float], yaw_rate: float) -> None:
@@ -108,7 +103,7 @@ class RosRequests:
                 x * cos(self.yaw) - y * sin(self.yaw),
                 x * sin(self.yaw) + y * cos(self.yaw),
             )
-        self._wanted = (x, y, 0.0 if self._robot.planar else z), time.monotonic() + DRIVE_LASTS
+        self._wanted = (x, y, 0.0 if self._planar else z), time.monotonic() + DRIVE_LASTS
 
     def pass_on(self) -> None:
         """Pass the newest velocity on, if it is due; say why teleop has not taken a request."""
@@ -141,8 +136,7 @@ class RosRequests:
     def _tell(self, text: str) -> None:
         now = time.monotonic()
         if now - self._said.get(text, -inf) > SAID_AGAIN:
-            fresh = {text: at for text, at in self._said.items() if now - at <= SAID_AGAIN}
-            self._said = {**fresh, text: now}
+            self._said[text] = now
             self._tell_user(text)
 
 
