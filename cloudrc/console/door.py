@@ -10,12 +10,12 @@ import asyncio
 import html
 import json
 import socket
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import websockets.asyncio.server
 from starlette.applications import Starlette
@@ -27,10 +27,12 @@ from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from cloudrc.console.access import PARAMETER, Access
-from cloudrc.console.steering import Answer
 from cloudrc.drivers.local import socket_folder
 from cloudrc.files import at_place
 from cloudrc.teleop.server import ThreadServer
+
+if TYPE_CHECKING:
+    from cloudrc.console.page import Page
 
 PAGES_MAX = 50
 """Largest number of pages that have the scene; each further one gets the plain page."""
@@ -59,15 +61,6 @@ HEADERS = [
 """Headers of every answer."""
 WEB = Path(__file__).parent / "web"
 """Folder of the pages' parts."""
-
-
-class Desk(NamedTuple):
-    """What the door needs of the console; it calls these functions in its own threads."""
-
-    stop: Callable[[], None]  # switches the robot off, does not wait
-    acts: Mapping[str, Callable[[], Answer]]  # name of a button -> act
-    describe: Callable[[], list[str]]  # the state, line by line
-    has_pilot: Callable[[], bool]  # whether a page with the scene steers
 
 
 class _Protocol(H11Protocol):
@@ -100,13 +93,13 @@ class _Protocol(H11Protocol):
 class Door(ThreadServer):
     """The console's server at 127.0.0.1."""
 
-    def __init__(self, port: int, access: Access, desk: Desk, scene: str) -> None:
+    def __init__(self, port: int, access: Access, page: Page, scene: str) -> None:
         """Open the port (0: any free one); answer after `start`.
 
         Args:
             port: TCP port.
             access: Rules by which requests are admitted.
-            desk: Functions of the console.
+            page: Carries out what browsers ask for.
             scene: HTML of the page with the scene.
         """
         with at_place(f"--port {port}"):
@@ -114,7 +107,7 @@ class Door(ThreadServer):
         self.port: int = opened.getsockname()[1]
         self._folder = TemporaryDirectory(prefix="cloudrc-", dir=socket_folder())
         self.viser = f"{self._folder.name}/viser.sock"  # only this user may enter its folder
-        self._access, self._desk, self._scene = access, desk, scene
+        self._access, self._page, self._scene = access, page, scene
         self._open = 0  # pages that have the scene
         self._routes = Starlette(
             routes=[
@@ -173,21 +166,21 @@ class Door(ThreadServer):
 
     def _state(self) -> dict[str, Any]:
         """Return the state, the buttons of the plain page, and whether all scenes are taken."""
-        is_read_only = self._desk.has_pilot()
+        is_read_only = self._page.pilot is not None
         lines = ["Read only: another browser steers."] if is_read_only else []
-        acts = [] if is_read_only else list(self._desk.acts)
-        lines += self._desk.describe()
+        acts = [] if is_read_only else list(self._page.acts)
+        lines += self._page.describe()
         return {"lines": lines, "acts": acts, "is_full": self._open >= PAGES_MAX}
 
     async def _act(self, request: Request) -> Response:
         """Carry out what a page asks for."""
         name = request.path_params["name"]
         if name == "stop":
-            self._desk.stop()
+            self._page.steering.stop()
             return PlainTextResponse("switching the robot off", 202)
-        if (act := self._desk.acts.get(name)) is None:
+        if (act := self._page.acts.get(name)) is None:
             return Response(status_code=404)
-        if self._desk.has_pilot():
+        if self._page.pilot is not None:
             return PlainTextResponse("another browser steers", 409)
         answer = await run_in_threadpool(act)
         return PlainTextResponse(f"Refused: {answer.text}" if answer.is_refusal else answer.text)

@@ -21,7 +21,7 @@ from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.scene import scene_of
 from cloudrc.console.access import PARAMETER, Access
 from cloudrc.console.controls import KEYS, Controls, TargetPlace, acts_of
-from cloudrc.console.door import Desk, Door, scene_page, viser_at
+from cloudrc.console.door import Door, scene_page, viser_at
 from cloudrc.console.feed import (
     CHARTED_FROM,
     DOWNLINK,
@@ -69,45 +69,46 @@ BELOW_STOP = '<div style="height: 36px"></div>'
 
 
 class Page:
-    """The console's web page of one flight, at `url`; this process is its server."""
+    """The console's web page of one flight, at `url`; this process is its server.
+
+    Attributes:
+        steering: Carries out what the page asks for.
+        acts: Name of a button -> what it does.
+        pilot: Number of the browser that has the controls; None: no page with the scene steers.
+    """
 
     def __init__(
         self,
+        experiment: ResolvedExperiment,
+        feed: FlightFeed,
+        steering: Steering,
         port: int = 0,
         token: Callable[[], str] | None = None,
         origins: Collection[str] = (),
     ) -> None:
-        """Choose where the page will be; `fill` serves it.
-
-        Args:
-            port: TCP port; 0 means any free port.
-            token: Function that returns the page's present token; None makes one.
-            origins: Origins of proxies that may serve the page.
-        """
-        own = token_hex(16)
-        self._wanted_port = port
-        self._access = Access(token or (lambda: own), origins)
-
-    def fill(self, experiment: ResolvedExperiment, feed: FlightFeed, steering: Steering) -> None:
         """Serve the page on this machine only; one browser at a time gets the controls.
 
         Args:
             experiment: What flies.
             feed: What the page shows.
             steering: Carries out what the page asks for.
+            port: TCP port; 0 means any free port.
+            token: Function that returns the page's present token; None makes one.
+            origins: Origins of proxies that may serve the page.
         """
-        self._experiment, self._feed, self._steering = experiment, feed, steering
-        self._acts = acts_of(experiment, steering)
-        desk = Desk(steering.stop, self._acts, self._describe_plainly, self._is_steered)
+        own = token_hex(16)
+        self._access = Access(token or (lambda: own), origins)
+        self._experiment, self._feed, self.steering = experiment, feed, steering
+        self.acts = acts_of(experiment, steering)
+        self.pilot: int | None = None
         viser_page = Path(viser.__file__).parent / "client" / "build" / "index.html"
         labels = {code: label for code, (label, _) in KEYS.items()}
-        page = scene_page(viser_page.read_text(encoding="utf-8"), labels)
-        self._door = Door(self._wanted_port, self._access, desk, page)
+        html = scene_page(viser_page.read_text(encoding="utf-8"), labels)
+        self._door = Door(port, self._access, self, html)
         rich.get_console().quiet = True  # viser prints about itself
         with viser_at(self._door.viser):
             self._server = viser.ViserServer(label="cloudrc", verbose=False)
         self._lock = threading.Lock()
-        self._pilot: int | None = None  # the client that has the controls
         self._controls: Controls | None = None
         self._due = -inf  # time of the next slow update [s]
         self._drawn = 0  # number of drawn points of the trail
@@ -150,7 +151,7 @@ class Page:
         if feed.flown != self._drawn:
             self._drawn = feed.flown
             scene.set_trail(*feed.trail())
-        mission, route = self._steering.state.get("mission"), self._steering.route
+        mission, route = self.steering.state.get("mission"), self.steering.route
         if not (mission and route):
             route = [point.position_m for point in self._experiment.mission.waypoints]
         scene.set_waypoints(np.array(route), len(mission["reached"]) if mission else 0)
@@ -180,7 +181,7 @@ class Page:
 
     def _describe(self, now: float) -> str:
         """Return guard, command age, mission and the newest answer, as Markdown."""
-        feed, state = self._feed, self._steering.state
+        feed, state = self._feed, self.steering.state
         if feed.status is None:
             return "**waiting for the robot**"
         silence, age = feed.silence(now), feed.command_age(now)
@@ -193,7 +194,7 @@ class Page:
             lines.append(f"Sensors: {shown}")
         if silence > STALE:
             lines[0] = f"**No telemetry for {silence:.1f} s**, last: {lines[0]}"
-        answer = self._steering.answer
+        answer = self.steering.answer
         if now - answer.at < ANSWER_SHOWN:
             lines.append(f"**Refused:** {answer.text}" if answer.is_refusal else answer.text)
         elif seen := state.get("seen"):
@@ -201,38 +202,35 @@ class Page:
         return "  \n".join(lines).replace("cloudrc mission ", "")  # buttons have the verbs' names
 
     def _describe_mission(self, now: float) -> str:
-        mission = self._steering.state.get("mission")
+        mission = self.steering.state.get("mission")
         is_free = not mission or mission["by_hand"] or mission["state"] == "held"
-        if is_free and self._steering.velocity(now) != ZERO:
+        if is_free and self.steering.velocity(now) != ZERO:
             return "driving by hand"
         if is_drive(mission):
             return "driving by hand, waits for keys"
         return describe_mission(mission) if mission else "no mission"
 
-    def _describe_plainly(self) -> list[str]:
+    def describe(self) -> list[str]:
         """Return the lines of the state, without marks."""
         return self._describe(time.monotonic()).replace("**", "").split("  \n")
-
-    def _is_steered(self) -> bool:
-        return self._pilot is not None
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Give the controls to a new browser if no other browser has them."""
         with self._lock:
-            is_pilot = self._pilot is None
+            is_pilot = self.pilot is None
             if is_pilot:
-                self._pilot = client.client_id
+                self.pilot = client.client_id
         if is_pilot:
-            self._controls = Controls(client, self._acts, self._steering, self._place)
+            self._controls = Controls(client, self.acts, self.steering, self._place)
         else:
             client.gui.add_markdown("**Read only**: another browser steers.", order=0)
 
     def _succeed(self, client: viser.ClientHandle) -> None:
         """Give the controls to another browser if the browser that had them has left."""
         with self._lock:
-            if self._pilot != client.client_id:
+            if self.pilot != client.client_id:
                 return
-            self._pilot = self._controls = None
+            self.pilot = self._controls = None
         for other in self._server.get_clients().values():
             other.gui.reset()
             self._welcome(other)

@@ -7,18 +7,22 @@ from contextlib import suppress
 from math import hypot, inf
 from typing import Any
 
+import numpy as np
+
 from cloudrc.geometry.clearance import NO_SIZE, Spheres
 from cloudrc.geometry.fence import Fence
+from cloudrc.geometry.obstacles import obstacles, surface
+from cloudrc.geometry.placement import find_crossed
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Start, Vector
 from cloudrc.metrics.verdict import FlightFailure, FlightVerdict
 from cloudrc.teleop.carrot import HEARTBEAT_NS, SPEED_MAX
-from cloudrc.teleop.obstacles import KnownObstacles
 from cloudrc.teleop.refusals import ConflictError, UnavailableError
 from cloudrc.teleop.runner import STOP_IS_SENT, MissionRunner
 from cloudrc.teleop.store import MissionRecord, MissionStore, Order
 from cloudrc.teleop.view import DRIVEN
 from cloudrc.teleop.wire import HELD, Leg, Plan
+from cloudrc.text import describe_point
 
 DRIVE_LIMIT = 3600.0
 """Time limit of a mission that begins with a request to drive [s]."""
@@ -77,7 +81,7 @@ class MissionService(MissionRunner):
         faster, and never faster than `SPEED_MAX`.
         """
         super().__init__(book, fence, units or {})
-        self._obstacles, self._hand = KnownObstacles(scene, hull), Hand(speed_max)
+        self._scene, self._hull, self._hand = scene, hull, Hand(speed_max)
         self._renewed_ns: dict[str, int] = {}  # mission's id -> time of its watcher's last word
 
     def create(self, order: Order, now_ns: int) -> tuple[MissionRecord, bool]:
@@ -245,10 +249,16 @@ class MissionService(MissionRunner):
 
     def _check_way(self, leg: Leg, order: Order) -> None:
         """Raise ConflictError if an obstacle lies between the robot and the waypoint of `leg`."""
-        if self.seen is None:
+        if self.seen is None or self._scene is None:
             return
-        if text := self._obstacles.crossed(self.seen, leg, order.touched):
-            raise ConflictError(text, self.current.id if self.current else "")
+        here, there = self.seen.position, leg.position
+        known = obstacles(self._scene, touch=order.touched)
+        through = int(find_crossed(known, self._hull, np.array([here]), np.array([there]))[0])
+        if through >= 0:
+            way = f"from where the robot is, {describe_point(here)}, to {describe_point(there)}"
+            text = f"the straight way {way} leads through {surface(known[through])}"
+            mission = self.current.id if self.current else ""
+            raise ConflictError(f"{text}; go round it first, by another target", mission)
 
     def _cancel_unwatched(self, now_ns: int) -> None:
         """Cancel each mission whose watcher has sent no word for the time of its lease.

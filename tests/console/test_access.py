@@ -26,8 +26,7 @@ def served():
             posted.append(path)
 
     flight = load_experiment("hover"), FlightFeed(), Steering(Api())
-    page = Page(0, lambda: TOKEN, [PROXY])
-    page.fill(*flight)
+    page = Page(*flight, 0, lambda: TOKEN, [PROXY])
     yield page, posted
     page.close()
 
@@ -145,9 +144,9 @@ def test_a_foreign_page_cannot_stop_and_the_own_page_can(served):
         assert ask(page, lines, "/hold", "POST")[0] == 403
         assert ask(page, lines, "/state")[0] == 403
     assert ask(page, [f"Host: {own}", cookie], "/stop")[0] == 404, "no link stops"
-    assert not page._steering._stops.is_set()
+    assert not page.steering._stops.is_set()
     assert ask(page, [f"Host: {own}", cookie, f"Origin: http://{own}"], "/stop", "POST")[0] == 202
-    assert page._steering._stops.is_set()
+    assert page.steering._stops.is_set()
     assert posted == []  # the thread that asks the API does not run here
 
 

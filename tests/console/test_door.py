@@ -34,8 +34,7 @@ def page(api):
     api.answers["/v1/state"] = {"mission": None, "seen": {"next_step": "start a mission"}}
     steering = Steering(api)
     steering.watch()
-    page = Page()
-    page.fill(load_experiment("hover"), FlightFeed(), steering)
+    page = Page(load_experiment("hover"), FlightFeed(), steering)
     yield page
     page.close()
 
@@ -75,7 +74,7 @@ def test_stop_does_not_wait_for_viser(page):
     page._server.get_event_loop().call_soon_threadsafe(over.wait)
     try:
         assert call(page, "stop", "POST")[0] == 202
-        assert page._steering._stops.is_set()
+        assert page.steering._stops.is_set()
         assert call(page, "plain")[0] == 200
         assert '<form id="stop"' in call(page, "")[1], "the page with the scene has STOP itself"
     finally:
@@ -111,7 +110,7 @@ def test_the_plain_page_shows_the_state_and_its_buttons_act(page, api):
     api.refused["/v1/resume"] = "nothing is held"
     assert call(page, "resume", "POST") == (200, "Refused: nothing is held")
     assert call(page, "fly", "POST")[0] == 404
-    page._pilot = 0  # a page with the scene steers
+    page.pilot = 0  # a page with the scene steers
     assert call(page, "hold", "POST")[0] == 409
     state = json.loads(call(page, "state")[1])
     assert (state["acts"], state["lines"][0][:9]) == ([], "Read only")
@@ -143,13 +142,13 @@ def test_a_page_without_a_place_and_one_without_webgl_become_plain(page, browse,
     late.get_by_role("button", name="Hold", exact=True).wait_for(timeout=LIMIT * 1e3)
     assert late.url.endswith("/plain")
     late.keyboard.press("Shift+X")
-    wait_until(page._steering._stops.is_set)
-    page._steering._stops.clear()
+    wait_until(page.steering._stops.is_set)
+    page.steering._stops.clear()
     page._door._open = 0
     late.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     late.goto(page.url)
     late.get_by_role("button", name="STOP", exact=True).click()
-    wait_until(page._steering._stops.is_set)
+    wait_until(page.steering._stops.is_set)
     late.wait_for_url("**/plain")
 
 
@@ -164,9 +163,9 @@ def test_shift_and_x_stops_by_letter_or_by_place(page, browse, key, code):
     names = {"key": key, "code": code, "bubbles": True, "cancelable": True}
     opened.evaluate(script, names)
     opened.evaluate(script, {**names, "shiftKey": True, "key": "y", "code": "KeyY"})
-    assert not page._steering._stops.is_set()
+    assert not page.steering._stops.is_set()
     opened.evaluate(script, {**names, "shiftKey": True})
-    wait_until(page._steering._stops.is_set)
+    wait_until(page.steering._stops.is_set)
 
 
 @pytest.mark.process
@@ -177,7 +176,7 @@ def test_held_keys_count_as_released_when_meta_changes_at_blur_and_when_hidden(p
     keys = opened.keyboard
 
     def speed():
-        return page._steering.velocity(time.monotonic())
+        return page.steering.velocity(time.monotonic())
 
     for change in (
         lambda: (keys.down("Meta"), keys.up("Meta")),
@@ -228,4 +227,4 @@ def test_a_port_in_use_is_an_error(api):
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(OSError, match=f"--port {port}"):
-            Page(port).fill(load_experiment("hover"), FlightFeed(), Steering(api))
+            Page(load_experiment("hover"), FlightFeed(), Steering(api), port)

@@ -63,8 +63,7 @@ def filled(api):
 
         def fill(name):
             feed, steering = FlightFeed(), Steering(api)
-            page = Page()
-            page.fill(load_experiment(name), feed, steering)
+            page = Page(load_experiment(name), feed, steering)
             opened.callback(page.close)
             return page, feed, steering
 
@@ -247,7 +246,7 @@ def test_the_state_tells_what_the_mission_follows(filled, waypoints, shown):
 
 def test_controls_of_a_browser_that_left_do_not_end_the_console(filled):
     page, _, steering = filled("hover")
-    page._controls = Controls(page._server, page._acts, steering, page._place)
+    page._controls = Controls(page._server, page.acts, steering, page._place)
     slider = page._controls._sliders["uplink.delay_ms"]
     steering.conditions = {"uplink.delay_ms": 60.0}
     page.update(1.0)
@@ -260,7 +259,7 @@ def test_controls_of_a_browser_that_left_do_not_end_the_console(filled):
 @pytest.mark.parametrize(("name", "axes"), [("hover", 3), ("pillars", 2)])
 def test_controls_have_heights_only_for_a_robot_that_flies(filled, name, axes):
     page, _, steering = filled(name)
-    page._controls = Controls(page._server, page._acts, steering, page._place)
+    page._controls = Controls(page._server, page.acts, steering, page._place)
     handles = page._server.gui._gui_input_handle_from_uuid.values()
     labels = {handle.label: handle for handle in handles if hasattr(handle, "label")}
     keys = {label for label, direction in KEYS.values() if axes == 3 or not direction[2]}

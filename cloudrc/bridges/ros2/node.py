@@ -153,25 +153,21 @@ class RosNode(OwnNode):
     def _read(self, data: bytes) -> RosAnswer:
         if not self._known:
             self.who()
-        stamp_ns, frame, row = self._decode(data)
+        stamp_ns, frame = None, WORLD
+        try:
+            if self._kind is Twist:
+                velocity, yaw_rate = decode_twist(data)
+            else:
+                stamp_ns, frame, velocity, yaw_rate = decode_stamped_twist(data)
+        except Exception:  # rosbags raises what it meets
+            text = f"sends {len(data)} bytes that are no {self._kind.__name__} of this ROS"
+            raise self.invalid(text) from None
+        row = [*velocity, yaw_rate]
         if not all(map(isfinite, row)):
             raise self.invalid(f"sends a velocity that is not finite: {row}")
         if frame not in (WORLD, ""):
             raise self.invalid(f"sends a velocity in the frame '{frame}'; cloudrc needs '{WORLD}'")
         return RosAnswer(stamp_ns, row)
-
-    def _decode(self, data: bytes) -> tuple[int | None, str, list[float]]:
-        """Return the stamp [ns], the frame and the numbers of a command."""
-        try:
-            if self._kind is Twist:
-                velocity, yaw_rate = decode_twist(data)
-                return None, WORLD, [*velocity, yaw_rate]
-            stamp_ns, frame, velocity, yaw_rate = decode_stamped_twist(data)
-        except Exception:  # rosbags raises what it meets
-            kind = UNSTAMPED if self._kind is Twist else STAMPED
-            text = f"sends {len(data)} bytes that are no {kind} of this ROS"
-            raise self.invalid(text) from None
-        return stamp_ns, frame, [*velocity, yaw_rate]
 
     def invalid(self, text: str) -> ControllerLostError:
         """Return the error that the user's node is wrong as `text` says."""
