@@ -1,7 +1,6 @@
 """The door answers without viser: STOP, the plain page, and what a browser may send."""
 
 import json
-import os
 import socket
 import threading
 import time
@@ -13,7 +12,7 @@ import pytest
 import viser
 import websockets.asyncio.server
 from starlette.responses import HTMLResponse
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from cloudrc.config.load import load_experiment
@@ -55,17 +54,6 @@ def scene(page):
     """Open the WebSocket of a page with the scene."""
     url = page.url.replace("http://", "ws://")
     return connect(url, subprotocols=[VERSION], max_size=None, compression=None, proxy=None)
-
-
-def read_to_the_end(connection):
-    while connection.recv(timeout=10):
-        pass
-
-
-def resident():
-    """Return the memory of this process [MB]."""
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") * 1e-6
 
 
 def test_stop_does_not_wait_for_viser(page):
@@ -191,20 +179,6 @@ def test_held_keys_count_as_released_when_meta_changes_at_blur_and_when_hidden(p
         time.sleep(0.5)
         assert speed() == ZERO
         keys.up("ArrowUp")
-
-
-def test_a_message_is_at_most_one_megabyte_and_memory_is_bounded(page):
-    """An unfinished frame of 48 MB is refused at its head; one below 1 MB ends by its limit."""
-    before = resident()
-    with ExitStack() as stack:
-        pages = [stack.enter_context(scene(page)) for _ in range(12)]
-        for each in pages:
-            each.socket.sendall(b"\x82\xff" + (48 << 20).to_bytes(8, "big") + bytes(4))
-        for each in pages:
-            with pytest.raises(ConnectionClosed, match="1009"):
-                read_to_the_end(each)
-    assert resident() - before < 50
-    wait_until(lambda: page._door._open == 0)
 
 
 def test_viser_listens_on_the_socket_alone(tmp_path):

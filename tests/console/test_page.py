@@ -28,7 +28,6 @@ from tests.console.conftest import (
     beside,
     session_with_console,
     start,
-    status,
 )
 
 
@@ -227,21 +226,6 @@ def test_the_first_view_shows_the_whole_mission(filled):
     assert np.abs(x / depth).max() < slope * (1280 - 2 * PANEL_WIDTH) / 800
     assert np.abs(y / depth).max() < slope
     assert forward[0] > abs(forward[1]), "along +x"
-
-
-@pytest.mark.parametrize(
-    ("waypoints", "shown"), [(7, "waypoint 1 of 7"), (0, "setpoints of a file")]
-)
-def test_the_state_tells_what_the_mission_follows(filled, waypoints, shown):
-    page, feed, steering = filled("hover")
-    mission = {"id": "m1", "name": "tour", "by_hand": False, "state": "flying", "reached": []}
-    steering.state = {
-        "mission": mission | {"waypoints": waypoints, "waypoint": 0, "verdict": None},
-        "seen": {"next_step": ""},
-    }
-    feed.take(status(0.1), 1.0)
-    page.update(1.0)
-    assert f"mission m1 (tour): flying, {shown}" in page._status.content
 
 
 def test_controls_of_a_browser_that_left_do_not_end_the_console(filled):

@@ -56,8 +56,7 @@ class Flight:
         self.obstacle_contacts, self.touch_speed, self.slip_ns = 0, float("nan"), 0
         self.sensors, self.orientation = (), UPRIGHT
         self.uplink = self.downlink = True
-        self.first_shown_ns = {}  # number of a request -> when telemetry first showed it
-        self.said, self.said_at = [], []
+        self.said = []
         self.stop = EmergencyStopRepeater()  # cloud's
 
     def step(self, position=None, seconds=0.01):
@@ -85,7 +84,6 @@ class Flight:
         )  # fmt: skip
 
     def see(self):
-        self.first_shown_ns.setdefault(self.mission, self.now_ns)
         self.teleop.see(self.seen, self.now_ns)
 
     def operate(self, verb, *words, number=0):
@@ -145,7 +143,6 @@ class Flight:
             for_session = isinstance(output, Setpoint | OperatorRequest)
             said = output._replace(epoch=0) if for_session else output
             self.said.append(said)
-            self.said_at.append(self.now_ns)
             if said == ALARM:
                 self.stop.sound()
             elif isinstance(said, OperatorRequest):

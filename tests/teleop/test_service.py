@@ -289,24 +289,6 @@ def test_what_the_robot_touched_decides(seen, codes, exit_code, restarted):
     assert [failure["code"] for failure in verdict["failures"]] == codes
 
 
-def test_the_operator_learns_when_and_where_the_robot_touched_an_obstacle_first():
-    flight = ServiceFlight()
-    mission_id = flight.create()
-    flight.step(seconds=0.05)
-    flight.obstacle_contacts = 1
-    flight.step(position=(0.1, 2.0, 0.7), seconds=0.05)
-    flight.obstacle_contacts = 2
-    flight.step(position=(3.0, -6.4, 0.7), seconds=0.05)
-    flight.teleop.cancel(mission_id, flight.now_ns)
-    first = r"the robot touched an obstacle at 0.0\d s, \(0.10, 2.00, 0.70\) m"
-    view = flight.view(mission_id)
-    told = [each["text"] for each in view["events"] if each["event"] == "obstacle_touched"]
-    assert re.fullmatch(first, told[0])
-    assert re.fullmatch(r"the robot touched an obstacle again, at 0.\d\d s", told[1])
-    (text,) = (f["text"] for f in view["verdict"]["failures"] if f["code"] == "obstacle_touched")
-    assert re.fullmatch(first + r" \(2 times\)", text)
-
-
 def test_after_a_stall_the_stop_belongs_to_the_stopped_mission():
     """Teleop's loop saw the robot stopped first, and that was why the mission had failed."""
     (flight, mission_id), bridge = service_flying(), Bridge()

@@ -1,12 +1,8 @@
 """The store of missions: what is on the disk is known, whatever happens to process and disk."""
 
 import os
-import signal
 import sqlite3
-import subprocess
-import sys
 from contextlib import closing
-from pathlib import Path
 
 import pytest
 
@@ -121,35 +117,6 @@ def test_anything_else_is_refused_and_left_alone(path, make, said):
     with pytest.raises(BadInputError, match=f"--journal {path}: .*{said}.*another"):
         open_store(path, b"")
     assert {"missions", "missions-wal"} >= set(os.listdir(path.parent))
-
-
-WRITER = """
-import sys
-from pathlib import Path
-from cloudrc.teleop.store import Order, open_store
-from cloudrc.teleop.wire import Leg, Plan
-store = open_store(Path(sys.argv[1]), b"")
-mission = store.add(Order(Plan(tuple(Leg((float(n), 0.0, 1.0)) for n in range(20_000)))))
-for n in range(20_000):
-    store.note(mission, "reached", "r", waypoint=n, elapsed=n / 2, world="w")
-    print(n, flush=True)
-"""
-"""A process that stores waypoints, until it is killed."""
-
-
-@pytest.mark.process
-@pytest.mark.promise("waypoints-once-in-order")
-def test_what_was_told_is_there_after_a_sigkill(path):
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    command = [sys.executable, "-c", WRITER, str(path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as writer:
-        told = [int(next(writer.stdout)) for _ in range(8)][-1]
-        writer.send_signal(signal.SIGKILL)
-        told = max([told, *map(int, writer.stdout.read().split())])
-    mission = open_store(path, b"").find("m1")
-    reached = [each["waypoint"] for each in mission.reached]
-    assert reached == list(range(len(reached)))
-    assert told + 1 <= len(reached) <= told + 2 < 20_000, "killed before its end"
 
 
 def test_the_number_of_missions_and_events_is_bounded():
