@@ -15,7 +15,7 @@ import numpy as np
 
 from cloudrc.geometry.clearance import NO_SIZE, Array, Spheres, clearance
 from cloudrc.geometry.obstacles import Obstacle
-from cloudrc.messages import NEVER_NS, GuardState
+from cloudrc.messages import GuardState
 from cloudrc.metrics.definitions import CHARTED, Echoes, PredictionJudge
 from cloudrc.records import Control
 from cloudrc.teleop.wire import RobotStatus
@@ -57,8 +57,8 @@ class FlightFeed:
         self.status: RobotStatus | None = None
         self.samples: deque[list[float]] = deque()
         self.flown = 0
-        # Times of the newest telemetry, control period, judged prediction and echo [s].
-        self._heard = self._controlled = self._judged = self._echoed = -inf
+        # Times of the newest control period, judged prediction and echo [s].
+        self._controlled = self._judged = self._echoed = -inf
         self._downlink = nan
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL_MAX)  # position and clearance
 
@@ -67,7 +67,7 @@ class FlightFeed:
         last = self.status
         if status is None or (last and last.stamp_ns == status.stamp_ns):
             return
-        self.status, self._heard = status, now
+        self.status = status
         if last is None or last.epoch != status.epoch:
             self._judge.reset()
             self._judged = -inf
@@ -78,16 +78,6 @@ class FlightFeed:
         self.samples.append(self._sample(status, now))
         while self.samples[0][TIME] < now - WINDOW:
             self.samples.popleft()
-
-    def silence(self, now: float) -> float:
-        """Return the time from the newest telemetry to `now` [s]; infinite before the first."""
-        return now - self._heard
-
-    def command_age(self, now: float) -> float:
-        """Return the age of the last applied command at `now` [s]; infinite if none."""
-        if self.status is None or self.status.command_age_ns == NEVER_NS:
-            return inf
-        return self.status.command_age_ns * 1e-9 + self.silence(now)
 
     def control(self, now: float) -> Control | None:
         """Return cloud's last command; None if it is old at `now` [s] or the robot is grounded."""

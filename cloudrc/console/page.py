@@ -28,7 +28,6 @@ from cloudrc.console.feed import (
     ERROR,
     ESTIMATE,
     SPEED,
-    STALE,
     UPLINK,
     FlightFeed,
 )
@@ -39,7 +38,7 @@ from cloudrc.messages import ZERO, Quaternion, Vector
 from cloudrc.metrics.definitions import CHARTED
 from cloudrc.robots.shapes import read_shapes
 from cloudrc.teleop.client import describe_mission
-from cloudrc.text import describe_sensors
+from cloudrc.teleop.telling import describe_robot
 
 SLOW_PERIOD = 0.3
 """Time between two updates of the page, except for the moving bodies [s]."""
@@ -180,25 +179,12 @@ class Page:
         panel.set_width(PANEL_WIDTH)
 
     def _describe(self, now: float) -> str:
-        """Return guard, command age, mission and the newest answer, as Markdown."""
-        feed, state = self._feed, self.steering.state
-        if feed.status is None:
-            return "**waiting for the robot**"
-        silence, age = feed.silence(now), feed.command_age(now)
-        lines = [
-            f"**{feed.status.guard.name}**: {feed.status.cause.words}",
-            f"Last command: {'none' if age == inf else f'{age:.2f} s ago'}",
-            self._describe_mission(now),
-        ]
-        if shown := describe_sensors((state.get("seen") or {}).get("sensors", ())):
-            lines.append(f"Sensors: {shown}")
-        if silence > STALE:
-            lines[0] = f"**No telemetry for {silence:.1f} s**, last: {lines[0]}"
-        answer = self.steering.answer
+        """Return mission, guard and the newest answer, as Markdown."""
+        state, answer = self.steering.state, self.steering.answer
+        robot = describe_robot(state.get("seen"), state.get("cloud_age_s"))
+        lines = [self._describe_mission(now), *robot]
         if now - answer.at < ANSWER_SHOWN:
-            lines.append(f"**Refused:** {answer.text}" if answer.is_refusal else answer.text)
-        elif seen := state.get("seen"):
-            lines.append(seen["next_step"])
+            lines.insert(0, f"**Refused:** {answer.text}" if answer.is_refusal else answer.text)
         return "  \n".join(lines).replace("cloudrc mission ", "")  # buttons have the verbs' names
 
     def _describe_mission(self, now: float) -> str:

@@ -51,6 +51,7 @@ from cloudrc.teleop.wire import (
     Output,
     RobotStatus,
 )
+from cloudrc.text import describe_point
 
 if TYPE_CHECKING:
     from cloudrc.teleop.store import MissionRecord
@@ -116,8 +117,7 @@ class MissionFlight:
     def go_to(self, now_ns: int, leg: Leg) -> None:
         """Fly to a point; raise ConflictError if the mission is not in the state `HELD`."""
         self._check("goto", HELD)
-        x, y, z = leg.position
-        self._report("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
+        self._report("goto", f"go to {describe_point(leg.position)} m", now_ns, NO_WAYPOINT)
         self._aim.select_point(leg)
 
     def hold(self, now_ns: int) -> None:
@@ -125,7 +125,7 @@ class MissionFlight:
         if not self._is_driven:
             self._check("hold", FLYING)
         self._aim.select_here()
-        self._report("held", self.route.leg, f"held {self.route.where}", now_ns)
+        self._report("held", f"held {self.route.where}", now_ns)
 
     def drive(self, now_ns: int, velocity: Vector) -> None:
         """Move the setpoint with `velocity` [m/s], world frame, for at most `HEARTBEAT_NS`.
@@ -143,7 +143,7 @@ class MissionFlight:
             return
         moves = velocity != ZERO
         if moves and not self._is_driven:
-            self._report("driving", NO_WAYPOINT, "driven by hand", now_ns)
+            self._report("driving", "driven by hand", now_ns, NO_WAYPOINT)
         self._released_ns = now_ns + HEARTBEAT_NS if moves else NEVER_NS
         aim.steer(velocity, now_ns)
 
@@ -152,11 +152,11 @@ class MissionFlight:
         self._check("resume", HELD)
         self.route.pause()
         self.route.select(now_ns)
-        self._report("resumed", self.route.leg, f"resumed {self.route.where}", now_ns)
+        self._report("resumed", f"resumed {self.route.where}", now_ns)
 
     def pause(self, now_ns: int) -> None:
         """Ask the robot to hold until the next teleop process continues the mission."""
-        self._report("paused", self.route.leg, f"paused by shutdown {self.route.where}", now_ns)
+        self._report("paused", f"paused by shutdown {self.route.where}", now_ns)
         self._requests.ask(Request.END)
         self._aim.select_here()  # cloud keeps this setpoint if the request is lost
         self._aim.stays = True
@@ -172,8 +172,7 @@ class MissionFlight:
         else:
             requests.forget()  # the new mission must not end
         self._aim.select_here()
-        last = len(self.plan.legs) - 1
-        self.outcome = self._report(code, min(self.route.leg, last), text, now_ns)
+        self.outcome = self._report(code, text, now_ns)
 
     def see(self, seen: RobotStatus, now_ns: int, confirmed: Request | None) -> None:
         """Begin, go on or end as telemetry shows; `confirmed` is the request that it confirms."""
@@ -205,7 +204,7 @@ class MissionFlight:
         if NEVER_NS < self._released_ns <= now_ns and self._is_driven:
             self._released_ns = NEVER_NS
             text = f"no request to drive for {HEARTBEAT_NS * 1e-9:g} s: the robot brakes and holds"
-            self._report("operator_lost", NO_WAYPOINT, text, now_ns)
+            self._report("operator_lost", text, now_ns, NO_WAYPOINT)
 
     def repeat_setpoint(self, now_ns: int) -> None:
         """Send the setpoint again, because a new session has begun.
@@ -267,13 +266,13 @@ class MissionFlight:
             text = f"mission started from {place}, {self.plan.contents}"
             if self.plan.unit == "waypoint":
                 text += f", judged by the {self.plan.judged_by} position"
-            self._report("started", 0, text, now_ns)
+            self._report("started", text, now_ns)
         if self._was_held or self.plan.by_hand:
             self._aim.select_here()
-            self._report("held", self.route.leg, f"held {self.route.where}", now_ns)
+            self._report("held", f"held {self.route.where}", now_ns)
         elif self._continued:
             text = f"resumed after a restart of teleop {self.route.where}"
-            self._report("resumed", self.route.leg, text, now_ns)
+            self._report("resumed", text, now_ns)
 
     def _follow_route(self, seen: RobotStatus, now_ns: int) -> None:
         """Go on to the next waypoint if the robot has reached one; move the setpoint."""
@@ -296,7 +295,7 @@ class MissionFlight:
             self._advance(done, now_ns)
 
     def _advance(self, how: str, now_ns: int) -> None:
-        self._report("reached", self.route.leg, f"{self.route.name} {how}", now_ns)
+        self._report("reached", f"{self.route.name} {how}", now_ns)
         begin = self.route.advance(now_ns)
         self._requests.report(self.number, self.route.leg)
         if self.route.leg == len(self.plan.legs):
@@ -317,7 +316,12 @@ class MissionFlight:
         if leg < len(self.plan.legs):
             self._aim.select_leg(self.plan.legs[leg], leg, now_ns)
 
-    def _report(self, code: str, waypoint: int, text: str, now_ns: int) -> MissionEvent:
+    def _report(
+        self, code: str, text: str, now_ns: int, waypoint: int | None = None
+    ) -> MissionEvent:
+        """Tell an event, by default one of the current waypoint; the last one stays current."""
+        if waypoint is None:
+            waypoint = min(self.route.leg, len(self.plan.legs) - 1)
         self.state = STATES.get(code, self.state)
         event = MissionEvent(now_ns, code, waypoint, text)
         self._tell(event)

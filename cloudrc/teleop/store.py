@@ -175,8 +175,8 @@ KEPT = 100
 KEEP_PERIOD_NS = 1_000_000_000
 """Time between two attempts to write events that the disk has refused [ns]."""
 _ORDER, _MISSION = TypeAdapter(Order), TypeAdapter(MissionRecord)
-_STATUS = {"state", "world", "elapsed", "reached", "events", "happened", "witness", "verdict"}
-"""Attributes of a mission that its events change."""
+_FIXED = {"id", "number", "order"}
+"""Attributes of a mission that its events do not change."""
 
 
 class MissionStore:
@@ -240,7 +240,7 @@ class MissionStore:
         number = int.from_bytes(digest[:8], "little") >> 1 or 1
         mission = MissionRecord(mission_id, replace(order, queue=False), number)
         ended = [each.id for each in self.missions.values() if each.ended]
-        old = ended[: max(0, len(ended) - KEPT)]
+        old = ended[:-KEPT]
         if not self._commit(mission, old):
             raise UnavailableError(f"no mission can start: {self.trouble}")
         self.missions[mission_id] = mission
@@ -319,4 +319,4 @@ def _row(mission_id: str) -> int:
 
 
 def _status(mission: MissionRecord) -> str:
-    return json.dumps(_MISSION.dump_python(mission, mode="json", include=_STATUS))
+    return json.dumps(_MISSION.dump_python(mission, mode="json", exclude=_FIXED))

@@ -107,7 +107,7 @@ WRONG = [
     ("twice", "controller_invalid", "node /twice answers an estimate twice"),
     ("silent", "controller_silent", "node /silent: no answer on /cloudrc/cmd_vel within 2 s"),
     ("type", "controller_invalid", "publishes geometry_msgs/msg/PoseStamped"),
-    ("unstamped", "controller_invalid", "geometry_msgs/msg/Twist, which has no stamp"),
+    ("unstamped", "controller_invalid", "publishes geometry_msgs/msg/Twist; cloudrc needs"),
     ("latched", "controller_invalid", "RELIABLE, TRANSIENT_LOCAL, which cannot match cloudrc's"),
 ]
 
@@ -148,7 +148,10 @@ def test_two_flights_at_once_need_a_domain_each(tmp_path, capsys):
     finally:
         other.close()
     assert code == 5
-    assert "node /cloudrc publishes /cloudrc/estimate" in capsys.readouterr().err.splitlines()[-1]
+    assert (
+        "node /cloudrc and /cloudrc publishes /cloudrc/estimate"
+        in capsys.readouterr().err.splitlines()[-1]
+    )
 
 
 def test_a_program_that_uses_ros_itself_flies_twice_with_one_node(tmp_path):

@@ -30,7 +30,7 @@ VERSION = f"viser-v{viser.__version__}"
 
 @pytest.fixture
 def page(api):
-    api.answers["/v1/state"] = {"mission": None, "seen": {"next_step": "start a mission"}}
+    api.answers["/v1/state"] = {"mission": None, "seen": None}
     steering = Steering(api)
     steering.watch()
     page = Page(load_experiment("hover"), FlightFeed(), steering)
@@ -90,7 +90,7 @@ def test_a_request_without_an_end_is_ended(page, monkeypatch):
 
 
 def test_the_plain_page_shows_the_state_and_its_buttons_act(page, api):
-    assert "waiting for the robot" in call(page, "plain")[1]
+    assert "no telemetry from the robot yet" in call(page, "plain")[1]
     state = json.loads(call(page, "state")[1])
     assert state["acts"] == ["start", "hold", "resume", "cancel", "acknowledge"]
     assert call(page, "hold", "POST") == (200, "holding")

@@ -205,17 +205,15 @@ class RosNode(OwnNode):
         if len(set(names)) > 1 or (crowded and len(names) > 1):
             text = f"nodes {' and '.join(names)} command both ({topic})"
             raise ControllerLostError(INVALID, f"{text}: end all but one; {LINGERS}")
-        word = ""
-        for info in infos:
-            if info.topic_type == UNSTAMPED and not self._virtual:
-                if self._kind is not Twist:
-                    self.node.destroy_subscription(self._commands)
-                    self._take_type(Twist)
-                    word = f"node {name_of(info)} publishes {UNSTAMPED} on {topic}, which has no "
-                    word += "stamp: cloudrc takes it as the answer to the newest estimate"
-            elif info.topic_type != STAMPED:
-                why = ", which has no stamp" if info.topic_type == UNSTAMPED else ""
-                raise self.invalid(f"publishes {info.topic_type}{why}; cloudrc needs {STAMPED}")
+        word, kinds = "", sorted({info.topic_type for info in infos})
+        if kinds == [UNSTAMPED] and not self._virtual:
+            if self._kind is not Twist:
+                self.node.destroy_subscription(self._commands)
+                self._take_type(Twist)
+                word = f"{self._known} publishes {UNSTAMPED} on {topic}, which has no stamp: "
+                word += "cloudrc takes it as the answer to the newest estimate"
+        elif kinds not in ([], [STAMPED]):
+            raise self.invalid(f"publishes {' and '.join(kinds)}; cloudrc needs {STAMPED}")
         for info in infos:
             if text := clash(info, self._commands.qos_profile, topic):
                 raise ControllerLostError(INVALID, text)
@@ -227,11 +225,10 @@ class RosNode(OwnNode):
         estimate = self._names["estimate"]
         names = [name_of(info) for info in known(self.node.get_publishers_info_by_topic(estimate))]
         if len(names) > 1:
-            names.sort(key=self.node.get_fully_qualified_name().__eq__)  # its own last
             raise ControllerLostError(
                 INVALID,
-                f"node {names[0]} publishes {estimate} in {self.domain}, too: give each flight a "
-                f"domain or a namespace of its own; {LINGERS}",
+                f"node {' and '.join(names)} publishes {estimate} in {self.domain}: give each "
+                f"flight a domain or a namespace of its own; {LINGERS}",
             )
 
     def _check_hears(self, names: set[str]) -> None:

@@ -58,9 +58,8 @@ class TopicRelay(OwnNode):
     def _full(self, flag: str, name: str) -> str:
         try:
             return str(self.node.resolve_topic_name(name))
-        except Exception as error:
-            text = to_one_line(str(error)).partition(", at ")[0].rpartition(": ")[2]
-            raise BadInputError(f"{flag} {name}: {text or 'no name of a topic'}") from None
+        except Exception:  # rclpy has an error for each kind of wrong name
+            raise BadInputError(f"{flag} {name}: no name of a topic") from None
 
     def wait_for_publisher(self, tell: Callable[[str], None]) -> None:
         """Wait until a node publishes the source; `tell` gets a word if that takes time.
