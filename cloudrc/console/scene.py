@@ -22,8 +22,11 @@ GHOST, SETPOINT, REACHED = (0, 114, 178), (213, 94, 0), (0, 158, 115)
 OPEN, PLAN = (120, 124, 130), (176, 180, 186)
 """Colours; those of ghost, setpoint and reached waypoints are colours of the figures."""
 GRID: dict[str, Any] = {
-    **{"cell_color": (228, 230, 233), "section_color": (206, 210, 214)},
-    **{"plane_color": (246, 247, 248), "plane_opacity": 1.0, "fade_distance": 40.0},
+    "cell_color": (228, 230, 233),
+    "section_color": (206, 210, 214),
+    "plane_color": (246, 247, 248),
+    "plane_opacity": 1.0,
+    "fade_distance": 40.0,
 }
 """Look of the floor, which is shown as a grid."""
 USUAL = 0.85

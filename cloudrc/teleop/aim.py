@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import dist
 
 from cloudrc.geometry.fence import Fence
 from cloudrc.messages import NEVER_NS, Drive, Motion, Setpoint, Vector
 from cloudrc.teleop.carrot import ACCELERATION, arrival_ns, steer
-from cloudrc.teleop.wire import Leg, RobotStatus
+from cloudrc.teleop.wire import Leg, Plan, RobotStatus
 
 NO_WAYPOINT = -1
 """Waypoint index in a setpoint or event that belongs to no waypoint."""
+NO_PLAN = Plan(())
+"""Plan before the first mission."""
 JUMP_SPEED = 6.0
 """Highest speed of the setpoint on a track [m/s]; along a faster part the setpoint jumps."""
 
@@ -34,6 +36,7 @@ class Aim:
         self.seen: RobotStatus | None = None
         self.seen_ns = NEVER_NS
         self.stays = False
+        self._plan = NO_PLAN
         self._knot = -1  # index of the point of the track that the setpoint has left last
 
     @property
@@ -41,9 +44,9 @@ class Aim:
         """Whether the setpoint moves with a velocity, by hand or along a track."""
         return self.setpoint is not None and type(self.setpoint.motion) is Drive
 
-    def begin(self) -> None:
+    def begin(self, plan: Plan) -> None:
         """Begin a mission: its track is followed from the first point on."""
-        self._knot = -1
+        self._plan, self._knot = plan, -1
 
     def select(self, setpoint: Setpoint) -> None:
         """Make and send a setpoint for the session in telemetry."""
@@ -62,15 +65,13 @@ class Aim:
         """Make a point the setpoint that is no waypoint of the mission."""
         self.select(self._setpoint_of(leg, NO_WAYPOINT))
 
-    def select_leg(
-        self, leg: Leg, waypoint: int, begin_ns: int, start: Vector | None = None
-    ) -> None:
+    def select_leg(self, waypoint: int, begin_ns: int, start: Vector | None = None) -> None:
         """Make a waypoint the setpoint, or move the setpoint to it if the leg has a speed.
 
         The motion begins at the time `begin_ns` [ns], from the point `start` [m] or, by default,
         from the robot.
         """
-        motion = None
+        leg, motion = self._plan.legs[waypoint], None
         if leg.speed and self.seen is not None:
             motion = Motion(start or self.seen.position, begin_ns, leg.speed, leg.acceleration)
         if not self.stays:
@@ -81,10 +82,9 @@ class Aim:
         assert self.setpoint is not None, "the setpoint is where the robot was held"
         self.select(steer(self.setpoint, velocity, now_ns, self._fence))
 
-    def follow(
-        self, track: Sequence[tuple[float, Vector]], waypoint: int, began_ns: int, now_ns: int
-    ) -> None:
-        """Move the setpoint from point to point of a track that has begun at `began_ns` [ns]."""
+    def follow(self, began_ns: int, now_ns: int) -> None:
+        """Move the setpoint from point to point of the track, which began at `began_ns` [ns]."""
+        track = self._plan.track
         elapsed = (now_ns - began_ns) * 1e-9
         knot = bisect_right(track, elapsed, key=lambda each: each[0]) - 1
         if not self._knot < knot < len(track) - 1:
@@ -96,9 +96,9 @@ class Aim:
             begin_ns, until_ns = (began_ns + round(at * 1e9) for at in (begin, end))
             box = self._fence.inner_low, self._fence.inner_high
             motion = Drive(start, begin_ns, (x, y, z), (x, y, z), ACCELERATION, until_ns, *box)
-        self.select(Setpoint(position, waypoint=waypoint, motion=motion))
+        self.select(Setpoint(position, waypoint=0, motion=motion))
 
-    def leaves_ns(self, leg: Leg, waypoint: int) -> int | None:
+    def leaves_ns(self, waypoint: int) -> int | None:
         """Return when the dwell time of the setpoint at a waypoint ends [ns].
 
         Return None if the present setpoint does not move gradually (`carrot`) to this waypoint.
@@ -106,7 +106,7 @@ class Aim:
         setpoint = self.setpoint
         if setpoint is None or type(setpoint.motion) is not Motion or setpoint.waypoint != waypoint:
             return None
-        return arrival_ns(setpoint) + round(leg.dwell * 1e9)
+        return arrival_ns(setpoint) + round(self._plan.legs[waypoint].dwell * 1e9)
 
     def _setpoint_of(self, leg: Leg, waypoint: int) -> Setpoint:
         """Return the setpoint at a leg; without a yaw, it keeps the yaw of the setpoint before."""

@@ -100,7 +100,7 @@ class MissionFlight:
         # Process of world in which the mission started; "": any. Numbers that the robot may
         # report; empty: any.
         self._world, self._expected = mission.world, tuple[int, ...]()
-        aim.begin()
+        aim.begin(self.plan)
         requests.begin(self.number, self.route.leg, touch=mission.order.touched or "")
         if self._continued:
             self._expected = (self.number,)
@@ -200,7 +200,7 @@ class MissionFlight:
         elif self.state == FLYING and (text := self.route.timeout()):
             self.end(now_ns, "leg_timed_out", text)
         if self.state == FLYING and self.plan.track:
-            self._aim.follow(self.plan.track, self.route.leg, self._began_ns, now_ns)
+            self._aim.follow(self._began_ns, now_ns)
         if NEVER_NS < self._released_ns <= now_ns and self._is_driven:
             self._released_ns = NEVER_NS
             text = f"no request to drive for {HEARTBEAT_NS * 1e-9:g} s: the robot brakes and holds"
@@ -219,7 +219,7 @@ class MissionFlight:
         elif self._is_driven:
             aim.select_here()
         elif setpoint is not None and type(setpoint.motion) is Motion:
-            aim.select_leg(self.plan.legs[setpoint.waypoint], setpoint.waypoint, now_ns)
+            aim.select_leg(setpoint.waypoint, now_ns)
         elif setpoint is not None:
             aim.select(setpoint)
 
@@ -314,7 +314,7 @@ class MissionFlight:
         self._is_pending = False
         leg = 0 if self._from_spawn else max(self.route.leg, self._onboard)
         if leg < len(self.plan.legs):
-            self._aim.select_leg(self.plan.legs[leg], leg, now_ns)
+            self._aim.select_leg(leg, now_ns)
 
     def _report(
         self, code: str, text: str, now_ns: int, waypoint: int | None = None

@@ -52,7 +52,7 @@ class Route:
 
     def select(self, begin_ns: int, start: Vector | None = None) -> None:
         """Make the waypoint the setpoint from `begin_ns` [ns] on; the way begins at `start` [m]."""
-        self._aim.select_leg(self.plan.legs[self.leg], self.leg, begin_ns, start)
+        self._aim.select_leg(self.leg, begin_ns, start)
 
     def lead(self, seen: RobotStatus, now_ns: int) -> None:
         """Keep the carrot, a moving setpoint, at the robot while the guard ignores commands.
@@ -78,7 +78,7 @@ class Route:
         rested = self._has_rested(leg, seen, now_ns)
         if not leg.speed:
             return rested
-        leaves_ns = self._aim.leaves_ns(leg, self.leg)
+        leaves_ns = self._aim.leaves_ns(self.leg)
         return leg.has(seen) and leaves_ns is not None and now_ns >= leaves_ns
 
     def _has_rested(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
@@ -101,7 +101,7 @@ class Route:
     def advance(self, now_ns: int) -> tuple[int, Vector | None]:
         """Go on to the next waypoint; return the arguments of `select` for it."""
         before = self.plan.legs[self.leg]
-        leaves_ns = self._aim.leaves_ns(before, self.leg)
+        leaves_ns = self._aim.leaves_ns(self.leg)
         self.leg += 1
         self._flown_ns = 0
         self.pause()

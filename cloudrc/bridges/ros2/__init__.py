@@ -6,8 +6,6 @@ Only this folder imports rclpy, and nothing imports this folder unless an experi
 from __future__ import annotations
 
 import importlib
-import importlib.util
-import os
 import sys
 
 from cloudrc.errors import MissingPrerequisiteError, to_one_line
@@ -19,19 +17,13 @@ def require_ros(purpose: str, module: str, packages: str) -> None:
     `purpose`, such as "cloud.controller ros2", is for the error text. `module` is the module of
     this folder that is needed; its `load_messages` loads those of the ROS packages `packages`.
     """
-    python = f"Python {sys.version_info.major}.{sys.version_info.minor}"
-    if importlib.util.find_spec("rclpy") is None:
-        raise MissingPrerequisiteError(
-            f"{purpose} needs ROS 2, and there is no rclpy here: run "
-            f"'source /opt/ros/DISTRIBUTION/setup.bash' of a ROS 2 for {python}, then cloudrc again"
-        )
     try:
         import rclpy  # noqa: F401  first: its error says most
 
         importlib.import_module(f"cloudrc.bridges.ros2.{module}").load_messages()
     except Exception as error:
-        ros = os.environ.get("ROS_DISTRO", "this ROS 2")
+        python = f"Python {sys.version_info.major}.{sys.version_info.minor}"
         raise MissingPrerequisiteError(
-            f"rclpy of {ros} cannot be used in {python}: {to_one_line(str(error))}; use cloudrc "
-            f"in the Python of this ROS, with {packages}"
+            f"{purpose} needs ROS 2 with {packages} ({to_one_line(str(error))}): run "
+            f"'source /opt/ros/DISTRIBUTION/setup.bash' of a ROS 2 for {python}, then cloudrc again"
         ) from None
