@@ -299,6 +299,12 @@ def play(flight, script):
             vars(flight).update(SWITCHES[action])
         elif action in ("create", "queue", "here"):
             flight.create(THREE if action == "here" else FROM_SPAWN, queue=action == "queue")
+        elif action in ("leased", "waiting"):
+            flight.create(lease=10.0, queue=action == "waiting")
+        elif action == "renew":
+            flight.teleop.renew("m1", flight.now_ns)
+        elif action == "change":
+            flight.teleop.tell_link("the link has changed", flight.now_ns)
         elif action == "goto":
             flight.teleop.go_to(Leg(AWAY), flight.now_ns)
         elif action.startswith("cancel"):

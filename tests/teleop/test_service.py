@@ -111,6 +111,18 @@ a stop after an acknowledgement counts: create 0.05 A stop 0.2 ack stop 0.3
 none while a stop is on its way: create 0.05 A mute stop !ack 0.2 !ack link 0.3 ack 0.2
   -> guard=GROUND
 
+# Leases of 10 s
+a watcher renews its lease: leased 9 renew 9 -> states=flying
+a mission without its watcher is cancelled: leased 9 renew 10.5
+  -> states=cancelled failure=cancelled guard=HOLD
+also one that waits, and it is never flown: create 0.05 waiting 11
+  -> states=flying,cancelled started=1
+a new teleop gives the full lease again: leased 9 restart 9 -> states=flying
+but no longer one: leased 9 restart 10.5 -> states=cancelled
+
+# The link
+a change of the link is in the log of the mission: create 0.05 change -> last=link_changed
+
 # The end of teleop
 in flight it holds: create 0.05 A away pause 0.5
   -> states=flying guard=HOLD last=paused setpoint=away:-1
@@ -204,16 +216,6 @@ def test_the_verdict_of_a_failed_mission_tells_its_interruptions(script, codes, 
     assert words in "; ".join(failure["text"] for failure in told)
 
 
-def test_a_change_of_the_link_is_in_the_log_of_the_mission_under_way():
-    flight = ServiceFlight()
-    flight.step()
-    flight.teleop.tell_link("the link has changed", flight.now_ns)
-    mission_id = flight.create()
-    flight.step(seconds=0.05)
-    flight.teleop.tell_link("the link has changed", flight.now_ns)
-    assert flight.names(mission_id)[-1] == "link_changed"
-
-
 def test_every_end_of_a_mission_is_counted_under_its_own_name():
     ends = {event for event, state in STATES.items() if state in ENDED}
     assert ends <= set(MISSION_OUTCOMES)
@@ -229,37 +231,6 @@ def test_a_key_is_that_of_one_order_for_ever():
                 flight.teleop.create(order, flight.now_ns)
         flight.restart_teleop()
     assert flight.create(key="another") == "m2"
-
-
-def test_a_mission_without_its_watcher_is_cancelled_when_its_lease_ends():
-    flight, mission_id = service_flying(lease=10.0)
-    flight.step(seconds=9.0)
-    flight.teleop.renew(mission_id, flight.now_ns)
-    flight.step(seconds=9.0)
-    assert state(flight) == "flying", "the watcher lives"
-    flight.step(seconds=1.5)
-    assert state(flight) == "cancelled"
-    verdict = flight.view(mission_id)["verdict"]
-    assert (verdict["outcome"], verdict["exit_code"]) == ("interrupted", 130)
-    assert "its watcher is gone" in flight.view(mission_id)["events"][-1]["text"]
-
-
-def test_a_waiting_mission_without_its_watcher_is_cancelled_and_never_flown():
-    flight, _ = service_flying()
-    waiting = flight.create(queue=True, lease=10.0)
-    flight.step(seconds=11.0)
-    assert (state(flight), state(flight, waiting)) == ("flying", "cancelled")
-    assert "started" not in flight.names(waiting)
-
-
-def test_a_restarted_teleop_gives_a_watcher_its_full_lease_again():
-    flight, _ = service_flying(lease=10.0)
-    flight.step(seconds=9.0)
-    flight.restart_teleop()
-    flight.step(seconds=9.0)
-    assert state(flight) == "flying"
-    flight.step(seconds=1.5)
-    assert state(flight) == "cancelled"
 
 
 @pytest.mark.parametrize(
