@@ -336,7 +336,7 @@ A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
 class Running:
     """API, service and robot; `flight.position` is where the robot is."""
 
-    def __init__(self, *, ready=True, unix=False, host="127.0.0.1", uplink=True):
+    def __init__(self, *, ready=True, unix=False, uplink=True):
         self.folder = TemporaryDirectory(prefix="cloudrc-")
         folder = Path(self.folder.name)
         for role, token in (("operator", OPERATOR), ("reader", READER)):
@@ -353,7 +353,7 @@ class Running:
         app = create_app(self.bridge, reader, self.complaints.append)
         tokens = None if unix else Tokens(folder, self.complaints.append)
         self.gate = Gate(app, tokens, self.log.append)
-        self.address = folder / "api.sock" if unix else (host, 0)
+        self.address = folder / "api.sock" if unix else ("127.0.0.1", 0)
         self.server = ApiServer(self.gate, self.bridge, self.address)
         self.url = self.server.url
         self.server.start()
