@@ -9,9 +9,9 @@ import asyncio
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from fastapi.responses import JSONResponse
 from fastapi.security import HTTPBearer
@@ -114,7 +114,8 @@ class Gate:
         path = scope["path"] = scope["path"].rstrip("/") or "/"
         # A stream calls `caller` again, because it can outlast its token.
         caller, scope["caller"] = await self.caller(scope), lambda: self.caller(scope)
-        status = self._refusal(caller, scope)
+        is_command = scope["method"] not in READS
+        status = self._refusal(caller, is_urgent=path in URGENT, is_command=is_command)
         if caller is None or status:
             reason, detail = REFUSED[status]
             self.counts[reason] += 1
@@ -132,13 +133,17 @@ class Gate:
         try:
             await self._app(scope, receive, keep)
         finally:
+            status = answer["status"]
             self._in_flight[caller.role] -= 1
             self.counts["served"] += 1
-            if path in ORDERS and answer["status"] in COUNTED:
-                self.counts[COUNTED[answer["status"]]] += 1
-            repeats = path.endswith(REPEATED) and answer["status"] == 200
-            if scope["method"] not in READS and not repeats:
-                self._log(_describe(caller, scope, answer))
+            if path in ORDERS and status in COUNTED:
+                self.counts[COUNTED[status]] += 1
+            if is_command and not (path.endswith(REPEATED) and status == 200):
+                said = json.loads(answer.get("body") or b"{}")
+                where = ":".join(map(str, scope.get("client") or ("local",)))
+                told = said.get("id") or "", said.get("detail") or said.get("state") or ""
+                line = f"{caller.name} {where} {scope['method']} {path[:200]}: {status}"
+                self._log(to_one_line(" ".join((line, *told))))
 
     async def caller(self, scope: Scope) -> Caller | None:
         """Return the caller of a request; None without a valid token."""
@@ -147,21 +152,11 @@ class Gate:
         sent = await BEARER(Request(scope))
         return None if sent is None else self.tokens.caller(sent.credentials)
 
-    def _refusal(self, caller: Caller | None, scope: Scope) -> int:
+    def _refusal(self, caller: Caller | None, *, is_urgent: bool, is_command: bool) -> int:
         """Return the HTTP status with which to refuse a request; 0 to serve the request."""
-        is_command = scope["method"] not in READS
         if caller is None:
             return 401
         if is_command and caller.role != OPERATOR:
             return 403
-        is_urgent = is_command and scope["path"] in URGENT
-        return 429 if self._in_flight[caller.role] >= IN_FLIGHT_MAX and not is_urgent else 0
-
-
-def _describe(caller: Caller, scope: Mapping[str, Any], answer: Mapping[str, Any]) -> str:
-    """Return the line of the log about a command and the `answer` to it."""
-    said = json.loads(answer.get("body") or b"{}")
-    where = ":".join(map(str, scope.get("client") or ("local",)))
-    outcome = said.get("detail") or said.get("state") or ""
-    line = f"{caller.name} {where} {scope['method']} {scope['path'][:200]}: {answer['status']}"
-    return to_one_line(f"{line} {said.get('id') or ''} {outcome}")
+        is_full = self._in_flight[caller.role] >= IN_FLIGHT_MAX
+        return 429 if is_full and not (is_command and is_urgent) else 0
