@@ -19,6 +19,7 @@ import viser
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import is_planar
 from cloudrc.config.scene import scene_of
+from cloudrc.config.schema import World
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.steering import SLIDERS, Answer, Steering
 from cloudrc.geometry.obstacles import fence_of
@@ -54,39 +55,6 @@ def acts_of(experiment: ResolvedExperiment, steering: Steering) -> dict[str, Cal
     return {"start": start, **{verb: partial(steering.act, verb) for verb in verbs}}
 
 
-class TargetPlace:
-    """Where the target is before somebody moves it, and where it may be."""
-
-    def __init__(self, experiment: ResolvedExperiment, feed: FlightFeed) -> None:
-        self._feed, self.is_planar = feed, is_planar(experiment.world.robot)
-        scene = scene_of(experiment.world)
-        fence, self._spawn = fence_of(scene), scene.spawn
-        self.limits: tuple[Vector, Vector] = fence.inner_low, fence.inner_high  # corners [m]
-        if self.is_planar:
-            ground = self._spawn[2]
-            self.limits = (*fence.inner_low[:2], ground), (*fence.inner_high[:2], ground)
-
-    def at(self, now: float) -> Vector:
-        """Return the position [m] at `now` [s] for a target that no user has moved.
-
-        It is the setpoint if cloud controls the robot, else the point 0.6 m above the robot, or the
-        robot's own place on the ground.
-        """
-        status = self._feed.status
-        if (control := self._feed.control(now)) is not None:
-            at: Any = control.setpoint
-        else:
-            at = np.add(
-                status.position if status else self._spawn, (0, 0, 0 if self.is_planar else 0.6)
-            )
-        x, y, z = map(float, np.round(np.clip(at, *self.limits), 2))
-        return x, y, z
-
-    def shown(self, place: Any) -> Any:
-        """Return a place [m] as the number fields show it: without a height on the ground."""
-        return tuple(map(float, place[:2] if self.is_planar else place))
-
-
 class Controls:
     """The controls of one browser."""
 
@@ -95,13 +63,20 @@ class Controls:
         client: viser.ClientHandle,
         acts: dict[str, Callable[[], Answer]],
         steering: Steering,
-        place: TargetPlace,
+        feed: FlightFeed,
+        world: World,
     ) -> None:
         """Add the controls to the panel and the scene of a browser.
 
-        `acts` are those of `acts_of`.
+        `acts` are those of `acts_of`; `world` tells robot and scene.
         """
-        self._steering, self._place = steering, place
+        self._steering, self._feed, self._is_planar = steering, feed, is_planar(world.robot)
+        scene = scene_of(world)
+        fence, self._spawn = fence_of(scene), scene.spawn
+        self._limits: tuple[Vector, Vector] = fence.inner_low, fence.inner_high  # corners [m]
+        if self._is_planar:
+            ground = self._spawn[2]
+            self._limits = (*fence.inner_low[:2], ground), (*fence.inner_high[:2], ground)
         self._touched = -inf  # when somebody last moved a slider [s]
         self._is_moved = False  # whether somebody has moved the target, and has not sent it
         gui = client.gui
@@ -119,8 +94,27 @@ class Controls:
             if now - self._touched >= TOUCHED:
                 self._follow_link()
             if not self._is_moved:
-                self._gizmo.position = place = self._place.at(now)
-                self._numbers.value = self._place.shown(place)
+                self._gizmo.position = place = self._target(now)
+                self._numbers.value = self._shown(place)
+
+    def _target(self, now: float) -> Vector:
+        """Return the position [m] at `now` [s] of a target that no user has moved.
+
+        It is the setpoint if cloud controls the robot, else the point 0.6 m above the robot, or the
+        robot's own place on the ground.
+        """
+        status = self._feed.status
+        if (control := self._feed.control(now)) is not None:
+            at: Any = control.setpoint
+        else:
+            above = (0, 0, 0 if self._is_planar else 0.6)
+            at = np.add(status.position if status else self._spawn, above)
+        x, y, z = map(float, np.round(np.clip(at, *self._limits), 2))
+        return x, y, z
+
+    def _shown(self, place: Any) -> Any:
+        """Return a place [m] as the number fields show it: without a height on the ground."""
+        return tuple(map(float, place[:2] if self._is_planar else place))
 
     def _follow_link(self) -> None:
         for key, slider in self._sliders.items():
@@ -141,26 +135,25 @@ class Controls:
 
     def _add_target(self, client: viser.ClientHandle) -> tuple[Any, Any]:
         """Add a gizmo and number fields for the target position; a change of one updates both."""
-        place, gui = self._place, client.gui
-        start = place.at(time.monotonic())
+        gui, start = client.gui, self._target(time.monotonic())
         gizmo = client.scene.add_transform_controls(
             "/target",
             scale=0.45,
             disable_rotations=True,
-            active_axes=(True, True, not place.is_planar),
-            translation_limits=tuple(zip(*place.limits, strict=True)),  # type: ignore[arg-type]
+            active_axes=(True, True, not self._is_planar),
+            translation_limits=tuple(zip(*self._limits, strict=True)),  # type: ignore[arg-type]
             depth_test=False,
             position=start,
         )
-        add: Any = gui.add_vector2 if place.is_planar else gui.add_vector3
-        numbers = add("Target [m]", place.shown(start), step=0.01)
+        add: Any = gui.add_vector2 if self._is_planar else gui.add_vector3
+        numbers = add("Target [m]", self._shown(start), step=0.01)
         send = gui.add_button("Send", hint="Go to the target; a mission is held first")
 
         @gizmo.on_update
         def _(event: Any) -> None:
             if event.client is not None:  # somebody drags
                 self._is_moved = True
-                numbers.value = place.shown(np.round(gizmo.position, 2))
+                numbers.value = self._shown(np.round(gizmo.position, 2))
 
         def move(event: Any) -> None:
             if event.client is not None:  # somebody has typed
@@ -180,7 +173,7 @@ class Controls:
         steering = self._steering
         speed = gui.add_slider("Drive [m/s]", 0.1, 1.0, 0.1, 0.4)
         for code, (label, direction) in KEYS.items():
-            if self._place.is_planar and direction[2]:
+            if self._is_planar and direction[2]:
                 continue  # the key has no button, so it does nothing
             button = gui.add_button(label, color="gray")
 

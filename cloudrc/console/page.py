@@ -20,7 +20,7 @@ import viser
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.scene import scene_of
 from cloudrc.console.access import PARAMETER, Access
-from cloudrc.console.controls import KEYS, Controls, TargetPlace, acts_of
+from cloudrc.console.controls import KEYS, Controls, acts_of
 from cloudrc.console.door import Door, scene_page, viser_at
 from cloudrc.console.feed import (
     CHARTED_FROM,
@@ -111,7 +111,6 @@ class Page:
         self._controls: Controls | None = None
         self._due = -inf  # time of the next slow update [s]
         self._drawn = 0  # number of drawn points of the trail
-        self._place = TargetPlace(experiment, feed)
         scene, shapes = scene_of(experiment.world), read_shapes(experiment.world)
         self._scene = FlightScene(self._server, experiment, shapes, scene, ASPECT)
         self._add_panels(with_legend=bool(scene.tubes))
@@ -207,7 +206,8 @@ class Page:
             if is_pilot:
                 self.pilot = client.client_id
         if is_pilot:
-            self._controls = Controls(client, self.acts, self.steering, self._place)
+            world = self._experiment.world
+            self._controls = Controls(client, self.acts, self.steering, self._feed, world)
         else:
             client.gui.add_markdown("**Read only**: another browser steers.", order=0)
 

@@ -13,7 +13,6 @@ from cloudrc.console.steering import Steering
 from cloudrc.drivers.readers import RecordReader, RecordSender
 from cloudrc.geometry.shapes import Shapes
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
-from cloudrc.record.ros import STORE
 from cloudrc.records import Lateness
 from cloudrc.report.markers import encode_markers, scene_shapes
 from tests.console.conftest import FakeApi, control, start
@@ -164,49 +163,6 @@ def test_a_plain_node_sees_the_robot_and_steers_it(tmp_path, watcher):
         assert answer.success, answer.message
         assert api.posted[-1] == ("/v1/estop", None)
     assert "/drone1/odom" in " ".join(said)
-
-
-@pytest.fixture
-def frames_type(tmp_path, monkeypatch):
-    """The type of /tf; the wheels of ROS have no tf2_msgs, so that another type carries the bytes.
-
-    A raw subscription does not look into the bytes.
-    """
-    if find_spec("tf2_msgs") is None:
-        package = tmp_path / "tf2_msgs"
-        package.mkdir()
-        (package / "__init__.py").touch()
-        text = "from visualization_msgs.msg import MarkerArray as TFMessage"
-        (package / "msg.py").write_text(text)
-        monkeypatch.syspath_prepend(tmp_path)
-    from tf2_msgs.msg import TFMessage
-
-    return TFMessage
-
-
-def test_frames_are_published_where_ros_has_their_messages(tmp_path, frames_type):
-    from rclpy.qos import DurabilityPolicy, QoSProfile
-
-    watcher, got, said = Watcher(), {"/tf": [], "/tf_static": []}, []
-    kept = QoSProfile(depth=9, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    for topic, messages in got.items():
-        qos = kept if topic == "/tf_static" else 10
-        watcher.node.create_subscription(frames_type, topic, messages.append, qos, raw=True)
-    with bridge(tmp_path, said):
-        watcher.wait(lambda: len(got["/tf"]) > 20 and got["/tf_static"])
-    watcher.close()
-    frames = {
-        (moved.header.frame_id, moved.child_frame_id): moved.transform.translation.z
-        for data in got["/tf"] + got["/tf_static"]
-        for moved in STORE.deserialize_cdr(data, "tf2_msgs/msg/TFMessage").transforms
-    }
-    assert frames == {
-        ("world", "drone1/base_link"): 3.0,
-        ("world", "drone1/estimate"): 1.0,
-        ("world", "drone1/setpoint"): 1.0,
-        ("world", "map"): 0.0,
-    }
-    assert not any("left out" in text for text in said)
 
 
 def test_the_bridge_of_a_session_ends_with_it(tmp_path, monkeypatch):
