@@ -36,7 +36,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     ),
     "fastapi": ("teleop/api", "teleop/auth"),
     "starlette": ("console/access", "console/door", "teleop/api", "teleop/auth"),
-    "uvicorn": ("console/door", "teleop/api", "teleop/auth"),
+    "uvicorn": ("console/door", "teleop/server"),
     "fcntl": (
         "drivers/local",
         "console/serve",

@@ -21,7 +21,7 @@ from cloudrc.config.robot import is_planar
 from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import World
 from cloudrc.console.feed import FlightFeed
-from cloudrc.console.steering import SLIDERS, Answer, Steering
+from cloudrc.console.steering import SLIDERS, Reply, Steering
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.messages import Vector
 
@@ -40,10 +40,10 @@ TOUCHED = 2.0
 """Time after a move of a slider for which no slider follows the link [s]."""
 
 
-def acts_of(experiment: ResolvedExperiment, steering: Steering) -> dict[str, Callable[[], Answer]]:
+def acts_of(experiment: ResolvedExperiment, steering: Steering) -> dict[str, Callable[[], Reply]]:
     """Return the name of each button of a mission, and what it does."""
 
-    def start() -> Answer:
+    def start() -> Reply:
         mission = experiment.mission
         if mission.steps is not None:
             text = "start: random steps are for 'cloudrc run'; send waypoints instead"
@@ -61,7 +61,7 @@ class Controls:
     def __init__(
         self,
         client: viser.ClientHandle,
-        acts: dict[str, Callable[[], Answer]],
+        acts: dict[str, Callable[[], Reply]],
         steering: Steering,
         feed: FlightFeed,
         world: World,
@@ -124,7 +124,7 @@ class Controls:
                 if abs(slider.value - shown) > 1e-6:
                     slider.value = shown
 
-    def _add_mission(self, gui: viser.GuiApi, acts: dict[str, Callable[[], Answer]]) -> None:
+    def _add_mission(self, gui: viser.GuiApi, acts: dict[str, Callable[[], Reply]]) -> None:
         names = [name.title() for name in acts]
         for label, some in (("Mission", names[:3]), (" ", names[3:])):
             group = gui.add_button_group(label, some)

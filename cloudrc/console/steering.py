@@ -44,7 +44,7 @@ VERBS = {
 """Verb of the operator, as in the path of teleop's API -> words of the answer."""
 
 
-class Answer(NamedTuple):
+class Reply(NamedTuple):
     """Result of a request, for the operator."""
 
     text: str
@@ -52,7 +52,7 @@ class Answer(NamedTuple):
     at: float = -inf  # time of the answer [s]
 
 
-NOTHING = Answer("")
+NOTHING = Reply("")
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Steering:
 
     api: Api
     link: LinkControl = LinkControl()
-    answer: Answer = NOTHING
+    answer: Reply = NOTHING
     state: dict[str, Any] = field(default_factory=dict)
     route: list[Vector] = field(default_factory=list)
     conditions: dict[str, float] = field(default_factory=dict)
@@ -114,7 +114,7 @@ class Steering:
         """Switch the robot off, and repeat the request until the API answers; return at once."""
         self._stops.set()
 
-    def ask(self, words: str, path: str, body: Mapping[str, Any] | None = None) -> Answer:
+    def ask(self, words: str, path: str, body: Mapping[str, Any] | None = None) -> Reply:
         """Post a request to `path` of the API; answer `words`, or with the reason of a refusal."""
         try:
             self.api.post(path, body)
@@ -122,12 +122,12 @@ class Steering:
             return self.say(str(error), is_refusal=True)
         return self.say(words)
 
-    def say(self, text: str, *, is_refusal: bool = False) -> Answer:
+    def say(self, text: str, *, is_refusal: bool = False) -> Reply:
         """Make `text` the newest answer; `is_refusal`: nothing was done."""
-        self.answer = answer = Answer(text, is_refusal, time.monotonic())
+        self.answer = answer = Reply(text, is_refusal, time.monotonic())
         return answer
 
-    def act(self, verb: str) -> Answer:
+    def act(self, verb: str) -> Reply:
         """Carry out one of `VERBS`; "resume" also ends a drive by hand."""
         if verb == "cancel":
             return self._cancel()
@@ -135,7 +135,7 @@ class Steering:
         words = "the drive ends, and the robot holds" if ends_drive else VERBS[verb]
         return self.ask(words, f"/v1/{verb}")
 
-    def _cancel(self) -> Answer:
+    def _cancel(self) -> Reply:
         """Cancel the mission under way, which may have begun after the last look."""
         try:
             mission = self.api.get("/v1/state")["mission"]
@@ -145,7 +145,7 @@ class Steering:
             return self.say("no mission is under way", is_refusal=True)
         return self.ask(VERBS["cancel"], f"/v1/missions/{mission['id']}/cancel")
 
-    def start_mission(self, order: Mapping[str, Any]) -> Answer:
+    def start_mission(self, order: Mapping[str, Any]) -> Reply:
         """Start a mission; if the user drives the robot by keys, first end this drive."""
         if is_drive(self.state.get("mission")):
             if (resumed := self.act("resume")).is_refusal:
@@ -155,7 +155,7 @@ class Steering:
         words = "starting; the robot is set back to its spawn" if back else "starting"
         return self.ask(words, "/v1/missions", order)
 
-    def go_to(self, position: Sequence[float], yaw_deg: float | None = None) -> Answer:
+    def go_to(self, position: Sequence[float], yaw_deg: float | None = None) -> Reply:
         """Hold the present mission, if one is under way, then ask the robot to go to a position.
 
         `position` [m] has two numbers for a robot that stays on the ground; `yaw_deg` is the yaw
