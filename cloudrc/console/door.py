@@ -183,7 +183,7 @@ class Door(ThreadServer):
         if self._page.pilot is not None:
             return PlainTextResponse("another browser steers", 409)
         answer = await run_in_threadpool(act)
-        return PlainTextResponse(f"Refused: {answer.text}" if answer.is_refusal else answer.text)
+        return PlainTextResponse(answer.words)
 
     def gives_scene_to(self, request: HTTPConnection) -> bool:
         """Return whether viser may serve a request: an admitted page opens its WebSocket."""

@@ -183,7 +183,7 @@ class Page:
         robot = describe_robot(state.get("seen"), state.get("cloud_age_s"))
         lines = [self._describe_mission(now), *robot]
         if now - answer.at < ANSWER_SHOWN:
-            lines.insert(0, f"**Refused:** {answer.text}" if answer.is_refusal else answer.text)
+            lines.insert(0, f"**{answer.words}**")
         return "  \n".join(lines).replace("cloudrc mission ", "")  # buttons have the verbs' names
 
     def _describe_mission(self, now: float) -> str:

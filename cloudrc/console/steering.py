@@ -51,6 +51,11 @@ class Reply(NamedTuple):
     is_refusal: bool = False  # whether nothing was done
     at: float = -inf  # time of the answer [s]
 
+    @property
+    def words(self) -> str:
+        """The text, which says so if nothing was done."""
+        return f"not done: {self.text}" if self.is_refusal else self.text
+
 
 NOTHING = Reply("")
 

@@ -105,13 +105,13 @@ def _draw(screen: curses.window, texts: Sequence[str]) -> None:
 
 def _lines(steering: Steering, api: Api, note: str) -> list[str]:
     """Return the text of the screen, important lines first: a small window cuts off the last."""
-    state, answer = steering.state, steering.answer
+    state = steering.state
     asked = ", ".join(f"{speed:.1f}" for speed in steering.velocity(time.monotonic()))
     mission = state.get("mission")
     lines = [
         f"asked for ({asked}) m/s",
         note,
-        f"not done: {answer.text}" if answer.is_refusal else answer.text,
+        steering.answer.words,
         *describe_robot(state.get("seen"), state.get("cloud_age_s")),
         describe_mission(mission) if mission else "no mission is under way",
         "",

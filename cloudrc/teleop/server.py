@@ -28,7 +28,7 @@ class ThreadServer(uvicorn.Server):
                 access_log=False,
                 server_header=False,
                 proxy_headers=False,  # a log has the true address
-                # No limit_concurrency: uvicorn would refuse an emergency stop, too.
+                # No limit_concurrency: it would keep an emergency stop out, too.
                 timeout_graceful_shutdown=STOP_LIMIT,
                 **settings,
             )

@@ -96,7 +96,7 @@ def test_the_plain_page_shows_the_state_and_its_buttons_act(page, api):
     assert call(page, "hold", "POST") == (200, "holding")
     assert api.posted == [("/v1/hold", None)]
     api.refused["/v1/resume"] = "nothing is held"
-    assert call(page, "resume", "POST") == (200, "Refused: nothing is held")
+    assert call(page, "resume", "POST") == (200, "not done: nothing is held")
     assert call(page, "fly", "POST")[0] == 404
     page.pilot = 0  # a page with the scene steers
     assert call(page, "hold", "POST")[0] == 409

@@ -122,7 +122,7 @@ def test_drag_and_send_moves_the_setpoint(flight, page, monkeypatch):
     numbers.nth(2).fill("99")
     page.keyboard.press("Enter")
     button(page, "Send").click()
-    page.get_by_text("Refused:").wait_for()
+    page.get_by_text("not done:").wait_for()
     beside(run.parents[1], monkeypatch)
     other = start(run, "console", run)
     assert "has a console already" in other.communicate(timeout=LIMIT)[0]
