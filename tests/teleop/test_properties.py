@@ -1,0 +1,127 @@
+"""The mission machine under any order of verbs, flights, silences and restarts."""
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from cloudrc.messages import Setpoint, Start
+from cloudrc.records import MissionEvent
+from cloudrc.teleop.refusals import ConflictError
+from cloudrc.teleop.wire import Leg, Plan
+from tests.teleop.conftest import Flight
+
+UNDER_WAY = {"STARTING", "FLYING", "HELD"}
+ENDS = {"DONE", "FAILED", "CANCELLED"}
+ALLOWED = {
+    "start": {"IDLE"} | ENDS,
+    "go_to": {"HELD"},
+    "hold": {"FLYING"},
+    "resume": {"HELD"},
+    "cancel": UNDER_WAY,
+}
+CODES = {"DONE": "done", "CANCELLED": "cancelled"}
+FAILURES = {"timed_out", "leg_timed_out", "world_restarted", "guard_stopped"}
+
+coordinates = st.integers(-3, 3).map(float)
+positions = st.tuples(coordinates, coordinates, coordinates)
+legs = st.builds(
+    Leg,
+    position=positions,
+    tolerance=st.sampled_from([0.1, 1.5]),
+    dwell=st.sampled_from([0.0, 0.1]),
+    time_limit=st.sampled_from([1.0, 60.0]),
+)
+plans = st.builds(
+    Plan,
+    legs=st.lists(legs, min_size=1, max_size=6).map(tuple),
+    start=st.sampled_from(Start),
+    time_limit=st.sampled_from([2.0, 600.0]),
+)
+verbs = st.one_of(
+    st.tuples(st.just("start"), plans),
+    st.tuples(st.just("go_to"), st.builds(Leg, positions)),
+    st.sampled_from([("hold",), ("resume",), ("cancel",)]),
+)
+
+
+class MissionMachine(RuleBasedStateMachine):
+    """Checks all that teleop has said after everything that can happen to it."""
+
+    def __init__(self):
+        super().__init__()
+        self.flight = Flight()
+        self.checked = 0
+        self.plan = None
+        self.reached = 0
+
+    @rule(verb=verbs)
+    def operate(self, verb):
+        flight = self.flight
+        before = (flight.state, len(flight.said), flight.outcome)
+        if flight.state not in ALLOWED[verb[0]]:
+            if flight.state != "IDLE" and verb[0] in (
+                "hold",
+                "resume",
+                "go_to",
+            ):  # the service sees to the others
+                with pytest.raises(ConflictError):
+                    flight.operate(*verb)
+            assert before == (flight.state, len(flight.said), flight.outcome)
+            return
+        flight.operate(*verb)
+        if flight.state == "STARTING":
+            self.plan, self.reached = verb[1], 0
+
+    @precondition(lambda self: self.flight.setpoints)
+    @rule(times=st.integers(1, 8), seconds=st.sampled_from([0.01, 0.12, 0.3]))
+    def fly_to_the_setpoint(self, times, seconds):
+        for _ in range(times):
+            self.flight.step(self.flight.setpoints[-1].position, seconds)
+
+    @rule(position=positions, seconds=st.sampled_from([0.01, 0.3, 1.5]))
+    def fly_elsewhere(self, position, seconds):
+        self.flight.step(position, seconds)
+
+    @rule(silent=st.sampled_from(["neither", "neither", "uplink", "downlink"]))
+    def change_link(self, silent):
+        self.flight.uplink, self.flight.downlink = silent != "uplink", silent != "downlink"
+
+    @rule()
+    def restart_world(self):
+        self.flight.restart()
+
+    @invariant()
+    def all_is_well(self):
+        self.check_what_was_said()
+        self.check_the_outcome()
+        self.check_the_last_setpoint()
+
+    def check_what_was_said(self):
+        for said in self.flight.said[self.checked :]:
+            if isinstance(said, Setpoint):
+                # Waypoints are flown to one after the other, each only when those before are done.
+                assert said.waypoint in (-1, self.reached)
+            elif isinstance(said, MissionEvent) and said.event == "reached":
+                assert said.waypoint == self.reached
+                self.reached += 1
+        self.checked = len(self.flight.said)
+
+    def check_the_outcome(self):
+        flight, outcome = self.flight, self.flight.outcome
+        if flight.state in UNDER_WAY | {"IDLE"}:
+            assert outcome is None
+            return
+        assert (outcome.event == "done") == (self.reached == len(self.plan.legs))
+        assert outcome.event == CODES.get(flight.state, outcome.event)
+        assert flight.state != "FAILED" or outcome.event in FAILURES
+        assert flight.events[-1] == outcome
+
+    def check_the_last_setpoint(self):
+        if self.flight.setpoints:
+            aims = {"FLYING": {self.reached}, "STARTING": {-1, self.reached}}
+            assert self.flight.setpoints[-1].waypoint in aims.get(self.flight.state, {-1})
+
+
+MissionMachine.TestCase.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
+TestMissionMachine = MissionMachine.TestCase
