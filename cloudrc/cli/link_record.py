@@ -42,10 +42,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Read the delays from SOURCE, write a trace per direction, and print a summary of each."""
-    from cloudrc.runs.links.trace import LogSettings, read_packets, write_trace_file
+    from cloudrc.runs.links.trace import read_packets, write_trace_file
 
     source, output = options.source, options.output
-    found = read_packets(source, LogSettings(options.direction, options.halve_rtt))
+    found = read_packets(source, options.direction, halve=options.halve_rtt)
     paths = {
         way: output.with_stem(f"{output.stem}-{way}") if len(found) > 1 else output for way in found
     }

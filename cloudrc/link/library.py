@@ -21,7 +21,6 @@ from cloudrc.link.draws import (
     Floats,
     Purpose,
     StreamKey,
-    bit_flips,
     stream_key,
     uniforms_of,
 )
@@ -42,6 +41,7 @@ COUNT = Quantity(ge=0, le=2**63 - 1, whole=True)
 PERIOD = Quantity("s", ge=1e-9, le=1e9)
 """Time between two packets."""
 _PACKETS = 10_000  # of which `expected` is computed
+_BYTE = b"\0"  # stands for the content of a packet
 _CHUNK = 64  # number of blocks that are computed together; their arrays fit into the cache
 
 
@@ -113,7 +113,6 @@ class OneWay:
         self.profile = profile
         self._uplink, self._stream = uplink, stream
         self._episode = 0
-        self._keyed: tuple[int, StreamKey] = -1, (0, 0)
         self._link = self._new()
 
     def send(self, episode: int, number: int, size: int, now_ns: int) -> Fate:
@@ -142,7 +141,7 @@ class OneWay:
         except (IndexError, OverflowError, TypeError, ValueError):
             number, size, now_ns = _whole(number=number, size=size, now_ns=now_ns)
             arrivals = self._link.send(self._episode, KIND, number, size, now_ns)
-        if self._link.corrupts and arrivals and self._is_damaged(episode, number):
+        if self._link.corrupts and self._link.corrupted(episode, KIND, number, _BYTE) != _BYTE:
             return ()
         return arrivals
 
@@ -175,18 +174,10 @@ class OneWay:
         conditions = self._link.only
         if conditions and _is_independent(self.profile, conditions):
             return self._independent(conditions, episode, first, count)
-        fresh = self._new()
-        found = []
-        for n in range(first, first + count):
-            now_ns = n * period_ns
-            arrivals = fresh.send(episode, KIND, n, size, now_ns)
-            found.append((min(arrivals) - now_ns) * 1e-9 if arrivals else np.nan)
-        delays = np.array(found)
-        if fresh.corrupts:
-            start, end = first // BLOCK, -(-(first + count) // BLOCK)
-            draws = uniforms_of(self._key(episode), Purpose.CORRUPT, start, end - start)
-            delays[draws[first - start * BLOCK :][:count] < self.profile.corrupt] = np.nan
-        return delays
+        from cloudrc.link.streams import sample
+
+        sent_ns = range(first * period_ns, (first + count) * period_ns, period_ns)
+        return sample(self._new(), KIND, sent_ns, size, epoch=episode, first=first).delays
 
     def expected(self, period: float = 0.01, size: int = 100) -> Numbers:
         """Compute what the profile asks for: statistics of 10,000 packets from the model.
@@ -206,19 +197,10 @@ class OneWay:
     def _new(self) -> LinkDirection:
         return LinkDirection(self.profile, self._seed, self._uplink, stream=self._stream)
 
-    def _is_damaged(self, episode: int, number: int) -> bool:
-        block, index = divmod(number, BLOCK)
-        return index in bit_flips(self._key(episode), block, self.profile.corrupt)
-
-    def _key(self, episode: int) -> StreamKey:
-        if episode != self._keyed[0]:
-            key = stream_key(self._seed, self._uplink, episode, KIND, self._stream)
-            self._keyed = episode, key
-        return self._keyed[1]
-
     def _independent(self, conditions: Conditions, episode: int, first: int, count: int) -> Floats:
         """Compute the delays [s] of packets with independent random numbers, shape (count,)."""
-        key, start, end = self._key(episode), first // BLOCK, -(-(first + count) // BLOCK)
+        start, end = first // BLOCK, -(-(first + count) // BLOCK)
+        key = stream_key(self._seed, self._uplink, episode, KIND, self._stream)
         delays = np.empty((end - start) * BLOCK)
         for block in range(start, end, _CHUNK):
             many = min(_CHUNK, end - block)

@@ -61,7 +61,7 @@ def sample(
     is called every few hundred microseconds, so that other threads can run.
     """
     delays, copies = np.full(len(sent_ns), np.nan), np.zeros(len(sent_ns), dtype=np.int64)
-    whole = bytes(size)
+    whole = bytes(size or 1)
     for n, now_ns in enumerate(sent_ns):
         releases = link.send(epoch, kind, first + n, size, now_ns)
         if link.corrupts and link.corrupted(epoch, kind, first + n, whole) != whole:

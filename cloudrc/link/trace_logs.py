@@ -3,8 +3,8 @@
     LC_ALL=C ping -D -O HOST
     irtt client -i 10ms -l 204 -d 1m -o irtt.json HOST
 
-Every reader fills a `Log` with packets, and `Log.packets` checks them. `Packets.notes` counts the
-packets that are left out or sorted. docs/traces.md describes the formats.
+Every reader collects the packets of its log, and `Log.packets` checks them. `Packets.notes` counts
+the packets that are left out or sorted. docs/traces.md describes the formats.
 
 Source: ping(8) of iputils; irtt-client(1), JSON format 1.
 """
@@ -14,9 +14,9 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from math import nan
+from math import isnan, nan
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -24,13 +24,15 @@ import numpy as np
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import Trace
 from cloudrc.link.streams import Stream
-from cloudrc.link.traces import Row, read_rows
+from cloudrc.link.traces import read_rows
+from cloudrc.outside.values import Quantity
 
 Direction: TypeAlias = Literal["uplink", "downlink"]
-Entry: TypeAlias = tuple[float, float]
-"""Time of sending [s] and delay [s]; the delay is NaN if the packet was lost."""
-REPEATED_MAX = 0.01  # largest share of packets with the time of an earlier one, in [0, 1]
+Entry: TypeAlias = tuple[float, float, bool]
+"""Time of sending [s], delay [s] (NaN: not known), and whether the packet arrived."""
 BACK_MAX = 1.0  # a log whose times go back by this time is refused [s]
+LOST = Quantity(ge=0, le=1, whole=True)
+"""Mark of a lost packet."""
 HALVE = (
     "a trace is one way; if both directions are alike, use half of each round trip with "
     "--halve-rtt; otherwise measure one way with irtt between synchronised clocks"
@@ -50,40 +52,31 @@ class Log:
     """The packets that a reader finds in a log, and the number of those that it left out."""
 
     name: str
-    entries: list[Entry] = field(default_factory=list)  # the packets in the order of the log
+    entries: list[Entry] = field(default_factory=list)  # in the order of the log
     counts: Counter[str] = field(default_factory=Counter)  # what was done -> number of packets
-    halved: bool = False  # whether the delays are halves of round trips
-    unmeasured: set[float] = field(default_factory=set)
-    """Times of sending [s] of packets that arrived with an unknown delay, NaN in `entries`."""
 
-    def packets(self) -> Packets:
+    def packets(self, *, halved: bool = False) -> Packets:
         """Check the packets, sort them by time of sending, and add a note on each correction.
 
-        Raise a BadInputError if no packet has a delay; if a delay is negative; if the times go far
-        back; or if more than 1 % of the packets have the time of an earlier packet.
+        `halved` tells whether the delays are halves of round trips. Raise a BadInputError if no
+        packet has a delay; if a delay is negative; or if the times go far back.
         """
-        times, delays = np.array(self.entries or [(nan, nan)]).T
+        sent, delays, arrived = np.array(self.entries or [(nan, nan, False)]).T
         if np.isnan(delays).all():
             raise self.error("no packet has a delay; give a log with at least one reply")
         self.refuse_early(float(np.nanmin(delays)))
-        back = np.maximum.accumulate(times) - times
+        back = np.maximum.accumulate(sent) - sent
         if back.max() >= BACK_MAX:  # sorting would mix two sessions
             raise self.error(
                 f"at packet {back.argmax() + 1} the times go back by {back.max():.4g} s: several "
                 "sessions in one log, or a step of the clock; give the rows of one session, "
                 "sorted by time"
             )
-        unique = dict(reversed(self.entries))  # of packets with the same time, the first is kept
-        repeated = len(times) - len(unique)
-        if repeated > REPEATED_MAX * len(times):
-            same = f"{repeated} of {len(times)} packets have the same time as another one"
-            raise self.error(f"{same}; give times with more digits")
+        times, first = np.unique(sent, return_index=True)  # of equal times, the first is kept
         self.counts["out of order, sorted"] += int(np.sum(back > 0.0))
-        self.counts["left out, at the time of another one"] += repeated
+        self.counts["left out, at the time of another one"] += len(sent) - len(times)
         notes = tuple(f"{count} {what}" for what, count in self.counts.items() if count)
-        sent, delays = np.array(sorted(unique.items())).T
-        copies = (np.isfinite(delays) | np.isin(sent, [*self.unmeasured])).astype(int)
-        return Packets(sent, delays, copies, notes, self.halved)
+        return Packets(times, delays[first], arrived[first].astype(int), notes, halved)
 
     def error(self, text: str) -> BadInputError:
         """Make an error that begins with the name of the log."""
@@ -116,8 +109,6 @@ def trace_of(packets: Packets) -> Trace:
 
 _MISSHAPEN = ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError
 """Errors that reading JSON with an unexpected layout can raise."""
-_IRTT_KEYS = {None: "rtt", "uplink": "send", "downlink": "receive"}
-"""Direction, None for round trips -> irtt's key of the delay."""
 
 
 def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool) -> Packets:
@@ -135,57 +126,45 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
         BadInputError: If the file is no output of irtt, or if it has no usable one-way delays and
             `halve` is false.
     """
-    log = Log(name, halved=halve)
+    log = Log(name)
+    if not (direction or halve):
+        raise log.error("irtt measures both directions; choose --direction, or --halve-rtt")
     try:
-        trips = json.loads(text)["round_trips"]
-        if direction is None and not halve:
-            raise log.error(
-                "irtt measures both directions; choose --direction uplink (sent by its client) or "
-                "downlink"
-            )
-        _read_trips(trips, None if halve else direction, log)
+        _read_trips(json.loads(text)["round_trips"], None if halve else direction, log)
     except _MISSHAPEN as error:
         raise log.error(
             f"not a log of irtt ({type(error).__name__}: {error}); give the file that 'irtt client "
-            "-o FILE.json' writes"
+            "-o FILE.json' writes, with the server's stamps or with --halve-rtt"
         ) from None
-    return log.packets()
+    return log.packets(halved=halve)
 
 
 def _read_trips(trips: list[dict[str, Any]], direction: Direction | None, log: Log) -> None:
-    """Read the time of sending and the delay of each packet [s] into `log`; the first time is 0.
+    """Read each packet into `log`; without a `direction`, half of each round trip.
 
+    The first time is 0.
     On the downlink, packets lost on the uplink are left out. The time is always that of the client,
     even for the downlink: a lost packet has no time of the server.
     """
-    arrived = [trip["delay"] for trip in trips if _fate(trip) == "false"]
-    if direction:
-        if any(not {"send", "receive"} <= delay.keys() for delay in arrived):
-            raise log.error(f"irtt's server sent no stamps: has round trips; {HALVE}")
-        both = [int(delay[key]) for delay in arrived for key in ("send", "receive")]
-        log.refuse_early(min(both, default=0) * 1e-9)  # of the other direction, too
     stamps = [trip["timestamps"]["client"]["send"] for trip in trips]
     sent_ns = [int(stamp.get("monotonic", stamp.get("wall"))) for stamp in stamps]
     for trip, stamp_ns in zip(trips, sent_ns, strict=True):
-        sent, fate, delay = (stamp_ns - sent_ns[0]) * 1e-9, _fate(trip), nan
-        if (direction, fate) == ("downlink", "true_up"):
-            continue
-        if fate == "false":
-            delay = int(trip["delay"][_IRTT_KEYS[direction]]) * (1e-9 if direction else 0.5e-9)
-        log.entries.append((sent, delay))
-        if (direction, fate) == ("uplink", "true_down"):
-            log.unmeasured.add(sent)
+        sent, fate = (stamp_ns - sent_ns[0]) * 1e-9, str(trip["lost"]).lower()
+        if fate == "false" and direction:
+            up, down = int(trip["delay"]["send"]), int(trip["delay"]["receive"])
+            log.refuse_early(min(up, down) * 1e-9)  # of the other direction, too
+            log.entries.append((sent, (up if direction == "uplink" else down) * 1e-9, True))
+        elif fate == "false":
+            log.entries.append((sent, int(trip["delay"]["rtt"]) * 0.5e-9, True))
+        elif direction == "uplink" and fate == "true_down":
+            log.entries.append((sent, nan, True))
             log.counts["lost on the way back, delay unknown"] += 1
-
-
-def _fate(trip: dict[str, Any]) -> str:
-    """Return whether a packet was lost: "false", "true", "true_up" or "true_down"."""
-    return str(trip["lost"]).lower()
+        elif direction != "downlink" or fate != "true_up":
+            log.entries.append((sent, nan, False))
 
 
 SCALES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-TIMES, DELAYS, LOSSES = ("time", "timestamp", "sent"), ("delay", "rtt"), ("loss", "lost")
-COLUMNS = "time_s and delay_ms, or with _s, _ms, _us or _ns; rtt_ for round trips; and loss"
+TIMES, DELAYS = "time|timestamp|sent", "delay|rtt"
 
 
 def read_csv(lines: Iterable[str], name: str, *, halve: bool) -> Packets:
@@ -198,64 +177,50 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool) -> Packets:
     Raises:
         BadInputError: If the log cannot be used; the text names line, value and remedy.
     """
+    log = Log(name)
     columns, rows = read_rows(lines, name)
-    time, time_unit = _find(columns, TIMES, name)
-    delay, unit = _find(columns, DELAYS, name)
-    log = Log(name, halved=delay.startswith("rtt"))
-    if log.halved and not halve:
-        raise BadInputError(f"{name}, column {delay}: has round trips; {HALVE}")
-    # A share of losses must not be passed over in silence.
-    losses = [column for column in columns if any(word in column for word in LOSSES)]
-    if {*losses} - {*LOSSES}:
-        raise log.error(f"column {losses[0]} is not read; call it loss, 0 or 1, or remove it")
-    raw = [(row.number(time), _csv_delay(row, delay, losses)) for row in rows]
+    (time, time_scale), (delay, scale) = (_find(columns, kind, log) for kind in (TIMES, DELAYS))
+    halved = delay.startswith("rtt")
+    if halved and not halve:
+        raise log.error(f"column {delay}: has round trips; {HALVE}")
+    scale *= 0.5 if halved else 1.0
+    # Whatever its name: a share of losses must not be passed over in silence.
+    losses = [column for column in columns if "loss" in column or "lost" in column]
+    sent, delays = list[float](), list[float]()
+    for row in rows:
+        is_lost = any([row.number(column, LOST) for column in losses])
+        is_lost |= row.cells[delay].lower() in ("", "nan")
+        sent.append(row.number(time))
+        delays.append(nan if is_lost else row.number(delay) * scale)
     # For nanoseconds since 1970 a float has a resolution of 256 ns, which is enough here.
-    start = min((sent for sent, _ in raw), default=0.0)
-    scales = SCALES[time_unit], SCALES[unit] * (0.5 if log.halved else 1.0)
-    log.entries = [((sent - start) * scales[0], value * scales[1]) for sent, value in raw]
-    return log.packets()
+    start = min(sent, default=0.0)
+    log.entries = [
+        ((at - start) * time_scale, value, not isnan(value))
+        for at, value in zip(sent, delays, strict=True)
+    ]
+    return log.packets(halved=halved)
 
 
-def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, str]:
-    """Return the only column named after one of `kinds` and a unit, as `delay_ms`, and the unit.
-
-    Raise an error if there is none, or more than one; `name` is the log's name, for the error.
-    """
-    pattern = re.compile(f"(?:{'|'.join(kinds)})_({'|'.join(SCALES)})")
-    found = [(column, it[1]) for column in columns if (it := pattern.fullmatch(column))]
+def _find(columns: list[str], kinds: str, log: Log) -> tuple[str, float]:
+    """Return the only column of these kinds, such as `delay_ms`, and the scale of its unit."""
+    pattern = re.compile(f"({kinds})_({'|'.join(SCALES)})")
+    found = [(column, SCALES[it[2]]) for column in columns if (it := pattern.fullmatch(column))]
     if len(found) != 1:
-        raise BadInputError(
-            f"{name}: has {len(found)} columns {kinds[0]} in {','.join(columns)[:200]!r}; name them"
-            f" {COLUMNS}"
-        )
+        shown = ",".join(columns)[:200]
+        raise log.error(f"needs one column ({kinds})_({'|'.join(SCALES)}), has {shown!r}")
     return found[0]
 
 
-def _csv_delay(row: Row, column: str, losses: list[str]) -> float:
-    """Read the delay of a packet from `column`, in the column's unit; return NaN for a lost packet.
-
-    `losses` are the columns that mark lost packets with 1 or "true".
-    """
-    lost = [row.cells[name].lower() not in ("0", "false") for name in losses]
-    if any(lost) or row.cells[column].lower() in ("", "nan"):
-        return nan
-    return row.number(column)
-
-
 _WRAP = 1 << 16  # after 65535 ping goes on with 0
-_PACKET = re.compile(r"(?:\[(\d+\.\d+)\] )?.*icmp_seq=(\d{1,5})\b(?: .*time=(\d+(?:\.\d+)?) ms)?")
-"""Line of `ping -D` about a packet: time stamp [s], sequence number, round trip [ms]."""
+_REPLY = re.compile(r"\[(\d+\.\d+)\] .*icmp_seq=(\d+) .*time=(\d+(?:\.\d+)?) ms")
+"""Line of `ping -D` about a reply: time stamp [s], sequence number, round trip [ms]."""
+_NUMBER = re.compile(r"icmp_seq=(\d+)\b")
 _SUMMARY = re.compile(r"(\d+) packets transmitted, \d+ received")
-_NO_LINUX = (
-    "is not what Linux' ping -D prints in English; measure with: LC_ALL=C ping -D -O HOST; Apple's "
-    "ping and others have no such lines, so measure with irtt there"
-)
 
 
 def is_ping(lines: list[str]) -> bool:
     """Return whether a text looks like the output of ping."""
-    signs = re.compile(r"icmp_seq|\bPING |\b(ttl|TTL)=")
-    return any(signs.search(line) for line in lines[:1000])
+    return any(re.search("icmp_seq|^PING |ttl=", line, re.IGNORECASE) for line in lines[:1000])
 
 
 def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
@@ -270,55 +235,36 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
         BadInputError: If `halve` is false; or if the log `name` has another form, no replies or
             several sessions.
     """
-    log = Log(name, halved=True)
+    log, newest = Log(name), 0
     if not halve:
         raise log.error(f"ping measures round trips; {HALVE}")
-    totals = [int(found[1]) for line in lines if (found := _SUMMARY.search(line))]
-    is_twice = max(len(totals), sum(line.startswith("PING ") for line in lines)) > 1
     sent, trips, numbers = dict[int, float](), dict[int, float](), set[int]()
-    for number, stamp, trip, line in _ping_packets(lines, log):
+    for line in lines:
+        if not (told := _NUMBER.search(line)) or "DUP!" in line:
+            continue
+        # A late reply may have a number from before the wrap.
+        number = int(told[1])
+        number += _WRAP * max(0, round((newest - number) / _WRAP))
+        newest = max(newest, number)
         numbers.add(number)
-        if trip is not None:
-            is_twice |= number in trips
-            sent[number], trips[number] = stamp - trip, trip
-        elif stamp and "no answer yet" in line:  # said just before ping sends the next packet
-            sent.setdefault(number + 1, stamp)
-    if is_twice:
-        raise log.error("has more than one session of ping; give the lines of one session")
+        if reply := _REPLY.match(line):
+            if number in trips:
+                raise log.error("has more than one session of ping; give the lines of one session")
+            trips[number] = float(reply[3]) * 1e-3
+            sent[number] = float(reply[1]) - trips[number]
     if not trips:
-        raise log.error(f"has no replies, or {_NO_LINUX}")
-    order = np.array(list(trips))
-    log.counts["out of order, sorted"] += int(np.sum(order < np.maximum.accumulate(order)))
+        raise log.error(
+            "has no replies as Linux' ping -D prints them in English; measure with: LC_ALL=C ping "
+            "-D -O HOST; Apple's ping and others have no such lines, so measure with irtt there"
+        )
+    totals = [int(found[1]) for line in lines if (found := _SUMMARY.search(line))]
     first, last = (1, max(*totals, *numbers)) if totals else (min(numbers), max(numbers))
     n, at = np.array(sorted(sent.items())).T
     period = max(float(np.median(np.diff(at) / np.diff(n))), 1e-6) if len(n) > 1 else 1.0
     # Without a reply, the time of sending is interpolated between its neighbours.
     every = np.arange(first, last + 1)
     outside = np.minimum(every - n[0], 0) + np.maximum(every - n[-1], 0)
-    sends = np.interp(every, n, at) + outside * period
-    halves = (trips.get(number, nan) / 2 for number in every.tolist())
-    log.entries = list(zip(sends.tolist(), halves, strict=True))
-    return log.packets()
-
-
-def _ping_packets(lines: list[str], log: Log) -> Iterator[tuple[int, float, float | None, str]]:
-    """Yield number, time stamp [s], round trip [s] and line of each packet; 0 without a stamp.
-
-    The round trip is None for a packet without a reply.
-    """
-    newest = 0
-    for line in lines:
-        found = _PACKET.match(line)
-        is_other = "ttl=" in line and not (found and found[1] and found[3])
-        if is_other or " data bytes" in line:
-            raise log.error(f"{line[:80]!r} {_NO_LINUX}")
-        if found is None:
-            continue
-        if "DUP!" in line:
-            log.counts["duplicates left out"] += 1
-            continue
-        # A late reply may have a number from before the wrap.
-        number = int(found[2])
-        number += _WRAP * max(0, round((newest - number) / _WRAP))
-        newest = max(newest, number)
-        yield number, float(found[1] or 0.0), float(found[3]) * 1e-3 if found[3] else None, line
+    times = (np.interp(every, n, at) + outside * period).tolist()
+    for number, time in zip(every.tolist(), times, strict=True):
+        log.entries.append((time, trips.get(number, nan) / 2, number in trips))
+    return log.packets(halved=True)

@@ -7,10 +7,10 @@ rising order of time; `delay_us` may replace `delay_ms`. Delays are one way.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from functools import lru_cache
-from math import fsum, inf, sqrt
+from math import fsum, sqrt
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,13 +25,13 @@ from cloudrc.link.profile import (
     Trace,
 )
 from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import Quantity
+from cloudrc.outside.values import ANY, Quantity
 from cloudrc.rounding import differences
 
 SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a second
 START_MAX = 600.0  # if the first row is later, times count from the first row [s]
-_SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
-_HEADERS = "time_s,delay_ms or time_s,delay_us, and may end in ,loss"
+_COLUMNS = dict.fromkeys(("time_s", "delay_ms", "delay_us"), Quantity(ge=0))
+_COLUMNS["loss"] = Quantity(ge=0, le=1)
 
 
 def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
@@ -92,13 +92,10 @@ def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
     trace = read_trace(path, size_max)
     losses = trace.losses or (0.0,) * len(trace.delays)
     delays = [delay for delay, loss in zip(trace.delays, losses, strict=True) if loss < 1.0]
-    mean = fsum(delays) / max(len(delays), 1)
-    deviation = sqrt(fsum((delay - mean) ** 2 for delay in delays) / max(len(delays), 1))
     if not delays or not differences(min(delays), max(delays)):
-        raise BadInputError(
-            f"table {path}: needs at least two different delays; give a trace with more rows, "
-            "or another distribution"
-        )
+        raise BadInputError(f"table {path}: needs at least two different delays")
+    mean = fsum(delays) / len(delays)
+    deviation = sqrt(fsum((delay - mean) ** 2 for delay in delays) / len(delays))
     return tuple(sorted((delay - mean) / deviation for delay in delays))
 
 
@@ -109,33 +106,29 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
     """
     place = f"trace {name}"
     columns, rows = read_rows(lines, place)
-    delay = next((column for column in columns if column in _SCALES), "delay_ms")
-    if sorted(columns) not in (sorted(["time_s", delay]), sorted(["time_s", delay, "loss"])):
-        raise BadInputError(f"{place}: the header is {_shown(columns)}; it must be {_HEADERS}")
-    found = _rising(rows, ["time_s", delay, "loss"][: len(columns)])
-    if not found:
-        raise BadInputError(f"{place}: no rows; give at least one, for example: 0,45")
-    times, delays, *losses = zip(*found, strict=True)
-    start = times[0] if times[0] > START_MAX else 0.0
-    scaled = tuple(one * _SCALES[delay] for one in delays)
-    return Trace(tuple(time - start for time in times), scaled, losses[0] if losses else None)
-
-
-_MOST = {"loss": 1.0}
-"""Column -> its largest number."""
-
-
-def _rising(rows: Iterable[Row], columns: Sequence[str]) -> list[list[float]]:
-    """Read the numbers of `columns` in each row; the first column is a time, which has to rise."""
+    delay = "delay_us" if "delay_us" in columns else "delay_ms"
+    wanted = ["time_s", delay, "loss"][: len(columns)]
+    if sorted(columns) != sorted(wanted) or len(wanted) < 2:
+        shown = ",".join(columns)[:200] or "missing"
+        raise BadInputError(
+            f"{place}: the header is {shown}; it must be time_s,delay_ms or time_s,delay_us, and "
+            "may end in ,loss"
+        )
     found = list[list[float]]()
     for row in rows:
-        found.append([row.number(column, 0.0, _MOST.get(column, inf)) for column in columns])
+        found.append([row.number(column, _COLUMNS[column]) for column in wanted])
         if len(found) > 1 and found[-1][0] <= found[-2][0]:
             raise BadInputError(
                 f"{row.where}: time_s {found[-1][0]:.12g} does not come after "
                 f"{found[-2][0]:.12g}; sort the rows by time and give each time once"
             )
-    return found
+    if not found:
+        raise BadInputError(f"{place}: no rows; give at least one, for example: 0,45")
+    times, delays, *losses = zip(*found, strict=True)
+    start = times[0] if times[0] > START_MAX else 0.0
+    scale = 1e-6 if delay == "delay_us" else 1e-3
+    scaled = tuple(one * scale for one in delays)
+    return Trace(tuple(time - start for time in times), scaled, losses[0] if losses else None)
 
 
 def write_trace(trace: Trace) -> str:
@@ -157,10 +150,10 @@ class Row(NamedTuple):
     where: str  # file and line, for messages
     cells: dict[str, str]  # column -> text without blanks and quotes at its ends
 
-    def number(self, column: str, low: float = -inf, high: float = inf) -> float:
-        """Parse a cell as a number from `low` to `high` [any unit], or raise a BadInputError."""
+    def number(self, column: str, valid: Quantity = ANY) -> float:
+        """Parse a cell as a number, or raise a BadInputError that says what is valid."""
         with naming(f"{self.where}: {column}"):
-            return float(Quantity(ge=low, le=high).read(self.cells[column]))
+            return float(valid.read(self.cells[column]))
 
 
 def read_rows(lines: Iterable[str], name: str) -> tuple[list[str], Iterator[Row]]:
@@ -190,7 +183,3 @@ def read_rows(lines: Iterable[str], name: str) -> tuple[list[str], Iterator[Row]
 
 def _cells(line: str) -> list[str]:
     return [cell.strip(' \t"') for cell in line.split(",")]
-
-
-def _shown(columns: Sequence[str]) -> str:
-    return ",".join(columns)[:200] or "missing"

@@ -57,7 +57,7 @@ def test_a_picture_replaces_a_picture_of_its_kind_alone(folder, call, refused):
 @pytest.mark.parametrize(
     ("name", "data", "says"),
     [
-        ("a.json", b'{"round_trips": []}', "choose --direction uplink"),
+        ("a.json", b'{"round_trips": []}', "choose --direction"),
         ("a.mcap", b"\x89MCAP0\r\n", "a.mcap"),
         (".", None, "no such file or folder"),
     ],

@@ -144,7 +144,7 @@ def test_irtt_without_good_clocks_is_refused(direction):
         irtt([trip(0, send=60, receive=-5)], direction)
     unstamped = trip(0)
     del unstamped["delay"]["send"]
-    with pytest.raises(BadInputError, match=r"server sent no stamps.*--halve-rtt"):
+    with pytest.raises(BadInputError, match=r"server's stamps or with --halve-rtt"):
         irtt([unstamped], direction)
 
 
@@ -193,7 +193,7 @@ def test_ping_gives_half_round_trips_at_the_time_of_sending(end, lost):
     assert packets.sent == pytest.approx((100.0, 100.2, 100.4, 100.6, 100.8, 101.0)[: 3 + lost])
     assert delays_of(packets)[:5] == pytest.approx((0.020, 0.015, None, 0.050, None))
     assert delays_of(packets).count(None) == lost
-    assert packets.notes == ("1 duplicates left out",)
+    assert packets.notes == ()
 
 
 def test_losses_before_the_first_reply_count_if_reported():
@@ -210,7 +210,6 @@ def test_ping_counts_on_after_65535():
     packets = ping(reply(65534, 1.0), reply(0, 3.0), reply(65535, 2.0), reply(1, 4.0))
     assert packets.sent == pytest.approx((0.98, 1.98, 2.98, 3.98))
     assert None not in delays_of(packets)
-    assert packets.notes == ("1 out of order, sorted",)
 
 
 @pytest.mark.parametrize(

@@ -9,14 +9,14 @@ from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, union
 from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.record.writer import COUNTS, McapWriter
 from cloudrc.records import Counted, MissionEvent
-from cloudrc.runs.links.trace import LogSettings, read_packets
+from cloudrc.runs.links.trace import read_packets
 from cloudrc.runs.replay import write_replay
 from cloudrc.studies.identify import identify
 from tests.record.conftest import MS, SECOND, cloud_records, world_records, write
 
 RECORDS = world_records(200)  # four chunks
 READERS = [
-    lambda path: read_packets(path, LogSettings()),
+    read_packets,
     identify,
     lambda path: write_replay(path, path.with_name("page.html")),
 ]

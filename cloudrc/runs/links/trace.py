@@ -5,8 +5,7 @@ The content of the source tells its format.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from math import inf, isnan, nan
 from pathlib import Path
 from shlex import quote
@@ -30,49 +29,35 @@ from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
     from cloudrc.record.columns import Recording, Table
-    from cloudrc.record.holes import Hole
-
-DIRECTIONS: tuple[Direction, ...] = ("uplink", "downlink")
 
 
-@dataclass(frozen=True)
-class LogSettings:
-    """How to read a log; a field is the flag of this name."""
+def read_packets(
+    source: Path, only: Direction | None = None, *, halve: bool = False
+) -> dict[Direction, Packets]:
+    """Read the delays in a source; return direction -> packets.
 
-    direction: Direction | None = None  # take this direction only
-    halve_rtt: bool = False  # take half of each round trip
-
-
-def read_packets(source: Path, settings: LogSettings) -> dict[Direction, Packets]:
-    """Read the delays in a source; return direction -> packets."""
-    only = settings.direction
+    `only` is the direction to take, `halve` takes half of each round trip.
+    """
     check_there(source, "name a run, a log or a CSV file")
-    if not _is_run(source):
-        return {only or "uplink": _from_log(source, settings)}
-    if settings.halve_rtt:
-        raise Log(str(source)).error("a run has one-way delays; leave out --halve-rtt")
-    require("a trace of a run", ("record",))
-    recording = _recording(source)
-    ways: tuple[Direction, ...] = (only,) if only else DIRECTIONS
-    return {way: one_way(recording, source, way) for way in ways}
+    name = str(source)
+    if source.is_dir() or _is_mcap(source):
+        if halve:
+            raise Log(name).error("a run has one-way delays; leave out --halve-rtt")
+        require("a trace of a run", ("record",))
+        recording = _recording(source)
+        ways: tuple[Direction, ...] = (only,) if only else ("uplink", "downlink")
+        return {way: one_way(recording, source, way) for way in ways}
+    lines = read_lines(source, name, "give a run, a log of ping or irtt, or a CSV file")
+    if lines and lines[0].lstrip().startswith(("{", "[{")):
+        found = read_irtt("\n".join(lines), name, only, halve=halve)
+    else:
+        found = (read_ping if is_ping(lines) else read_csv)(lines, name, halve=halve)
+    return {only or "uplink": found}
 
 
-def _is_run(path: Path) -> bool:
-    if path.is_dir():
-        return True
+def _is_mcap(path: Path) -> bool:
     with path.open("rb") as file:
         return file.read(8) == b"\x89MCAP0\r\n"
-
-
-def _from_log(path: Path, settings: LogSettings) -> Packets:
-    name, halve = str(path), settings.halve_rtt
-    remedy = "give a run, a log of ping or irtt, or a CSV file"
-    lines = read_lines(path, name, remedy)
-    if lines and lines[0].lstrip().startswith(("{", "[{")):
-        return read_irtt("\n".join(lines), name, settings.direction, halve=halve)
-    if is_ping(lines):
-        return read_ping(lines, name, halve=halve)
-    return read_csv(lines, name, halve=halve)
 
 
 def _recording(path: Path) -> Recording:
@@ -98,68 +83,43 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     If a datagram arrived twice, the shorter delay counts. `path` is the name of the recording.
     """
     from cloudrc.metrics.link import SENT, transit_ns
-
-    log, sent_topic, topic = Log(str(path)), SENT[direction], f"/{direction}_delay"
-    sent, arrivals = recording[sent_topic], recording[topic]
-    if not len(sent) or not len(arrivals):
-        missing = sent_topic if not len(sent) else topic
-        raise log.error(
-            f"no rows on {missing}, so no {direction}; give the run's folder or its mission.mcap"
-        )
-    delays = _delays(arrivals, log)
-    rows = list(_columns(sent, "stamp_ns", "epoch", "counter"))
-    longest_ns = transit_ns(recording, direction)
-    known = _outside_holes(rows, recording.holes, longest_ns, log)
-    # The link did not lose what arrived before the receiver's session was open, and what may
-    # still arrive after the end. All datagrams of these times are left out, also those that
-    # arrived: if they alone remained, the trace would lose too few.
-    latest_first = reversed(list(_columns(arrivals, "epoch", "counter")))
-    first = {epoch: counter for epoch, counter in latest_first}  # the first arrival remains
-    last_ns = {epoch: stamp_ns for stamp_ns, epoch, _ in rows}
-    log.entries = [
-        ((stamp_ns - rows[0][0]) * 1e-9, delays.get((epoch, counter), nan))
-        for stamp_ns, epoch, counter in known
-        if counter >= first.get(epoch, inf) and stamp_ns < last_ns[epoch] - longest_ns
-    ]
-    unknown = len(known) - len(log.entries)
-    last = f"in its last {longest_ns * 1e-6:.4g} ms"
-    log.counts[f"left out, sent before the session was open or {last}"] += unknown
-    return log.packets()
-
-
-def _outside_holes(
-    rows: list[tuple[float, ...]], holes: Iterable[Hole], longest_ns: int, log: Log
-) -> list[tuple[float, ...]]:
-    """Leave out the datagrams whose arrival may be lost in a hole of the recording.
-
-    `rows` begin with the stamp of sending [ns], and `longest_ns` is the longest time to the arrival
-    [ns]. `log` notes what is left out.
-    """
     from cloudrc.record.holes import describe
 
     def seconds(stamp_ns: float) -> float:
         return (stamp_ns - rows[0][0]) * 1e-9
 
-    lost = [row for row in rows if any(h.meets(row[0], row[0] + longest_ns) for h in holes)]
-    if lost:
-        why = f"their arrivals may be lost: {describe(holes, seconds)}"
-        log.counts[f"left out, because {why}"] += len(lost)
-    left_out = set(lost)
-    return [row for row in rows if row not in left_out]
-
-
-def _delays(arrivals: Table, log: Log) -> dict[tuple[float, float], float]:
-    """Return epoch and counter of each datagram that arrived -> its delay [s]."""
-    delays: dict[tuple[float, float], float] = {}
+    log, sent_topic, topic = Log(str(path)), SENT[direction], f"/{direction}_delay"
+    sent, arrivals = recording[sent_topic], recording[topic]
+    if not len(sent) or not len(arrivals):
+        raise log.error(f"no rows on {sent_topic} or {topic}, so no {direction}")
+    delays = dict[tuple[float, float], float]()
     for epoch, counter, delay in _columns(arrivals, "epoch", "counter", "delay"):
         if isnan(delay):
             raise log.error(
                 "its ends did not share a clock, so one-way delays are not known; record a run in "
                 "local mode, or measure with irtt"
             )
-        log.counts["duplicates left out"] += (epoch, counter) in delays
-        delays[epoch, counter] = min(delay, delays.get((epoch, counter), delay))
-    return delays
+        delays[epoch, counter] = min(delay, delays.get((epoch, counter), inf))
+    rows = list(_columns(sent, "stamp_ns", "epoch", "counter"))
+    longest_ns = transit_ns(recording, direction)
+    holes = recording.holes
+    known = [row for row in rows if not any(h.meets(row[0], row[0] + longest_ns) for h in holes)]
+    why = f"their arrivals may be lost: {describe(holes, seconds)}"
+    log.counts[f"left out, because {why}"] += len(rows) - len(known)
+    # The link did not lose what arrived before the receiver's session was open, and what may
+    # still arrive after the end. All datagrams of these times are left out, also those that
+    # arrived: if they alone remained, the trace would lose too few.
+    latest_first = reversed(list(_columns(arrivals, "epoch", "counter")))
+    first = {epoch: counter for epoch, counter in latest_first}  # the first arrival remains
+    last_ns = {epoch: stamp_ns for stamp_ns, epoch, _ in rows}
+    for stamp_ns, epoch, counter in known:
+        if counter >= first.get(epoch, inf) and stamp_ns < last_ns[epoch] - longest_ns:
+            delay = delays.get((epoch, counter), nan)
+            log.entries.append((seconds(stamp_ns), delay, not isnan(delay)))
+    unknown = len(known) - len(log.entries)
+    last = f"in its last {longest_ns * 1e-6:.4g} ms"
+    log.counts[f"left out, sent before the session was open or {last}"] += unknown
+    return log.packets()
 
 
 def _columns(table: Table, *names: str) -> Iterator[tuple[float, ...]]:
