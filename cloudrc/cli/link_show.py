@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -51,8 +50,8 @@ def execute(options: argparse.Namespace) -> int:
     check_picture(output, "-o")
     from cloudrc.cli.progress import Progress
 
-    with closing(Progress(f"reads {options.profile}")) as view:
-        title, text, picture = _drawn(options, output.suffix[1:], view.tell)
+    with closing(Progress(f"draws {options.profile}")):
+        title, text, picture = _drawn(options, output.suffix[1:])
     with at_place(output):
         output.write_bytes(picture)
     print(title)
@@ -61,18 +60,15 @@ def execute(options: argparse.Namespace) -> int:
     return 0
 
 
-def _drawn(
-    options: argparse.Namespace, kind: str, see: Callable[[str], None]
-) -> tuple[str, str, bytes]:
-    """Return title, statistics and picture of a profile; `see` gets each step of the work."""
+def _drawn(options: argparse.Namespace, kind: str) -> tuple[str, str, bytes]:
+    """Return title, statistics and picture of a profile."""
     from cloudrc.report.figures.link import render_link
     from cloudrc.runs.links.sample import SampleSettings, sample_profile, statistics_table
 
     settings = settings_from(options, SampleSettings)
     about, ways = sample_profile(
-        options.profile, settings, lambda text: print_line(f"cloudrc: {text}", sys.stderr), see
+        options.profile, settings, lambda text: print_line(f"cloudrc: {text}", sys.stderr)
     )
-    see("draws the picture")
     title = escape(": ".join(filter(None, (Path(options.profile).stem, about))))
     samples = [sample for sample, _ in ways.values()]
     picture = render_link(title, samples[0], samples[1] if samples[1:] else None, kind)

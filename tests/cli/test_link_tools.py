@@ -108,9 +108,7 @@ def test_a_trace_is_shown_row_by_row_whatever_its_span(folder, call):
     assert "downlink" not in trace
 
 
-def test_a_trace_needs_no_ending_and_a_profile_no_name(folder, call):
-    (folder / "t.txt").write_text("# half of ping\ntime_s,delay_ms\n0,40\n1,50\n")
-    assert call("link show t.txt").out.startswith("t: a trace of 2 rows in 1 s\n")
+def test_a_profile_needs_no_description(folder, call):
     (folder / "mine.yaml").write_text("---\nuplink: {delay_ms: 30}\n")
     assert call("link show mine.yaml").out.startswith("mine\n")
 

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isnan, nan
+from operator import attrgetter
 from pathlib import Path
 from statistics import fmean
-from typing import TypeAlias
 
-from cloudrc.config.profile import DirectionConfig, Profile, load_profile
+from cloudrc.config.profile import DIRECTIONS, DirectionConfig, Profile, load_profile
 from cloudrc.errors import BadInputError
 from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.profile import DirectionProfile, Timeline, Trace
+from cloudrc.link.profile import Timeline, Trace
 from cloudrc.link.streams import Numbers, Stream, numbers, sample
-from cloudrc.link.traces import link_profile, read_lines, read_trace
+from cloudrc.link.traces import link_profile, read_trace
 from cloudrc.report.figures.link import DirectionSample
 from cloudrc.text import table
 from cloudrc.tunnel.codec import SIZES, TELEMETRY_SIZES, Kind
@@ -24,7 +23,6 @@ from cloudrc.tunnel.codec import SIZES, TELEMETRY_SIZES, Kind
 PACKETS_MAX = 10_000_000  # in one direction
 ROWS = 1000  # least number of packets for a trace that has shares of losses
 SECONDS = 30.0  # time that a figure shows by default [s]; a longer time line is shown in full
-Tell: TypeAlias = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -38,61 +36,65 @@ class SampleSettings:
 
 
 def sample_profile(
-    name: str, settings: SampleSettings, tell: Tell, see: Tell = lambda text: None
+    name: str, settings: SampleSettings, tell: Callable[[str], None]
 ) -> tuple[str, dict[str, tuple[DirectionSample, Numbers]]]:
-    """Simulate both directions of a profile, or the one of a trace.
+    """Simulate both directions of a profile, or the one of a trace, which is a file `name`.csv.
 
     Return the description; and direction -> packets for the figure, and statistics. `tell` receives
-    a warning about a doubtful trace, `see` the present step of the work.
+    a warning about a link that loses nearly all.
     """
-    profile, is_trace = _profile(name)
-    ways = ("uplink",) if is_trace else ("uplink", "downlink")
-    samples = {way: _way(getattr(profile, way), way, settings, tell, see) for way in ways}
-    return profile.description, samples
+    profile, ways = _profile(name)
+    found = {}
+    for way in ways:
+        asked = getattr(profile, way)
+        for doubt in describe_heavy_loss(asked, way):
+            tell(f"warning: {doubt}")
+        found[way] = _sample(asked, way == "uplink", settings)
+    return profile.description, found
 
 
-def _profile(name: str) -> tuple[Profile, bool]:
-    """Load the profile `name`, or make one from a trace; return whether `name` is a trace."""
-    path = Path(name).absolute()
+def _profile(name: str) -> tuple[Profile, Sequence[str]]:
+    """Load a profile, or make one from a trace; return it, and its directions to show."""
     if not name.endswith(".csv"):
-        lines = read_lines(path, name, "give a profile or a trace") if path.is_file() else []
-        if not re.match(r"(\s|#.*\n)*(time_s|\d)", "\n".join(lines[:9])):
-            return load_profile(name), False
+        return load_profile(name), DIRECTIONS
+    path = Path(name).absolute()
     times = read_trace(path).times
     about = f"a trace of {len(times)} rows in {times[-1] - times[0]:.4g} s"
-    return Profile.model_validate({"description": about, "uplink": {"trace": str(path)}}), True
+    uplink = {"trace": str(path)}
+    return Profile.model_validate({"description": about, "uplink": uplink}), ("uplink",)
 
 
-def _way(
-    asked: DirectionConfig, name: str, settings: SampleSettings, tell: Tell, see: Tell
+def _sample(
+    asked: DirectionConfig, uplink: bool, settings: SampleSettings
 ) -> tuple[DirectionSample, Numbers]:
     """Simulate one direction of the link; return the packets for the figure, and statistics.
 
     If the conditions are constant, the statistics come from more packets than the figure shows.
     """
     profile = link_profile(asked)
-    timeline = Timeline(profile)
+    timeline, period_ns = Timeline(profile), round(1e9 / settings.rate)
+    # Telemetry of a robot with one sensor of its own.
+    kind, size = Kind.COMMAND, SIZES[Kind.COMMAND]
+    if uplink:
+        kind, size = Kind.TELEMETRY, TELEMETRY_SIZES[1]
 
     def send(sent_ns: Sequence[int]) -> Stream:
-        see(f"sends {len(sent_ns)} packets through the {name}")
-        return _send(profile, name == "uplink", settings.seed, sent_ns)
+        return sample(LinkDirection(profile, settings.seed, uplink), kind, sent_ns, size)
 
-    period_ns = round(1e9 / settings.rate)
     if profile.rows is not None and settings.seconds is None:
         shown = send(_row_times(profile.rows))
     else:
         seconds = settings.seconds or max(SECONDS, 1.1e-9 * timeline.last_ns)
-        if seconds * settings.rate > PACKETS_MAX:
+        count = max(1, round(seconds * settings.rate))
+        if count > PACKETS_MAX:
             raise BadInputError(
                 f"{seconds:g} s at {settings.rate:g} packets a second are more than {PACKETS_MAX} "
                 "packets; give less with --seconds or --rate"
             )
-        shown = send(range(0, max(1, round(seconds * settings.rate)) * period_ns, period_ns))
+        shown = send(range(0, count * period_ns, period_ns))
     many = shown
     if timeline.only() is not None:
         many = send(range(0, settings.packets * period_ns, period_ns))
-    for doubt in describe_heavy_loss(profile, name):
-        tell(f"warning: {doubt}")
     return DirectionSample(asked, shown.sent, shown.delays, many.delays), numbers(many)
 
 
@@ -105,25 +107,17 @@ def _row_times(trace: Trace) -> list[int]:
     return [a + n * (b - a) // many for a, b in zip(rows, ends, strict=True) for n in range(many)]
 
 
-def _send(profile: DirectionProfile, uplink: bool, seed: int, sent_ns: Sequence[int]) -> Stream:
-
-    kind, size = Kind.COMMAND, SIZES[Kind.COMMAND]
-    if uplink:
-        kind, size = Kind.TELEMETRY, TELEMETRY_SIZES[1]  # a robot with one sensor of its own
-    return sample(LinkDirection(profile, seed, uplink), kind, sent_ns, size)
-
-
 STATISTICS: dict[str, tuple[str, float, Callable[[Numbers], float]]] = {
-    "mean": ("ms", 1e3, lambda one: one.mean),
-    "standard deviation": ("ms", 1e3, lambda one: one.deviation),
-    "least": ("ms", 1e3, lambda one: one.least),
-    "median": ("ms", 1e3, lambda one: one.median),
-    "99 %": ("ms", 1e3, lambda one: one.p99),
-    "most": ("ms", 1e3, lambda one: one.most),
-    "correlation with the next": ("", 1.0, lambda one: one.correlation),
-    "overtaken by a later one": ("%", 1e2, lambda one: one.overtaken),
-    "duplicated": ("%", 1e2, lambda one: one.duplicated),
-    "lost": ("%", 1e2, lambda one: one.loss),
+    "mean": ("ms", 1e3, attrgetter("mean")),
+    "standard deviation": ("ms", 1e3, attrgetter("deviation")),
+    "least": ("ms", 1e3, attrgetter("least")),
+    "median": ("ms", 1e3, attrgetter("median")),
+    "99 %": ("ms", 1e3, attrgetter("p99")),
+    "most": ("ms", 1e3, attrgetter("most")),
+    "correlation with the next": ("", 1.0, attrgetter("correlation")),
+    "overtaken by a later one": ("%", 1e2, attrgetter("overtaken")),
+    "duplicated": ("%", 1e2, attrgetter("duplicated")),
+    "lost": ("%", 1e2, attrgetter("loss")),
     "lost in a row, mean": ("", 1.0, lambda one: fmean(one.runs) if one.runs else nan),
     "lost in a row, most": ("", 1.0, lambda one: max(one.runs, default=0)),
 }
