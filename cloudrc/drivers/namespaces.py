@@ -48,6 +48,7 @@ class ProgramEnd:
     Attributes:
         way: Privilege that allowed the namespace: "root" or "unprivileged user namespaces".
         has_ipv6: Whether the namespace has IPv6.
+        device: File descriptor of the TUN device, which reads and writes packets.
     """
 
     def __init__(self, name: str, *, reads_stdin: bool = False) -> None:
@@ -71,10 +72,10 @@ class ProgramEnd:
                 # A program that writes to a pipe would hold its lines back.
                 env={**os.environ, "PYTHONUNBUFFERED": "1"},
             )
-        self._device, self._namespace = -1, ""
+        self.device, self._namespace = -1, ""
         with ExitStack() as stack:
             stack.callback(self.close)
-            hello, (self._device,) = self._read_answer(1)
+            hello, (self.device,) = self._read_answer(1)
             stack.pop_all()
         self.way, self.has_ipv6 = str(hello["way"]), bool(hello["ipv6"])
         self._namespace = str(hello["namespace"])
@@ -86,11 +87,6 @@ class ProgramEnd:
         assert process.stdout is not None
         assert process.stderr is not None
         return process.stdout, process.stderr
-
-    def take_device(self) -> int:
-        """Return the file descriptor that reads and writes packets; the caller closes it."""
-        device, self._device = self._device, -1
-        return device
 
     def run(self, command: str) -> None:
         """Start a program by a command of the shell."""
@@ -127,8 +123,8 @@ class ProgramEnd:
         self.hang_up()
         await_or_kill(self._process, END_LIMIT + 1.0)
         self.hang_up()
-        if self._device >= 0:
-            os.close(self._device)
+        if self.device >= 0:
+            os.close(self.device)
         for output in self.outputs:
             output.close()
 

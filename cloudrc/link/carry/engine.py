@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 from cloudrc.link.carry.log import PacketLog, ReleaseErrors
 from cloudrc.link.model import HEADER_BYTES, LinkDirection
+from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.queue import PacketQueue
 
 BATCH = 32  # packets that a port takes before the engine sends, and sent before it takes again
@@ -31,6 +32,11 @@ class LinkWay:
     received: int = 0  # number of packets that have entered
     first: int = 0  # number of the first packet since the profile has changed
     waited: int = 0  # packets of full batches: how long they waited to be read is not known
+
+    def replace_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
+        """Use another profile from the next packet on, as `LinkDirection.replace_profile`."""
+        self.link.replace_profile(profile, restart=restart)
+        self.first = self.received
 
 
 class Packet(NamedTuple):

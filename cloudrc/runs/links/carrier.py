@@ -1,38 +1,38 @@
-"""A link that a command runs between programs, connections or topics, and judges at the end."""
+"""A link that a command runs, that `cloudrc link set` changes, and that is judged at the end."""
 
 from __future__ import annotations
 
 import contextlib
-import os
+import json
+import shutil
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from cloudrc.config.link_edit import edit_profile
-from cloudrc.drivers.local import LINK, announced, socket_folder
+from cloudrc.config.profile import DIRECTIONS, load_profile
+from cloudrc.drivers.link_control import ControlServer
+from cloudrc.drivers.local import LINK, LINK_FOLDER, announced, link_socket, socket_folder
 from cloudrc.link.carry.engine import Engine, LinkWay
-from cloudrc.link.carry.punctual import ask_for_fifo, settle
-from cloudrc.link.carry.tun import IN_FLIGHT_MAX, TunPort, write_packet
-from cloudrc.link.follow import Loaded
+from cloudrc.link.carry.tcp.medium import Medium
+from cloudrc.link.follow import Loaded, Profiles, make_folder, state_after
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.profile import DIRECTIONS
-from cloudrc.link.queue import NOTHING_NS
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.state import STATE_FILE, LinkState, publish, to_text
+from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.packets import Period
 from cloudrc.outside.document import Document
 from cloudrc.runs.folder import new_folder
-from cloudrc.runs.links.live import Changed, Check, LiveLink
 
 STEP = 0.05  # longest time until the engine reacts to a change or a signal [s]
-DRAIN_LIMIT = 1.0  # for the packets in flight at the end [s]
-FLOWS = {"uplink": ("client", "server"), "downlink": ("server", "client")}
-"""Direction -> the end that sends, and the end that receives."""
 Tell = Callable[[str], None]
 """Function that shows a line to the user."""
+Check = Callable[[DirectionProfile, str], None]
+"""Function that raises an error if a direction cannot have a profile."""
 
 
 @dataclass(frozen=True)
@@ -44,77 +44,107 @@ class CarrySettings:
     seed: int
 
 
-def open_live(
-    asked: CarrySettings,
-    command: str,
-    tell: Tell,
-    stack: contextlib.ExitStack,
-    *,
-    output: Path | None = None,
-    flag: str = "-o",
-    check: Check = lambda profile, name: None,
-) -> LiveLink:
-    """Read the profile of a command's link, and make the folder of its state.
-
-    `output` is a new folder for the link's state, given by `flag`; without it, the state is in a
-    temporary folder. `check` is that of `LiveLink`.
-
-    Raises:
-        CloudrcError: If the profile or a setting cannot be used.
-    """
-    edit = edit_profile(Document({}), asked.link, asked.settings, command)
-    for note in edit.notes:
-        tell(f"note: {note}")
-    base = tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder())
-    sockets = Path(stack.enter_context(base))
-    folder = sockets if output is None else new_folder(output, "", flag=flag)
-    url = f"unix:{sockets}/api.sock"  # as of a run, though nothing listens there
-    stack.enter_context(announced(folder, url, LINK))
-    live = LiveLink(edit, folder, url, f"cloudrc {command}", check)
-    stack.callback(live.close)
-    return live
-
-
-class CarriedLink:
-    """A link whose packets an engine carries.
+class LiveLink:
+    """Both directions of a link, whose profile can change.
 
     Attributes:
-        live: The profile in force, which `cloudrc link set` changes.
-        ways: Direction -> what happened to its packets; empty before `begin`.
-        engine: Carries the packets; None before `begin`.
+        cause: The profile and its changes in words.
+        folder: Folder of the states, and of the profile.
+        url: URL beside which the sockets are that take changes.
+        states: Direction -> its present state; empty before `serve`.
+        origins_ns: Direction -> start of its time line, monotonic clock [ns].
+        ways: Direction -> what happened to its packets; empty before `carry`.
+        engine: Carries the packets; None before `serve`.
         unread: Direction -> number of packets that were dropped before the engine has read them.
+        export: Gets each new state of a direction.
     """
 
-    def __init__(self, live: LiveLink, seed: int, stream: str = "") -> None:
-        """Prepare a link; `stream` is its name, as in `cloudrc.link.open`."""
-        self.live, self.seed, self._stream = live, seed, stream
-        self.ways = dict[str, LinkWay]()
+    def __init__(
+        self,
+        asked: CarrySettings,
+        command: str,
+        tell: Tell,
+        stack: contextlib.ExitStack,
+        *,
+        output: Path | None = None,
+        flag: str = "-o",
+        check: Check = lambda profile, name: None,
+    ) -> None:
+        """Read the profile of a command's link, and make the folder of its state.
+
+        `output` is a new folder for the link's state, given by `flag`; without it, the state is in
+        a temporary folder. `tell` gets notes, and a sentence about each change.
+
+        Raises:
+            CloudrcError: If the profile or a setting cannot be used, or if `check` raises one.
+        """
+        edit = edit_profile(Document({}), asked.link, asked.settings, command)
+        for note in edit.notes:
+            tell(f"note: {note}")
+        base = tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder())
+        sockets = Path(stack.enter_context(base))
+        folder = sockets if output is None else new_folder(output, "", flag=flag)
+        self.url = f"unix:{sockets}/api.sock"  # as of a run, though nothing listens there
+        stack.enter_context(announced(folder, self.url, LINK))
+        self.cause, self.seed, self.folder = edit.cause, asked.seed, folder / LINK_FOLDER
+        self._reason, self._tell, self._check = f"cloudrc {command}", tell, check
+        file = make_folder(self.folder, edit.values)
+        self._files = {
+            way: Profiles(file, partial(self._load, way), lambda _: None) for way in DIRECTIONS
+        }
+        self._loaded = {way: profiles.first() for way, profiles in self._files.items()}
+        self.states, self.ways = dict[str, LinkState](), dict[str, LinkWay]()
+        self.origins_ns, self.unread = dict[str, int](), dict[str, int]()
         self.engine: Engine | None = None
-        self.unread = dict[str, int]()
+        self.export: Callable[[LinkState], None] = lambda state: None
+        self._followers: Mapping[str, LinkWay | Medium] = {}
+        self._servers: list[ControlServer] = []
+        stack.callback(self.close)
 
-    def begin(self, gives: Mapping[str, Callable[[Any], bool]], changed: Changed) -> None:
-        """Begin the time line; `gives`: direction -> function that hands its packets on."""
-        self.live.serve(self._queue, self._follow, changed)
-        for name, give in gives.items():
-            profile, origin_ns = self.live.profiles[name], self.live.origins_ns[name]
-            up = name == "uplink"
-            link = LinkDirection(profile, self.seed, up, origin_ns, stream=self._stream)
-            self.ways[name] = LinkWay(link, give)
+    def profile(self, way: str) -> DirectionProfile:
+        """Return the present profile of a direction."""
+        return self._loaded[way].direction
 
-    def _queue(self, change: Callable[[], None]) -> None:
-        assert self.engine is not None
-        self.engine.changes.append(change)
+    def begin(self) -> int:
+        """Begin the time line; return its start, monotonic clock [ns]."""
+        now_ns = time.monotonic_ns()
+        self.origins_ns = dict.fromkeys(DIRECTIONS, now_ns)
+        return now_ns
 
-    def _follow(self, name: str, loaded: Loaded, now_ns: int) -> None:
-        """Use another profile from the next packet on."""
-        if way := self.ways.get(name):
-            way.link.replace_profile(loaded.direction, restart=loaded.change.restart)
-            way.first = way.received
+    def carry(self, gives: Mapping[str, Callable[[Any], bool]], stream: str = "") -> None:
+        """Begin the time line of `ways`; `gives`: direction -> function that hands its packets on.
 
-    def period(self, name: str) -> Period:
+        `stream` is the name of the link, as in `cloudrc.link.open`.
+        """
+        now_ns = self.begin()
+        for way, give in gives.items():
+            up = way == "uplink"
+            link = LinkDirection(self.profile(way), self.seed, up, now_ns, stream=stream)
+            self.ways[way] = LinkWay(link, give)
+
+    def serve(self, engine: Engine, media: Mapping[str, Medium] | None = None) -> None:
+        """Take changes from now on, for `media`, else for `ways`; `engine` carries the packets."""
+        self.engine, self._followers = engine, media or self.ways
+        for way in DIRECTIONS:
+            self._publish(way, time.monotonic_ns())
+            take, state = partial(self._take, way), partial(self.states.get, way)
+            self._servers.append(ControlServer(link_socket(self.url, way), take, state))
+
+    def close(self) -> None:
+        """Take no more changes, and remove the states."""
+        for server in self._servers:
+            server.shutdown()
+            server.server_close()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def status_page(self) -> str:
+        """Return the states of both directions as JSON. Any thread may call this method."""
+        return json.dumps({way: asdict(state) for way, state in self.states.items()}) + "\n"
+
+    def period(self, way: str) -> Period:
         """Return which packets of a direction followed its present profile."""
-        profile, origin_ns = self.live.profiles[name], self.live.origins_ns[name]
-        return Period(profile, self.seed, name == "uplink", self.ways[name].first, origin_ns)
+        first, origin_ns = self.ways[way].first, self.origins_ns[way]
+        return Period(self.profile(way), self.seed, way == "uplink", first, origin_ns)
 
     def counts(self) -> dict[str, int]:
         """Return the number of packets by outcome, and their lateness [ns]."""
@@ -124,59 +154,40 @@ class CarriedLink:
         errors.pop("released", None)
         return {**self.engine.counts(), "unread": sum(self.unread.values()), **errors}
 
+    def _load(self, way: str, path: Path) -> Loaded:
+        """Read one direction of a profile's file."""
+        profile = load_profile(path)
+        direction = link_profile(getattr(profile, way))
+        self._check(direction, way)
+        return Loaded(direction, profile.model_dump(mode="json", exclude_defaults=True))
 
-class ExecLink(CarriedLink):
-    """The link between two programs. A thread of its own carries the packets.
+    def _take(self, way: str, document: bytes) -> str:
+        """Take a change from `cloudrc link set`; return its number."""
+        loaded = self._files[way].take(document, self.folder)
 
-    Attributes:
-        failure: Why the engine has stopped; "" while it works.
-    """
+        def change() -> None:
+            now_ns = time.monotonic_ns()
+            if loaded.change.restart:
+                self.origins_ns[way] = now_ns
+            self._loaded[way] = loaded
+            if way in self._followers:
+                restart = loaded.change.restart
+                self._followers[way].replace_profile(loaded.direction, restart=restart)
+            self._publish(way, now_ns)
 
-    def __init__(self, live: LiveLink, seed: int) -> None:
-        """Prepare a link."""
-        super().__init__(live, seed)
-        self.failure = ""
-        self.unread = dict.fromkeys(DIRECTIONS, 0)
-        self._stopping = False
-        self._thread: threading.Thread | None = None
-        self._devices: list[int] = []
+        assert self.engine is not None
+        self.engine.changes.append(change)
+        return loaded.change.number
 
-    def start(self, devices: Mapping[str, int], changed: Changed) -> None:
-        """Carry packets between the `devices` of "client" and "server", which this link closes.
-
-        The time line of the profile begins.
-        """
-        self._devices = list(devices.values())
-        flows = FLOWS.items()
-        self.begin({name: partial(write_packet, devices[to]) for name, (_, to) in flows}, changed)
-        port = TunPort({devices[sender]: self.ways[name] for name, (sender, _) in flows})
-        engine = self.engine = Engine(port, list(self.ways.values()), IN_FLIGHT_MAX)
-        port.drain()
-        self._thread = threading.Thread(target=self._work, args=(engine,), daemon=True)
-        self._thread.start()
-
-    def wait_until_empty(self) -> None:
-        """Wait until the packets in flight have arrived, at most `DRAIN_LIMIT`."""
-        deadline = time.monotonic() + DRAIN_LIMIT
-        while self.engine and self.engine.queue.next_ns != NOTHING_NS:
-            if time.monotonic() > deadline:
-                return
-            time.sleep(0.005)
-
-    def close(self) -> None:
-        """Stop the engine; packets in flight are lost."""
-        self._stopping = True
-        self.live.close()
-        if self._thread:
-            self._thread.join()
-        for device in self._devices:
-            os.close(device)
-
-    def _work(self, engine: Engine) -> None:
-        settle()
-        ask_for_fifo()
-        try:
-            while not self._stopping:
-                engine.step(STEP)
-        except Exception as error:
-            self.failure = f"{type(error).__name__}: {error}"
+    def _publish(self, way: str, now_ns: int) -> None:
+        """Publish the new state of a direction; tell the user if the direction has changed."""
+        before, loaded = self.states.get(way), self._loaded[way]
+        facts = {"shaper": "relay", "reason": self._reason, "mode": "relay", "direction": way}
+        origin_ns = self.origins_ns[way]
+        state = state_after(before, loaded, now_ns, **facts, origin_ns=origin_ns)
+        self.states[way] = state
+        publish(to_text(state), self.folder / way / STATE_FILE)
+        self.export(state)
+        if before and way in self._followers:
+            if loaded.change.restart or before.profile.get(way) != state.profile.get(way):
+                self._tell(f"the {way} has changed: {state.cause}")

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,17 +22,23 @@ from cloudrc.errors import (
     MissingPrerequisiteError,
     TimedOutError,
 )
+from cloudrc.link.carry.engine import Engine
+from cloudrc.link.carry.punctual import ask_for_fifo, settle
+from cloudrc.link.carry.tun import IN_FLIGHT_MAX, TunPort, write_packet
 from cloudrc.link.exec.listening import is_loopback
 from cloudrc.link.exec.namespace import ADDRESSES
-from cloudrc.runs.links.carrier import FLOWS, CarrySettings, ExecLink, Tell, open_live
+from cloudrc.link.queue import NOTHING_NS
+from cloudrc.runs.links.carrier import STEP, CarrySettings, LiveLink, Tell
 
 if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
-    from cloudrc.link.state import LinkState
 
 LOOK_PERIOD = 0.05  # between two looks at the programs [s]
 COUNT_PERIOD = 1.0  # between two updates of the metrics [s]
 PATIENCE = 3.0  # until the command says that it waits [s]
+DRAIN_LIMIT = 1.0  # for the packets in flight at the end [s]
+FLOWS = {"uplink": ("client", "server"), "downlink": ("server", "client")}
+"""Direction -> the end that sends, and the end that receives."""
 OUTPUT_LIMIT = 2.0  # for the last lines of a program, which may have to be killed [s]
 
 
@@ -56,21 +63,19 @@ class ExecOutcome:
     interrupted: bool
 
 
-def run_programs(settings: ExecSettings, tell: Tell) -> tuple[ExecOutcome, ExecLink]:
+def run_programs(settings: ExecSettings, tell: Tell) -> tuple[ExecOutcome, LiveLink]:
     """Run both programs until the client ends; return how they ended, and the link.
 
     Raises:
         CloudrcError: If the link or a program cannot start.
     """
     with contextlib.ExitStack() as stack:
-        live = open_live(settings, "link exec", tell, stack, output=settings.output)
-        link = ExecLink(live, settings.seed)
-        stack.callback(link.close)
-        run = _Run(link, tell)
-        run.open_ends(stack)
+        link = LiveLink(settings, "link exec", tell, stack, output=settings.output)
+        run = _Run(link, tell, stack)
+        run.open_ends()
         commands = run.fill_in({"server": settings.server, "client": settings.client})
         if settings.metrics_port is not None:
-            run.serve_metrics(settings.metrics_port, stack)
+            run.serve_metrics(settings.metrics_port)
         for port in settings.expose:
             stack.callback(Forwarder(run.ends["server"], port).close)
             tell(f"127.0.0.1:{port} leads to the server's port {port}, beside the link")
@@ -78,19 +83,48 @@ def run_programs(settings: ExecSettings, tell: Tell) -> tuple[ExecOutcome, ExecL
     return outcome, link
 
 
+class _EngineThread(threading.Thread):
+    """Carries packets; `failure` says why it has stopped, "" while it works."""
+
+    def __init__(self, engine: Engine) -> None:
+        super().__init__(daemon=True)
+        self._engine, self._stopping, self.failure = engine, False, ""
+        self.start()
+
+    def run(self) -> None:
+        settle()
+        ask_for_fifo()
+        try:
+            while not self._stopping:
+                self._engine.step(STEP)
+        except Exception as error:
+            self.failure = f"{type(error).__name__}: {error}"
+
+    def drain(self) -> None:
+        """Wait until the packets in flight have arrived, at most `DRAIN_LIMIT`."""
+        deadline = time.monotonic() + DRAIN_LIMIT
+        while self._engine.queue.next_ns != NOTHING_NS and time.monotonic() < deadline:
+            time.sleep(0.005)
+
+    def close(self) -> None:
+        """Stop; packets in flight are lost."""
+        self._stopping = True
+        self.join()
+
+
 class _Run:
     """The two ends with their programs."""
 
-    def __init__(self, link: ExecLink, tell: Tell) -> None:
-        self._link, self._tell = link, tell
+    def __init__(self, link: LiveLink, tell: Tell, stack: contextlib.ExitStack) -> None:
+        self._link, self._tell, self._stack = link, tell, stack
         self.ends = dict[str, ProgramEnd]()
         self._exporter: Exporter | None = None
         self._printers = list[threading.Thread]()
         self._counted_at = 0.0
 
-    def open_ends(self, stack: contextlib.ExitStack) -> None:
+    def open_ends(self) -> None:
         """Make both namespaces, and print what their programs write."""
-        stack.callback(self._close_ends)
+        self._stack.callback(self._close_ends)
         for name in ADDRESSES:
             end = self.ends[name] = ProgramEnd(name, reads_stdin=name == "client")
             for source, target in zip(end.outputs, (sys.stdout, sys.stderr), strict=True):
@@ -126,14 +160,15 @@ class _Run:
             )
         return filled
 
-    def serve_metrics(self, port: int, stack: contextlib.ExitStack) -> None:
+    def serve_metrics(self, port: int) -> None:
         """Serve the link's metrics on a port of this machine."""
         from cloudrc.drivers.exporter import Exporter
 
         exporter = self._exporter = Exporter("link")
-        exporter.link.tell = self._link.live.status_page
+        exporter.link.tell = self._link.status_page
         exporter.serve(("127.0.0.1", port))
-        stack.callback(exporter.close)
+        self._link.export = partial(export_state, exporter)
+        self._stack.callback(exporter.close)
 
     def run(self, commands: Mapping[str, str], wait: float) -> ExecOutcome:
         """Start the server, then the client; return when one of them has ended the run."""
@@ -142,14 +177,24 @@ class _Run:
             server.run(commands["server"])
             if (code := self._wait_for_server(server, wait)) is not None:
                 return ExecOutcome(code, {"server": code, "client": None}, interrupted=False)
-            self._link.start(
-                {name: end.take_device() for name, end in self.ends.items()}, self._changed
-            )
+            carrier = self._start_link()
             self._tell(_describe(self._link, client))
             client.run(commands["client"])
-            return self._supervise()
+            return self._supervise(carrier)
         except KeyboardInterrupt:
             return ExecOutcome(InterruptedRunError.exit_code, {}, interrupted=True)
+
+    def _start_link(self) -> _EngineThread:
+        """Carry packets between the devices of both ends; the time line begins."""
+        link, devices = self._link, {name: end.device for name, end in self.ends.items()}
+        link.carry({way: partial(write_packet, devices[to]) for way, (_, to) in FLOWS.items()})
+        port = TunPort({devices[one]: link.ways[way] for way, (one, _) in FLOWS.items()})
+        engine = Engine(port, list(link.ways.values()), IN_FLIGHT_MAX)
+        port.drain()
+        link.serve(engine)
+        carrier = _EngineThread(engine)
+        self._stack.callback(carrier.close)
+        return carrier
 
     def _wait_for_server(self, server: ProgramEnd, limit: float) -> int | None:
         """Wait until other namespaces can reach the server; return its exit code if it ends."""
@@ -175,15 +220,15 @@ class _Run:
             )
         return None
 
-    def _supervise(self) -> ExecOutcome:
+    def _supervise(self, carrier: _EngineThread) -> ExecOutcome:
         while True:
             states = {name: end.state() for name, end in self.ends.items()}
             codes = {name: state.code for name, state in states.items()}
             self._count(states)
-            if self._link.failure:
-                raise InvalidRunError(f"the relay has failed: {self._link.failure}; report it")
+            if carrier.failure:
+                raise InvalidRunError(f"the relay has failed: {carrier.failure}; report it")
             if (code := codes["client"]) is not None:
-                self._link.wait_until_empty()
+                carrier.drain()
                 return ExecOutcome(code, codes, interrupted=False)
             if code := codes["server"]:
                 self._tell(f"the server ended with exit code {code}; the client is ended")
@@ -199,19 +244,14 @@ class _Run:
             self._counted_at = now
             export_counts(self._exporter, self._link.counts())
 
-    def _changed(self, state: LinkState, news: str) -> None:
-        if news:
-            self._tell(news)
-        export_state(self._exporter, state)
 
-
-def _describe(link: ExecLink, end: ProgramEnd) -> str:
+def _describe(link: LiveLink, end: ProgramEnd) -> str:
     way = f"by {end.way}"
     client, server = (
         addresses.ipv4 + (f" and {addresses.ipv6}" if end.has_ipv6 else "")
         for addresses in (ADDRESSES["client"], ADDRESSES["server"])
     )
-    return f"link: {link.live.cause}, seed {link.seed}, {way}; client {client}, server {server}"
+    return f"link: {link.cause}, seed {link.seed}, {way}; client {client}, server {server}"
 
 
 def _only_loopback(state: ProgramState) -> str:

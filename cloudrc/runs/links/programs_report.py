@@ -15,14 +15,14 @@ from cloudrc.link.verify.packets import judge_packets, recording
 from cloudrc.runs.links.verify import Report, make_report
 
 if TYPE_CHECKING:
-    from cloudrc.runs.links.carrier import CarriedLink
+    from cloudrc.runs.links.carrier import LiveLink
     from cloudrc.runs.links.programs import ExecOutcome, ExecSettings
 
 WAITED = 0.01
 """Share of packets that were read behind a full batch, above which the relay lacks CPU time."""
 
 
-def make_exec_report(settings: ExecSettings, outcome: ExecOutcome, link: CarriedLink) -> Report:
+def make_exec_report(settings: ExecSettings, outcome: ExecOutcome, link: LiveLink) -> Report:
     """Judge the link between two programs; return the content of link.json."""
     return {
         **make_link_report(link),
@@ -34,7 +34,7 @@ def make_exec_report(settings: ExecSettings, outcome: ExecOutcome, link: Carried
     }
 
 
-def make_link_report(link: CarriedLink) -> Report:
+def make_link_report(link: LiveLink) -> Report:
     """Judge the directions of a link."""
     judged = {name: judge_packets(way.log, link.period(name)) for name, way in link.ways.items()}
     late = link.counts().get("release_error_p99_ns", 0) * 1e-9
@@ -42,7 +42,7 @@ def make_link_report(link: CarriedLink) -> Report:
     for name, rows in judged.items():
         facts = _facts(link, name, late)
         findings[name] = Findings([row for _, row in rows], facts, _packets(link, name))
-    report = make_report(link.live.cause, findings)
+    report = make_report(link.cause, findings)
     for name, rows in judged.items():
         asked = {row.name: value for value, row in rows}
         for row in report["directions"][name]["rows"]:
@@ -50,7 +50,7 @@ def make_link_report(link: CarriedLink) -> Report:
             if (value := asked[row["name"]]) == value:
                 row["asked"] = value
     report["notes"] += _lateness(link)
-    states = {name: asdict(link.live.states[name]) for name in link.ways}
+    states = {name: asdict(link.states[name]) for name in link.ways}
     return {
         "schemaVersion": 1,
         **report,
@@ -60,7 +60,7 @@ def make_link_report(link: CarriedLink) -> Report:
     }
 
 
-def _lateness(link: CarriedLink) -> Iterator[str]:
+def _lateness(link: LiveLink) -> Iterator[str]:
     """Yield notes about how late packets left."""
     counts = link.counts()
     p50, p99 = (counts.get(f"release_error_{one}_ns", 0) * 1e-9 for one in ("p50", "p99"))
@@ -70,13 +70,13 @@ def _lateness(link: CarriedLink) -> Iterator[str]:
             yield f"{name}: the relay lacks CPU time: {starved}"
 
 
-def _packets(link: CarriedLink, name: str) -> str:
+def _packets(link: LiveLink, name: str) -> str:
     first = link.period(name).first
     since = ", since the last change" if first else ""
     return f"{link.ways[name].received - first} packets{since}"
 
 
-def _facts(link: CarriedLink, name: str, late: float) -> ShaperFacts:
+def _facts(link: LiveLink, name: str, late: float) -> ShaperFacts:
     way, unread = link.ways[name], link.unread.get(name, 0)
     signs = (
         (late > LATE, f"1 % of packets left later than {in_unit(late, 's')}"),
@@ -86,7 +86,7 @@ def _facts(link: CarriedLink, name: str, late: float) -> ShaperFacts:
     return ShaperFacts(shaper="relay", starved=", ".join(text for holds, text in signs if holds))
 
 
-def write_report(folder: Path, report: Report, link: CarriedLink) -> None:
+def write_report(folder: Path, report: Report, link: LiveLink) -> None:
     """Write link.json, and a recording of the packets of each direction."""
     path = folder / "link.json"
     with at_place(path):

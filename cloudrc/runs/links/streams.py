@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import socket
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from ipaddress import ip_address
@@ -18,11 +17,9 @@ from cloudrc.files import at_place
 from cloudrc.link.carry.punctual import settle
 from cloudrc.link.carry.tcp.medium import Medium
 from cloudrc.link.carry.tcp.relay import StreamRelay
-from cloudrc.link.follow import Loaded
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.state import LinkState
 from cloudrc.runs.interrupts import until_interrupted
-from cloudrc.runs.links.carrier import STEP, CarrySettings, open_live
+from cloudrc.runs.links.carrier import STEP, CarrySettings, LiveLink
 
 WAITING = 512  # connections that the kernel keeps until the relay accepts them
 
@@ -42,7 +39,7 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
         BadInputError: If the profile or an address cannot be used.
     """
     with contextlib.ExitStack() as stack:
-        live = open_live(settings, "relay tcp", tell, stack, check=refuse_unsupported)
+        link = LiveLink(settings, "relay tcp", tell, stack, check=refuse_unsupported)
         family, to = _find(settings.to)
         listening = stack.enter_context(_listen(settings.listen))
         where = show_address(listening.getsockname()[:2])
@@ -51,25 +48,16 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
                 f"--to {show_address(settings.to)}: this is the relay's own address, --listen"
                 f" {where}; name the server's host and port"
             )
-        now_ns = time.monotonic_ns()
+        now_ns = link.begin()
         up, down = (
-            Medium(live.profiles[way], settings.seed, way == "uplink", now_ns) for way in DIRECTIONS
+            Medium(link.profile(way), settings.seed, way == "uplink", now_ns) for way in DIRECTIONS
         )
         relay = StreamRelay(listening, to, family, (up, down))
         stack.callback(relay.close)
-
-        def follow(way: str, loaded: Loaded, at_ns: int) -> None:
-            origin_ns = at_ns if loaded.change.restart else None
-            (up if way == "uplink" else down).replace_profile(loaded.direction, origin_ns)
-
-        def changed(_: LinkState, news: str) -> None:
-            if news:
-                tell(news)
-
-        live.serve(relay.engine.changes.append, follow, changed)
+        link.serve(relay.engine, {"uplink": up, "downlink": down})
         settle()
         with until_interrupted():
-            tell(f"{where} leads to {show_address(settings.to)}; link: {live.cause}")
+            tell(f"{where} leads to {show_address(settings.to)}; link: {link.cause}")
             while True:
                 relay.engine.step(STEP)
         return _summary(relay)

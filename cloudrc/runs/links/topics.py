@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 from cloudrc.bridges.ros2 import require_ros
 from cloudrc.link.carry.engine import Engine
 from cloudrc.link.carry.punctual import ask_for_fifo, settle
-from cloudrc.link.state import LinkState
 from cloudrc.runs.interrupts import until_interrupted
-from cloudrc.runs.links.carrier import STEP, CarriedLink, CarrySettings, open_live
+from cloudrc.runs.links.carrier import STEP, CarrySettings, LiveLink
 from cloudrc.runs.links.programs_report import make_link_report, write_report
 from cloudrc.runs.links.verify import Report
 
@@ -47,26 +46,22 @@ def relay_topic(settings: TopicSettings, tell: Callable[[str], None]) -> Report:
 
     way = settings.direction
 
-    def changed(state: LinkState, news: str) -> None:
-        if news and state.direction == way:
-            tell(news)
-
     with contextlib.ExitStack() as stack:
         relay = TopicRelay(settings.source, settings.to)
         stack.callback(relay.close)
-        live = open_live(settings, "relay ros", tell, stack, output=settings.out, flag="--out")
+        link = LiveLink(settings, "relay ros", tell, stack, output=settings.out, flag="--out")
         relay.wait_for_publisher(tell)
-        link = CarriedLink(live, settings.seed, settings.stream)
-        link.begin({way: relay.publish}, changed)
-        link.engine, quality = relay.open(link.ways[way], reliable=settings.reliable)
+        link.carry({way: relay.publish}, settings.stream)
+        engine, quality = relay.open(link.ways[way], reliable=settings.reliable)
+        link.serve(engine)
         settle()
         ask_for_fifo()
         tell(
-            f"{relay.source} ({relay.kind}) leads to {relay.target}; link: {live.cause}, "
+            f"{relay.source} ({relay.kind}) leads to {relay.target}; link: {link.cause}, "
             f"{way}, seed {settings.seed}; QoS {quality}"
         )
         with until_interrupted():
-            _run(link.engine, relay, tell)
+            _run(engine, relay, tell)
         report = {
             **make_link_report(link),
             "from": relay.source,

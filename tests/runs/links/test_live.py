@@ -1,10 +1,11 @@
 """A link whose profile changes while it runs says which direction has changed."""
 
 import contextlib
+from types import SimpleNamespace
 
 import pytest
 
-from cloudrc.runs.links.carrier import CarrySettings, open_live
+from cloudrc.runs.links.carrier import CarrySettings, LiveLink
 from cloudrc.runs.links.change import set_here
 
 
@@ -21,14 +22,10 @@ from cloudrc.runs.links.change import set_here
 def test_a_change_is_told_for_the_directions_that_it_changes(profile, settings, changed):
     told = []
     with contextlib.ExitStack() as stack:
-        live = open_live(CarrySettings("lte", [], 1), "a test", told.append, stack)
-        live.serve(
-            lambda change: change(),
-            lambda way, loaded, now_ns: None,
-            lambda state, news: told.append(news),
-        )
+        live = LiveLink(CarrySettings("lte", [], 1), "a test", told.append, stack)
+        live.carry(dict.fromkeys(["uplink", "downlink"]))
+        at_once = SimpleNamespace(append=lambda change: change())
+        live.serve(SimpleNamespace(changes=at_once))
         edit, states = set_here(live.folder, live.url, profile, settings, "1")
     assert [state.changes for state in states] == [1, 1]
-    assert [news for news in told if news] == [
-        f"the {way} has changed: {edit.cause}" for way in changed
-    ]
+    assert told == [f"the {way} has changed: {edit.cause}" for way in changed]

@@ -26,7 +26,7 @@ def wait(monkeypatch):
         server = SimpleNamespace(
             state=lambda: ProgramState(None, True, listens_at(now[0] - 100.0), 0)
         )
-        run = programs._Run(None, said.append)
+        run = programs._Run(None, said.append, None)
         try:
             run._wait_for_server(server, limit)
         except TimedOutError:

@@ -24,18 +24,19 @@ class Medium:
 
     def __init__(self, profile: DirectionProfile, seed: int, uplink: bool, origin_ns: int) -> None:
         """Make the direction; its time line begins at `origin_ns` [ns]."""
-        self._seed, self._uplink, self._origin_ns = seed, uplink, origin_ns
+        self._origin_ns: int | None = origin_ns
         self._departures = deque[int]()
+        self._link = LinkDirection(profile, seed, uplink, origin_ns)
         self.replace_profile(profile)
 
-    def replace_profile(self, profile: DirectionProfile, origin_ns: int | None = None) -> None:
-        """Use another profile from now on; with `origin_ns` [ns], its time line begins there."""
-        if origin_ns is not None:
-            self._origin_ns = origin_ns
+    def replace_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
+        """Use another profile from now on; with `restart`, its time line begins now."""
+        if restart:
+            self._origin_ns = None
         self._queue_packets, self._timeline = profile.queue_packets, Timeline(profile)
         changes = tuple(replace(change, rate_kbit=None) for change in profile.changes)
         behind = replace(profile, rate_kbit=None, changes=changes)  # what follows the bottleneck
-        self._link = LinkDirection(behind, self._seed, self._uplink, self._origin_ns)
+        self._link.replace_profile(behind, restart=restart)
 
     def delay_ns(self, now_ns: int) -> int:
         """Return the delay of a packet without jitter [ns]."""
@@ -69,4 +70,6 @@ class Medium:
         return arrivals[0] if arrivals else None
 
     def _at(self, now_ns: int) -> Conditions:
+        if self._origin_ns is None:
+            self._origin_ns = now_ns
         return self._timeline.at(now_ns - self._origin_ns)
