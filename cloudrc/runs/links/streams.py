@@ -18,7 +18,7 @@ from cloudrc.link.carry.punctual import settle
 from cloudrc.link.carry.tcp.medium import Medium
 from cloudrc.link.carry.tcp.relay import StreamRelay
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.runs.interrupts import until_interrupted
+from cloudrc.runs.interrupts import is_interrupted, noted_interrupts
 from cloudrc.runs.links.carrier import STEP, CarrySettings, LiveLink
 
 WAITING = 512  # connections that the kernel keeps until the relay accepts them
@@ -33,7 +33,7 @@ class RelaySettings(CarrySettings):
 
 
 def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str, Any]:
-    """Relay connections until KeyboardInterrupt; return counts, and the times of turns [s].
+    """Relay connections until a signal interrupts; return counts, and the times of turns [s].
 
     Raises:
         BadInputError: If the profile or an address cannot be used.
@@ -56,9 +56,9 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
         stack.callback(relay.close)
         link.serve(relay.engine, {"uplink": up, "downlink": down})
         settle()
-        with until_interrupted():
+        with noted_interrupts():  # an exception at any line would leave a half-closed connection
             tell(f"{where} leads to {show_address(settings.to)}; link: {link.cause}")
-            while True:
+            while not is_interrupted():
                 relay.engine.step(STEP)
         return _summary(relay)
 
@@ -96,14 +96,7 @@ def _is_same(listen: tuple[Any, ...], to: tuple[str, int]) -> bool:
 
 def _summary(relay: StreamRelay) -> dict[str, Any]:
     turns = sorted(turn * 1e-9 for turn in relay.turns)
-    found: dict[str, Any] = {
-        "schemaVersion": 1,
-        "connections": relay.connected,
-        "refused": relay.refused,
-        "uplink_bytes": relay.up_bytes,
-        "downlink_bytes": relay.down_bytes,
-        "turns": {"count": len(turns)},
-    }
+    found: dict[str, Any] = {"schemaVersion": 1, **relay.counts, "turns": {"count": len(turns)}}
     if turns:
         cuts = quantiles(turns, n=100, method="inclusive") if len(turns) > 1 else turns * 99
         found["turns"] |= {"median": cuts[49], "p95": cuts[94], "max": turns[-1]}

@@ -72,7 +72,7 @@ class LinkStream:
         self._order = deque[Segment]()  # not delivered yet, in the order of the bytes
         self._count = self._transmissions = 0  # segments, and how often they were sent
         self._bytes = 0  # sent, and not taken by the receiver
-        self._start_ns, self._arrival_ns, self._is_waiting = NOTHING_NS, 0, False
+        self._start_ns, self._arrival_ns, self._wakes_ns = NOTHING_NS, 0, 0
 
     @property
     def room(self) -> int:
@@ -102,15 +102,11 @@ class LinkStream:
         while self._again or self._has_more():
             room_ns = self._way.room_ns(now_ns)
             if room_ns > now_ns:
-                if not self._is_waiting:
-                    self._is_waiting = True
-                    self._agenda.put(self._go_on, (room_ns,), ())
+                if self._wakes_ns <= now_ns:  # else it wakes already
+                    self._wakes_ns = room_ns
+                    self._agenda.put(self._pump, (room_ns,), ())
                 return
             self._send(self._again.popleft() if self._again else self._next_segment(), now_ns)
-
-    def _go_on(self, now_ns: int) -> None:
-        self._is_waiting = False
-        self._pump(now_ns)
 
     def _has_more(self) -> bool:
         """Return whether a new segment may be sent, or the end of the stream."""
