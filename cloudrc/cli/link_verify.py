@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from contextlib import closing
 from typing import TYPE_CHECKING
 
@@ -35,8 +34,6 @@ tunnel's own datagrams, within a minute. It reports what it cannot judge.
 
 exit codes: 0 believed, 1 not believed or undecided, 2 bad input,
 3 missing prerequisite, 4 no answer in time, 5 cluster, 6 a process died"""
-AWAITED = "waits for the verdicts of both pods"
-"""Step of a measurement on a cluster."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,13 +64,13 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.runs.links.verify import as_text  # imports large packages
 
     interrupt_on_signals()  # on a signal, remove namespaces and processes
-    with closing(Progress("starts")) as view:
-        report = _verify(options, view.tell)
+    with closing(Progress("measures the link")):
+        report = _verify(options)
     print_result(options.output, report, as_text(report, paint))
     return 0 if report["verdict"] == "believed" else 1
 
 
-def _verify(options: argparse.Namespace, tell: Callable[[str], None]) -> Report:
+def _verify(options: argparse.Namespace) -> Report:
     from cloudrc.runs.links.verify import (
         RELEASE_TIMEOUT,
         forwarded_pods,
@@ -87,17 +84,14 @@ def _verify(options: argparse.Namespace, tell: Callable[[str], None]) -> Report:
         hosts = options.ends.split(",")
         if len(hosts) != 2 or not all(hosts):
             raise BadInputError(f"--ends {options.ends}: give two hosts, WORLD,CLOUD")
-        tell(AWAITED)
         return verify_release(options.release or "cloudrc", pods_at(hosts), limit)
     if options.mode == "cluster":
         release = flown_release(options)
         with forwarded_pods(release) as pods:
-            tell(AWAITED)
             return verify_release(release.name, pods, limit)
     return verify(
         options.target,
         options.settings,
         shaper=options.shaper,
         seconds=options.seconds,
-        tell=tell,
     )
