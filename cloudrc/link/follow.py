@@ -8,6 +8,7 @@ arrives first and ignores the other.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from cloudrc.errors import BadInputError
 from cloudrc.files import version
 from cloudrc.link.profile import DIRECTIONS, summary
-from cloudrc.link.state import CHANGE_FILE, ChangeFacts, LinkState, parse, read_change
+from cloudrc.link.state import CHANGE_FILE, ChangeFacts, LinkState, read_change
 from cloudrc.outside.document import write_yaml
 
 if TYPE_CHECKING:
@@ -82,9 +83,9 @@ def read_handed(text: bytes | str) -> dict[str, str]:
     Raises:
         ValueError: If the text is invalid, or if a file name could lead to another folder.
     """
-    files = parse(dict[str, str], text)
-    if PROFILE not in files or not all(map(_NAME.fullmatch, files)):
-        raise ValueError(f"not a profile's files: {', '.join(sorted(files))}")
+    files = json.loads(text)
+    if not isinstance(files, dict) or PROFILE not in files or not all(map(_NAME.fullmatch, files)):
+        raise ValueError("not the files of a profile")
     return files
 
 
@@ -129,7 +130,7 @@ class Profiles:
         files = read_handed(document)
         with TemporaryDirectory(prefix="handed-", dir=folder) as made:
             for name, text in files.items():
-                (Path(made) / name).write_text(text, encoding="utf-8")
+                (Path(made) / name).write_text(str(text), encoding="utf-8")
             loaded = self._read_profile(Path(made) / PROFILE)
         if not loaded.change.number:
             raise ValueError("the change has no number")

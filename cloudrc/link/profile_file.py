@@ -6,7 +6,7 @@ The classes in `link/profile.py` say which keys there are, and which values each
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
@@ -18,6 +18,7 @@ from cloudrc.link.profile import DIRECTIONS, DirectionKeys, DirectionProfile, Pr
 from cloudrc.outside.document import Document, KeyPath, Source, read_document
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import InvalidValueError, to_plain
+from cloudrc.text import unknown_name_text
 
 FOLDER = Path(__file__).with_name("profiles")
 FILE_KEYS = ("trace", "table")
@@ -67,8 +68,6 @@ def _document(profile: str | Path | Mapping[str, Any]) -> Document:
         return read_document(file, file.name)
     path = Path(os.path.expanduser(name))
     if not path.is_file():
-        from cloudrc.text import unknown_name_text
-
         names = sorted(shipped.stem for shipped in FOLDER.glob("*.yaml"))
         raise BadInputError(f"{unknown_name_text('profile', name, names)}; no such file: {path}")
     return read_document(path, name)
@@ -83,7 +82,9 @@ def _section(kind: Any, values: Mapping[str, Any], path: KeyPath) -> Any:
     hints, made = get_type_hints(kind, include_extras=True), {}
     for key, value in values.items():
         if key not in hints:
-            raise _WrongValueError((*path, key), f"unknown key; {_nearest(key, hints)}")
+            # `delay` is nearest to `delay_ms`: a forgotten unit is more likely than a typo.
+            near = [name for name in hints if name.startswith(f"{key}_")] or [*hints]
+            raise _WrongValueError((*path, key), unknown_name_text("key", key, near))
         made[key] = _value(hints[key], value, (*path, key))
     for field in fields(kind):
         if field.default is MISSING and field.name not in values:
@@ -129,12 +130,3 @@ def _words(kind: Any) -> str:
     if get_origin(kind) is tuple:
         return "a list"
     return "null" if kind is NoneType else _WORDS.get(kind, "a mapping of keys")
-
-
-def _nearest(key: str, known: Iterable[str]) -> str:
-    import difflib
-
-    # `delay` is nearest to `delay_ms`: a forgotten unit is more likely than a typo.
-    without_unit = [name for name in known if name.startswith(f"{key}_")]
-    near = without_unit or difflib.get_close_matches(key, list(known), n=1)
-    return f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"

@@ -9,14 +9,10 @@ from __future__ import annotations
 import json
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
 from cloudrc.files import write_atomically
-
-if TYPE_CHECKING:
-    from pydantic import TypeAdapter
 
 STATE_FILE = "link.json"  # name of the state file, in the folder of the route file
 STATE_MAX = 1 << 16
@@ -75,30 +71,12 @@ def publish(text: str, file: Path) -> None:
         write_atomically(file, text.encode())
 
 
-T = TypeVar("T")
-
-
-@cache
-def _adapter(kind: type) -> TypeAdapter[Any]:  # takes 1 ms, and the control loop parses, too
-    from pydantic import TypeAdapter  # slow to import
-
-    return TypeAdapter(kind)
-
-
-def parse(kind: type[T], text: bytes | str) -> T:
-    """Parse JSON as a dataclass; raise a ValueError with one line if the text is invalid."""
-    from pydantic import ValidationError
-
-    try:
-        found: T = _adapter(kind).validate_json(text)  # type: ignore[arg-type]
-        return found
-    except ValidationError as error:
-        raise ValueError(f"not a {kind.__name__}: {error.errors()[0]['msg']}") from None
-
-
 def from_text(text: bytes | str) -> LinkState:
     """Parse the JSON text of a link's state; raise a ValueError if the text is invalid."""
-    return parse(LinkState, text)
+    try:
+        return LinkState(**json.loads(text))
+    except TypeError as error:
+        raise ValueError(f"not a LinkState: {error}") from None
 
 
 def write_change(change: ChangeFacts) -> str:

@@ -144,7 +144,7 @@ def test_a_mapping_is_read_as_a_file_and_has_the_plain_classes(tmp_path):
     ("profile", "words"),
     [
         ("let", "no profile named 'let'.*did you mean lte"),
-        ({"uplink": {"delay": 40}}, "uplink.delay: unknown key; did you mean delay_ms"),
+        ({"uplink": {"delay": 40}}, "uplink.delay: no key named 'delay'; .*did you mean delay_ms"),
         ({"uplink": {"distribution": "table"}}, "uplink: distribution: table needs the key table"),
         (70, "not int"),
     ],

@@ -146,9 +146,11 @@ class Measurement:
         """
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
         sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
-        seeds = range(-RUNS, 0)  # the seed of an experiment is not negative
-        made = replace(self, profile=netem_makes(self.profile))
-        return [replace(made, flow=self.flow._replace(seed=seed)).draw(sent) for seed in seeds]
+        return replace(self, profile=netem_makes(self.profile))._simulated(RUNS, sent)
+
+    def _simulated(self, count: int, sent: Floats) -> list[Stream]:
+        seeds = range(-count, 0)  # the seed of an experiment is not negative
+        return [replace(self, flow=self.flow._replace(seed=seed)).draw(sent) for seed in seeds]
 
     @cached_property
     def chance(self) -> Expected:
@@ -187,11 +189,8 @@ class Measurement:
 
     def asked(self) -> dict[str, float]:
         """Return the mean quantities of links with other random numbers, by name."""
-        seeds = range(-ASKED_RUNS, 0)  # the seed of an experiment is not negative
-        links = [
-            replace(self, flow=self.flow._replace(seed=seed)).draw(self.sent) for seed in seeds
-        ]
-        return {name: band[0] for name, band in self._expect(links).bands.items()}
+        expected = self._expect(self._simulated(ASKED_RUNS, self.sent))
+        return {name: mean for name, (mean, _, _) in expected.bands.items()}
 
     def _judge(self, measured: Stream, expected: Expected) -> list[Judgement]:
         found = self.quantities(measured, expected.pooled)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import re
 import sys
 import threading
 import time
@@ -140,24 +139,17 @@ class _Run:
 
     def fill_in(self, commands: Mapping[str, str]) -> dict[str, str]:
         """Replace {server}, {client}, {server6} and {client6} in commands by addresses."""
-        filled = dict(commands)
-        has_ipv6 = all(end.has_ipv6 for end in self.ends.values())
+        filled = {}
         for name, command in commands.items():
-            for other, addresses in ADDRESSES.items():
-                if f"{{{other}6}}" in command and not has_ipv6:
+            for end, addresses in ADDRESSES.items():
+                if f"{{{end}6}}" in command and not self.ends[end].has_ipv6:
                     raise MissingPrerequisiteError(
-                        f"--{name}: {{{other}6}} needs IPv6, which is off on this machine;"
-                        f" use {{{other}}}"
+                        f"--{name}: {{{end}6}} needs IPv6, which is off on this machine; use"
+                        f" {{{end}}}"
                     )
-                command = command.replace(f"{{{other}6}}", addresses.ipv6)
-                command = command.replace(f"{{{other}}}", addresses.ipv4)
+                command = command.replace(f"{{{end}6}}", addresses.ipv6)
+                command = command.replace(f"{{{end}}}", addresses.ipv4)
             filled[name] = command
-        local = re.search(r"localhost|127\.0\.0\.1|\[?::1\b", commands["client"])
-        if local and "{server" not in commands["client"]:
-            self._tell(
-                f"note: --client names {local[0]}, where the server is not; write {{server}} for"
-                " its address"
-            )
         return filled
 
     def serve_metrics(self, port: int) -> None:
