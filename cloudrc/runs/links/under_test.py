@@ -51,10 +51,10 @@ class Way:
     """One direction of a link under test, with the socket of its probes and its shaper process."""
 
     own: socket.socket  # sends the probes of this direction, receives those of the other
-    ports: tuple[int, int]  # port at which a relay receives, and metrics port
+    ports: list[int]  # port at which a relay receives, and metrics port
     namespace: str  # network namespace; "" for the namespace of this process
-    peer: tuple[str, int] = ("", 0)  # address of the other direction's socket
-    folder: Path = Path()
+    peer: tuple[str, int]  # address of the other direction's socket
+    folder: Path
     process: subprocess.Popen[bytes] | None = None
 
 
@@ -84,14 +84,13 @@ def run_link(experiment: ResolvedExperiment, shaper: str) -> Iterator[dict[str, 
         names, hosts = dict.fromkeys(WAYS, ""), dict.fromkeys(WAYS, LOOPBACK)
         if shaper == "netem":
             names, hosts = stack.enter_context(_namespaces()), HOSTS
-        ways = {}
+        own, ways = dict[str, socket.socket](), dict[str, Way]()
         for name in WAYS:
             with inside(names[name]):
-                own = stack.enter_context(bind((hosts[name], 0)))
-                listen, pages = free_ports(2)
-            ways[name] = Way(own, (listen, pages), names[name], folder=folder / name)
-        for (name, way), other in zip(ways.items(), reversed(ways.values()), strict=True):
-            way.peer = other.own.getsockname()
+                own[name] = stack.enter_context(bind((hosts[name], 0)))
+        for name, far in zip(WAYS, reversed(own.values()), strict=True):
+            ports, peer = free_ports(2), far.getsockname()
+            way = ways[name] = Way(own[name], ports, names[name], peer, folder / name)
             way.process = _start(name, way, shaper)
             stack.callback(end_process, way.process)
         deadline = time.monotonic() + START_LIMIT
@@ -133,17 +132,16 @@ def _namespaces() -> Iterator[dict[str, str]]:
         )
     names = {way: f"cloudrc-{way}-{os.getpid()}" for way in HOSTS}
     near, far = names.values()
+    commands = [f"-n {near} link add {DEVICE} type veth peer {DEVICE} netns {far}"]
+    for way, name in names.items():
+        commands.append(f"-n {name} addr add {HOSTS[way]}/24 dev {DEVICE}")
+        commands += [f"-n {name} link set {device} up" for device in ("lo", DEVICE)]
     with contextlib.ExitStack() as stack:
         for name in names.values():
             run_tool(("ip", "netns", "add", name))
             stack.callback(run_tool, ("ip", "netns", "del", name))
-        run_tool(
-            ("ip", "-n", near, "link", "add", DEVICE, "type", "veth", "peer", DEVICE, "netns", far)
-        )
-        for way, name in names.items():
-            run_tool(("ip", "-n", name, "addr", "add", f"{HOSTS[way]}/24", "dev", DEVICE))
-            for device in ("lo", DEVICE):
-                run_tool(("ip", "-n", name, "link", "set", device, "up"))
+        for command in commands:
+            run_tool(("ip", *command.split()))
         yield names
 
 
