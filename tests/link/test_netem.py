@@ -177,20 +177,6 @@ def test_tables_are_the_models_distributions(distribution, tmp_path):
     assert np.quantile(found, shares) == pytest.approx(np.quantile(drawn, shares), abs=0.06)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("", "no program tc (package iproute2)"),
-        ("RTNETLINK answers: Operation not permitted\n", "NET_ADMIN and uid 0"),
-    ],
-)
-def test_an_error_of_tc_becomes_one_sentence(text, words):
-    said = str(explain(("tc", "qdisc", "add", "netem"), text, missing=not text))
-    assert words in said
-    assert "link.mode=relay" in said
-    assert "\n" not in said
-
-
 def test_only_tunnel_datagrams_go_to_netem_and_close_removes_all():
     kernel, shaper = shaped(PLAIN, until=0.1)
     assert {"forwarded": 90, "lost": 10, "restored": 0}.items() <= shaper.counts().items()

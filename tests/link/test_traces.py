@@ -4,7 +4,7 @@ import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.link import traces
-from cloudrc.link.profile import Conditions, DirectionProfile, Timeline, Trace
+from cloudrc.link.profile import Trace
 from cloudrc.link.traces import parse_trace, read_table, read_trace, write_trace
 
 HEAD = "time_s,delay_ms"
@@ -70,14 +70,3 @@ def test_an_unchanged_file_is_read_once_and_a_changed_one_anew(tmp_path, monkeyp
     assert len(reads) == 1
     path.write_text(f"{HEAD}\n0,45\n1,50\n")
     assert read_trace(path).times == (0.0, 1.0)
-
-
-def test_each_row_of_a_trace_is_a_piece_of_the_time_line():
-    trace = Trace((0.5, 1.0, 2.0), (0.01, 0.02, 0.03), (0.0, 0.5, 1.0))
-    line = Timeline(DirectionProfile(rows=trace, jitter_ms=2.0, rate_kbit=8.0))
-    assert line.pass_ns == [0, 500_000_000, 1_000_000_000, 2_000_000_000]
-    delays, losses = (10_000_000, 10_000_000, 20_000_000, 30_000_000), (0.0, 0.0, 0.5, 1.0)
-    assert line.pieces == [
-        Conditions(delay, 0.002, loss, 8000.0, False)
-        for delay, loss in zip(delays, losses, strict=True)
-    ]

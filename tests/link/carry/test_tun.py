@@ -1,6 +1,5 @@
 """The relay between two programs, over sockets in place of TUN devices, and its verdict."""
 
-import os
 import socket
 from functools import partial
 from types import SimpleNamespace
@@ -13,7 +12,7 @@ from cloudrc.link.carry import tun
 from cloudrc.link.carry.engine import Engine, LinkWay
 from cloudrc.link.carry.log import LOST, PacketLog
 from cloudrc.link.carry.tun import TunPort, write_packet
-from cloudrc.link.exec import listening, namespace
+from cloudrc.link.exec import namespace
 from cloudrc.link.library import KIND
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.verify.packets import Period, judge_packets, recording
@@ -97,25 +96,6 @@ def test_the_relay_asks_the_model_for_packets_by_their_numbers_and_sizes(joined,
     assert relay.counts()["lost"] == list(log.due).count(LOST) > 0
 
 
-def test_more_packets_in_flight_than_memory_are_dropped_and_counted(joined, clock):
-    relay, client, _ = joined(profile_of(1.0))
-    for _ in range(10):
-        client.send(PACKET)
-    relay.step(0.0)
-    counts = {"received": 10, "forwarded": 0, "lost": 0, "overflow": 7, "unsent": 0}
-    assert relay.counts() == counts
-
-
-def test_only_the_first_packets_of_a_long_run_are_recorded(joined, clock):
-    relay, client, server = joined(profile_of(0.0))
-    relay.up.log = PacketLog(2)
-    for _ in range(3):
-        client.send(PACKET)
-    relay.step(0.0)
-    assert [server.recv(2000) for _ in range(3)] == [PACKET] * 3
-    assert len(relay.up.log) == 2
-
-
 def log_of(profile, late_ns=0, count=2000):
     """Make the log of a relay that adds `late_ns` to each packet [ns]."""
     log, model = PacketLog(), LinkDirection(profile, 7, True)
@@ -180,33 +160,6 @@ def test_a_recording_is_a_log_that_link_record_reads(tmp_path, call):
     lost = list(log.due).count(LOST) / 500
     said = call(f"link record {path} -o {tmp_path / 'trace.csv'}").out
     assert f"{lost:.3g} lost" in said
-
-
-TCP = """\
-  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid  timeout inode
-   0: 0100007F:1F90 00000000:0000 0A 00000000:00000000 00:00000000 00000000     0        0 1
-   1: 0100007F:1F91 0100007F:1F90 01 00000000:00000000 00:00000000 00000000     0        0 2
-"""
-TCP6 = TCP.replace("0100007F:1F90 00000000", "00000000000000000000000000000000:1F40 00000000")
-
-
-@pytest.mark.skipif(os.sys.byteorder != "little", reason="the table is of a little-endian machine")
-def test_listening_sockets_are_read_from_the_kernels_tables(monkeypatch):
-    texts = {"tcp": TCP, "tcp6": TCP6}
-
-    def read_text(path, encoding):
-        if path.name not in texts:
-            raise FileNotFoundError(path)  # IPv6 is off
-        return texts[path.name]
-
-    monkeypatch.setattr(listening.Path, "read_text", read_text)
-    assert listening.listening_at() == [("127.0.0.1", 8080), ("::", 8000)]
-    assert [listening.is_loopback(host) for host in ("127.0.0.1", "::1", "::", "0.0.0.0")] == [
-        True,
-        True,
-        False,
-        False,
-    ]
 
 
 def test_a_machine_that_refuses_namespaces_names_the_relay_without_privileges(monkeypatch):

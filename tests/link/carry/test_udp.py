@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.exposition.table import LINK_OUTCOMES, RELEASE_PERCENTILES
 from cloudrc.link.carry import udp as module
 from cloudrc.link.carry.log import QUANTILES, ReleaseErrors
@@ -199,14 +198,6 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
     words += [f"--listen=127.0.0.1:{listen[1]}", f"--route={folder / 'route'}", "--mode"]
     bare = ["setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin"]
     command = [*(bare if os.geteuid() == 0 else []), sys.executable, "-m", "cloudrc", *words]
-    refused = subprocess.run([*command, "netem"], cwd=ROOT, capture_output=True, text=True)
-    assert refused.returncode == MissingPrerequisiteError.exit_code
-    assert "give it NET_ADMIN and uid 0, or use the relay" in refused.stderr
-    with bind_loopback(listen[1]):
-        taken = subprocess.run([*command, "relay"], cwd=ROOT, capture_output=True, text=True)
-    assert taken.returncode == BadInputError.exit_code
-    said = f"error: --listen 127.0.0.1:{listen[1]}: Address already in use; "
-    assert said in taken.stderr
     with subprocess.Popen([*command, "auto"], cwd=ROOT) as process:
         killer = Timer(PATIENCE, process.kill)  # where this test fails, the process ends, too
         killer.start()
@@ -237,9 +228,3 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
         assert process.returncode == 0
         killer.cancel()
     assert [path.name for path in folder.iterdir()] == ["link.json"]
-
-
-def test_an_end_that_cannot_be_reached_is_named():
-    direction = LinkDirection(PLAIN, 1, True)
-    with pytest.raises(OSError, match=r"does not reach --end 198\.51\.100\.7"):
-        Relay(("127.0.0.1", 0), direction, peek, ("198.51.100.7", 7400))

@@ -139,10 +139,6 @@ def test_the_exit_code_is_the_clients_or_the_servers_if_it_fails_first(
     run(server=server, client=client, code=code)
 
 
-def test_a_server_that_listens_late_is_waited_for(folder):
-    run(server=f"sleep 2; {HTTP}", client="curl -sf http://{server}:8000/blob -o copy")
-
-
 def test_a_server_that_no_client_can_reach_ends_the_command(folder):
     _, error = run("--wait", "2", server=HTTP.replace("8000", "8000 --bind 127.0.0.1"), code=4)
     assert "only at 127.0.0.1:8000, let it listen at 0.0.0.0" in error.splitlines()[-1]

@@ -13,7 +13,7 @@ from cloudrc.link.verify.judge import Flow, netem_makes
 from cloudrc.link.verify.probe import PROBE, plan_probes
 from cloudrc.records import Arrival, Fault, LinkChecked
 from cloudrc.tunnel.codec import SIZES, Kind
-from tests.link.profiles import changed, in_bursts, profile_of
+from tests.link.profiles import in_bursts, profile_of
 
 
 def asked(name, way):
@@ -93,28 +93,21 @@ def is_believed(moment):
 
 def random_profile(rng):
     """Draw a profile that a user might write."""
-    delay = float(rng.uniform(5e-3, 0.15))
-    profile = profile_of(
+
+    def one_of(*values):
+        return values[rng.integers(len(values))]
+
+    delay, is_queue = float(rng.uniform(5e-3, 0.15)), rng.random() < 0.3
+    bursts = in_bursts(float(rng.uniform(1e-3, 0.01)), float(rng.uniform(0.2, 0.6)))
+    return profile_of(
         delay,
-        min(0.03, float(rng.uniform(0.0, 0.4)) * delay),
-        str(rng.choice(["uniform", "normal", "pareto"])),
+        min(0.01 if is_queue else 0.03, float(rng.uniform(0.0, 0.4)) * delay),
+        one_of("uniform", "normal", "pareto"),
+        one_of(0.0, 0.0, 0.4),
+        one_of(0.0, float(rng.uniform(0.0, 0.1)), bursts),
+        duplicate=one_of(0.0, 0.0, 0.0, 0.05),
+        reorder=0.0 if is_queue else one_of(0.0, 0.0, 0.2),
+        corrupt=one_of(0.0, 0.0, 0.0, 0.1),
+        keep_order=is_queue,
+        rate=one_of(None, float(rng.uniform(1e6, 2e7))) if is_queue else None,
     )
-    if rng.random() < 0.3:
-        profile = changed(profile, correlation=float(rng.uniform(0.1, 0.6)))
-    if rng.random() < 0.3:
-        profile = changed(profile, keep_order=True, jitter_ms=min(10.0, profile.jitter_ms))
-    elif rng.random() < 0.3:
-        profile = changed(profile, reorder=float(rng.uniform(0.01, 0.3)))
-    if rng.random() < 0.2:
-        profile = changed(profile, duplicate=float(rng.uniform(0.01, 0.1)))
-    if rng.random() < 0.2:
-        profile = changed(profile, corrupt=float(rng.uniform(0.001, 0.2)))
-    if rng.random() < 0.2:
-        rate = float(rng.uniform(1e6, 2e7))
-        return changed(profile, rate=rate, keep_order=True, jitter_ms=min(10.0, profile.jitter_ms))
-    if rng.random() < 0.3:
-        bursts = in_bursts(float(rng.uniform(1e-3, 0.01)), float(rng.uniform(0.2, 0.6)))
-        return changed(profile, loss=bursts)
-    if rng.random() < 0.6:
-        return changed(profile, loss=float(rng.uniform(0.0, 0.1)))
-    return profile

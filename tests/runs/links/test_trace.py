@@ -80,16 +80,3 @@ def test_a_repeated_datagram_that_arrives_much_later_hides_no_loss():
     first = next(each for each in log.cloud if isinstance(each, Arrival) and each.uplink)
     log.cloud.append(first._replace(stamp_ns=DONE, used=False))
     assert loss(ended(log, DONE + TRANSIT)) == pytest.approx(0.1, rel=0.05)
-
-
-def test_a_direction_without_arrivals_lost_everything():
-    assert loss(losing(lambda counter, sent: True)) == 1.0
-
-
-def test_an_offset_between_the_clocks_changes_no_loss():
-    """Cloud's stamps are 30 ms early, as after an uncertain estimate of the offset."""
-    log = losing(lambda counter, sent: 9.0 <= sent < 9.5)
-    for index, each in enumerate(log.cloud):
-        log.cloud[index] = each._replace(stamp_ns=each.stamp_ns - 3 * SECOND // 100)
-    assert loss(log) == pytest.approx(0.05, rel=0.05)
-    assert loss(log, "downlink") == 0
