@@ -3,7 +3,8 @@
     LC_ALL=C ping -D -O HOST
     irtt client -i 10ms -l 204 -d 1m -o irtt.json HOST
 
-Every reader collects the packets of its log, and `Log.packets` checks them. `Packets.notes` counts
+Every reader collects the packets of its log, and `packets_of` checks them. An InvalidValueError
+says why a log cannot be used. `Packets.notes` counts
 the packets that are left out or sorted. docs/traces.md describes the formats.
 
 Source: ping(8) of iputils; irtt-client(1), JSON format 1.
@@ -14,18 +15,17 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from math import isnan, nan
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from cloudrc.errors import BadInputError
 from cloudrc.link.profile import Trace
 from cloudrc.link.streams import Stream
 from cloudrc.link.traces import read_rows
-from cloudrc.outside.values import Quantity
+from cloudrc.outside.values import InvalidValueError, Quantity
 
 Direction: TypeAlias = Literal["uplink", "downlink"]
 Entry: TypeAlias = tuple[float, float, bool]
@@ -47,49 +47,42 @@ class Packets(Stream):
     halved: bool = False  # whether the delays are halves of round trips
 
 
-@dataclass(slots=True)
-class Log:
-    """The packets that a reader finds in a log, and the number of those that it left out."""
+def packets_of(
+    entries: Sequence[Entry], counts: Counter[str] | None = None, *, halved: bool = False
+) -> Packets:
+    """Check the packets of a log, sort them by time of sending, and note each correction.
 
-    name: str
-    entries: list[Entry] = field(default_factory=list)  # in the order of the log
-    counts: Counter[str] = field(default_factory=Counter)  # what was done -> number of packets
+    `counts` tells what was done already, and with how many packets; `halved`, whether the delays
+    are halves of round trips. Raise an InvalidValueError if no packet has a delay; if a delay is
+    negative; or if the times go far back.
+    """
+    sent, delays, arrived = np.array(entries or [(nan, nan, False)]).T
+    if np.isnan(delays).all():
+        raise InvalidValueError("no packet has a delay; give a log with at least one reply")
+    refuse_early(float(np.nanmin(delays)))
+    back = np.maximum.accumulate(sent) - sent
+    if back.max() >= BACK_MAX:  # sorting would mix two sessions
+        raise InvalidValueError(
+            f"at packet {back.argmax() + 1} the times go back by {back.max():.4g} s: several "
+            "sessions in one log, or a step of the clock; give the rows of one session, "
+            "sorted by time"
+        )
+    times, first = np.unique(sent, return_index=True)  # of equal times, the first is kept
+    done = dict(counts or {})
+    done["out of order, sorted"] = int(np.sum(back > 0.0))
+    done["left out, at the time of another one"] = len(sent) - len(times)
+    notes = tuple(f"{count} {what}" for what, count in done.items() if count)
+    return Packets(times, delays[first], arrived[first].astype(int), notes, halved)
 
-    def packets(self, *, halved: bool = False) -> Packets:
-        """Check the packets, sort them by time of sending, and add a note on each correction.
 
-        `halved` tells whether the delays are halves of round trips. Raise a BadInputError if no
-        packet has a delay; if a delay is negative; or if the times go far back.
-        """
-        sent, delays, arrived = np.array(self.entries or [(nan, nan, False)]).T
-        if np.isnan(delays).all():
-            raise self.error("no packet has a delay; give a log with at least one reply")
-        self.refuse_early(float(np.nanmin(delays)))
-        back = np.maximum.accumulate(sent) - sent
-        if back.max() >= BACK_MAX:  # sorting would mix two sessions
-            raise self.error(
-                f"at packet {back.argmax() + 1} the times go back by {back.max():.4g} s: several "
-                "sessions in one log, or a step of the clock; give the rows of one session, "
-                "sorted by time"
-            )
-        times, first = np.unique(sent, return_index=True)  # of equal times, the first is kept
-        self.counts["out of order, sorted"] += int(np.sum(back > 0.0))
-        self.counts["left out, at the time of another one"] += len(sent) - len(times)
-        notes = tuple(f"{count} {what}" for what, count in self.counts.items() if count)
-        return Packets(times, delays[first], arrived[first].astype(int), notes, halved)
-
-    def error(self, text: str) -> BadInputError:
-        """Make an error that begins with the name of the log."""
-        return BadInputError(f"{self.name}: {text}")
-
-    def refuse_early(self, least: float) -> None:
-        """Raise a BadInputError if the shortest delay in the log, `least` [s], is negative."""
-        if least < 0.0:
-            raise self.error(
-                f"a packet arrived {-least * 1e3:.4g} ms before it was sent: the two clocks differ;"
-                " synchronise them, or use round trips and take half of each (--halve-rtt);"
-                " leave the delay of a lost packet empty"
-            )
+def refuse_early(least: float) -> None:
+    """Raise an InvalidValueError if the shortest delay in a log, `least` [s], is negative."""
+    if least < 0.0:
+        raise InvalidValueError(
+            f"a packet arrived {-least * 1e3:.4g} ms before it was sent: the two clocks differ;"
+            " synchronise them, or use round trips and take half of each (--halve-rtt);"
+            " leave the delay of a lost packet empty"
+        )
 
 
 def trace_of(packets: Packets) -> Trace:
@@ -111,7 +104,7 @@ _MISSHAPEN = ArithmeticError, AttributeError, LookupError, RecursionError, TypeE
 """Errors that reading JSON with an unexpected layout can raise."""
 
 
-def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool) -> Packets:
+def read_irtt(text: str, direction: Direction | None, *, halve: bool) -> Packets:
     """Read the output of `irtt client -o FILE.json`.
 
     The packets that irtt's client sends count as the uplink. A packet that was lost on the way back
@@ -120,27 +113,30 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
     are on the client's monotonic clock, so steps of the client's wall clock have no effect.
 
     `halve`: use half of each round trip as one-way delay, and ignore `direction`. Without `halve`,
-    `direction` selects the one-way delays to read. `name` is the file name for messages.
+    `direction` selects the one-way delays to read.
 
     Raises:
-        BadInputError: If the file is no output of irtt, or if it has no usable one-way delays and
-            `halve` is false.
+        InvalidValueError: If the file is no output of irtt, or if it has no usable one-way delays
+            and `halve` is false.
     """
-    log = Log(name)
     if not (direction or halve):
-        raise log.error("irtt measures both directions; choose --direction, or --halve-rtt")
+        raise InvalidValueError("irtt measures both ways; choose --direction, or --halve-rtt")
     try:
-        _read_trips(json.loads(text)["round_trips"], None if halve else direction, log)
+        entries = _read_trips(json.loads(text)["round_trips"], None if halve else direction)
+    except InvalidValueError:
+        raise
     except _MISSHAPEN as error:
-        raise log.error(
+        raise InvalidValueError(
             f"not a log of irtt ({type(error).__name__}: {error}); give the file that 'irtt client "
             "-o FILE.json' writes, with the server's stamps or with --halve-rtt"
         ) from None
-    return log.packets(halved=halve)
+    unknown = sum(arrived and isnan(delay) for _, delay, arrived in entries)
+    counts = Counter({"lost on the way back, delay unknown": unknown})
+    return packets_of(entries, counts, halved=halve)
 
 
-def _read_trips(trips: list[dict[str, Any]], direction: Direction | None, log: Log) -> None:
-    """Read each packet into `log`; without a `direction`, half of each round trip.
+def _read_trips(trips: list[dict[str, Any]], direction: Direction | None) -> list[Entry]:
+    """Read each packet; without a `direction`, half of each round trip.
 
     The first time is 0.
     On the downlink, packets lost on the uplink are left out. The time is always that of the client,
@@ -148,19 +144,19 @@ def _read_trips(trips: list[dict[str, Any]], direction: Direction | None, log: L
     """
     stamps = [trip["timestamps"]["client"]["send"] for trip in trips]
     sent_ns = [int(stamp.get("monotonic", stamp.get("wall"))) for stamp in stamps]
+    entries = list[Entry]()
     for trip, stamp_ns in zip(trips, sent_ns, strict=True):
-        sent, fate = (stamp_ns - sent_ns[0]) * 1e-9, str(trip["lost"]).lower()
+        sent, fate, delay = (stamp_ns - sent_ns[0]) * 1e-9, str(trip["lost"]).lower(), nan
         if fate == "false" and direction:
             up, down = int(trip["delay"]["send"]), int(trip["delay"]["receive"])
-            log.refuse_early(min(up, down) * 1e-9)  # of the other direction, too
-            log.entries.append((sent, (up if direction == "uplink" else down) * 1e-9, True))
+            refuse_early(min(up, down) * 1e-9)  # of the other direction, too
+            delay = (up if direction == "uplink" else down) * 1e-9
         elif fate == "false":
-            log.entries.append((sent, int(trip["delay"]["rtt"]) * 0.5e-9, True))
-        elif direction == "uplink" and fate == "true_down":
-            log.entries.append((sent, nan, True))
-            log.counts["lost on the way back, delay unknown"] += 1
-        elif direction != "downlink" or fate != "true_up":
-            log.entries.append((sent, nan, False))
+            delay = int(trip["delay"]["rtt"]) * 0.5e-9
+        if (direction, fate) != ("downlink", "true_up"):
+            arrived = fate == "false" or (direction, fate) == ("uplink", "true_down")
+            entries.append((sent, delay, arrived))
+    return entries
 
 
 SCALES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -172,17 +168,17 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool) -> Packets:
 
     A packet counts as lost if its delay is empty or `nan`, or if its column `loss` contains 1. With
     `halve`, the log may have round-trip times; half of each counts as one-way delay. `name` is the
-    file name for messages.
+    file name for errors about a line.
 
     Raises:
-        BadInputError: If the log cannot be used; the text names line, value and remedy.
+        BadInputError: If a value cannot be used; the text names line, value and remedy.
+        InvalidValueError: If the log cannot be used.
     """
-    log = Log(name)
     columns, rows = read_rows(lines, name)
-    (time, time_scale), (delay, scale) = (_find(columns, kind, log) for kind in (TIMES, DELAYS))
+    (time, time_scale), (delay, scale) = (_find(columns, kind) for kind in (TIMES, DELAYS))
     halved = delay.startswith("rtt")
     if halved and not halve:
-        raise log.error(f"column {delay}: has round trips; {HALVE}")
+        raise InvalidValueError(f"column {delay}: has round trips; {HALVE}")
     scale *= 0.5 if halved else 1.0
     # Whatever its name: a share of losses must not be passed over in silence.
     losses = [column for column in columns if "loss" in column or "lost" in column]
@@ -194,20 +190,20 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool) -> Packets:
         delays.append(nan if is_lost else row.number(delay) * scale)
     # For nanoseconds since 1970 a float has a resolution of 256 ns, which is enough here.
     start = min(sent, default=0.0)
-    log.entries = [
+    entries = [
         ((at - start) * time_scale, value, not isnan(value))
         for at, value in zip(sent, delays, strict=True)
     ]
-    return log.packets(halved=halved)
+    return packets_of(entries, halved=halved)
 
 
-def _find(columns: list[str], kinds: str, log: Log) -> tuple[str, float]:
+def _find(columns: list[str], kinds: str) -> tuple[str, float]:
     """Return the only column of these kinds, such as `delay_ms`, and the scale of its unit."""
     pattern = re.compile(f"({kinds})_({'|'.join(SCALES)})")
     found = [(column, SCALES[it[2]]) for column in columns if (it := pattern.fullmatch(column))]
     if len(found) != 1:
         shown = ",".join(columns)[:200]
-        raise log.error(f"needs one column ({kinds})_({'|'.join(SCALES)}), has {shown!r}")
+        raise InvalidValueError(f"needs one column ({kinds})_({'|'.join(SCALES)}), has {shown!r}")
     return found[0]
 
 
@@ -223,7 +219,7 @@ def is_ping(lines: list[str]) -> bool:
     return any(re.search("icmp_seq|^PING |ttl=", line, re.IGNORECASE) for line in lines[:1000])
 
 
-def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
+def read_ping(lines: list[str], *, halve: bool) -> Packets:
     """Read the output of `ping -D` of Linux in English.
 
     The one-way delay is half of each round trip; `halve` has to permit this. Packets count as lost
@@ -232,13 +228,13 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
     ignored.
 
     Raises:
-        BadInputError: If `halve` is false; or if the log `name` has another form, no replies or
+        InvalidValueError: If `halve` is false; or if the log has another form, no replies or
             several sessions.
     """
-    log, newest = Log(name), 0
     if not halve:
-        raise log.error(f"ping measures round trips; {HALVE}")
-    sent, trips, numbers = dict[int, float](), dict[int, float](), set[int]()
+        raise InvalidValueError(f"ping measures round trips; {HALVE}")
+    newest, numbers = 0, set[int]()
+    sent, trips = dict[int, float](), dict[int, float]()
     for line in lines:
         if not (told := _NUMBER.search(line)) or "DUP!" in line:
             continue
@@ -249,11 +245,13 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
         numbers.add(number)
         if reply := _REPLY.match(line):
             if number in trips:
-                raise log.error("has more than one session of ping; give the lines of one session")
+                raise InvalidValueError(
+                    "has more than one session of ping; give the lines of one session"
+                )
             trips[number] = float(reply[3]) * 1e-3
             sent[number] = float(reply[1]) - trips[number]
     if not trips:
-        raise log.error(
+        raise InvalidValueError(
             "has no replies as Linux' ping -D prints them in English; measure with: LC_ALL=C ping "
             "-D -O HOST; Apple's ping and others have no such lines, so measure with irtt there"
         )
@@ -265,6 +263,8 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
     every = np.arange(first, last + 1)
     outside = np.minimum(every - n[0], 0) + np.maximum(every - n[-1], 0)
     times = (np.interp(every, n, at) + outside * period).tolist()
-    for number, time in zip(every.tolist(), times, strict=True):
-        log.entries.append((time, trips.get(number, nan) / 2, number in trips))
-    return log.packets(halved=True)
+    entries = [
+        (time, trips.get(number, nan) / 2, number in trips)
+        for number, time in zip(every.tolist(), times, strict=True)
+    ]
+    return packets_of(entries, halved=True)

@@ -1,7 +1,5 @@
 """A trace of a flight's delays gives the same delays and losses when it is replayed."""
 
-from pathlib import Path
-
 import numpy as np
 
 from cloudrc.link.trace_logs import trace_of
@@ -12,7 +10,7 @@ from tests.flights.conftest import fly
 
 def uplink(*settings):
     settings = ("mission.steps.count=5", "guard.command_age_max_ms=1000", *settings)
-    return one_way(fly("steps", *settings).flight.recording, Path("flight"), "uplink")
+    return one_way(fly("steps", *settings).flight.recording, "uplink")
 
 
 def test_a_replayed_flight_gives_its_delays_and_losses_again(tmp_path):

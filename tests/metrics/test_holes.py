@@ -1,7 +1,6 @@
 """A flight of which messages are lost: no number and no verdict says more than what is left."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -138,8 +137,8 @@ def test_a_step_of_which_messages_are_lost_is_no_step():
 
 @pytest.mark.parametrize("way", ["uplink", "downlink"])
 def test_a_trace_has_no_loss_at_the_edges_of_a_hole(way):
-    whole = one_way(flown().flight().recording, Path("flight"), way)
-    found = one_way(lossy(flown(), (5.0, 5.5)).recording, Path("flight"), way)
+    whole = one_way(flown().flight().recording, way)
+    found = one_way(lossy(flown(), (5.0, 5.5)).recording, way)
     assert not np.isnan(found.delays).any()
     assert len(whole.delays) - 20 < len(found.delays) < len(whole.delays)
     assert any("0.50 s lost at 6.00 s" in note for note in found.notes)  # since the first packet

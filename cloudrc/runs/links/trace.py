@@ -5,6 +5,7 @@ The content of the source tells its format.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from math import inf, isnan, nan
 from pathlib import Path
@@ -15,9 +16,10 @@ from cloudrc.files import at_place
 from cloudrc.link.streams import numbers
 from cloudrc.link.trace_logs import (
     Direction,
-    Log,
+    Entry,
     Packets,
     is_ping,
+    packets_of,
     read_csv,
     read_irtt,
     read_ping,
@@ -25,6 +27,8 @@ from cloudrc.link.trace_logs import (
 )
 from cloudrc.link.traces import read_lines, write_trace
 from cloudrc.outside.paths import check_there
+from cloudrc.outside.refusal import naming
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
@@ -39,20 +43,19 @@ def read_packets(
     `only` is the direction to take, `halve` takes half of each round trip.
     """
     check_there(source, "name a run, a log or a CSV file")
-    name = str(source)
-    if source.is_dir() or _is_mcap(source):
-        if halve:
-            raise Log(name).error("a run has one-way delays; leave out --halve-rtt")
-        require("a trace of a run", ("record",))
-        recording = _recording(source)
-        ways: tuple[Direction, ...] = (only,) if only else ("uplink", "downlink")
-        return {way: one_way(recording, source, way) for way in ways}
-    lines = read_lines(source, name, "give a run, a log of ping or irtt, or a CSV file")
+    with naming(str(source)):
+        if source.is_dir() or _is_mcap(source):
+            return _read_run(source, ("uplink", "downlink") if only is None else (only,), halve)
+        return {only or "uplink": _read_log(source, only, halve)}
+
+
+def _read_log(source: Path, direction: Direction | None, halve: bool) -> Packets:
+    lines = read_lines(source, str(source), "give a run, a log of ping or irtt, or a CSV file")
     if lines and lines[0].lstrip().startswith(("{", "[{")):
-        found = read_irtt("\n".join(lines), name, only, halve=halve)
-    else:
-        found = (read_ping if is_ping(lines) else read_csv)(lines, name, halve=halve)
-    return {only or "uplink": found}
+        return read_irtt("\n".join(lines), direction, halve=halve)
+    if is_ping(lines):
+        return read_ping(lines, halve=halve)
+    return read_csv(lines, str(source), halve=halve)
 
 
 def _is_mcap(path: Path) -> bool:
@@ -60,7 +63,10 @@ def _is_mcap(path: Path) -> bool:
         return file.read(8) == b"\x89MCAP0\r\n"
 
 
-def _recording(path: Path) -> Recording:
+def _read_run(path: Path, ways: tuple[Direction, ...], halve: bool) -> dict[Direction, Packets]:
+    if halve:
+        raise InvalidValueError("a run has one-way delays; leave out --halve-rtt")
+    require("a trace of a run", ("record",))
     from cloudrc.record.columns import Recording
     from cloudrc.record.holes import SOMEWHERE
     from cloudrc.runs.session import check_ended
@@ -70,17 +76,18 @@ def _recording(path: Path) -> Recording:
     check_there(file, "name the folder of a run, or a file")
     recording = Recording.read(file, whole=True)
     if SOMEWHERE in recording.holes:
-        raise Log(str(file)).error(
+        raise InvalidValueError(
             f"{recording.note}: nobody knows when, so what the link has lost is not known; give "
             "the original file"
         )
-    return recording
+    return {way: one_way(recording, way) for way in ways}
 
 
-def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
+def one_way(recording: Recording, direction: Direction) -> Packets:
     """Compute one-way delays by matching the records of sent and of arrived datagrams.
 
-    If a datagram arrived twice, the shorter delay counts. `path` is the name of the recording.
+    If a datagram arrived twice, the shorter delay counts. Raise an InvalidValueError if the
+    recording lacks the delays.
     """
     from cloudrc.metrics.link import SENT, transit_ns
     from cloudrc.record.holes import describe
@@ -88,14 +95,14 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     def seconds(stamp_ns: float) -> float:
         return (stamp_ns - rows[0][0]) * 1e-9
 
-    log, sent_topic, topic = Log(str(path)), SENT[direction], f"/{direction}_delay"
+    sent_topic, topic = SENT[direction], f"/{direction}_delay"
     sent, arrivals = recording[sent_topic], recording[topic]
     if not len(sent) or not len(arrivals):
-        raise log.error(f"no rows on {sent_topic} or {topic}, so no {direction}")
+        raise InvalidValueError(f"no rows on {sent_topic} or {topic}, so no {direction}")
     delays = dict[tuple[float, float], float]()
     for epoch, counter, delay in _columns(arrivals, "epoch", "counter", "delay"):
         if isnan(delay):
-            raise log.error(
+            raise InvalidValueError(
                 "its ends did not share a clock, so one-way delays are not known; record a run in "
                 "local mode, or measure with irtt"
             )
@@ -104,22 +111,23 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     longest_ns = transit_ns(recording, direction)
     holes = recording.holes
     known = [row for row in rows if not any(h.meets(row[0], row[0] + longest_ns) for h in holes)]
-    why = f"their arrivals may be lost: {describe(holes, seconds)}"
-    log.counts[f"left out, because {why}"] += len(rows) - len(known)
+    why = f"left out, because their arrivals may be lost: {describe(holes, seconds)}"
+    counts = Counter({why: len(rows) - len(known)})
     # The link did not lose what arrived before the receiver's session was open, and what may
     # still arrive after the end. All datagrams of these times are left out, also those that
     # arrived: if they alone remained, the trace would lose too few.
     latest_first = reversed(list(_columns(arrivals, "epoch", "counter")))
     first = {epoch: counter for epoch, counter in latest_first}  # the first arrival remains
+    entries = list[Entry]()
     last_ns = {epoch: stamp_ns for stamp_ns, epoch, _ in rows}
     for stamp_ns, epoch, counter in known:
         if counter >= first.get(epoch, inf) and stamp_ns < last_ns[epoch] - longest_ns:
             delay = delays.get((epoch, counter), nan)
-            log.entries.append((seconds(stamp_ns), delay, not isnan(delay)))
-    unknown = len(known) - len(log.entries)
+            entries.append((seconds(stamp_ns), delay, not isnan(delay)))
     last = f"in its last {longest_ns * 1e-6:.4g} ms"
-    log.counts[f"left out, sent before the session was open or {last}"] += unknown
-    return log.packets()
+    unknown = f"left out, sent before the session was open or {last}"
+    counts[unknown] = len(known) - len(entries)
+    return packets_of(entries, counts)
 
 
 def _columns(table: Table, *names: str) -> Iterator[tuple[float, ...]]:

@@ -1,7 +1,5 @@
 """A trace of a run, and its report, have the losses of the link, also near the end."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -37,7 +35,7 @@ def ended(log, at_ns):
 
 
 def trace(log):
-    return one_way(log.flight().recording, Path("flight"), "uplink")
+    return one_way(log.flight().recording, "uplink")
 
 
 def loss(log, way="uplink"):
