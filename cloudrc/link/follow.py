@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from cloudrc.errors import BadInputError
 from cloudrc.files import version
 from cloudrc.link.profile import DIRECTIONS, summary
-from cloudrc.link.state import CHANGE_FILE, ChangeFacts, LinkState, read_change
+from cloudrc.link.state import CHANGE_FILE, ChangeFacts, LinkState, publish, read_change, to_text
 from cloudrc.outside.document import write_yaml
 
 if TYPE_CHECKING:
@@ -44,12 +44,14 @@ class Loaded(NamedTuple):
     change: ChangeFacts = ChangeFacts()  # the last change of the profile: its number and cause
 
 
-def state_after(before: LinkState | None, loaded: Loaded, now_ns: int, **facts: Any) -> LinkState:
-    """Return the state of a direction that uses a profile from `now_ns` on [ns].
+def publish_state(
+    file: Path, before: LinkState | None, loaded: Loaded, now_ns: int, **facts: Any
+) -> LinkState:
+    """Write the state of a direction that uses a profile from `now_ns` on [ns]; return it.
 
-    `facts` are the other fields of the state.
+    `before` is its state until then. `facts` are the other fields of the state.
     """
-    return LinkState(
+    state = LinkState(
         **facts,
         profile=loaded.values,
         since=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -59,6 +61,8 @@ def state_after(before: LinkState | None, loaded: Loaded, now_ns: int, **facts: 
         cause=loaded.change.cause if before else "",
         asked=summary(loaded.direction),
     )
+    publish(to_text(state), file)
+    return state
 
 
 Load = Callable[[Path], Loaded]

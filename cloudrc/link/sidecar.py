@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 from cloudrc.errors import CloudrcError
 from cloudrc.files import write_atomically
 from cloudrc.link.carry.udp import Address, Relay
-from cloudrc.link.follow import Loaded, state_after
+from cloudrc.link.follow import Loaded, publish_state
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, publish, to_text
 
@@ -116,8 +116,8 @@ class Sidecar:
         self._shaper = shaper
         try:
             machine.log(f"{shaper.name} shapes the {self._direction} ({self._reason})")
-            state = self._publish_state(self._next_state(shaper, profile))
-            self._publish_route(route)
+            state = self._publish(shaper, profile)
+            self._publish_route(route)  # others read the state once the route is there
             self._tell(state)
             count_ns = machine.clock()
             while not stop():
@@ -163,24 +163,28 @@ class Sidecar:
             self._machine.log(f"the new profile is refused, the old one stays: {error}")
             if self.state:
                 number = profile.change.number
-                self._publish_state(replace(self.state, refused=number, refusal=str(error)))
+                self.state = replace(self.state, refused=number, refusal=str(error))
+                publish(to_text(self.state), self._state_file)
             return True
         if restart:
             self._origin_ns = self._machine.clock()
         self._machine.log(f"the new profile is in force ({profile.change.cause})")
-        self._tell(self._publish_state(self._next_state(shaper, profile)))
+        self._tell(self._publish(shaper, profile))
         return True
 
-    def _next_state(self, shaper: Shaper, profile: Loaded) -> LinkState:
-        """Return the state after a change of profile or shaper."""
-        facts = {"shaper": shaper.name, "reason": self._reason, "mode": self._mode}
-        facts |= {"direction": self._direction}
-        now_ns, origin_ns = self._machine.clock(), self._origin_ns
-        return state_after(self.state, profile, now_ns, **facts, origin_ns=origin_ns)
-
-    def _publish_state(self, state: LinkState) -> LinkState:
-        self.state = state
-        publish(to_text(state), self._state_file)
+    def _publish(self, shaper: Shaper, profile: Loaded) -> LinkState:
+        """Publish the state after a change of profile or shaper; return it."""
+        state = self.state = publish_state(
+            self._state_file,
+            self.state,
+            profile,
+            self._machine.clock(),
+            shaper=shaper.name,
+            reason=self._reason,
+            mode=self._mode,
+            direction=self._direction,
+            origin_ns=self._origin_ns,
+        )
         return state
 
     def _publish_route(self, route: Address) -> None:

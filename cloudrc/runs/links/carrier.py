@@ -19,10 +19,10 @@ from cloudrc.drivers.link_control import ControlServer
 from cloudrc.drivers.local import LINK, LINK_FOLDER, announced, link_socket, socket_folder
 from cloudrc.link.carry.engine import Engine, LinkWay
 from cloudrc.link.carry.tcp.medium import Medium
-from cloudrc.link.follow import Loaded, Profiles, make_folder, state_after
+from cloudrc.link.follow import Loaded, Profiles, make_folder, publish_state
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.state import STATE_FILE, LinkState, publish, to_text
+from cloudrc.link.state import STATE_FILE, LinkState
 from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.packets import Period
 from cloudrc.outside.document import Document
@@ -182,11 +182,17 @@ class LiveLink:
     def _publish(self, way: str, now_ns: int) -> None:
         """Publish the new state of a direction; tell the user if the direction has changed."""
         before, loaded = self.states.get(way), self._loaded[way]
-        facts = {"shaper": "relay", "reason": self._reason, "mode": "relay", "direction": way}
-        origin_ns = self.origins_ns[way]
-        state = state_after(before, loaded, now_ns, **facts, origin_ns=origin_ns)
-        self.states[way] = state
-        publish(to_text(state), self.folder / way / STATE_FILE)
+        state = self.states[way] = publish_state(
+            self.folder / way / STATE_FILE,
+            before,
+            loaded,
+            now_ns,
+            shaper="relay",
+            reason=self._reason,
+            mode="relay",
+            direction=way,
+            origin_ns=self.origins_ns[way],
+        )
         self.export(state)
         if before and way in self._followers:
             if loaded.change.restart or before.profile.get(way) != state.profile.get(way):
