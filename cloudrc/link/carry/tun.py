@@ -12,7 +12,6 @@ from cloudrc.link.exec.namespace import MTU
 from cloudrc.link.library import KIND
 from cloudrc.link.model import HEADER_BYTES
 
-_new = tuple.__new__  # makes a named tuple twice as fast as its class does
 IN_FLIGHT_MAX = 50_000  # packets in both directions, 75 MB at most; more are dropped and counted
 
 
@@ -57,6 +56,6 @@ class TunPort:
                     break
                 # The model counts the bytes of UDP payload, and adds the headers itself.
                 size = len(data) - HEADER_BYTES
-                yield _new(Packet, (way, (KIND, 1, way.received), size, data, clock()))
+                yield Packet(way, (KIND, 1, way.received), size, data, clock())
             else:
                 way.waited += BATCH

@@ -18,6 +18,7 @@ from contextlib import suppress
 from time import monotonic_ns, time_ns
 from typing import TypeAlias
 
+from cloudrc.files import at_place
 from cloudrc.link.carry.engine import BATCH, Engine, LinkWay, Packet
 from cloudrc.link.carry.log import PacketLog, ReleaseErrors
 from cloudrc.link.model import LinkDirection
@@ -99,11 +100,8 @@ class Relay:
         try:
             self._inside.bind(listen)
             if end is not None:
-                try:
+                with at_place(f"--end {end[0]}"):
                     self._inside.connect(end)
-                except OSError as error:
-                    error.strerror = f"it does not reach --end {end[0]} ({error.strerror})"
-                    raise
         except OSError:
             self.close()
             raise

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import islice
 from math import inf, isnan
 from typing import Any, NamedTuple
 
@@ -144,14 +143,10 @@ def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
         yield read
         if read[0] != "throttled":
             return
-    yield from islice(_by_numbers(off), 1)
-
-
-def _by_numbers(off: Mapping[str, Judgement]) -> Iterator[tuple[str, str]]:
-    """Yield code and text of each cause that the measured values show, the most certain first."""
     for code, name, low, high, text in _BY_NUMBERS:
         if name in off and low <= _ratio(off[name]) <= high:
-            yield (code, describe(off[name]) + text)
+            yield code, describe(off[name]) + text
+            return
 
 
 def _of_machine(

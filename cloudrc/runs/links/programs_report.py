@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,54 +36,39 @@ def make_exec_report(settings: ExecSettings, outcome: ExecOutcome, link: LiveLin
 
 def make_link_report(link: LiveLink) -> Report:
     """Judge the directions of a link."""
-    judged = {name: judge_packets(way.log, link.period(name)) for name, way in link.ways.items()}
-    late = link.counts().get("release_error_p99_ns", 0) * 1e-9
-    findings = {}
-    for name, rows in judged.items():
-        facts = _facts(link, name, late)
-        findings[name] = Findings([row for _, row in rows], facts, _packets(link, name))
-    report = make_report(link.cause, findings)
-    for name, rows in judged.items():
-        asked = {row.name: value for value, row in rows}
-        for row in report["directions"][name]["rows"]:
-            row["applied"] = row.pop("asked")
-            if (value := asked[row["name"]]) == value:
-                row["asked"] = value
-    report["notes"] += _lateness(link)
-    states = {name: asdict(link.states[name]) for name in link.ways}
-    return {
-        "schemaVersion": 1,
-        **report,
-        "seed": link.seed,
-        "counts": link.counts(),
-        "states": states,
-    }
-
-
-def _lateness(link: LiveLink) -> Iterator[str]:
-    """Yield notes about how late packets left."""
     counts = link.counts()
     p50, p99 = (counts.get(f"release_error_{one}_ns", 0) * 1e-9 for one in ("p50", "p99"))
-    yield f"packets left {in_unit(p50, 's')} (median) or {in_unit(p99, 's')} (99 %) late"
-    for name in link.ways:
-        if starved := _facts(link, name, p99).starved:
-            yield f"{name}: the relay lacks CPU time: {starved}"
+    notes = [f"packets left {in_unit(p50, 's')} (median) or {in_unit(p99, 's')} (99 %) late"]
+    findings, asked = dict[str, Findings](), dict[str, dict[str, float]]()
+    for name, way in link.ways.items():
+        starved, first = _starved(link, name, p99), link.period(name).first
+        if starved:
+            notes.append(f"{name}: the relay lacks CPU time: {starved}")
+        judged = judge_packets(way.log, link.period(name))
+        packets = f"{way.received - first} packets" + ", since the last change" * (first > 0)
+        facts = ShaperFacts(shaper="relay", starved=starved)
+        findings[name] = Findings([row for _, row in judged], facts, packets)
+        asked[name] = {row.name: value for value, row in judged if not isnan(value)}
+    report = make_report(link.cause, findings)
+    for name, direction in report["directions"].items():
+        for row in direction["rows"]:
+            row["applied"] = row.pop("asked")
+            if row["name"] in asked[name]:
+                row["asked"] = asked[name][row["name"]]
+    report["notes"] += notes
+    states = {name: asdict(link.states[name]) for name in link.ways}
+    return {"schemaVersion": 1, **report, "seed": link.seed, "counts": counts, "states": states}
 
 
-def _packets(link: LiveLink, name: str) -> str:
-    first = link.period(name).first
-    since = ", since the last change" if first else ""
-    return f"{link.ways[name].received - first} packets{since}"
-
-
-def _facts(link: LiveLink, name: str, late: float) -> ShaperFacts:
+def _starved(link: LiveLink, name: str, late: float) -> str:
+    """Return signs that the relay lacks CPU time; `late` is the 99 % quantile of lateness [s]."""
     way, unread = link.ways[name], link.unread.get(name, 0)
     signs = (
         (late > LATE, f"1 % of packets left later than {in_unit(late, 's')}"),
         (way.waited > WAITED * way.received, f"{way.waited} packets waited to be read"),
         (unread > 0, f"{unread} packets not read in time"),
     )
-    return ShaperFacts(shaper="relay", starved=", ".join(text for holds, text in signs if holds))
+    return ", ".join(text for holds, text in signs if holds)
 
 
 def write_report(folder: Path, report: Report, link: LiveLink) -> None:

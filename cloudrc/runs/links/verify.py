@@ -26,7 +26,6 @@ from cloudrc.config.robot import known_robot
 from cloudrc.config.schema import Experiment
 from cloudrc.drivers.programs import run_tool
 from cloudrc.errors import TimedOutError
-from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.netem import check, find_netems
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import link_profile
@@ -107,10 +106,7 @@ def verify(
         found = {way: now[way]._replace(rows=rows[way]) for way in now}
         if "off" not in {verdict_of(one.rows) for one in found.values()}:
             break
-    report = make_report(target, found)
-    for way in found:
-        report["notes"] += describe_heavy_loss(link_profile(getattr(experiment, way)), way)
-    return report
+    return make_report(target, found)
 
 
 def make_plans(
