@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -103,6 +103,7 @@ def _with_names(values: dict[str, Any]) -> dict[str, Any]:
     return values | {way: keys | names[way] for way, keys in ways.items()}
 
 
+@dataclass
 class Profiles:
     """Watches the profile's file for changes, and takes changes that are sent.
 
@@ -113,16 +114,18 @@ class Profiles:
     A check for a change takes only one system call, because it runs 20 times per second.
     """
 
-    def __init__(self, profile: Path, load: Load, log: Callable[[str], None]) -> None:
-        """Watch the file `profile`."""
-        self._profile, self._load, self._log = profile, load, log
-        self._seen = version(profile)
-        self._known: dict[str, dict[str, Any]] = {}  # number of a change -> its values
+    file: Path
+    load: Load
+    log: Callable[[str], None]
+    _known: dict[str, dict[str, Any]] = field(default_factory=dict)  # number -> values
+
+    def __post_init__(self) -> None:
+        self._seen = version(self.file)
 
     def first(self) -> Loaded:
         """Read the profile for the first time; raise a BadInputError if it is invalid."""
-        self._seen = version(self._profile)
-        loaded = self._read_profile(self._profile)
+        self._seen = version(self.file)
+        loaded = self._read_profile(self.file)
         self._known[loaded.change.number] = loaded.values
         return loaded
 
@@ -146,13 +149,13 @@ class Profiles:
 
         An invalid profile is logged.
         """
-        before, self._seen = self._seen, version(self._profile)
+        before, self._seen = self._seen, version(self.file)
         if self._seen == before:
             return None
         try:
-            loaded = self._read_profile(self._profile)
+            loaded = self._read_profile(self.file)
         except (BadInputError, OSError, ValueError) as error:
-            self._log(f"the new profile is refused, the old one stays: {error}")
+            self.log(f"the new profile is refused, the old one stays: {error}")
             return None
         number = loaded.change.number
         known = self._known.get(number) if number else None
@@ -167,7 +170,7 @@ class Profiles:
         return None
 
     def _read_profile(self, path: Path) -> Loaded:
-        loaded = self._load(path)
+        loaded = self.load(path)
         try:
             note = path.with_name(CHANGE_FILE).read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError):
@@ -175,6 +178,7 @@ class Profiles:
         return loaded._replace(change=read_change(note))
 
 
+@dataclass
 class PeerName:
     """Resolves the name of the other pod, whose address changes when the pod is replaced.
 
@@ -183,26 +187,21 @@ class PeerName:
     counts failed resolutions.
     """
 
-    def __init__(
-        self, peer: Address, resolve: Callable[[str], Sequence[str]], log: Callable[[str], None]
-    ) -> None:
-        """Set `peer`, host name and port of the other pod; do not resolve the name yet.
-
-        `resolve` returns the addresses of a host name or raises an OSError; `log` writes one line.
-        """
-        self._name, self._port = peer
-        self._resolve, self._log = resolve, log
-        self._known: list[str] = []
-        self._said = ""
-        self.failures = 0
+    peer: Address  # host name and port of the other pod
+    resolve: Callable[[str], Sequence[str]]  # returns the addresses of a host name, or OSError
+    log: Callable[[str], None]
+    failures: int = 0
+    _known: list[str] = field(default_factory=list)
+    _said: str = ""
 
     def poll(self) -> Address | None:
         """Resolve the name once and return the peer's address; log each change of the address.
 
         If the resolution fails, return the last known address; None before the first success.
         """
+        name, port = self.peer
         try:
-            addresses = sorted(self._resolve(self._name))
+            addresses = sorted(self.resolve(name))
         except OSError as error:
             self.failures += 1
             keeps = "its last address stays" if self._known else "the link waits"
@@ -213,5 +212,5 @@ class PeerName:
             said = f"is {self._known[-1]}"
         if said != self._said:
             self._said = said
-            self._log(f"{self._name} {said}")
-        return (self._known[-1], self._port) if self._known else None
+            self.log(f"{name} {said}")
+        return (self._known[-1], port) if self._known else None

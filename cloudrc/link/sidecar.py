@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
@@ -44,42 +44,30 @@ class Machine(NamedTuple):
     log: Callable[[str], None]  # writes one line to the log
 
 
+@dataclass(eq=False, kw_only=True)
 class Sidecar:
     """Shapes the datagrams that the own end of the tunnel sends.
 
-    Other threads set `peer`, the address of the other end, and `profile`, the requested profile.
-    They also call `publish_released`, because the loop that forwards must not wait for a disk.
-    `state` is the last state that is published, None before the first.
+    Other threads set `peer` and `profile`. They also call `publish_released`, because the loop that
+    forwards must not wait for a disk.
     """
 
-    def __init__(
-        self,
-        machine: Machine,
-        profile: Loaded,
-        *,
-        mode: Mode,
-        direction: str,
-        route: Path,
-        tell: Callable[[LinkState], object],
-        count: Callable[[dict[str, int]], object],
-        origin_ns: int = 0,
-    ) -> None:
-        """Store the arguments; `route` is the file with the address to which the tunnel sends.
+    machine: Machine
+    profile: Loaded  # requested profile
+    mode: Mode
+    direction: str  # "uplink" or "downlink"
+    route: Path  # file with the address to which the tunnel sends; the state is beside it
+    tell: Callable[[LinkState], object]  # exports each new state of the link as metrics
+    count: Callable[[dict[str, int]], object]  # exports datagrams by outcome, once a second
+    origin_ns: int = 0  # start of the time line [ns]; 0: when the peer becomes known
+    peer: Address | None = None  # address of the other end
+    state: LinkState | None = None  # last state that is published
+    _reason: str = ""  # why this shaper was chosen, in words
+    _shaper: Shaper | None = None
 
-        The state file is in the same folder. `direction` is "uplink" or "downlink". `tell` exports
-        each new state of the link as metrics. `count` exports the numbers of datagrams by outcome,
-        once a second. `origin_ns` is the time at which the time line of the profile starts [ns];
-        0 means the time at which the peer becomes known.
-        """
-        self.peer: Address | None = None
-        self.profile = profile
-        self.state: LinkState | None = None
-        self._machine, self._tell, self._count = machine, tell, count
-        self._mode, self._direction, self._route = mode, direction, route
-        self._state_file = route.with_name(STATE_FILE)
+    def __post_init__(self) -> None:
+        self._state_file = self.route.with_name(STATE_FILE)
         self._released_file = self._state_file.with_suffix(RELEASED_SUFFIX)
-        self._reason, self._origin_ns = "", origin_ns
-        self._shaper: Shaper | None = None
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Wait until the peer is known, then shape datagrams until `stop` returns True.
@@ -88,17 +76,17 @@ class Sidecar:
             CloudrcError: If the mode names a shaper (relay or netem), and this shaper cannot
                 realise the profile.
         """
-        self._route.unlink(missing_ok=True)  # an earlier process may have left one
+        self.route.unlink(missing_ok=True)  # an earlier process may have left one
         while self.peer is None:
             if stop():
                 return
-            self._machine.wait(STEP)
-        self._origin_ns = self._origin_ns or self._machine.clock()
+            self.machine.wait(STEP)
+        self.origin_ns = self.origin_ns or self.machine.clock()
         try:
             while not stop():
                 self._shape(self.peer, stop)
         finally:
-            for file in (self._route, self._released_file):
+            for file in (self.route, self._released_file):
                 file.unlink(missing_ok=True)
 
     def publish_released(self) -> None:
@@ -109,16 +97,16 @@ class Sidecar:
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
         """Run netem or the relay until `stop()` is true, or until a profile needs the other."""
-        profile, machine = self.profile, self._machine
+        profile, machine = self.profile, self.machine
         if self.state and profile.change.restart:
-            self._origin_ns = machine.clock()
+            self.origin_ns = machine.clock()
         shaper, route = self._choose(profile, peer)
         self._shaper = shaper
         try:
-            machine.log(f"{shaper.name} shapes the {self._direction} ({self._reason})")
+            machine.log(f"{shaper.name} shapes the {self.direction} ({self._reason})")
             state = self._publish(shaper, profile)
             self._publish_route(route)  # others read the state once the route is there
-            self._tell(state)
+            self.tell(state)
             count_ns = machine.clock()
             while not stop():
                 if self.peer is not None and self.peer != peer:
@@ -131,24 +119,24 @@ class Sidecar:
                 shaper.step(STEP)
                 if (now_ns := machine.clock()) >= count_ns:
                     count_ns = now_ns + COUNT_PERIOD_NS
-                    self._count(shaper.counts())
+                    self.count(shaper.counts())
         finally:
             self._shaper = None
             shaper.close()
 
     def _choose(self, profile: Loaded, peer: Address) -> tuple[Shaper, Address]:
         """Choose netem or the relay, and store the reason; "auto" uses netem if it works."""
-        machine, mode = self._machine, self._mode
+        machine, mode = self.machine, self.mode
         self._reason = f"link.mode={mode}"
         if mode != "relay":
-            netem = machine.netem(profile.direction, self._origin_ns)
+            netem = machine.netem(profile.direction, self.origin_ns)
             try:
                 return netem, netem.follow_peer(peer)
             except CloudrcError as error:
                 if mode == "netem":
                     raise
                 self._reason = f"netem does not work here: {_cause(error)}"
-        relay = machine.relay(profile.direction, self._origin_ns)
+        relay = machine.relay(profile.direction, self.origin_ns)
         return relay, relay.follow_peer(peer)
 
     def _replace(self, shaper: Shaper, profile: Loaded) -> bool:
@@ -157,19 +145,19 @@ class Sidecar:
         try:
             shaper.follow_profile(profile.direction, restart=restart)
         except CloudrcError as error:
-            if self._mode == "auto":
-                self._machine.log(f"the shaper changes to the relay: {_cause(error)}")
+            if self.mode == "auto":
+                self.machine.log(f"the shaper changes to the relay: {_cause(error)}")
                 return False
-            self._machine.log(f"the new profile is refused, the old one stays: {error}")
+            self.machine.log(f"the new profile is refused, the old one stays: {error}")
             if self.state:
                 number = profile.change.number
                 self.state = replace(self.state, refused=number, refusal=str(error))
                 publish(to_text(self.state), self._state_file)
             return True
         if restart:
-            self._origin_ns = self._machine.clock()
-        self._machine.log(f"the new profile is in force ({profile.change.cause})")
-        self._tell(self._publish(shaper, profile))
+            self.origin_ns = self.machine.clock()
+        self.machine.log(f"the new profile is in force ({profile.change.cause})")
+        self.tell(self._publish(shaper, profile))
         return True
 
     def _publish(self, shaper: Shaper, profile: Loaded) -> LinkState:
@@ -178,17 +166,17 @@ class Sidecar:
             self._state_file,
             self.state,
             profile,
-            self._machine.clock(),
+            self.machine.clock(),
             shaper=shaper.name,
             reason=self._reason,
-            mode=self._mode,
-            direction=self._direction,
-            origin_ns=self._origin_ns,
+            mode=self.mode,
+            direction=self.direction,
+            origin_ns=self.origin_ns,
         )
         return state
 
     def _publish_route(self, route: Address) -> None:
-        write_atomically(self._route, f"{route[0]}:{route[1]}\n".encode())
+        write_atomically(self.route, f"{route[0]}:{route[1]}\n".encode())
 
 
 def _cause(error: CloudrcError) -> str:

@@ -76,8 +76,8 @@ def run_link(settings: LinkSettings, stop: StopSignal) -> None:
     with TemporaryDirectory(prefix="tc-", dir=settings.route.parent) as tables:
         programs = Programs(tables)
         sidecar = Sidecar(
-            _machine(settings, experiment.seed, programs, Path(tables)),
-            profile,
+            machine=_machine(settings, experiment.seed, programs, Path(tables)),
+            profile=profile,
             mode=settings.mode,
             direction=settings.direction,
             route=settings.route,

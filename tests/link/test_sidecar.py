@@ -74,8 +74,8 @@ class Bench:
         )
         loaded = Loaded(profile_of(), {"description": "nothing"})
         self.sidecar = Sidecar(
-            machine,
-            loaded,
+            machine=machine,
+            profile=loaded,
             mode=mode,
             direction="uplink",
             route=self.route,
