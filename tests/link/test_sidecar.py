@@ -2,7 +2,6 @@
 
 import json
 import re
-from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
@@ -54,7 +53,7 @@ class Bench:
 
     def __init__(self, folder, mode, refuses=None):
         self.did, self.log, self.routes, self.plan, self.now_ns = [], [], [], [], 0
-        self.counted_ns, self.origins_ns, self.delays = [], [], []
+        self.counted_ns, self.origins_ns = [], []
         self.route, self.state = folder / "route", folder / "link.json"
 
         def relay(asked, origin_ns):
@@ -65,24 +64,16 @@ class Bench:
             self.origins_ns.append(origin_ns)
             return Shaper(self, "netem", REFUSED if asked.delay_ms == 9e3 else refuses)
 
-        machine = Machine(
-            relay=relay,
-            netem=netem,
-            clock=lambda: self.now_ns,
-            wait=self.wait,
-            log=self.log.append,
-        )
-        loaded = Loaded(profile_of(), {"description": "nothing"})
         self.sidecar = Sidecar(
-            machine=machine,
-            profile=loaded,
+            machine=Machine(relay, netem, lambda: self.now_ns, self.wait, self.log.append),
+            profile=Loaded(profile_of(), {"description": "nothing"}),
             mode=mode,
             direction="uplink",
             route=self.route,
             tell=self.tell,
             count=lambda counts: self.counted_ns.append(self.now_ns),
+            peer=PEER,
         )
-        self.sidecar.peer = PEER
 
     def at(self, time, action):
         self.plan.append((time, action))
@@ -101,7 +92,6 @@ class Bench:
     def tell(self, state):
         assert self.route.exists()
         self.did.append(f"metric {state.shaper}")
-        self.delays.append(state.asked["delay"])
 
     def replace(self, delay, change=ChangeFacts()):  # noqa: B008
         values = {"description": f"{delay:g} s"}
@@ -126,11 +116,9 @@ def test_relay_touches_no_netem_and_leaves_no_route(tmp_path):
 def test_auto_takes_netem_where_it_works(tmp_path):
     bench = Bench(tmp_path, "auto").run()
     assert bench.routes == ["10.244.0.7:7400\n"]
-    told = bench.told()
-    assert datetime.now(UTC) - datetime.fromisoformat(told["since"]) < timedelta(minutes=1)
     expected = {"shaper": "netem", "reason": "link.mode=auto", "mode": "auto", "origin_ns": 0}
     expected |= {"direction": "uplink", "profile": {"description": "nothing"}, "changes": 0}
-    assert expected.items() <= told.items()
+    assert expected.items() <= bench.told().items()
 
 
 @pytest.mark.parametrize(
@@ -173,13 +161,10 @@ def test_a_new_profile_is_followed_within_a_step(tmp_path):
     states = []
     by_hand = ChangeFacts("a1", "downlink.delay_ms=500", restart=False)
     bench.at(1.0, lambda: bench.replace(0.5, by_hand))
-    bench.at(1.15, lambda: bench.did.append("later"))
     bench.at(1.5, lambda: states.append(bench.told()))
     bench.at(2.0, lambda: bench.replace(0.1))
     bench.run()
-    assert bench.did[2:4] == ["relay 0.5 s", "metric relay"]
-    assert bench.did[4:6] == ["later", "relay 0.1 s from now"]
-    assert bench.delays == [0.0, 0.5, 0.1]
+    assert bench.did[2:5] == ["relay 0.5 s", "metric relay", "relay 0.1 s from now"]
     (state,) = states
     assert (state["change"], state["cause"], state["changes"]) == ("a1", by_hand.cause, 1)
     assert state["profile"] == {"description": "0.5 s"}

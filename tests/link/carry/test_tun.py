@@ -1,6 +1,7 @@
 """The relay between two programs, over sockets in place of TUN devices, and its verdict."""
 
 import socket
+from contextlib import ExitStack
 from functools import partial
 from types import SimpleNamespace
 
@@ -36,64 +37,25 @@ def clock(monkeypatch):
     return time
 
 
-class Joined:
-    """An engine between two devices."""
-
-    def __init__(self, profile, client, server, capacity=3):
-        self.up = LinkWay(LinkDirection(profile, 1, True), partial(write_packet, server))
-        self.down = LinkWay(LinkDirection(profile, 1, False), partial(write_packet, client))
-        self.port = TunPort({client: self.up, server: self.down})
-        self.engine = Engine(self.port, (self.up, self.down), capacity)
-        self.step, self.counts = self.engine.step, self.engine.counts
-
-
-@pytest.fixture
-def joined():
-    """Return a function that makes a relay, and the programs' sides of both devices."""
-    opened = []
-
-    def make(uplink, capacity=3):
+def test_a_packet_leaves_when_it_is_due_and_not_before(clock):
+    with ExitStack() as opened:
         pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2)]
-        opened.extend(one for pair in pairs for one in pair)
-        for inside, own in pairs:
-            inside.setblocking(False)
-            own.setblocking(False)
-        client, server = (own.fileno() for _, own in pairs)
-        return Joined(uplink, client, server, capacity), pairs[0][0], pairs[1][0]
-
-    yield make
-    for one in opened:
-        one.close()
-
-
-def test_a_packet_leaves_when_it_is_due_and_not_before(joined, clock):
-    relay, client, server = joined(profile_of(0.020))
-    client.send(PACKET)
-    relay.step(0.0)
-    assert relay.counts()["forwarded"] == 0
-    with pytest.raises(BlockingIOError):
-        server.recv(2000)
-    clock["now"] += 21 * MS
-    relay.step(0.0)
-    assert server.recv(2000) == PACKET
-    log = relay.up.log
-    assert log.due[0] - log.sent[0] == 20 * MS
-    assert 0 <= log.left[0] - log.due[0] < 2 * MS
-    assert relay.down.received == 0
-
-
-def test_the_relay_asks_the_model_for_packets_by_their_numbers_and_sizes(joined, clock):
-    """The same packets meet the same fates as in `cloudrc.link.open`."""
-    profile = profile_of(0.005, 0.004, loss=0.3)
-    relay, client, _ = joined(profile, 100)
-    for _ in range(40):
+        for one in (*pairs[0], *pairs[1]):
+            one.setblocking(False)
+            opened.enter_context(one)
+        (client, near), (server, far) = pairs
+        write = partial(write_packet, far.fileno())
+        way = LinkWay(LinkDirection(profile_of(0.020), 1, True), write)
+        engine = Engine(TunPort({near.fileno(): way}), (way,), 3)
         client.send(PACKET)
-        relay.step(0.0)
-    log, model = relay.up.log, LinkDirection(profile, 1, True)
-    for number, sent_ns in enumerate(log.sent):
-        fate = model.send(1, KIND, number, len(PACKET) - 28, sent_ns)
-        assert log.due[number] == (fate[0] if fate else LOST)
-    assert relay.counts()["lost"] == list(log.due).count(LOST) > 0
+        engine.step(0.0)
+        with pytest.raises(BlockingIOError):
+            server.recv(2000)
+        clock["now"] += 21 * MS
+        engine.step(0.0)
+        assert server.recv(2000) == PACKET
+    assert way.log.due[0] - way.log.sent[0] == 20 * MS
+    assert 0 <= way.log.left[0] - way.log.due[0] < 2 * MS
 
 
 def log_of(profile, late_ns=0, count=2000):

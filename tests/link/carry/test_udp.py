@@ -22,7 +22,6 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.verify.judge import Flow, Measurement
 from cloudrc.link.verify.probe import PROBE, ProbeEnd
 from cloudrc.runs.links.verify import find_experiment
-from cloudrc.tunnel.codec import Kind, encode_header
 from tests.conftest import wait_until
 from tests.link.profiles import profile_of
 from tools.bench_link import compare
@@ -198,12 +197,9 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
     words += [f"--listen=127.0.0.1:{listen[1]}", f"--route={folder / 'route'}", "--mode"]
     bare = ["setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin"]
     command = [*(bare if os.geteuid() == 0 else []), sys.executable, "-m", "cloudrc", *words]
-    with subprocess.Popen([*command, "auto"], cwd=ROOT) as process:
-        killer = Timer(PATIENCE, process.kill)  # where this test fails, the process ends, too
-        killer.start()
+    with subprocess.Popen([*command, "auto"], cwd=ROOT) as process, ExitStack() as killer:
+        killer.callback(process.kill)  # where this test fails, the process ends, too
         wait_until((folder / "route").exists)
-        with bind_loopback() as stranger:
-            stranger.sendto(encode_header(Kind.TELEMETRY, 0, 1, 999) + bytes(150), listen)
         Timer(0.2, draft.replace, [profile]).start()
         plan = Measurement(PLAIN, Flow(1, True, PROBE, 204), np.zeros(300))
         with bind_loopback(end[1]) as own, bind_loopback(peer[1]) as far:
@@ -226,5 +222,4 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
         process.terminate()
         assert wait_until(lambda: process.poll() is not None) < 0.5
         assert process.returncode == 0
-        killer.cancel()
     assert [path.name for path in folder.iterdir()] == ["link.json"]

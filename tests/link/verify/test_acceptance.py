@@ -38,7 +38,6 @@ def netem(**facts):
 # Requested, found on the uplink, found on the downlink, reported by the machine.
 FAULTS = {
     "no_qdisc": (PAPER, NOTHING, NOTHING, ShaperFacts("none", interface="eth0")),
-    "wrong_interface": (PAPER, NOTHING, NOTHING, ShaperFacts("none", elsewhere=("eth1",))),
     "doubled_delay": (PAPER, *[changed(PAPER, delay=0.090)] * 2, netem()),
     "halved_delay": (PAPER, *[changed(PAPER, delay=0.0225, jitter=0.0125)] * 2, netem()),
     "one_direction": (PAPER, PAPER, NOTHING, netem()),
@@ -49,7 +48,6 @@ FAULTS = {
     "order_kept": (PAPER, *[changed(PAPER, keep_order=True)] * 2, netem()),
     "rate_ignored": (NARROW, *[changed(NARROW, rate=None)] * 2, netem()),
     "no_sch_netem": (PAPER, NOTHING, NOTHING, ShaperFacts("none", "this kernel has no sch_netem")),
-    "shaped_twice": (PAPER, *[changed(PAPER, delay=0.090)] * 2, netem(layers=2)),
     "order_broken": (NARROW, *[changed(NARROW, keep_order=False, jitter=0.015)] * 2, netem()),
     "wrong_duplicates": (PAPER, *[changed(PAPER, duplicate=0.1)] * 2, netem()),
 }

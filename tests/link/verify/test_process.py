@@ -49,20 +49,15 @@ def test_netem_without_root_is_a_missing_prerequisite(monkeypatch, refused):
     assert "needs root" in refused("link verify ideal --shaper netem", code=3)
 
 
-@pytest.mark.parametrize(
-    ("code", "words", "exit_code", "says"),
-    [
-        (2, "cloudrc: error: no such profile", 2, "the uplink is not shaped: no such profile"),
-        (70, "internal error: X", 6, "not shaped: internal error: X (exit code 70)"),
-    ],
-)
-def test_an_early_end_has_the_exit_code_of_the_process(code, words, exit_code, says, monkeypatch):
+@pytest.mark.parametrize(("code", "exit_code"), [(2, 2), (70, 6)])
+def test_an_early_end_has_the_exit_code_of_the_process(code, exit_code, monkeypatch):
     def start(name, way, shaper):
-        (way.folder / "log").write_text(f"before\n{words}\n" if words else "")
+        (way.folder / "log").write_text("before\ncloudrc: error: no such profile\n")
         return subprocess.Popen(["sh", "-c", f"exit {code}" if name == "uplink" else "sleep 9"])
 
     monkeypatch.setattr(under_test, "_start", start)
-    with pytest.raises(CloudrcError) as ended, run_link(find_experiment("paper-p1", []), "relay"):
+    says = "the uplink is not shaped: no such profile"
+    experiment = find_experiment("paper-p1", [])
+    with pytest.raises(CloudrcError, match=says) as ended, run_link(experiment, "relay"):
         pass
     assert ended.value.exit_code == exit_code
-    assert str(ended.value).endswith(says)

@@ -13,8 +13,6 @@ from cloudrc.runs.links.change import set_here
     ("profile", "settings", "changed"),
     [
         (None, ["uplink.delay_ms=300"], ["uplink"]),
-        (None, ["downlink.loss=0.5"], ["downlink"]),
-        (None, ["uplink.delay_ms=300", "downlink.delay_ms=1"], ["uplink", "downlink"]),
         (None, ["uplink.delay_ms=30"], []),  # as before
         ("lte", [], ["uplink", "downlink"]),  # the time lines begin again
     ],
