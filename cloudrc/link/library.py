@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cloudrc.errors import BadInputError
 from cloudrc.link.draws import (
     BLOCK,
     Fate,
@@ -108,8 +107,6 @@ class OneWay:
         """Open a direction; `seed` and `stream` are those of `cloudrc.link.open`."""
         with naming("seed"):
             self._seed = SEED.of(seed)
-        if not isinstance(stream, str):
-            raise BadInputError(f"stream {stream!r}: give a text, the name of this link")
         self.profile = profile
         self._uplink, self._stream = uplink, stream
         self._episode = 0
@@ -132,15 +129,15 @@ class OneWay:
             BadInputError: If an argument is negative, or `episode` or `number` is not whole.
         """
         if episode != self._episode:
-            with naming("episode"):
-                self._episode, self._link = COUNT.of(episode), self._new()
+            (episode,) = _whole(episode=episode)
+            self._episode, self._link = episode, self._new()
         try:  # takes less time than to check each packet
             if type(number) is not int or not (size >= 0 and now_ns >= 0):  # also NaN
                 raise TypeError
             arrivals = self._link.send(episode, KIND, number, size, now_ns)
         except (IndexError, OverflowError, TypeError, ValueError):
             number, size, now_ns = _whole(number=number, size=size, now_ns=now_ns)
-            arrivals = self._link.send(self._episode, KIND, number, size, now_ns)
+            arrivals = self._link.send(episode, KIND, number, size, now_ns)
         if self._link.corrupts and self._link.corrupted(episode, KIND, number, _BYTE) != _BYTE:
             return ()
         return arrivals

@@ -108,6 +108,9 @@ class LinkDirection:
         if len(fate) == 1 and self._plain:  # nearly all packets: save time
             delay_ns = conditions.delay_ns + fate[0]
             return (now_ns + delay_ns if delay_ns > 0 else now_ns,)
+        if len(fate) == 1:
+            arrival = self._arrival(fate[0], conditions, size, now_ns)
+            return () if arrival is None else (arrival,)
         arrivals = [self._arrival(entry, conditions, size, now_ns) for entry in fate]
         return tuple([arrival for arrival in arrivals if arrival is not None])
 
