@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 LOOK_PERIOD = 0.05  # between two looks at the programs [s]
 COUNT_PERIOD = 1.0  # between two updates of the metrics [s]
-PATIENCE = 3.0  # until the command says that it waits [s]
 DRAIN_LIMIT = 1.0  # for the packets in flight at the end [s]
 FLOWS = {"uplink": ("client", "server"), "downlink": ("server", "client")}
 """Direction -> the end that sends, and the end that receives."""
@@ -190,8 +189,8 @@ class _Run:
 
     def _wait_for_server(self, server: ProgramEnd, limit: float) -> int | None:
         """Wait until other namespaces can reach the server; return its exit code if it ends."""
-        began, told = time.monotonic(), False
-        while (waited := time.monotonic() - began) < limit:
+        deadline, why = time.monotonic() + limit, "it listens at no port"
+        while time.monotonic() < deadline:
             state = server.state()
             if state.code is not None and (state.code or not state.lives):
                 hint = "" if state.code else "; --wait 0 starts the client without a server"
@@ -199,13 +198,11 @@ class _Run:
                 return state.code or InvalidRunError.exit_code
             if not all(is_loopback(host) for host, _ in state.listens):
                 return None
-            if waited > PATIENCE and not told:
-                told = True
-                why = f"; {_only_loopback(state)}" if state.listens else ""
-                self._tell(f"waits up to {limit:g} s (--wait) until the server listens{why}")
+            if state.listens:
+                places = ", ".join(sorted({show_address(place) for place in state.listens}))
+                why = f"the server listens only at {places}, let it listen at 0.0.0.0"
             time.sleep(LOOK_PERIOD)
         if limit:
-            why = _only_loopback(state) if state.listens else "it listens at no port"
             raise TimedOutError(
                 f"no client can reach the server after {limit:g} s: {why}; --wait S waits longer,"
                 " --wait 0 not at all"
@@ -244,8 +241,3 @@ def _describe(link: LiveLink, end: ProgramEnd) -> str:
         for addresses in (ADDRESSES["client"], ADDRESSES["server"])
     )
     return f"link: {link.cause}, seed {link.seed}, {way}; client {client}, server {server}"
-
-
-def _only_loopback(state: ProgramState) -> str:
-    places = ", ".join(sorted({show_address(place) for place in state.listens}))
-    return f"the server listens only at {places}, let it listen at 0.0.0.0"
