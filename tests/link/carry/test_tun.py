@@ -64,16 +64,14 @@ def log_of(profile, late_ns=0, count=2000):
     for number in range(count):
         sent_ns = number * 10 * MS
         fate = model.send(1, KIND, number, 72, sent_ns)
-        log.sent.append(sent_ns)
-        log.size.append(100)
-        log.due.append(fate[0] if fate else LOST)
-        log.left.append(fate[0] + late_ns if fate else LOST)
-        log.copies.append(len(fate))
+        log.enter(sent_ns, 100, fate)
+        for due_ns in fate:
+            log.leave(number, due_ns + late_ns)
     return log
 
 
-def verdicts(log, profile, first=0):
-    rows = judge_packets(log, Period(profile, 7, True, first, 0))
+def verdicts(log, profile):
+    rows = judge_packets(log, Period(profile, 7, True, 0, 0))
     return {row.name: row.verdict for _, row in rows}
 
 
