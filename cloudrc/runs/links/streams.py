@@ -6,7 +6,6 @@ import contextlib
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
-from ipaddress import ip_address
 from statistics import quantiles
 from typing import Any
 
@@ -43,7 +42,7 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
         family, to = _find(settings.to)
         listening = stack.enter_context(_listen(settings.listen))
         where = show_address(listening.getsockname()[:2])
-        if _is_same(listening.getsockname(), to):
+        if listening.getsockname()[:2] == to:
             raise BadInputError(
                 f"--to {show_address(settings.to)}: this is the relay's own address, --listen"
                 f" {where}; name the server's host and port"
@@ -86,12 +85,6 @@ def _find(to: Address) -> tuple[int, tuple[str, int]]:
     # A server rarely listens at ::1 alone, but localhost often names it first.
     family, _, _, _, address = min(found, key=lambda one: one[0] != socket.AF_INET)
     return int(family), (str(address[0]), int(address[1]))
-
-
-def _is_same(listen: tuple[Any, ...], to: tuple[str, int]) -> bool:
-    """Return whether a connection to `to` reaches the socket that listens at `listen`."""
-    here, there = ip_address(listen[0]), ip_address(to[0])
-    return listen[1] == to[1] and (here == there or (here.is_unspecified and there.is_loopback))
 
 
 def _summary(relay: StreamRelay) -> dict[str, Any]:
