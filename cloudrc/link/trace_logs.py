@@ -207,6 +207,7 @@ def _find(columns: list[str], kinds: str) -> tuple[str, float]:
     return found[0]
 
 
+SESSIONS = "has more than one session of ping; give the lines of one session"
 _WRAP = 1 << 16  # after 65535 ping goes on with 0
 _REPLY = re.compile(r"\[(\d+\.\d+)\] .*icmp_seq=(\d+) .*time=(\d+(?:\.\d+)?) ms")
 """Line of `ping -D` about a reply: time stamp [s], sequence number, round trip [ms]."""
@@ -233,6 +234,8 @@ def read_ping(lines: list[str], *, halve: bool) -> Packets:
     """
     if not halve:
         raise InvalidValueError(f"ping measures round trips; {HALVE}")
+    if sum(line.startswith("PING ") for line in lines) > 1:
+        raise InvalidValueError(SESSIONS)
     newest, numbers = 0, set[int]()
     sent, trips = dict[int, float](), dict[int, float]()
     for line in lines:
@@ -245,9 +248,7 @@ def read_ping(lines: list[str], *, halve: bool) -> Packets:
         numbers.add(number)
         if reply := _REPLY.match(line):
             if number in trips:
-                raise InvalidValueError(
-                    "has more than one session of ping; give the lines of one session"
-                )
+                raise InvalidValueError(SESSIONS)
             trips[number] = float(reply[3]) * 1e-3
             sent[number] = float(reply[1]) - trips[number]
     if not trips:
