@@ -7,11 +7,11 @@ prevents the flight.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from importlib.util import find_spec
 from itertools import pairwise
 from math import ceil, dist, floor
 from typing import TYPE_CHECKING, Any
 
+from cloudrc.config.scene import has_mujoco
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.rounding import exceeds, format_limit
 
@@ -214,7 +214,7 @@ def _balance(experiment: ResolvedExperiment) -> Iterator[str]:
 
     Without MuJoCo there are none, because the controller's plug-in may need it.
     """
-    if experiment.world.is_nominal or find_spec("mujoco") is None:
+    if experiment.world.is_nominal or not has_mujoco():
         return
     controller = experiment.cloud.controller
     gains = (controller.model_extra or {})["gain_p"] if controller.name == "pid" else (0.0, 0, 0.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from importlib.util import find_spec
 
 import numpy as np
 
@@ -62,11 +61,6 @@ def _read_hull(name: str, robot: RobotFiles) -> Spheres:
         return _spheres(plugins.find("hull", robot.hull_points, look=False))
     if robot.hull is not None:
         return ball(robot.hull)
-    if find_spec("mujoco") is None:
-        raise MissingPrerequisiteError(
-            f"robot {name}: its size needs MuJoCo; give hull_m in its robot.yaml, or run: "
-            "pip install 'cloudrc[world]'"
-        )
     from cloudrc.sim.bodies import reach_of
 
     with naming(f"robot {name}"):

@@ -14,6 +14,11 @@ from cloudrc.outside.refusal import naming
 from cloudrc.outside.reuse import reuse
 
 
+def has_mujoco() -> bool:
+    """Return whether MuJoCo is here; it may lack where flights in a cluster are started."""
+    return find_spec("mujoco") is not None
+
+
 def scene_of(world: World) -> Scene:
     """Read the scene of an experiment; its fence is world.fence_m if this key is given.
 
@@ -26,7 +31,7 @@ def scene_of(world: World) -> Scene:
 def _read(world: World) -> Scene:
     with naming("world.scene"):
         scene = load_scene(world.scene, world.fence_m)
-        if scene.path is None or find_spec("mujoco") is None:
+        if scene.path is None or not has_mujoco():
             return scene
         from cloudrc.sim.bodies import complete
 

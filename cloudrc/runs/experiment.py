@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from importlib.util import find_spec
 
 from cloudrc import metrics
 from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import OUTSIDE, ROS2, parse_settings
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.scene import has_mujoco
 from cloudrc.config.schema import Parameters, World
 from cloudrc.outside.reuse import reuse
 from cloudrc.runs.requirements import require
@@ -69,7 +69,7 @@ def check_world(world: World, *, turns: bool = False) -> None:
     shipped = not ("/" in world.robot or world.scene.endswith(".xml"))
     if shipped and world.is_nominal and world.tuning is None and world.onboard == Parameters():
         return
-    if find_spec("mujoco") is None:
+    if not has_mujoco():
         return
     from cloudrc.robots.build import check_robot
 

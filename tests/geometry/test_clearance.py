@@ -1,6 +1,7 @@
 """Clearance equals distances that were computed by hand, published, or computed pose by pose."""
 
 import math
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from cloudrc.config.hull import hull_of, known_hull
 from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import World
+from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.geometry.clearance import (
     clearance,
     clearance_per_obstacle,
@@ -117,5 +119,6 @@ def test_the_ball_of_a_robot_holds_its_geoms(tmp_path, monkeypatch):
         "</body></worldbody></mujoco>"
     )
     assert hull_of(str(tmp_path)).radii == pytest.approx([0.5629], abs=1e-3)
-    monkeypatch.setattr("cloudrc.config.hull.find_spec", lambda name: None)
-    assert known_hull(str(tmp_path)) is None, "its size needs MuJoCo"
+    absent = Mock(side_effect=MissingPrerequisiteError("the simulator needs MuJoCo"))
+    monkeypatch.setattr("cloudrc.sim.bodies.reach_of", absent)
+    assert known_hull(str(tmp_path)) is None
