@@ -53,12 +53,12 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "kubernetes": ("cluster/",),
     "prometheus_client": ("drivers/",),
     "argparse": ("cli/",),
-    "importlib.metadata": ("plugins", "cli/", "report/", "runs/doctor"),
+    "importlib.metadata": ("plugins", "cli/", "report/"),
     "pkgutil": ("plugins",),
     # A compiler makes the machine code of the usual step.
     "subprocess": (
         *("drivers/", "cli/", "cluster/", "robots/pelican/native/library"),
-        *("exercise/scoring", "link/exec/holder", "runs/doctor", "runs/links/under_test"),
+        *("exercise/scoring", "link/exec/holder", "runs/links/under_test"),
     ),
     "multiprocessing": ("drivers/", "trials/workers"),
     "concurrent": ("cli/", "trials/workers", "cluster/", "teleop/", "policy/serve"),

@@ -8,12 +8,8 @@ measurement and prints the shortest processor time.
 
 from __future__ import annotations
 
-import argparse
-from contextlib import closing
-
 from cloudrc.cli.output import output_argument, print_result
-from cloudrc.cli.parser import read_count
-from cloudrc.runs.requirements import require
+from cloudrc.cli.parser import Options, Parser, flags, read_count
 
 EPILOG = """\
 'raw mj_step' replays the thrusts and the drag of the same flight in C and must
@@ -21,20 +17,17 @@ end in the same bits. Close other programs before you compare two machines; the
 ratios of one run are comparable between machines."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     output_argument(parser)
-    about = "how often to measure each part (default: 7)"
-    parser.add_argument("--repeats", type=read_count, default=7, metavar="N", help=about)
+    flags(parser)("--repeats", "N", "how often to measure each part (default: 7)", 7, read_count)
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> None:
     """Run all measurements; print for each the processor time per physics step [us]."""
-    require("the bench", ("world",))
     from cloudrc.cli.progress import Progress
     from cloudrc.runs.bench import as_text, bench
 
-    with closing(Progress(f"measures each part {options.repeats} times")):
+    with Progress(f"measures each part {options.repeats} times"):
         document = bench(options.repeats)
     print_result(options.output, document, as_text(document))
-    return 0

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.parser import number
+from cloudrc.cli.parser import Add, Options, Parser, flags, number
 from cloudrc.cluster.client import DEFAULT_RELEASE as DEFAULT_RELEASE
 from cloudrc.runs.requirements import require
 
@@ -17,42 +15,34 @@ READY_LIMIT = 300.0
 """Default time limit for the pods of a release to become ready [s]."""
 
 
-def release_arguments(
-    parser: argparse.ArgumentParser, default: str = "the only one of the namespace"
-) -> Callable[..., argparse.Action]:
+def release_arguments(parser: Parser, default: str = "the only one of the namespace") -> Add:
     """Declare `--context` and `--namespace`, as in kubectl, and `--release` with a default.
 
     Return a function that adds another flag to the same group of the help.
     """
-    group = cluster_arguments(parser, "(default: the context's, or default)")
-    about = f"Helm release (default: {default})"
-    group.add_argument("--release", metavar="NAME", help=about)
-    return group.add_argument
+    add = cluster_arguments(parser, "(default: the context's, or default)")
+    add("--release", "NAME", f"Helm release (default: {default})")
+    return add
 
 
-def cluster_arguments(parser: argparse.ArgumentParser, namespace: str) -> argparse._ArgumentGroup:
+def cluster_arguments(parser: Parser, namespace: str) -> Add:
     """Declare `--context` and `--namespace`; the help of the latter ends with `namespace`.
 
-    Return the group of the help, to which further flags may be added.
+    Return a function that adds another flag to the same group of the help.
     """
-    group = parser.add_argument_group("in a cluster (uses KUBECONFIG)")
-    group.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
-    group.add_argument("-n", "--namespace", metavar="NAME", help=f"namespace {namespace}")
-    return group
+    add = flags(parser.add_argument_group("in a cluster (uses KUBECONFIG)"))
+    add("--context", "NAME", "kubeconfig context (default: current)")
+    add("-n --namespace", "NAME", f"namespace {namespace}")
+    return add
 
 
-def timeout_argument(parser: argparse.ArgumentParser) -> None:
+def timeout_argument(parser: Parser) -> None:
     """Declare `--timeout`, the time limit for a release to become ready."""
-    parser.add_argument(
-        "--timeout",
-        type=number(1e-3, 86_400, "seconds"),
-        default=READY_LIMIT,
-        metavar="S",
-        help=f"seconds to wait until the release is ready (default: {READY_LIMIT:g})",
-    )
+    about = f"seconds to wait until the release is ready (default: {READY_LIMIT:g})"
+    flags(parser)("--timeout", "S", about, READY_LIMIT, number(1e-3, 86_400, "seconds"))
 
 
-def release_from_flags(options: argparse.Namespace) -> Release:
+def release_from_flags(options: Options) -> Release:
     """Return the release that the flags name; by default "cloudrc" in the current context.
 
     Raise a MissingPrerequisiteError if the Kubernetes client or a kubeconfig is missing.
@@ -64,7 +54,7 @@ def release_from_flags(options: argparse.Namespace) -> Release:
     return connect(options.context, options.namespace, name)
 
 
-def flown_release(options: argparse.Namespace) -> Release:
+def flown_release(options: Options) -> Release:
     """Return the release that the flags name; without `--release`, the only one of the namespace.
 
     Raise a BadInputError if the namespace has several, a ClusterError if it has none.

@@ -2,23 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
-from contextlib import closing
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.output import (
-    TABLES,
-    output_argument,
-    print_or_drop,
-    print_result,
-    warn,
-)
-from cloudrc.cli.parser import read_count
+from cloudrc.cli.output import TABLES, output_argument, print_result, tell, warn
+from cloudrc.cli.parser import Options, Parser, flags, read_count
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.runs.interrupts import interrupt_on_signals
-from cloudrc.runs.requirements import MODES, require
 from cloudrc.text import csv_table, latex_table
 
 if TYPE_CHECKING:
@@ -39,32 +27,29 @@ examples:
   cloudrc compare last_sample constant_velocity --in runs/sweep-steps-1"""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = parser.add_argument
-    add("a", metavar="A", help="the setting to compare with")
-    add("b", metavar="B", help="the setting to judge")
+    add = flags(parser)
+    add("a", "A", "the setting to compare with")
+    add("b", "B", "the setting to judge")
     flight_arguments(parser, seeds=10)
-    add("--in", type=Path, dest="sweep", metavar="DIR", help="compare flights of this sweep")
+    add("--in", "DIR", "compare flights of this sweep", dest="sweep")
     about = "compare this metric instead of the default ones; repeatable"
-    add("--number", action="append", default=[], metavar="NAME", help=about)
+    add("--number", "NAME", about, many=True)
     output_argument(parser, forms=TABLES)
 
 
-def flight_arguments(parser: argparse.ArgumentParser, seeds: int) -> None:
+def flight_arguments(parser: Parser, seeds: int) -> None:
     """Declare --of, --set and --seeds; `seeds` is the default number of seeds."""
-    add = parser.add_argument
+    add = flags(parser)
     about = "experiment to fly: a shipped name or a YAML file (default: steps)"
-    add("--of", default="steps", dest="experiment", metavar="EXPERIMENT", help=about)
-    about = "change one key of the experiment; repeatable"
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
-    about = f"fly seeds 1 to N (default: {seeds})"
-    add("--seeds", type=read_count, default=seeds, metavar="N", help=about)
+    add("--of", "EXPERIMENT", about, "steps", dest="experiment")
+    add("--set", "KEY=VALUE", "change one key of the experiment; repeatable")
+    add("--seeds", "N", f"fly seeds 1 to N (default: {seeds})", seeds, read_count)
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> int:
     """Compare A and B, print the result, and return the exit code: 0 if all flights were flown."""
-    interrupt_on_signals()
     from cloudrc.cli.progress import Progress
     from cloudrc.studies.compare import compare, of_sweep
     from cloudrc.studies.compare_text import as_text, cells
@@ -73,15 +58,15 @@ def execute(options: argparse.Namespace) -> int:
     if options.set and options.sweep:
         raise BadInputError(f"--set {options.set[0]}: these flights are finished; leave it out")
     if options.sweep:
-        with closing(Progress(f"reads {options.sweep}")):
+        with Progress(f"reads {options.sweep}"):
             found = of_sweep(options.sweep, options.a, options.b)
     else:
         found, stopped = _fly_both(options)
     if stopped:
-        print_or_drop(f"cloudrc: {stopped}: {len(found.pairs)} pairs are finished", sys.stderr)
+        tell(f"{stopped}: {len(found.pairs)} pairs are finished")
         if not found.pairs:
             return stopped.exit_code
-    with closing(Progress(f"compares {len(found.pairs):,} pairs of flights")):
+    with Progress(f"compares {len(found.pairs):,} pairs of flights"):
         compared = compare(found.pairs, found.units, options.number)
     document = {
         **{"a": options.a, "b": options.b, "of": found.what},
@@ -90,15 +75,15 @@ def execute(options: argparse.Namespace) -> int:
     }
     rows = []
     for name, each in document["numbers"].items():
-        ends = dict(zip(("low", "high"), each["interval"] or (), strict=False))
-        rows.append({"number": name, **each, **ends})
+        low, high = each["interval"] or (None, None)
+        rows.append({"number": name, **each, "low": low, "high": high})
         del rows[-1]["interval"]
     tables = {"csv": csv_table(rows), "latex": latex_table(cells(document))}
     print_result(options.output, document, as_text(document), **tables)
     return stopped.exit_code if stopped else 0
 
 
-def _fly_both(options: argparse.Namespace) -> tuple[Pairs, CloudrcError | None]:
+def _fly_both(options: Options) -> tuple[Pairs, CloudrcError | None]:
     """Fly the experiment with the settings A and with the settings B, each with all seeds.
 
     Return the pairs of flights; and why the work ended early, or None.
@@ -109,12 +94,11 @@ def _fly_both(options: argparse.Namespace) -> tuple[Pairs, CloudrcError | None]:
     for text in (options.a, options.b):
         if "=" not in text:
             raise BadInputError(f"{text}: is not KEY=VALUE; for a value of a sweep, add --in DIR")
-    require("compare", MODES["virtual"])
     sides = split_settings(options.a), split_settings(options.b)
     plan = plan_sides(options.experiment, options.set, *sides, options.seeds, options.number)
     warn(*plan.points)
     count = len(plan.flights)
     head = f"{plan.name}: A and B, each with seeds 1 to {options.seeds}, {count} flights"
-    with closing(SweepView(head, count)) as view:
+    with SweepView(head, count) as view:
         pairs, stopped = fly_pairs(plan, count, view.see)
     return Pairs(pairs, plan.units, f"experiment {options.experiment}"), stopped

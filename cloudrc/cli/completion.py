@@ -7,12 +7,9 @@ does not have to start Python.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 from collections.abc import Iterator
 
-from cloudrc.cli.output import STDOUT
-from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.files import at_place
+from cloudrc.cli.parser import Options, Parser, flags
 
 EPILOG = """\
 installation:
@@ -21,17 +18,13 @@ installation:
   cloudrc completion fish > ~/.config/fish/completions/cloudrc.fish"""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("shell", choices=("bash", "zsh", "fish"), help="your shell")
+    flags(parser)("shell", None, "your shell", choices=("bash", "zsh", "fish"))
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> None:
     """Print the completion script for the given shell."""
-    if importlib.util.find_spec("shtab") is None:
-        raise MissingPrerequisiteError(
-            "completion needs shtab, which is not installed; run: pip install shtab"
-        )
     import shtab
 
     from cloudrc.cli.parser import COMMANDS, build_parser
@@ -47,18 +40,17 @@ def execute(options: argparse.Namespace) -> int:
         "KEY=VALUE": of_link,  # the arguments of `link set`
         **dict.fromkeys("AB", keys),  # the arguments of `compare`
     }
-    parser = build_parser(COMMANDS, for_completion=True)
+    parser = build_parser(COMMANDS)
     for action in _actions(parser):
         name = " of ".join([str(action.metavar), *action.option_strings])
         action.choices = words.get(name) or words.get(str(action.metavar)) or action.choices
-    with at_place(STDOUT):
-        print(shtab.complete(parser, options.shell))
-    return 0
+    print(shtab.complete(parser, options.shell))
 
 
-def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+def _actions(parser: Parser) -> Iterator[argparse.Action]:
     for action in parser._actions:
         yield action
         if isinstance(action, argparse._SubParsersAction):
+            action.help = "what to do"  # without it, shtab leaves the commands out
             for command in action.choices.values():
                 yield from _actions(command)

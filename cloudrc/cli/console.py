@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from secrets import token_hex
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.cluster_flags import flown_release, release_arguments
-from cloudrc.cli.find_run import find_local_run
-from cloudrc.cli.output import open_page, print_line
-from cloudrc.cli.parser import whole_number
+from cloudrc.cli.find_run import need_run_here
+from cloudrc.cli.output import open_page, print_line, tell
+from cloudrc.cli.parser import Options, Parser, flags, whole_number
 from cloudrc.cli.token_flag import given_token, token_argument
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
-from cloudrc.runs.requirements import require
 from cloudrc.teleop.client import Api
 
 if TYPE_CHECKING:
@@ -35,23 +33,24 @@ along x and y, W and S up and down, while they are held; Space holds; Shift+X
 switches it off. No key turns the robot: it keeps its heading."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = parser.add_argument
+    add = flags(parser)
     about = "folder of the flying run (default: the only run in flight), or a release"
-    add("run", nargs="?", type=Path, metavar="RUN|RELEASE", help=about)
+    add("run", "RUN|RELEASE", about, nargs="?")
     port = "port of the page on 127.0.0.1 (default: any free port)"
-    add("--port", type=whole_number(0, 65_535), default=0, metavar="N", help=port)
+    add("--port", "N", port, 0, whole_number(0, 65_535))
     about = "show the page of a release, and carry out its changes of the link until Ctrl-C"
-    add("--cluster", action="store_true", help=about)
-    add("--no-open", action="store_true", help="print the page's address, open no browser")
+    add("--cluster", "", about)
+    add("--no-open", "", "print the page's address, open no browser")
     about = "origin of a proxy that serves the page, such as https://hub.example.org; repeatable"
-    add("--allow-origin", type=_origin, action="append", default=[], metavar="ORIGIN", help=about)
+    add("--allow-origin", "ORIGIN", about, read=_origin, many=True)
     release_arguments(parser)
     pod = parser.add_argument_group("in the container of the chart")
-    pod.add_argument("--config", type=Path, metavar="FILE", help="experiment file")
-    pod.add_argument("--profile", type=Path, metavar="FILE", help="file of the link profile")
-    pod.add_argument("--api", metavar="URL", help="the API of teleop")
+    add = flags(pod)
+    add("--config", "FILE", "experiment file")
+    add("--profile", "FILE", "file of the link profile")
+    add("--api", "URL", "the API of teleop")
     token_argument(pod)
 
 
@@ -64,15 +63,14 @@ def _origin(text: str) -> str:
     return text
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> int:
     """Serve the page until the flight ends or the user interrupts."""
     run: Path | None = options.run
     if run and len(run.parts) == 1 and not (run.exists() or options.release):
-        print_line(f"cloudrc: no folder '{run}' here: looking for a release", sys.stderr)
+        tell(f"no folder '{run}' here: looking for a release")
         options.run, options.release = None, str(run)
     if options.cluster or options.context or options.namespace or options.release:
         return _show_release(options)
-    require("the console", ("console", "world"))
     flight = _in_pod(options) if options.config else _local(options)
     from cloudrc.console.serve import serve
 
@@ -85,20 +83,17 @@ def execute(options: argparse.Namespace) -> int:
             open_page(page.url)
 
     serve(flight, ready, options.port, options.allow_origin)
-    print_line("the flight has ended", sys.stderr)
+    tell("the flight has ended")
     return 0
 
 
-def _local(options: argparse.Namespace) -> ConsoleTarget:
+def _local(options: Options) -> ConsoleTarget:
     from cloudrc.console.serve import ConsoleTarget
     from cloudrc.console.steering import LinkControl
     from cloudrc.drivers.local import LINK_FOLDER, under_way
     from cloudrc.runs.links.change import read_states, set_here
-    from cloudrc.runs.under_way import not_found
 
-    found = find_local_run(options, flag="")
-    if found is None:
-        raise BadInputError(not_found("no run flies here; start one: cloudrc up"))
+    found = need_run_here(options.run)
     run, url = found.folder.resolve(), found.url
 
     def read() -> dict[str, Any]:
@@ -111,7 +106,7 @@ def _local(options: argparse.Namespace) -> ConsoleTarget:
     return ConsoleTarget(run / "config.yaml", Api(url), link, lambda: under_way().get(run) != url)
 
 
-def _in_pod(options: argparse.Namespace) -> ConsoleTarget:
+def _in_pod(options: Options) -> ConsoleTarget:
     if not (options.api and options.profile):
         raise BadInputError("--config is for the chart's container: give --api and --profile, too")
     from cloudrc.console.in_pod import flight_of_pod
@@ -120,7 +115,7 @@ def _in_pod(options: argparse.Namespace) -> ConsoleTarget:
     return flight_of_pod(options.config, options.profile, options.api, token, print_line)
 
 
-def _show_release(options: argparse.Namespace) -> int:
+def _show_release(options: Options) -> int:
     """Forward a release's console page to this machine; apply link changes made on the page."""
     if options.run:
         raise BadInputError("RUN names a run here, the other flags a cluster; give one")
@@ -148,5 +143,5 @@ def _show_release(options: argparse.Namespace) -> int:
             keep(release, link, send(release, link, None, settings, token_hex(4)))
             print_line(line)
         except CloudrcError as error:
-            print_line(f"cloudrc: {line}: {error}", sys.stderr)
+            tell(f"{line}: {error}")
     raise InterruptedRunError("the container 'console' has ended; see its log")

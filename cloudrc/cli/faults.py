@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import os
-import sys
-from contextlib import closing
 from functools import partial
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.output import output_argument, paint, print_line, print_result
-from cloudrc.cli.parser import add_verbs, number, read_count, whole_number
+from cloudrc.cli.output import output_argument, paint, print_line, print_result, tell
+from cloudrc.cli.parser import Options, Parser, add_verbs, flags, number, read_count, whole_number
 from cloudrc.errors import BadInputError
-from cloudrc.runs.interrupts import interrupt_on_signals
-from cloudrc.runs.requirements import require
-from cloudrc.text import escape, table
+from cloudrc.text import table
 from cloudrc.trials.workers import map_in_order, take_each
 
 if TYPE_CHECKING:
@@ -47,29 +41,27 @@ STORE = Path("faults-found")
 FAILED = 1
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     parsers = add_verbs(parser, VERBS)
     for verb in parsers.values():
         output_argument(verb)
-    what = parsers["run"].add_mutually_exclusive_group(required=True)
+    what = flags(parsers["run"].add_mutually_exclusive_group(required=True))
     text = "name of the fault, its number: F13, or a schedule's file (.yaml)"
-    what.add_argument("name", nargs="?", type=_name_or_file, metavar="NAME", help=text)
-    what.add_argument("--all", action="store_true", help="every fault")
-    add, seed = parsers["run"].add_argument, whole_number(0, SEED_MAX)
-    add("--seed", type=seed, default=1, metavar="N", help="seed (default: 1)")
+    what("name", "NAME", text, read=_name_or_file, nargs="?")
+    what("--all", "", "every fault")
+    add, seed = flags(parsers["run"]), whole_number(0, SEED_MAX)
+    add("--seed", "N", "seed (default: 1)", 1, seed)
     about = "number of parallel processes, at most one per core (default: 1)"
-    add("--jobs", type=read_count, default=1, metavar="J", help=about)
-    add, minutes = parsers["search"].add_argument, number(0, MINUTES_MAX, "minutes")
-    add("--minutes", type=minutes, default=1.0, metavar="M", help="duration (default: 1)")
-    add("--first", type=seed, default=1, metavar="SEED", help="first seed (default: 1)")
-    add("--jobs", type=read_count, default=1, metavar="J", help=about)
-    about = f"folder for failing schedules (default: ./{STORE})"
-    add("--store", type=_folder, default=STORE, metavar="DIR", help=about)
-    about = "the cloud has valid keys and tries to break the invariants"
-    add("--adversarial", action="store_true", help=about)
+    add("--jobs", "J", about, 1, read_count)
+    add = flags(parsers["search"])
+    add("--minutes", "M", "duration (default: 1)", 1.0, number(0, MINUTES_MAX, "minutes"))
+    add("--first", "SEED", "first seed (default: 1)", 1, seed)
+    add("--jobs", "J", about, 1, read_count)
+    add("--store", "DIR", f"folder for failing schedules (default: ./{STORE})", STORE)
+    add("--adversarial", "", "the cloud has valid keys and tries to break the invariants")
     about = "name of a shipped robot, or path of a robot (default: that of every experiment)"
-    add("--robot", type=_robot, metavar="NAME", help=about)
+    add("--robot", "NAME", about)
 
 
 def _name_or_file(text: str) -> str | Path:
@@ -77,31 +69,12 @@ def _name_or_file(text: str) -> str | Path:
     return Path(text) if is_path else text
 
 
-def _robot(text: str) -> str:
-    from cloudrc.config import shipped
-
-    try:
-        return shipped.model_path("robot", text, Path())
-    except BadInputError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def _folder(text: str) -> Path:
-    path = Path(text)
-    existing = next(each for each in (path, *path.absolute().parents) if each.exists())
-    if not (existing.is_dir() and os.access(existing, os.W_OK)):
-        raise argparse.ArgumentTypeError(f"{text}: cannot be written")
-    return path
-
-
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> int | None:
     """Run the chosen verb; return 1 if a check failed, 130 after an interrupt signal."""
-    require("the fault suite", ("world", "record"))
-    interrupt_on_signals()
     return {"list": print_faults, "run": run, "search": search}[options.verb](options)
 
 
-def print_faults(options: argparse.Namespace) -> int:
+def print_faults(options: Options) -> None:
     """Print each fault: how it is injected, and the expected reaction of the system."""
     from cloudrc.faults.scenarios import SCENARIOS
 
@@ -110,10 +83,9 @@ def print_faults(options: argparse.Namespace) -> int:
     head = "fault", "name", "injection", "expected reaction"
     text = table([head, *(tuple(each.values()) for each in faults)])
     print_result(options.output, {"faults": faults}, text)
-    return 0
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Options) -> int:
     """Run one fault, all faults, or the schedule of faults in a file; return the exit code."""
     from cloudrc.cli.progress import Progress
     from cloudrc.faults.scenarios import SCENARIOS, find
@@ -128,32 +100,30 @@ def run(options: argparse.Namespace) -> int:
         scenario = chosen[len(faults)]
         faults.append(scenario.as_json(outcome))
         if options.output == "table":
-            for line in scenario.as_lines(outcome, paint, briefly=options.all):
-                print(line)
+            print("\n".join(scenario.as_lines(outcome, paint, briefly=options.all)))
 
     run_seed = partial(run_fault, seed=options.seed)
     flown = map_in_order(run_seed, [each.name for each in chosen], options.jobs)
-    with closing(Progress("flies with the faults")):
+    with Progress("flies with the faults"):
         stopped = take_each(flown, take)
     done, failed = len(faults), sum(each["result"] == "failed" for each in faults)
     document = {"seed": options.seed, "passed": not failed, "faults": faults}
     text = f"\nseed {options.seed}: {done - failed} of {done} passed, {failed} failed"
     print_result(options.output, document, text)
     if stopped:
-        text = f"cloudrc: {stopped}; {done} of {len(chosen)} faults were run before"
-        print(text, file=sys.stderr, flush=True)
+        tell(f"{stopped}; {done} of {len(chosen)} faults were run before")
         return stopped.exit_code
     return FAILED if failed else 0
 
 
-def run_file(options: argparse.Namespace) -> int:
+def run_file(options: Options) -> int:
     """Fly the schedule of faults in a file; return 1 if the flight breaks a safety invariant."""
     from cloudrc.cli.progress import Progress
     from cloudrc.faults.trial import fly_file
 
     if options.seed != 1:
         raise BadInputError("--seed belongs to named faults, not to a schedule's file")
-    with closing(Progress(f"flies {options.name}")):
+    with Progress(f"flies {options.name}"):
         finding = fly_file(options.name)
     breaches = [breach._asdict() for breach in finding.breaches]
     document = {"records_sha256": finding.sha256, "breaches": breaches}
@@ -161,35 +131,33 @@ def run_file(options: argparse.Namespace) -> int:
     return FAILED if breaches else 0
 
 
-def search(options: argparse.Namespace) -> int:
+def search(options: Options) -> int:
     """Fly random schedules of faults; print the failures, and how to continue the search."""
     from cloudrc.cli.progress import Progress
+    from cloudrc.config import shipped
     from cloudrc.config.schema import World
     from cloudrc.faults.search import SearchSettings, search, search_rows, search_summary
 
-    shown, seeds = options.output == "table", (options.first, options.minutes, options.jobs)
-    settings = SearchSettings(
-        options.adversarial, *seeds, options.store, options.robot or World().robot
-    )
+    options.store.mkdir(parents=True, exist_ok=True)
+    robot = shipped.model_path("robot", options.robot or World().robot, Path())
+    seeds = options.first, options.minutes, options.jobs
+    settings = SearchSettings(options.adversarial, *seeds, options.store, robot)
+    shown = options.output == "table"
     if shown:
-        about = (
-            f"{settings.kind} schedules of {escape(settings.robot)} from seed {options.first} on"
-        )
-        print(f"{about}, for {options.minutes:g} min")
+        about = f"{settings.kind} schedules of {robot} from seed {options.first} on"
+        print_line(f"{about}, for {options.minutes:g} min")
 
     def see(failure: dict[str, Any]) -> None:
         if shown:
             print_line(f"FAILED seed {failure['seed']}: {failure['breaches'][0]['text']}")
             print_line(f"  again: cloudrc faults run {failure['file']}")
 
-    with closing(Progress("flies schedules")):
+    with Progress("flies schedules"):
         found, stopped = search(settings, see)
-    again = f"cloudrc faults search{' --adversarial' if options.adversarial else ''}"
-    again += f" --robot {quote(options.robot)}" if options.robot else ""
-    again += f" --first {found['next']}"
-    lines = table(search_rows(found), right=(1, 2)), "", search_summary(found)
-    print_result(options.output, found, "\n".join(["", *lines, f"to continue: {again}"]))
+    again = f"to continue, add --first {found['next']}"
+    lines = "", table(search_rows(found), right=(1, 2)), "", search_summary(found), again
+    print_result(options.output, found, "\n".join(lines))
     if stopped:
-        print(f"cloudrc: {stopped}; continue with '{again}'", file=sys.stderr, flush=True)
+        tell(f"{stopped}; {again}")
         return stopped.exit_code
     return FAILED if found["failures"] else 0

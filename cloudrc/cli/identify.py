@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
-import os
-from contextlib import closing
 from pathlib import Path
 
 from cloudrc.cli.output import format_document, output_argument, print_result
-from cloudrc.errors import BadInputError
+from cloudrc.cli.parser import Options, Parser, flags
 from cloudrc.files import write_atomically
-from cloudrc.runs.requirements import require
+from cloudrc.outside.paths import check_new
 from cloudrc.text import escape
 
 EPILOG = """\
@@ -21,26 +18,23 @@ examples:
       --set cloud.predictor.model=model.yaml"""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or an MCAP file")
-    about = "file for the model (default: model.yaml)"
-    parser.add_argument("--out", type=Path, default=Path("model.yaml"), metavar="FILE", help=about)
+    add = flags(parser)
+    add("run", "RUN", "folder of a run, or an MCAP file")
+    add("--out", "FILE", "file for the model (default: model.yaml)", Path("model.yaml"))
     output_argument(parser)
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> None:
     """Fit the model, write it to a file, and print it."""
-    require("identify", ("record",))
     from cloudrc.cli.progress import Progress
     from cloudrc.studies.identify import as_text, describe, identify
 
     out = options.out
-    if os.path.lexists(out):
-        raise BadInputError(f"{out}: already there; name another file with --out")
-    with closing(Progress(f"reads {options.run} and fits the model")):
+    check_new(out, "name another file with --out")
+    with Progress(f"reads {options.run} and fits the model"):
         found = identify(options.run)
     document = describe(*found)
     write_atomically(out, f"{format_document(document, 'yaml')}\n".encode())
     print_result(options.output, document, f"{as_text(*found)}\n{escape(str(out))}")
-    return 0

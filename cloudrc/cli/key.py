@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
 from cloudrc.cli.output import print_line
-from cloudrc.cli.parser import add_verbs
+from cloudrc.cli.parser import Options, Parser, add_verbs, flags
 
 VERBS = {
     "new": "make a key file, or rotate the key in one",
@@ -25,14 +22,14 @@ each of them:
     --dry-run=client -o yaml | kubectl apply -f -"""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     new, drop = add_verbs(parser, VERBS).values()
-    new.add_argument("file", type=Path, metavar="FILE", help="key file to write, with mode 0600")
-    drop.add_argument("file", type=Path, metavar="FILE", help="key file made by 'new'")
+    flags(new)("file", "FILE", "key file to write, with mode 0600")
+    flags(drop)("file", "FILE", "key file made by 'new'")
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> None:
     """Run `key new` (make or rotate a key) or `key drop` (remove the previous key)."""
     from cloudrc.drivers.keyfile import drop_previous, make_or_rotate
 
@@ -43,4 +40,3 @@ def execute(options: argparse.Namespace) -> int:
     else:
         keys, said = drop_previous(path), " is the only key"
     print_line(f"key {keys.current.name}{said}: {path}")
-    return 0

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 
-from cloudrc.cli.parser import add_verbs
+from cloudrc.cli.parser import Parser, add_verbs
 
 EPILOG = """\
 examples:
@@ -29,16 +28,10 @@ VERBS = {
 """Verb -> its line in the help."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     for name, verb in add_verbs(parser, VERBS).items():
         module = importlib.import_module(f"cloudrc.cli.link_{name}")
         verb.epilog = module.EPILOG
         module.arguments(verb)
-        verb.set_defaults(act=module.execute)
-
-
-def execute(options: argparse.Namespace) -> int:
-    """Run the verb that the user has chosen, such as `set`; return the exit code."""
-    code: int = options.act(options)
-    return code
+        verb.set_defaults(execute=module.execute)

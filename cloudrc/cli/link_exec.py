@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
-from pathlib import Path
 
-from cloudrc.cli.output import print_line
-from cloudrc.cli.parser import number, read_seed, settings_from, whole_number
-from cloudrc.runs.interrupts import interrupt_on_signals
+from cloudrc.cli.output import print_lines, tell
+from cloudrc.cli.parser import Options, Parser, flags, number, settings_from, whole_number
+from cloudrc.cli.relay import link_arguments
 
 EPILOG = """\
 examples:
@@ -35,50 +33,33 @@ exit codes: that of the client, or of the server if it fails first; 2 bad input,
 with 0 before it listened, or the relay failed, 130 interrupted"""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the action's arguments."""
-    add = parser.add_argument
-    add("--link", default="ideal", metavar="PROFILE", help="shipped profile, or a file")
-    add("--seed", type=read_seed, default=1, metavar="S", help="seed (default: 1)")
-    setting = "change of the profile, such as uplink.loss=0.05; repeatable"
-    add("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help=setting)
-    ends = {"--server": "the program that serves", "--client": "the program that asks"}
-    for flag, text in ends.items():
-        add(flag, type=_read_command, required=True, metavar="COMMAND", help=text)
+    link_arguments(parser)
+    add = flags(parser)
+    add("--server", "COMMAND", "the program that serves", required=True)
+    add("--client", "COMMAND", "the program that asks", required=True)
     port = whole_number(1, 65535)
     expose = "forward this TCP port of 127.0.0.1 to the server, beside the link; repeatable"
-    add("--expose", type=port, action="append", default=[], metavar="PORT", help=expose)
+    add("--expose", "PORT", expose, read=port, many=True)
     wait = "longest time for the server to listen (default: 60); 0: start the client at once"
-    add("--wait", type=number(0, 3600, "seconds"), default=60.0, metavar="S", help=wait)
-    metrics = "serve Prometheus metrics at this port of 127.0.0.1"
-    add("--metrics-port", type=port, metavar="PORT", help=metrics)
+    add("--wait", "S", wait, 60.0, number(0, 3600, "seconds"))
+    add("--metrics-port", "PORT", "serve Prometheus metrics at this port of 127.0.0.1", read=port)
     output = "new folder for link.json and the recordings of both directions"
-    add("-o", "--output", type=Path, metavar="FOLDER", help=output)
+    add("-o --output", "FOLDER", output)
 
 
-def _read_command(text: str) -> str:
-    if not text.strip():
-        raise argparse.ArgumentTypeError("empty; give a command for the shell")
-    return text
-
-
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> int:
     """Run both programs, print the verdict on the link, and return the client's exit code."""
-    interrupt_on_signals()
     from cloudrc.runs.links.programs import ExecSettings, run_programs
     from cloudrc.runs.links.programs_report import make_exec_report, write_report
     from cloudrc.runs.links.verify import as_text
-
-    def tell(text: str) -> None:
-        print_line(f"cloudrc: {text}", sys.stderr)
 
     settings = settings_from(options, ExecSettings)
     outcome, link = run_programs(settings, tell)
     if link.engine is not None:
         report = make_exec_report(settings, outcome, link)
-        print_line("", sys.stderr)
-        for line in as_text(report).splitlines():
-            print_line(line, sys.stderr)
+        print_lines(["", *as_text(report).splitlines()], sys.stderr)
         if settings.output:
             write_report(settings.output, report, link)
             tell(f"{settings.output}: link.json, uplink.csv, downlink.csv")

@@ -6,9 +6,9 @@ format from the content of the source.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
+from cloudrc.cli.parser import Options, Parser, flags
 from cloudrc.outside.paths import check_new
 
 EPILOG = """\
@@ -30,17 +30,17 @@ A trace describes one direction. A run has two: without --direction the command
 writes both, and adds the direction to each file name."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the action's arguments."""
-    add = parser.add_argument
-    add("source", type=Path, metavar="SOURCE", help="a run, a log or a CSV file")
-    add("-o", "--output", type=Path, required=True, metavar="FILE", help="the trace to write")
-    add("--direction", choices=("uplink", "downlink"), help="take this direction only")
+    add = flags(parser)
+    add("source", "SOURCE", "a run, a log or a CSV file", read=Path)
+    add("-o --output", "FILE", "the trace to write", required=True)
+    add("--direction", None, "take this direction only", choices=("uplink", "downlink"))
     halve = "take half of each round trip of a log; correct only if both directions are equal"
-    add("--halve-rtt", action="store_true", help=halve)
+    add("--halve-rtt", "", halve)
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> None:
     """Read the delays from SOURCE, write a trace per direction, and print a summary of each."""
     from cloudrc.runs.links.trace import read_packets, write_trace_file
 
@@ -53,4 +53,3 @@ def execute(options: argparse.Namespace) -> int:
         check_new(path)
     for way, packets in found.items():
         print("\n".join(write_trace_file(packets, paths[way], way)))
-    return 0

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import secrets
-import sys
 from dataclasses import asdict, replace
 from time import monotonic
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.cluster_flags import flown_release, release_arguments
-from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
-from cloudrc.cli.output import output_argument, print_line, print_result
+from cloudrc.cli.cluster_flags import release_arguments
+from cloudrc.cli.find_run import find_local_run, need_release, run_argument
+from cloudrc.cli.output import output_argument, print_result, tell
+from cloudrc.cli.parser import Options, Parser, flags
 from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.text import escape
@@ -38,27 +37,25 @@ anew; single values leave them running. The change is recorded. It lasts until
 the next change, the end of the run, or 'helm upgrade'."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = parser.add_argument
-    add("settings", nargs="*", metavar="KEY=VALUE", help="uplink.KEY=VALUE or downlink.KEY=VALUE")
-    add("--profile", metavar="NAME", help="shipped profile, or a file")
+    about = "uplink.KEY=VALUE or downlink.KEY=VALUE"
+    parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help=about)
+    flags(parser)("--profile", "NAME", "shipped profile, or a file")
     run_argument(parser)
     output_argument(parser)
     release_arguments(parser)
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> None:
     """Change the link as the flags say, and print the new state of the link."""
     began, number = monotonic(), secrets.token_hex(4)
     from cloudrc.drivers.local import LINK_FOLDER
     from cloudrc.runs.links.change import set_here, states_table
 
     if (found := find_local_run(options, links=True)) is not None:
-        run = found.folder
-        folder, asked = run / LINK_FOLDER, (options.profile, options.settings)
-        edit, states = set_here(folder, found.url, *asked, number)
-        where = str(run)
+        where, asked = str(found.folder), (options.profile, options.settings)
+        edit, states = set_here(found.folder / LINK_FOLDER, found.url, *asked, number)
         took = monotonic() - began
     else:
         from cloudrc.cluster.link import keep, send
@@ -72,25 +69,21 @@ def execute(options: argparse.Namespace) -> int:
         where = f"release '{place.name}'{f' {place.where}' if place.namespace else ''}"
         edit, states = sent.edit, sent.states
     for text in edit.notes:
-        print_line(f"cloudrc: note: {text}", sys.stderr)
+        tell(f"note: {text}")
     links = {state.direction: asdict(state) for state in states}
     document = {"change": number, "seconds": round(took, 3), "links": links}
     said = escape(f"{where}: in force after {took:.1f} s")
     print_result(options.output, document, f"{states_table(states)}\n{said}")
-    return 0
 
 
-def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
+def _link_of(options: Options, where: Release) -> LinkParts:
     from cloudrc.cluster.link import read_link
     from cloudrc.cluster.pods import find_pod
 
     try:
         return read_link(where)
     except (ClusterError, MissingPrerequisiteError):  # such as kubectl
-        try:
-            release = flown_release(options)
-            for part in ("world", "cloud"):
-                find_pod(release, part)  # raises the most precise error
-        except MissingPrerequisiteError as error:
-            raise no_run_error(options, error, "--run") from None
+        release = need_release(options)
+        for part in ("world", "cloud"):
+            find_pod(release, part)  # raises the most precise error
         raise

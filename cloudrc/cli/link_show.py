@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
-from contextlib import closing
 from pathlib import Path
 
-from cloudrc.cli.output import print_line
-from cloudrc.cli.parser import number, read_seed, settings_from, whole_number
+from cloudrc.cli.output import tell
+from cloudrc.cli.parser import (
+    Options,
+    Parser,
+    flags,
+    number,
+    read_seed,
+    settings_from,
+    whole_number,
+)
 from cloudrc.files import at_place
 from cloudrc.outside.paths import check_picture
-from cloudrc.runs.requirements import require
 from cloudrc.text import escape
 
 EPILOG = """\
@@ -27,48 +31,40 @@ A trace has one packet per row, whatever the duration of the row; a short trace
 with losses between 0 and 1 has several."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the arguments."""
-    add = parser.add_argument
-    add("profile", metavar="PROFILE", help="shipped profile, a file, or a trace in CSV")
+    add = flags(parser)
+    add("profile", "PROFILE", "shipped profile, a file, or a trace in CSV")
     picture = "the picture: .png, .svg or .pdf (default: NAME.png)"
-    add("-o", "--output", type=Path, metavar="FILE", help=picture)
+    add("-o --output", "FILE", picture)
     seconds = "time to show (default: 30, or the whole time line)"
-    add("--seconds", type=number(0.001, 86_400, "seconds"), metavar="S", help=seconds)
-    seed = "seed of the random draws (default: 1)"
-    add("--seed", type=read_seed, default=1, metavar="S", help=seed)
-    rate = "packets per second (default: 100)"
-    add("--rate", type=number(1, 10_000, "Hz"), default=100.0, metavar="HZ", help=rate)
+    add("--seconds", "S", seconds, read=number(0.001, 86_400, "seconds"))
+    add("--seed", "S", "seed of the random draws (default: 1)", 1, read_seed)
+    add("--rate", "HZ", "packets per second (default: 100)", 100.0, number(1, 10_000, "Hz"))
     packets = "packets for the statistics of an unchanging link (default: 100000)"
-    add("--packets", type=whole_number(1, 10_000_000), default=100_000, metavar="N", help=packets)
+    add("--packets", "N", packets, 100_000, whole_number(1, 10_000_000))
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> None:
     """Write a picture of a profile; print statistics and, in the last line, the file's path."""
-    require("a picture of a link", ("report",))
     output = options.output or Path(f"{Path(options.profile).stem}.png")
     check_picture(output, "-o")
     from cloudrc.cli.progress import Progress
 
-    with closing(Progress(f"draws {options.profile}")):
+    with Progress(f"draws {options.profile}"):
         title, text, picture = _drawn(options, output.suffix[1:])
     with at_place(output):
         output.write_bytes(picture)
-    print(title)
-    print(text)
-    print_line(str(output))
-    return 0
+    print(title, text, escape(str(output)), sep="\n")
 
 
-def _drawn(options: argparse.Namespace, kind: str) -> tuple[str, str, bytes]:
+def _drawn(options: Options, kind: str) -> tuple[str, str, bytes]:
     """Return title, statistics and picture of a profile."""
     from cloudrc.report.figures.link import render_link
     from cloudrc.runs.links.sample import SampleSettings, sample_profile, statistics_table
 
     settings = settings_from(options, SampleSettings)
-    about, ways = sample_profile(
-        options.profile, settings, lambda text: print_line(f"cloudrc: {text}", sys.stderr)
-    )
+    about, ways = sample_profile(options.profile, settings, tell)
     title = escape(": ".join(filter(None, (Path(options.profile).stem, about))))
     samples = [sample for sample, _ in ways.values()]
     picture = render_link(title, samples[0], samples[1] if samples[1:] else None, kind)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
-from contextlib import closing
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import flown_release, release_arguments
 from cloudrc.cli.output import output_argument, paint, print_result
-from cloudrc.cli.parser import number
-from cloudrc.errors import BadInputError
+from cloudrc.cli.parser import Options, Parser, flags, number
 from cloudrc.link.verify import DEFAULT
-from cloudrc.runs.interrupts import interrupt_on_signals
 
 if TYPE_CHECKING:
     from cloudrc.runs.links.verify import Report
@@ -36,41 +32,40 @@ exit codes: 0 believed, 1 not believed or undecided, 2 bad input,
 3 missing prerequisite, 4 no answer in time, 5 cluster, 6 a process died"""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the arguments."""
-    add = parser.add_argument
+    add = flags(parser)
     target = f"name of a shipped one, or a file (default: {DEFAULT})"
-    add("target", nargs="?", default=DEFAULT, metavar="PROFILE|EXPERIMENT", help=target)
+    add("target", "PROFILE|EXPERIMENT", target, DEFAULT, nargs="?")
     setting = "override one value of the experiment, for example link.uplink.loss=0.1"
-    add("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help=setting)
+    add("--set", "KEY=VALUE", setting, dest="settings")
     seconds = (
         "time to send probes (default: as long as needed, at most 120); with --mode cluster: "
         "time to wait for a verdict (default: 270)"
     )
-    add("--seconds", type=number(1, 3600, "seconds"), metavar="S", help=seconds)
+    add("--seconds", "S", seconds, read=number(1, 3600, "seconds"))
     shaper = "relay (default), or netem between two network namespaces (needs root)"
-    add("--shaper", choices=("relay", "netem"), default="relay", help=shaper)
+    add("--shaper", None, shaper, "relay", choices=("relay", "netem"))
     mode = "a link started on this machine (default), or the link of a release"
-    add("--mode", choices=("local", "cluster"), default="local", help=mode)
+    add("--mode", None, mode, "local", choices=("local", "cluster"))
     ends = "hosts of a release's two pods, from inside its cluster; used by 'helm test'"
-    add("--ends", metavar="WORLD,CLOUD", help=ends)
+    add("--ends", "WORLD,CLOUD", ends)
     release_arguments(parser)
     output_argument(parser)
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> int:
     """Measure the link and print the verdict; return 0 if the link matches its profile, else 1."""
     from cloudrc.cli.progress import Progress
     from cloudrc.runs.links.verify import as_text  # imports large packages
 
-    interrupt_on_signals()  # on a signal, remove namespaces and processes
-    with closing(Progress("measures the link")):
+    with Progress("measures the link"):
         report = _verify(options)
     print_result(options.output, report, as_text(report, paint))
     return 0 if report["verdict"] == "believed" else 1
 
 
-def _verify(options: argparse.Namespace) -> Report:
+def _verify(options: Options) -> Report:
     from cloudrc.runs.links.verify import (
         RELEASE_TIMEOUT,
         forwarded_pods,

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
-from contextlib import closing
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.compare import flight_arguments
 from cloudrc.cli.output import output_argument, print_result
-from cloudrc.cli.parser import number
-from cloudrc.runs.interrupts import interrupt_on_signals
-from cloudrc.runs.requirements import MODES, require
+from cloudrc.cli.parser import Options, Parser, flags, number
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
@@ -32,29 +28,27 @@ cloud.horizon_max_s, cloud.freeze_after_s and guard.command_age_max_ms as the
 delays need it, unless --set gives them."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    add = parser.add_argument
-    add("key", metavar="KEY", help="key of the experiment whose value is a number")
+    add = flags(parser)
+    add("key", "KEY", "key of the experiment whose value is a number")
     flight_arguments(parser, seeds=3)
     above_0 = number(1e-9, 1e12, "units")
     about = "largest value to try (default: 32 times the first, which is the present one)"
-    add("--max", type=above_0, metavar="X", help=about)
+    add("--max", "X", about, read=above_0)
     about = "try multiples of R (default: 10 for a key in ms, 1 for whole numbers, else 0.01)"
-    add("--resolution", type=above_0, metavar="R", help=about)
+    add("--resolution", "R", about, read=above_0)
     output_argument(parser)
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> int:
     """Print both answers; return 0, or 1 if no value is stable (or, without that, none settles)."""
-    interrupt_on_signals()
-    require("margin", MODES["virtual"])
     from cloudrc.cli.progress import Progress
     from cloudrc.studies.margin import Asked, Margin, as_text, describe
 
     asked = options.key, options.experiment, options.set, options.seeds
     margin = Margin(Asked(*asked, options.max, options.resolution))
-    with closing(Progress("flies")) as view:
+    with Progress("flies") as view:
         for name in margin.questions:
             _search(options, margin, name, view.say)
         document = describe(margin)
@@ -64,7 +58,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _search(
-    options: argparse.Namespace, margin: Margin, question: str, say: Callable[[str], None]
+    options: Options, margin: Margin, question: str, say: Callable[[str], None]
 ) -> None:
     """Search the answer to a question, and `say` each value that is tried."""
     from cloudrc.studies.margin import QUESTIONS, why
@@ -72,9 +66,9 @@ def _search(
 
     facts = {"small": SMALL, "scene": SCENE, "experiment": options.experiment}
     text = QUESTIONS[question].format(**facts)
-    say(escape(f"{text}, seeds 1 to {options.seeds}"))
+    say(f"{text}, seeds 1 to {options.seeds}")
 
     def see(number: int, answer: Answer) -> None:
-        say(escape(f"  {margin.name(number):<26}{why(question, answer)}"))
+        say(f"  {margin.name(number):<26}{why(question, answer)}")
 
     margin.search(question, see)

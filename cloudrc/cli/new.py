@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
 from shlex import quote
 
-from cloudrc.cli.output import print_or_drop
-from cloudrc.cli.parser import add_verbs
+from cloudrc.cli.parser import Options, Parser, add_verbs, flags
 
 VERBS = {"robot": "write a folder with a robot that flies, to change"}
 EPILOG = """\
@@ -16,13 +13,13 @@ examples:
   cloudrc robot check ./my_robot"""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     (robot,) = add_verbs(parser, VERBS).values()
-    robot.add_argument("folder", type=Path, metavar="DIR", help="folder for the files")
+    flags(robot)("folder", "DIR", "folder for the files")
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> None:
     """Write the files, and print what to type next."""
     from cloudrc.runs.new_robot import write_robot
 
@@ -30,10 +27,9 @@ def execute(options: argparse.Namespace) -> int:
     names = write_robot(folder)
     path = folder if folder.is_absolute() or folder.parts[:1] == ("..",) else f"./{folder}"
     typed = quote(str(path))
-    print_or_drop(
+    print(
         f"change {', '.join(names)} in {folder}, then:\n"
         f"  cloudrc robot check {typed}\n"
         f"  cloudrc run steps --mode virtual --set world.robot={typed}\n"
         f"  pytest {typed}"
     )
-    return 0

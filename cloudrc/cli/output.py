@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from cloudrc.cli.parser import Parser
 from cloudrc.errors import DISK_FULL
 from cloudrc.files import at_place
 from cloudrc.text import escape
@@ -32,7 +32,7 @@ STDOUT = "the output (stdout)"
 
 
 def output_argument(
-    parser: argparse.ArgumentParser, what: str = "output format", *, forms: Sequence[str] = ()
+    parser: Parser, what: str = "output format", *, forms: Sequence[str] = ()
 ) -> None:
     """Declare the flag `--output`; `what` is its help text, `forms` are further forms."""
     forms, about = (TABLE, "json", "yaml", *forms), f"{what} (default: table)"
@@ -87,13 +87,6 @@ def reserve_stdout() -> Iterator[None]:
             stack.enter_context(contextlib.redirect_stdout(document))
             stack.callback(document.close)
         yield
-
-
-def end_output() -> None:
-    """Send what plug-ins print at the end of this process to stderr: the result is complete."""
-    stdout, stderr = _descriptor(sys.stdout), _descriptor(sys.stderr)
-    if stdout is not None and stderr is not None:
-        os.dup2(stderr, stdout)
 
 
 def is_live(stream: TextIO) -> bool:
@@ -157,9 +150,19 @@ def print_line(line: str, stream: TextIO | None = None) -> None:
         print(escape(line), file=stream, flush=True)
 
 
+def print_lines(lines: Iterable[str], stream: TextIO | None = None) -> None:
+    """Print lines as `print_line` does."""
+    for line in lines:
+        print_line(line, stream)
+
+
+def tell(text: str) -> None:
+    """Print a line about the work of this command, such as a note, on stderr."""
+    print_line(f"cloudrc: {text}", sys.stderr)
+
+
 def warn(*experiments: ResolvedExperiment) -> None:
     """Print warnings about experiments on stderr."""
     from cloudrc.runs.experiment import advice_on
 
-    for text in advice_on(*experiments):
-        print_line(f"cloudrc: warning: {text}", sys.stderr)
+    print_lines((f"cloudrc: warning: {text}" for text in advice_on(*experiments)), sys.stderr)

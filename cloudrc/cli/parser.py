@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import importlib
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from cloudrc.errors import BadInputError
 from cloudrc.outside.values import InvalidValueError, Quantity
+from cloudrc.text import suggest_name, unknown_name_text
 from cloudrc.version import __version__
 
 GROUPS: dict[str, dict[str, str]] = {
@@ -82,6 +83,12 @@ exit codes: 0 done, 1 mission failed its criteria, 2 usage or bad input,
 
 
 Settings = TypeVar("Settings")
+Options = argparse.Namespace
+"""What the user has given: an attribute per argument."""
+Add = Callable[..., argparse.Action]
+"""Function that declares an argument; `flags` returns it."""
+PATHS = ("FILE", "DIR", "FOLDER", "RUN", "RUN|RELEASE")
+"""Names of values that are paths."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -101,20 +108,16 @@ class Parser(argparse.ArgumentParser):
         """Refuse unknown arguments here: argparse would name the help of the first command."""
         known, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            near = difflib.get_close_matches(
-                unknown[0], self._option_string_actions, n=1, cutoff=0.8
-            )
-            hint = f" (did you mean {near[0]}?)" if near else ""
+            hint = suggest_name(unknown[0], [*self._option_string_actions])
             self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         return known, unknown
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Refuse an unknown choice and suggest the most similar one; argparse would list all."""
+        """Refuse an unknown choice, and suggest the most similar one."""
         if action.choices is not None and value not in action.choices:
-            near = difflib.get_close_matches(value, action.choices, n=1, cutoff=0.5)
-            known = ", ".join(sorted(action.choices))
-            hint = f"did you mean '{near[0]}'?" if near else f"choose one of {known}"
-            raise argparse.ArgumentError(action, f"no '{value}'; {hint}")
+            raise argparse.ArgumentError(
+                action, unknown_name_text("choice", value, [*action.choices])
+            )
 
 
 @dataclass(frozen=True)
@@ -145,13 +148,45 @@ def number(low: float, high: float, unit: str) -> NumberFlag:
     return NumberFlag(Quantity(unit, low, high))
 
 
-def figure_arguments(parser: argparse.ArgumentParser, width: float) -> None:
+def flags(parser: argparse._ActionsContainer) -> Add:
+    """Return a function that declares an argument: `add(name, value, text, default, read)`.
+
+    A `name` may be two, such as "-n --namespace". `value` names the value in the help: with "" the
+    argument is a flag without a value, with None it has `choices`. A value named in `PATHS` is a
+    path; KEY=VALUE, and an argument with `many`, may be repeated. `text` is the help, `read`
+    converts a text. Others are those of argparse.
+    """
+    return partial(_declare, parser)
+
+
+def _declare(
+    parser: argparse._ActionsContainer,
+    name: str,
+    value: str | None,
+    text: str,
+    default: object = None,
+    read: Any = None,
+    *,
+    many: bool = False,
+    **others: Any,
+) -> argparse.Action:
+    if value == "":
+        return parser.add_argument(*name.split(), action="store_true", help=text)
+    if many or value == "KEY=VALUE":
+        others["action"], default = "append", []
+    read = read or (Path if value in PATHS else None)
+    return parser.add_argument(
+        *name.split(), metavar=value, help=text, default=default, type=read, **others
+    )
+
+
+def figure_arguments(parser: Parser, width: float) -> None:
     """Declare the arguments for the size of figures; `width` is the default width [in]."""
-    add = parser.add_argument
+    add = flags(parser)
     about = f"width of figures in inches: one column of a paper has 3.5 (default: {width})"
-    add("--width", type=number(2, 20, "inches"), default=width, metavar="IN", help=about)
+    add("--width", "IN", about, width, number(2, 20, "inches"))
     about = "size of the text of figures in points (default: 9)"
-    add("--font-size", type=number(5, 24, "points"), default=9.0, metavar="PT", help=about)
+    add("--font-size", "PT", about, 9.0, number(5, 24, "points"))
 
 
 class _Version(argparse.Action):
@@ -164,11 +199,10 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
+def build_parser(wanted: Container[str]) -> Parser:
     """Build the parser of all commands, with the arguments of the `wanted` commands only.
 
-    The function imports only the modules of these commands. With `for_completion`, the help also
-    contains argparse's list of commands, which the completion script needs.
+    The function imports only the modules of these commands.
     """
     # kubectl starts a plug-in by its file name, which nobody types.
     typed = "kubectl cloudrc" if Path(sys.argv[0]).name == KUBECTL_PLUGIN else "cloudrc"
@@ -181,27 +215,24 @@ def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Pars
     parser.add_argument(
         "--version", action=_Version, nargs=0, help="print version and hash of the code"
     )
-    shown = "what to do" if for_completion else argparse.SUPPRESS
-    commands = parser.add_subparsers(dest="command", help=shown, prog=typed)
+    commands = parser.add_subparsers(dest="command", help=argparse.SUPPRESS, prog=typed)
     for name, line in COMMANDS.items():
-        module = _find_command(name) if name in set(wanted) else None
         command = commands.add_parser(name, help=line, description=_sentence(line))
-        if module is not None:
+        if name in wanted:
+            module = _find_command(name)
             command.epilog = getattr(module, "EPILOG", None)
             module.arguments(command)
-            command.set_defaults(execute=module.execute)
+            command.set_defaults(execute=getattr(module, "execute", None))
     return parser
 
 
-def settings_from(options: argparse.Namespace, kind: Callable[..., Settings]) -> Settings:
+def settings_from(options: Options, kind: Callable[..., Settings]) -> Settings:
     """Make a dataclass from the flags with the names of its fields."""
     names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
     return kind(**{name: getattr(options, name) for name in names})
 
 
-def add_verbs(
-    parser: argparse.ArgumentParser, lines: Mapping[str, str]
-) -> dict[str, argparse.ArgumentParser]:
+def add_verbs(parser: Parser, lines: Mapping[str, str]) -> dict[str, Parser]:
     """Declare the verbs of a command; `lines` maps each verb to its line in the help.
 
     Return verb -> its parser. When the command runs, `options.verb` is the user's choice.
@@ -218,7 +249,10 @@ def _sentence(line: str) -> str:
 
 
 def _find_command(name: str) -> Any:
-    """Return the module or `Command` with the functions `arguments` and `execute` of a command."""
+    """Return what has the functions `arguments` and `execute` of a command.
+
+    `execute` gets the `Options`, and returns the exit code; None means 0. Verbs may have their own.
+    """
     module = importlib.import_module(f"cloudrc.cli.{MODULES.get(name, name)}")
     return getattr(module, name, module) if name in MODULES else module
 

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
-from pathlib import Path
 
-from cloudrc.cli.output import print_line
-from cloudrc.cli.parser import add_verbs, whole_number
+from cloudrc.cli.output import print_line, tell
+from cloudrc.cli.parser import Options, Parser, add_verbs, flags, whole_number
 from cloudrc.drivers.process import StopSignal
 from cloudrc.policy.address import KEY_VARIABLE
-from cloudrc.runs.interrupts import interrupt_on_signals
-from cloudrc.runs.requirements import require
 
 VERBS = {
     "serve": "serve a Python policy over openpi's wire, until Ctrl-C",
@@ -30,38 +26,33 @@ GET /healthz answers OK. If {KEY_VARIABLE} is set, clients must send this
 API key."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     serve, drive = add_verbs(parser, VERBS).values()
-    add = serve.add_argument
-    add("policy", metavar="POLICY", help="a Python file with infer(observation)")
-    about = "address to listen at (default: 127.0.0.1)"
-    add("--host", default="127.0.0.1", metavar="HOST", help=about)
+    add = flags(serve)
+    add("policy", "POLICY", "a Python file with infer(observation)")
+    add("--host", "HOST", "address to listen at (default: 127.0.0.1)", "127.0.0.1")
     about = "port to listen at; 0: any free port (default: 8000)"
-    add("--port", type=whole_number(0, 65_535), default=8000, metavar="N", help=about)
+    add("--port", "N", about, 8000, whole_number(0, 65_535))
 
-    about = "experiment file (YAML)"
-    drive.add_argument("--config", type=Path, metavar="FILE", required=True, help=about)
-    about = "folder of the sockets of 'cloudrc cloud --teleop DIR'"
-    drive.add_argument("--socket", type=Path, metavar="DIR", required=True, help=about)
-    about = "write status for a supervisor to stdout (default: events only)"
-    drive.add_argument("--feed", action="store_true", help=about)
+    add = flags(drive)
+    add("--config", "FILE", "experiment file (YAML)", required=True)
+    add("--socket", "DIR", "folder of the sockets of 'cloudrc cloud --teleop DIR'", required=True)
+    add("--feed", "", "write status for a supervisor to stdout (default: events only)")
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> None:
     """Serve a policy, or ask a remote controller, until the user interrupts."""
-    if options.verb == "drive":
-        stop = StopSignal()
-        require("a remote controller", ("policy",))
-        from cloudrc.processes.ends import run_remote
+    if options.verb == "serve":
+        _serve(options)
+        return
+    stop = StopSignal()
+    from cloudrc.processes.ends import run_remote
 
-        run_remote(options.config, options.socket, stop, watched=options.feed)
-        return 0
-    return _serve(options)
+    run_remote(options.config, options.socket, stop, watched=options.feed)
 
 
-def _serve(options: argparse.Namespace) -> int:
-    require("a policy's server", ("policy",))
+def _serve(options: Options) -> None:
     import asyncio
 
     from cloudrc.drivers.realtime import show_address
@@ -69,7 +60,6 @@ def _serve(options: argparse.Namespace) -> int:
     from cloudrc.policy.serve import PolicyServer
     from cloudrc.processes.ports import warn_if_exposed
 
-    interrupt_on_signals()
     host, stdout = options.host, sys.stdout
     warn_if_exposed((host, options.port))
 
@@ -77,10 +67,6 @@ def _serve(options: argparse.Namespace) -> int:
         url = f"ws://{show_address((host, port))}"
         print_line(f"policy {options.policy}: {url}", stdout)  # a policy's own output is elsewhere
 
-    def tell(text: str) -> None:
-        print_line(f"cloudrc: {text}", sys.stderr)
-
     server = PolicyServer(options.policy, tell, os.environ.get(KEY_VARIABLE, ""))
     with apart():
         asyncio.run(server.run(host, options.port, ready))
-    return 0

@@ -5,63 +5,42 @@ from __future__ import annotations
 import argparse
 import re
 import socket
-from collections.abc import Callable
-from pathlib import Path
-from typing import NamedTuple
+from types import SimpleNamespace
 
-from cloudrc.cli.parser import settings_from
+from cloudrc.cli.parser import Options, Parser, flags, settings_from
 from cloudrc.drivers.process import StopSignal
 from cloudrc.drivers.realtime import Address, split_address
 
 
-class CliCommand(NamedTuple):
-    """One command of a module that defines several commands.
-
-    A module with only one command is used in place of a `CliCommand`: it defines the same names.
-    """
-
-    arguments: Callable[[argparse.ArgumentParser], None]
-    execute: Callable[[argparse.Namespace], int]
-    EPILOG: str | None = None
-
-
-def _add(
-    parser: argparse.ArgumentParser, flag: str, kind: str, text: str, *, required: bool = False
-) -> None:
-    """Declare a flag; `kind`, such as "FILE", names its value; with "" the flag has no value."""
-    if not kind:
-        parser.add_argument(flag, action="store_true", help=text)
-        return
-    read: Callable[[str], object] = {"HOST:PORT": read_address, "SIZE": read_size}.get(kind, Path)
-    parser.add_argument(flag, type=read, metavar=kind, help=text, required=required)
-
-
-def process_arguments(parser: argparse.ArgumentParser) -> None:
+def process_arguments(parser: Parser) -> None:
     """Declare the flags that world, cloud, link and teleop have in common."""
-    _add(parser, "--config", "FILE", "experiment file (YAML)", required=True)
-    _add(parser, "--feed", "", "write status for a supervisor to stdout (default: events only)")
-    _add(parser, "--metrics", "HOST:PORT", "serve metrics and health checks here (default: off)")
+    add = flags(parser)
+    add("--config", "FILE", "experiment file (YAML)", required=True)
+    add("--feed", "", "write status for a supervisor to stdout (default: events only)")
+    about = "serve metrics and health checks here (default: off)"
+    add("--metrics", "HOST:PORT", about, read=read_address)
 
 
-def _end_arguments(parser: argparse.ArgumentParser) -> None:
+def _end_arguments(parser: Parser) -> None:
     process_arguments(parser)
+    add = flags(parser)
     file = "MCAP file to record to; an existing one becomes NAME.before.mcap"
-    _add(parser, "--record", "FILE", file, required=True)
-    _add(parser, "--record-flights", "", "no periodic records while the robot does not fly")
+    add("--record", "FILE", file, required=True)
+    add("--record-flights", "", "no periodic records while the robot does not fly")
     size = "limit of both recordings, such as 500M or 1Gi; at 90 %% the recording ends"
-    _add(parser, "--record-max", "SIZE", size)
-    _add(parser, "--listen", "HOST:PORT", "address to receive at", required=True)
-    _add(parser, "--key", "FILE", "the tunnel's key ('cloudrc key new FILE')", required=True)
+    add("--record-max", "SIZE", size, read=read_size)
+    add("--listen", "HOST:PORT", "address to receive at", read=read_address, required=True)
+    add("--key", "FILE", "the tunnel's key ('cloudrc key new FILE')", required=True)
     route = "the link's file with the address to send to; the link's state is beside it"
-    _add(parser, "--route", "FILE", route, required=True)
+    add("--route", "FILE", route, required=True)
 
 
-def _cloud_arguments(parser: argparse.ArgumentParser) -> None:
+def _cloud_arguments(parser: Parser) -> None:
     _end_arguments(parser)
-    text = "folder of the sockets of 'cloudrc teleop --socket DIR'"
-    _add(parser, "--teleop", "DIR", text, required=True)
+    add = flags(parser)
+    add("--teleop", "DIR", "folder of the sockets of 'cloudrc teleop --socket DIR'", required=True)
     text = "folder of the sockets of programs that read cloud's records (default: that of teleop)"
-    _add(parser, "--records", "DIR", text)
+    add("--records", "DIR", text)
 
 
 def read_address(text: str) -> Address:
@@ -94,21 +73,19 @@ def read_size(text: str) -> float:
     return float(number) * (1024.0 if binary else 1000.0) ** power
 
 
-def _run_world(options: argparse.Namespace) -> int:
+def _run_world(options: Options) -> None:
     stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
     from cloudrc.processes.ends import EndSettings, run_world
 
     run_world(settings_from(options, EndSettings), stop)
-    return 0
 
 
-def _run_cloud(options: argparse.Namespace) -> int:
+def _run_cloud(options: Options) -> None:
     stop = StopSignal()
     from cloudrc.processes.ends import EndSettings, run_cloud
 
     run_cloud(settings_from(options, EndSettings), options.teleop, options.records, stop)
-    return 0
 
 
-world = CliCommand(_end_arguments, _run_world)
-cloud = CliCommand(_cloud_arguments, _run_cloud)
+world = SimpleNamespace(arguments=_end_arguments, execute=_run_world)
+cloud = SimpleNamespace(arguments=_cloud_arguments, execute=_run_cloud)

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from threading import Event, Thread
-from time import monotonic
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
-    ProgressColumn,
+    RenderableColumn,
     SpinnerColumn,
-    Task,
     TimeRemainingColumn,
 )
 from rich.progress import Progress as Bars
@@ -26,7 +24,6 @@ from cloudrc.cli.output import is_live, print_or_drop
 from cloudrc.drivers.process import in_words
 from cloudrc.messages import NEVER_NS, GuardState, Vector
 from cloudrc.records import (
-    CONTROLLER_LOST,
     Control,
     Fault,
     GuardChange,
@@ -45,33 +42,22 @@ PERIOD = 10.0
 """Time from one line to the next on a stream that is no terminal [s]."""
 
 
-class _Line(ProgressColumn):
-    """The line of a `Progress`, cropped to the terminal."""
-
-    def __init__(self, line: Callable[[], Text]) -> None:
-        super().__init__(Column(no_wrap=True, overflow="crop"))
-        self._line = line
-
-    def render(self, task: Task) -> Text:
-        return self._line()
-
-
 class Progress:
-    """Shows the present step of a command until it is closed, and how much of it is done."""
+    """Shows the present step of a command in a `with` block, and how much of it is done."""
 
     def __init__(
-        self, step: str = "", total: int | None = None, *, says_on_stdout: bool = False
+        self, step: str = "", total: int | None = None, *, on_stdout: bool = False
     ) -> None:
         """Set the first step, such as "reads the recording", and the number of its pieces of work.
 
-        `say` prints on stderr, or with `says_on_stdout` on stdout.
+        `say` prints on stderr, or with `on_stdout` on stdout.
         """
         self._step = step
         is_moving = is_live(sys.stderr)
         bar = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()) if total else ()
         self._bars = Bars(
             SpinnerColumn(),
-            _Line(self.line),
+            RenderableColumn(self, table_column=Column(no_wrap=True, overflow="crop")),
             *bar,
             console=Console(stderr=True),
             transient=True,
@@ -85,12 +71,12 @@ class Progress:
         (self._work,) = self._bars.tasks
         self._closed, self._thread = Event(), Thread(target=self._log, daemon=True)
         self._bars.start()
-        # Now: while plug-ins run, sys.stdout is stderr.
-        self._out = sys.stdout if says_on_stdout else sys.stderr
+        # Now: rich has replaced the streams, and while plug-ins run, sys.stdout is stderr.
+        self._out = sys.stdout if on_stdout else sys.stderr
         if not is_moving:
             self._thread.start()
 
-    def line(self) -> Text:
+    def __rich__(self) -> Text:
         """Return the present step, and how long it takes."""
         return Text(f"{escape(self._step)} ({self._work.elapsed or 0:.0f} s)")
 
@@ -101,7 +87,7 @@ class Progress:
 
     def log_line(self) -> str:
         """Return the line for a stream that is no terminal; "": none."""
-        line, left = str(self.line()), self._work.time_remaining
+        line, left = str(self.__rich__()), self._work.time_remaining
         if self._work.total:
             line = f"{line}  {self._work.completed:.0f}/{self._work.total:.0f}"
         return line if left is None else f"{line}, {left:.0f} s left"
@@ -117,9 +103,13 @@ class Progress:
 
     def say(self, line: str) -> None:
         """Print a line for good; on a terminal, above the moving one."""
-        print_or_drop(line, self._out)
+        print_or_drop(escape(line), self._out)
 
-    def close(self) -> None:
+    def __enter__(self) -> Self:
+        """Show the step during the block."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
         """Erase the moving line."""
         self._closed.set()
         self._bars.stop()
@@ -139,56 +129,41 @@ class FlightView(Progress):
         `unit` is what the mission counts; "": nothing. With `events`, print them on stdout.
         """
         self._waypoints, self._unit, self._events = waypoints, unit, events
-        self._first_ns = self._now_ns = self._start_ns = NEVER_NS
+        self._now_ns = self._start_ns = NEVER_NS
         self._mission = 0  # number of the mission in the newest telemetry
-        self._moved_at = self._seen = monotonic()
         self._position: Vector = (math.nan, math.nan, math.nan)
         self._delay, self._waypoint = math.nan, -1
         self._guard, self._ended = GuardState.GROUND, False
-        super().__init__(says_on_stdout=events)
+        super().__init__(on_stdout=events)
 
     def see(self, records: Iterable[Record]) -> None:
         """Show new records of world or cloud, in the order of time."""
         for record in records:
             match record:
-                case TelemetrySent():
-                    self._see_telemetry(record)
+                case TelemetrySent(telemetry=seen):
+                    if seen.mission_id != self._mission:
+                        self._mission, self._start_ns = seen.mission_id, record.stamp_ns
+                    self._now_ns, self._position = record.stamp_ns, seen.odometry.position
                 case Control():
                     # The horizon is 0 and meaningless before the first round trip.
                     self._delay = math.nan if math.isnan(record.rtt) else record.horizon
                     self._waypoint = record.waypoint
                 case GuardChange():
-                    self._see_guard(record)
+                    self._guard = record.state
+                    # The robot holds its position after every mission: do not print this.
+                    is_usual = self._ended and record.state is GuardState.HOLD
+                    if record.state > GuardState.TRACK and not is_usual:
+                        self._event(f"{record.state.name}: {record.cause}", record.stamp_ns)
                 case MissionEvent():
                     self._ended = record.event in ENDINGS
                     self._event(record.text, record.stamp_ns)
-                case Fault(code=code) if code in CONTROLLER_LOST:
-                    pass  # the error at the end of the command says it
                 case Fault() | LinkChanged():
                     self._event(in_words(record), record.stamp_ns)
 
-    def _see_telemetry(self, record: TelemetrySent) -> None:
-        if self._first_ns == NEVER_NS:
-            self._first_ns, self._moved_at = record.stamp_ns, monotonic()
-        if record.telemetry.mission_id != self._mission:
-            self._mission, self._start_ns = record.telemetry.mission_id, record.stamp_ns
-        self._now_ns, self._seen = record.stamp_ns, monotonic()
-        self._position = record.telemetry.odometry.position
-
-    def _see_guard(self, record: GuardChange) -> None:
-        self._guard = record.state
-        # The robot holds its position after every mission: do not print this.
-        is_usual = self._ended and record.state is GuardState.HOLD
-        if record.state > GuardState.TRACK and not is_usual:
-            self._event(f"{record.state.name}: {record.cause}", record.stamp_ns)
-        if record.state > GuardState.HOLD and not self._waypoints:
-            self.say("  to fly again, find the cause, then: cloudrc mission acknowledge")
-
-    def line(self) -> Text:
+    def __rich__(self) -> Text:
         """Return the status line; it ends with the least important part, which may be cropped."""
         if self._step:
-            return super().line()
-        elapsed, flown = self._seen - self._moved_at, (self._now_ns - self._first_ns) * 1e-9
+            return super().__rich__()
         since = self._now_ns - self._start_ns if self._start_ns != NEVER_NS else 0
         cells = (
             f"{since * 1e-9:6.1f} s",
@@ -196,7 +171,6 @@ class FlightView(Progress):
             self._leg(),
             self._place(),
             "" if math.isnan(self._delay) else f"delay {self._delay * 1e3:3.0f} ms",
-            f"x{flown / elapsed:.2f}" if elapsed > 0 and flown > 0 else "",
         )
         line = Text(_joined(cells))
         colour = "green" if self._guard == GuardState.TRACK else "yellow"
@@ -223,7 +197,7 @@ class FlightView(Progress):
             return
         since = (stamp_ns - self._start_ns) * 1e-9
         time = " " * 9 if self._start_ns == NEVER_NS else f"{since:7.2f} s"
-        self.say(_joined((time, f"{escape(text):<44}", self._place())))
+        self.say(_joined((time, f"{text:<44}", self._place())))
 
 
 def _joined(cells: Iterable[str]) -> str:
@@ -233,41 +207,36 @@ def _joined(cells: Iterable[str]) -> str:
 class SweepView(Progress):
     """Counts flights; prints the first failure of each verdict."""
 
-    def __init__(self, head: str, total: int, *, says_on_stdout: bool = False) -> None:
+    def __init__(self, head: str, total: int, *, on_stdout: bool = False) -> None:
         """Print the headline `head`; set `total`, the number of flights to fly."""
-        super().__init__("flies", total, says_on_stdout=says_on_stdout)
-        self.say(escape(head))
-        self._total, self._done, self._failed = total, 0, 0
-        self._told = set[str]()
+        super().__init__("flies", total, on_stdout=on_stdout)
+        self.say(head)
+        self._failed, self._told = 0, set[str]()
 
     def see(self, row: Row) -> None:
         """Count a finished flight, and tell about it."""
-        self._done += 1
-        self._failed += row["verdict"] != "success"
+        self._bars.advance(self._work.id)
+        if row["verdict"] != "success":
+            self._failed += 1
+            self._step = f"flies, {self._failed} failed"
         self._tell(row)
-        self._step = f"flies, {self._failed} failed" if self._failed else "flies"
-        self.count(self._done)
 
     def _tell(self, row: Row) -> None:
         """Print the first failure of each verdict, and why a metric has no value once per text."""
         kind = row["verdict"] if row["failures"] else row["text"]
         if row["text"] and kind not in self._told:
             self._told.add(kind)
-            self.say(escape(f"{row['key']}: {row['verdict']}: {row['text']}"))
+            self.say(f"{row['key']}: {row['verdict']}: {row['text']}")
 
 
 class SeedsView(SweepView):
-    """Prints a line per flight on stdout, with its seed, its verdict and why it failed."""
-
-    def __init__(self, head: str, total: int) -> None:
-        """Print the headline `head`; set `total`, the number of flights to fly."""
-        super().__init__(head, total, says_on_stdout=True)
+    """Prints a line per flight, with its seed, its verdict and why it failed."""
 
     def _tell(self, row: Row) -> None:
         """Print the line of a flight; say why a metric has no value once per text."""
-        count = f"{self._done}/{self._total}"
+        count = f"{self._work.completed:.0f}/{self._work.total:.0f}"
         line = f"{count:>7}  seed {row['seed']}  {row['verdict']}"
         if row["failures"] or row["text"] not in ("", *self._told):
             line += f": {row['text']}"
         self._told.add(row["text"])
-        self.say(escape(line))
+        self.say(line)

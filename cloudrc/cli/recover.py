@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
-import os
 from collections import Counter
-from contextlib import closing
 from pathlib import Path
 
 from cloudrc.cli.output import output_argument, print_result
+from cloudrc.cli.parser import Options, Parser, flags
 from cloudrc.errors import BadInputError
-from cloudrc.runs.requirements import require
+from cloudrc.outside.paths import check_new
 from cloudrc.text import escape
 
 EPILOG = """\
@@ -22,17 +20,17 @@ exit codes: 0 copied, and what is missing is printed, 2 nothing readable, or
   still in flight"""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="a recording (.mcap)")
+    add = flags(parser)
+    add("file", "FILE", "a recording (.mcap)")
     about = "file for the clean copy (default: FILE with '.recovered' before its ending)"
-    parser.add_argument("-t", "--to", type=Path, metavar="NEW", help=about)
+    add("-t --to", "NEW", about, read=Path)
     output_argument(parser)
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> None:
     """Copy a recording; print what is in the copy, and what is missing."""
-    require("a recovery", ("record",))
     from cloudrc.cli.progress import Progress
     from cloudrc.record.columns import Recording
     from cloudrc.runs.session import check_ended
@@ -40,15 +38,12 @@ def execute(options: argparse.Namespace) -> int:
     source: Path = options.file
     check_ended(source.resolve().parent)
     target = options.to or source.parent / f"{source.stem}.recovered{source.suffix}"
-    if os.path.lexists(target):
-        raise BadInputError(f"{target}: already there; name another file with --to")
-    with closing(Progress(f"copies what is readable of {source}")):
+    check_new(target, "name another file with --to")
+    with Progress(f"copies what is readable of {source}"):
         recording = Recording.read(source)
         if not recording.messages:
             reason = "; ".join([*recording.remarks, recording.note]).strip("; ") or "none is in it"
-            raise BadInputError(
-                f"{source}: holds no readable message: {reason}; nothing is written"
-            )
+            raise BadInputError(f"{source}: holds no readable message: {reason}")
         recording.write(target)
     topics = Counter(topic for topic, _, _ in [*recording.messages, *recording.views])
     kept = {"messages": topics.total(), "attachments": len(recording.attachments)}
@@ -68,4 +63,3 @@ def execute(options: argparse.Namespace) -> int:
         lines.append(f"missing: {recording.note}")
     lines += [f"the recording {remark}" for remark in recording.remarks]
     print_result(options.output, found, "\n".join(map(escape, [*lines, str(target)])))
-    return 0

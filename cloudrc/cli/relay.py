@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
-from pathlib import Path
 from typing import Any
 
-from cloudrc.cli.output import output_argument, print_line, print_result
-from cloudrc.cli.parser import add_verbs, read_seed, settings_from
+from cloudrc.cli.output import output_argument, print_result, tell
+from cloudrc.cli.parser import Options, Parser, add_verbs, flags, read_seed, settings_from
 from cloudrc.cli.processes import read_address
-from cloudrc.runs.interrupts import interrupt_on_signals
 
 VERBS = {
     "tcp": "carry TCP connections to a server over the emulated link",
@@ -50,65 +46,54 @@ ROS repeats what it loses itself, but not what the link loses.
 Needs a sourced ROS 2, exit code 3 without it."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     verbs = add_verbs(parser, VERBS)
     tcp, ros = verbs["tcp"], verbs["ros"]
     tcp.epilog, ros.epilog = TCP_EPILOG, ROS_EPILOG
-    add = tcp.add_argument
-    listen = "where clients connect"
-    add("--listen", type=read_address, required=True, metavar="HOST:PORT", help=listen)
-    add("--to", type=read_address, required=True, metavar="HOST:PORT", help="the server")
-    _link_arguments(tcp)
-    add = ros.add_argument
-    add("--from", required=True, metavar="TOPIC", dest="source", help="topic to hear")
-    add("--to", required=True, metavar="TOPIC", help="topic to publish")
+    add = flags(tcp)
+    add("--listen", "HOST:PORT", "where clients connect", read=read_address, required=True)
+    add("--to", "HOST:PORT", "the server", read=read_address, required=True)
+    link_arguments(tcp)
+    output_argument(tcp)
+    add = flags(ros)
+    add("--from", "TOPIC", "topic to hear", required=True, dest="source")
+    add("--to", "TOPIC", "topic to publish", required=True)
     way = "direction of the profile that the messages take (default: uplink)"
-    add("--direction", choices=("uplink", "downlink"), default="uplink", help=way)
-    add("--reliable", action="store_true", help="publish RELIABLE (default: BEST_EFFORT)")
-    _link_arguments(ros)
+    add("--direction", None, way, "uplink", choices=("uplink", "downlink"))
+    add("--reliable", "", "publish RELIABLE (default: BEST_EFFORT)")
+    link_arguments(ros)
+    output_argument(ros)
     stream = "name of the link; links with one seed and other names draw other numbers"
-    add("--stream", default="", metavar="NAME", help=stream)
-    out = "new folder for link.json and the recording of the messages"
-    add("--out", type=Path, metavar="FOLDER", help=out)
+    add("--stream", "NAME", stream, "")
+    add("--out", "FOLDER", "new folder for link.json and the recording of the messages")
 
 
-def _link_arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--link", default="ideal", metavar="PROFILE", help="shipped profile, or a file")
+def link_arguments(parser: Parser) -> None:
+    """Declare the arguments that choose an emulated link."""
+    add = flags(parser)
+    add("--link", "PROFILE", "shipped profile, or a file", "ideal")
     setting = "change of the profile, such as uplink.loss=0.05; repeatable"
-    add("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help=setting)
-    add("--seed", type=read_seed, default=1, metavar="S", help="seed (default: 1)")
-    output_argument(parser)
+    add("--set", "KEY=VALUE", setting, dest="settings")
+    add("--seed", "S", "seed (default: 1)", 1, read_seed)
 
 
-def execute(options: argparse.Namespace) -> int:
-    """Relay until a signal; print what was measured, and return 0."""
-    interrupt_on_signals()
-    return _tcp(options) if options.verb == "tcp" else _ros(options)
+def execute(options: Options) -> None:
+    """Relay until a signal; print what was measured."""
+    if options.verb == "tcp":
+        from cloudrc.processes.ports import warn_if_exposed
+        from cloudrc.runs.links.streams import RelaySettings, relay_tcp
 
+        warn_if_exposed(options.listen)
+        report = relay_tcp(settings_from(options, RelaySettings), tell)
+        text = _as_text(report)
+    else:
+        from cloudrc.runs.links.topics import TopicSettings, relay_topic
+        from cloudrc.runs.links.verify import as_text
 
-def _tcp(options: argparse.Namespace) -> int:
-    from cloudrc.processes.ports import warn_if_exposed
-    from cloudrc.runs.links.streams import RelaySettings, relay_tcp
-
-    warn_if_exposed(options.listen)
-    report = relay_tcp(settings_from(options, RelaySettings), _tell)
-    print_result(options.output, report, _as_text(report))
-    return 0
-
-
-def _ros(options: argparse.Namespace) -> int:
-    from cloudrc.runs.links.topics import TopicSettings, relay_topic
-    from cloudrc.runs.links.verify import as_text
-
-    report = relay_topic(settings_from(options, TopicSettings), _tell)
-    print_result(options.output, report, as_text(report))
-    return 0
-
-
-def _tell(text: str) -> None:
-    print_line(f"cloudrc: {text}", sys.stderr)
+        report = relay_topic(settings_from(options, TopicSettings), tell)
+        text = as_text(report)
+    print_result(options.output, report, text)
 
 
 def _as_text(report: dict[str, Any]) -> str:

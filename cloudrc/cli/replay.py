@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
-from contextlib import closing
-from pathlib import Path
-
-from cloudrc.cli.output import open_page, print_line
+from cloudrc.cli.output import open_page, print_line, tell
+from cloudrc.cli.parser import Options, Parser, flags
 from cloudrc.outside.paths import check_new
-from cloudrc.runs.requirements import require
 
 EPILOG = """\
 examples:
@@ -17,25 +12,23 @@ examples:
   cloudrc replay runs/latest/mission.mcap --out flight.html --no-open"""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or an MCAP file")
-    about = "file for the page (default: replay.html beside the recording)"
-    parser.add_argument("--out", type=Path, metavar="FILE", help=about)
-    parser.add_argument("--no-open", action="store_true", help="write the page, open no browser")
+    add = flags(parser)
+    add("run", "RUN", "folder of a run, or an MCAP file")
+    add("--out", "FILE", "file for the page (default: replay.html beside the recording)")
+    add("--no-open", "", "write the page, open no browser")
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> None:
     """Write the page, open it in the browser, and print its path."""
     if options.out is not None:
         check_new(options.out, "name another file with --out")
-    require("a replay", ("world", "record", "console"))
     from cloudrc.cli.progress import Progress
     from cloudrc.runs.replay import write_replay
 
-    with closing(Progress(f"reads the recording of {options.run}")):
+    with Progress(f"reads the recording of {options.run}"):
         out = write_replay(options.run, options.out)
     if not options.no_open and not open_page(out.absolute().as_uri()):
-        print_line("cloudrc: found no browser here; open the page yourself", sys.stderr)
+        tell("found no browser here; open the page yourself")
     print_line(str(out))
-    return 0

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from typing import Any
 
-from cloudrc.cli.output import output_argument, paint, print_line, print_result
-from cloudrc.cli.parser import figure_arguments
+from cloudrc.cli.output import output_argument, paint, print_lines, print_result
+from cloudrc.cli.parser import Options, Parser, figure_arguments, flags
 from cloudrc.errors import BadInputError
-from cloudrc.runs.requirements import missing, require
+from cloudrc.runs.requirements import missing
 from cloudrc.text import escape
 
 EPILOG = """\
@@ -25,38 +23,35 @@ examples:
   cloudrc report runs/paper-local-seed1-1 -o json"""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run")
-    parser.add_argument(
-        "--metric",
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="also evaluate the metric in this Python file; repeatable. Files named by the run's"
-        " configuration are never executed",
+    add = flags(parser)
+    add("run", "RUN", "the folder of a run")
+    about = (
+        "also evaluate the metric in this Python file; repeatable. Files named by the run's"
+        " configuration are never executed"
     )
+    add("--metric", "FILE", about, read=str, many=True)
     files_argument(parser)
     figure_arguments(parser, 7.16)
     output_argument(parser)
 
 
-def report_arguments(parser: argparse.ArgumentParser) -> None:
+def report_arguments(parser: Parser) -> None:
     """Declare the arguments that say which files a flight's report has."""
     about = "page: write report.html (default); none: the recording and report.json alone"
-    parser.add_argument("--report", choices=["page", "none"], default="page", help=about)
+    flags(parser)("--report", None, about, "page", choices=["page", "none"])
     files_argument(parser)
 
 
-def files_argument(parser: argparse.ArgumentParser) -> None:
+def files_argument(parser: Parser) -> None:
     """Declare the argument for the files of the figures."""
     about = "also write each figure as PDF, PNG and SVG into the run's folder figures/"
-    parser.add_argument("--figures", action="store_true", help=about)
+    flags(parser)("--figures", "", about)
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> int:
     """Write the report from the recording; return the exit code of the run's verdict."""
-    require("a report", ("record", "report"))
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
     from cloudrc import metrics
@@ -70,7 +65,7 @@ def execute(options: argparse.Namespace) -> int:
 
     metrics.check(options.metric)
     look = Look(options.width, options.font_size)
-    with closing(Progress(f"reads the recording of {options.run}")) as view:
+    with Progress(f"reads the recording of {options.run}") as view:
         check_ended(options.run)
         restore_mission(options.run)
         recording, experiment, run = read_run(options.run)
@@ -101,8 +96,7 @@ def summary(report: Mapping[str, Any], folder: Path, last: str = "report.html") 
     return "\n".join(["", summarize(report, paint), "", escape(replay), escape(path)])
 
 
-def print_traceback(options: argparse.Namespace, report: Mapping[str, Any]) -> None:
+def print_traceback(options: Options, report: Mapping[str, Any]) -> None:
     """With --debug, print the traceback of the first failure of a plug-in to stderr."""
-    if getattr(options, "debug", False) and "traceback" in report:
-        for line in report["traceback"].splitlines():
-            print_line(line, sys.stderr)
+    if "debug" in options and "traceback" in report:
+        print_lines(report["traceback"].splitlines(), sys.stderr)

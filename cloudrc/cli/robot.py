@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
-from contextlib import closing
-from pathlib import Path
-
 from cloudrc.cli.output import (
     output_argument,
     print_result,
 )
-from cloudrc.cli.parser import add_verbs
+from cloudrc.cli.parser import Options, Parser, add_verbs, flags
 from cloudrc.errors import BadInputError
-from cloudrc.runs.requirements import require
 
 VERBS = {"check": "say what a robot is, fly it in virtual time, and say what must change"}
 EPILOG = """\
@@ -24,23 +19,22 @@ examples:
 exit code 2: something must change"""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     (check,) = add_verbs(parser, VERBS).values()
     about = "a folder with robot.yaml, an .xml file, or the name of a shipped robot"
-    check.add_argument("robot", metavar="ROBOT", help=about)
+    flags(check)("robot", "ROBOT", about)
     about = "picture to write: .png, .svg or .pdf (default: check.png in a folder of yours)"
-    check.add_argument("--picture", type=Path, metavar="FILE", help=about)
+    flags(check)("--picture", "FILE", about)
     output_argument(check)
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> int:
     """Check the robot; return 0, or 2 if something must change."""
-    require("a check", ("world",))
     from cloudrc.cli.progress import Progress
     from cloudrc.runs.robot_check import as_text, check_robot
 
-    with closing(Progress(f"flies {options.robot}")):
+    with Progress(f"flies {options.robot}"):
         document, note = check_robot(options.robot, options.picture)
     print_result(options.output, document, as_text(document, note))
     return BadInputError.exit_code if document["changes"] else 0

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cloudrc.cli.output import print_line
-from cloudrc.cli.parser import add_verbs
+from cloudrc.cli.find_run import need_run_here
+from cloudrc.cli.output import print_line, tell
+from cloudrc.cli.parser import Options, Parser, add_verbs, flags
 from cloudrc.cli.token_flag import given_token, token_argument
 from cloudrc.errors import BadInputError
-from cloudrc.runs.interrupts import interrupt_on_signals
-from cloudrc.runs.requirements import require
 from cloudrc.teleop.client import Api
 
 VERBS = {"bridge": "publish a flight on ROS 2, and take goals and velocities from nodes"}
@@ -31,22 +28,20 @@ cmd_vel, and serves cloudrc/hold, resume, cancel, estop and acknowledge. It ends
 with the flight. docs/ros2.md describes the topics."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     bridge = add_verbs(parser, VERBS)["bridge"]
     bridge.epilog = EPILOG
-    add = bridge.add_argument
-    about = "folder of the flying run (default: the only run in flight)"
-    add("run", nargs="?", type=Path, metavar="RUN", help=about)
+    add = flags(bridge)
+    add("run", "RUN", "folder of the flying run (default: the only run in flight)", nargs="?")
     about = "namespace of topics and services, and prefix of the robot's frames (default: none)"
-    add("--namespace", type=_namespace, default="", metavar="NAME", help=about)
-    add("--observe", action="store_true", help="let nodes see the robot, but not steer it")
+    add("--namespace", "NAME", about, "", ros_namespace)
+    add("--observe", "", "let nodes see the robot, but not steer it")
     pod = bridge.add_argument_group("in the container of the chart")
-    pod.add_argument("--config", type=Path, metavar="FILE", help="experiment file")
-    about = "folder of 'cloudrc cloud --records DIR'"
-    pod.add_argument("--records", type=Path, metavar="DIR", help=about)
-    about = "the API of teleop; without a token, nodes cannot steer"
-    pod.add_argument("--api", metavar="URL", help=about)
+    add = flags(pod)
+    add("--config", "FILE", "experiment file")
+    add("--records", "DIR", "folder of 'cloudrc cloud --records DIR'")
+    add("--api", "URL", "the API of teleop; without a token, nodes cannot steer")
     token_argument(pod)
 
 
@@ -60,33 +55,25 @@ class _Flight(NamedTuple):
     has_ended: Callable[[], bool]
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> None:
     """Be the node of the flight until it ends or the user interrupts."""
-    interrupt_on_signals()
     in_pod = (options.config, options.records, options.api, options.token_file)
     flight = _in_pod(options) if any(in_pod) else None
     from cloudrc.bridges.ros2 import require_ros
 
     packages = "nav_msgs, geometry_msgs, std_msgs, std_srvs, diagnostic_msgs, visualization_msgs"
     require_ros("ros bridge", "bridge", packages)
-    require("ros bridge", ("world", "record"))
     flight = flight or _local(options)
     with ExitStack() as stack:
         bridge, reader = _open(stack, options, flight)
         bridge.run(reader, flight.has_ended)
-    print_line("the flight has ended", sys.stderr)
-    return 0
+    tell("the flight has ended")
 
 
-def _local(options: argparse.Namespace) -> _Flight:
+def _local(options: Options) -> _Flight:
     from cloudrc.drivers.local import under_way
-    from cloudrc.runs.under_way import find_run, not_found
 
-    found = find_run(options.run, steers=not options.observe, flag="")
-    if found is None:
-        raise BadInputError(not_found("no run flies here; start one: cloudrc up"))
-    if found.note:
-        print_line(f"cloudrc: {found.note}", sys.stderr)
+    found = need_run_here(options.run, steers=not options.observe)
     run, socket = found.folder.resolve(), Path(found.url.removeprefix("unix:"))
 
     def has_ended() -> bool:
@@ -95,7 +82,7 @@ def _local(options: argparse.Namespace) -> _Flight:
     return _Flight(run / "config.yaml", socket.parent, Api(found.url), True, has_ended)
 
 
-def _in_pod(options: argparse.Namespace) -> _Flight:
+def _in_pod(options: Options) -> _Flight:
     if options.run or not (options.config and options.records and options.api):
         text = "are for the chart's container: give all of them, and no RUN"
         raise BadInputError(f"--config, --records and --api {text}")
@@ -104,7 +91,7 @@ def _in_pod(options: argparse.Namespace) -> _Flight:
     return _Flight(options.config, options.records, api, token is not None, lambda: False)
 
 
-def _open(stack: ExitStack, options: argparse.Namespace, flight: _Flight) -> tuple[Any, Any]:
+def _open(stack: ExitStack, options: Options, flight: _Flight) -> tuple[Any, Any]:
     """Open the bridge and the reader of cloud's records; `stack` closes them."""
     from cloudrc.bridges.ros2.bridge import RosBridge
     from cloudrc.bridges.ros2.requests import RosRequests
@@ -144,13 +131,10 @@ def _open(stack: ExitStack, options: argparse.Namespace, flight: _Flight) -> tup
     return bridge, reader
 
 
-def _namespace(text: str) -> str:
-    from pydantic import TypeAdapter, ValidationError
+def ros_namespace(text: str) -> str:
+    """Check a namespace; raise a ValueError."""
+    from pydantic import TypeAdapter
 
     from cloudrc.config.schema import RosNamespace
 
-    try:
-        return TypeAdapter[str](RosNamespace).validate_python(text)
-    except ValidationError:
-        about = "is no namespace of ROS 2; give one such as drone1"
-        raise argparse.ArgumentTypeError(f"'{text}' {about}") from None
+    return TypeAdapter[str](RosNamespace).validate_python(text)

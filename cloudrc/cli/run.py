@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from shlex import quote, split
 from shutil import which
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.cluster_flags import (
     DEFAULT_RELEASE,
@@ -18,26 +18,19 @@ from cloudrc.cli.cluster_flags import (
     release_from_flags,
     timeout_argument,
 )
-from cloudrc.cli.output import (
-    output_argument,
-    print_line,
-    print_or_drop,
-    print_result,
-    warn,
-)
-from cloudrc.cli.parser import read_count, read_seed
+from cloudrc.cli.output import output_argument, print_line, print_or_drop, print_result, tell, warn
+from cloudrc.cli.parser import Options, Parser, flags, read_count, read_seed
 from cloudrc.cli.report import print_traceback, report_arguments, summary
-from cloudrc.errors import BadInputError, CloudrcError, NothingFlownError
+from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.runs.folder import point_to, run_folder
-from cloudrc.runs.interrupts import interrupt_on_signals, is_interrupted
+from cloudrc.runs.interrupts import is_interrupted
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
+    from cloudrc.cluster.client import Release
     from cloudrc.config.resolved import ResolvedExperiment
 
-Flight = Callable[[Path], dict[str, Any]]
-"""Function that flies, writes all files of the run into a folder, and returns the report."""
 Ready = Callable[[Path, Callable[[str], None], contextlib.ExitStack, str, dict[str, str]], None]
 """Function that a session calls when it is ready. Arguments: the run's folder, a function that
 prints a line, a stack that closes at the end, the API's URL, process -> HOST:PORT of metrics."""
@@ -62,44 +55,41 @@ examples:
 line of the output is the path of the report."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     many = parser.add_mutually_exclusive_group()
     experiment_arguments(parser, many)
     about = "where to fly (default: local; with --seeds: virtual)"
-    parser.add_argument("--mode", choices=MODES, help=about)
-    about = "fly seeds 1 to N on all cores and print a table"
-    many.add_argument("--seeds", type=read_count, metavar="N", help=about)
+    add = flags(parser)
+    add("--mode", None, about, choices=MODES)
+    flags(many)("--seeds", "N", "fly seeds 1 to N on all cores and print a table", read=read_count)
     about = "start this program with the flight, and end it with it: a remote controller"
-    parser.add_argument("--with", dest="beside", default="", metavar="CMD", help=about)
+    add("--with", "CMD", about, "", dest="beside")
     report_arguments(parser)
     output_argument(parser, "json, yaml: print only the report")
     release_arguments(parser, DEFAULT_RELEASE)
     timeout_argument(parser)
 
 
-def experiment_arguments(parser: argparse.ArgumentParser, seed: argparse._ActionsContainer) -> None:
+def experiment_arguments(parser: Parser, seed: argparse._ActionsContainer) -> None:
     """Declare the arguments that choose an experiment, with `--seed` in the group `seed`."""
-    add = parser.add_argument
+    add = flags(parser)
     about = "name of a shipped experiment, or a YAML file (default: paper)"
-    add("experiment", nargs="?", default="paper", metavar="EXPERIMENT", help=about)
+    add("experiment", "EXPERIMENT", about, "paper", nargs="?")
     about = "random seed of this run (default: the experiment's)"
-    seed.add_argument("--seed", type=read_seed, metavar="S", help=about)
-    about = "change one key of the experiment; repeatable"
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
-    add("--out", type=Path, metavar="DIR", help="folder of the run (default: a new one in runs/)")
+    flags(seed)("--seed", "S", about, read=read_seed)
+    add("--set", "KEY=VALUE", "change one key of the experiment; repeatable")
+    add("--out", "DIR", "folder of the run (default: a new one in runs/)")
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> int:
     """Fly once, or once per seed with `--seeds`; return the exit code."""
-    interrupt_on_signals()  # an interrupted flight still gets its report
     mode = options.mode or ("virtual" if options.seeds else "local")
-    if options.seeds and mode != "virtual":
-        raise BadInputError(f"--seeds flies in virtual time; leave out --mode {mode}")
+    if options.seeds and (mode != "virtual" or options.figures or options.beside):
+        text = "flies in virtual time, many flights; leave out --mode, --figures and --with"
+        raise BadInputError(f"--seeds {text}")
     if options.beside:
-        _check_beside(options, mode)
-    if options.seeds and options.figures:
-        raise BadInputError("--figures draws one flight; leave out --seeds")
+        _check_beside(options.beside, mode)
     is_drawn = options.report == "page" or options.figures
     require(f"mode {mode}", [each for each in MODES[mode] if is_drawn or each != "report"])
     if options.seeds:
@@ -109,39 +99,18 @@ def execute(options: argparse.Namespace) -> int:
     return fly_once(options, mode)
 
 
-def _check_beside(options: argparse.Namespace, mode: str) -> None:
-    if options.seeds or mode == "cluster":
-        other = "--seeds" if options.seeds else "--mode cluster"
-        raise BadInputError(f"--with starts a program for one flight here; leave out {other}")
+def _check_beside(command: str, mode: str) -> None:
+    if mode == "cluster":
+        raise BadInputError("--with starts a program for a flight here; leave out --mode cluster")
     try:
-        words = split(options.beside)
+        words = split(command)
     except ValueError as error:
-        raise BadInputError(f"--with '{options.beside}': no command: {error}") from None
+        raise BadInputError(f"--with '{command}': no command: {error}") from None
     if not words or which(words[0]) is None:
-        program = words[0] if words else ""
-        raise BadInputError(f"--with '{options.beside}': there is no program '{program}' here")
+        raise BadInputError(f"--with '{command}': there is no such program here")
 
 
-def _experiment(options: argparse.Namespace, *, is_session: bool) -> ResolvedExperiment:
-    """Return the experiment that `options` name.
-
-    The missions of a session come later. Its scene thus needs no body that the experiment's own
-    mission touches.
-    """
-    from cloudrc.runs.experiment import load
-
-    try:
-        return load(options.experiment, options.set, options.seed)
-    except BadInputError:
-        if not is_session:
-            raise
-        with contextlib.suppress(BadInputError):
-            settings = ["mission.touch=null", *options.set]
-            return load(options.experiment, settings, options.seed)
-        raise
-
-
-def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None) -> int:
+def fly_once(options: Options, mode: str, ready: Ready | None = None) -> int:
     """Fly as `options` say, print the summary, and return the exit code.
 
     With `ready`, fly a session of any number of missions; `ready` is called when the session waits
@@ -155,24 +124,39 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
     check_mode(experiment, mode)
     warn(experiment)
     if changes := describe_changes(options.experiment, experiment):
-        print_line(f"cloudrc: warning: {changes}", sys.stderr)
-    in_cluster, for_programs = mode == "cluster", options.output != "table"
-    # First prepare the flight: if that fails, no folder must be left.
-    if in_cluster:
-        flight = _cluster_flight(experiment, options, sys.stderr if for_programs else sys.stdout)
-    else:
-        flight = _local_flight(experiment, mode, ready, options)
+        tell(f"warning: {changes}")
+    # First: if there is no cluster, no folder must be left.
+    release = _checked_release(experiment, options) if mode == "cluster" else None
     folder = run_folder(experiment, "session" if ready else mode, options.out)
-    if not for_programs:
+    if options.output == "table":
         facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
         flown = "session" if ready else experiment.mission.contents
         print_or_drop(escape(f"{experiment.name}: {facts}, {flown}"))
     with _place_of_recording(folder):
-        report = flight(folder)
+        if release:
+            report = _fly_in_cluster(experiment, folder, release, options)
+        else:
+            report = _fly_here(experiment, folder, mode, ready, options)
     print_traceback(options, report)
     last = "report.html" if options.report == "page" else "report.json"
     print_result(options.output, report, summary(report, folder, last))
     return 0 if ready else exit_code(report)
+
+
+def _experiment(options: Options, *, is_session: bool) -> ResolvedExperiment:
+    """Return the experiment that `options` name.
+
+    The missions of a session come later. Its scene thus needs no body that the experiment's own
+    mission touches.
+    """
+    from cloudrc.runs.experiment import load
+
+    try:
+        return load(options.experiment, options.set, options.seed)
+    except BadInputError:
+        if not is_session:
+            raise
+    return load(options.experiment, ["mission.touch=null", *options.set], options.seed)
 
 
 @contextlib.contextmanager
@@ -180,89 +164,80 @@ def _place_of_recording(folder: Path) -> Iterator[None]:
     """Say where the recording is if the flight inside the `with` block fails or is interrupted."""
     try:
         yield
-    except (CloudrcError, KeyboardInterrupt) as error:
-        nothing = isinstance(error, NothingFlownError)  # the regular end of a session by a signal
-        if isinstance(error, BadInputError) and is_interrupted() and not nothing:
-            error = KeyboardInterrupt()  # a library has converted the exception
+    except (CloudrcError, KeyboardInterrupt):
         if any(folder.glob("*.mcap*")):
-            text = f"the recording is in {folder}"
-            if isinstance(error, KeyboardInterrupt):
-                text += f"; to write its report: cloudrc report {quote(str(folder))}"
-            print_line(text, sys.stderr)
-        raise error
+            shown = quote(str(folder))
+            tell(f"the recording is in {shown}; to write its report: cloudrc report {shown}")
+        raise
 
 
-def _local_flight(
+def _fly_here(
     experiment: ResolvedExperiment,
+    folder: Path,
     mode: str,
     ready: Ready | None,
-    options: argparse.Namespace,
-) -> Flight:
-    """Return a function that flies on this machine and shows the progress.
+    options: Options,
+) -> dict[str, Any]:
+    """Fly on this machine, and show the progress; return the report.
 
-    With `ready`, the function flies a session, in which teleop waits for missions. It calls `ready`
-    when all processes are ready.
+    With `ready`, fly a session, in which teleop waits for missions. Call `ready` when all processes
+    are ready.
     """
     from cloudrc.cli.progress import FlightView
     from cloudrc.runs.fly import fly
 
-    def flight(folder: Path) -> dict[str, Any]:
-        with contextlib.ExitStack() as stack:
-            mission = experiment.mission
-            counted = (0, "waypoint") if ready else (mission.count, mission.unit)
-            view = FlightView(*counted, events=options.output == "table")
-            stack.enter_context(contextlib.closing(view))
+    mission = experiment.mission
+    counted = (0, "waypoint") if ready else (mission.count, mission.unit)
+    with (
+        FlightView(*counted, events=options.output == "table") as view,
+        contextlib.ExitStack() as stack,
+    ):
 
-            def landed() -> None:
-                if is_interrupted():
-                    text = "interrupted: writes the report; Ctrl-C again leaves it out"
-                    view.say(
-                        "the session ends; Ctrl-C again leaves its report out" if ready else text
-                    )
-                view.tell("writes the report")
+        def landed() -> None:
+            if is_interrupted():
+                view.say("interrupted: writes the report; Ctrl-C again leaves it out")
+            view.tell("writes the report")
 
-            session = partial(ready, folder, view.say, stack) if ready else None
-            return fly(
-                experiment,
-                mode,
-                folder,
-                view.see,
-                page=options.report == "page",
-                figures=options.figures,
-                session=session,
-                beside=options.beside,
-                landed=landed,
-            )
-
-    return flight
+        return fly(
+            experiment,
+            mode,
+            folder,
+            view.see,
+            page=options.report == "page",
+            figures=options.figures,
+            session=partial(ready, folder, view.say, stack) if ready else None,
+            beside=options.beside,
+            landed=landed,
+        )
 
 
-def _cluster_flight(
-    experiment: ResolvedExperiment, options: argparse.Namespace, stream: TextIO
-) -> Flight:
-    from cloudrc.cluster.flight import check_can_begin, fly_in_cluster
+def _checked_release(experiment: ResolvedExperiment, options: Options) -> Release:
+    """Return the release that the flags name; check that it can fly the experiment."""
+    from cloudrc.cluster.flight import check_can_begin
     from cloudrc.cluster.own_files import check_experiment
 
     check_experiment(experiment)
     release = release_from_flags(options)
     check_can_begin(release)
+    return release
 
-    def tell(text: str) -> None:
-        print_line(f"  {text}", stream)
 
-    def flight(folder: Path) -> dict[str, Any]:
-        try:
-            return fly_in_cluster(
-                experiment,
-                folder,
-                release,
-                options.timeout,
-                tell,
-                page=options.report == "page",
-                figures=options.figures,
-            )
-        finally:
-            if options.out is None and folder.exists():
-                point_to(folder, "latest")
+def _fly_in_cluster(
+    experiment: ResolvedExperiment, folder: Path, release: Release, options: Options
+) -> dict[str, Any]:
+    from cloudrc.cluster.flight import fly_in_cluster
 
-    return flight
+    stream = sys.stdout if options.output == "table" else sys.stderr
+    try:
+        return fly_in_cluster(
+            experiment,
+            folder,
+            release,
+            options.timeout,
+            lambda text: print_line(f"  {text}", stream),
+            page=options.report == "page",
+            figures=options.figures,
+        )
+    finally:
+        if options.out is None and folder.exists():
+            point_to(folder, "latest")

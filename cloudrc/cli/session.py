@@ -7,43 +7,37 @@ the session; `mission.mcap` and the report contain the last mission.
 
 from __future__ import annotations
 
-import argparse
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from shlex import quote
 from threading import Thread
+from types import SimpleNamespace
 from typing import IO, Any
 
 from cloudrc.cli.find_run import run_argument
-from cloudrc.cli.output import print_line
-from cloudrc.cli.parser import whole_number
-from cloudrc.cli.processes import CliCommand
+from cloudrc.cli.output import print_line, tell
+from cloudrc.cli.parser import Options, Parser, flags, whole_number
 from cloudrc.cli.report import report_arguments
 from cloudrc.cli.run import experiment_arguments, fly_once
-from cloudrc.errors import BadInputError, CloudrcError, NothingFlownError
-from cloudrc.runs.interrupts import interrupt_on_signals
+from cloudrc.errors import CloudrcError, NothingFlownError
 from cloudrc.runs.requirements import MODES, require
-from cloudrc.text import escape
 
 Say = Callable[[str], None]
 """Function that prints a line above the status line of a flight."""
 DOWN_LIMIT = 120.0
 """Time limit for a session to end and to write its report [s]."""
 NEXT = """\
+the robot waits on the ground
+  folder   {run}
+  API      {api}
+  metrics  http://127.0.0.1:PORT/metrics ({ports})
 in another terminal:
   cloudrc mission run {mission}
   cloudrc mission goto {point}
   cloudrc link set --profile paper-p3
 to end: Ctrl-C here, or cloudrc down"""
-NEXT_UNSEEN = """\
-in another terminal:
-  cloudrc mission run {mission} --api {api}
-  cloudrc mission goto {point} --api {api}
-to end: Ctrl-C here"""
-"""In place of `NEXT` if other commands do not find the session."""
 UP_EPILOG = """\
 examples:
   cloudrc up
@@ -60,41 +54,37 @@ DOWN_EPILOG = """\
 does not end a flight of 'cloudrc run'; that flight ends with its mission."""
 
 
-def _up_arguments(parser: argparse.ArgumentParser) -> None:
+def _up_arguments(parser: Parser) -> None:
     experiment_arguments(parser, parser)
-    parser.add_argument("--console", action="store_true", help="also open the console's page")
+    add = flags(parser)
+    add("--console", "", "also open the console's page")
     about = "serve the flight to Foxglove at this port of 127.0.0.1 (default: 8765)"
-    port = whole_number(1, 65535)
-    parser.add_argument("--foxglove", type=port, nargs="?", const=8765, metavar="PORT", help=about)
+    add("--foxglove", "PORT", about, read=whole_number(1, 65535), nargs="?", const=8765)
     report_arguments(parser)
     parser.set_defaults(output="table", beside="")
 
 
-def _up(options: argparse.Namespace) -> int:
+def _up(options: Options) -> int:
     """Start a session, and keep it until a signal; return 0 after a regular end."""
 
     def ready(
         folder: Path, say: Say, stack: ExitStack, api: str, metrics: Mapping[str, str]
     ) -> None:
+        run = folder.resolve()
         ports = ", ".join(f"{name} :{at.rpartition(':')[2]}" for name, at in metrics.items())
-        say("the robot waits on the ground")
-        say(escape(f"  folder   {short(folder.resolve())}"))
-        say(escape(f"  API      {api}"))
-        say(f"  metrics  http://127.0.0.1:PORT/metrics ({ports})")
-        is_seen = folder.resolve() in under_way()
-        mission, point = propose(folder / "config.yaml")
-        text = NEXT if is_seen else NEXT_UNSEEN
-        say(text.format(api=quote(escape(api)), mission=mission, point=point))
+        mission, point = propose(run / "config.yaml")
+        for line in NEXT.format(
+            run=short(run), api=api, ports=ports, mission=mission, point=point
+        ).splitlines():
+            say(line)
         if options.console:
             stack.enter_context(_beside(say, "cloudrc", "console", str(folder)))
         if options.foxglove:
-            words = str(folder.resolve()), str(options.foxglove)
+            words = str(run), str(options.foxglove)
             stack.enter_context(_beside(say, "cloudrc.processes.foxglove_live", *words))
 
-    from cloudrc.drivers.local import under_way
     from cloudrc.runs.under_way import short
 
-    interrupt_on_signals()
     more = [name for name in ("console", "foxglove") if getattr(options, name)]
     require("a session", (*MODES["local"], *more))
     try:
@@ -105,11 +95,8 @@ def _up(options: argparse.Namespace) -> int:
 
 
 def propose(config: Path) -> tuple[str, str]:
-    """Return a shipped mission and a point that fit the scene and the robot of an experiment.
-
-    `config` is the experiment's file. If no mission fits, return a word for a user's file.
-    """
-    from cloudrc.config.load import load_experiment, read_experiment
+    """Return a mission and a point that fit the scene and the robot of an experiment's file."""
+    from cloudrc.config.load import read_experiment
     from cloudrc.config.robot import is_planar
     from cloudrc.config.scene import scene_of
     from cloudrc.config.shipped import names
@@ -117,11 +104,7 @@ def propose(config: Path) -> tuple[str, str]:
     world = read_experiment(config, flown=True).world
     x, y, z = scene_of(world).spawn
     point = f"{x + 1:g} {y:g}" if is_planar(world.robot) else f"{x + 0.5:g} {y:g} {z + 1.1:g}"
-    for mission in sorted(names("mission"), key=lambda name: name != world.scene):
-        with suppress(BadInputError):
-            load_experiment(config, [f"mission={mission}"], build=False)
-            return mission, point
-    return "MISSION.yaml", point
+    return world.scene if world.scene in names("mission") else "MISSION.yaml", point
 
 
 @contextmanager
@@ -142,7 +125,7 @@ def _beside(say: Say, *words: str) -> Iterator[None]:
     def read(lines: IO[str]) -> None:
         for line in lines:
             if line.startswith(("console:", "cloudrc:", "foxglove:")):
-                say(escape(line.rstrip()))
+                say(line.rstrip())
 
     reader = Thread(target=read, args=[process.stdout], daemon=True)
     with process:
@@ -154,7 +137,7 @@ def _beside(say: Say, *words: str) -> Iterator[None]:
             reader.join()
 
 
-def _down(options: argparse.Namespace) -> int:
+def _down(options: Options) -> None:
     """End a session, and print the path of its report."""
     from cloudrc.drivers.local import end_session
     from cloudrc.runs.session import last_mission
@@ -162,7 +145,7 @@ def _down(options: argparse.Namespace) -> int:
 
     run, note = find_session(options.run)
     if note:
-        print_line(f"cloudrc: {note}", sys.stderr)
+        tell(note)
     end_session(run, DOWN_LIMIT)
     name = short(run)
     page, report = run / "report.html", run / "report.json"
@@ -173,8 +156,7 @@ def _down(options: argparse.Namespace) -> int:
         raise CloudrcError(f"{name}: {text}; to write it: cloudrc report {quote(str(name))}")
     else:
         print_line(f"{name}: ended; no mission flew")
-    return 0
 
 
-up = CliCommand(_up_arguments, _up, UP_EPILOG)
-down = CliCommand(run_argument, _down, DOWN_EPILOG)
+up = SimpleNamespace(arguments=_up_arguments, execute=_up, EPILOG=UP_EPILOG)
+down = SimpleNamespace(arguments=run_argument, execute=_down, EPILOG=DOWN_EPILOG)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
-from cloudrc.cli.parser import settings_from
+from cloudrc.cli.parser import Options, Parser, flags, settings_from
 from cloudrc.cli.processes import process_arguments, read_address
 from cloudrc.drivers.process import StopSignal
 from cloudrc.drivers.realtime import Address
@@ -24,27 +23,22 @@ file, which only its owner can open. To make a token that only you can read:
 read."""
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     process_arguments(parser)
     where = (
         "serve the API here: [HOST:]PORT (default HOST: 127.0.0.1; PORT 0: any free port) or "
         "unix:PATH, for your user only"
     )
-    for flag, metavar, kind, text in (
-        ("--socket", "DIR", Path, "folder of the two sockets"),
-        ("--api", "WHERE", api_address, where),
-        ("--tokens", "DIR", Path, "folder of the token files 'operator' and 'reader'"),
-        ("--api-file", "FILE", Path, "write the API's URL to this file"),
-        ("--link", "FILE", Path, "state of the link: its changes go to the mission's log"),
-    ):
-        required = flag in ("--socket", "--api")
-        parser.add_argument(flag, type=kind, metavar=metavar, required=required, help=text)
-    missions = parser.add_mutually_exclusive_group()
-    journal = "store missions in this file (default: not stored)"
-    missions.add_argument("--journal", type=Path, metavar="FILE", help=journal)
-    start = "fly the experiment's mission, then exit"
-    missions.add_argument("--start", action="store_true", help=start)
+    add = flags(parser)
+    add("--socket", "DIR", "folder of the two sockets", required=True)
+    add("--api", "WHERE", where, read=api_address, required=True)
+    add("--tokens", "DIR", "folder of the token files 'operator' and 'reader'")
+    add("--api-file", "FILE", "write the API's URL to this file")
+    add("--link", "FILE", "state of the link: its changes go to the mission's log")
+    add = flags(parser.add_mutually_exclusive_group())
+    add("--journal", "FILE", "store missions in this file (default: not stored)")
+    add("--start", "", "fly the experiment's mission, then exit")
 
 
 def api_address(text: str) -> Address | Path:
@@ -56,7 +50,7 @@ def api_address(text: str) -> Address | Path:
     return (host.strip("[]"), 0) if host and port == "0" else read_address(f"{host}:{port}")
 
 
-def execute(options: argparse.Namespace) -> int:
+def execute(options: Options) -> None:
     """Run teleop until a signal stops the process or, with --start, the mission has ended."""
     if options.tokens is None and not isinstance(options.api, Path):
         raise BadInputError(
@@ -68,4 +62,3 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.processes.teleop import TeleopSettings, run_teleop
 
     run_teleop(settings_from(options, TeleopSettings), stop)
-    return 0

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from cloudrc.cli.output import print_line
+from cloudrc.cli.output import tell
+from cloudrc.cli.parser import Options, flags
 from cloudrc.files import warn_if_readable
 from cloudrc.outside.paths import read_token
 from cloudrc.teleop.client import VARIABLE
@@ -21,10 +21,10 @@ from cloudrc.teleop.client import VARIABLE
 def token_argument(parser: argparse._ActionsContainer) -> None:
     """Declare the argument --token-file."""
     text = f"file with the API's token (default: from {VARIABLE}, or the release's Secret)"
-    parser.add_argument("--token-file", type=Path, metavar="FILE", help=text)
+    flags(parser)("--token-file", "FILE", text)
 
 
-def given_token(options: argparse.Namespace) -> Callable[[], str] | None:
+def given_token(options: Options) -> Callable[[], str] | None:
     """Return a function that reads the token from the file that the user has named, else None.
 
     The flag comes before the environment. Print a warning if other users can read the file.
@@ -35,5 +35,5 @@ def given_token(options: argparse.Namespace) -> Callable[[], str] | None:
         path, named = Path(name), f"{VARIABLE}={name}"
     else:
         return None
-    warn_if_readable(path, lambda text: print_line(f"cloudrc: {text}", sys.stderr))
+    warn_if_readable(path, tell)
     return lambda: read_token(path, named)

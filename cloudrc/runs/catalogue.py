@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 
 from cloudrc.text import Paint, plain, table
@@ -74,54 +73,22 @@ def as_text(found: Mapping[str, Mapping[str, str]], paint: Paint = plain) -> str
 
 
 def settings() -> Iterator[str]:
-    """Yield the beginning of each setting: KEY=NAME if the key takes names, else KEY=."""
-    from cloudrc.config import problems
+    """Yield the beginning of each setting: KEY=NAME if the key takes names, else KEY=.
+
+    Keys of plug-ins' parameters are left out.
+    """
+    from cloudrc import plugins
+    from cloudrc.config import problems, shipped
+    from cloudrc.config.overrides import KINDS as PLUGIN_KINDS
     from cloudrc.config.schema import Experiment
 
-    named = _named_keys()
+    named: dict[str, Sequence[str]] = {
+        **{f"cloud.{key}": plugins.names(kind) for key, kind in PLUGIN_KINDS.items()},
+        **{f"world.{kind}": shipped.names(kind) for kind in ("robot", "scene")},
+        "link.profile": shipped.names("profile"),
+        "mission": shipped.names("mission"),
+    }
     keys = {".".join(path) for path, _ in problems.leaves(Experiment) if "0" not in path}
-    keys |= _keys_in_cloud(named)
-    of_robots, named["world.tuning"] = _of_robots()
-    keys |= of_robots
     keys |= {key.replace("uplink", "both") for key in keys if key.startswith("link.uplink.")}
     yield from (f"{key}=" for key in sorted(keys - set(named)) if not key.endswith(".name"))
     yield from sorted(f"{key}={name}" for key, names in named.items() for name in names)
-
-
-def _keys_in_cloud(named: Mapping[str, Sequence[str]]) -> set[str]:
-    """Return the keys of the parameters of all plug-ins of cloud."""
-    from cloudrc.config.overrides import KINDS as PLUGIN_KINDS
-    from cloudrc.config.overrides import parameter_names
-
-    keys = set[str]()
-    for key, kind in PLUGIN_KINDS.items():
-        for name in named[f"cloud.{key}"]:
-            keys |= {f"cloud.{key}.{parameter}" for parameter in parameter_names(kind, name)}
-    return keys
-
-
-def _named_keys() -> dict[str, Sequence[str]]:
-    """Return the keys whose values are names of something shipped: key -> names."""
-    from cloudrc import plugins
-    from cloudrc.config import shipped
-    from cloudrc.config.overrides import KINDS as PLUGIN_KINDS
-
-    named: dict[str, Sequence[str]] = {
-        f"cloud.{key}": plugins.names(kind) for key, kind in PLUGIN_KINDS.items()
-    }
-    named |= {"link.profile": shipped.names("profile"), "mission": shipped.names("mission")}
-    return named | {f"world.{kind}": shipped.names(kind) for kind in ("robot", "scene")}
-
-
-def _of_robots() -> tuple[set[str], list[str]]:
-    """Return the keys of the onboard controllers of shipped robots, and the names of tunings."""
-    from cloudrc.config import shipped
-    from cloudrc.config.overrides import default_parameters
-    from cloudrc.config.robot import find_robot
-
-    keys, tunings = set[str](), set[str]()
-    for robot in map(find_robot, shipped.names("robot")):
-        tunings |= robot.tunings.keys()
-        if find_spec("mujoco") is not None:  # without it, some controllers have no signature
-            keys |= default_parameters("onboard", robot.onboard.name).keys()
-    return {f"world.onboard.{key}" for key in keys}, sorted(tunings)

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import heapq
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from math import inf
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from cloudrc import assembly, source
 from cloudrc.config.overrides import OUTSIDE, REMOTE
@@ -24,7 +24,7 @@ from cloudrc.link.follow import make_folder
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.record.merge import merge
 from cloudrc.record.writer import CODE, McapWriter
-from cloudrc.records import CONTROLLER_LOST, Record
+from cloudrc.records import Record
 from cloudrc.report.document import Run
 from cloudrc.report.views import views
 from cloudrc.report.write import attachments, write_report
@@ -37,6 +37,8 @@ See: TypeAlias = Callable[[list[Record]], None]
 Session: TypeAlias = Callable[[str, dict[str, str]], None]
 """Function that a session calls when it is ready, with the API's address, and process -> HOST:PORT
 of its metrics."""
+Report: TypeAlias = Callable[[Recording, ResolvedExperiment, Run], dict[str, Any]]
+"""Function that writes and returns the report of a recorded flight."""
 
 
 def fly(
@@ -63,23 +65,22 @@ def fly(
     `beside` is a command: a program that runs during the flight, such as a remote controller.
     `landed` is called once the flight is over, before the report is written.
     """
-    own = experiment.report.metrics
     try:
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
         files = hash_files(experiment)  # now: the user may edit them during the flight
-        with contextlib.ExitStack() as stack:
-            gone = stack.enter_context(_beside(beside, experiment, folder))
+
+        def look(records: list[Record]) -> None:
+            raise_if_interrupted()  # a library may have caught the exception
+            see(records)
+
+        def report(recording: Recording, flown: ResolvedExperiment, run: Run) -> dict[str, Any]:
+            own, run = experiment.report.metrics, replace(run, files=files)
+            return write_report(folder, recording, flown, run, own=own, page=page, figures=figures)
+
+        with _beside(beside, experiment, folder) as gone:
             if mode == "virtual":
-                flown = _record_virtual(experiment, folder, see, gone, landed)
-            else:
-                flown = _record_local(experiment, folder, see, gone, landed, session=session)
-            recording, resolved, run = stack.enter_context(flown)
-            if _is_refused(recording):
-                return {}  # the end of the block raises the error
-            run = replace(run, files=files)
-            return write_report(
-                folder, recording, resolved, run, own=own, page=page, figures=figures
-            )
+                return _fly_virtual(experiment, folder, look, gone, landed, report)
+            return _fly_local(experiment, folder, look, gone, landed, report, session)
     except OSError as error:
         error.filename = str(error.filename or folder)
         raise machine_error(error) or error from error
@@ -99,47 +100,22 @@ def _beside(
     return companion(command, folder, url)
 
 
-def _raise_if_lost(records: list[Record]) -> None:
-    """Raise the error with which a flight ends if a controller outside is lost."""
-    for error in assembly.lost_controller(records):
-        raise error
-
-
-def _is_refused(recording: Recording) -> bool:
-    """Return whether a controller outside was lost before a command of it was flown."""
-    lost = {*CONTROLLER_LOST} & {*recording["/fault"]["code"]}
-    return bool(lost) and not recording["/cmd_vel"]["command"].any()
-
-
-def _interruptible(see: See) -> See:
-    """Return a function that first looks for a signal: a library may have caught the exception."""
-
-    def look(records: list[Record]) -> None:
-        raise_if_interrupted()
-        see(records)
-
-    return look
-
-
-@contextlib.contextmanager
-def _record_virtual(
+def _fly_virtual(
     experiment: ResolvedExperiment,
     folder: Path,
     see: See,
     gone: Callable[[], bool],
     landed: Callable[[], None],
-) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
-    """Fly in virtual time, and yield the recording, the experiment and facts about the run.
+    report: Report,
+) -> dict[str, Any]:
+    """Fly in virtual time, and return the report; mission.mcap gets a copy of it.
 
-    `gone` is that of `assembly.fly`, `landed` that of `fly`. The caller writes the report in the
-    `with` block. After the block, this function attaches a copy of the report to mission.mcap.
+    `gone` is that of `assembly.fly`, `landed` that of `fly`.
     """
-    from cloudrc.robots.build import describe_steps
     from cloudrc.robots.shapes import flown_files
 
-    store, interrupted, see = RecordStore(), False, _interruptible(see)
-    lost: ControllerLostError | None = None
-    code = source.code_hash()
+    store, code = RecordStore(), source.code_hash()
+    interrupted, lost = False, None
     # The recording is kept if the run or its report fails; a copy cut short has the experiment.
     with McapWriter(folder / "mission.mcap", clock="world", code=code) as writer:
         at_start = attachments(folder) | flown_files(experiment.world)
@@ -160,40 +136,65 @@ def _record_virtual(
             lost = error
         landed()
         try:
-            steps = describe_steps(experiment.world)
-            notes = (*assembly.virtual_notes(experiment), *([str(lost)] if lost else ()))
-            run = Run("virtual", "virtual", interrupted, notes, steps)
+            notes = assembly.virtual_notes(experiment)
+            run = _describe("virtual", interrupted, experiment, notes, lost)
             writer.note(run.metadata)
             recording = Recording(records=store, metadata={CODE: code}, attachments=at_start)
             writer.write_views(views(recording, experiment))
-            yield recording, experiment, run
+            _raise_if_refused(recording, lost)
+            document = report(recording, experiment, run)
         finally:
             for name, data in attachments(folder).items() - at_start.items():
                 writer.attach(name, data)
     if lost:
         raise lost
+    return document
 
 
-@contextlib.contextmanager
-def _record_local(
+def _describe(
+    mode: Literal["virtual", "local"],
+    interrupted: bool,
+    experiment: ResolvedExperiment,
+    notes: Iterable[str],
+    error: CloudrcError | None,
+) -> Run:
+    """Return facts about a run; `error` is the reason why the flight ended early."""
+    from cloudrc.robots.build import describe_steps
+
+    every = (*notes, *([str(error)] if error else ()))
+    shaper = "relay" if mode == "local" else mode
+    return Run(mode, shaper, interrupted, every, describe_steps(experiment.world))
+
+
+def _raise_if_lost(records: list[Record]) -> None:
+    """Raise the error with which a flight ends if a controller outside is lost."""
+    for error in assembly.lost_controller(records):
+        raise error
+
+
+def _raise_if_refused(recording: Recording, error: CloudrcError | None) -> None:
+    """Raise `error` if a controller outside was lost before a command of it was flown."""
+    if isinstance(error, ControllerLostError) and not recording["/cmd_vel"]["command"].any():
+        raise error
+
+
+def _fly_local(
     experiment: ResolvedExperiment,
     folder: Path,
     see: See,
     gone: Callable[[], bool],
     landed: Callable[[], None],
-    session: Session | None = None,
-) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
-    """Fly in real time; yield the merged recording, the experiment and facts about the run.
+    report: Report,
+    session: Session | None,
+) -> dict[str, Any]:
+    """Fly in real time, and return the report; mission.mcap is the merged recording.
 
-    With `session`, as in `fly`, yield those of its last mission. `gone` is that of `LocalRun`,
-    `landed` that of `fly`.
+    With `session`, the report is that of its last mission. The other functions are those of `fly`.
     """
-    from cloudrc.robots.build import describe_steps
-
     make_folder(folder / LINK_FOLDER, experiment.link_values)
-    see, remote = _interruptible(see), experiment.cloud.controller.name in OUTSIDE
-    local = LocalRun(folder, see, session, remote=remote, lost=_raise_if_lost, gone=gone)
     broken, interrupted = None, True
+    remote = experiment.cloud.controller.name in OUTSIDE
+    local = LocalRun(folder, see, session, remote=remote, lost=_raise_if_lost, gone=gone)
     try:
         local.fly(inf if session else assembly.flight_limit(experiment))
         interrupted = False
@@ -211,15 +212,15 @@ def _record_local(
         if broken or (interrupted and not session):
             raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
         raise
-    notes = (*local.notes, *([str(broken)] if broken else ()))
-    steps = describe_steps(experiment.world)
-    run = Run("local", "relay", interrupted, notes, steps)
+    run = _describe("local", interrupted, experiment, local.notes, broken)
     mission.metadata |= run.metadata
     try:
         mission.views = views(mission, experiment)
-        yield mission, experiment, run
+        _raise_if_refused(mission, broken)
+        document = report(mission, experiment, run)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))
         local.announcement.close()
     if broken:
         raise broken
+    return document

@@ -9,31 +9,23 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from types import FrameType
+from types import FrameType, SimpleNamespace
+
+_state = SimpleNamespace(asked=False, only_notes=False)
+"""Whether a signal has asked this process to end, and whether it then raises no exception."""
 
 
-class _Interrupt:
-    """The handler of all signals that interrupt this process."""
-
-    def __init__(self) -> None:
-        self.asked = False
-        self.only_notes = False
-
-    def ask(self, number: int, frame: FrameType | None) -> None:
-        """Interrupt the process."""
-        if number == signal.SIGHUP:
-            # The shell and the kernel each send one; the second must not interrupt the report.
-            signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        self.asked = True
-        if not self.only_notes:
-            raise KeyboardInterrupt
-
-
-_interrupt = _Interrupt()
+def _ask(number: int, frame: FrameType | None) -> None:
+    if number == signal.SIGHUP:
+        # The shell and the kernel each send one; the second must not interrupt the report.
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    _state.asked = True
+    if not _state.only_notes:
+        raise KeyboardInterrupt
 
 
 def interrupt_on_signals() -> None:
-    """Raise KeyboardInterrupt on SIGINT, SIGTERM and SIGHUP.
+    """Raise KeyboardInterrupt on SIGINT, SIGTERM and SIGHUP; earlier signals do not count.
 
     A signal that this process ignores, such as SIGHUP under `nohup`, stays ignored. SIGTERM never
     does: the first process of a container ignores it by default.
@@ -41,7 +33,7 @@ def interrupt_on_signals() -> None:
     forget_interrupt()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _interrupt.ask)
+            signal.signal(number, _ask)
 
 
 @contextmanager
@@ -50,26 +42,26 @@ def noted_interrupts() -> Iterator[None]:
 
     An exception at any line would leave a lock of `concurrent.futures` taken for ever.
     """
-    before, _interrupt.only_notes = _interrupt.only_notes, True
+    before, _state.only_notes = _state.only_notes, True
     try:
         yield
     finally:
-        _interrupt.only_notes = before
+        _state.only_notes = before
 
 
 def is_interrupted() -> bool:
     """Return whether a signal has asked this process to end."""
-    return _interrupt.asked
+    return bool(_state.asked)
 
 
 def forget_interrupt() -> None:
     """Begin a new command: earlier signals do not count."""
-    _interrupt.asked = False
+    _state.asked = False
 
 
 def raise_if_interrupted() -> None:
     """Raise KeyboardInterrupt if a signal has asked this process to end."""
-    if _interrupt.asked:
+    if _state.asked:
         raise KeyboardInterrupt
 
 

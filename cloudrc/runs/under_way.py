@@ -27,9 +27,7 @@ def short(path: Path) -> str:
     return str(path.relative_to(here) if is_inside else path)
 
 
-def find_run(
-    run: Path | None, *, steers: bool = True, flag: str = "--run ", links: bool = False
-) -> RunInFlight | None:
+def find_run(run: Path | None, *, steers: bool = True, links: bool = False) -> RunInFlight | None:
     """Find the run in flight that a user means: `run`, else the only one.
 
     If the user's newest run here, ./runs/latest, has ended, a command that changes a flight rejects
@@ -38,7 +36,6 @@ def find_run(
     Args:
         run: Folder of the run; None if the user names none.
         steers: Whether the command changes the flight.
-        flag: Flag that names a run, for the texts of errors; "" for a positional argument.
         links: Whether the command can also use a link of `link exec` or `relay tcp`.
 
     Returns:
@@ -54,11 +51,10 @@ def find_run(
     if run is not None:
         url = flights.get(Path(os.path.realpath(run)))
         if url is None:
-            text = not_found("no run flies there; name another folder")
-            raise BadInputError(f"{flag}{run}: {text}")
+            raise BadInputError(f"{run}: {not_found('no run flies there; name another folder')}")
         return RunInFlight(run, url)
     without_flight = bool(flights) and flights.keys().isdisjoint(under_way())
-    note = ask_if_unclear(flights, steers=steers and not without_flight, flag=flag)
+    note = ask_if_unclear(flights, steers=steers and not without_flight)
     return next((RunInFlight(Path(short(run)), url, note) for run, url in flights.items()), None)
 
 
@@ -90,24 +86,20 @@ def find_session(run: Path | None) -> tuple[Path, str]:
     return sessions[0], note
 
 
-def ask_if_unclear(candidates: Collection[Path], *, steers: bool, flag: str = "--run ") -> str:
+def ask_if_unclear(candidates: Collection[Path], *, steers: bool) -> str:
     """Raise a BadInputError if it is unclear which flight the user means; return a note about it.
 
     It is unclear if there are several `candidates`, the folders of the local runs that the command
     can use. If the command changes a flight (`steers`), it is also unclear if ./runs/latest has
-    ended or cannot be used. `flag` names a run in error messages.
+    ended or cannot be used.
     """
     latest = Path(os.path.realpath(RUNS / "latest"))
-    names = " or ".join(f"{flag}{short(run)}" for run in sorted(candidates))
+    names = " or ".join(short(run) for run in sorted(candidates))
     if len(candidates) > 1:
-        raise BadInputError(f"{len(candidates)} runs are flying here; choose one: {names}")
+        raise BadInputError(f"{len(candidates)} runs are flying here; name one: {names}")
     is_mine = latest in candidates
     if steers and not is_mine and (latest / LINK_LOG).exists():  # this user steered that flight
-        names = names or "--release NAME (in a cluster)"
-        if unused := say_unused():
-            raise BadInputError(f"{short(latest)}: {unused}; name another flight: {names}")
-        why = "does not take this command" if latest in under_way() else "has ended"
-        raise BadInputError(
-            f"{short(latest)} {why}; name another flight: {names}; or start one: cloudrc up"
-        )
-    return f"using the run in {names.removeprefix(flag)}" if candidates and not is_mine else ""
+        others = names or "--release NAME (in a cluster)"
+        text = f"has ended, or does not take this command; name another flight: {others}"
+        raise BadInputError(f"{short(latest)}: {not_found(text)}; or start one: cloudrc up")
+    return f"using the run in {names}" if candidates and not is_mine else ""

@@ -230,10 +230,9 @@ def test_markers_move_with_the_robots_frames_and_the_scene_stays():
     assert len(markers[-1].points) == 2
 
 
-@pytest.mark.parametrize("name", ["9", "a-b"])
-def test_a_namespace_that_ros_refuses_is_bad_input(name, capsys):
-    assert main(["ros", "bridge", "--namespace", name]) == 2
-    assert "is no namespace of ROS 2" in capsys.readouterr().err
+def test_a_namespace_that_ros_refuses_is_bad_input(capsys):
+    assert main(["ros", "bridge", "--namespace", "a-b"]) == 2
+    assert "invalid ros_namespace value" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

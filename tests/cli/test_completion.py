@@ -20,7 +20,7 @@ def test_the_script_knows_commands_and_options(shell, call):
     [
         (["do"], ["down", "doctor"]),
         (["link", "show", "satel"], ["satellite"]),
-        (["run", "--set", "world.tun"], ["world.tuning=fast"]),
+        (["run", "--set", "world.tun"], ["world.tuning="]),
         (["link", "set", "uplink.dela"], ["uplink.delay_ms="]),
     ],
 )

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import doctor
+from cloudrc.cli import doctor as work
+from cloudrc.cli.doctor import Check
 from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.runs import doctor as work
 from cloudrc.runs import requirements
-from cloudrc.runs.doctor import Check, Survey
 
 GOOD = Check("python", "ok", "3.12.1", "", ("local", "virtual"))
 NO_HELM = Check("helm", "missing", "not in PATH", "https://helm.sh", ("cluster",))
@@ -26,7 +25,7 @@ NO_PHYSICS = Check("physics", "missing", "aborted", "install mujoco", ("local", 
     ],
 )
 def test_only_a_needed_check_gives_exit_code_3(mode, found, code, monkeypatch, call):
-    monkeypatch.setattr(doctor, "all_checks", lambda *given: iter(found))
+    monkeypatch.setattr(work, "all_checks", lambda *given: iter(found))
     text = call(f"doctor --mode {mode}", code=code).out
     assert text.splitlines()[-1].startswith(f"Mode {mode} can")
     assert all(check.fix in text for check in found)
@@ -36,7 +35,7 @@ def test_only_a_needed_check_gives_exit_code_3(mode, found, code, monkeypatch, c
 
 def test_every_problem_says_how_to_fix_it(monkeypatch):
     monkeypatch.setitem(requirements.EXTRAS, "world", ("no_such_module",))
-    checks = {check.name: check for check in work.all_checks("local", Survey())}
+    checks = {check.name: check for check in work.all_checks("local", None)}
     for check in checks.values():
         assert check.state == "ok" or check.fix, check.name
         assert len(f"  missing  {check.name}  {check.found}") < 160

@@ -1,7 +1,6 @@
 """Text from files and from the API is escaped: it cannot control the terminal or fake a line."""
 
 import json
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -53,7 +52,7 @@ def test_what_is_printed_of_a_flight(printed):
     found = {"verdict": "failure", "failures": failures, "numbers": {}}
     print(report.summary(found, Path(EVIL)))
     printed(count=4)
-    with closing(FlightView(1)) as view:
+    with FlightView(1) as view:
         view.see([Fault(0, "bad", EVIL)])
     printed()
     print(table([["name", "value"], [EVIL, "1"]]))

@@ -46,7 +46,7 @@ def test_the_only_run_is_used_and_of_several_one_is_named(tmp_path, elsewhere, s
         assert said(0, "mission estop") == f"cloudrc: using the run in {tmp_path / 'a'}\n"
         with flying(elsewhere / "runs" / "latest") as here:
             error = said(2, "mission estop")
-            assert f"choose one: --run {tmp_path / 'a'} or --run runs/latest" in error
+            assert f"name one: {tmp_path / 'a'} or runs/latest" in error
             assert (len(a.alarms), len(here.alarms)) == (1, 0)
             assert said(0, "mission estop --run", tmp_path / "a") == ""
     with flying(elsewhere / "runs" / "one"):
@@ -60,12 +60,12 @@ def test_no_command_steers_another_flight_after_yours_has_ended(tmp_path, elsewh
     latest.mkdir(parents=True)
     (latest / "uplink.log").touch()
     for words in ("mission hold", "mission run pipes", SET):
-        assert "runs/latest has ended; name another flight: --release" in said(2, words)
+        assert "name another flight: --release" in said(2, words)
     assert "no cluster is configured" in said(3, "mission list"), "it may read in a cluster"
     assert "no cluster is configured" in said(3, "mission hold --release other")
     with flying(tmp_path / "a") as api:
         using = f"cloudrc: using the run in {tmp_path / 'a'}\n"
-        assert f"has ended; name another flight: --run {tmp_path}/a; " in said(2, "mission estop")
+        assert f"name another flight: {tmp_path}/a; " in said(2, "mission estop")
         assert api.alarms == []
         assert said(0, "mission list") == using
         (latest / "uplink.log").unlink()  # as after a run in virtual time, which nobody steers
@@ -79,7 +79,7 @@ def test_a_link_without_a_flight_is_changed_after_yours_has_ended(tmp_path, else
     with local.announced(tmp_path / "a", "unix:/none.sock", local.LINK):
         assert f"using the run in {tmp_path / 'a'}" in said(2, SET)  # it has no state to change
         with flying(tmp_path / "b"):
-            assert "2 runs are flying here; choose one" in said(2, SET)
+            assert "2 runs are flying here; name one" in said(2, SET)
 
 
 def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
@@ -95,7 +95,7 @@ def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
         for words, does in (
             ("hold", "holding at ("),
             ("goto 0.5 -1 1.2", "on the way to (0.5, -1, 1.2); mission m1 (far): held"),
-            ("resume", "flying to waypoint 1 of 1; mission m1 (far): flying"),
+            ("resume", "mission m1 continues; mission m1 (far): flying"),
             ("cancel", "holding at ("),
             ("acknowledge", "acknowledged: the next mission may fly"),
             ("run pipes", "mission m2: starting, waypoints: 7; the robot is set back to its spawn"),
@@ -111,20 +111,14 @@ def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
             error = call(f"mission {words}", code=code).err
             assert error.startswith("cloudrc: error: runs/latest: "), error
             assert why in error
-        api.post("/v1/drive", {"velocity_mps": [0.1, 0.0, 0.0]})
-        served.until(lambda: api.get("/v1/state")["mission"]["state"] == "held")
-        ends = "runs/latest: the drive ends, and the robot holds; mission m3 is then done"
-        assert call("mission resume").out.startswith(ends)
 
 
 def test_the_console_names_a_run_as_it_was_given(tmp_path, elsewhere, said):
     with flying(tmp_path / "a"), flying(tmp_path / "b"):
         assert "error: runs/nope: no run flies there" in said(2, "console runs/nope")
-        assert f"choose one: {tmp_path / 'a'} or {tmp_path / 'b'}" in said(2, "console")
+        assert "2 runs are flying here" in said(2, "console")
         looks = "cloudrc: no folder 'nope' here: looking for a release\n"
         assert said(3, "console nope") == looks + said(3, "console --release nope")
-        (elsewhere / "nope").mkdir()
-        assert "error: nope: no run flies there" in said(2, "console nope")
 
 
 def test_no_request_goes_to_a_server_that_a_folder_names(elsewhere, said):
@@ -157,7 +151,6 @@ def test_link_set_finds_the_only_run(elsewhere, said, monkeypatch):
         monkeypatch.setattr(sys, "argv", ["/usr/local/bin/kubectl-cloudrc"])
         error = said(3, SET)
         assert "KUBECONFIG" in error, "the plug-in of kubectl never uses a local run"
-    assert f"--run {here}: no run flies there" in said(2, SET, "--run", here)
+    assert f"{here}: no run flies there" in said(2, SET, "--run", here)
     monkeypatch.setenv("PATH", str(elsewhere))  # without kubectl
-    nowhere = "no run flies here (start one: cloudrc run; or name one: --run)"
-    assert nowhere in said(3, SET)
+    assert "no run flies here; start one: cloudrc up; and " in said(3, SET)

@@ -33,11 +33,6 @@ def test_a_key_is_made_rotated_and_dropped(tmp_path, key):
     assert (path.is_symlink(), stat.S_IMODE(path.stat().st_mode)) == (True, 0o600)
 
 
-def test_a_second_new_replaces_the_second_key(tmp_path, key):
-    made = [key("new") and read_keys(tmp_path / "key").current for _ in range(3)]
-    assert read_keys(tmp_path / "key") == KeySet(made[2], made[1])
-
-
 @pytest.mark.parametrize(
     ("verb", "name", "data", "said"),
     [

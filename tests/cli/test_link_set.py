@@ -36,9 +36,6 @@ def traced(tmp_path):
     [
         ("uplink.loss=0.02 link.uplink.delay_ms=60", "uplink", {"delay_ms": 60.0, "loss": 0.02},
          []),
-        ("uplink.loss=1", "uplink", {"delay_ms": 40.0, "loss": 1.0},
-         ["the uplink loses 100 % of its packets: its loss is a share from 0 to 1, so 1 % is"
-          " 0.01 (link.uplink.loss)"]),
         ("downlink.delay_ms=120", "downlink",
          {"delay_ms": 120.0, "changes": [{"at_s": 9.0, "jitter_ms": 20.0}, CHANGES[1]]},
          ["the time line of the downlink no longer changes delay_ms"]),

@@ -40,30 +40,16 @@ def uplink(limit):
          "settles up to 220 ms (RTT 290 ms); fails at 230 ms (RTT 300 ms): not_settled, seed 1:"),
         (f"{KEY} --resolution 20", uplink(228), 0,
          "settles up to 220 ms (RTT 290 ms); fails at 240 ms"),
-        (f"{KEY} --max 80", lambda found: True, 0,
-         "settles up to 80 ms (RTT 150 ms), the largest value tried; raise --max"),
         (f"{KEY} --max 80", lambda found: False, 1,
          f"no value settles; it fails at 10 ms (RTT 80 ms): {LATE}"),
         # The experiment allows no loss above 1: that is no failure of the loop.
         ("link.uplink.loss --resolution 0.3", lambda found: True, 0,
          "settles up to 0.9, the largest value possible: --set: link.uplink.loss: 1.2:"),
-        # Nor is a robot too heavy to lift off.
-        ("world.plant.payload_kg --set world.robot=nano --resolution 0.004 --max 0.05 --seeds 1",
-         lambda found: True, 0,
-         "settles up to 0.012, the largest value possible: world.plant: the thrust-to-weight"),
-        # A large value is flown with all digits.
-        ("link.uplink.rate_kbit --max 1234567 --resolution 1 --seeds 1",
-         lambda found: found.uplink.rate_kbit <= 1234567, 0, "settles up to 1234567,"),
         # The stable side is above.
         ("guard.command_age_max_ms --max 500",
          lambda found: found.guard.command_age_max_ms > 117, 0,
          f"settles from 120 ms up to 500 ms, the largest value tried; raise --max; "
          f"fails at 110 ms: {LATE}"),
-        # The limits of the delay would lower the largest speed.
-        (f"{KEY} --max 0.5", lambda found: True, 0,
-         "settles up to 0.5 ms (RTT "),
-        ("guard.speed_max_mps --max 7 --resolution 1", lambda found: True, 0,
-         "settles up to 6, the largest value possible: --set: guard.speed_max_mps: must be at"),
         # Whole numbers are tried, one by one.
         ("cloud.command_rate_hz --max 120", lambda found: found.cloud.command_rate_hz < 111, 0,
          "settles up to 110; fails at 111: "),

@@ -4,7 +4,7 @@ import io
 import json
 import subprocess
 import sys
-from contextlib import closing, redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 
 import pytest
 import yaml
@@ -14,7 +14,6 @@ from cloudrc.cli.output import is_live, paint
 from cloudrc.cli.progress import FlightView, Progress
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import Fault, GuardChange, MissionEvent, TelemetrySent
-from cloudrc.text import format_number
 from tests.conftest import wait_until
 
 
@@ -28,11 +27,6 @@ def plain_environment(monkeypatch):
     for name in ("CI", "NO_COLOR"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("TERM", "xterm-256color")
-
-
-def test_numbers_have_four_digits():
-    shown = {0.1474: "0.1474", 0.0: "0", 1234.5: "1234", -3e-7: "-3.000e-07"}
-    assert {value: format_number(value) for value in shown} == shown
 
 
 def test_colour_and_a_status_line_are_for_terminals(monkeypatch):
@@ -55,7 +49,7 @@ def test_yaml_has_the_content_of_json(line, call):
 
 def test_a_log_gets_a_line_again_and_again(monkeypatch):
     monkeypatch.setattr(progress, "PERIOD", 0.05)
-    with redirect_stderr(io.StringIO()) as stderr, closing(Progress("flies", 9)) as view:
+    with redirect_stderr(io.StringIO()) as stderr, Progress("flies", 9) as view:
         wait_until(lambda: stderr.getvalue().count("flies (0 s)  0/9\n") >= 2, 5.0)
         for done in (1, 2, 3):
             view.count(done)
@@ -76,11 +70,11 @@ def test_events_are_plain_lines_or_wrapped_on_a_terminal(monkeypatch):
     for stream in streams:
         monkeypatch.setattr("sys.stdout", stream)
         monkeypatch.setattr("sys.stderr", stream)
-        view = FlightView(7)
-        view.see([early, TelemetrySent(0, 1, 0, before), seen, reached, hold, track, late, done])
-        view.see([hold, TelemetrySent(7_100_000_000, 1, 2, before._replace(mission_id=7))])
-        assert str(view.line()).lstrip().startswith("6.1 s")
-        view.close()
+        with FlightView(7) as view:
+            first = TelemetrySent(0, 1, 0, before)
+            view.see([early, first, seen, reached, hold, track, late, done])
+            view.see([hold, TelemetrySent(7_100_000_000, 1, 2, before._replace(mission_id=7))])
+            assert str(view.__rich__()).lstrip().startswith("6.1 s")
     shown, wrapped = (stream.getvalue() for stream in streams)
     place = " (-1.00, 2.50, 0.00) m"
     assert [" ".join(line.split()) for line in shown.splitlines()] == [
@@ -98,7 +92,7 @@ def test_events_are_plain_lines_or_wrapped_on_a_terminal(monkeypatch):
 def test_a_flight_shows_what_happens_before_it_and_after_it(kind, monkeypatch):
     """MuJoCo loads for a second, and the report takes several."""
     monkeypatch.setattr(progress, "PERIOD", 0.01)
-    with redirect_stderr(kind()) as stderr, closing(FlightView(7)) as view:
+    with redirect_stderr(kind()) as stderr, FlightView(7) as view:
         wait_until(lambda: "GROUND" in stderr.getvalue(), 5.0)
         view.tell("writes [it]")
         wait_until(lambda: "writes [it] (0 s)" in stderr.getvalue(), 5.0)
@@ -106,7 +100,7 @@ def test_a_flight_shows_what_happens_before_it_and_after_it(kind, monkeypatch):
 
 def test_a_session_that_waits_writes_no_log_but_tells_of_its_report(monkeypatch):
     monkeypatch.setattr(progress, "PERIOD", 0.01)
-    with redirect_stderr(io.StringIO()) as stderr, closing(FlightView(0)) as view:
+    with redirect_stderr(io.StringIO()) as stderr, FlightView(0) as view:
         assert view.log_line() == ""
         view.tell("writes the report")
         wait_until(lambda: stderr.getvalue().startswith("writes the report (0 s)\n"), 5.0)
@@ -114,17 +108,16 @@ def test_a_session_that_waits_writes_no_log_but_tells_of_its_report(monkeypatch)
 
 def test_a_moving_line_leaves_stdout_alone():
     document, stderr = io.StringIO(), Terminal()
-    with redirect_stdout(document), redirect_stderr(stderr), closing(Progress("reads")):
+    with redirect_stdout(document), redirect_stderr(stderr), Progress("reads"):
         print("{}")
     assert document.getvalue() == "{}\n"
     assert "reads" in stderr.getvalue()
 
 
 PRINTS = """\
-import atexit, os, subprocess
+import os, subprocess
 os.write(1, b"descriptor\\n")
 subprocess.run(["echo", "child"])
-atexit.register(print, "at the end")
 from cloudrc.cloud.predictors.last_sample import LastSample as build
 """
 
@@ -135,14 +128,7 @@ def test_nothing_that_a_plugin_prints_gets_into_a_document(folder):
     command = [sys.executable, "-m", "cloudrc", *line.split()]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert json.loads(done.stdout)["schemaVersion"] == 1
-    assert {"descriptor", "child", "at the end"} <= set(done.stderr.splitlines())
-
-
-def test_a_stdout_that_the_shell_has_closed_is_no_error(folder):
-    command = [sys.executable, "-c", "import os, sys; os.close(1); os.execv(sys.executable, "
-               "[sys.executable, '-m', 'cloudrc', 'list'])"]  # fmt: skip
-    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert {"descriptor", "child"} <= set(done.stderr.splitlines())
 
 
 @pytest.mark.parametrize("line", ["list -o json"])

@@ -24,10 +24,3 @@ def test_the_replay_of_a_run_is_written_and_opened(folder, monkeypatch, call):
     assert (folder / "b.html").read_text() == (folder / "a/replay.html").read_text()
     assert len(opened) == 1
     assert "b.html: already there" in call("replay a --out b.html", code=2).err
-
-
-@pytest.mark.parametrize("name", ["nothing", "empty", "text.mcap"])
-def test_what_is_no_run_gives_one_line(name, folder, refused):
-    (folder / "empty").mkdir()
-    (folder / "text.mcap").write_text("no recording")
-    assert name in refused(f"replay {name}")

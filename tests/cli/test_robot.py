@@ -35,13 +35,6 @@ def test_a_new_robot_is_complete_and_its_test_flies_it(mine):
     assert subprocess.run(command, cwd=mine, check=False).returncode == 0
 
 
-def test_the_check_says_that_a_robot_is_larger_than_its_hull(mine, capsys):
-    replace(mine / "robot.yaml", "hull_m: 0.34", "hull_m: 0.1")
-    assert main(["robot", "check", str(mine), "-o", "json"]) == 2
-    (told,) = json.loads(capsys.readouterr().out)["changes"]
-    assert told == f"{mine}/robot.yaml: hull_m is 0.1, but the geoms reach 0.333 m from the base"
-
-
 @pytest.fixture
 def wheeled(tmp_path):
     return shutil.copytree(FOLDERS["robot"] / "rover", tmp_path / "wheeled")
@@ -56,7 +49,7 @@ def changes_of(robot, capsys):
 
 @pytest.mark.parametrize(
     ("onboard", "count"),
-    [("turn_rate_max: 0.05", 1), ("turn_gain: 0.1", 1), ("turn_rate_max: 1", 0)],
+    [("turn_rate_max: 0.05", 1), ("turn_rate_max: 1", 0)],
 )
 def test_the_check_lets_a_robot_with_wheels_turn(wheeled, capsys, onboard, count):
     replace(
@@ -68,56 +61,45 @@ def test_the_check_lets_a_robot_with_wheels_turn(wheeled, capsys, onboard, count
     ] * count
 
 
-@pytest.mark.parametrize(
-    ("size", "caster", "rests"), [(".25", "-.2", "0.2"), (".03", "-.02", "0.050")]
-)
-def test_a_planar_robot_that_does_not_rest_at_the_height_of_the_spawn_is_refused(
-    wheeled, capsys, tmp_path, size, caster, rests
-):
-    replace(wheeled / "robot.xml", 'size=".08 .01"', f'size="{size} .01"')
-    replace(wheeled / "robot.xml", 'pos="-.2 0 -.07"', f'pos="-.2 0 {caster}"')
-    run = ["run", "pillars", "--mode", "virtual", "--set", f"world.robot={wheeled}"]
-    for command in (["robot", "check", str(wheeled)], [*run, "--out", str(tmp_path / "run")]):
-        assert main(command) == 2
-        error = capsys.readouterr().err
-        assert f"rests at a height of {rests}" in error
-        assert "is at 0.100 m" in error
-        assert error.count("\n") == 1
+def test_a_planar_robot_that_does_not_rest_at_the_height_of_the_spawn_is_refused(wheeled, refused):
+    replace(wheeled / "robot.xml", 'size=".08 .01"', 'size=".03 .01"')
+    replace(wheeled / "robot.xml", 'pos="-.2 0 -.07"', 'pos="-.2 0 -.02"')
+    run = f"run pillars --mode virtual --out run --set world.robot={wheeled}"
+    for command in (f"robot check {wheeled}", run):
+        assert "rests at a height of 0.050" in refused(command)
 
 
 def test_a_folder_with_files_stays_as_it_is(mine, capsys):
     before = (mine / "robot.yaml").read_text()
-    for path in (mine, mine / "robot.yaml"):
-        assert main(["new", "robot", str(path)]) == 2
-        assert "already exists; name a new folder" in capsys.readouterr().err
+    assert main(["new", "robot", str(mine)]) == 2
+    assert "already exists; name a new folder" in capsys.readouterr().err
     assert (mine / "robot.yaml").read_text() == before
 
 
 def test_a_new_robot_needs_no_change(mine, capsys):
     assert main(["robot", "check", str(mine), "-o", "json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert (found["ok"], found["changes"]) == (True, [])
+    assert found["ok"]
     assert found["facts"]["mass_kg"] == pytest.approx(1.3)
     assert (mine / "check.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("robot", ["pelican", "nano", "rover"])
-def test_a_shipped_robot_needs_no_change(robot, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(["robot", "check", robot]) == 0
-    assert "nothing must change" in capsys.readouterr().out
+def test_a_shipped_robot_needs_no_change(robot, call, tmp_path):
+    assert "nothing must change" in call("robot check", robot).out
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ("file", "old", "new", "shown"),
+    ("old", "new", "shown"),
     [
-        ("robot.yaml", "braking_mps2: 3", "braking_mps2: 9", "guard.braking_mps2 is 9, but"),
-        ("robot.yaml", "onboard: multirotor", "onboard: ./own.py", "own.py:10 in update"),
-        ("robot.yaml", "onboard: multirotor", "onboard: ./turns.py", "the robot turns over"),
+        ("hull_m: 0.34", "hull_m: 0.1", "hull_m is 0.1, but the geoms reach 0.333 m from the base"),
+        ("braking_mps2: 3", "braking_mps2: 9", "guard.braking_mps2 is 9, but"),
+        ("onboard: multirotor", "onboard: ./own.py", "own.py:10 in update"),
+        ("onboard: multirotor", "onboard: ./turns.py", "the robot turns over"),
     ],
 )
-def test_what_must_change_is_a_line_each_and_exit_code_2(mine, capsys, file, old, new, shown):
+def test_what_must_change_is_a_line_each_and_exit_code_2(mine, call, old, new, shown):
     law = "from cloudrc.robots.onboard.multirotor import build as general\n"
     own = """
 class Mine:
@@ -137,10 +119,9 @@ def build(model):
 """
     (mine / "own.py").write_text(law + own.replace("{0}", "return commands"))
     (mine / "turns.py").write_text(own.replace("{0}", "return (8.0, 8.0, 0.0, 0.0)"))
-    replace(mine / file, old, new)
-    assert main(["robot", "check", str(mine)]) == 2
-    found = capsys.readouterr()
-    (line,) = [each for each in found.out.splitlines() if each.startswith("must change: ")]
+    replace(mine / "robot.yaml", old, new)
+    out = call("robot check", mine, code=2).out
+    (line,) = [each for each in out.splitlines() if each.startswith("must change: ")]
     assert shown in line
 
 
@@ -151,12 +132,9 @@ def build(model):
         (' gear="0 0 1 0 0 .02"', ' gear="0 0 1"', "which has no room"),
     ],
 )
-def test_a_model_that_cannot_fly_is_refused_in_one_line(mine, capsys, old, new, shown):
+def test_a_model_that_cannot_fly_is_refused_in_one_line(mine, refused, old, new, shown):
     replace(mine / "robot.xml", old, new)
-    assert main(["robot", "check", str(mine)]) == 2
-    error = capsys.readouterr().err
-    assert shown in error
-    assert error.count("\n") == 1
+    assert shown in refused("robot check", mine)
 
 
 def test_a_picture_replaces_no_other_file(mine, capsys):
@@ -171,8 +149,7 @@ def test_a_tuning_that_no_experiment_has_chosen_yet_is_checked(mine, capsys):
     tunings = "{slow: {tilt: 3}, wild: {tilt_max_deg: 80}, ok: {tilt_max_deg: 30}}"
     with (mine / "robot.yaml").open("a") as file:
         file.write(f"tunings: {tunings}\n")
-    assert main(["robot", "check", str(mine), "-o", "json"]) == 2
-    changes = json.loads(capsys.readouterr().out)["changes"]
+    changes = changes_of(mine, capsys)
     assert [each.partition("tunings.")[2].partition(":")[0] for each in changes] == [
         "slow.tilt",
         "wild.tilt_max_deg",

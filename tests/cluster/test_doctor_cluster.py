@@ -5,9 +5,9 @@ import shutil
 
 import pytest
 
+from cloudrc.cli import doctor as checks
 from cloudrc.cli.main import main
 from cloudrc.cluster import client
-from cloudrc.runs import doctor as checks
 from tests.cluster.conftest import CONFIG_PLACE, kubeconfig
 
 

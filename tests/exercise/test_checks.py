@@ -208,7 +208,3 @@ def test_files_are_not_overwritten_and_a_folder_must_exist(tmp_path, refused):
     refused("class check", tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     assert "has none of delay_estimator.py" in refused("class check", tmp_path / "empty")
-    (tmp_path / "student.zip").write_bytes(b"PK")
-    assert "is a file; if it is an archive, unpack it" in refused(
-        "class check", tmp_path / "student.zip"
-    )
