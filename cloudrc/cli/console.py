@@ -7,11 +7,15 @@ from pathlib import Path
 from secrets import token_hex
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.cluster_flags import flown_release, release_arguments
-from cloudrc.cli.find_run import need_run_here
 from cloudrc.cli.output import open_page, print_line, tell
 from cloudrc.cli.parser import Options, Parser, flags, whole_number
-from cloudrc.cli.token_flag import given_token, token_argument
+from cloudrc.cli.where import (
+    flown_release,
+    given_token,
+    need_run_here,
+    release_arguments,
+    token_argument,
+)
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 from cloudrc.teleop.client import Api
 

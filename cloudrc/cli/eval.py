@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.output import TABLES, output_argument, print_result, tell
 from cloudrc.cli.parser import COUNT_MAX, Options, Parser, flags, number, read_count, whole_number
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import CloudrcError
 from cloudrc.outside.refusal import naming
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.lock import lock_folder
@@ -152,8 +152,6 @@ def _read(options: Options) -> tuple[EvalSetup, list[Episode]]:
     )
     values.check_policy(setup.policy)
     values.check_round_trips(setup.link, options.rtt)
-    if not all(executors):
-        raise BadInputError(f"--executor {options.executor}: a name is missing")
     episodes = [
         Episode(rtt, executor, seed)
         for executor in executors

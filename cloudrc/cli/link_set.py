@@ -7,10 +7,9 @@ from dataclasses import asdict, replace
 from time import monotonic
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.cluster_flags import release_arguments
-from cloudrc.cli.find_run import find_local_run, need_release, run_argument
 from cloudrc.cli.output import output_argument, print_result, tell
 from cloudrc.cli.parser import Options, Parser, flags
+from cloudrc.cli.where import find_local_run, need_release, release_arguments, run_argument
 from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.text import escape

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.cluster_flags import flown_release, release_arguments
 from cloudrc.cli.output import output_argument, paint, print_result
 from cloudrc.cli.parser import Options, Parser, flags, number
+from cloudrc.cli.where import flown_release, release_arguments
 from cloudrc.link.verify import DEFAULT
 
 if TYPE_CHECKING:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from cloudrc.cli.cluster_flags import cluster_arguments, release_from_flags
 from cloudrc.cli.output import output_argument, paint, print_result, tell
 from cloudrc.cli.parser import Options, Parser, flags
+from cloudrc.cli.where import cluster_arguments, release_from_flags
 from cloudrc.runs.catalogue import KINDS, as_text, describe_all
 
 RELEASES = "releases"

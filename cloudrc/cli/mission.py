@@ -13,8 +13,6 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any, NoReturn
 
-from cloudrc.cli.cluster_flags import release_arguments, timeout_argument
-from cloudrc.cli.find_run import find_local_run, need_release, run_argument
 from cloudrc.cli.output import (
     leave_message,
     output_argument,
@@ -24,9 +22,17 @@ from cloudrc.cli.output import (
     tell,
 )
 from cloudrc.cli.parser import Options, Parser, add_verbs, flags, number
-from cloudrc.cli.token_flag import given_token, token_argument
+from cloudrc.cli.where import (
+    find_local_run,
+    given_token,
+    need_release,
+    release_arguments,
+    run_argument,
+    timeout_argument,
+    token_argument,
+)
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.runs.missions import MissionFollower, read_mission
+from cloudrc.runs.missions import Json, MissionFollower, read_mission
 from cloudrc.teleop.client import (
     Api,
     UnreachableError,
@@ -134,17 +140,12 @@ def _run(options: Options, api: Api) -> int:
 
     After Ctrl-C the mission goes on.
     """
+
+    def stopped(mission: str) -> None:
+        tell(f"mission {mission} goes on; cancel it: cloudrc mission cancel {mission}")
+
     follower = MissionFollower(api, RUN_TIMEOUT, tell=print_line)
-    order = read_mission(options.mission, options.name)
-    mission_id = follower.post({**order, "queue": options.queue})
-    try:
-        verdict = follower.follow(mission_id)
-    except KeyboardInterrupt:
-        command = f"cloudrc mission cancel {mission_id}"
-        tell(f"mission {mission_id} goes on; cancel it: {command}")
-        raise
-    print_line(describe_verdict(verdict))
-    return int(verdict["exit_code"])
+    return _follow(options, follower, read_mission(options.mission, options.name), stopped)
 
 
 def _fly(options: Options, api: Api) -> int:
@@ -154,16 +155,26 @@ def _fly(options: Options, api: Api) -> int:
     Teleop cancels the mission if no pod follows it for the time of the lease. Ctrl-C of somebody
     who runs this command by hand cancels the mission at once.
     """
+
+    def stopped(mission: str) -> None:
+        with suppress(CloudrcError):
+            api.post(f"{mission_path(mission)}/cancel")
+        print_line("INTERRUPTED: the mission is cancelled")
+
     signal.signal(signal.SIGTERM, _leave)
     follower = MissionFollower(api, API_TIMEOUT, options.lease, print_line)
     order = {**read_mission(options.mission), "key": options.key}
-    mission_id = follower.post({**order, "queue": options.queue})
+    return _follow(options, follower, order, stopped)
+
+
+def _follow(
+    options: Options, follower: MissionFollower, order: Json, stopped: Callable[[str], None]
+) -> int:
+    mission = follower.post({**order, "queue": options.queue})
     try:
-        verdict = follower.follow(mission_id)
+        verdict = follower.follow(mission)
     except KeyboardInterrupt:
-        with suppress(CloudrcError):
-            api.post(f"{mission_path(mission_id)}/cancel")
-        print_line("INTERRUPTED: the mission is cancelled")
+        stopped(mission)
         raise
     text = describe_verdict(verdict)
     print_line(text)
@@ -222,12 +233,11 @@ def _logs(options: Options, api: Api) -> None:
         for event in api.events():
             if not options.id or event["mission"] == options.id:
                 print_line(describe_event(event))
-    elif options.id:
-        print_lines(describe_history(api.get(mission_path(options.id))))
-    else:
-        ids = [mission["id"] for mission in api.get("/v1/missions")["missions"]]
-        events = [event for each in ids for event in api.get(mission_path(each))["events"]]
-        print_lines(map(describe_event, sorted(events, key=lambda event: int(event["id"]))))
+        return
+    known = api.get("/v1/missions")["missions"]
+    ids = [options.id] if options.id else [mission["id"] for mission in known]
+    events = [event for each in ids for event in api.get(mission_path(each))["events"]]
+    print_lines(map(describe_event, sorted(events, key=lambda event: int(event["id"]))))
 
 
 def _goto(options: Options, api: Api) -> None:

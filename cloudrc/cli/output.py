@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -41,9 +40,9 @@ def output_argument(
 
 def format_document(document: object, form: str) -> str:
     """Return plain values as text; `form` is "json" or "yaml"."""
-    text = json.dumps(document, indent=2, ensure_ascii=False)
-    if form == "json":  # escaped: a terminal must not obey control characters
-        return re.sub("[\x7f-\x9f]", lambda found: f"\\u{ord(found[0]):04x}", text)
+    text = json.dumps(document, indent=2)  # escaped: a terminal must not obey control characters
+    if form == "json":
+        return text
     from cloudrc.outside.document import write_yaml
 
     return write_yaml(json.loads(text)).rstrip("\n")
@@ -74,19 +73,18 @@ def reserve_stdout() -> Iterator[None]:
 
     So child processes and C libraries of a plug-in do not write into a document.
     """
-    with contextlib.ExitStack() as stack:
-        if (number := _descriptor(sys.stdout)) is not None:
-            sys.stdout.flush()
-            kept = os.dup(number)
-            os.dup2(sys.stderr.fileno(), number)
-            stack.callback(os.close, kept)
-            stack.callback(os.dup2, kept, number)
-            document = open(
-                kept, "w", encoding=sys.stdout.encoding, errors=sys.stdout.errors, closefd=False
-            )
-            stack.enter_context(contextlib.redirect_stdout(document))
-            stack.callback(document.close)
+    stdout = sys.stdout
+    if (number := _descriptor(stdout)) is None:
         yield
+        return
+    stdout.flush()
+    with open(os.dup(number), "w", encoding=stdout.encoding, errors=stdout.errors) as document:
+        os.dup2(sys.stderr.fileno(), number)
+        try:
+            with contextlib.redirect_stdout(document):
+                yield
+        finally:
+            os.dup2(document.fileno(), number)
 
 
 def is_live(stream: TextIO) -> bool:

@@ -122,15 +122,14 @@ class Parser(argparse.ArgumentParser):
 
 @dataclass(frozen=True)
 class NumberFlag:
-    """A type for argparse: a number, which the first letter of its unit may follow, as in 300s."""
+    """A type for argparse: a number."""
 
     quantity: Quantity
 
     def __call__(self, text: str) -> Any:
         """Read a number; raise argparse's error for anything else."""
-        unit = self.quantity.unit[:1]
         try:
-            return self.quantity.read(text.removesuffix(unit) if unit.isalpha() else text)
+            return self.quantity.read(text)
         except InvalidValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from None
 

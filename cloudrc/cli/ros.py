@@ -7,10 +7,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cloudrc.cli.find_run import need_run_here
 from cloudrc.cli.output import print_line, tell
 from cloudrc.cli.parser import Options, Parser, add_verbs, flags
-from cloudrc.cli.token_flag import given_token, token_argument
+from cloudrc.cli.where import given_token, need_run_here, token_argument
 from cloudrc.errors import BadInputError
 from cloudrc.teleop.client import Api
 

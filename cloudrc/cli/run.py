@@ -12,15 +12,15 @@ from shlex import quote, split
 from shutil import which
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.cluster_flags import (
+from cloudrc.cli.output import output_argument, print_line, print_or_drop, print_result, tell, warn
+from cloudrc.cli.parser import Options, Parser, flags, read_count, read_seed
+from cloudrc.cli.report import print_traceback, report_arguments, summary
+from cloudrc.cli.where import (
     DEFAULT_RELEASE,
     release_arguments,
     release_from_flags,
     timeout_argument,
 )
-from cloudrc.cli.output import output_argument, print_line, print_or_drop, print_result, tell, warn
-from cloudrc.cli.parser import Options, Parser, flags, read_count, read_seed
-from cloudrc.cli.report import print_traceback, report_arguments, summary
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.runs.folder import point_to, run_folder
 from cloudrc.runs.interrupts import is_interrupted

@@ -16,11 +16,11 @@ from threading import Thread
 from types import SimpleNamespace
 from typing import IO, Any
 
-from cloudrc.cli.find_run import run_argument
 from cloudrc.cli.output import print_line, tell
 from cloudrc.cli.parser import Options, Parser, flags, whole_number
 from cloudrc.cli.report import report_arguments
 from cloudrc.cli.run import experiment_arguments, fly_once
+from cloudrc.cli.where import run_argument
 from cloudrc.errors import CloudrcError, NothingFlownError
 from cloudrc.runs.requirements import MODES, require
 

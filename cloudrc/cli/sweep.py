@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from cloudrc.cli.cluster_flags import release_arguments
 from cloudrc.cli.output import output_argument
 from cloudrc.cli.parser import (
     COUNT_MAX,
@@ -15,6 +14,7 @@ from cloudrc.cli.parser import (
     read_count,
     whole_number,
 )
+from cloudrc.cli.where import release_arguments
 
 VERBS = {
     "run": "fly all points of a grid, or those that are missing in --out",

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Generator, Sequence
 
-from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.output import print_line, print_or_drop, print_result, tell, warn
 from cloudrc.cli.parser import Options
 from cloudrc.cli.progress import Progress, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
+from cloudrc.cli.where import release_from_flags
 from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
 from cloudrc.metrics.verdict import EXIT_CODES

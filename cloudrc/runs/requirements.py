@@ -41,16 +41,8 @@ def require(purpose: str, extras: Iterable[str]) -> None:
 
     `purpose`, such as "mode virtual", is for the error text.
     """
-    absent = {extra: found for extra in extras if (found := missing(extra))}
-    if absent:
-        modules = ", ".join(module for names in absent.values() for module in names)
-        names = list(absent)
-        if absent.keys() >= set(SIM):
-            names = ["sim", *(name for name in absent if name not in SIM)]
-        raise MissingPrerequisiteError(
-            f"{purpose} needs {modules} (not installed); "
-            f"run: pip install 'cloudrc[{','.join(names)}]'"
-        )
+    if absent := {extra: found for extra in extras if (found := missing(extra))}:
+        raise _error(purpose, [module for found in absent.values() for module in found], absent)
 
 
 def name_extra(error: ModuleNotFoundError) -> MissingPrerequisiteError | None:
@@ -59,10 +51,12 @@ def name_extra(error: ModuleNotFoundError) -> MissingPrerequisiteError | None:
     For what loads a module of an extra before it knows whether it needs the extra.
     """
     module = (error.name or "").partition(".")[0]
-    for extra, modules in EXTRAS.items():
-        if module in modules:
-            named = "sim" if extra in SIM else extra
-            return MissingPrerequisiteError(
-                f"this needs {module} (not installed); run: pip install 'cloudrc[{named}]'"
-            )
-    return None
+    named = [extra for extra, modules in EXTRAS.items() if module in modules]
+    return _error("this", [module], named[:1]) if named else None
+
+
+def _error(purpose: str, modules: Iterable[str], extras: Iterable[str]) -> MissingPrerequisiteError:
+    return MissingPrerequisiteError(
+        f"{purpose} needs {', '.join(modules)} (not installed); "
+        f"run: pip install 'cloudrc[{','.join(extras)}]'"
+    )

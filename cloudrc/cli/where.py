@@ -1,0 +1,153 @@
+"""Flags that say which flight is meant: a run on this machine, an API, a release in a cluster.
+
+The token of teleop's API is read from a file, because a token on the command line would appear in
+the list of processes and in the history of the shell.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cloudrc.cli.output import tell
+from cloudrc.cli.parser import KUBECTL_PLUGIN, Add, Options, Parser, flags, number
+from cloudrc.cluster.client import DEFAULT_RELEASE as DEFAULT_RELEASE
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.files import warn_if_readable
+from cloudrc.outside.paths import read_token
+from cloudrc.runs.requirements import require
+from cloudrc.teleop.client import VARIABLE
+
+if TYPE_CHECKING:
+    from cloudrc.cluster.client import Release
+    from cloudrc.runs.under_way import RunInFlight
+
+READY_LIMIT = 300.0
+"""Default time limit for the pods of a release to become ready [s]."""
+
+
+def release_arguments(parser: Parser, default: str = "the only one of the namespace") -> Add:
+    """Declare `--context` and `--namespace`, as in kubectl, and `--release` with a default.
+
+    Return a function that adds another flag to the same group of the help.
+    """
+    add = cluster_arguments(parser, "(default: the context's, or default)")
+    add("--release", "NAME", f"Helm release (default: {default})")
+    return add
+
+
+def cluster_arguments(parser: Parser, namespace: str) -> Add:
+    """Declare `--context` and `--namespace`; the help of the latter ends with `namespace`.
+
+    Return a function that adds another flag to the same group of the help.
+    """
+    add = flags(parser.add_argument_group("in a cluster (uses KUBECONFIG)"))
+    add("--context", "NAME", "kubeconfig context (default: current)")
+    add("-n --namespace", "NAME", f"namespace {namespace}")
+    return add
+
+
+def timeout_argument(parser: Parser) -> None:
+    """Declare `--timeout`, the time limit for a release to become ready."""
+    about = f"seconds to wait until the release is ready (default: {READY_LIMIT:g})"
+    flags(parser)("--timeout", "S", about, READY_LIMIT, number(1e-3, 86_400, "seconds"))
+
+
+def release_from_flags(options: Options) -> Release:
+    """Return the release that the flags name; by default "cloudrc" in the current context.
+
+    Raise a MissingPrerequisiteError if the Kubernetes client or a kubeconfig is missing.
+    """
+    require("a cluster", ("kube",))
+    from cloudrc.cluster.client import connect
+
+    name = getattr(options, "release", None) or DEFAULT_RELEASE
+    return connect(options.context, options.namespace, name)
+
+
+def flown_release(options: Options) -> Release:
+    """Return the release that the flags name; without `--release`, the only one of the namespace.
+
+    Raise a BadInputError if the namespace has several, a ClusterError if it has none.
+    """
+    require("a cluster", ("kube",))
+    from cloudrc.cluster.releases import choose_release
+
+    return choose_release(options.context, options.namespace, options.release)
+
+
+def run_argument(parser: Parser) -> None:
+    """Declare the flag `--run`, which names a run on this machine."""
+    flags(parser)("--run", "DIR", "folder of a run that is flying on this machine")
+
+
+def find_local_run(
+    options: Options, *, steers: bool = True, links: bool = False
+) -> RunInFlight | None:
+    """Find the run in flight that a command means; None if its flags name a cluster.
+
+    The parameters and errors are those of `runs.under_way.find_run`.
+    """
+    in_cluster = options.context or options.namespace or options.release
+    if options.run is None and (in_cluster or Path(sys.argv[0]).name == KUBECTL_PLUGIN):
+        return None
+    if in_cluster:
+        raise BadInputError("--run names a run here, the other flags a cluster; give one")
+    return find_run_here(options.run, steers=steers, links=links)
+
+
+def find_run_here(run: Path | None, *, steers: bool, links: bool = False) -> RunInFlight | None:
+    """Find a run as `runs.under_way.find_run` does; tell which one was chosen."""
+    from cloudrc.runs.under_way import find_run
+
+    found = find_run(run, steers=steers, links=links)
+    if found is not None and found.note:
+        tell(found.note)
+    return found
+
+
+def need_run_here(run: Path | None, *, steers: bool = True) -> RunInFlight:
+    """Find a run as `find_run_here` does; raise a BadInputError if none flies."""
+    from cloudrc.runs.under_way import not_found
+
+    if (found := find_run_here(run, steers=steers)) is None:
+        raise BadInputError(not_found("no run flies here; start one: cloudrc up"))
+    return found
+
+
+def need_release(options: Options) -> Release:
+    """Return the release in flight, for a command that has found no run on this machine."""
+    from cloudrc.runs.under_way import not_found
+
+    try:
+        return flown_release(options)
+    except MissingPrerequisiteError as error:
+        if options.context or options.namespace:
+            raise
+        text = not_found("no run flies here; start one: cloudrc up")
+        raise MissingPrerequisiteError(f"{text}; and {error}") from None
+
+
+def token_argument(parser: argparse._ActionsContainer) -> None:
+    """Declare the argument --token-file."""
+    text = f"file with the API's token (default: from {VARIABLE}, or the release's Secret)"
+    flags(parser)("--token-file", "FILE", text)
+
+
+def given_token(options: Options) -> Callable[[], str] | None:
+    """Return a function that reads the token from the file that the user has named, else None.
+
+    The flag comes before the environment. Print a warning if other users can read the file.
+    """
+    if path := options.token_file:
+        named = f"--token-file {path}"
+    elif name := os.environ.get(VARIABLE):
+        path, named = Path(name), f"{VARIABLE}={name}"
+    else:
+        return None
+    warn_if_readable(path, tell)
+    return lambda: read_token(path, named)
