@@ -84,12 +84,6 @@ PROGRESS = re.compile(r"(([a-z]+s| +[\d.]+ s) .*\n)*")
 """What a quick command says on a busy machine."""
 
 
-def test_the_first_ten_lines_name_and_show_the_console():
-    top = "\n".join(TEXT.splitlines()[:10])
-    assert "cloudrc up --console" in top
-    assert "(docs/console.webp)" in top
-
-
 @pytest.mark.parametrize("command", [c for c in QUICK if c not in FLIGHTS[1:]])
 def test_a_command_works(command, folder):
     done = execute(command, folder)

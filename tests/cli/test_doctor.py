@@ -45,18 +45,9 @@ def test_every_problem_says_how_to_fix_it(monkeypatch):
         requirements.require("mode virtual", ["world", "record"])
 
 
-def test_the_doctor_says_where_the_usual_steps_run(monkeypatch):
-    monkeypatch.setenv("CLOUDRC_NATIVE", "0")
-    _, steps = work.said(work.start(f"print('one'); {work.STEPS_PROGRAM}"))
-    check = work.native_steps(steps)
-    assert (check.state, check.found) == ("warn", "Python (CLOUDRC_NATIVE=0)")
-    assert "CLOUDRC_NATIVE" in check.fix
-
-
 @pytest.mark.parametrize(
     ("program", "told"),
     [
-        ("print('one'); print('two')", ("one", "two")),
         ("print('one', flush=True); import os; os._exit(7)", ("one", "exit code 7")),
         ("raise OSError('no library')", ("OSError: no library",) * 2),
     ],

@@ -9,7 +9,7 @@ import pytest
 from cloudrc.cli.link import VERBS
 from cloudrc.cli.main import INTERNAL, main
 from cloudrc.cli.parser import COMMANDS
-from cloudrc.errors import BadInputError, InvalidRunError
+from cloudrc.errors import BadInputError
 
 HEAVY = ("numpy", "mujoco", "matplotlib", "pydantic", "yaml", "kubernetes", "rosbags", "mcap")
 QUIET = f"""
@@ -67,11 +67,9 @@ def test_a_wrong_command_line_is_one_line_of_error(line, words, refused):
     ("error", "code", "words"),
     [
         (BadInputError("key x"), 2, "key x"),
-        (InvalidRunError("fell behind"), 6, "fell behind"),
         (PermissionError(13, "Not allowed", "/x"), 2, "/x: Not allowed; check path"),
         (OSError(111, "Connection refused"), 2, "error: Connection refused; check path"),
         (OSError(24, "Too many open files"), 3, "Too many open files; raise 'ulimit -n'"),
-        (OSError(28, "No space left on device"), 3, "disk_full: a file: free some space"),
         (RuntimeError("Could not allocate memory"), 3, "memory ran out (RuntimeError: Could not"),
         (ZeroDivisionError("two\nlines"), INTERNAL, "ZeroDivisionError: two lines"),
     ],

@@ -178,9 +178,3 @@ def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
     path.write_text(path.read_text() + "\n" * ends.TRACE_MAX)
     assert load(trace=str(path)) is None
     assert load(trace="/dev/zero") is None, "an endless device would fill the memory"
-
-
-def test_a_driver_needs_a_controller_outside(tmp_path, call):
-    (tmp_path / "mine.yaml").write_text("cloud: {controller: pid}\n")
-    said = call("policy drive --config", tmp_path / "mine.yaml", "--socket", tmp_path, code=2).err
-    assert "cloud.controller is neither remote nor ros2" in said

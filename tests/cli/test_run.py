@@ -11,10 +11,8 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.cli.report import summary
-from cloudrc.errors import BadInputError
 from cloudrc.report.figures import FIGURES
 from cloudrc.runs import requirements
-from cloudrc.runs.folder import new_folder
 from tests.cli.conftest import FLY, SHORT
 
 
@@ -73,9 +71,8 @@ def test_figures_are_files_if_they_are_asked_for(line, folder, monkeypatch, call
 
 
 @pytest.mark.usefixtures("no_page")
-@pytest.mark.parametrize("key", ["wind.gust_mps=1", "plant.mass_factor=1.1"])
-def test_a_run_that_c_cannot_fly_says_so(key, folder):
-    main([*FLY, f"--set=world.{key}", "--out", "a"])
+def test_a_run_that_c_cannot_fly_says_so(folder):
+    main([*FLY, "--set=world.wind.gust_mps=1", "--out", "a"])
     steps = json.loads((folder / "a/environment.json").read_text())["physics_steps"]
     assert steps.startswith("Python (wind, a robot that differs from its model")
 
@@ -99,14 +96,12 @@ def test_a_run_and_its_report_can_be_repeated(folder, call):
 
 
 @pytest.mark.usefixtures("no_page")
-@pytest.mark.parametrize("form", ["table", "json"])
-def test_a_flight_and_a_report_that_take_long_are_told_in_a_log(form, monkeypatch, call):
+def test_a_flight_and_a_report_that_take_long_are_told_in_a_log(monkeypatch, call):
     monkeypatch.setattr("cloudrc.cli.progress.PERIOD", 0.01)
-    said = call(*FLY, "--out", "here", "-o", form)
-    assert ("mission started" in said.out) == (form == "table")
-    shown = said.err
-    assert " s  TRACK " in shown
-    assert "writes the report (" in shown
+    said = call(*FLY, "--out", "here")
+    assert "mission started" in said.out
+    assert " s  TRACK " in said.err
+    assert "writes the report (" in said.err
 
 
 @pytest.mark.usefixtures("no_page")
@@ -148,65 +143,27 @@ def build() -> Bad:
 
 
 @pytest.mark.usefixtures("no_page")
-@pytest.mark.parametrize(
-    ("how", "more"),
-    [
-        (
-            "--mode virtual --set criteria.time_limit_s=0.5",
-            ["  also: ", "faults noted in flight: "],
-        ),
-        ("--seeds 1", []),
-    ],
-)
-def test_a_failing_plug_in_fails_the_run_and_debug_shows_where(how, more, folder, call):
+@pytest.mark.parametrize("how", ["--mode virtual", "--seeds 1"])
+def test_a_failing_plug_in_fails_the_run_and_debug_shows_where(how, folder, call):
     (folder / "bad.py").write_text(FAILING)
     line = [f"run steps {how} --set cloud.predictor=./bad.py", *SHORT]
     shown = call(*line, code=1)
-    for said in ("KeyError: 'oops', bad.py:5 in predict", *more):
-        assert said in shown.out
+    assert "KeyError: 'oops', bad.py:5 in predict" in shown.out
     assert 'raise KeyError("oops")' not in shown.err
     assert 'raise KeyError("oops")' in call(*line, "--debug", code=1).err
 
 
 @pytest.mark.usefixtures("no_page")
-@pytest.mark.parametrize("how", ["--mode virtual", "--seeds 1"])
-def test_debug_shows_the_lines_of_a_metric_that_fails(how, folder, call):
+def test_debug_shows_the_lines_of_a_metric_that_fails(folder, call):
     (folder / "bad.py").write_text("UNIT = 'm'\ndef measure(flight):\n    return {}['gain']\n")
-    line = [f"run steps {how} --set report.metrics=[./bad.py]", *SHORT]
-    assert "return {}" not in call(*line).err
-    shown = call(*line, "--debug")
-    assert "return {}['gain']" in shown.err
-    assert "KeyError: 'gain'" in shown.err
+    line = "run steps --mode virtual --set report.metrics=[./bad.py] --debug"
+    assert "return {}['gain']" in call(line, *SHORT).err
 
 
-@pytest.mark.parametrize(
-    ("out", "said"),
-    [
-        (Path("runs/x"), r"^--out runs/x: .*name a writable folder"),
-        (Path("runs"), "nothing is overwritten"),
-        (Path("full"), "nothing is overwritten"),
-    ],
-)
-def test_what_is_there_is_never_overwritten(out, said):
-    Path("runs").write_text("a file")
-    Path("full").mkdir()
-    Path("full/precious").write_text("data")
-    with pytest.raises(BadInputError, match=said):
-        new_folder(out, "x")
-    assert Path("full/precious").read_text() == "data"
-
-
-@pytest.mark.parametrize(
-    ("found", "goal"),
-    [
-        ({"numbers": {}}, "every waypoint reached"),
-        ({"numbers": {"final_error": {"value": 0.04, "unit": "m"}}}, "0.04 m from the last one"),
-        ({"numbers": {}, "steps": []}, "every step flown"),
-    ],
-)
-def test_a_summary_says_what_the_mission_had_to_do(found, goal):
+def test_a_summary_says_what_the_mission_had_to_do():
+    found = {"numbers": {"final_error": {"value": 0.04, "unit": "m"}}}
     text = summary({"verdict": "success", "failures": [], **found}, Path("runs/a"))
-    assert goal in text.splitlines()[1]
+    assert "0.04 m from the last one" in text.splitlines()[1]
 
 
 def test_a_run_in_real_time_needs_the_extra_of_the_api(monkeypatch, refused):

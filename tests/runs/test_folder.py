@@ -25,3 +25,4 @@ def test_a_process_may_use_its_folder_again_until_something_is_in_it(tmp_path):
     (out / "config.yaml").touch()
     with pytest.raises(BadInputError, match="already exists"):
         new_folder(out, "")
+    assert (out / "config.yaml").exists()
