@@ -12,7 +12,6 @@ from typing import Any
 from cloudrc.cli.output import output_argument, paint, print_lines, print_result
 from cloudrc.cli.parser import Options, Parser, figure_arguments, flags
 from cloudrc.errors import BadInputError
-from cloudrc.runs.requirements import missing
 from cloudrc.text import escape
 
 EPILOG = """\
@@ -89,11 +88,8 @@ def summary(report: Mapping[str, Any], folder: Path, last: str = "report.html") 
     """Summarize a report as text, and say where the replay and the file `last` are."""
     from cloudrc.report.summary import summarize
 
-    command = f"cloudrc replay {quote(str(folder))}"
-    how = f"pip install 'cloudrc[console]', then {command}"
-    replay = f"replay in 3-D: {how if missing('console') else command}"
-    path = str(folder / last)
-    return "\n".join(["", summarize(report, paint), "", escape(replay), escape(path)])
+    replay = f"replay in 3-D: cloudrc replay {quote(str(folder))}"
+    return "\n".join(["", summarize(report, paint), "", escape(replay), escape(str(folder / last))])
 
 
 def print_traceback(options: Options, report: Mapping[str, Any]) -> None:

@@ -81,12 +81,11 @@ def advice_on(*experiments: ResolvedExperiment) -> list[str]:
     """Return the warnings of `advise`, each once.
 
     For three or more experiments, such as the points of a sweep, return at most `WARNINGS_MAX`, and
-    their number. Of many experiments, only the first, the last and some between them are looked at,
-    because each takes some milliseconds: together about `ADVISED_MAX`.
+    their number. Of many experiments, about `ADVISED_MAX` are looked at, because each takes some
+    milliseconds.
     """
-    every = range(len(experiments))
-    some = dict.fromkeys([*every[:: len(every) // ADVISED_MAX + 1], *every[-1:]])
-    advice = list(dict.fromkeys(text for index in some for text in advise(experiments[index])))
+    some = experiments[:: len(experiments) // ADVISED_MAX + 1]
+    advice = list(dict.fromkeys(text for each in some for text in advise(each)))
     if len(experiments) > 2 and len(advice) > WARNINGS_MAX:
         advice[WARNINGS_MAX:] = [f"{len(advice)} warnings; the others are alike"]
     return advice

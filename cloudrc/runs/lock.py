@@ -12,7 +12,6 @@ import logging
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import IO
 
 from cloudrc.errors import BadInputError
 
@@ -32,22 +31,15 @@ def lock_folder(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[
         names["{}-{}-of-{}".format(LOCK, *shard)] = ALONE
     with ExitStack() as stack:
         for name, how in names.items():
-            if not _try_lock(stack.enter_context((folder / name).open("a+")), how, folder):
+            try:
+                fcntl.flock(stack.enter_context((folder / name).open("a+")), how)
+            except BlockingIOError:
                 text = "another command flies into it now; wait for its end"
-                raise BadInputError(f"--out {folder}: {text}")
+                raise BadInputError(f"--out {folder}: {text}") from None
+            except OSError as error:
+                logging.getLogger("cloudrc").warning(
+                    "%s: its file system has no locks (%s); do not write into it twice at a time",
+                    folder,
+                    error.strerror,
+                )
         yield
-
-
-def _try_lock(file: IO[str], how: int, folder: Path) -> bool:
-    """Return whether no other process has locked a folder, or there are no locks."""
-    try:
-        fcntl.flock(file, how)
-    except BlockingIOError:
-        return False
-    except OSError as error:
-        logging.getLogger("cloudrc").warning(
-            "%s: its file system has no locks (%s); do not write into it twice at the same time",
-            folder,
-            error.strerror,
-        )
-    return True

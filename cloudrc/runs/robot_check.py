@@ -12,7 +12,7 @@ from cloudrc.files import write_atomically
 from cloudrc.outside.paths import check_picture
 from cloudrc.robots.check import SCENE, check, facts_table
 from cloudrc.robots.shapes import read_shapes
-from cloudrc.runs.requirements import missing, require
+from cloudrc.runs.requirements import missing
 
 PICTURE = "check.png"
 """Name of the picture in the folder of a robot."""
@@ -34,25 +34,19 @@ def check_robot(given: str, picture: Path | None = None) -> tuple[dict[str, Any]
     if place is not None:
         check_picture(place, "--picture")
     facts, changes = check(name)
-    note = _draw(name, place, required=picture is not None)
-    return {"robot": given, "ok": not changes, "changes": changes, "facts": facts}, note
+    document = {"robot": given, "ok": not changes, "changes": changes, "facts": facts}
+    if place is None:
+        return document, ""
+    if picture is None and missing("report"):
+        return document, "no picture: cloudrc[report] is not installed"
+    from cloudrc.report.robot_picture import draw_robot
+
+    shapes = read_shapes(World.model_validate({"robot": name, "scene": SCENE}))
+    write_atomically(place, draw_robot(shapes.robot, place.suffix[1:]))
+    return document, f"picture: {place}"
 
 
 def as_text(document: Mapping[str, Any], note: str) -> str:
     """Format the result of `check_robot` for people."""
     lines = [f"must change: {each}" for each in document["changes"]] or ["nothing must change"]
     return "\n".join([facts_table(document["facts"]), "", *lines, *([note] if note else [])])
-
-
-def _draw(name: str, picture: Path | None, *, required: bool) -> str:
-    """Write the picture of a robot; return a note about it."""
-    if picture is None:
-        return ""
-    if not required and missing("report"):
-        return "no picture: cloudrc[report] is not installed"
-    require("a picture", ("report",))
-    from cloudrc.report.robot_picture import draw_robot
-
-    shapes = read_shapes(World.model_validate({"robot": name, "scene": SCENE}))
-    write_atomically(picture, draw_robot(shapes.robot, picture.suffix[1:]))
-    return f"picture: {picture}"
