@@ -18,7 +18,6 @@ def test_the_script_knows_commands_and_options(shell, call):
 @pytest.mark.parametrize(
     ("words", "found"),
     [
-        (["do"], ["down", "doctor"]),
         (["link", "show", "satel"], ["satellite"]),
         (["run", "--set", "world.tun"], ["world.tuning="]),
         (["link", "set", "uplink.dela"], ["uplink.delay_ms="]),

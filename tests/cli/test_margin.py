@@ -4,8 +4,6 @@ import json
 
 import pytest
 
-from tests.cli.conftest import SHORT
-
 KEY = "link.uplink.delay_ms"
 FAILED = {"verdict": "failure", "failures": ["not_settled"], "text": "it is late; lower it"}
 GROWS = {"stable": False, "code": "unstable", "text": "z swings; lower it"}
@@ -121,14 +119,6 @@ def test_the_end_of_the_limits_is_no_failure_of_the_loop(fly_with, call):
 )
 def test_a_search_that_cannot_begin_is_refused(arguments, text, refused):
     assert text in refused(f"margin {arguments}")
-
-
-def test_a_short_flight_has_a_margin(call):
-    """One second of flight with the settling judged: no delay lets the robot arrive."""
-    command = f"margin {KEY} -o json --seeds 1 --max 20"
-    found = json.loads(call(command, *SHORT[:2]).out)
-    assert found["settles_trials"][0]["code"] == "not_settled"
-    assert (found["stable_up_to"], found["settles_up_to"]) == (20, None)
 
 
 @pytest.mark.full

@@ -38,15 +38,6 @@ from tests.record.conftest import cloud_records, world_records, write
 USING = "cloudrc: using the run in s\n"
 
 
-def test_a_flown_order_becomes_the_mission_of_the_report():
-    experiment = load_experiment("paper")
-    plan = assembly.mission_plan(experiment.mission, 33.0, fence=FENCE)
-    order = Order(plan, touch=experiment.mission.touch)
-    flown = assembly.with_order(load_experiment("hover"), order, "")
-    assert assembly.mission_plan(flown.mission, flown.criteria.time_limit_s, fence=FENCE) == plan
-    assert (flown.mission.touched, flown.name) == ("board", "hover")
-
-
 @pytest.fixture
 def down(monkeypatch, call):
     """Return a function that runs `cloudrc down`, which ends no session; it returns the output."""
@@ -283,5 +274,4 @@ def test_a_session_without_a_mission_has_no_report(folder, command):
         assert "s: the session has not ended; end it: cloudrc down" in command("report s", code=2)
         assert command("down") == f"s: ended; no mission flew\n{USING}"
         assert process.wait(10) == 0
-    assert "s: no mission flew, so there is no report" in (folder / "said").read_text()
     assert "no mission flew, so there is no report" in command("report s", code=2)

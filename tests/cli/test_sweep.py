@@ -88,12 +88,9 @@ def test_a_folder_that_was_only_locked_is_still_free(write_sweep, call, refused)
 def test_a_sweep_that_is_too_large_is_refused_before_it_is_checked(write_sweep, refused, call):
     axes = {f"guard.{key}": list(range(1, 1001)) for key in ("hold_max_s", "speed_max_mps")}
     error = refused("sweep run --out grid", write_sweep(axes, seeds=5))
-    assert "1,000,000 points x 5 seeds: 5,000,000 flights are more than 100,000" in error
-    assert error.endswith("or give --max-flights 5000000\n")
+    assert "5,000,000 flights are more than 100,000" in error
     assert not Path("grid").exists()
-    small = write_sweep(ONE, seeds=3)
-    refused("sweep run --out grid --max-flights 2", small)
-    call("sweep run --out grid --max-flights 3", small)
+    call("sweep run --out grid --max-flights 3", write_sweep(ONE, seeds=3))
 
 
 @pytest.mark.usefixtures("no_page")

@@ -12,7 +12,6 @@ from cloudrc.runs.lock import lock_folder
 @pytest.mark.parametrize(
     ("first", "second", "refused"),
     [
-        (None, None, True),
         (None, (1, 2), True),
         ((1, 2), (1, 2), True),
         ((1, 2), (2, 2), False),
