@@ -7,7 +7,7 @@ import contextlib
 import sys
 from collections.abc import Sequence
 
-from cloudrc.cli.output import STDOUT, TABLE, discard_output, leave_message, reserve_stdout
+from cloudrc.cli.output import STDOUT, TABLE, discard_output, reserve_stdout
 from cloudrc.cli.parser import build_parser
 from cloudrc.errors import (
     DISK_FULL,
@@ -44,7 +44,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Escape text from files, but keep the line breaks of our messages: two blanks follow them.
         shown = "\n  ".join(map(escape, message.split("\n  ")))
         print(f"cloudrc: error: {shown}", file=sys.stderr)
-        leave_message(message)
         return code
 
 

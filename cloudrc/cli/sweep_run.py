@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Generator, Sequence
 
-from cloudrc.cli.output import print_line, print_or_drop, print_result, tell, warn
+from cloudrc.cli.output import leave_message, print_line, print_or_drop, print_result, tell, warn
 from cloudrc.cli.parser import Options
 from cloudrc.cli.progress import Progress, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.cli.where import release_from_flags
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.files import write_atomically
 from cloudrc.metrics.verdict import EXIT_CODES
 from cloudrc.outside.paths import check_picture
@@ -154,15 +154,22 @@ def _fly_in_pods(
 
 
 def rows(options: Options) -> None:
-    """Fly one shard (part) of the flights in a file; print the result of each flight as a row."""
+    """Fly one shard (part) of the flights in a file; print the result of each flight as a row.
+
+    If the shard cannot be finished, leave the reason for Kubernetes, which flies the shard again.
+    """
     shard, count = options.shard
 
     def print_row(row: Row) -> None:
         print(json.dumps(row, allow_nan=False), flush=True)
 
-    flights = unpack(options.file)[shard - 1 :: count]
-    if stopped := take_each(map_in_order(play, flights, jobs=1), print_row):
-        raise stopped
+    try:
+        flights = unpack(options.file)[shard - 1 :: count]
+        if stopped := take_each(map_in_order(play, flights, jobs=1), print_row):
+            raise stopped
+    except CloudrcError as error:
+        leave_message(str(error))
+        raise
 
 
 # `cloudrc run --seeds N`.
