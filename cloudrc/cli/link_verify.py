@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from cloudrc.cli.output import output_argument, paint, print_result
 from cloudrc.cli.parser import Options, Parser, flags, number
 from cloudrc.cli.where import flown_release, release_arguments
+from cloudrc.errors import BadInputError
 from cloudrc.link.verify import DEFAULT
 
 if TYPE_CHECKING:

@@ -57,9 +57,7 @@ def execute(options: Options) -> int:
     return 0 if document[f"{margin.questions[0]}_up_to"] is not None else 1
 
 
-def _search(
-    options: Options, margin: Margin, question: str, say: Callable[[str], None]
-) -> None:
+def _search(options: Options, margin: Margin, question: str, say: Callable[[str], None]) -> None:
     """Search the answer to a question, and `say` each value that is tried."""
     from cloudrc.studies.margin import QUESTIONS, why
     from cloudrc.studies.stability import SCENE, SMALL
