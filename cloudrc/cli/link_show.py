@@ -66,7 +66,6 @@ def _drawn(options: Options, kind: str) -> tuple[str, str, bytes]:
     settings = settings_from(options, SampleSettings)
     about, ways = sample_profile(options.profile, settings, tell)
     title = escape(": ".join(filter(None, (Path(options.profile).stem, about))))
-    samples = [sample for sample, _ in ways.values()]
-    picture = render_link(title, samples[0], samples[1] if samples[1:] else None, kind)
+    picture = render_link(title, [sample for sample, _ in ways.values()], kind)
     text = statistics_table({name: numbers for name, (_, numbers) in ways.items()})
     return title, text, picture

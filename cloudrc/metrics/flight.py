@@ -106,15 +106,6 @@ class Flight:
         begin_ns = 0 if self.is_start_lost else self.start_ns
         return tuple(h for h in self.recording.holes if h.meets(begin_ns, self.end_ns))
 
-    def rows_behind_holes(self, stamp_ns: Array) -> Array:
-        """Return the rows before which messages are lost, shape (m,).
-
-        `stamp_ns` are the stamps of the rows [ns], in their order, shape (n,).
-        """
-        middles_ns = [(hole.begin_ns + hole.end_ns) // 2 for hole in self.recording.holes]
-        rows = np.unique(np.searchsorted(stamp_ns, np.array(middles_ns, np.int64)))
-        return rows[(rows > 0) & (rows < len(stamp_ns))]
-
     @property
     def duration(self) -> float:
         """Time from the start of the mission to its end [s]; 0 if the robot never flew."""

@@ -35,9 +35,8 @@ def subject_of(*changes, uplink=CALM, log=None):
 
 
 def band(subject, time, *, uplink=True):
-    """Return the bounds of the delay [s] at a time since the start of the flight [s]."""
-    found = bounds(subject, np.array([time]), uplink=uplink)
-    return float(found[0][0]), float(found[1][0])
+    """Return the bounds of the delay [ms] at a time since the start of the flight [s]."""
+    return bounds(subject, np.array([time]), uplink=uplink)[:, 0].tolist()
 
 
 def low(subject, *times):
@@ -48,8 +47,8 @@ def test_the_band_follows_the_profile():
     steps = (ChangeConfig(at_s=5.0, delay_ms=70.0), ChangeConfig(at_s=9.0, jitter_ms=5.0))
     timed = DirectionConfig(delay_ms=5.0, jitter_ms=20.0, changes=steps)
     # The link started one second before the mission. A delay is never negative.
-    assert band(subject_of(uplink=timed), 3.99) == pytest.approx((0.0, 0.025))
-    assert band(subject_of(uplink=timed), 4.0) == pytest.approx((0.050, 0.090))
+    assert band(subject_of(uplink=timed), 3.99) == pytest.approx((0, 25))
+    assert band(subject_of(uplink=timed), 4.0) == pytest.approx((50, 90))
 
 
 def test_a_trace_replaces_the_delay(tmp_path):
@@ -57,16 +56,16 @@ def test_a_trace_replaces_the_delay(tmp_path):
     trace.write_text("time_s,delay_ms,loss\n1,30,0\n5,90,0\n", encoding="utf-8-sig")  # of Excel
     subject = subject_of(uplink=DirectionConfig(delay_ms=5.0, jitter_ms=10.0, trace=str(trace)))
     # The first row also holds before it.
-    assert low(subject, -0.9, 6.0) == pytest.approx([0.020, 0.080])
+    assert low(subject, -0.9, 6.0) == pytest.approx([20, 80])
     trace.unlink()
-    assert bounds(subject, np.zeros(1), uplink=True) is None
+    assert np.isnan(low(subject, 0.0)).all()
 
 
 def test_a_time_line_starts_at_its_change_and_ends_at_the_next():
     subject = subject_of(changed(1.0, TIMED, "profile timed"), changed(4.0, CALM, "profile calm"))
-    assert band(subject, 1.5, uplink=False)[0] == pytest.approx(0.05), "the other way stays"
-    assert low(subject, 0.5, 1.5, 4.5) == pytest.approx([0.05, 0.02, 0.05])
-    assert bounds(subject, np.array([2.5]), uplink=True) is None, "in its blackout"
+    assert band(subject, 1.5, uplink=False)[0] == pytest.approx(50), "the other way stays"
+    assert low(subject, 0.5, 1.5, 4.5) == pytest.approx([50, 20, 50])
+    assert np.isnan(low(subject, 2.5)).all(), "in its blackout"
     said = "set in flight (profile timed, at 1.0 s; profile calm, at 4.0 s)."
     assert said in legend(subject)
 

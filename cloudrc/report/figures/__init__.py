@@ -17,16 +17,14 @@ from cloudrc.record import wall_time
 from cloudrc.report.figures import curves, flight, marks
 from cloudrc.report.figures.style import Look, Subject
 
-Draw = Callable[[Subject], Figure]
-Write = Callable[[Subject], str]
-FIGURES: dict[str, tuple[Draw, Write, str]] = {
-    "flight": (flight.draw, flight.caption, flight.ALT),
-    "delay": (curves.draw_delay, lambda s: curves.DELAY + marks.legend(s), curves.DELAY_ALT),
-    "odom": (curves.draw_odom, lambda s: curves.ODOM + marks.legend(s), curves.ODOM_ALT),
-    "error": (curves.draw_error, lambda s: curves.ERROR + marks.legend(s), curves.ERROR_ALT),
+FIGURES: dict[str, tuple[Callable[[Subject], Figure], str, str]] = {
+    "flight": (flight.draw, flight.CAPTION, flight.ALT),
+    "delay": (curves.draw_delay, curves.DELAY, curves.DELAY_ALT),
+    "odom": (curves.draw_odom, curves.ODOM, curves.ODOM_ALT),
+    "error": (curves.draw_error, curves.ERROR, curves.ERROR_ALT),
 }
-"""Name of a figure -> function that draws the figure, function that returns the caption, text for
-readers who cannot see the figure. The figures of the paper are delay, odom and error."""
+"""Name of a figure -> function that draws the figure, caption, text for readers who cannot see the
+figure. The figures of the paper are delay, odom and error."""
 PAGE_KINDS, PRINT_KINDS = ("svg",), ("pdf", "png", "svg")
 """Kinds of files: what the page contains, and what the folder figures/ has of each figure."""
 
@@ -56,8 +54,9 @@ def draw_all(subject: Subject, kinds: Iterable[str] = PAGE_KINDS) -> list[Pictur
             figure = draw(subject)
             _lay_out(figure)
             files = {kind: save(figure, kind, flown) for kind in kinds}
-            width, panels = subject.look.width, _over_time(figure)
-            pictures.append(Picture(name, files, caption(subject), width, alt, panels))
+            panels = _over_time(figure)
+            text = caption + (marks.legend(subject) if panels else "")
+            pictures.append(Picture(name, files, text, subject.look.width, alt, panels))
     return pictures
 
 

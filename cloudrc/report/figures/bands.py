@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite, nan, radians, sin
+from math import isfinite, nan
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +21,9 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", "-.", ":")
 """Lines take them in turn. The counts of colours and markers have no common factor: only after 56
 lines does a pair of both come again."""
+
+LETTERS_MAX = 100
+"""Letters along x that have room in an inch at a size of one point."""
 
 
 class Point(NamedTuple):
@@ -52,34 +55,23 @@ def draw(
     line). With `x_names`, the x axis has names instead of numbers, and no line joins the points.
     """
     with own_settings(look):
-        slant, rise = _slant(x_names, look)
-        figure = new_figure(0.7 + rise + 1.3 * len(panels), look.width)
+        crowded = sum(map(len, x_names)) > LETTERS_MAX * look.width / look.font_size
+        figure = new_figure(1.0 + crowded + 1.3 * len(panels), look.width)
         column = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
         for n, (axes, each) in enumerate(zip(column, panels, strict=True)):
             _draw_panel(axes, each, named=bool(x_names))
             panel(axes, chr(ord("a") + n), each.title + f" ({each.unit})" * bool(each.unit))
         column[-1].set_xlabel(_label(x))
         if x_names:
-            turned = {"rotation": slant, "ha": "right", "rotation_mode": "anchor"} if slant else {}
-            column[-1].set_xticks(range(len(x_names)), x_names, **turned)
+            column[-1].set_xticks(range(len(x_names)), x_names)
             column[-1].set_xlim(-0.5, len(x_names) - 0.5)
+            if crowded:
+                column[-1].tick_params(axis="x", rotation=90)
         if by:
             lines = column[0].get_legend_handles_labels()
             shape = {"ncols": 2, "alignment": "left", "title_fontsize": look.font_size - 1.0}
             figure.legend(*lines, loc="outside upper left", title=_label(by), **shape)
         return {kind: save(figure, kind) for kind in PRINT_KINDS}
-
-
-def _slant(names: Sequence[str], look: Look) -> tuple[float, float]:
-    """Return the angle of the names along x [deg], and the height that they need for it [in].
-
-    It is 0 if the names have room beside each other.
-    """
-    letter = 0.5 * (look.font_size - 1.0) / 72.0  # mean width of a letter [in]
-    longest = letter * max(map(len, names), default=0)
-    if longest * len(names) < 0.8 * look.width:  # the rest is the y axis and the gaps
-        return 0.0, 0.0
-    return 35.0, longest * sin(radians(35.0))
 
 
 def _draw_panel(axes: Axes, content: Panel, *, named: bool) -> None:

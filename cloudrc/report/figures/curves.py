@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,12 +12,13 @@ from cloudrc.metrics.control import prediction_errors, round_trips, tracking_err
 from cloudrc.metrics.flight import Array, rms
 from cloudrc.report.figures import style
 from cloudrc.report.figures.marks import bounds, mark_events
-from cloudrc.report.figures.style import Subject, broken, dots, legend_above, new_figure, panel
+from cloudrc.report.figures.style import Subject, dots, legend_above, new_figure, panel
 
 DELAY_ALT = "Two scatter plots over time: one-way delays, and the loop delay with its estimate."
 DELAY = (
     "Delays. (a) Each dot is the one-way delay of a datagram that arrived, late ones included; the "
-    "band is the link profile, with gaps in blackouts. (b) Each dot is the loop delay of one echo: "
+    "band is the link profile, with gaps in blackouts. Without dots, the two ends do not share a "
+    "clock. Delays far above the others are cut off. (b) Each dot is the loop delay of one echo: "
     "the time from a command's stamp to its first echo. The solid line is the delay "
     "estimate, over which the controller predicts. The band is the sum of both directions of the "
     "link profile, the dashed line its mean. Only applied commands have echoes; if the newest "
@@ -25,81 +26,48 @@ DELAY = (
 )
 TIME = "time since start (s)"
 """Label of the time axis; the report page finds panels over time by this label."""
-Limits: TypeAlias = tuple[Array, Array]
-"""Smallest and largest delay according to a profile at each time [s]."""
 MARGIN = 1.25
 """Ratio of the upper end of the delay axis to the 99.5th percentile of the delays."""
 
 
 def draw_delay(subject: Subject) -> Figure:
-    """Draw the one-way delay of each datagram, and the loop delay with cloud's estimate of it."""
+    """Draw the one-way delay of each datagram, and the loop delay with cloud's estimate of it.
+
+    The bands are the limits of the link profile in force, if they are known.
+    """
     figure, (one_way, loop) = subject.look.two_panels()
-    time = np.linspace(0.0, subject.flight.duration, 600)
-    limits = [bounds(subject, time, uplink=uplink) for uplink in (True, False)]
-    known = [each for each in limits if each is not None]
+    flight, time = subject.flight, np.linspace(0.0, subject.flight.duration, 600)
     panel(one_way, "a")
-    _draw_one_way(one_way, subject, time, known)
+    for name, colour in (("uplink", style.UPLINK), ("downlink", style.DOWNLINK)):
+        arrivals = flight.during(f"/{name}_delay")
+        dots(one_way, flight.seconds(arrivals["stamp_ns"]), arrivals["delay"] * 1e3, colour, name)
+    known = [bounds(subject, time, uplink=uplink) for uplink in (True, False)]
+    for each, label in zip(known, ("profile", "_"), strict=True):
+        _fill(one_way, time, each, label)
+    _finish_delay(one_way, subject, "one-way delay (ms)")
+
     panel(loop, "b")
-    _draw_loop(loop, subject, time, known)
+    echoes, total = round_trips(flight), np.sum(known, axis=0)
+    time_of = flight.seconds(echoes["stamp_ns"])
+    dots(loop, time_of, echoes["loop_delay"] * 1e3, style.SKY, "loop delay")
+    horizon = flight.control["horizon"] * 1e3
+    loop.plot(subject.times, horizon, color=style.BLACK, label="estimate", zorder=4)
+    _fill(loop, time, total, "profile")
+    mean = total.mean(axis=0)
+    loop.plot(time, mean, color=style.GREEN, lw=0.8, ls="--", label="mean", zorder=3)
+    _finish_delay(loop, subject, "loop delay (ms)")
     return figure
 
 
-def _draw_one_way(axes: Axes, subject: Subject, time: Array, known: list[Limits]) -> None:
-    """Draw the one-way delays, and over `time` [s] the `known` limits of the profile [s]."""
-    flight, shown = subject.flight, []
-    for name, colour in (("uplink", style.UPLINK), ("downlink", style.DOWNLINK)):
-        arrivals = flight.during(f"/{name}_delay")
-        delay = arrivals["delay"] * 1e3
-        if np.isfinite(delay).any():
-            dots(axes, flight.seconds(arrivals["stamp_ns"]), delay, colour, name)
-            shown.append(delay)
-    if not shown:
-        text = "unknown: the two ends\ndo not share a clock"
-        axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
-    for index, (low, high) in enumerate(known):
-        _fill(axes, time, low, high, "_" if index else "profile")
-        shown.append(high * 1e3)
-    _finish_delay(axes, subject, "one-way delay (ms)", shown)
+def _fill(axes: Axes, time: Array, limits: Array, label: str) -> None:
+    """Draw the `limits` of a profile [ms], shape (2, n), at each `time` [s], shape (n,)."""
+    axes.fill_between(time, *limits, color=style.LIGHT, lw=0, label=label, zorder=1)
 
 
-def _draw_loop(axes: Axes, subject: Subject, time: Array, known: list[Limits]) -> None:
-    """Draw the loop delay with cloud's estimate, and the profile's limits if both are `known`."""
-    flight = subject.flight
-    echoes, control = round_trips(flight), flight.control
-    loop_delay, horizon = echoes["loop_delay"] * 1e3, control["horizon"] * 1e3
-    dots(axes, flight.seconds(echoes["stamp_ns"]), loop_delay, style.SKY, "loop delay")
-    stamps, behind = _times(subject)
-    axes.plot(stamps, broken(horizon, behind), color=style.BLACK, label="estimate", zorder=4)
-    shown = [loop_delay, horizon]
-    if len(known) == 2:
-        low, high = (sum(each) for each in zip(*known, strict=True))
-        _fill(axes, time, low, high, "profile")
-        mean = (low + high) * 1e3 / 2
-        axes.plot(time, mean, color=style.GREEN, lw=0.8, ls="--", label="mean", zorder=3)
-        shown.append(high * 1e3)
-    _finish_delay(axes, subject, "loop delay (ms)", shown)
-
-
-def _times(subject: Subject) -> tuple[Array, Array]:
-    """Return the times of the control periods [s], broken at holes, and the rows behind holes."""
-    stamps_ns = subject.flight.control["stamp_ns"]
-    behind = subject.flight.rows_behind_holes(stamps_ns)
-    return broken(subject.flight.seconds(stamps_ns), behind), behind
-
-
-def _fill(axes: Axes, time: Array, low: Array, high: Array, label: str) -> None:
-    axes.fill_between(time, low * 1e3, high * 1e3, color=style.LIGHT, lw=0, label=label, zorder=1)
-
-
-def _finish_delay(axes: Axes, subject: Subject, label: str, shown: list[Array]) -> None:
-    """Scale the delay axis of a panel; cut off outliers, and write their number."""
-    values = [v[np.isfinite(v)] for v in shown]
-    top = max((float(np.percentile(v, 99.5)) for v in values if len(v)), default=1.0) * MARGIN
-    top = max(top, 1.0)
-    axes.set_ylim(0.0, top)
-    above = sum(int((v > top).sum()) for v in values)
-    if above:
-        axes.plot([], [], "^", ms=3.5, color=style.GREY, label=f"{above} above")
+def _finish_delay(axes: Axes, subject: Subject, label: str) -> None:
+    """Complete a panel of delays; its axis leaves out what is far above the others."""
+    drawn = np.concatenate([np.zeros(1), *(line.get_ydata() for line in axes.lines)])
+    axes.set_ylim(0.0, max(MARGIN * float(np.nanpercentile(drawn, 99.5)), 1.0))
     _finish(axes, subject, label, 4)
 
 
@@ -169,9 +137,8 @@ def draw_odom(subject: Subject) -> Figure:
 
 def _draw_position(axes: Axes, subject: Subject, index: int) -> None:
     """Draw the position along one axis of the world, 0 to 2."""
-    time, behind = _times(subject)
     for column, look in LINES.items():
-        axes.plot(time, broken(subject.flight.control[column][:, index], behind), **look)
+        axes.plot(subject.times, subject.flight.control[column][:, index], **look)
 
 
 def _largest_step(subject: Subject, count: int) -> tuple[int, float] | None:
@@ -184,14 +151,13 @@ def _largest_step(subject: Subject, count: int) -> tuple[int, float] | None:
     if jumps.max(initial=0.0) <= STEP_MIN:
         return None
     row, index = divmod(int(jumps.argmax()), count)
-    return index, float(subject.flight.seconds(control["stamp_ns"][row + 1])) - BEFORE
+    return index, float(subject.times[row + 1]) - BEFORE
 
 
 def _draw_step(axes: Axes, subject: Subject, index: int, begin: float) -> None:
     """Enlarge the measured and the estimated position of an axis from `begin` [s] on."""
     _draw_position(axes, subject, index)
-    control = subject.flight.control
-    time = subject.flight.seconds(control["stamp_ns"])
+    control, time = subject.flight.control, subject.times
     inside = (time >= begin) & (time <= begin + ZOOM)
     shown = np.concatenate([control[name][inside, index] for name in ("measured", "position")])
     room = 0.1 * np.ptp(shown) + 1e-3
@@ -216,18 +182,17 @@ def draw_error(subject: Subject) -> Figure:
     flight, control = subject.flight, subject.flight.control
 
     panel(tracking, "a")
-    time, behind = _times(subject)
     for column in ("measured", "position"):
         error = tracking_errors(flight, control[column])
         look = LINES[column] | {"label": f"{LINES[column]['label']}{_rms(error, 'm', 1.0)}"}
-        tracking.plot(time, broken(np.linalg.norm(error, axis=1), behind), **look)
+        tracking.plot(subject.times, np.linalg.norm(error, axis=1), **look)
     tracking.set_ylim(bottom=0.0)
     _finish(tracking, subject, "distance to reference (m)", 2)
 
     panel(accuracy, "b")
     _, instants_ns, error = prediction_errors(flight)
     time, distance = flight.seconds(instants_ns), np.linalg.norm(error, axis=1) * 1e3
-    dots(accuracy, time, distance, style.SKY, f"each command{_rms(error, 'mm', 1e3)}", 2.0)
+    dots(accuracy, time, distance, style.SKY, f"each command{_rms(error, 'mm', 1e3)}")
     accuracy.set_ylim(bottom=0.0)
     _finish(accuracy, subject, "distance to truth (mm)", 2)
     return figure

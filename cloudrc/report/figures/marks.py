@@ -35,14 +35,14 @@ def delays_of(direction: DirectionConfig) -> Timeline | None:
 
 
 def band(delays: Timeline, time: Array) -> tuple[Array, Array]:
-    """Compute delay - jitter and delay + jitter [s] at each `time` [s] since the link's start.
+    """Compute delay - jitter and delay + jitter [ms] at each `time` [s] since the link's start.
 
     Both are NaN in blackouts. Uniformly distributed delays are all in this band; for other
     distributions, its half width is one standard deviation.
     """
     found = [delays.at(round(instant * 1e9)) for instant in time.tolist()]
-    delay = np.array([nan if each.blackout else each.delay_ns * 1e-9 for each in found])
-    jitter = np.array([conditions.jitter for conditions in found])
+    delay = np.array([nan if each.blackout else each.delay_ns * 1e-6 for each in found])
+    jitter = np.array([each.jitter * 1e3 for each in found])
     return np.maximum(delay - jitter, 0.0), delay + jitter
 
 
@@ -77,20 +77,20 @@ def parts(subject: Subject, *, uplink: bool) -> list[LinkSpan]:
     return found
 
 
-def bounds(subject: Subject, time: Array, *, uplink: bool) -> tuple[Array, Array] | None:
-    """Compute delay - jitter and delay + jitter [s] at each `time` [s] since the flight's start.
+def bounds(subject: Subject, time: Array, *, uplink: bool) -> Array:
+    """Compute delay - jitter and delay + jitter [ms] at each `time` [s] since the flight's start.
 
-    The values are those of the profile in force. They are NaN in blackouts, and if the file of a
-    trace is missing. Return None if all are NaN.
+    The values, shape (2, n), are those of the profile in force. They are NaN in blackouts, and if
+    the file of a trace is missing.
     """
-    low, high = np.full((2, len(time)), nan)
+    limits = np.full((2, len(time)), nan)
     found = parts(subject, uplink=uplink)
     newest = np.searchsorted([part.begin for part in found], time, "right") - 1
     for number in np.unique(newest):  # a drag of a slider makes many parts without a time
         rows, delays = newest == number, delays_of(found[number].direction)
         if delays:
-            low[rows], high[rows] = band(delays, time[rows] - found[number].origin)
-    return None if np.isnan(low).all() else (low, high)
+            limits[:, rows] = band(delays, time[rows] - found[number].origin)
+    return limits
 
 
 def set_in_flight(subject: Subject) -> list[tuple[float, str]]:

@@ -22,7 +22,7 @@ PAGE = 7.16
 """Width of both columns of a page [in]. Source: IEEE conference template."""
 NARROW = 5.0
 """Figures below this width [in] have their panels below each other."""
-BLACK, GREY, LIGHT, BORE = "#1a1a1a", "#6b6b6b", "#d9d9d9", "#f4f4f4"
+BLACK, GREY, LIGHT = "#1a1a1a", "#6b6b6b", "#d9d9d9"
 BLUE, SKY, GREEN = "#0072B2", "#56B4E9", "#009E73"
 ORANGE, VERMILION, PURPLE = "#E69F00", "#D55E00", "#CC79A7"
 UPLINK, DOWNLINK = BLUE, ORANGE
@@ -95,12 +95,12 @@ def legend_above(axes: Axes, columns: int) -> None:
         )
 
 
-def dots(axes: Axes, x: Array, y: Array, colour: str, name: str, size: float = 1.8) -> None:
-    """Draw dots of `size` [points] at `x` and `y`, any unit, and add them to the legend.
+def dots(axes: Axes, x: Array, y: Array, colour: str, name: str) -> None:
+    """Draw dots at `x` and `y`, any unit, and add them to the legend.
 
     In an SVG file the dots are a bitmap, because thousands of vector shapes are slow to display.
     """
-    axes.plot(x, y, ".", ms=size, mew=0, color=colour, rasterized=True, zorder=2)
+    axes.plot(x, y, ".", ms=1.8, mew=0, color=colour, rasterized=True, zorder=2)
     axes.plot([], [], "o", ms=3.5, mew=0, color=colour, label=name)
 
 
@@ -115,24 +115,11 @@ class Subject:
     shapes: Shapes = NOTHING  # of robot and scene
 
     @property
+    def times(self) -> Array:
+        """Times of the control periods since the start of the mission [s], shape (n,)."""
+        return np.asarray(self.flight.seconds(self.flight.control["stamp_ns"]))
+
+    @property
     def touch(self) -> str | None:
         """Name of the body that the mission touches; None if there is none."""
         return self.flight.mission.touched
-
-
-def broken(values: Array, behind: Array) -> Array:
-    """Insert NaN into `values`, any unit, shape (n, ...), so that no line crosses a hole.
-
-    `behind` are the rows behind the holes, shape (m,).
-    """
-    return np.insert(values, behind, np.nan, axis=0)
-
-
-def sampled(count: int, behind: Array) -> Array:
-    """Choose 20 of the 100 points per second of a path: it looks smooth, and the file is smaller.
-
-    `count` is the number of points. `behind` are the rows behind holes [row numbers], shape (m,).
-    Return the chosen rows, among them both sides of each hole.
-    """
-    every = [*range(0, count, 5), *range(count)[-1:]]
-    return np.unique(np.array([*every, *(behind - 1), *behind], dtype=int))

@@ -49,7 +49,8 @@ def sample_profile(
         asked = getattr(profile, way)
         for doubt in describe_heavy_loss(asked, way):
             tell(f"warning: {doubt}")
-        found[way] = _sample(asked, way == "uplink", settings)
+        label = way if len(ways) > 1 else "one way"
+        found[way] = _sample(asked, label, way == "uplink", settings)
     return profile.description, found
 
 
@@ -65,7 +66,7 @@ def _profile(name: str) -> tuple[Profile, Sequence[str]]:
 
 
 def _sample(
-    asked: DirectionConfig, uplink: bool, settings: SampleSettings
+    asked: DirectionConfig, label: str, uplink: bool, settings: SampleSettings
 ) -> tuple[DirectionSample, Numbers]:
     """Simulate one direction of the link; return the packets for the figure, and statistics.
 
@@ -95,7 +96,7 @@ def _sample(
     many = shown
     if timeline.only() is not None:
         many = send(range(0, settings.packets * period_ns, period_ns))
-    return DirectionSample(asked, shown.sent, shown.delays, many.delays), numbers(many)
+    return DirectionSample(label, asked, shown.sent, shown.delays, many.delays), numbers(many)
 
 
 def _row_times(trace: Trace) -> list[int]:
