@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.errors import CloudrcError, InterruptedRunError, NothingFlownError
-from cloudrc.metrics import Flight
-from cloudrc.metrics.flight import Columns
+from cloudrc.metrics.flight import Columns, Flight
 from cloudrc.metrics.response import Step, steps
 from cloudrc.metrics.verdict import FlightFailure
 from cloudrc.outside.refusal import check_names, naming

@@ -53,8 +53,8 @@ def execute(options: Options) -> int:
     """Write the report from the recording; return the exit code of the run's verdict."""
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
-    from cloudrc import metrics
     from cloudrc.cli.progress import Progress
+    from cloudrc.metrics import measure
     from cloudrc.metrics.verdict import exit_code
     from cloudrc.record.topics import TOPICS
     from cloudrc.report.figures.style import Look
@@ -62,14 +62,14 @@ def execute(options: Options) -> int:
     from cloudrc.report.write import write_report
     from cloudrc.runs.session import check_ended, restore_mission
 
-    metrics.check(options.metric)
+    measure.check(options.metric)
     look = Look(options.width, options.font_size)
     with Progress(f"reads the recording of {options.run}") as view:
         check_ended(options.run)
         restore_mission(options.run)
         recording, experiment, run = read_run(options.run)
         # The run may come from somebody else: never execute files that it names.
-        unmeasured = metrics.not_measured(experiment.report.metrics, options.metric)
+        unmeasured = measure.not_measured(experiment.report.metrics, options.metric)
         run = replace(run, notes=(*run.notes, *unmeasured))
         count = sum(len(recording[topic]) for topic in TOPICS)
         view.tell(f"measures {count:,} messages and draws the figures")

@@ -16,7 +16,6 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from cloudrc import metrics
 from cloudrc.assembly import assemble, build_links, flight_limit
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.loop import ControlLoop
@@ -26,6 +25,7 @@ from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Link
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.messages import Datagram, Odometry, Setpoint
+from cloudrc.metrics import measure
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import RESULT
 from cloudrc.record.columns import Recording, RecordStore
@@ -159,7 +159,7 @@ class RobotEnv(gymnasium.Env[Any, Any]):
             experiment, [f"{key}={json.dumps(value, default=str)}" for key, value in texts.items()]
         )
         self.experiment = loaded.model_copy(update={"link": Link(profile="ideal")})
-        metrics.check(self.experiment.report.metrics)
+        measure.check(self.experiment.report.metrics)
         guard = self.experiment.guard
         axes = PLANE if is_planar(self.experiment.world.robot) else SPACE
         self._parts = (*axes, "yaw rate")
@@ -220,7 +220,7 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         own = flight.experiment.report.metrics
         found = assess(recording, flight.experiment, run, own)
         for note in found.notes:
-            if note.startswith(metrics.METRIC_NOTE):
+            if note.startswith(measure.METRIC_NOTE):
                 warnings.warn(note, stacklevel=3)
         return {
             "verdict": found.verdict.outcome,

@@ -27,9 +27,10 @@ import numpy as np
 from cloudrc.config.schema import Touch
 from cloudrc.errors import DISK_FULL, DiskFullError
 from cloudrc.messages import Cause, GuardState, Vector
-from cloudrc.metrics import Flight, Number
 from cloudrc.metrics.counters import growth
 from cloudrc.metrics.definitions import real_time_factor
+from cloudrc.metrics.flight import Flight
+from cloudrc.metrics.measure import Number
 from cloudrc.metrics.mission import (
     first_touch,
     lost_contacts,

@@ -14,7 +14,8 @@ from typing import Any, Literal
 
 from cloudrc.config.resolved import ResolvedExperiment, fingerprint
 from cloudrc.files import write_atomically
-from cloudrc.metrics import Flight, Number
+from cloudrc.metrics.flight import Flight
+from cloudrc.metrics.measure import Number
 from cloudrc.metrics.response import steps
 from cloudrc.metrics.verdict import FlightVerdict
 

@@ -9,7 +9,7 @@ from cloudrc.config.robot import is_planar
 from cloudrc.config.scene import scene_of
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.geometry.shapes import SHAPES_FILE, Shapes
-from cloudrc.metrics import Flight
+from cloudrc.metrics.flight import Flight
 from cloudrc.outside.refusal import naming
 from cloudrc.record.columns import Recording
 

@@ -15,7 +15,8 @@ from string import Template
 from typing import Any
 
 from cloudrc.config.resolved import ResolvedExperiment, dump
-from cloudrc.metrics import SHIPPED, Flight, Number
+from cloudrc.metrics.flight import Flight
+from cloudrc.metrics.measure import SHIPPED, Number
 from cloudrc.metrics.verdict import FlightFailure
 from cloudrc.record import wall_time
 from cloudrc.report.document import Assessment, Run

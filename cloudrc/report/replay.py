@@ -17,7 +17,7 @@ import viser
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.console.scene import FlightScene
 from cloudrc.errors import NothingFlownError
-from cloudrc.metrics import Flight
+from cloudrc.metrics.flight import Flight
 from cloudrc.metrics.mission import reported
 from cloudrc.report.flown import flown_shapes
 

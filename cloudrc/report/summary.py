@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from cloudrc.metrics import METRIC_NOTE, SHIPPED, Metric, Number, scale
+from cloudrc.metrics.flight import Metric
+from cloudrc.metrics.measure import METRIC_NOTE, SHIPPED, Number, scale
 from cloudrc.report.document import INCOMPLETE
 from cloudrc.text import Paint, escape, plain, table
 

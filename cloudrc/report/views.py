@@ -15,9 +15,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.metrics import Flight
 from cloudrc.metrics.control import prediction_errors, tracking_errors
-from cloudrc.metrics.flight import Array, Columns, select
+from cloudrc.metrics.flight import Array, Columns, Flight, select
 from cloudrc.record.columns import Recording
 from cloudrc.record.content import Message
 from cloudrc.record.live import encode_transforms

@@ -14,7 +14,8 @@ from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import read_json, write_atomically
 from cloudrc.geometry.obstacles import has_surface, obstacles
-from cloudrc.metrics import Flight, measure_all
+from cloudrc.metrics.flight import Flight
+from cloudrc.metrics.measure import measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
 from cloudrc.report.document import (

@@ -27,7 +27,7 @@ def describe_all(kind: str) -> dict[str, str]:
     if kind in PLUGINS:
         lines = {name: plugins.describe(kind, name) for name in plugins.names(kind)}
         if kind == "metrics":
-            from cloudrc.metrics import SHIPPED
+            from cloudrc.metrics.measure import SHIPPED
 
             lines |= {metric.name: metric.meaning for metric in SHIPPED.values()}
         elif kind == "onboard":

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from cloudrc import metrics
 from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import OUTSIDE, ROS2, parse_settings
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.scene import has_mujoco
 from cloudrc.config.schema import Parameters, World
+from cloudrc.metrics import measure
 from cloudrc.outside.reuse import reuse
 from cloudrc.runs.requirements import require
 from cloudrc.warnings import advise
@@ -25,7 +25,7 @@ def load(name: str, overrides: Iterable[str], seed: int | None = None) -> Resolv
     """Load an experiment by name or path with `overrides` (KEY=VALUE); check `report.metrics`."""
     seeds = [] if seed is None else [f"seed={seed}"]
     experiment = load_experiment(name, [*overrides, *seeds])
-    metrics.check(experiment.report.metrics)
+    measure.check(experiment.report.metrics)
     return experiment
 
 

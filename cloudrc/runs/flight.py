@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias
 
-from cloudrc import assembly, metrics, plugins
+from cloudrc import assembly, plugins
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import describe_error, machine_error
+from cloudrc.metrics.measure import METRIC_NOTE, SHIPPED, find
 from cloudrc.outside import code
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.record.columns import Recording, RecordStore
@@ -50,7 +51,7 @@ def measure(experiment: ResolvedExperiment) -> Row:
     """Fly an experiment in virtual time and measure it."""
     found = fly_in_memory(experiment)
     failures = found.verdict.failures
-    notes = (note for note in found.notes if note.startswith(metrics.METRIC_NOTE))
+    notes = (note for note in found.notes if note.startswith(METRIC_NOTE))
     return {
         "verdict": found.verdict.outcome,
         "failures": [failure.code for failure in failures],
@@ -77,8 +78,8 @@ def units(own: Iterable[str]) -> dict[str, str]:
 
     `own` contains names of metrics and paths of files with a metric.
     """
-    names = (*metrics.SHIPPED, *plugins.names("metrics"), *own)
-    return {metric.name: metric.unit for metric in map(metrics.find, names)}
+    names = (*SHIPPED, *plugins.names("metrics"), *own)
+    return {metric.name: metric.unit for metric in map(find, names)}
 
 
 @reuse_results()  # a flight looks ten times at the file of its robot

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cloudrc.errors import CloudrcError, NothingFlownError
-from cloudrc.metrics import SHIPPED
+from cloudrc.metrics.measure import SHIPPED
 from cloudrc.outside.refusal import check_names, naming
 from cloudrc.outside.values import InvalidValueError
 from cloudrc.runs.flight import counts

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from cloudrc.metrics import scale
+from cloudrc.metrics.measure import scale
 from cloudrc.statistics import LEVEL, by_chance
 from cloudrc.studies.compare import LEFT_OUT
 from cloudrc.text import FAILED_MARK, FAILED_NOTE, format_number, table

@@ -7,7 +7,7 @@ from math import nan
 from statistics import median
 from typing import Any
 
-from cloudrc.metrics import scale
+from cloudrc.metrics.measure import scale
 from cloudrc.outside.refusal import check_names
 from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.report.figures.style import Look

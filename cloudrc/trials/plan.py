@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from pydantic import Field
 
-from cloudrc import files, metrics, source
+from cloudrc import files, source
 from cloudrc.config import problems, shipped
 from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import Settings, collect_settings, parse_settings
@@ -26,6 +26,7 @@ from cloudrc.config.problems import ConfigProblem, ProblemsError, validate
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.section import Section
 from cloudrc.errors import BadInputError
+from cloudrc.metrics import measure
 from cloudrc.outside.document import Document, Source, parse_yaml, read_document, write_yaml
 from cloudrc.outside.reuse import reuse, reuse_results
 from cloudrc.runs import flight
@@ -151,7 +152,7 @@ class Draft(NamedTuple):
             lines = [f"{_label(settings, problem)}{problem}" for problem in error.problems]
             raise BadInputError("; ".join(lines)) from error
         own = resolved.report.metrics
-        reuse(("metrics", own), lambda: metrics.check(own))
+        reuse(("metrics", own), lambda: measure.check(own))
         return resolved
 
 
@@ -283,7 +284,7 @@ def _entries(
         if not choices:
             text = "must be a list of values, or names, each with a mapping of keys to values"
             found.append(ConfigProblem(("grid", axis), "", text))
-        if axis in {*COLUMNS, *metrics.SHIPPED}:
+        if axis in {*COLUMNS, *measure.SHIPPED}:
             text = "is the name of another column; rename the axis"
             found.append(ConfigProblem(("grid", axis), "", text))
     return [entry(key, value, "set", key) for key, value in file.set.items()], axes

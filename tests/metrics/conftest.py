@@ -12,7 +12,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Criteria, MissionConfig, Touch, Waypoint
 from cloudrc.geometry.scene import Plate, Scene, Tube
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
-from cloudrc.metrics import Flight
+from cloudrc.metrics.flight import Flight
 from cloudrc.record.columns import Recording
 from cloudrc.records import (
     Arrival,

@@ -5,7 +5,7 @@ from random import Random
 import pytest
 
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.metrics import SHIPPED
+from cloudrc.metrics.measure import SHIPPED
 from cloudrc.records import CommandApplied, GuardChange, MissionEvent
 from tests.metrics.conftest import Log, at
 

@@ -21,7 +21,6 @@ from cloudrc.config.load import load_experiment
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.exposition.table import METRICS
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
-from cloudrc.metrics import SHIPPED
 from cloudrc.metrics.control import round_trips
 from cloudrc.metrics.definitions import (
     LONG_AGO_NS,
@@ -35,6 +34,7 @@ from cloudrc.metrics.definitions import (
 )
 from cloudrc.metrics.flight import _statistic
 from cloudrc.metrics.link import WINDOW_MAX, count_accepted, transit_ns
+from cloudrc.metrics.measure import SHIPPED
 from cloudrc.records import (
     Arrival,
     CommandApplied,

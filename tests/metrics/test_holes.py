@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cloudrc.messages import GuardState
-from cloudrc.metrics import SHIPPED, measure_all
-from cloudrc.metrics.measure import IN_SPITE_OF_HOLES
+from cloudrc.metrics.measure import IN_SPITE_OF_HOLES, SHIPPED, measure_all
 from cloudrc.metrics.response import steps
 from cloudrc.metrics.verdict import exit_code, flight_evidence, judge
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole

@@ -8,8 +8,9 @@ import pytest
 from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
-from cloudrc.metrics import SHIPPED, Flight, measure_all
 from cloudrc.metrics.control import compare_with_truth
+from cloudrc.metrics.flight import Flight
+from cloudrc.metrics.measure import SHIPPED, measure_all
 from cloudrc.metrics.mission import unconfirmed
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS

@@ -9,7 +9,7 @@ import pytest
 from cloudrc import plugins
 from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
-from cloudrc.metrics import SHIPPED, measure_all
+from cloudrc.metrics.measure import SHIPPED, measure_all
 from cloudrc.runs.catalogue import describe_all
 from cloudrc.runs.flight import fly_point
 from tests.cli.conftest import KEYS

@@ -6,7 +6,7 @@ from math import cos, exp, pi, sin, sqrt
 import pytest
 
 from cloudrc.config.schema import MissionConfig, Steps
-from cloudrc.metrics import SHIPPED
+from cloudrc.metrics.measure import SHIPPED
 from cloudrc.metrics.response import responses, steps
 from cloudrc.metrics.verdict import flight_evidence, judge
 from cloudrc.records import Control, MissionEvent

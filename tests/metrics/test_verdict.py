@@ -5,7 +5,7 @@ import pytest
 from cloudrc.config.schema import MissionConfig, Waypoint
 from cloudrc.errors import DISK_FULL
 from cloudrc.messages import GuardState
-from cloudrc.metrics import SHIPPED, Number, measure_all
+from cloudrc.metrics.measure import SHIPPED, Number, measure_all
 from cloudrc.metrics.verdict import SLIP_MAX, exit_code, flight_evidence, judge, operator_verdict
 from cloudrc.records import (
     REAL_TIME_FACTOR_MIN,

@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from cloudrc.metrics import Number
+from cloudrc.metrics.measure import Number
 from cloudrc.metrics.verdict import FlightFailure, FlightVerdict
 from cloudrc.report.document import Run, environment_document
 from cloudrc.report.figures import FIGURES, Picture

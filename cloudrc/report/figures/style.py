@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 
 from cloudrc.config.profile import DirectionConfig
 from cloudrc.geometry.shapes import Shapes
-from cloudrc.metrics import Flight
-from cloudrc.metrics.flight import Array
+from cloudrc.metrics.flight import Array, Flight
 
 PAGE = 7.16
 """Width of both columns of a page [in]. Source: IEEE conference template."""

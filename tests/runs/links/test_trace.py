@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cloudrc.metrics import SHIPPED
+from cloudrc.metrics.measure import SHIPPED
 from cloudrc.records import Arrival
 from cloudrc.runs.links.trace import one_way
 from tests.metrics.conftest import DONE, END, PERIOD, SECOND, START, UPLINK, flown
