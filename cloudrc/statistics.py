@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from statistics import NormalDist
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,6 @@ PAIRS_MIN = 6
 """Smallest number of pairs that can decide: with 5 pairs, p is at least 2 / 2^5, above 0.05."""
 EXACT_MAX = 200
 """Largest number of pairs with an exact signed-rank test; above it, the normal approximation."""
-MEANS_MAX = 2000
-"""Largest number of differences whose means of two are all kept in memory: 2 million [1]."""
 Z = NormalDist().inv_cdf(1 - LEVEL / 2)
 
 
@@ -203,58 +201,21 @@ def paired(differences: Sequence[float]) -> Paired:
     """
     values = np.sort(np.asarray(differences, dtype=float))
     n, lower, higher = len(values), int((values < 0).sum()), int((values > 0).sum())
-    means, cut = _Means(values), _cut(n)
-    interval = (means.at(cut), means.at(means.count - 1 - cut)) if cut >= 0 else None
+    means, cut = _means(values), _cut(n)
+    interval = (float(means[cut]), float(means[-1 - cut])) if cut >= 0 else None
     p = signed_rank_test(values.tolist())
     decided = interval is not None and p < LEVEL and (interval[0] > 0 or interval[1] < 0)
     needed = _pairs_needed(values, means, PAIRS_MIN if decided else max(PAIRS_MIN, n + 1))
-    middle = (means.at((means.count - 1) // 2) + means.at(means.count // 2)) / 2
-    p_sign = sign_test(lower, higher)
+    middle, p_sign = float(np.median(means)), sign_test(lower, higher)
     return Paired(n, lower, higher, middle, interval, p, p_sign, decided, needed)
 
 
-class _Means:
-    """The means of every two of n sorted differences, and each difference itself, in order.
-
-    Many differences have more means than fit into memory: then a mean is found by counting.
-    """
-
-    def __init__(self, values: NDArray[Any]) -> None:
-        """Set the differences, any unit."""
-        n = len(values)
-        self._values, self._places = values, np.arange(n)
-        self.count = n * (n + 1) // 2
-        self._all: NDArray[Any] | None = None
-        if n <= MEANS_MAX:
-            each = [rounding.differences(-values[i], values[i:]) / 2 for i in range(n)]
-            self._all = np.sort(np.concatenate(each))
-
-    def at(self, rank: int) -> float:
-        """Return the mean that `rank` others precede."""
-        values = self._values
-        if self._all is not None:
-            return float(self._all[rank])
-        low, high = values[0], values[-1]
-        for _ in range(64):  # more halves than a float has bits
-            middle = (low + high) / 2
-            enough = self._preceding(middle, "right") > rank
-            low, high = (low, middle) if enough else (middle, high)
-        partners = np.searchsorted(values, 2 * high - values)
-        near = np.concatenate((partners, partners - 1)).clip(0, len(values) - 1)
-        means = rounding.differences(-np.tile(values, 2), values[near]) / 2
-        return float(means[np.argmin(np.abs(means - high))])
-
-    @property
-    def balance(self) -> float:
-        """The number of means above 0, less that of the means below 0."""
-        if self._all is not None:
-            return float(np.sign(self._all).sum())
-        return self.count - self._preceding(0.0, "right") - self._preceding(0.0, "left")
-
-    def _preceding(self, limit: float, side: Literal["left", "right"]) -> int:
-        """Count the means below `limit`, and with side "right" also those that are equal."""
-        ends = np.searchsorted(self._values, 2 * limit - self._values, side)
-        return int(np.maximum(ends - self._places, 0).sum())
+def _means(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the means of every two of the sorted `values`, and each value itself, in order."""
+    n = len(values)
+    return np.sort(
+        np.concatenate([rounding.differences(-values[i], values[i:]) / 2 for i in range(n)])
+    )
 
 
 def _cut(n: int) -> int:
@@ -270,7 +231,7 @@ def _cut(n: int) -> int:
     return int(np.searchsorted(chances, LEVEL / 2, side="right")) - 1
 
 
-def _pairs_needed(values: NDArray[Any], means: _Means, least: int) -> int | None:
+def _pairs_needed(values: NDArray[Any], means: NDArray[Any], least: int) -> int | None:
     """Return how many pairs the signed-rank test needs for a power of 80 %: `least` or more.
 
     Return None if the data show no effect. `values` contains the n differences B - A.
@@ -278,7 +239,7 @@ def _pairs_needed(values: NDArray[Any], means: _Means, least: int) -> int | None
     """
     n = len(values)
     # The share of means of two different pairs that are above 0; a mean of 0 counts half.
-    above = means.balance - np.sign(values).sum()
+    above = np.sign(means).sum() - np.sign(values).sum()
     effect = abs(above) / max(n * (n - 1), 1)  # = |share - 1/2|
     if effect == 0:
         return None

@@ -132,22 +132,6 @@ def test_the_sign_test_holds_its_level_for_skewed_differences():
     assert np.mean([each.p_wilcoxon < 0.05 for each in found]) > 0.1
 
 
-@given(
-    st.lists(st.integers(-9, 9) | st.integers(-9999, 9999), min_size=1, max_size=60),
-    st.sampled_from([1.0, 0.1, 1e-9, 1e9]),
-)
-def test_many_differences_are_evaluated_like_few(values, scale):
-    """Their means are counted, because all of them do not fit into memory."""
-    differences = [value * scale for value in values]
-    few = paired(differences)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(statistics, "MEANS_MAX", 0)
-        many = paired(differences)
-    assert many.difference == pytest.approx(few.difference)
-    assert many.interval == (few.interval and pytest.approx(few.interval))
-    assert many.pairs_needed == few.pairs_needed
-
-
 def test_holms_p_has_the_values_of_a_calculation_by_hand():
     """4 · .005, then 3 · .01, then 2 · .03, then the p before it, which is above .04."""
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])

@@ -173,10 +173,6 @@ def prediction_errors(flight: Flight) -> tuple[float | None, Array, Array]:
     return compare_with_truth(flight, flight.applied["stamp_ns"], flight.applied["position"])
 
 
-def _prediction_error(flight: Flight) -> float | None:
-    return prediction_errors(flight)[0]
-
-
 def estimate_errors(flight: Flight) -> tuple[float | None, Array, Array]:
     """Compare each predicted position with the true position at the instant of the prediction.
 
@@ -186,10 +182,6 @@ def estimate_errors(flight: Flight) -> tuple[float | None, Array, Array]:
     control = flight.control
     at_ns = control["basis_stamp_ns"] + np.rint(control["horizon"] * 1e9).astype(np.int64)
     return compare_with_truth(flight, at_ns, control["position"])
-
-
-def _estimate_error(flight: Flight) -> float | None:
-    return estimate_errors(flight)[0]
 
 
 def _delay_error(flight: Flight) -> float | None:
@@ -269,9 +261,10 @@ add_metrics(
 add_metrics(
     "Estimation and tracking",
     ("prediction_error_rms", "m", "RMS distance from the predicted to the true position when each "
-     "command was applied, or while the robot followed its plan.", _prediction_error),
+     "command was applied, or while the robot followed its plan.",
+     lambda flight: prediction_errors(flight)[0]),
     ("estimate_error_rms", "m", "RMS distance from the predicted to the true position at the "
-     "instant of the prediction.", _estimate_error),
+     "instant of the prediction.", lambda flight: estimate_errors(flight)[0]),
     ("delay_estimate_error_rms", "s", "RMS difference between the horizon and the true delay from "
      "odometry to applied command, from the first echo on; without plans only.", _delay_error),
     prediction_error_rms="prediction error, RMS",

@@ -7,7 +7,7 @@ Both end with the event that ends the mission or, without such an event, with th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial, reduce
 from math import isfinite
@@ -54,22 +54,10 @@ class Flight:
 
     @cached_property
     def start_ns(self) -> int | None:
-        """Start of the flight [ns], world's clock; None if the robot never flew.
-
-        If the recording has lost the start, this is the first telemetry of a robot in flight.
-        """
+        """Start of the flight [ns], world's clock; None if the robot never flew."""
         guard = self.recording["/guard"]
         tracking = guard["stamp_ns"][guard["state"] == GuardState.TRACK]
-        if self.is_start_lost:
-            telemetry = self.recording["/telemetry"]
-            tracking = telemetry["stamp_ns"][telemetry["guard"] == GuardState.TRACK]
         return int(tracking[0]) if len(tracking) else None
-
-    @property
-    def is_start_lost(self) -> bool:
-        """Whether the recording has lost messages, among them the start of the flight."""
-        is_known = (self.recording["/guard"]["state"] == GuardState.TRACK).any()
-        return bool(self.recording.holes) and not is_known
 
     @cached_property
     def mission_ns(self) -> int | None:
@@ -101,10 +89,9 @@ class Flight:
     @cached_property
     def holes(self) -> tuple[Hole, ...]:
         """Times of the flight in which messages are lost."""
-        if self.start_ns is None or self.end_ns is None:
+        if self.span_ns is None:
             return self.recording.holes
-        begin_ns = 0 if self.is_start_lost else self.start_ns
-        return tuple(h for h in self.recording.holes if h.meets(begin_ns, self.end_ns))
+        return tuple(hole for hole in self.recording.holes if hole.meets(*self.span_ns))
 
     @property
     def duration(self) -> float:
@@ -114,12 +101,10 @@ class Flight:
     @cached_property
     def ending(self) -> tuple[int, str, str] | None:
         """Event that ended the mission: stamp [ns], name, text; None if there is no such event."""
-        mission = self.recording["/mission"]
-        rows = zip(mission["stamp_ns"], mission["event"], mission["text"], strict=True)
-        for stamp, event, text in rows:
-            if self.start_ns is not None and stamp > self.start_ns and event not in UNDER_WAY:
-                return int(stamp), str(event), str(text)
-        return None
+        if (start_ns := self.start_ns) is None:
+            return None
+        rows = rows_of(self.recording["/mission"], "stamp_ns", "event", "text")
+        return next((row for row in rows if row[0] > start_ns and row[1] not in UNDER_WAY), None)
 
     def seconds(self, stamp_ns: Any) -> Any:
         """Convert stamps on world's clock [ns] to times since the start of the mission [s]."""
@@ -128,7 +113,7 @@ class Flight:
     def during(self, topic: str) -> Columns:
         """Select the rows of a topic from the first to the last instant of the flight."""
         if topic not in self._during:  # fifty metrics ask for ten topics
-            self._during[topic] = self._within(_columns(self.recording[topic]))
+            self._during[topic] = self._within(self.recording[topic].columns)
         return self._during[topic]
 
     @cached_property
@@ -178,7 +163,7 @@ class Flight:
 
     def truth_until(self, end_ns: int) -> Columns:
         """Select the true states from the start of the flight to `end_ns` [ns], even after it."""
-        columns = _columns(self.recording["/ground_truth"])
+        columns = self.recording["/ground_truth"].columns
         stamps, start_ns = columns["stamp_ns"], self.start_ns or 0
         return select(columns, (stamps >= start_ns) & (stamps <= end_ns))
 
@@ -210,7 +195,7 @@ class Flight:
 
     def _joined(self, topics: Iterable[str]) -> Columns:
         """Return all columns of topics in whose rows the same records are."""
-        tables = [_columns(self.recording[topic]) for topic in topics]
+        tables = [self.recording[topic].columns for topic in topics]
         # In the last period of a torn recording some topics may be missing.
         stamps = reduce(np.intersect1d, [table["stamp_ns"] for table in tables])
         columns: Columns = {}
@@ -301,8 +286,9 @@ def turn_between(start: Array, end: Array | float) -> Array:
     return turns
 
 
-def _columns(table: Table) -> Columns:
-    return {name: table[name] for name in table.names}
+def rows_of(columns: Columns | Table, *names: str) -> Iterator[Any]:
+    """Yield the rows of some columns, in the types of Python."""
+    return zip(*(columns[name].tolist() for name in names), strict=True)
 
 
 def select(columns: Columns, rows: Array) -> Columns:
@@ -402,7 +388,7 @@ def _distance(flight: Flight) -> float | None:
 add_metrics(
     "Mission",
     ("duration", "s", "Time from the start of the mission to its end.",
-     lambda flight: None if flight.is_start_lost else flight.count(flight.duration)),
+     lambda flight: flight.count(flight.duration)),
     ("start_delay", "s", "Time from the start of the mission until the robot followed its first "
      "command.", lambda flight: flight.start_ns and float(flight.seconds(flight.start_ns))),
     ("distance_flown", "m", "Length of the path that the robot's base flew.", _distance),

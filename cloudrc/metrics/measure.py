@@ -27,7 +27,7 @@ METRIC_NOTE = "metric "
 
 
 IN_SPITE_OF_HOLES = {
-    *("duration", "waypoints_reached", "obstacle_contacts", "rtt_mean", "rtt_p95"),
+    *("duration", "waypoints_reached", "rtt_mean", "rtt_p95"),
     "delay_sample_mean",
     *("uplink_delay_mean", "downlink_delay_mean", "late_uplink", "late_downlink"),
     *("age_of_information_mean", "prediction_error_rms", "estimate_error_rms"),

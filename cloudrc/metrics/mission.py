@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from math import degrees, radians
+from math import radians
 
 import numpy as np
 
@@ -18,12 +18,13 @@ from cloudrc.metrics.flight import (
     add_metrics,
     finite,
     mean,
+    rows_of,
     select,
     turn_between,
     yaw_of,
 )
 from cloudrc.record.merge import machine_time_ns
-from cloudrc.rounding import differences, exceeds, format_limit
+from cloudrc.rounding import differences, exceeds
 
 IMPACT_NS = 100_000_000
 """Time from the first touch over which the impulse is summed [ns]: the impact and its bounces."""
@@ -56,18 +57,10 @@ def first_touch(flight: Flight) -> dict[str, Array] | None:
 
 def holds(flight: Flight) -> list[tuple[int, int]]:
     """List start and end of each HOLD that interrupted the flight [ns], world's clock."""
-    return _measure_holds(flight)[1]
-
-
-def _measure_holds(flight: Flight) -> tuple[Holds, list[tuple[int, int]]]:
-    """Measure the HOLDs that interrupted the flight; also return start and end of each [ns]."""
-    measured, found, guard = Holds(), list[tuple[int, int]](), flight.during("/guard")
-    rows = zip(guard["stamp_ns"].tolist(), guard["state"], guard["cause"], strict=True)
-    for stamp_ns, state, cause in rows:
-        found += measured.take(stamp_ns, state, cause)
-    if flight.end_ns is not None:
-        found += measured.end(flight.end_ns)
-    return measured, found
+    measured, found = Holds(), list[tuple[int, int]]()
+    for change in rows_of(flight.during("/guard"), "stamp_ns", "state", "cause"):
+        found += measured.take(*change)
+    return found if flight.end_ns is None else found + measured.end(flight.end_ns)
 
 
 def reported(flight: Flight) -> dict[int, int]:
@@ -76,14 +69,13 @@ def reported(flight: Flight) -> dict[int, int]:
     If the mission is judged by predictions, it is the time for which the prediction was made.
     """
     mission = flight.during("/mission")
-    rows = mission["event"] == "reached"
-    stamps = mission["stamp_ns"][rows]
+    reached = select(mission, mission["event"] == "reached")
+    stamps = reached["stamp_ns"]
     if flight.mission.judged_by == "predicted" and len(flight.control["stamp_ns"]):
         row = np.searchsorted(flight.control["stamp_ns"], stamps, side="right") - 1
         ahead = select(flight.control, np.maximum(row, 0))
         stamps = ahead["basis_stamp_ns"] + np.round(ahead["horizon"] * 1e9).astype(np.int64)
-    pairs = zip(mission["waypoint"][rows], stamps, strict=True)
-    return {int(waypoint): int(stamp_ns) for waypoint, stamp_ns in pairs}
+    return dict(zip(reached["waypoint"].tolist(), stamps.tolist(), strict=True))
 
 
 def _waypoints_reached(flight: Flight) -> float | None:
@@ -103,7 +95,7 @@ def _count_reached(flight: Flight) -> float | None:
     if flight.mission.setpoints is not None:
         return flight.count(len(stamps) and missed_end(flight) is None)
     known = (i for i in stamps if i < len(points))
-    return flight.count(sum(_Visit(flight, points[i], stamps[i]).is_confirmed for i in known))
+    return flight.count(sum(_stay(flight, points[i], stamps[i])[0] for i in known))
 
 
 def _yaw_error(flight: Flight) -> float | None:
@@ -144,71 +136,42 @@ def missed_end(flight: Flight) -> float | None:
     return error if exceeds(error, tolerance + NOISE * flight.position_noise) else None
 
 
-class _Visit:
-    """What the robot did near a waypoint before teleop reported it as reached, at `until_ns` [ns].
+def _stay(flight: Flight, waypoint: Waypoint, until_ns: int) -> tuple[bool, str]:
+    """Look at what the robot did before teleop reported a waypoint as reached, at `until_ns` [ns].
 
     The true position counts, give or take `NOISE` times the noise of the measured positions, which
     are all that the operator sees, and likewise the true yaw if the waypoint has one. Times count
     on the operator's clock, as in teleop: it goes on while world's clock lags behind.
+
+    Return whether the robot stayed near the waypoint for its dwell time. If not, also say where it
+    was when it was first away in the dwell time; "" if it never was.
     """
-
-    def __init__(self, flight: Flight, waypoint: Waypoint, until_ns: int) -> None:
-        truth = flight.truth_until(until_ns)
-        self._flight, self._waypoint, self._stamps_ns = flight, waypoint, truth["stamp_ns"]
-        # If the mission has a `carrot` (a moving setpoint), a stay of any length is enough, because
-        # the setpoint waits at the waypoint for the dwell time.
-        self._dwell = 0.0 if flight.mission.carrot else waypoint.dwell_s
-        self._distance = np.linalg.norm(truth["position"] - waypoint.position_m, axis=1)
-        self._turn = np.zeros(len(self._distance))
-        if waypoint.yaw_deg is not None:
-            yaws = yaw_of(truth["orientation_wxyz"])
-            self._turn = np.abs(turn_between(yaws, radians(waypoint.yaw_deg)))
-        self._yaw_allowed = radians(waypoint.yaw_tolerance_deg or YAW_TOLERANCE_DEG)
-        tolerance = waypoint.tolerance_m + NOISE * flight.position_noise
-        self._near = differences(tolerance, self._distance) <= 0.0
-        self._faces = differences(self._yaw_allowed + NOISE * flight.yaw_noise, self._turn) <= 0.0
-        # At `until_ns` the robot is where the last row shows it.
-        stamps_ns = np.append(self._stamps_ns, until_ns)
-        self._operator_ns = machine_time_ns(flight.recording["/telemetry"], stamps_ns)
-
-    @property
-    def is_confirmed(self) -> bool:
-        """Whether the robot stayed near the waypoint for its dwell time."""
-        there = self._near & self._faces
-        edges = np.flatnonzero(np.diff(np.pad(np.append(there, there[-1:]), 1)))
-        stays_ns = self._operator_ns[edges[1::2] - 1] - self._operator_ns[edges[::2]]
-        # The dwell time may lie between two samples.
-        return bool((stays_ns >= self._dwell * 1e9 - ODOMETRY_NS).any())
-
-    def describe(self) -> str:
-        """Say when and how far the robot was away in the dwell time; "" if it was not."""
-        begin_ns = self._operator_ns[-1] - self._dwell * 1e9
-        since = max(int(np.searchsorted(self._operator_ns[:-1], begin_ns, side="right")) - 1, 0)
-        if (self._near & self._faces)[since:].all():
-            return ""
-        if not self._near[since:].all():
-            row = since + int(np.argmax(self._distance[since:]))
-            limit = self._waypoint.tolerance_m
-            text = f"{self._distance[row]:.4g} m from it"
-            text += f"{self._measured(row)}, above tolerance_m {format_limit(limit)}"
-            return f"{text}, {self._at(row)}"
-        row = since + int(np.argmax(self._turn[since:]))
-        limit = degrees(self._yaw_allowed)
-        text = f"turned {degrees(self._turn[row]):.4g} deg away, above yaw_tolerance_deg "
-        text += format_limit(limit)
-        return f"{text}, {self._at(row)}"
-
-    def _at(self, row: int) -> str:
-        return f"at {self._flight.seconds(self._stamps_ns[row]):.2f} s"
-
-    def _measured(self, row: int) -> str:
-        """Say which distance the last measurement up to `row` showed; "" without one."""
-        odometry = self._flight.during("/odometry")
-        last = int(np.searchsorted(odometry["stamp_ns"], self._stamps_ns[row], side="right")) - 1
-        if last < 0:
-            return ""
-        offset = odometry["position"][last] - self._waypoint.position_m
-        return f" (measured: {np.linalg.norm(offset):.2f} m)"
+    truth = flight.truth_until(until_ns)
+    stamps_ns, turned = truth["stamp_ns"], ""
+    distance = np.linalg.norm(truth["position"] - waypoint.position_m, axis=1)
+    there = differences(waypoint.tolerance_m + NOISE * flight.position_noise, distance) <= 0.0
+    if waypoint.yaw_deg is not None:
+        yaws = yaw_of(truth["orientation_wxyz"])
+        turn = np.abs(turn_between(yaws, radians(waypoint.yaw_deg)))
+        allowed = radians(waypoint.yaw_tolerance_deg or YAW_TOLERANCE_DEG)
+        there &= differences(allowed + NOISE * flight.yaw_noise, turn) <= 0.0
+        turned = " or not turned as asked"
+    # If the mission has a `carrot` (a moving setpoint), a stay of any length is enough, because the
+    # setpoint waits at the waypoint for the dwell time.
+    dwell_ns = 0.0 if flight.mission.carrot else waypoint.dwell_s * 1e9
+    # At `until_ns` the robot is where the last row shows it.
+    telemetry = flight.recording["/telemetry"]
+    operator_ns = machine_time_ns(telemetry, np.append(stamps_ns, until_ns))
+    edges = np.flatnonzero(np.diff(np.pad(np.append(there, there[-1:]), 1)))
+    stays_ns = operator_ns[edges[1::2] - 1] - operator_ns[edges[::2]]
+    if (stays_ns >= dwell_ns - ODOMETRY_NS).any():  # it may begin between two samples
+        return True, ""
+    begin = int(operator_ns[:-1].searchsorted(operator_ns[-1] - dwell_ns, "right")) - 1
+    away = np.flatnonzero(~there)
+    if not (away := away[away >= begin]).size:
+        return False, ""
+    seconds = flight.seconds(stamps_ns[away[0]])
+    return False, f"{distance[away[0]]:.4g} m from it{turned} at {seconds:.2f} s"
 
 
 def unconfirmed(flight: Flight) -> str:
@@ -218,11 +181,8 @@ def unconfirmed(flight: Flight) -> str:
     """
     points = flight.mission.waypoints
     for index, stamp_ns in reported(flight).items():
-        if index >= len(points):
-            continue
-        visit = _Visit(flight, points[index], stamp_ns)
-        if not visit.is_confirmed and (text := visit.describe()):
-            return f"in the dwell time at waypoint {index + 1} the robot was {text}"
+        if index < len(points) and (where := _stay(flight, points[index], stamp_ns)[1]):
+            return f"in the dwell time at waypoint {index + 1} the robot was {where}"
     return ""
 
 
@@ -283,25 +243,6 @@ def obstacle_contacts(flight: Flight) -> dict[str, Array]:
     return select(contact, np.array(rows, dtype=bool))
 
 
-def lost_contacts(flight: Flight) -> tuple[int, int]:
-    """Count the contacts with obstacles that telemetry counts, but that are not in the recording.
-
-    Also return the stamp of the first telemetry that counts one [ns]. Only a recording that has
-    lost messages has such contacts.
-    """
-    if not flight.recording.note:
-        return 0, 0
-    telemetry, known_ns = flight.during("/telemetry"), obstacle_contacts(flight)["stamp_ns"]
-    lost = telemetry["obstacle_contacts"] - known_ns.searchsorted(telemetry["stamp_ns"], "right")
-    first = int(np.argmax(lost > 0)) if len(lost) else 0
-    return (int(lost.max()), int(telemetry["stamp_ns"][first])) if (lost > 0).any() else (0, 0)
-
-
-def _obstacle_contacts(flight: Flight) -> float | None:
-    known = len(obstacle_contacts(flight)["stamp_ns"])
-    return flight.count(known + lost_contacts(flight)[0])
-
-
 def _steady_error(flight: Flight, axis: int) -> float | None:
     """Average the distance from setpoint to true position [m] along x, y or z (`axis` 0, 1 or 2).
 
@@ -336,9 +277,8 @@ def _fault_count(flight: Flight) -> float | None:
 
 
 def _recorder_dropped(flight: Flight) -> float | None:
-    count = flight.recording["/count"]
-    rows = zip(count["end"], count["name"], count["total"], strict=True)
-    last = {end: int(value) for end, name, value in rows if name == "recorder_dropped"}
+    rows = rows_of(flight.recording["/count"], "end", "name", "total")
+    last = {end: total for end, name, total in rows if name == "recorder_dropped"}
     return float(sum(last.values())) if last else None
 
 
@@ -353,7 +293,8 @@ add_metrics(
     ("final_error", "m", "Distance from the last setpoint of a file to the true position when the "
      "mission ended.", _final_error),
     ("obstacle_contacts", "1", "Number of contacts with obstacles. These are all bodies but the "
-     "floor and the body that the mission has to touch.", _obstacle_contacts),
+     "floor and the body that the mission has to touch.",
+     lambda flight: flight.count(len(obstacle_contacts(flight)["body"]))),
     ("contact_time", "s", "Time from the start of the mission to the first touch of what it has "
      "to touch.", _of_touch(lambda flight, touch: float(flight.seconds(touch["stamp_ns"])))),
     ("touch_speed", "m/s", "Speed of the probe (without one: of the base) just before this touch.",
@@ -374,9 +315,9 @@ add_metrics(
 add_metrics(
     "Guard and faults",
     ("hold_count", "1", "Number of times that the guard went to HOLD because fresh commands were "
-     "missing.", lambda flight: flight.count(_measure_holds(flight)[0].count)),
+     "missing.", lambda flight: flight.count(len(holds(flight)))),
     ("hold_time", "s", "Total time in HOLD, in which the guard flies without commands.",
-     lambda flight: flight.count(_measure_holds(flight)[0].time(flight.end_ns or 0))),
+     lambda flight: flight.count(sum(end - begin for begin, end in holds(flight)) * 1e-9)),
     ("fault_count", "1", "Number of faults that did not stop the flight: each failed call of a "
      "plug-in in the flight, and each other fault once.", _fault_count),
     ("recorder_dropped", "1", "Number of records that the recorder dropped, since it started, "

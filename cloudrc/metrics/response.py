@@ -86,7 +86,7 @@ def _measured(flight: Flight) -> list[tuple[Step, bool]]:
     is_cut = flight.ending is None or flight.ending[1] not in ENDS_STEP
     found = []
     before_ns = stamps[np.maximum(begins - 1, 0)]  # the step may have begun since then
-    before_ns[0] = 0 if flight.is_start_lost else min(flight.start_ns or 0, stamps[0])
+    before_ns[0] = min(flight.start_ns or 0, stamps[0])
     for number in np.flatnonzero(ends_ns - begins_ns >= SHORTEST_NS):
         span = int(before_ns[number]), int(ends_ns[number])
         if any(hole.meets(*span) for hole in flight.holes):

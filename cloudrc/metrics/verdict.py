@@ -17,9 +17,10 @@ The same rules apply to two kinds of evidence. The report uses the recorded trut
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from math import inf, isfinite
+from math import inf
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -29,11 +30,10 @@ from cloudrc.errors import DISK_FULL, DiskFullError
 from cloudrc.messages import Cause, GuardState, Vector
 from cloudrc.metrics.counters import growth
 from cloudrc.metrics.definitions import real_time_factor
-from cloudrc.metrics.flight import Flight
+from cloudrc.metrics.flight import Flight, rows_of
 from cloudrc.metrics.measure import Number
 from cloudrc.metrics.mission import (
     first_touch,
-    lost_contacts,
     missed_end,
     obstacle_contacts,
     reported,
@@ -146,8 +146,7 @@ def judge(evidence: Evidence) -> FlightVerdict:
     codes = {failure.code for failure in violations}
     unmet = [f for f in _unmet_goals(evidence) if f.code not in codes]
     proven = [f for f in unmet if not evidence.lost or f.code not in PROVEN_BY_ALL]
-    failures = [*violations, *proven]
-    failures.sort(key=_rank)
+    failures = sorted([*violations, *proven], key=_rank)
     if evidence.slow:
         return FlightVerdict("invalid", (FlightFailure("not_real_time", evidence.slow), *failures))
     if evidence.lost and not failures:
@@ -257,12 +256,9 @@ def _violations(flight: Flight) -> Iterator[FlightFailure]:
 def _ending(flight: Flight, interrupted: bool) -> Ending:
     if flight.ending is not None:
         return Ending(*flight.ending[1:])
-    faults = flight.recording["/fault"]
-    for code, text in zip(faults["code"], faults["text"], strict=True):
+    for code, text in rows_of(flight.recording["/fault"], "code", "text"):
         if code in CONTROLLER_LOST:  # the runner ends a flight with this fault
-            return Ending(str(code), str(text))
-    if interrupted and flight.end_ns is None:
-        return Ending("interrupted", "the run was stopped before the mission started")
+            return Ending(code, text)
     if any(words in flight.recording.note for words in DISK_FULL.values()):
         text = f"the recording is cut off ({flight.recording.note}); free some space"
         return Ending("disk_full", text)
@@ -283,49 +279,40 @@ def _moment(flight: Flight, stamp_ns: int) -> Moment:
 
 def _obstacles(flight: Flight, until_ns: float = inf) -> Iterator[FlightFailure]:
     """Yield a failure for each obstacle that the robot touched at or before `until_ns`."""
-    contact = obstacle_contacts(flight)
-    for body in sorted(set(map(str, contact["body"]))):
-        stamps = contact["stamp_ns"][contact["body"] == body]
-        stamps = stamps[stamps <= until_ns]
-        if len(stamps):
-            yield _obstacle_touched(body, len(stamps), _moment(flight, int(stamps[0])))
-    lost, seen_ns = lost_contacts(flight)
-    if lost and seen_ns <= until_ns:
-        name = "an obstacle, as telemetry counts; the recording has lost the contact"
-        yield _obstacle_touched(name, lost, Moment(float(flight.seconds(seen_ns))))
+    touched = defaultdict[str, list[int]](list)
+    for body, stamp_ns in rows_of(obstacle_contacts(flight), "body", "stamp_ns"):
+        if stamp_ns <= until_ns:
+            touched[body].append(stamp_ns)
+    for body, stamps_ns in sorted(touched.items()):
+        yield _obstacle_touched(body, len(stamps_ns), _moment(flight, stamps_ns[0]))
 
 
 def _interventions(flight: Flight) -> Iterator[FlightFailure]:
     """Yield a failure for each change of the guard to GROUND, LAND or ESTOP."""
-    guard, before = flight.during("/guard"), None
-    rows = zip(guard["stamp_ns"], guard["state"], guard["cause"], strict=True)
-    for stamp_ns, state, cause in rows:
+    before = None
+    for stamp_ns, state, cause in rows_of(flight.during("/guard"), "stamp_ns", "state", "cause"):
         before, repeated = state, state == before  # a touch-down repeats LAND
         is_known = cause == Cause.FAILED.words  # by `_onboard_failures`
         if state not in (GuardState.TRACK, GuardState.HOLD) and not repeated and not is_known:
             text = f"the guard went to {GuardState(state).name}: {cause}"
-            yield FlightFailure("guard_intervened", text, *_moment(flight, int(stamp_ns)))
+            yield FlightFailure("guard_intervened", text, *_moment(flight, stamp_ns))
 
 
 def _onboard_failures(flight: Flight) -> Iterator[FlightFailure]:
     """Yield a failure for each failure of the onboard controller, on which the guard stops."""
     starts = flight.end_ns is not None  # a robot that fails on the ground starts no mission
     faults = flight.during("/fault") if starts else flight.recording["/fault"]
-    rows = zip(faults["stamp_ns"], faults["code"], faults["text"], strict=True)
-    for stamp_ns, code, text in rows:
+    for stamp_ns, code, text in rows_of(faults, "stamp_ns", "code", "text"):
         if code == "onboard_failed":
-            moment = _moment(flight, int(stamp_ns)) if starts else UNKNOWN
-            yield FlightFailure(code, str(text), *moment)
+            yield FlightFailure(code, text, *(_moment(flight, stamp_ns) if starts else UNKNOWN))
 
 
 def _restarts(flight: Flight) -> Iterator[FlightFailure]:
-    session = flight.during("/session")
-    rows = zip(session["stamp_ns"], session["end"], session["cause"], strict=True)
-    for stamp_ns, end, cause in rows:
+    for stamp_ns, end, cause in rows_of(flight.during("/session"), "stamp_ns", "end", "cause"):
         # The session that the mission itself opens may have the stamp of the start.
         if end == "world" and stamp_ns > (flight.start_ns or 0):
             text = f"world opened a new session in flight: {cause}"
-            yield FlightFailure("world_restarted", text, *_moment(flight, int(stamp_ns)))
+            yield FlightFailure("world_restarted", text, *_moment(flight, stamp_ns))
 
 
 def plugin_failures(
@@ -470,8 +457,3 @@ class Observations:
             slow=_too_slow(real_time_factor(elapsed - slip, slip)) if elapsed > 0 else "",
             **known,
         )
-
-
-def finite_or_none(value: float) -> float | None:
-    """Return `value` [any unit], or None if it is NaN or infinite, which JSON cannot express."""
-    return value if isfinite(value) else None

@@ -55,22 +55,22 @@ class Table:
         Without columns, the table has no rows.
         """
         kinds = [("stamp_ns", "int"), *((field.name, field.kind) for field in topic.fields)]
-        self._columns = {}
+        self.columns: dict[str, Column] = {}
         for (name, kind), values in zip(kinds, chain(columns, repeat(())), strict=False):
-            self._columns[name] = _column(kind, values)
+            self.columns[name] = _column(kind, values)
         self.topic = topic
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the columns, `stamp_ns` first."""
-        return tuple(self._columns)
+        return tuple(self.columns)
 
     def __len__(self) -> int:
-        return len(self._columns["stamp_ns"])
+        return len(self.columns["stamp_ns"])
 
     def __getitem__(self, name: str) -> Column:
         try:
-            return self._columns[name]
+            return self.columns[name]
         except KeyError:
             known = ", ".join(self.names)
             raise KeyError(f"no column {name!r} in {self.topic.name}; it has: {known}") from None

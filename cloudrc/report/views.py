@@ -35,7 +35,7 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]
     flight, truth = flight_of(recording, experiment), recording["/ground_truth"]
     if not len(truth):
         return []
-    poses, control = _thin({name: truth[name] for name in truth.names}), _thin(flight.control)
+    poses, control = _thin(truth.columns), _thin(flight.control)
     first_ns = int(truth["stamp_ns"][0])
     shapes = scene_shapes(flown_shapes(recording, experiment), flight.scene.tubes)
     if len(path := poses["position"]) > 1:

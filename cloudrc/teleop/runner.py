@@ -12,7 +12,8 @@ from typing import Any
 
 from cloudrc.geometry.fence import Fence
 from cloudrc.messages import GuardState, Setpoint
-from cloudrc.metrics.verdict import Ending, Observations, finite_or_none, judge
+from cloudrc.metrics.flight import finite
+from cloudrc.metrics.verdict import Ending, Observations, judge
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop.interruptions import SILENCE, Interruptions
 from cloudrc.teleop.mission import MissionFlight, Teleop
@@ -211,7 +212,7 @@ class MissionRunner:
             known,
             obstacle_contacts=seen.obstacle_contacts,
             first_contact=first,
-            touch_speed=finite_or_none(seen.touch_speed),
+            touch_speed=finite(seen.touch_speed),
             slip_ns=known.slip_ns + (seen.slip_ns - before.slip_ns if before else 0),
         )
         for event, text in mission.witness.news(known, time, touched or ""):

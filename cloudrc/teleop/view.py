@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from cloudrc.messages import GuardState
-from cloudrc.metrics.verdict import finite_or_none
+from cloudrc.metrics.flight import finite
 from cloudrc.teleop.interruptions import SILENCE
 from cloudrc.teleop.wire import HELD, RobotStatus
 
@@ -91,17 +91,17 @@ class RobotView:
             "age_s": age,
             "epoch": seen.epoch,
             "world": seen.world,
-            "position_m": [finite_or_none(value) for value in seen.position],
+            "position_m": [finite(value) for value in seen.position],
             "guard": seen.guard.name,
             "cause": seen.cause.words,
             "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
             "next_step": next_step(seen.guard, age, cloud_age, mission),
             "obstacle_contacts": seen.obstacle_contacts,
-            "touch_speed_mps": finite_or_none(seen.touch_speed),
+            "touch_speed_mps": finite(seen.touch_speed),
             "sensors": self._sensors(seen.sensors),
-            "horizon_s": control and finite_or_none(control.horizon),
-            "rtt_s": control and finite_or_none(control.rtt),
-            "loop_delay_s": control and finite_or_none(control.loop_delay),
+            "horizon_s": control and finite(control.horizon),
+            "rtt_s": control and finite(control.rtt),
+            "loop_delay_s": control and finite(control.loop_delay),
         }
 
     def _sensors(self, values: tuple[float, ...]) -> list[dict[str, Any]]:
@@ -109,6 +109,6 @@ class RobotView:
         if len(values) != len(self._units):
             return []
         return [
-            {"name": name, "value": finite_or_none(value), "unit": unit}
+            {"name": name, "value": finite(value), "unit": unit}
             for (name, unit), value in zip(self._units, values, strict=True)
         ]

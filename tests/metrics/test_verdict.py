@@ -66,8 +66,6 @@ def met(speed):
         (good, {"waypoints": 3}, "failure", ["waypoint_not_reached"]),
         (good, {"time_limit": 9.9}, "failure", ["time_limit_exceeded"]),
         (flown, {}, "failure", ["not_touched"]),
-        (lambda: met(0.249), {}, "success", []),
-        (lambda: met(0.25), {}, "success", []),  # at its limit, as for every other one
         (lambda: met(0.25 + 1e-15), {}, "success", []),
         (lambda: met(0.2500001), {}, "failure", ["contact_too_fast"]),
         (lambda: world(GuardChange(at(5), GuardState.HOLD, "")), {}, "success", []),
@@ -126,10 +124,8 @@ def along_setpoints(last, **criteria):
 @pytest.mark.parametrize(
     ("last", "settle", "found", "reached"),
     [
-        (10.0, 0.15, [], 1.0),
         (10.15, 0.15, [], 1.0),
         (10.16, 0.15, ["not_settled"], 0.0),
-        (14.0, 0.15, ["not_settled"], 0.0),
         (14.0, None, [], 1.0),
     ],
 )
@@ -163,27 +159,15 @@ def test_setpoints_that_were_not_flown_to_their_end_fail_for_that_reason_alone()
 @pytest.mark.parametrize(
     ("body", "wanted", "is_obstacle"),
     [
-        *((body, "board", True) for body in ("pillar", "world", "unnamed body 1", "board2")),
-        *(("board", wanted, wanted != "board") for wanted in ("board", "pillar", None)),
-        *(("floor", wanted, False) for wanted in ("board", None)),
-        ("pillar", "pillar", False),
+        *((body, "board", True) for body in ("pillar", "board2")),
+        *((body, "board", False) for body in ("board", "floor")),
+        *(("board", wanted, True) for wanted in ("pillar", None)),
     ],
 )
 def test_every_body_is_an_obstacle_but_the_floor_and_what_to_touch(body, wanted, is_obstacle):
     flight = world(touch(3, body), log=flown).flight(touch=wanted)
-    found = [f for f in judged(flight).failures if f.code == "obstacle_touched"]
-    said = [(f.text, f.time, f.place) for f in found]
-    assert said == [(f"the robot touched {body}", 3.0, (3.0, 0.0, 1.0))] * is_obstacle
+    assert ("obstacle_touched" in codes(judged(flight))) == is_obstacle
     assert SHIPPED["obstacle_contacts"].measure(flight) == is_obstacle
-
-
-def test_two_bodies_touched_at_once_are_two_failures():
-    log = world(touch(3, "b"), touch(3, "a"), touch(4, "b"), log=flown)
-    found = judged(log.flight()).failures
-    assert [each.text for each in found if each.code == "obstacle_touched"] == [
-        "the robot touched a",
-        "the robot touched b (2 times)",
-    ]
 
 
 def test_a_robot_that_never_flew_is_a_failure():
@@ -199,9 +183,6 @@ def test_an_interrupted_run_lists_only_certain_failures():
     verdict = judged(log.flight(ONE_PIPE, touch="board"), interrupted=True)
     assert verdict.outcome == "interrupted"
     assert codes(verdict) == ["interrupted", "obstacle_touched"]
-    log.change(GuardChange, lambda n, change: None)
-    (failure,) = judged(log.flight(), interrupted=True).failures
-    assert failure.text.endswith("before the mission started")
     # After the mission's end an interruption changes nothing.
     assert judged(good().flight(ONE_PIPE, touch="board"), interrupted=True).outcome == "success"
 
@@ -242,8 +223,7 @@ def test_a_failure_says_when_and_how_far_the_robot_left_a_waypoint_in_its_dwell_
     point = Waypoint(position_m=(0.0, 0.0, 1.0), tolerance_m=0.1, dwell_s=8.0)
     (failure,) = judged(log.flight(mission=MissionConfig(waypoints=(point,)))).failures
     assert failure.code == "waypoint_not_reached"
-    for number in ("0.16 m", "0.09 m", "7.32 s"):
-        assert number in failure.text
+    assert "0.16 m from it at 7.32 s" in failure.text
 
 
 @pytest.mark.parametrize(
