@@ -41,7 +41,7 @@ def test_a_peak_is_the_age_just_before_a_command_that_lowers_it():
     assert peak == pytest.approx((0.15 + 0.25 + 0.14) / 3)
 
 
-@pytest.mark.parametrize("limit_ms", [1, 60, 120, 198, 200, 248, 300])
+@pytest.mark.parametrize("limit_ms", [60, 198, 200])
 def test_the_violation_is_the_share_of_the_steps_with_a_command_in_use(limit_ms):
     ages = []
     for now in range(0, 1000, 2):  # [ms]
@@ -55,7 +55,7 @@ def test_the_violation_is_the_share_of_the_steps_with_a_command_in_use(limit_ms)
     assert measured(found, "age_at_actuator_mean") == pytest.approx(sum(ages) / len(ages) / 1000)
 
 
-@pytest.mark.parametrize("loss", [0.3, 0.5])
+@pytest.mark.parametrize("loss", [0.3])
 def test_a_constant_delay_with_losses_gives_the_closed_forms(loss):
     """Period T, delay D, loss p: mean peak D + T / (1 - p), P(age > D + k T) = p^k."""
     delay, period, count, rng = 0.2, 0.01, 60_000, Random(1)

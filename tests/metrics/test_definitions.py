@@ -15,22 +15,17 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.cloud.estimators import DelaySample
-from cloudrc.cloud.estimators.running_mean import RunningMean
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.exposition.table import METRICS
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
-from cloudrc.metrics.control import round_trips
 from cloudrc.metrics.definitions import (
-    LONG_AGO_NS,
     QUANTITIES,
     WINDOW,
     DatagramTally,
     Echoes,
     PredictionJudge,
     RecordQuantity,
-    real_time_factor,
 )
 from cloudrc.metrics.flight import _statistic
 from cloudrc.metrics.link import WINDOW_MAX, count_accepted, transit_ns
@@ -103,7 +98,7 @@ def flying_along_x(predicted_lead, *, every_ms=10):
         yield control(7.0 + x, x, measured=(x, 0.0, 0.0), position=predicted, horizon=0.025)
 
 
-@pytest.mark.parametrize(("lead", "every_ms", "judged"), [(0.01, 10, 37), (0, 10, 37), (1, 60, 0)])
+@pytest.mark.parametrize(("lead", "every_ms", "judged"), [(0.01, 10, 37), (1, 60, 0)])
 def test_a_prediction_is_compared_at_its_own_instant(lead, every_ms, judged):
     """The last three wait for a measurement 25 ms later; none is compared across a gap."""
     judge = PredictionJudge()
@@ -114,26 +109,10 @@ def test_a_prediction_is_compared_at_its_own_instant(lead, every_ms, judged):
     assert judge.error == pytest.approx((lead, 0, 0) if judged else (math.nan,) * 3, nan_ok=True)
 
 
-def test_nothing_is_judged_before_the_first_known_position():
-    judge = PredictionJudge()
-    judge.predict(0, (1.0, 0.0, 0.0))
-    judge.know(0, (0.0, 0.0, 0.0))
-    assert judge.judged == 0
-    judge.predict(0, (1.0, 0.0, 0.0))
-    judge.know(10_000_000, (0.0, 0.0, 0.0))
-    assert (judge.judged, judge.error) == (1, (1.0, 0.0, 0.0))
-    assert LONG_AGO_NS < -SECOND
-
-
 def test_a_round_trip_is_new_once():
     echoes, none = Echoes(), math.nan
     periods = [(none, none), (0.1, 0.2), (0.1, 0.2), (0.1, 0.3), (none, none), (0.1, 0.3)]
     assert [echoes.take(*each) for each in periods] == [False, True, False, True, False, True]
-
-
-def test_the_real_time_factor_is_simulated_time_over_machine_time():
-    assert real_time_factor(9.0, 1.0) == 0.9
-    assert math.isnan(real_time_factor(0.0, 0.0))
 
 
 def test_one_row_is_a_number_a_live_metric_and_a_panel():
@@ -198,14 +177,8 @@ def seen_in(flight, cloud):
     return live
 
 
-def test_round_trips_over_an_even_link_have_its_delay():
-    flight = fly("hover", "link.both.delay_ms=33", "link.both.jitter_ms=0").flight
-    assert measured(flight, "rtt_mean") == pytest.approx(0.066, abs=1e-3)
-
-
 SAMPLED = [
     ("paper-verbatim", "link.profile=paper-p3"),
-    ("hover", "link.profile=paper-p3", "cloud={estimator: running_mean, command_rate_hz: 50}"),
     ("hover", "link.profile=lossy", "cloud.estimator=running_mean"),
 ]
 
@@ -222,35 +195,6 @@ def test_delays_of_the_loop_are_equal_live_and_in_the_report(flown):
     for name in ("rtt", "loop_delay", "delay_sample"):
         true = measured(flight, f"{name}_mean")
         assert average(live, f"cloudrc_{name}_seconds") == pytest.approx(true, rel=1e-9), name
-
-
-@pytest.mark.parametrize("flown", SAMPLED)
-def test_the_mean_delay_sample_is_what_eq_1_averages(flown):
-    """The estimator gets, from the records alone, what telemetry said; cloud had the same mean."""
-    flight, estimator = fly(*flown).flight, RunningMean()
-    experiment = load_experiment(flown[0], flown[1:])
-    world, cloud = ends(*flown)
-    longest_ns = 5 * SECOND // experiment.cloud.command_rate_hz
-    sent = {(r.epoch, r.counter): r.telemetry for r in world if isinstance(r, TelemetrySent)}
-    for arrival in (r for r in cloud if isinstance(r, Arrival) and r.used):
-        told = sent[arrival.epoch, arrival.counter]
-        known = told.echo_stamp_ns >= 0 and told.echo_hold_ns <= longest_ns
-        if known and flight.start_ns <= arrival.stamp_ns <= flight.end_ns:
-            loop_delay = (arrival.stamp_ns - told.echo_stamp_ns) * 1e-9
-            estimator.update(DelaySample(loop_delay, math.nan))
-    mean = measured(flight, "delay_sample_mean")
-    assert mean == pytest.approx(estimator.horizon(0.0), rel=1e-9)
-    assert mean == pytest.approx(flight.control["horizon"][-1], abs=2e-4)
-    assert mean > measured(flight, "loop_delay_mean") + 0.003
-
-
-def test_each_command_has_one_round_trip_even_if_telemetry_arrives_at_once():
-    flight = lossy()[0]
-    found = round_trips(flight)
-    made = np.round(found["stamp_ns"] - found["loop_delay"] * 1e9)
-    assert len(np.unique(made)) == len(made)
-    periods = np.unique(flight.control["stamp_ns"].searchsorted(found["stamp_ns"]))
-    assert len(periods) < len(made)
 
 
 def test_age_and_tracking_error_of_a_flight_are_equal_live_and_in_the_report():
@@ -326,7 +270,7 @@ HELD = [
 ]
 
 
-@pytest.mark.parametrize("first", [0, 2, 3, 5])
+@pytest.mark.parametrize("first", [0, 2, 5])
 def test_the_holds_of_a_flight_are_equal_live_and_in_the_report(first):
     """A HOLD after LAND, or after the mission, interrupts no mission."""
     log, live = flown(), LiveMetrics("world")

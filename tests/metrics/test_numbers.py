@@ -8,7 +8,6 @@ import pytest
 from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
-from cloudrc.metrics.control import compare_with_truth
 from cloudrc.metrics.flight import Flight
 from cloudrc.metrics.measure import SHIPPED, measure_all
 from cloudrc.metrics.mission import unconfirmed
@@ -28,7 +27,6 @@ from cloudrc.records import (
     TelemetrySent,
 )
 from tests.metrics.conftest import (
-    END,
     ONE_PIPE,
     OPEN_AIR,
     PELICAN,
@@ -134,18 +132,6 @@ def traffic():
     return log.flight()
 
 
-def held():
-    """In HOLD, from 2 s to 5 s, the robot follows no command."""
-    log = flown()
-    log.world += [
-        GuardChange(at(2.0), GuardState.HOLD, "no fresh commands"),
-        GuardChange(at(5.0), GuardState.TRACK, "fresh commands again"),
-    ]
-    within = range(at(2.0), at(5.0))
-    log.change(CommandApplied, lambda n, c: None if c.stamp_ns in within else c)
-    return log.flight()
-
-
 def planned():
     """All commands have plans, which begin 0.1 s early; their position is off at each odometry."""
     log = flown()
@@ -174,19 +160,6 @@ def resting():
     log = flown(lambda t: (0.97, 0.0, 1.001))
     log.change(Control, lambda n, c: c._replace(setpoint=(1.0, 0.0, 1.0)))
     log.change(MissionEvent, lambda n, e: None if e.event == "done" else e)
-    return log.flight()
-
-
-def resting_until_done():
-    """The mission ends in a control period, which already has the setpoint of the stay after it."""
-    log = flown(lambda t: (0.97, 0.0, 1.001))
-
-    def stay(n, control):
-        over = {"setpoint": (0.9, 0.0, 1.0), "waypoint": -1} if control.stamp_ns >= END else {}
-        return control._replace(setpoint=(1.0, 0.0, 1.0))._replace(**over)
-
-    log.change(Control, stay)
-    log.change(MissionEvent, lambda n, e: e._replace(stamp_ns=END) if e.event == "done" else e)
     return log.flight()
 
 
@@ -307,7 +280,6 @@ NUMBERS = {
         "packets_sent_downlink": 500.0,
         "bytes_sent_downlink": None,
     },
-    held: {"age_at_actuator_mean": approx(0.109, abs=1e-3), "age_at_actuator_max": approx(0.128)},
     planned: {
         "prediction_error_rms": approx(0.005),  # off by (3, 4, 0) mm
         "delay_estimate_error_rms": None,
@@ -325,11 +297,6 @@ NUMBERS = {
         "steady_error_y": approx(0.0),
         "steady_error_z": approx(0.001),
         "duration": approx(15.0),  # without an end it lasts as its recording
-    },
-    resting_until_done: {
-        "steady_error_x": approx(0.03),
-        "steady_error_y": approx(0.0),
-        "steady_error_z": approx(0.001),
     },
     slow_machine: {
         "world_slip": approx(0.5),
@@ -407,7 +374,6 @@ def test_a_missing_topic_makes_no_metric_fail(lost):
     [
         (9.0, 0.53, 1.0, 1.0),
         (9.0, 0.53, 1.1, 0.0),
-        (9.0, 0.1, 0.0, 1.0),
         (10.5, 0.4, 0.0, 0.0),
         (10.3, 0.3, 0.0, 1.0),  # 10.3 - 10.0 is above 0.3 in floating point
     ],
@@ -420,16 +386,10 @@ def test_a_waypoint_counts_if_the_true_position_confirms_it(x, tolerance, dwell,
 
 
 @pytest.mark.parametrize(
-    ("stalled", "dwell", "reached"),
-    [
-        (9.5, 1.2, 1.0),
-        (9.5, 1.3, 0.0),
-        (8.0, 1.0, 1.0),  # the stall was over before
-        (8.0, 1.2, 0.0),
-        (99.0, 1.2, 0.0),
-    ],
+    ("stalled", "reached"),
+    [(9.5, 1.0), (8.0, 0.0)],  # 8.0: the stall was over before
 )
-def test_the_dwell_time_counts_on_the_operators_clock(stalled, dwell, reached):
+def test_the_dwell_time_counts_on_the_operators_clock(stalled, reached):
     """The robot is near for 1 s of world's clock, which loses 0.2 s at `stalled` [s]."""
 
     def stall(n, sent):
@@ -438,13 +398,13 @@ def test_the_dwell_time_counts_on_the_operators_clock(stalled, dwell, reached):
 
     log = flown()
     log.change(TelemetrySent, stall)
-    point = Waypoint(position_m=(9.5, 0.0, 1.0), tolerance_m=0.5, dwell_s=dwell)
+    point = Waypoint(position_m=(9.5, 0.0, 1.0), tolerance_m=0.5, dwell_s=1.2)
     flight = log.flight(mission=MissionConfig(waypoints=(point,)))
     assert SHIPPED["waypoints_reached"].measure(flight) == reached
     assert bool(unconfirmed(flight)) == (not reached)
 
 
-@pytest.mark.parametrize(("noise", "reached"), [(0.0, 0.0), (0.16, 0.0), (0.18, 1.0)])
+@pytest.mark.parametrize(("noise", "reached"), [(0.16, 0.0), (0.18, 1.0)])
 def test_the_noise_of_the_measured_positions_is_added_to_the_tolerance(noise, reached):
     """The robot ends .5 m from the waypoint; a noise of .18 m in x alone has an rms of .104 m."""
 
@@ -473,14 +433,3 @@ def test_the_first_telemetry_of_a_session_may_be_that_of_its_first_mission():
     numbers = measure_all(log.flight())[0]
     assert numbers["start_delay"].value == approx(0.4)
     assert numbers["duration"].value == approx(10.4)
-
-
-@pytest.mark.parametrize("row", [3, 4])
-def test_a_prediction_for_the_stamp_of_a_true_position_counts(row):
-    flight = flown().flight()
-    truth = flight.recording["/ground_truth"]
-    at_ns = truth["stamp_ns"][[row, row + 2]]
-    predicted = truth["position"][[row, row + 2]] + (0.003, 0.004, 0.0)
-    error, instants, _ = compare_with_truth(flight, at_ns, predicted)
-    assert instants.tolist() == at_ns.tolist()
-    assert error == approx(0.005)

