@@ -7,7 +7,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, union
 from cloudrc.record.merge import cut_to_last_mission, merge
-from cloudrc.record.writer import COUNTS, McapWriter
+from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted, MissionEvent
 from cloudrc.runs.links.trace import read_packets
 from cloudrc.runs.replay import write_replay
@@ -56,16 +56,6 @@ def test_an_intact_recording_has_no_hole_and_one_that_ends_in_its_views_lacks_th
         writer.write_views([("/tf", n * 10 * MS, bytes(100)) for n in range(40)])
     assert Recording.read(path).holes == ()
     assert Recording.read(without(path, [4])).holes == (Hole(RECORDS[-1].stamp_ns, END_NS),)
-
-
-def test_a_copy_that_was_torn_again_is_counted_by_its_own_writer(path):
-    """The counts of the file that it was copied from prove nothing."""
-    whole = Recording.read(path)
-    whole.metadata[COUNTS] = '{"/odometry": 1}'
-    whole.write(path)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    found = Recording.read(path)
-    assert found.holes == (Hole(found.messages[-1][1], END_NS),)
 
 
 def test_a_merged_recording_has_the_holes_of_both_ends_on_worlds_clock(tmp_path):

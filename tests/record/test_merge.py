@@ -36,7 +36,7 @@ def files(folder, world, cloud, ids):
 
 @pytest.mark.parametrize(
     ("start", "ahead"),
-    [(4 * SECOND, 0), (9 * SECOND, 5 * SECOND), (4 * SECOND, -3 * SECOND - 1), (0, -SECOND)],
+    [(9 * SECOND, 5 * SECOND), (0, -SECOND)],
 )
 def test_two_clocks_are_related_by_the_packets(tmp_path, start, ahead):
     """With delays of 40 ms up and 30 ms down, the estimate is wrong by 5 ms; its bound is 35 ms.
@@ -190,7 +190,6 @@ FIRST = {1: "started", 2: "reached", 3: "done"}
     [
         (FIRST | {10: "started", 20: "reached", 30: "done"}, [10, 20, 30]),
         (FIRST | {20: "reached", 30: "done"}, [20, 30]),  # not the earlier mission
-        ({2: "reached", 3: "done", 20: "reached", 30: "done"}, [20, 30]),
         (FIRST | {10: "started", 20: "reached"}, [10, 20]),
         (FIRST | {30: "done"}, [1, 2, 3]),  # the later mission was cancelled before its start
         ({1: "started", 9.5: "done", 10: "started", 12: "done"}, [10, 12]),

@@ -80,7 +80,7 @@ def copied(path):
     return Recording.read(target)
 
 
-@pytest.mark.parametrize("cut", [0, 1, 8, 30])
+@pytest.mark.parametrize("cut", [0, 8])
 def test_a_lost_index_loses_nothing(path, cut):
     path.write_bytes(WHOLE[: len(WHOLE) - cut])
     recording = Recording.read(path)
@@ -112,14 +112,11 @@ def test_a_file_without_a_message_is_named(path, refused, data, reason):
 @pytest.mark.parametrize(
     "options",
     [
-        {"compression": CompressionType.LZ4},
-        {"compression": CompressionType.NONE},
-        {"use_chunking": False},
-        {"chunk_size": 1, "enable_crcs": False},
-        {"use_statistics": False, "repeat_channels": False, "use_summary_offsets": False},
+        {"compression": CompressionType.LZ4, "enable_crcs": False},
+        {"use_chunking": False, "use_statistics": False},
         {"shuffle": lambda messages: Random(1).shuffle(messages)},
     ],
-    ids=["lz4", "plain", "no-chunks", "no-crc", "no-summary", "shuffled"],
+    ids=["lz4", "no-chunks", "shuffled"],
 )
 def test_an_unusual_layout_is_read(whole, path, options):
     rewrite(whole, path, **options)
@@ -134,12 +131,10 @@ def test_an_unusual_layout_is_read(whole, path, options):
     ("options", "said"),
     [
         ({"keep": lambda c, m: c.topic != "/guard"}, "it holds 0 of 1 on /guard$"),
-        ({"rename": lambda t: f"/r2{t}"}, "it holds 0 of"),
         ({"rename": lambda t: t.replace("/odometry", "/ground_truth")}, "/odometry, 320 of 160 on"),
         ({"metadata": False}, "the metadata of cloudrc, which names the clock, is not there$"),
-        ({"shuffle": lambda all: all.extend(all[:4])}, "messages were removed or added: it holds "),
     ],
-    ids=["topic", "renamed", "joined", "metadata", "doubled"],
+    ids=["topic", "joined", "metadata"],
 )
 def test_changes_by_another_program_are_noted(whole, path, options, said):
     recording = Recording.read(rewrite(whole, path, **options))
@@ -197,13 +192,11 @@ def test_an_unreadable_message_gives_one_line(path):
         Recording.read(path)["/uplink_delay"]
 
 
-SOME = [start + n for _, start, _ in spans(WHOLE) for n in (0, 1) if start + n < len(WHOLE)][::6]
-SOME += range(3, len(WHOLE), 7919)
-FOURTHS = [range(part, len(WHOLE), 4) for part in range(4)]
+SOME = [start for _, start, _ in spans(WHOLE)][::6]
 EVERYWHERE = pytest.mark.parametrize(
     "places",
-    [SOME, *(pytest.param(part, marks=pytest.mark.full) for part in FOURTHS)],
-    ids=["some", *"1234"],
+    [[*SOME, *range(3, len(WHOLE), 7919)], pytest.param(range(len(WHOLE)), marks=pytest.mark.full)],
+    ids=["some", "all"],
 )
 
 
@@ -244,15 +237,10 @@ def test_a_torn_file_says_what_was_read(path):
     assert 40 < len(copy["/odometry"]) < 80
 
 
-LENGTH, HUGE = CHUNKS[2][0] + 2, CHUNKS[2][0] + 7
 DAMAGED = {
     "flipped": flipped(THIRD),
-    "length": flipped(LENGTH),
-    "huge length": flipped(HUGE),
-    "zeros": WHOLE[:THIRD] + bytes(500) + WHOLE[THIRD + 500 :],
+    "huge length": flipped(CHUNKS[2][0] + 7),
     "cut out": WHOLE[:THIRD] + WHOLE[THIRD + 300 :],
-    "put in": WHOLE[:THIRD] + bytes(300) + WHOLE[THIRD:],
-    "in a torn file": flipped(THIRD)[: CHUNKS[3][0] + 50],
 }
 
 
@@ -283,7 +271,7 @@ def test_damage_that_only_the_checksum_of_all_data_shows_may_be_anywhere(path):
     assert recording.holes == (SOMEWHERE,)
 
 
-@pytest.mark.parametrize("rest", [bytes(4096), b"rubbish" * 99, WHOLE])
+@pytest.mark.parametrize("rest", [b"rubbish" * 99, WHOLE])
 def test_bytes_behind_the_end_are_left_out_and_told(path, rest):
     path.write_bytes(WHOLE + rest)
     recording = Recording.read(path)

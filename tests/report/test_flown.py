@@ -6,20 +6,17 @@ import shutil
 import numpy as np
 import pytest
 
-from cloudrc.config.flown import FLOWN_FILE, FlownWorld
+from cloudrc.config.flown import FlownWorld
 from cloudrc.config.hull import hull_of
 from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import find_robot
 from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of
-from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import clearance_per_obstacle
 from cloudrc.geometry.obstacles import obstacles
-from cloudrc.geometry.shapes import SHAPES_FILE
 from cloudrc.record.columns import Recording
-from cloudrc.report.flown import flown_shapes, flown_world
-from cloudrc.robots.shapes import read_shapes
+from cloudrc.report.flown import flown_shapes
 from cloudrc.runs.fly import fly
 
 GHOST = '<body name="ghost"><geom size=".1" contype="0" conaffinity="0"/></body>'
@@ -42,15 +39,6 @@ def run(tmp_path_factory):
     experiment = load_experiment("pillars", sets)
     fly(experiment, "virtual", folder, page=False)
     return folder, files, experiment
-
-
-def test_the_recording_has_the_shapes_and_a_copy_keeps_them(run, tmp_path):
-    folder, _, experiment = run
-    recording = Recording.read(folder / "mission.mcap")
-    wanted = read_shapes(experiment.world).to_bytes()
-    assert recording.attachments[SHAPES_FILE] == wanted
-    recording.write(tmp_path / "copy.mcap")
-    assert Recording.read(tmp_path / "copy.mcap").attachments[SHAPES_FILE] == wanted
 
 
 def test_the_recordings_own_shapes_count_and_not_those_of_changed_files(run):
@@ -93,20 +81,6 @@ def test_a_report_is_that_of_the_flight_without_the_users_files(run, call):
     assert "No replay in 3-D" not in (folder / "report.html").read_text()
 
 
-def test_a_recording_without_the_numbers_of_the_world_needs_the_users_files(run):
-    folder, files, experiment = run
-    recording = Recording.read(folder / "mission.mcap")
-    recorded = flown_world(recording, experiment)
-    del recording.attachments[FLOWN_FILE]
-    assert repr(flown_world(recording, experiment).scene.tubes) == repr(recorded.scene.tubes)
-    away = files.rename(files.with_name("away"))
-    try:
-        with pytest.raises(BadInputError, match="No such file"):
-            flown_world(recording, experiment)
-    finally:
-        away.rename(files)
-
-
 @pytest.fixture
 def flown(tmp_path):
     """A world with one solid of each shape."""
@@ -137,9 +111,3 @@ def test_robot_and_scene_are_kept_exactly(flown):
     assert found[0].shape[1] == 10  # three tubes and seven bodies
     assert (found[0] == found[1]).all()
     assert read.steered == flown.steered
-
-
-@pytest.mark.parametrize("data", [b"", b'{"scene": 1, "hull": null, "planar": 0}'])
-def test_a_damaged_file_is_refused(data):
-    with pytest.raises(BadInputError, match="is not readable"):
-        FlownWorld.from_bytes(data)

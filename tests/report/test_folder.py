@@ -8,14 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from mcap.reader import make_reader
 
 from cloudrc.config.resolved import dump
 from cloudrc.errors import BadInputError
 from cloudrc.metrics.verdict import exit_code
 from cloudrc.record.columns import Recording
-from cloudrc.record.merge import merge
-from cloudrc.records import Counted
 from cloudrc.report.document import Run
 from cloudrc.report.folder import read_run
 from cloudrc.report.summary import summarize
@@ -51,10 +48,9 @@ def test_a_new_report_keeps_the_machine_that_flew(run):
     environment.write_text(flown := '{"cores": 3, "physics_steps": "C (compiled by cc)"}')
     write_report(run, *read_run(run), page=False)
     assert environment.read_text() == flown
-    for unusable in ("{", "[1]", "[" * 10_000):
-        environment.write_text(unusable)
-        write_report(run, *read_run(run), page=False)
-        assert json.loads(environment.read_text())["cores"] == os.cpu_count()
+    environment.write_text("{")
+    write_report(run, *read_run(run), page=False)
+    assert json.loads(environment.read_text())["cores"] == os.cpu_count()
 
 
 def filtered(**options):
@@ -75,14 +71,6 @@ def recorded(config):
     return change
 
 
-def damage(source, target):
-    with source.open("rb") as stream:
-        chunk = make_reader(stream).get_summary().chunk_indexes[8]
-    data = bytearray(source.read_bytes())
-    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
-    target.write_bytes(data)
-
-
 OTHER = b"seed: 2\nmission: pipes\n"
 
 
@@ -94,7 +82,6 @@ OTHER = b"seed: 2\nmission: pipes\n"
             "it holds 0 of 401 on /telemetry, .* and 12 more",
         ),
         (cut, "cut short: .* but report.json describes the whole"),
-        (damage, "damaged .*: mcap recover, but report.json describes the whole"),
         (recorded(OTHER), "is the recording of an experiment with other values for: "),
     ],
 )
@@ -107,49 +94,32 @@ def test_an_insufficient_recording_is_refused(run, refused, change, said):
     assert {path: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
 
 
-@pytest.mark.parametrize(("change", "said"), [(cut, "cut short"), (damage, "damaged at byte")])
-def test_a_torn_or_damaged_recording_has_a_report_that_says_so(run, change, said):
+def test_a_torn_recording_has_a_report_that_says_so(run):
     (run / "report.json").unlink()
-    mission = run / "mission.mcap"
-    change(mission, mission)
+    cut(run / "mission.mcap", run / "mission.mcap")
     found = write_report(run, *read_run(run), page=False)
     assert (found["verdict"], found["complete"], exit_code(found)) == ("invalid", False, 6)
-    assert found["notes"][0].startswith(f"The recording is incomplete: {said}")
+    assert found["notes"][0].startswith("The recording is incomplete: cut short")
     assert 0 < found["numbers"]["duration"]["value"] < 10
     assert "records_sha256" not in found
     assert write_report(run, *read_run(run), page=False) == found
-    first, *rest = summarize(found).splitlines()
-    assert first.startswith("INVALID (recording incomplete): ")
-    assert [line for line in rest if f"The recording is incomplete: {said}" in line]
+    assert summarize(found).startswith("INVALID (recording incomplete): ")
 
 
 @pytest.mark.parametrize("was_interrupted", [False, True])
-@pytest.mark.parametrize("copies", [False, True])
-def test_a_run_whose_end_is_lost_is_invalid_unless_it_was_interrupted(run, was_interrupted, copies):
+def test_a_run_whose_end_is_lost_is_invalid_unless_it_was_interrupted(run, was_interrupted):
     (run / "report.json").unlink()
     mission, facts = run / "mission.mcap", replace(RUN, interrupted=was_interrupted)
     recording = Recording.read(mission)
     recording.metadata |= facts.metadata
     recording.write(mission)  # the facts about the run come first
     cut(mission, run / "torn.mcap")
-    if copies:
-        Recording.read(run / "torn.mcap").write(mission)
-    else:
-        (run / "torn.mcap").replace(mission)
+    Recording.read(run / "torn.mcap").write(mission)
     found = write_report(run, *read_run(run), page=False)
     verdict = "interrupted" if was_interrupted else "invalid"
     assert (found["verdict"], exit_code(found)) == (verdict, 130 if was_interrupted else 6)
     text = found["failures"][0]["text"]
     assert was_interrupted or re.search(r"not known .*: all lost from \d\.\d\d s on", text)
-
-
-def test_the_hash_is_of_the_recording_beside_the_report(run):
-    before, (world, cloud) = report(run), good().ends()
-    longer = [*world, Counted(world[-1].stamp_ns, "world", "sent", 1)]
-    write_mission(run / "mission.mcap", longer, cloud)
-    found = write_report(run, *read_run(run), page=False)
-    assert found["records_sha256"] == Recording.from_records(longer, cloud).sha256
-    assert found["records_sha256"] != before["records_sha256"]
 
 
 def test_an_interrupted_run_stays_interrupted(run):
@@ -165,17 +135,6 @@ def write_ends(folder):
     """Record the flight as the processes of world and cloud do."""
     for end, records in zip(("world", "cloud"), good().ends(), strict=True):
         write(folder / f"{end}.mcap", records, end, "same")
-
-
-def test_a_run_with_a_torn_end_keeps_its_facts(run):
-    write_ends(run)
-    cut(run / "world.mcap", run / "world.mcap")
-    mission = merge(run / "world.mcap", run / "cloud.mcap")
-    facts = replace(RUN, mode="cluster", shaper="netem", interrupted=True)
-    mission.metadata |= facts.metadata
-    mission.write(run / "mission.mcap", {})
-    (run / "report.json").unlink()
-    assert read_run(run)[2] == facts
 
 
 def test_the_recordings_are_merged_if_they_are_not_yet(run):

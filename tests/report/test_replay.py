@@ -70,13 +70,6 @@ def test_a_minute_of_flight_takes_less_than_2_mb(flight, section, figure):
     figure("replay of a minute", len(section) / minutes / 1e6, "<=", 2.0, "MB")
 
 
-def test_a_long_flight_has_fewer_frames_a_second(flight, monkeypatch):
-    monkeypatch.setattr(replay, "FRAMES_MAX", 50)
-    duration, said = messages(replay.write_section(flight, paper()[0]))
-    assert duration == pytest.approx(flight.seconds(flight.end_ns))
-    assert len({now for now, _ in said}) == 51
-
-
 @pytest.mark.parametrize(("lack", "words"), [("viser", "pip install"), ("flight", "never flew")])
 def test_without_replay_a_line_says_why(lack, words, tmp_path, monkeypatch):
     experiment, recording = paper()

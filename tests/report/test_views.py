@@ -91,15 +91,6 @@ def test_the_scene_has_robot_pipes_board_and_path(flown):
     np.testing.assert_allclose(ends, truth["position"][[0, -1]], atol=0.05)
 
 
-def test_plotted_errors_agree_with_the_report(flown):
-    _, report, messages = flown
-    known = {name: entry["value"] for name, entry in report["numbers"].items()}
-    errors = {topic: [m.data for _, m in messages[topic]] for topic in VIEWS if "error" in topic}
-    assert max(errors["/tracking_error"]) == pytest.approx(known["tracking_error_peak"], rel=0.05)
-    rms = np.sqrt(np.mean(np.square(errors["/prediction_error"])))
-    assert rms == pytest.approx(known["prediction_error_rms"], rel=0.2), "a sample of them"
-
-
 def test_every_path_of_the_layout_is_in_a_recording(flown):
     layout, messages = json.loads(LAYOUT.read_text()), flown[2]
     for panel in layout["configById"].values():
@@ -126,7 +117,6 @@ def test_messages_for_viewers_change_neither_hash_nor_report(flown, tmp_path):
     recording = Recording.read(path)
     assert not {message[0] for message in recording.messages} - TOPICS.keys()
     assert (recording.note, recording.remarks) == ("", ())
-    assert "started" not in recording.metadata, "virtual time has no wall time"
     recording.write(tmp_path / "copy.mcap")
     assert Recording.read(tmp_path / "copy.mcap").views == recording.views
     recording.views = []
