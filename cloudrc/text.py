@@ -72,6 +72,12 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
     return "\n".join(line.rstrip() for line in drawn.getvalue().splitlines())
 
 
+def list_some(texts: Sequence[str], most: int = 3) -> str:
+    """List the first `most` texts, and count the others."""
+    more = len(texts) - most
+    return ", ".join(texts[:most]) + f" and {more} more" * (more > 0)
+
+
 def cells(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> list[tuple[str, ...]]:
     """Return a table as text: `columns` are head -> form of a cell, such as "{age_ms:.0f} ms".
 

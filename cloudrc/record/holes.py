@@ -11,6 +11,8 @@ import json
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
+from cloudrc.text import list_some
+
 HOLES = "holes"
 """Metadata key: start and end of each hole as JSON [ns]."""
 END_NS = 1 << 62
@@ -34,22 +36,16 @@ class Hole(NamedTuple):
             return "messages lost, nobody knows when"
         if self.end_ns >= END_NS:
             return f"all lost from {begin:.2f} s on"
-        if not self.begin_ns:
-            return f"all lost up to {end:.2f} s"
         return f"{end - begin:.2f} s lost at {begin:.2f} s"
 
 
 SOMEWHERE = Hole(0, END_NS)
 """In place of the holes if nobody knows when the lost messages were."""
-SHOWN_MAX = 3
-"""Largest number of holes that a text describes."""
 
 
 def describe(holes: Iterable[Hole], seconds: Callable[[int], float]) -> str:
     """Describe the first holes in words, and count the others; "" without a hole."""
-    texts = [hole.describe(seconds) for hole in sorted(set(holes))]
-    more = len(texts) - SHOWN_MAX
-    return ", ".join(texts[:SHOWN_MAX]) + f" and {more} more holes" * (more > 0)
+    return list_some([hole.describe(seconds) for hole in sorted(set(holes))])
 
 
 def goes_on(holes: Iterable[Hole]) -> bool:

@@ -30,9 +30,8 @@ from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, of_metadata, union
 from cloudrc.record.ros import decode, is_known
 from cloudrc.record.topics import TOPICS, VIEWS, Row, Topic
 from cloudrc.record.writer import CLOCK, COUNTS, MISSING
+from cloudrc.text import list_some
 
-LISTED_MAX = 3
-"""Largest number of topics that a text lists."""
 KINDS = {
     b"#ROSBAG V": "is a ROS 1 bag, not an MCAP file; convert it with: rosbags-convert",
     b"SQLite format 3": "is an SQLite file, not MCAP; convert it with: ros2 bag convert",
@@ -182,7 +181,7 @@ class _Reader:
         metadata = content.metadata
         others = {self._channels[n].topic for n, is_ours in self._ours.items() if not is_ours}
         if foreign := sorted(others - TOPICS.keys()):
-            told = f"has topics that cloudrc does not record: {_list_some(foreign)}"
+            told = f"has topics that cloudrc does not record: {list_some(foreign)}"
             content.remarks += (to_one_line(told),)
         if other := sorted(others & TOPICS.keys()):
             yield f"topics of another layout were left out: {', '.join(other)}"
@@ -192,11 +191,14 @@ class _Reader:
             return
         if metadata.get(COUNTS) == "" and MISSING not in metadata:
             yield "it was torn, and another program added an end"
-        if counts := _stored_counts(content):
-            read = Counter(message[0] for message in content.messages)
+        if stored := metadata.get(COUNTS):
+            counts, read = (
+                Counter(json.loads(stored)),
+                Counter(each[0] for each in content.messages),
+            )
             wrong = [f"{read[t]} of {counts[t]} on {t}" for t in TOPICS if read[t] != counts[t]]
             if wrong:
-                yield f"messages were removed or added: it holds {_list_some(wrong)}"
+                yield f"messages were removed or added: it holds {list_some(wrong)}"
 
 
 def read(path: Path, *, whole: bool = False) -> Content:
@@ -236,14 +238,3 @@ def decode_all(topic: Topic, messages: Iterable[bytes], what: str) -> list[Row]:
         return [decode(topic, data) for data in messages]
     except Exception as error:  # rosbags may raise anything on malformed bytes
         raise BadInputError(f"{what} is not readable; use the original file") from error
-
-
-def _stored_counts(content: Content) -> Counter[str]:
-    """Return the number of messages by topic that the writer has noted; empty if it has not."""
-    return Counter(json.loads(content.metadata.get(COUNTS) or "{}"))
-
-
-def _list_some(topics: list[str]) -> str:
-    """List the first topics in words, and count the others."""
-    more = len(topics) - LISTED_MAX
-    return ", ".join(topics[:LISTED_MAX]) + f" and {more} more topics" * (more > 0)

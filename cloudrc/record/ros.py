@@ -14,6 +14,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterable
 from functools import cache, partial
+from operator import attrgetter
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -29,7 +30,6 @@ _ROS_NAMES: dict[Kind, str] = {
     "bool": "bool",
     "string": "string",
     "vector": "geometry_msgs/Vector3",
-    "quaternion": "geometry_msgs/Quaternion",
 }
 STORE = get_typestore(Stores.ROS2_JAZZY)
 """All message types that rosbags can encode: those of ROS 2 Jazzy and of cloudrc."""
@@ -154,16 +154,13 @@ def build_odometry(header: Any, values: Values, child: str = "base_link") -> Any
 
 def _parse_odometry(message: Any) -> Values:
     pose, twist = message.pose.pose, message.twist.twist
-    wxyz = _wxyz(pose.orientation)
+    turn = pose.orientation
+    wxyz = turn.w, turn.x, turn.y, turn.z
     return _xyz(pose.position), wxyz, _rotate(wxyz, _xyz(twist.linear)), _xyz(twist.angular)
 
 
 def _xyz(vector: Any) -> Vector:
     return vector.x, vector.y, vector.z
-
-
-def _wxyz(quaternion: Any) -> Quaternion:
-    return quaternion.w, quaternion.x, quaternion.y, quaternion.z
 
 
 _Parse: TypeAlias = Callable[[Any], Values]
@@ -182,9 +179,7 @@ _TO_ROS: dict[Kind, Callable[[Any], Any]] = {
     "bool": bool,
     "string": lambda text: text if text.isascii() else text.encode("utf-8", "replace").decode(),
     "vector": lambda vector: _Vector3(*vector),
-    "quaternion": lambda q: _Quaternion(q[1], q[2], q[3], q[0]),
 }
-_FROM_ROS: dict[Kind, Callable[[Any], Any]] = {"vector": _xyz, "quaternion": _wxyz}
 
 
 def _builder(topic: Topic) -> Callable[[Any, Values], Any]:
@@ -201,13 +196,10 @@ def _parser(topic: Topic) -> _Parse:
     if parse_all := _PARSERS.get(topic.ros_type):
         count = len(topic.fields)
         return lambda message: parse_all(message)[:count]
-    from_ros = [(field.name, _FROM_ROS.get(field.kind)) for field in topic.fields]
-
-    def parse(message: Any) -> Values:
-        raw = [(getattr(message, name), turn) for name, turn in from_ros]
-        return tuple([turn(value) if turn else value for value, turn in raw])
-
-    return parse
+    read = [(attrgetter(field.name), field.kind == "vector") for field in topic.fields]
+    return lambda message: tuple(
+        [_xyz(get(message)) if is_vector else get(message) for get, is_vector in read]
+    )
 
 
 _HEAD = "<4siII6s"

@@ -43,7 +43,7 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     experiment = read_experiment(config, flown=True)
     before = _read_merged(folder)
     recording = before or merge(folder / "world.mcap", folder / "cloud.mcap")
-    whole = _is_of_whole_recording(folder / "report.json")
+    whole = read_json(folder / "report.json", REPORT_BYTES_MAX).get("complete") is True
     for lack in _lacking(recording, config, whole=whole):
         raise BadInputError(f"{merged}: {lack}; no report is written")
     run = _read_facts(recording)
@@ -97,11 +97,6 @@ def _flown(data: bytes, name: str) -> dict[str, Any]:
     document, _ = parse_yaml(data.decode("utf-8", "replace"), name)
     values = document if isinstance(document, dict) else {}
     return {key: value for key, value in values.items() if key not in JUDGEMENT}
-
-
-def _is_of_whole_recording(report: Path) -> bool:
-    """Return whether a report.json exists and was made from a complete recording."""
-    return read_json(report, REPORT_BYTES_MAX).get("complete") is True
 
 
 def _read_facts(recording: Recording) -> Run:

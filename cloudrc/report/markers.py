@@ -6,9 +6,7 @@ A marker moves with its frame: the robot with `base_link`, the robot that cloud 
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -37,15 +35,15 @@ def scene_shapes(bodies: Shapes, tubes: Sequence[Tube], prefix: str = "") -> lis
     `tubes` are the tubes among the bodies of the scene. `prefix` precedes the names of the robot's
     frames.
     """
-    shapes = []
-    if bodies.robot:
-        ghost = [replace(surface, rgba=GHOST) for surface in bodies.robot]
-        shapes.append(_solid("robot", f"{prefix}base_link", bodies.robot))
-        shapes.append(_solid("estimate", f"{prefix}estimate", ghost))
-    size = min(GOAL_SIZE, bodies.size / 4) if bodies.robot else GOAL_SIZE
-    shapes.append(("setpoint", SPHERE, f"{prefix}setpoint", size, GOAL))
-    shapes += [_solid(tube.name, "world", [wall(tube, GLASS, 24)]) for tube in tubes]
-    return shapes + _obstacles(bodies, {tube.name for tube in tubes})
+    size, names = bodies.size / 4 or GOAL_SIZE, {tube.name for tube in tubes}
+    scene = [each for each in bodies.scene if each.body not in names]
+    scene += [wall(tube, GLASS, 24) for tube in tubes]
+    return [
+        *(_solid("robot", f"{prefix}base_link", part, part.rgba) for part in bodies.robot),
+        *(_solid("estimate", f"{prefix}estimate", part, GHOST) for part in bodies.robot),
+        ("setpoint", SPHERE, f"{prefix}setpoint", min(GOAL_SIZE, size), GOAL),
+        *(_solid(surface.body, "world", surface, surface.rgba) for surface in scene),
+    ]
 
 
 def path_shape(name: str, points: Iterable[Any], colour: _Colour = PATH) -> MarkerShape:
@@ -71,7 +69,6 @@ def _marker(
     size: float,
     colour: _Colour,
     points: Iterable[Any] = (),
-    colours: Iterable[_Colour] = (),
 ) -> Any:
     """Make a ROS marker at the origin of `frame`; `size` and `points`, shape (n, 3), in [m]."""
     point, none = "geometry_msgs/msg/Point", np.zeros(0, np.uint8)
@@ -86,30 +83,14 @@ def _marker(
     about = header(stamp_ns, frame), name, number, kind, 0, pose
     look = part("geometry_msgs/msg/Vector3", *(size,) * 3), part("std_msgs/msg/ColorRGBA", *colour)
     corners = [part(point, *xyz) for xyz in np.asarray(points, np.float32).tolist()]
-    paint = [part("std_msgs/msg/ColorRGBA", *each) for each in colours]
     return part(
         "visualization_msgs/msg/Marker",
-        *(*about, *look, forever, True, corners, paint),
+        *(*about, *look, forever, True, corners, []),
         *("", picture, [], "", "", mesh, False),  # no texture, text or mesh
     )
 
 
-def _obstacles(bodies: Shapes, tubes: set[str]) -> list[MarkerShape]:
-    """Make a shape for each body of the scene that is not a tube."""
-    parts: defaultdict[str, list[Surface]] = defaultdict(list)
-    for surface in bodies.scene:
-        if surface.body not in tubes:
-            parts[surface.body].append(surface)
-    return [_solid(body, "world", surfaces) for body, surfaces in parts.items()]
-
-
-def _solid(name: str, frame: str, surfaces: Sequence[Surface]) -> MarkerShape:
-    """Make a shape of triangles; each triangle has the colour and opacity of its surface."""
-    points = [surface.corners[surface.triangles].reshape(-1, 3) for surface in surfaces]
-    colours = [
-        surface.rgba
-        for surface, corners in zip(surfaces, points, strict=True)
-        for _ in range(len(corners))
-    ]
-    several = colours if len(set(colours)) > 1 else []
-    return name, TRIANGLE_LIST, frame, 1.0, surfaces[0].rgba, np.concatenate(points), several
+def _solid(name: str, frame: str, surface: Surface, colour: _Colour) -> MarkerShape:
+    """Make a shape of triangles."""
+    points = surface.corners[surface.triangles].reshape(-1, 3)
+    return name, TRIANGLE_LIST, frame, 1.0, colour, points

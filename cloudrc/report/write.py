@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from html import escape
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
@@ -57,10 +57,7 @@ def assess(
         notes.append(f"{INCOMPLETE}: {recording.note}.")
     notes += [f"The recording {remark}." for remark in recording.remarks]
     notes += [f"{text[0].upper()}{text[1:]}." for text in recording["/fault"]["text"] if text]
-    notes += _default_robot(experiment)
-    notes += _clamped_horizon(flight, experiment)
-    notes += _unknown_clearance(flight)
-    notes += _flown_through(flight)
+    notes += _remarks(flight, experiment)
     if flight.ending is not None:
         seen = operator_verdict(flight, evidence, numbers)
         if seen.outcome != verdict.outcome:
@@ -76,52 +73,32 @@ def assess(
     return Assessment(run, experiment, flight, numbers, verdict, operator, kept, digest, first)
 
 
-def _clamped_horizon(flight: Flight, experiment: ResolvedExperiment) -> list[str]:
-    """Return a note if cloud had to limit the estimator's horizon."""
-    clamped = round(flight.growth("horizon_clamped") or 0)
-    if not clamped:
-        return []
-    control = flight.recording["/delay_estimate"] if flight.span_ns is None else flight.control
-    periods = len(control["stamp_ns"])
-    return [
-        f"In {clamped} of {periods} periods, the estimator's horizon was not in the range 0 to "
-        f"{experiment.cloud.horizon_max_s:g} s (cloud.horizon_max_s), and cloud limited it; a "
-        "horizon is in seconds."
-    ]
-
-
-def _default_robot(experiment: ResolvedExperiment) -> list[str]:
-    """Return a note if the robot is a model alone, without a robot.yaml."""
-    robot = PurePath(experiment.world.robot)
-    if robot.suffix != ".xml":
-        return []
-    return [
-        f"The robot is the model {robot.name} alone, without a robot.yaml: its onboard controller "
-        "and its guard have default values."
-    ]
-
-
-def _unknown_clearance(flight: Flight) -> list[str]:
-    """Return a note if the report has no clearance from some obstacles of the scene."""
+def _remarks(flight: Flight, experiment: ResolvedExperiment) -> Iterator[str]:
+    """Yield what a reader of the numbers has to know about the robot, cloud and the scene."""
+    robot, scene = PurePath(experiment.world.robot), flight.scene
+    if robot.suffix == ".xml":
+        yield (
+            f"The robot is the model {robot.name} alone, without a robot.yaml: its onboard "
+            "controller and its guard have default values."
+        )
+    if clamped := round(flight.growth("horizon_clamped") or 0):
+        yield (
+            f"In {clamped} periods, the estimator's horizon was not in the range 0 to "
+            f"{experiment.cloud.horizon_max_s:g} s (cloud.horizon_max_s), and cloud limited it; a "
+            "horizon is in seconds."
+        )
+    found = obstacles(scene, touch=flight.mission.touched)
     if flight.hull is None:
-        return [f"{UNKNOWN} anything: the size of the robot is not known here."]
-    if flight.scene.path is not None:
-        return [f"{UNKNOWN} all bodies but declared tubes: MuJoCo is not installed."]
-    found = obstacles(flight.scene, touch=flight.mission.touched)
-    if unknown := sorted({each.name for each in found if not has_surface(each)}):
-        return [f"{UNKNOWN} {', '.join(unknown)}: of a height field, only the box around it is."]
-    return []
-
-
-def _flown_through(flight: Flight) -> list[str]:
-    """Return a note if the scene has bodies that the robot cannot touch."""
-    names = flight.scene.intangible
-    if not names:
-        return []
-    return [
-        f"The robot flies through {', '.join(names)}: by contype and conaffinity, their geoms "
-        "never meet those of the robot."
-    ]
+        yield f"{UNKNOWN} anything: the size of the robot is not known here."
+    elif scene.path is not None:
+        yield f"{UNKNOWN} all bodies but declared tubes: MuJoCo is not installed."
+    elif unknown := sorted({each.name for each in found if not has_surface(each)}):
+        yield f"{UNKNOWN} {', '.join(unknown)}: of a height field, only the box around it is."
+    if scene.intangible:
+        yield (
+            f"The robot flies through {', '.join(scene.intangible)}: by contype and conaffinity, "
+            "their geoms never meet those of the robot."
+        )
 
 
 def write_report(
