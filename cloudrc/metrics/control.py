@@ -23,7 +23,6 @@ from cloudrc.metrics.flight import (
     add_metrics,
     finite,
     mean,
-    percentile,
     rms,
     select,
 )
@@ -233,25 +232,23 @@ def _missed_periods(flight: Flight) -> float | None:
 add_metrics(
     "Link and loop",
     ("rtt_mean", "s", "Mean round trip from command to echo, without the hold time in world.",
-     lambda flight: mean(round_trips(flight)["rtt"])),
+     lambda flight: round_trips(flight)["rtt"], "mean"),
     ("rtt_p95", "s", "Round trip from command to echo, without the hold time in world: 95th "
-     "percentile.", lambda flight: percentile(round_trips(flight)["rtt"], 95.0)),
+     "percentile.", lambda flight: round_trips(flight)["rtt"], "p95"),
     ("loop_delay_mean", "s", "Mean round trip from command to echo, with the hold time in world; "
-     "each command counts once.", lambda flight: mean(round_trips(flight)["loop_delay"])),
+     "each command counts once.", lambda flight: round_trips(flight)["loop_delay"], "mean"),
     ("delay_sample_mean", "s", "Mean of the estimator's delay samples, one per telemetry that "
-     "cloud used: the paper's tau_n, which eq. (1) averages.",
-     lambda flight: mean(delay_samples(flight))),
+     "cloud used: the paper's tau_n, which eq. (1) averages.", delay_samples, "mean"),
     ("age_of_information_mean", "s", "Mean age of cloud's newest odometry when it computes a "
      "command.", _age_of_information),
     ("age_at_actuator_mean", "s", "Mean age of information at the actuator: of the odometry behind "
-     "the command that the robot follows.",
-     lambda flight: mean(ages_at_actuator(flight))),
+     "the command that the robot follows.", ages_at_actuator, "mean"),
     ("age_at_actuator_p99", "s", "Age of information at the actuator: 99th percentile.",
-     lambda flight: percentile(ages_at_actuator(flight), 99.0)),
+     ages_at_actuator, "p99"),
     ("age_at_actuator_max", "s", "Largest age of information at the actuator.",
-     lambda flight: percentile(ages_at_actuator(flight), 100.0)),
+     ages_at_actuator, "max"),
     ("peak_age_mean", "s", "Mean peak age: age of information at the actuator just before each "
-     "command that lowers it.", lambda flight: mean(peak_ages(flight))),
+     "command that lowers it.", peak_ages, "mean"),
     ("age_violation", "1", "Share of the time with a command in use whose age of information is "
      "above criteria.age_deadline_s.", _age_violation),
     ("commands_applied", "1", "Number of commands that reached the low-level controller.",
@@ -272,9 +269,9 @@ add_metrics(
 add_metrics(
     "Real time",
     ("world_lateness_p99", "s", "Lateness of world's wakes: 99th percentile; real time only.",
-     lambda flight: percentile(wakes(flight, "world")["lateness"], 99.0)),
+     lambda flight: wakes(flight, "world")["lateness"], "p99"),
     ("cloud_lateness_p99", "s", "Lateness of cloud's wakes: 99th percentile; real time only.",
-     lambda flight: percentile(wakes(flight, "cloud")["lateness"], 99.0)),
+     lambda flight: wakes(flight, "cloud")["lateness"], "p99"),
     ("world_slip", "s", "Time by which world's clock fell behind the machine's clock because "
      "the simulation was late.", _slip),
     ("real_time_factor", "1", "Simulated time divided by time on the machine's clock; real time "

@@ -315,30 +315,37 @@ SHIPPED: dict[str, Metric] = {}
 """The metrics of cloudrc by name; complete once `cloudrc.metrics.measure` is imported."""
 
 
-def add_metrics(group: str, *rows: tuple[str, str, str, Measure], **labels: str) -> None:
+def add_metrics(group: str, *rows: tuple[Any, ...], **labels: str) -> None:
     """Add metrics of cloudrc to a group; each row has name, unit, meaning and function.
 
+    A row may also name a key of `STATISTICS`: its function then returns an array of a flight.
     `labels` are the labels of those that the summary of a report shows.
     """
-    SHIPPED.update({row[0]: Metric(*row, group, labels.get(row[0], "")) for row in rows})
+    for name, unit, meaning, measure, *statistic in rows:
+        if statistic:
+            measure = partial(_summarize, measure, *statistic)
+        SHIPPED[name] = Metric(name, unit, meaning, measure, group, labels.get(name, ""))
+
+
+def _summarize(values: Callable[[Flight], Array], statistic: str, flight: Flight) -> float | None:
+    found = values(flight)
+    if statistic != "rms" and found.ndim > 1:
+        found = np.linalg.norm(found, axis=1)
+    return STATISTICS[statistic](found)
 
 
 def add_quantities() -> None:
     """Add the metrics of `QUANTITIES`."""
     for each in QUANTITIES:
         if each.name:
-            row = each.name, each.unit, each.meaning, partial(_statistic, each)
+            row = each.name, each.unit, each.meaning, partial(_values, each), each.statistic
             add_metrics(each.group, row, **{each.name: each.label})
 
 
-def _statistic(quantity: RecordQuantity, flight: Flight) -> float | None:
+def _values(quantity: RecordQuantity, flight: Flight) -> Array:
+    """Return a quantity in each row of a flight, shape (n,) or, of vectors, (n, 3)."""
     found = quantity.value(flight.rows(quantity.source))
-    values = np.stack(found, axis=1) if isinstance(found, tuple) else np.asarray(found)
-    if quantity.statistic == "rms":
-        return rms(values)
-    sizes = np.linalg.norm(values, axis=1) if values.ndim > 1 else values
-    percent = {"p95": 95.0, "p99": 99.0, "max": 100.0}.get(quantity.statistic)
-    return mean(sizes) if percent is None else percentile(sizes, percent)
+    return np.stack(found, axis=1) if isinstance(found, tuple) else np.asarray(found)
 
 
 def finite(value: float) -> float | None:
@@ -369,6 +376,15 @@ def rms(errors: Array) -> float | None:
     squares = np.square(errors) if errors.ndim == 1 else np.square(errors).sum(axis=1)
     square = mean(squares)
     return None if square is None else float(np.sqrt(square))
+
+
+STATISTICS: dict[str, Callable[[Array], float | None]] = {
+    "mean": mean,
+    "rms": rms,
+    "p95": partial(percentile, percent=95.0),
+    "p99": partial(percentile, percent=99.0),
+    "max": partial(percentile, percent=100.0),
+}
 
 
 def _least_clearance(flight: Flight, *, inside: bool) -> float | None:

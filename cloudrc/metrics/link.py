@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from cloudrc.metrics.counters import growth
-from cloudrc.metrics.flight import Array, Flight, add_metrics, mean, select
+from cloudrc.metrics.flight import Array, Flight, add_metrics, select
 from cloudrc.record.columns import Recording, datagrams, join
 
 WAYS = {"uplink": "from world to cloud", "downlink": "from cloud to world"}
@@ -29,11 +29,6 @@ COUNTS = {
     "relay_stalled": "that waited 50 ms or more until the relay read them.",
     "released_early": "that left before they were due; above 0 the relay has a bug.",
 }
-
-
-def _delay_mean(flight: Flight, way: str) -> float | None:
-    """Return the mean one-way delay [s]; None if world and cloud may have different clocks."""
-    return mean(flight.during(f"/{way}_delay")["delay"])
 
 
 def _late(flight: Flight, way: str) -> float | None:
@@ -102,7 +97,7 @@ def _add_direction(way: str, words: str) -> None:
     add_metrics(
         "Link and loop",
         (f"{way}_delay_mean", "s", f"Mean one-way delay {words} of all datagrams that arrived, "
-         "late ones included.", partial(_delay_mean, way=way)),
+         "late ones included.", lambda flight: flight.during(f"/{way}_delay")["delay"], "mean"),
         (f"packets_sent_{way}", "1", f"Number of datagrams sent {words} in the flight.",
          partial(_sent, way=way, name="sent")),
         (f"bytes_sent_{way}", "B", f"UDP payload of the datagrams sent {words} in the flight.",

@@ -322,7 +322,9 @@ def plugin_failures(
 
     `span_ns` are the begin and the end of the time that counts [ns], or None for all.
     """
-    periods, faults = _count_periods(recording, span_ns), recording["/fault"]
+    stamps_ns, faults = recording["/delay_estimate"]["stamp_ns"], recording["/fault"]
+    begin_ns, end_ns = span_ns or (0, inf)
+    periods = int(((stamps_ns >= begin_ns) & (stamps_ns <= end_ns)).sum())
     for kind in ("estimator", "predictor", "controller"):
         failed = growth(recording, f"{kind}_failed", span_ns)
         share = (failed or 0.0) / max(periods, 1)
@@ -333,19 +335,6 @@ def plugin_failures(
             limit = f"{PLUGIN_FAILURES_MAX:.0%}"
             text = f"cloud.{kind} failed in {shown}% of its periods, above {limit}{why}"
             yield FlightFailure("plugin_failed", text)
-
-
-def _count_periods(recording: Recording, span_ns: tuple[int, int] | None) -> int:
-    """Count cloud's control periods; each has a datagram, whose number tells of lost rows."""
-    table = recording["/delay_estimate"]
-    stamps, epochs, numbers = table["stamp_ns"], table["epoch"], table["counter"]
-    if span_ns is not None:
-        rows = (stamps >= span_ns[0]) & (stamps <= span_ns[1])
-        epochs, numbers = epochs[rows], numbers[rows]
-    if not recording.holes:
-        return len(numbers)
-    sessions = [numbers[epochs == epoch] for epoch in np.unique(epochs)]
-    return sum(int(each.max() - each.min()) + 1 for each in sessions)
 
 
 def _responses(flight: Flight, settle: float) -> Iterator[FlightFailure]:
