@@ -77,11 +77,6 @@ def test_the_estimator_sees_compute_time_as_loop_delay():
     assert computed - usual == pytest.approx(0.008, abs=0.003)
 
 
-def test_measured_compute_time_marks_the_run():
-    measured = waiting("cloud.compute_measured=true", "cloud.compute_ms=1")
-    assert fly_in_memory(measured).notes[0].startswith("Not repeatable: ")
-
-
 def test_no_number_depends_on_the_clocks():
     clocks = ("seed=1", "cloud.clock_offset_s=86400.5", "cloud.clock_drift_ppm=-1000")
     same, later, drift = (
@@ -95,9 +90,7 @@ def test_no_number_depends_on_the_clocks():
         assert drift[name] == pytest.approx(later[name], rel=0.03), name
 
 
-@pytest.mark.parametrize(
-    ("odometry", "commands"), [(20, 100), (50, 500), (125, 30), (500, 100), (100, 20)]
-)
+@pytest.mark.parametrize(("odometry", "commands"), [(20, 100), (125, 30), (100, 500)])
 def test_rates_are_those_of_the_experiment(odometry, commands):
     keys = f"world.odometry_rate_hz={odometry}", f"cloud.command_rate_hz={commands}"
     recording = flown("link.profile=paper-p1", *keys)

@@ -67,6 +67,14 @@ class Log:
             changed = [next(new) if isinstance(each, kind) else each for each in records]
             records[:] = [each for each in changed if each is not None]
 
+    def tell(self, how):
+        """Replace those values of each telemetry that `how(sent)` returns."""
+
+        def told(_, sent):
+            return sent._replace(telemetry=sent.telemetry._replace(**how(sent)))
+
+        self.change(TelemetrySent, told)
+
     def flight(
         self, scene=OPEN_AIR, *, waypoints=1, mission=None, time_limit=60.0, touch=None, **criteria
     ):

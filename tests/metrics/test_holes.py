@@ -10,21 +10,13 @@ from cloudrc.metrics.measure import IN_SPITE_OF_HOLES, SHIPPED, measure_all
 from cloudrc.metrics.response import steps
 from cloudrc.metrics.verdict import exit_code, flight_evidence, judge
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole
-from cloudrc.records import Control, GuardChange, TelemetrySent
+from cloudrc.records import Control, GuardChange
 from cloudrc.runs.links.trace import one_way
 from tests.metrics.conftest import OPEN_AIR, SECOND, at, flown, good
 
 
-def on_the_ground(_, sent):
-    """Let telemetry before the start say that the robot is on the ground."""
-    if sent.stamp_ns >= at(0):
-        return sent
-    return sent._replace(telemetry=sent.telemetry._replace(guard=GuardState.GROUND))
-
-
 def lossy(log, *spans, **options):
     """Return the flight of a log without the records of the spans of time [s]."""
-    log.change(TelemetrySent, on_the_ground)
     holes = [Hole(at(first), at(last)) for first, last in spans]
     for records in (log.world, log.cloud):
         records[:] = [each for each in records if not any(b < each.stamp_ns < e for b, e in holes)]
@@ -116,10 +108,7 @@ def test_a_trace_has_no_loss_at_the_edges_of_a_hole(way):
 
 def test_a_lost_end_does_not_change_the_start_of_the_first_mission():
     log = flown()
-    log.change(
-        TelemetrySent,
-        lambda _, sent: sent._replace(telemetry=sent.telemetry._replace(mission_id=1)),
-    )
+    log.tell(lambda sent: {"mission_id": 1})
     flight = log.flight()
     flight.recording.holes = (Hole(at(6), END_NS),)
     assert flight.mission_ns == flight.recording["/telemetry"]["stamp_ns"][0] < flight.start_ns

@@ -93,14 +93,14 @@ def echoes_repeated():
     """Each command is echoed twice, the second time with 40 ms more in world."""
     log = flown()
 
-    def repeat(n, sent):
-        told = sent.telemetry
-        again = told._replace(
-            echo_stamp_ns=told.echo_stamp_ns - PERIOD, echo_hold_ns=told.echo_hold_ns + PERIOD
-        )
-        return sent._replace(telemetry=again) if sent.counter % 2 else sent
+    def repeat(sent):
+        told, more = sent.telemetry, PERIOD * (sent.counter % 2)
+        return {
+            "echo_stamp_ns": told.echo_stamp_ns - more,
+            "echo_hold_ns": told.echo_hold_ns + more,
+        }
 
-    log.change(TelemetrySent, repeat)
+    log.tell(repeat)
     return log.flight()
 
 
@@ -146,12 +146,7 @@ def planned():
 def armed_early():
     """World arms the robot for mission 7 0.4 s before the first command, after mission 6."""
     log = flown()
-
-    def number(n, sent):
-        mission = 7 if sent.stamp_ns >= at(-0.4) else 6
-        return sent._replace(telemetry=sent.telemetry._replace(mission_id=mission))
-
-    log.change(TelemetrySent, number)
+    log.tell(lambda sent: {"mission_id": 7 if sent.stamp_ns >= at(-0.4) else 6})
     log.world.append(touch(8))
     return log.flight(touch="board")
 
@@ -346,13 +341,13 @@ def test_an_empty_recording_has_no_numbers():
 def test_a_waypoint_with_a_yaw_needs_the_true_yaw_too(degree, reached):
     half = radians(degree) / 2
 
-    def turn(record):
+    def turned(record):
         facing = (cos(half), 0.0, 0.0, sin(half))
-        return record._replace(odometry=record.odometry._replace(orientation_wxyz=facing))
+        return {"odometry": record.odometry._replace(orientation_wxyz=facing)}
 
     log = flown()
-    log.change(GroundTruth, lambda n, record: turn(record))
-    log.change(TelemetrySent, lambda n, sent: sent._replace(telemetry=turn(sent.telemetry)))
+    log.change(GroundTruth, lambda n, record: record._replace(**turned(record)))
+    log.tell(lambda sent: turned(sent.telemetry))
     point = Waypoint(position_m=(10.0, 0.0, 1.0), tolerance_m=10.0, dwell_s=0.0, yaw_deg=90.0)
     flight = log.flight(mission=MissionConfig(waypoints=(point,)))
     assert SHIPPED["waypoints_reached"].measure(flight) == reached
@@ -391,13 +386,8 @@ def test_a_waypoint_counts_if_the_true_position_confirms_it(x, tolerance, dwell,
 )
 def test_the_dwell_time_counts_on_the_operators_clock(stalled, reached):
     """The robot is near for 1 s of world's clock, which loses 0.2 s at `stalled` [s]."""
-
-    def stall(n, sent):
-        lag = 200_000_000 if sent.stamp_ns >= at(stalled) else 0
-        return sent._replace(telemetry=sent.telemetry._replace(slip_ns=lag))
-
     log = flown()
-    log.change(TelemetrySent, stall)
+    log.tell(lambda sent: {"slip_ns": 200_000_000 * (sent.stamp_ns >= at(stalled))})
     point = Waypoint(position_m=(9.5, 0.0, 1.0), tolerance_m=0.5, dwell_s=1.2)
     flight = log.flight(mission=MissionConfig(waypoints=(point,)))
     assert SHIPPED["waypoints_reached"].measure(flight) == reached
@@ -408,14 +398,14 @@ def test_the_dwell_time_counts_on_the_operators_clock(stalled, reached):
 def test_the_noise_of_the_measured_positions_is_added_to_the_tolerance(noise, reached):
     """The robot ends .5 m from the waypoint; a noise of .18 m in x alone has an rms of .104 m."""
 
-    def shake(n, sent):
+    def shake(sent):
         odometry = sent.telemetry.odometry
         x, y, z = odometry.position
-        odometry = odometry._replace(position=(x + (noise if n % 2 else -noise), y, z))
-        return sent._replace(telemetry=sent.telemetry._replace(odometry=odometry))
+        x += noise if sent.counter % 2 else -noise
+        return {"odometry": odometry._replace(position=(x, y, z))}
 
     log = flown()
-    log.change(TelemetrySent, shake)
+    log.tell(shake)
     point = Waypoint(position_m=(10.5, 0.0, 1.0), tolerance_m=0.2, dwell_s=0.0)
     flight = log.flight(mission=MissionConfig(waypoints=(point,)))
     assert SHIPPED["waypoints_reached"].measure(flight) == reached
@@ -423,13 +413,8 @@ def test_the_noise_of_the_measured_positions_is_added_to_the_tolerance(noise, re
 
 def test_the_first_telemetry_of_a_session_may_be_that_of_its_first_mission():
     log = flown()
-
-    def number(_, sent):
-        if sent.stamp_ns < at(-0.4):
-            return None
-        return sent._replace(telemetry=sent.telemetry._replace(mission_id=7))
-
-    log.change(TelemetrySent, number)
+    log.change(TelemetrySent, lambda _, sent: sent if sent.stamp_ns >= at(-0.4) else None)
+    log.tell(lambda sent: {"mission_id": 7})
     numbers = measure_all(log.flight())[0]
     assert numbers["start_delay"].value == approx(0.4)
     assert numbers["duration"].value == approx(10.4)
