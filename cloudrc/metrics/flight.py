@@ -163,9 +163,7 @@ class Flight:
 
     def truth_until(self, end_ns: int) -> Columns:
         """Select the true states from the start of the flight to `end_ns` [ns], even after it."""
-        columns = self.recording["/ground_truth"].columns
-        stamps, start_ns = columns["stamp_ns"], self.start_ns or 0
-        return select(columns, (stamps >= start_ns) & (stamps <= end_ns))
+        return between(self.recording["/ground_truth"].columns, self.start_ns or 0, end_ns)
 
     @cached_property
     def control(self) -> Columns:
@@ -264,10 +262,7 @@ class Flight:
         return bool((self.during("/command_applied")["planned_ns"] >= 0).any())
 
     def _within(self, columns: Columns) -> Columns:
-        stamps, span = columns["stamp_ns"], self.span_ns
-        if span is None:
-            return select(columns, np.zeros(len(stamps), dtype=bool))
-        return select(columns, (stamps >= span[0]) & (stamps <= span[1]))
+        return between(columns, *(self.span_ns or (0, -1)))
 
 
 def yaw_of(orientations_wxyz: Array) -> Array:
@@ -294,6 +289,12 @@ def rows_of(columns: Columns | Table, *names: str) -> Iterator[Any]:
 def select(columns: Columns, rows: Array) -> Columns:
     """Select rows of all columns by `rows` [1]: an index, indices, or a truth value per row."""
     return {name: column[rows] for name, column in columns.items()}
+
+
+def between(columns: Columns, first_ns: float, last_ns: float) -> Columns:
+    """Select the rows with stamps from `first_ns` to `last_ns` [ns]."""
+    stamps_ns = columns["stamp_ns"]
+    return select(columns, (stamps_ns >= first_ns) & (stamps_ns <= last_ns))
 
 
 Measure: TypeAlias = Callable[[Flight], float | None]

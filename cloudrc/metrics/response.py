@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cloudrc.metrics.control import tracking_errors
-from cloudrc.metrics.flight import Array, Flight, add_metrics, mean
+from cloudrc.metrics.flight import Array, Flight, add_metrics, between, mean
 from cloudrc.rounding import differences, exceeds
 
 SHORTEST_NS = 500_000_000
@@ -103,11 +103,11 @@ def _measure(flight: Flight, row: int, end_ns: int, *, cut: bool) -> Step | None
 
     `cut` is True if the step has no end of its own.
     """
-    control, truth = flight.control, flight.truth
+    control = flight.control
     begin_ns, setpoint = int(control["stamp_ns"][row]), control["setpoint"][row]
-    rows = (truth["stamp_ns"] >= begin_ns) & (truth["stamp_ns"] < end_ns)
-    times = (truth["stamp_ns"][rows] - begin_ns) * 1e-9
-    errors = truth["position"][rows] - setpoint
+    truth = between(flight.truth, begin_ns, end_ns - 1)
+    times = (truth["stamp_ns"] - begin_ns) * 1e-9
+    errors = truth["position"] - setpoint
     sizes = np.linalg.norm(errors, axis=1)
     length = float(sizes[0]) if len(sizes) else 0.0
     if length < LENGTH_MIN:
@@ -117,7 +117,7 @@ def _measure(flight: Flight, row: int, end_ns: int, *, cut: bool) -> Step | None
     commands = (control["stamp_ns"] >= begin_ns) & (control["stamp_ns"] < end_ns)
     speeds = np.linalg.norm(control["command"][commands], axis=1)
     sent = (control["stamp_ns"][commands] - begin_ns) * 1e-9
-    late = truth["stamp_ns"][rows] >= end_ns - SHORTEST_NS
+    late = truth["stamp_ns"] >= end_ns - SHORTEST_NS
     return Step(
         waypoint=int(control["waypoint"][row]),
         start=float(flight.seconds(begin_ns)),

@@ -30,7 +30,7 @@ from cloudrc.errors import DISK_FULL, DiskFullError
 from cloudrc.messages import Cause, GuardState, Vector
 from cloudrc.metrics.counters import growth
 from cloudrc.metrics.definitions import real_time_factor
-from cloudrc.metrics.flight import Flight, rows_of
+from cloudrc.metrics.flight import Flight, between, rows_of
 from cloudrc.metrics.measure import Number
 from cloudrc.metrics.mission import (
     first_touch,
@@ -322,12 +322,11 @@ def plugin_failures(
 
     `span_ns` are the begin and the end of the time that counts [ns], or None for all.
     """
-    stamps_ns, faults = recording["/delay_estimate"]["stamp_ns"], recording["/fault"]
-    begin_ns, end_ns = span_ns or (0, inf)
-    periods = int(((stamps_ns >= begin_ns) & (stamps_ns <= end_ns)).sum())
+    periods = between(recording["/delay_estimate"].columns, *(span_ns or (0, inf)))
+    faults = recording["/fault"]
     for kind in ("estimator", "predictor", "controller"):
         failed = growth(recording, f"{kind}_failed", span_ns)
-        share = (failed or 0.0) / max(periods, 1)
+        share = (failed or 0.0) / max(len(periods["stamp_ns"]), 1)
         if share > PLUGIN_FAILURES_MAX:
             first = faults["text"][faults["code"] == f"{kind}_failed"]
             why = f": {first[0]}" if len(first) else ""

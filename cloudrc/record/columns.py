@@ -113,12 +113,7 @@ class Recording(Content):
         """
         from cloudrc.record.reader import read
 
-        return Recording.of(read(path, whole=whole))
-
-    @staticmethod
-    def of(content: Content) -> Recording:
-        """Make a recording of what a file contains; both share the content."""
-        return Recording(**vars(content))
+        return Recording(**vars(read(path, whole=whole)))
 
     def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
         """Write the messages and further `attachments` to a file, atomically; may raise OSError."""

@@ -18,7 +18,7 @@ from operator import attrgetter
 from typing import Any, TypeAlias
 
 import numpy as np
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from cloudrc.messages import Quaternion, Vector
 from cloudrc.record.topics import TOPICS, VIEWS, Kind, Row, Topic, Values
@@ -71,7 +71,7 @@ def is_known(ros_type: str, text: str) -> bool:
         return True
     try:
         found = get_types_from_msg(text, ros_type)
-    except Exception:  # rosbags' parser may raise anything on a foreign text
+    except TypesysError:
         return False
     known = {name: fields for name, (_, fields) in STORE.fielddefs.items()}
     return all(known.get(name) == fields for name, (_, fields) in found.items())

@@ -6,7 +6,6 @@ import json
 import os
 import platform
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -137,8 +136,10 @@ def versions(names: Iterable[str]) -> dict[str, str]:
     """Return the versions of packages; leave out those that are not installed."""
     found = dict[str, str]()
     for name in names:
-        with suppress(metadata.PackageNotFoundError):
+        try:
             found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
     return found
 
 

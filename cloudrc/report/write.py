@@ -11,10 +11,10 @@ import numpy as np
 
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
-from cloudrc.errors import BadInputError, CloudrcError, describe_error
+from cloudrc.errors import CloudrcError, describe_error
 from cloudrc.files import read_json, write_atomically
 from cloudrc.geometry.obstacles import has_surface, obstacles
-from cloudrc.metrics.flight import Flight
+from cloudrc.metrics.flight import Flight, select
 from cloudrc.metrics.measure import measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
@@ -29,7 +29,6 @@ from cloudrc.report.document import (
 from cloudrc.report.flown import flight_of, flown_shapes, flown_world
 
 if TYPE_CHECKING:
-    from cloudrc.report.figures import Picture
     from cloudrc.report.figures.style import Look
 
 
@@ -124,8 +123,7 @@ def write_report(
     document = assessment.document
     write_json(folder / "report.json", document)
     environment = _environment(folder / ENVIRONMENT_FILE, assessment)
-    if driven := _driven(assessment):
-        write_atomically(folder / DRIVE_FILE, driven.encode())
+    _write_drive(folder / DRIVE_FILE, assessment)
     if page or figures:
         _draw(folder, assessment, environment, look, page=page, figures=figures)
     return document
@@ -141,21 +139,20 @@ def _environment(path: Path, assessment: Assessment) -> dict[str, Any]:
     return document
 
 
-def _driven(assessment: Assessment) -> str:
-    """Return the setpoints of the operator's drive by hand, as CSV; "" if nobody drove."""
+def _write_drive(path: Path, assessment: Assessment) -> None:
+    """Write the setpoints of the operator's drive by hand, if there was one, as CSV."""
     flight = assessment.flight
     mission, control = flight.during("/mission"), flight.control
     begins_ns = mission["stamp_ns"][mission["event"] == "driving"]
     if not len(begins_ns):
-        return ""
+        return
     by_hand = (control["stamp_ns"] >= begins_ns[0]) & (control["waypoint"] < 0)
-    rows = np.flatnonzero(by_hand)[::2]  # 50 Hz are enough
-    if len(rows) < 2:
-        return ""
-    times = (control["stamp_ns"][rows] - begins_ns[0]) * 1e-9
-    setpoints = zip(times.tolist(), control["setpoint"][rows].tolist(), strict=True)
-    fence = flown_world(flight.recording, assessment.experiment).steered
-    return write_setpoints(setpoints, fence)
+    driven = select(control, np.flatnonzero(by_hand)[::2])  # 50 Hz are enough
+    if len(driven["stamp_ns"]) > 1:
+        times = (driven["stamp_ns"] - begins_ns[0]) * 1e-9
+        fence = flown_world(flight.recording, assessment.experiment).steered
+        setpoints = zip(times.tolist(), driven["setpoint"].tolist(), strict=True)
+        write_atomically(path, write_setpoints(setpoints, fence).encode())
 
 
 def _draw(
@@ -175,27 +172,17 @@ def _draw(
     flown = assessment.experiment
     shapes = flown_shapes(assessment.flight.recording, flown)
     subject = Subject(assessment.flight, flown.uplink, flown.downlink, look or Look(), shapes)
-    try:
-        pictures = draw_all(subject, PRINT_KINDS if figures else PAGE_KINDS)
-    except ValueError as error:  # matplotlib cannot draw impossible values
-        raise BadInputError(
-            f"{folder}: the recorded values cannot be drawn ({describe_error(error)}); "
-            "report.json is written, check the recording"
-        ) from error
+    pictures = draw_all(subject, PRINT_KINDS if figures else PAGE_KINDS)
     if figures:
-        _write_figures(folder / "figures", pictures)
+        if (target := folder / "figures").is_symlink():
+            target.unlink()  # in a run from somebody else, the link may point anywhere
+        target.mkdir(exist_ok=True)
+        for picture in pictures:
+            for kind, content in picture.files.items():
+                write_atomically(target / f"{picture.name}.{kind}", content)
     if page:
         text = render(assessment, pictures, environment, _replay(assessment))
         write_atomically(folder / "report.html", text.encode("utf-8"))
-
-
-def _write_figures(folder: Path, pictures: Iterable[Picture]) -> None:
-    if folder.is_symlink():  # in a run from somebody else, the link may point anywhere
-        folder.unlink()
-    folder.mkdir(exist_ok=True)
-    for picture in pictures:
-        for kind, content in picture.files.items():
-            write_atomically(folder / f"{picture.name}.{kind}", content)
 
 
 def _replay(assessment: Assessment) -> str:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from cloudrc.config.load import read_attached
 from cloudrc.files import write_atomically
-from cloudrc.report.attached import read_flight
+from cloudrc.record.columns import Recording
 from cloudrc.report.flown import flight_of
+from cloudrc.report.folder import read_run
 from cloudrc.report.replay import write_page
 from cloudrc.runs.session import check_ended
 
@@ -17,7 +19,11 @@ def write_replay(run: Path, out: Path | None = None) -> Path:
     By default the page is replay.html beside the recording, and replaces an earlier one.
     """
     check_ended(run if run.is_dir() else run.parent)
-    recording, experiment = read_flight(run)
+    if run.is_dir():
+        recording, experiment, _ = read_run(run)
+    else:
+        recording = Recording.read(run, whole=True)
+        experiment = read_attached(recording.attachments, str(run))
     page = write_page(flight_of(recording, experiment), experiment)
     path = out or (run if run.is_dir() else run.parent) / "replay.html"
     write_atomically(path, page.encode())

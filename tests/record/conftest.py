@@ -131,7 +131,6 @@ def rewrite(
     rename=str,
     shuffle=lambda messages: None,
     metadata=True,
-    noted=(),
     **options,
 ):
     """Rewrite a recording as another program does; `shuffle` changes the messages in place."""
@@ -151,7 +150,7 @@ def rewrite(
         for each in reader.iter_attachments() if metadata else ():
             writer.add_attachment(**vars(each))
         for entry in reader.iter_metadata() if metadata else ():
-            writer.add_metadata(entry.name, entry.metadata | dict(noted))
+            writer.add_metadata(entry.name, entry.metadata)
         writer.finish()
     return target
 
