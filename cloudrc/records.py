@@ -95,6 +95,16 @@ class GroundTruth(NamedTuple):
     odometry: Odometry  # true pose and twist
     reference: Annotated[Vector, "m/s", "after the guard's caps, world frame"]
 
+    @property
+    def position(self) -> Vector:
+        """Position of the base [m], world frame."""
+        return self.odometry.position
+
+    @property
+    def velocity(self) -> Vector:
+        """Velocity of the base [m/s], world frame."""
+        return self.odometry.velocity
+
 
 class SensorLabel(NamedTuple):
     """What robot.yaml says of a sensor."""

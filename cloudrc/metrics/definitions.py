@@ -121,14 +121,14 @@ class RecordQuantity:
 QUANTITIES = (
     RecordQuantity(
         GroundTruth,
-        lambda row: row.odometry.position,
+        lambda row: row.position,
         "m",
         live="cloudrc_position_meters[axis]",
         now="True position of the base, world frame.",
     ),
     RecordQuantity(
         GroundTruth,
-        lambda row: row.odometry.velocity,
+        lambda row: row.velocity,
         "m/s",
         "speed_max",
         "max",

@@ -7,7 +7,7 @@ Both end with the event that ends the mission or, without such an event, with th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial, reduce
 from math import isfinite
@@ -31,9 +31,6 @@ from cloudrc.records import UNDER_WAY, Control, Record
 
 Array: TypeAlias = NDArray[Any]
 Columns: TypeAlias = dict[str, Array]
-
-CONTROL_TOPICS = tuple(topic.name for topic in BY_SOURCE[Control])
-"""Topics that the control loop writes in every period."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,33 +164,26 @@ class Flight:
 
     @cached_property
     def control(self) -> Columns:
-        """One row per control period of the flight, with the columns of all `CONTROL_TOPICS`."""
+        """One row per control period of the flight, with the columns of all its topics."""
         return self._within(self._control)
 
     @cached_property
     def _control(self) -> Columns:
-        return self._joined(CONTROL_TOPICS)
+        return self._joined(Control)
 
     def rows(self, source: type[Record]) -> Any:
         """Return the flight's records of a class as one record, whose fields are arrays.
 
         A vector is a tuple of x, y and z.
         """
-        topics = BY_SOURCE[source]
-        columns = self._within(self._joined([topic.name for topic in topics]))
-        found = SimpleNamespace(stamp_ns=columns["stamp_ns"])
-        for field in (field for topic in topics for field in topic.fields):
-            *parents, name = field.path.split(".")
-            part = found
-            for parent in parents:
-                part = vars(part).setdefault(parent, SimpleNamespace())
-            column = columns[field.name]
-            setattr(part, name, tuple(column.T) if column.ndim > 1 else column)
-        return found
+        columns = self._within(self._joined(source)).items()
+        return SimpleNamespace(
+            **{name: tuple(values.T) if values.ndim > 1 else values for name, values in columns}
+        )
 
-    def _joined(self, topics: Iterable[str]) -> Columns:
-        """Return all columns of topics in whose rows the same records are."""
-        tables = [self.recording[topic].columns for topic in topics]
+    def _joined(self, source: type[Record]) -> Columns:
+        """Return the columns of all topics in whose rows the records of a class are."""
+        tables = [self.recording[topic.name].columns for topic in BY_SOURCE[source]]
         # In the last period of a torn recording some topics may be missing.
         stamps = reduce(np.intersect1d, [table["stamp_ns"] for table in tables])
         columns: Columns = {}
