@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
@@ -16,7 +17,7 @@ from typing import Any
 
 from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.metrics.flight import Flight
-from cloudrc.metrics.measure import SHIPPED, Number
+from cloudrc.metrics.measure import Number
 from cloudrc.metrics.verdict import FlightFailure
 from cloudrc.record import wall_time
 from cloudrc.report.document import Assessment, Run
@@ -82,7 +83,7 @@ def render(
 def _facts(run: Run, experiment: ResolvedExperiment, flight: Flight) -> str:
     cloud = experiment.cloud
     flown = wall_time(flight.recording.metadata, flight.start_ns or 0)
-    pairs = {
+    facts = {
         "Experiment": experiment.name,
         "Mode": run.mode,
         "Seed": str(experiment.seed),
@@ -94,7 +95,7 @@ def _facts(run: Run, experiment: ResolvedExperiment, flight: Flight) -> str:
         # A flight in virtual time has no date.
         "Flown" if flown else "Report written": f"{flown or datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     }
-    return _pairs(pairs)
+    return _pairs(facts)
 
 
 def _pairs(pairs: Mapping[str, str]) -> str:
@@ -133,19 +134,16 @@ def _figure(number: int, picture: Picture) -> str:
 
 
 def _table_rows(numbers: Mapping[str, Number]) -> str:
-    groups: dict[str, list[str]] = {}
-    for metric in in_groups():
-        if metric.name in numbers:
-            groups.setdefault(metric.group, []).append(_row(metric.name, numbers[metric.name]))
-    others = [_row(name, number) for name, number in numbers.items() if name not in SHIPPED]
+    groups = defaultdict[str, str](str)  # title -> its rows
+    shipped = {metric.name: metric.group for metric in in_groups()}
+    for name, title in (
+        shipped | dict.fromkeys(sorted(numbers.keys() - shipped), "Others")
+    ).items():
+        if name in numbers:
+            groups[title] += _row(name, numbers[name])
     return "\n".join(
-        "\n".join(
-            [
-                f'<tbody>\n<tr><th scope="rowgroup" colspan="4">{escape(title)}</th></tr>',
-                *(*rows, "</tbody>"),
-            ]
-        )
-        for title, rows in (groups | ({"Others": others} if others else {})).items()
+        f'<tbody>\n<tr><th scope="rowgroup" colspan="4">{escape(title)}</th></tr>\n{rows}</tbody>'
+        for title, rows in groups.items()
     )
 
 
@@ -154,5 +152,5 @@ def _row(name: str, number: Number) -> str:
     return (
         f"<tr><td><code>{escape(name)}</code></td>"
         f'<td class="value">{escape(digits)}</td><td class="unit">{escape(unit)}</td>'
-        f"<td>{escape(number.meaning)}</td></tr>"
+        f"<td>{escape(number.meaning)}</td></tr>\n"
     )
