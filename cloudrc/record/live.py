@@ -10,14 +10,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from math import cos, sin
 from typing import Any, NamedTuple, TypeAlias
 
+import numpy as np
+
 from cloudrc.messages import UPRIGHT, Quaternion, Vector
-from cloudrc.record.ros import STORE, build_odometry, header, part
+from cloudrc.record.ros import STORE, header, pack, rotate
 from cloudrc.records import Control
 
 WORLD, BASE = "world", "base_link"
 """Frame of poses and of commanded velocities, and frame of the robot's base."""
-_ODOMETRY = "nav_msgs/msg/Odometry"
-_STAMPED = "geometry_msgs/msg/TwistStamped"
+_NO_COVARIANCE = np.zeros(36)
 Pose: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Position [m], shape (3,), and orientation wxyz [1], shape (4,)."""
 
@@ -40,26 +41,28 @@ def encode_odometry(
         angular_velocity_body: Angular velocity [rad/s], body frame, shape (3,).
         child: Name of the body frame.
     """
-    values = (position, orientation_wxyz, velocity, angular_velocity_body)
-    return _bytes(build_odometry(header(stamp_ns), values, child), _ODOMETRY)
+    w, x, y, z = orientation_wxyz
+    pose = position, (x, y, z, w)
+    twist = rotate((w, -x, -y, -z), velocity), angular_velocity_body
+    covered = (pose, _NO_COVARIANCE), (twist, _NO_COVARIANCE)
+    return pack("nav_msgs/msg/Odometry", header(stamp_ns), child, *covered)
 
 
 def encode_pose(stamp_ns: int, position: Sequence[float], yaw: float) -> bytes:
     """Encode a geometry_msgs/PoseStamped as CDR: `position` [m], world frame, and `yaw` [rad]."""
-    turn = part("geometry_msgs/msg/Quaternion", 0.0, 0.0, sin(yaw / 2), cos(yaw / 2))
-    pose = part("geometry_msgs/msg/Pose", part("geometry_msgs/msg/Point", *position), turn)
-    return _pack("geometry_msgs/msg/PoseStamped", header(stamp_ns), pose)
+    pose = position, (0.0, 0.0, sin(yaw / 2), cos(yaw / 2))
+    return pack("geometry_msgs/msg/PoseStamped", header(stamp_ns), pose)
 
 
 def encode_span(stamp_ns: int, duration: float) -> bytes:
     """Encode a sensor_msgs/TimeReference as CDR: `duration` [s] from time_ref to its stamp."""
-    begin = header(stamp_ns - round(duration * 1e9)).stamp
-    return _pack("sensor_msgs/msg/TimeReference", header(stamp_ns, ""), begin, "")
+    begin, _ = header(stamp_ns - round(duration * 1e9))
+    return pack("sensor_msgs/msg/TimeReference", header(stamp_ns, ""), begin, "")
 
 
 def encode_clock(now_ns: int) -> bytes:
     """Encode a rosgraph_msgs/Clock as CDR: `now_ns` is the time [ns]."""
-    return _pack("rosgraph_msgs/msg/Clock", header(now_ns).stamp)
+    return pack("rosgraph_msgs/msg/Clock", header(now_ns)[0])
 
 
 def frames_of(control: Control, prefix: str = "") -> dict[str, Pose]:
@@ -72,19 +75,16 @@ def frames_of(control: Control, prefix: str = "") -> dict[str, Pose]:
 
 def encode_transforms(stamp_ns: int, poses: Mapping[str, Pose]) -> bytes:
     """Encode a tf2_msgs/TFMessage as CDR: frame -> its pose in `world` at `stamp_ns` [ns]."""
-    transforms = []
-    for frame, (position, (w, x, y, z)) in poses.items():
-        move = part("geometry_msgs/msg/Vector3", *position)
-        turn = part("geometry_msgs/msg/Quaternion", x, y, z, w)
-        transform = part("geometry_msgs/msg/Transform", move, turn)
-        about = header(stamp_ns), frame
-        transforms.append(part("geometry_msgs/msg/TransformStamped", *about, transform))
-    return _pack("tf2_msgs/msg/TFMessage", transforms)
+    transforms = [
+        (header(stamp_ns), frame, (position, (x, y, z, w)))
+        for frame, (position, (w, x, y, z)) in poses.items()
+    ]
+    return pack("tf2_msgs/msg/TFMessage", transforms)
 
 
 def encode_text(text: str) -> bytes:
     """Encode a std_msgs/String as CDR."""
-    return _pack("std_msgs/msg/String", text)
+    return pack("std_msgs/msg/String", text)
 
 
 OK, WARN, ERROR, STALE = range(4)
@@ -102,19 +102,8 @@ class HealthStatus(NamedTuple):
 
 def encode_diagnostics(stamp_ns: int, statuses: Iterable[HealthStatus], robot: str = "") -> bytes:
     """Encode a diagnostic_msgs/DiagnosticArray as CDR; `robot` is the name of the robot."""
-    found = []
-    for level, name, text, values in statuses:
-        pairs = [part("diagnostic_msgs/msg/KeyValue", *pair) for pair in values.items()]
-        found.append(part("diagnostic_msgs/msg/DiagnosticStatus", level, name, text, robot, pairs))
-    return _pack("diagnostic_msgs/msg/DiagnosticArray", header(stamp_ns, ""), found)
-
-
-def _pack(ros_type: str, *values: Any) -> bytes:
-    return _bytes(part(ros_type, *values), ros_type)
-
-
-def _bytes(message: Any, ros_type: str) -> bytes:
-    return bytes(STORE.serialize_cdr(message, ros_type, little_endian=True))
+    found = [(each.level, each.name, each.text, robot, each.values.items()) for each in statuses]
+    return pack("diagnostic_msgs/msg/DiagnosticArray", header(stamp_ns, ""), found)
 
 
 def decode_stamped_twist(data: bytes) -> tuple[int, str, Vector, float]:
@@ -122,7 +111,7 @@ def decode_stamped_twist(data: bytes) -> tuple[int, str, Vector, float]:
 
     Return stamp [ns], frame, linear velocity [m/s], and angular velocity about z [rad/s].
     """
-    message: Any = STORE.deserialize_cdr(data, _STAMPED)
+    message: Any = STORE.deserialize_cdr(data, "geometry_msgs/msg/TwistStamped")
     stamp, twist = message.header.stamp, message.twist
     linear = (twist.linear.x, twist.linear.y, twist.linear.z)
     return (

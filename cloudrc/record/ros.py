@@ -12,16 +12,17 @@ encodes and hashes all types.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
 from operator import attrgetter
 from typing import Any, TypeAlias
 
 import numpy as np
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from cloudrc.messages import Quaternion, Vector
-from cloudrc.record.topics import TOPICS, VIEWS, Kind, Row, Topic, Values
+from cloudrc.record.topics import TOPICS, Kind, Row, Topic, Values
 
 _OURS = "cloudrc_msgs/"
 _ROS_NAMES: dict[Kind, str] = {
@@ -81,38 +82,55 @@ _SECOND_NS = 1_000_000_000
 _ENCAPSULATION = 4
 """Size of the encapsulation header [bytes]; its second byte is 1 in little-endian messages."""
 
-_type: dict[str, Any] = dict(STORE.types)
-_Time, _Header = _type["builtin_interfaces/msg/Time"], _type["std_msgs/msg/Header"]
-_Vector3, _Point, _Quaternion, _Pose, _Twist, _PoseWithCovariance, _TwistWithCovariance = (
-    _type[f"geometry_msgs/msg/{name}"]
-    for name in "Vector3 Point Quaternion Pose Twist PoseWithCovariance TwistWithCovariance".split()
-)
-_Odometry = _type["nav_msgs/msg/Odometry"]
-_NO_COVARIANCE = np.zeros(36)
+Make: TypeAlias = Callable[[Iterable[Any]], Any]
+
+
+def pack(ros_type: str, *values: Any) -> bytes:
+    """Encode the values of a message's fields as little-endian CDR with encapsulation header.
+
+    The value of a field that is a message itself is a tuple with the values of its fields.
+    """
+    return bytes(STORE.serialize_cdr(_maker(ros_type)(values), ros_type, little_endian=True))
+
+
+@cache
+def _maker(ros_type: str) -> Make:
+    """Return a function that makes rosbags' object of a type from the values of its fields."""
+    cls: Any = STORE.types[ros_type]
+    makers = [_maker_of_field(*kind) for _, kind in STORE.fielddefs[ros_type][1]]
+    if not any(makers):
+        return lambda values: cls(*values)
+    return lambda values: cls(
+        *[make(value) if make else value for make, value in zip(makers, values, strict=True)]
+    )
+
+
+def _maker_of_field(kind: Nodetype, detail: Any) -> Make | None:
+    """Return the function for a field that is a message, or a list of messages."""
+    if kind == Nodetype.NAME:
+        return _maker(detail)
+    if kind == Nodetype.SEQUENCE and detail[0][0] == Nodetype.NAME:
+        make = _maker(detail[0][1])
+        return lambda values: [make(value) for value in values]
+    return None
 
 
 def encode(topic: Topic, row: Row) -> bytes:
     """Encode a row as little-endian CDR with encapsulation header."""
-    if pack := _PACKERS[topic.name]:
-        return pack(row)
-    message = _BUILD[topic.name](header(row[0]), row[1:])
-    return bytes(STORE.serialize_cdr(message, topic.ros_type, little_endian=True))
+    if pack_row := _PACKERS[topic.name]:
+        return pack_row(row)
+    values = [_readable(value) if isinstance(value, str) else value for value in row[1:]]
+    return pack(topic.ros_type, header(row[0]), *values)
 
 
-def encode_view(topic: str, *values: Any) -> bytes:
-    """Encode the field values of a message for viewers (topic in `VIEWS`) as little-endian CDR."""
-    message = _type[VIEWS[topic]](*values)
-    return bytes(STORE.serialize_cdr(message, VIEWS[topic], little_endian=True))
+def _readable(text: str) -> str:
+    """Replace what UTF-8 cannot express."""
+    return text if text.isascii() else text.encode("utf-8", "replace").decode()
 
 
-def part(name: str, *values: Any) -> Any:
-    """Make an object of the ROS type `name`, such as "geometry_msgs/msg/Point", from its fields."""
-    return _type[name](*values)
-
-
-def header(stamp_ns: int, frame: str = "world") -> Any:
-    """Make the header of a message from its stamp [ns] and the name of its frame."""
-    return _Header(_Time(*divmod(stamp_ns, _SECOND_NS)), frame)
+def header(stamp_ns: int, frame: str = "world") -> Values:
+    """Return the values of a message's header from its stamp [ns] and the name of its frame."""
+    return divmod(stamp_ns, _SECOND_NS), frame
 
 
 def decode(topic: Topic, data: bytes) -> Row:
@@ -132,7 +150,7 @@ def shifted(data: bytes, offset_ns: int) -> bytes:
     return data[:_ENCAPSULATION] + moved + data[_ENCAPSULATION + stamp.size :]
 
 
-def _rotate(orientation_wxyz: Quaternion, vector: Vector) -> Vector:
+def rotate(orientation_wxyz: Quaternion, vector: Sequence[float]) -> Vector:
     """Rotate a vector from the body frame to the world frame: v + 2 · u x (u x v + w · v).
 
     This is Rodrigues' formula for the unit quaternion (w, u).
@@ -143,20 +161,11 @@ def _rotate(orientation_wxyz: Quaternion, vector: Vector) -> Vector:
     return a + 2 * (y * r - z * q), b + 2 * (z * p - x * r), c + 2 * (x * q - y * p)
 
 
-def build_odometry(header: Any, values: Values, child: str = "base_link") -> Any:
-    """Make a message with pose and, in the frame `child`, twist: the values of a row of a topic."""
-    position, (w, x, y, z), velocity, rates = values
-    pose = _Pose(_Point(*position), _Quaternion(x, y, z, w))
-    twist = _Twist(_Vector3(*_rotate((w, -x, -y, -z), velocity)), _Vector3(*rates))
-    with_pose = _PoseWithCovariance(pose, _NO_COVARIANCE)
-    return _Odometry(header, child, with_pose, _TwistWithCovariance(twist, _NO_COVARIANCE))
-
-
 def _parse_odometry(message: Any) -> Values:
     pose, twist = message.pose.pose, message.twist.twist
     turn = pose.orientation
     wxyz = turn.w, turn.x, turn.y, turn.z
-    return _xyz(pose.position), wxyz, _rotate(wxyz, _xyz(twist.linear)), _xyz(twist.angular)
+    return _xyz(pose.position), wxyz, rotate(wxyz, _xyz(twist.linear)), _xyz(twist.angular)
 
 
 def _xyz(vector: Any) -> Vector:
@@ -173,22 +182,6 @@ _PARSERS: dict[str, _Parse] = {
     "geometry_msgs/msg/PointStamped": lambda message: (_xyz(message.point),),
 }
 """Standard ROS type -> function to decode it; a topic may use only its first fields."""
-_TO_ROS: dict[Kind, Callable[[Any], Any]] = {
-    "int": int,
-    "float": float,
-    "bool": bool,
-    "string": lambda text: text if text.isascii() else text.encode("utf-8", "replace").decode(),
-    "vector": lambda vector: _Vector3(*vector),
-}
-
-
-def _builder(topic: Topic) -> Callable[[Any, Values], Any]:
-    """Return a function that makes a message of cloudrc from its header and a row's values."""
-    cls = _type[topic.ros_type]
-    to_ros = [_TO_ROS[field.kind] for field in topic.fields]
-    return lambda header, values: cls(
-        header, *[turn(value) for turn, value in zip(to_ros, values, strict=True)]
-    )
 
 
 def _parser(topic: Topic) -> _Parse:
@@ -225,7 +218,7 @@ def _odometry_numbers(
     position: Vector, wxyz: Quaternion, velocity: Vector, rates: Vector = _NO_RATES
 ) -> Values:
     w, x, y, z = wxyz
-    twist = *_rotate((w, -x, -y, -z), velocity), *rates
+    twist = *rotate((w, -x, -y, -z), velocity), *rates
     return len("base_link") + 1, b"base_link", *position, x, y, z, w, *twist
 
 
@@ -268,11 +261,11 @@ def _numbers(kinds: Iterable[Kind], values: Values) -> list[Any]:
 
 _PACKERS = {name: _packer(topic) for name, topic in TOPICS.items()}
 _PARSE = {name: _parser(topic) for name, topic in TOPICS.items()}
-_BUILD = {name: _builder(topic) for name, topic in TOPICS.items() if not _PACKERS[name]}
 
 # What the writing thread needs is made on import: rosbags takes milliseconds for each type, and in
 # flight the thread would block the loop for that time.
 for _name in _NAMES:
     definition(_name), type_hash(_name)
-for _name in _BUILD:
-    STORE.get_msgdef(TOPICS[_name].ros_type)
+for _name, _pack in _PACKERS.items():
+    if not _pack:
+        STORE.get_msgdef(TOPICS[_name].ros_type)

@@ -14,7 +14,8 @@ import numpy as np
 from cloudrc.geometry.scene import Tube
 from cloudrc.geometry.shapes import Shapes, Surface
 from cloudrc.geometry.tubes import wall
-from cloudrc.record.ros import encode_view, header, part
+from cloudrc.record.ros import header, pack
+from cloudrc.record.topics import VIEWS
 
 _Colour: TypeAlias = tuple[float, float, float, float]
 MarkerShape: TypeAlias = tuple[Any, ...]
@@ -57,7 +58,7 @@ def encode_markers(stamp_ns: int, shapes: Iterable[MarkerShape]) -> bytes:
     With the stamp 0, RViz uses the newest poses of the frames.
     """
     markers = [_marker(number, stamp_ns, *shape) for number, shape in enumerate(shapes)]
-    return encode_view("/scene", markers)
+    return pack(VIEWS["/scene"], markers)
 
 
 def _marker(
@@ -70,24 +71,16 @@ def _marker(
     colour: _Colour,
     points: Iterable[Any] = (),
 ) -> Any:
-    """Make a ROS marker at the origin of `frame`; `size` and `points`, shape (n, 3), in [m]."""
-    point, none = "geometry_msgs/msg/Point", np.zeros(0, np.uint8)
-    pose = part(
-        "geometry_msgs/msg/Pose",
-        part(point, 0.0, 0.0, 0.0),
-        part("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
-    )
-    forever = part("builtin_interfaces/msg/Duration", 0, 0)
-    picture = part("sensor_msgs/msg/CompressedImage", header(0, ""), "", none)
-    mesh = part("visualization_msgs/msg/MeshFile", "", none)
-    about = header(stamp_ns, frame), name, number, kind, 0, pose
-    look = part("geometry_msgs/msg/Vector3", *(size,) * 3), part("std_msgs/msg/ColorRGBA", *colour)
-    corners = [part(point, *xyz) for xyz in np.asarray(points, np.float32).tolist()]
-    return part(
-        "visualization_msgs/msg/Marker",
-        *(*about, *look, forever, True, corners, []),
-        *("", picture, [], "", "", mesh, False),  # no texture, text or mesh
-    )
+    """Return the values of a ROS marker at the origin of `frame`.
+
+    `size` and `points`, shape (n, 3), are in [m].
+    """
+    none, still = np.zeros(0, np.uint8), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    about = header(stamp_ns, frame), name, number, kind, 0, still, (size, size, size), colour
+    corners = np.asarray(points, np.float32).reshape(-1, 3).tolist()
+    picture = header(0, ""), "", none
+    # Shown for ever, moving with its frame; no colours of corners, no texture, text or mesh.
+    return *about, (0, 0), True, corners, [], "", picture, [], "", "", ("", none), False
 
 
 def _solid(name: str, frame: str, surface: Surface, colour: _Colour) -> MarkerShape:

@@ -20,7 +20,8 @@ from cloudrc.metrics.flight import Array, Columns, Flight, select
 from cloudrc.record.columns import Recording
 from cloudrc.record.content import Message
 from cloudrc.record.live import encode_transforms
-from cloudrc.record.ros import encode_view
+from cloudrc.record.ros import pack
+from cloudrc.record.topics import VIEWS
 from cloudrc.report.flown import flight_of, flown_shapes
 from cloudrc.report.markers import encode_markers, path_shape, scene_shapes
 
@@ -82,4 +83,4 @@ def _errors(topic: str, stamps_ns: Array, errors: Array) -> Iterator[Message]:
     thin = _thin({"stamp_ns": stamps_ns, "error": errors})
     sizes = np.linalg.norm(thin["error"], axis=1).astype(np.float32).tolist()
     for stamp_ns, size in zip(thin["stamp_ns"].tolist(), sizes, strict=True):
-        yield topic, stamp_ns, encode_view(topic, size)
+        yield topic, stamp_ns, pack(VIEWS[topic], size)
