@@ -20,8 +20,8 @@ SENT = {"uplink": "/telemetry", "downlink": "/delay_estimate"}
 SENDER = {"uplink": "world", "downlink": "cloud"}
 """Direction -> the end that sends in this direction."""
 WINDOW_MAX = 1024
-"""A missing datagram counts as lost after this number of newer datagrams; the receiver refuses an
-older one, whether it is new or repeated (`cloudrc.tunnel.channel.WINDOW`)."""
+"""A missing datagram counts as lost after this number of newer datagrams; the receiver accepts
+no older one, whether it is new or repeated (`cloudrc.tunnel.channel.WINDOW`)."""
 PERCENTILES = {"p50": "median", "p99": "99th percentile", "p999": "99.9th percentile"}
 COUNTS = {
     "relay_overflow": "that the relay dropped because its queue was full.",

@@ -68,15 +68,15 @@ def _finish_delay(axes: Axes, subject: Subject, label: str) -> None:
     """Complete a panel of delays; its axis leaves out what is far above the others."""
     drawn = np.concatenate([np.zeros(1), *(line.get_ydata() for line in axes.lines)])
     axes.set_ylim(0.0, max(MARGIN * float(np.nanpercentile(drawn, 99.5)), 1.0))
-    _finish(axes, subject, label, 4)
+    _finish(axes, subject, label)
 
 
-def _finish(axes: Axes, subject: Subject, label: str, columns: int) -> None:
+def _finish(axes: Axes, subject: Subject, label: str) -> None:
     """Complete a panel over time: marks of events, labels of the axes, legend."""
     mark_events(axes, subject)
     _time_axis(axes, subject)
     axes.set_ylabel(label)
-    legend_above(axes, columns)
+    legend_above(axes)
 
 
 def _time_axis(axes: Axes, subject: Subject) -> None:
@@ -126,7 +126,7 @@ def draw_odom(subject: Subject) -> Figure:
         axes.sharex(rows[-1])
         axes.tick_params(labelbottom=False)
     _time_axis(rows[-1], subject)
-    legend_above(rows[0], 3)
+    legend_above(rows[0])
     figure.align_ylabels(rows)
     if step:
         index, begin = step
@@ -135,10 +135,10 @@ def draw_odom(subject: Subject) -> Figure:
     return figure
 
 
-def _draw_position(axes: Axes, subject: Subject, index: int) -> None:
-    """Draw the position along one axis of the world, 0 to 2."""
+def _draw_position(axes: Axes, subject: Subject, index: int, rows: Any = slice(None)) -> None:
+    """Draw `rows` of the position along one axis of the world, 0 to 2."""
     for column, look in LINES.items():
-        axes.plot(subject.times, subject.flight.control[column][:, index], **look)
+        axes.plot(subject.times[rows], subject.flight.control[column][rows, index], **look)
 
 
 def _largest_step(subject: Subject, count: int) -> tuple[int, float] | None:
@@ -155,13 +155,9 @@ def _largest_step(subject: Subject, count: int) -> tuple[int, float] | None:
 
 
 def _draw_step(axes: Axes, subject: Subject, index: int, begin: float) -> None:
-    """Enlarge the measured and the estimated position of an axis from `begin` [s] on."""
-    _draw_position(axes, subject, index)
-    control, time = subject.flight.control, subject.times
-    inside = (time >= begin) & (time <= begin + ZOOM)
-    shown = np.concatenate([control[name][inside, index] for name in ("measured", "position")])
-    room = 0.1 * np.ptp(shown) + 1e-3
-    axes.set(xlim=(begin, begin + ZOOM), ylim=(shown.min() - room, shown.max() + room))
+    """Enlarge the position along an axis from `begin` [s] on."""
+    rows = (subject.times >= begin) & (subject.times <= begin + ZOOM)
+    _draw_position(axes, subject, index, rows)
     axes.locator_params(nbins=4, axis="x")
     axes.set_xlabel("time (s)")
 
@@ -187,14 +183,14 @@ def draw_error(subject: Subject) -> Figure:
         look = LINES[column] | {"label": f"{LINES[column]['label']}{_rms(error, 'm', 1.0)}"}
         tracking.plot(subject.times, np.linalg.norm(error, axis=1), **look)
     tracking.set_ylim(bottom=0.0)
-    _finish(tracking, subject, "distance to reference (m)", 2)
+    _finish(tracking, subject, "distance to reference (m)")
 
     panel(accuracy, "b")
     _, instants_ns, error = prediction_errors(flight)
     time, distance = flight.seconds(instants_ns), np.linalg.norm(error, axis=1) * 1e3
     dots(accuracy, time, distance, style.SKY, f"each command{_rms(error, 'mm', 1e3)}")
     accuracy.set_ylim(bottom=0.0)
-    _finish(accuracy, subject, "distance to truth (mm)", 2)
+    _finish(accuracy, subject, "distance to truth (mm)")
     return figure
 
 

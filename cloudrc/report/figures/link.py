@@ -81,7 +81,7 @@ def _draw_delay(axes: Axes, way: DirectionSample, top: float) -> None:
     axes.set_ylim(-0.09 * top, top)
     axes.set_xlabel("time since the link started (s)")
     axes.set_ylabel("one-way delay (ms)")
-    legend_above(axes, 4)
+    legend_above(axes)
 
 
 def _draw_blackouts(axes: Axes, way: DirectionSample, duration: float) -> None:
@@ -105,4 +105,4 @@ def _draw_tail(axes: Axes, ways: Sequence[DirectionSample]) -> None:
     axes.set_xlim(left=0.0)
     axes.set_xlabel("one-way delay (ms)")
     axes.set_ylabel("share with more delay")
-    legend_above(axes, 4)
+    legend_above(axes)

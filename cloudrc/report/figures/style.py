@@ -32,10 +32,9 @@ RC: dict[Any, Any] = {
     "font.family": "serif",  # the first one is shipped with matplotlib, the others for an SVG
     "font.serif": ["STIXGeneral", "STIX Two Text", "Times New Roman", "Times"],
     "mathtext.fontset": "stix",
-    **dict.fromkeys(("axes.titlesize", "axes.labelsize"), "medium"),
+    "axes.titlesize": "medium",
     **dict.fromkeys(("axes.linewidth", "xtick.major.width", "ytick.major.width"), 0.6),
     **dict.fromkeys(("xtick.major.size", "ytick.major.size"), 3.0),
-    **dict.fromkeys(("xtick.direction", "ytick.direction"), "out"),
     **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
     **dict.fromkeys(("axes.grid", "axes.axisbelow"), True),
     "grid.linewidth": 0.5,
@@ -47,7 +46,6 @@ RC: dict[Any, Any] = {
     **{"svg.fonttype": "none", "pdf.fonttype": 42},  # text stays text
     "svg.hashsalt": "cloudrc",  # the same flight gives an identical file
     "savefig.dpi": 200,
-    "figure.dpi": 100,
 }
 """Settings of matplotlib for figures of any size."""
 
@@ -82,13 +80,13 @@ def panel(axes: Axes, letter: str, title: str = "") -> None:
     axes.set_title(f"({letter}) {title}".rstrip(), loc="left")
 
 
-def legend_above(axes: Axes, columns: int) -> None:
-    """Draw the legend of a panel, if there is one, above the panel in `columns` columns."""
+def legend_above(axes: Axes) -> None:
+    """Draw the legend of a panel, if there is one, above the panel."""
     if axes.get_legend_handles_labels()[0]:
         axes.legend(
             loc="lower right",
             bbox_to_anchor=(1.0, 1.0),
-            ncols=columns,
+            ncols=4,
             columnspacing=1.0,
             handletextpad=0.4,
         )
