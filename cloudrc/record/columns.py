@@ -55,25 +55,15 @@ class Table:
         Without columns, the table has no rows.
         """
         kinds = [("stamp_ns", "int"), *((field.name, field.kind) for field in topic.fields)]
-        self.columns: dict[str, Column] = {}
+        self.columns: dict[str, Column] = {}  # `stamp_ns` first
         for (name, kind), values in zip(kinds, chain(columns, repeat(())), strict=False):
             self.columns[name] = _column(kind, values)
-        self.topic = topic
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the columns, `stamp_ns` first."""
-        return tuple(self.columns)
 
     def __len__(self) -> int:
         return len(self.columns["stamp_ns"])
 
     def __getitem__(self, name: str) -> Column:
-        try:
-            return self.columns[name]
-        except KeyError:
-            known = ", ".join(self.names)
-            raise KeyError(f"no column {name!r} in {self.topic.name}; it has: {known}") from None
+        return self.columns[name]
 
 
 def _column(kind: Kind, values: Any) -> Column:
@@ -137,8 +127,8 @@ class Recording(Content):
             mixed = topic.end == "either"
             rows = np.argsort(table["stamp_ns"], kind="stable") if mixed else slice(None)
             total.update(f"{topic.name} {len(table)}\n".encode())
-            for name in table.names:
-                column = table[name][rows]
+            for name, values in table.columns.items():
+                column = values[rows]
                 if column.dtype == object:
                     known = {text: text.encode("utf-8", "replace") for text in {*column}}
                     total.update(repr([known[text] for text in column]).encode())
@@ -163,8 +153,6 @@ class Recording(Content):
 
     def __getitem__(self, topic: str) -> Table:
         if topic not in self._tables:
-            if topic not in TOPICS:
-                raise KeyError(f"no topic {topic!r}; there are: {', '.join(TOPICS)}")
             known = self.records.table(TOPICS[topic]) if self.records else self._decode(topic)
             self._tables[topic] = known
         return self._tables[topic]
@@ -245,7 +233,7 @@ class RecordStore:
             self._convert(kind)
         if not (blocks := self._blocks[topic.name]):
             return Table(topic, ())
-        columns = [np.concatenate([block[name] for block in blocks]) for name in blocks[0].names]
+        columns = [np.concatenate([block[name] for block in blocks]) for name in blocks[0].columns]
         if topic.end == "either" or topic.also:  # in the order of time, world's row first
             order = np.argsort(columns[0], kind="stable")
             columns = [column[order] for column in columns]

@@ -152,9 +152,9 @@ class McapWriter:
         """Note in words what is missing from the file, and the times of the missing messages."""
         self.note({MISSING: text} | to_metadata(holes))
 
-    def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
+    def attach(self, name: str, data: bytes) -> None:
         """Attach a file, such as report.json, to the recording."""
-        self._mcap.add_attachment(0, self._latest_ns, name, media_type, data)
+        self._mcap.add_attachment(0, self._latest_ns, name, "application/octet-stream", data)
 
     def flush(self) -> None:
         """Complete the present chunk and pass it to the operating system."""

@@ -12,7 +12,6 @@ import pytest
 from cloudrc.assembly import assemble, build_cloud, build_links, build_world, start_mission
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.virtual import VirtualRun
-from cloudrc.messages import Passed
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.runs.flight import fly_in_memory
 from cloudrc.tunnel.codec import DecodeError
@@ -74,15 +73,6 @@ def test_who_watches_cloud_sees_the_telemetry_that_it_uses_and_changes_nothing()
     used = arrivals["used"].astype(bool)
     assert seen == [*zip(arrivals["epoch"][used], arrivals["counter"][used], strict=True)]
     assert recording.sha256 == digest(experiment)
-
-
-def test_a_link_that_damages_datagrams_gets_bytes():
-    damaging = short("link.downlink.corrupt=0.2", "link.profile=ideal")
-    for experiment, kind in ((short(), Passed), (damaging, bytes)):
-        world, _, _, run = assemble(experiment)
-        run.fly(lambda: False, 200_000_000, lambda of_world, of_cloud: None)
-        world.handle_deadline(world.next_deadline_ns())
-        assert {type(data) for data in world.take_datagrams()} == {kind}
 
 
 def watch_damage(link, session):

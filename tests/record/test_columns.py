@@ -4,7 +4,6 @@ import hashlib
 import struct
 from operator import attrgetter
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,14 +11,6 @@ from cloudrc import records as rec
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.record.topics import ADDED, TOPICS
 from tests.record.conftest import MS, any_record, assert_equal, cloud_records, world_records, write
-
-
-def test_the_error_for_an_unknown_name_lists_known_names():
-    recording = Recording.from_records([])
-    with pytest.raises(KeyError, match="no topic '/odometri'; there are: /odometry, /telemetry"):
-        recording["/odometri"]
-    with pytest.raises(KeyError, match="no column 'x' in /guard; it has: stamp_ns, state, cause"):
-        recording["/guard"]["x"]
 
 
 @given(st.lists(any_record(), max_size=12))
