@@ -83,19 +83,16 @@ def _waypoints_reached(flight: Flight) -> float | None:
 
     None if messages are lost and the others do not prove all waypoints.
     """
-    count = _count_reached(flight)
-    wanted = 1 if flight.mission.setpoints else flight.waypoints
-    return None if flight.holes and (count or 0.0) < wanted else count
-
-
-def _count_reached(flight: Flight) -> float | None:
     stamps, points = reported(flight), flight.mission.waypoints
     if flight.mission.steps:  # they end after their time, anywhere
-        return flight.count(len(stamps))
-    if flight.mission.setpoints is not None:
-        return flight.count(len(stamps) and missed_end(flight) is None)
-    known = (i for i in stamps if i < len(points))
-    return flight.count(sum(_stay(flight, points[i], stamps[i])[0] for i in known))
+        count = len(stamps)
+    elif flight.mission.setpoints is not None:
+        count = int(bool(stamps) and missed_end(flight) is None)
+    else:
+        known = (i for i in stamps if i < len(points))
+        count = sum(_stay(flight, points[i], stamps[i])[0] for i in known)
+    wanted = 1 if flight.mission.setpoints else flight.waypoints
+    return None if flight.holes and count < wanted else flight.count(count)
 
 
 def _yaw_error(flight: Flight) -> float | None:

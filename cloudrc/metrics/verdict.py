@@ -215,7 +215,7 @@ def flight_evidence(
     `real_time` is True if the run had to keep real time: in all modes except virtual. `interrupted`
     is True if the run was stopped.
     """
-    criteria, end_ns = flight.criteria, flight.end_ns
+    recording, end_ns = flight.recording, flight.end_ns
     reached, touch = numbers.get("waypoints_reached"), None
     if row := first_touch(flight):
         speed = float(np.linalg.norm(row["touch_velocity"]))
@@ -226,19 +226,13 @@ def flight_evidence(
         wanted=flight.mission.touch,
         ending=_ending(flight, interrupted),
         end=UNKNOWN if end_ns is None else _moment(flight, end_ns),
-        time_limit=criteria.time_limit_s or inf,
+        time_limit=flight.criteria.time_limit_s or inf,
         touch=touch,
         violations=tuple(_violations(flight)),
         slow=_not_real_time(numbers) if real_time else "",
-        lost=_lost(flight),
+        lost=describe(recording.holes, flight.seconds) or recording.note,
         unconfirmed=unconfirmed(flight),
     )
-
-
-def _lost(flight: Flight) -> str:
-    """Describe what the recording of a flight has lost; "" if nothing."""
-    recording = flight.recording
-    return describe(recording.holes, flight.seconds) or recording.note
 
 
 def _violations(flight: Flight) -> Iterator[FlightFailure]:
