@@ -65,7 +65,7 @@ def _draw_view(axes: Axes, subject: Subject, sides: tuple[int, int]) -> ScalarMa
     for number, waypoint in enumerate(subject.flight.mission.waypoints, start=1):
         x, y = (waypoint.position_m[side] for side in sides)
         axes.plot(x, y, "o", ms=8, mfc="white", mec=BLACK, mew=0.8, zorder=5)
-        axes.plot(x, y, marker=f"${number}$", ms=4, mew=0.2, color=BLACK, zorder=6)
+        axes.text(x, y, str(number), size="x-small", ha="center", va="center", zorder=6)
     _draw_obstacles(axes, subject, sides)
     path = _draw_path(axes, subject, subject.flight.truth["position"][:, sides])
     axes.margins(MARGIN)
