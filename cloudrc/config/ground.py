@@ -9,8 +9,6 @@ from cloudrc.config.schema import GROUND, MissionConfig
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Vector
 
-ABOVE = "but the robot stays on the ground"
-"""Part of the messages about missions that lead off the ground."""
 SAME = 1e-6
 """Largest difference from the height of the spawn [m]."""
 
@@ -30,22 +28,15 @@ def put_on_ground(mission: MissionConfig, scene: Scene) -> MissionConfig:
     return mission.model_copy(update={"waypoints": placed})
 
 
-def check_heights(mission: MissionConfig, scene: Scene) -> list[ConfigProblem]:
-    """List what leads a robot off the ground, each with its path inside the mission."""
-    return list(_heights(mission, scene.spawn[2]))
-
-
-def _heights(mission: MissionConfig, height: float) -> Iterator[ConfigProblem]:
-    steps = mission.steps
+def check_heights(mission: MissionConfig, scene: Scene) -> Iterator[ConfigProblem]:
+    """Yield what leads a robot off the ground, with its path inside the mission."""
+    steps, height = mission.steps, scene.spawn[2]
+    ground = f"but the robot stays on the ground, at {height:g}"
     if steps is not None and (steps.range_m[2] or abs(steps.centre_m[2] - height) > SAME):
-        reason = (
-            f"have heights, {ABOVE}; set range_m to [x, y, 0] and the third number of centre_m to "
-            f"{height:g}, or give waypoints"
-        )
-        yield ConfigProblem(("steps",), "", reason)
+        yield ConfigProblem(("steps",), "", f"have heights, {ground}")
     for index, waypoint in enumerate(mission.waypoints):
         if abs(waypoint.position_m[2] - height) > SAME:
             path = ("waypoints", str(index), "position_m")
             shown = f"[{', '.join(f'{value:g}' for value in waypoint.position_m)}]"
-            yield ConfigProblem(path, shown, f"has a height, {ABOVE}; give two numbers, x and y")
+            yield ConfigProblem(path, shown, f"has a height, {ground}; give two numbers, x and y")
             return

@@ -18,17 +18,12 @@ WHY: dict[Heading, str] = {
 
 
 def check_yaws(mission: MissionConfig, heading: Heading) -> Iterator[ConfigProblem]:
-    """Yield each yaw that the robot would not obey, and each tolerance without a yaw."""
+    """Yield each yaw that the robot would not obey."""
     for index, waypoint in enumerate(mission.waypoints):
-        path, yaw = ("waypoints", str(index)), waypoint.yaw_deg
-        if yaw is None:
-            if waypoint.yaw_tolerance_deg is not None:
-                shown = f"{waypoint.yaw_tolerance_deg:g}"
-                reason = "is the tolerance of yaw_deg; give the waypoint a yaw_deg, or delete it"
-                yield ConfigProblem((*path, "yaw_tolerance_deg"), shown, reason)
-        elif heading in WHY and not _is_held(yaw, heading):
+        yaw = waypoint.yaw_deg
+        if yaw is not None and heading in WHY and (heading, yaw) != ("fixed", 0.0):
             reason = f"{WHY[heading]}; leave it out, or choose another robot, such as x2"
-            yield ConfigProblem((*path, "yaw_deg"), f"{yaw:g}", reason)
+            yield ConfigProblem(("waypoints", str(index), "yaw_deg"), f"{yaw:g}", reason)
 
 
 def without_held_yaws(mission: MissionConfig, heading: Heading) -> MissionConfig:
@@ -38,7 +33,3 @@ def without_held_yaws(mission: MissionConfig, heading: Heading) -> MissionConfig
     kept = {"yaw_deg": None, "yaw_tolerance_deg": None}
     waypoints = tuple(waypoint.model_copy(update=kept) for waypoint in mission.waypoints)
     return mission.model_copy(update={"waypoints": waypoints})
-
-
-def _is_held(yaw: float, heading: Heading) -> bool:
-    return heading == "fixed" and yaw == 0.0

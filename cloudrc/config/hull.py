@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from cloudrc import plugins
-from cloudrc.config.robot import RobotFiles, known_robot
+from cloudrc.config.robot import RobotFile, known_robot
 from cloudrc.config.shipped import ROBOT_FILE
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry.clearance import Spheres, ball
@@ -47,20 +47,20 @@ def doubts(name: str) -> Iterator[str]:
     from cloudrc.sim.bodies import reach_of
 
     robot = known_robot(name)
-    if robot.hull is None or robot.hull_points is not None:
+    if robot.hull_m is None or robot.hull_points is not None:
         return
     with naming(f"robot {name}"):
         reach = reach_of(robot.model)
-    if robot.hull < reach - TOLERANCE:
-        text = f"hull_m is {robot.hull:g}, but the geoms reach {reach:.3f} m from the base"
+    if robot.hull_m < reach - TOLERANCE:
+        text = f"hull_m is {robot.hull_m:g}, but the geoms reach {reach:.3f} m from the base"
         yield f"{name}/{ROBOT_FILE}: {text}"
 
 
-def _read_hull(name: str, robot: RobotFiles) -> Spheres:
+def _read_hull(name: str, robot: RobotFile) -> Spheres:
     if robot.hull_points is not None:
         return _spheres(plugins.find("hull", robot.hull_points, look=False))
-    if robot.hull is not None:
-        return ball(robot.hull)
+    if robot.hull_m is not None:
+        return ball(robot.hull_m)
     from cloudrc.sim.bodies import reach_of
 
     with naming(f"robot {name}"):

@@ -7,7 +7,6 @@ error lists all problems of an experiment, each with its file and line.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from math import inf
@@ -15,16 +14,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from pydantic import (
-    ValidationError,
-)
-
 from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
-from cloudrc.config.ground import ABOVE, put_on_ground
+from cloudrc.config.ground import put_on_ground
 from cloudrc.config.heading import without_held_yaws
 from cloudrc.config.hull import hull_of
-from cloudrc.config.mission_check import UNREACHED, check_mission, check_reach, check_scene
+from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.profile import (
@@ -45,7 +40,8 @@ from cloudrc.config.resolved import (
     ResolvedExperiment,
     speed_cap,
 )
-from cloudrc.config.robot import DEFAULT_LIMITS, known_robot, parameters
+from cloudrc.config.robot import DEFAULT_LIMITS, known_robot
+from cloudrc.config.robot import facts as facts_of
 from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import (
     Cloud,
@@ -59,6 +55,16 @@ from cloudrc.link.traces import read_trace
 from cloudrc.outside.document import Document, KeyPath, read_document
 from cloudrc.outside.reuse import reuse, reuse_results
 
+_NO_BOUNDS = Bounds(DEFAULT_LIMITS.model_copy(update={"acceleration_max_mps2": inf}), inf)
+"""Bounds of a flight that is over: it had the limits that its file gives."""
+_NAMES: dict[KeyPath, Any] = {
+    ("mission",): Experiment().mission,
+    **{("world", key): getattr(World(), key) for key in ("robot", "scene")},
+    **{("cloud", key): getattr(Cloud(), key) for key in overrides.KINDS},
+}
+"""Key path of a name -> value in place of null."""
+_SECTIONS = ("world", "guard", "link", "cloud", "report")
+"""Sections that may be null, and get values."""
 _PROFILE_KEYS = {("link",), ("link", "profile")}
 """If a setting gives one of these keys, it replaces the whole link profile."""
 
@@ -79,17 +85,45 @@ def load_experiment(
     BadInputError that lists the experiment's problems.
     """
     name = str(name)
-    document = shipped.read("experiment", name, Path())
+    document, found = _combine(name, settings, build=build, flown=flown)
+    lost = _resolve_paths(document)
+    draft = problems.validate(document, Experiment, name, found if flown else found + lost)
+    guard, facts = draft.guard, None
+    if flown and guard.speed_max_mps and guard.acceleration_max_mps2:
+        bounds = _NO_BOUNDS
+    else:
+        with problems.collect(found, ("world", "scene")):
+            bounds = _bounds(draft)
+        with problems.collect(found, ("world", "tuning")):
+            facts = facts_of(draft.world, guard.acceleration_max_mps2)
+        problems.raise_problems(document, found, name)
+    if build and facts:
+        found += overrides.complete_plugins(document, draft.cloud, facts)
+    else:
+        overrides.name_plugins(document, draft.cloud)
+    experiment = problems.validate(document, ResolvedExperiment, name, found, context=bounds)
+    return experiment if flown else _judge(document, experiment, name)
+
+
+def _combine(
+    name: str, settings: Iterable[str] | Settings, *, build: bool, flown: bool
+) -> tuple[Document, list[ConfigProblem]]:
+    """Read an experiment, apply settings, and replace the names of mission and profile.
+
+    Also return the problems of these two.
+    """
+    document, found = shipped.read("experiment", name, Path()), list[ConfigProblem]()
     changes = settings if isinstance(settings, dict) else overrides.parse_settings(settings)
     inner = {path: value for path, value in changes.items() if _is_inside_name(path)}
     _default(document, ("name",), Path(name).stem)
-    if _has_all_values(document) and not flown:
-        _remove_derived(document, new_profile=bool(changes.keys() & _PROFILE_KEYS))
+    if changes and _has_all_values(document) and not flown:
+        _remove_derived(document, name, new_profile=bool(changes.keys() & _PROFILE_KEYS))
     outer = {path: value for path, value in changes.items() if path not in inner}
     overrides.apply_overrides(document, outer, build=build)
-    for key in ("world", "guard", "link", "cloud", "report"):
+    for key in _SECTIONS:
         _default(document, (key,), {})
-    found: list[ConfigProblem] = []
+    for path, name in _NAMES.items():
+        _default(document, path, name)
     with problems.collect(found, ("mission",)):
         _inline_mission(document)
     with problems.collect(found, ("link", "profile")):
@@ -97,51 +131,22 @@ def load_experiment(
     _take_contact(document)
     overrides.apply_overrides(document, inner)
     _default(document, ("guard", "plan_max_s"), _plan_max(document))
-    for key in overrides.KINDS:
-        _default(document, ("cloud", key), getattr(Cloud(), key))
-    _keep_setpoints(document, inner)
+    if ("mission", "setpoints") in inner and document.get("mission", "setpoints"):
+        for key in {"waypoints", "steps", "carrot", "touch"} - {path[1] for path in inner}:
+            document.tree["mission"].pop(key, None)
     if isinstance(names := document.get("report", "metrics"), str):  # one metric without a list
         document.tree["report"]["metrics"] = [names]
-    lost = _resolve_paths(document)
-    found += overrides.resolve_plugins(document, build=build)
-    if flown:
-        bounds = _no_bounds(document) or _bounds(document, [])
-    else:
-        found += lost
-        bounds = _bounds(document, found)
-    experiment = problems.validate(
-        document, ResolvedExperiment, name, found, described=Experiment, context=bounds
-    )
-    return experiment if flown else _judge(document, experiment, name)
+    return document, found
 
 
 def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> ResolvedExperiment:
-    """Complete an experiment with what depends on its scene and robot.
-
-    Raise a BadInputError if the mission does not fit.
-    """
-    mission = experiment.mission
-    scene = scene_of(experiment.world)
-    robot, found = known_robot(experiment.world.robot), list[ConfigProblem]()
-    with problems.collect(found, ("world", "tuning")):
-        parameters(robot, experiment.world)
-    found += _without_effect(document, experiment)
-    mission = put_on_ground(mission, scene) if robot.planar else mission
-    fit = _check_fit(mission, experiment.world)
-    if fit and (other := _other_command(fit[0], experiment.world)):
-        found, fit = [], [fit[0]._replace(reason=f"{fit[0].reason}; this flies: {other}")]
-    found += [_blame_scene(document, each) for each in fit]
+    """Check that the mission fits the scene and the robot, and complete it with what they give."""
+    mission, robot = experiment.mission, known_robot(experiment.world.robot)
+    mission = put_on_ground(mission, scene_of(experiment.world)) if robot.planar else mission
+    found = [*_without_effect(document, experiment), *_check_fit(mission, experiment.world)]
     problems.raise_problems(document, found, name)
     mission = without_held_yaws(mission, robot.heading)
     return experiment.model_copy(update={"mission": mission})
-
-
-def _other_command(problem: ConfigProblem, world: World) -> str:
-    """Return a command that flies a robot for which a mission does not fit; "" if unknown."""
-    setting = f"--set world.robot={world.robot}"
-    if problem.reason == UNREACHED and "fast" in known_robot(world.robot).tunings:
-        return f"cloudrc run fast {setting} --set mission=legs"
-    return f"cloudrc run pillars {setting}" if ABOVE in problem.reason else ""
 
 
 def _without_effect(document: Document, experiment: ResolvedExperiment) -> Iterator[ConfigProblem]:
@@ -158,16 +163,6 @@ def _without_effect(document: Document, experiment: ResolvedExperiment) -> Itera
                 yield ConfigProblem(path, str(document.get(*path)), text)
 
 
-def _blame_scene(document: Document, problem: ConfigProblem) -> ConfigProblem:
-    """Name the scene of a setting, if the mission that does not fit it is of no setting."""
-    scene = ("world", "scene")
-    if problem.path[0] != "mission" or not document.source(scene).is_setting:
-        return problem
-    if document.source(problem.path).is_setting:
-        return problem
-    return ConfigProblem(scene, str(document.get(*scene)), f"does not fit: {problem}")
-
-
 def _check_fit(mission: MissionConfig, world: World) -> list[ConfigProblem]:
     """List the problems of a mission in a scene, with their paths in the experiment."""
     robot, scene = known_robot(world.robot), scene_of(world)
@@ -177,8 +172,6 @@ def _check_fit(mission: MissionConfig, world: World) -> list[ConfigProblem]:
         if above := check_scene(scene, size, touch=mission.touched, planar=robot.planar):
             return above
         wrong = check_mission(mission, scene, size, planar=robot.planar, heading=robot.heading)
-        if not wrong and robot.probe is None:
-            wrong = check_reach(mission, scene, size)
         return [problem._replace(path=("mission", *problem.path)) for problem in wrong]
 
     key = "mission", mission.model_dump_json(), world.scene, world.fence_m, world.robot
@@ -248,22 +241,12 @@ def _default(document: Document, path: KeyPath, value: Any) -> None:
 
 def _inline_mission(document: Document) -> None:
     """Replace the name of the mission by the content of the mission's file."""
-    _default(document, ("mission",), Experiment().mission)
     name = document.tree["mission"]
     if isinstance(name, str):
         file = shipped.read("mission", name, document.source(("mission",)).folder)
         problems.validate(file, MissionConfig, name)
         document.tree["mission"] = file.tree
         document.sources |= {("mission", *key): source for key, source in file.sources.items()}
-
-
-def _keep_setpoints(document: Document, changes: Settings) -> None:
-    """Remove what setpoints replace if one of the `changes` gives them to the mission."""
-    if ("mission", "setpoints") not in changes or not document.get("mission", "setpoints"):
-        return
-    has_touch = any(path[:2] == ("mission", "touch") for path in changes)
-    for key in ("waypoints", "steps", "carrot", *([] if has_touch else ["touch"])):
-        document.tree["mission"].pop(key, None)
 
 
 def _take_contact(document: Document) -> None:
@@ -284,18 +267,17 @@ def _inline_profile(document: Document) -> None:
     name = document.get("link", "profile")
     if not isinstance(name, str):
         return
-    if _has_all_values(document):
-        if any(document.get(*path) is None for path in _implied(Profile())):  # set to null again
-            _default_all(document, _implied(_present_profile(document)))
-        return
-    source = document.source(("link", "profile"))
-    file = shipped.read("profile", name, source.folder)
-    profile = problems.validate(file, Profile, name)
-    if shipped.is_path(name):
-        document.set_value(("link", "profile"), str(source.absolute(name)), source)
-    for way in DIRECTIONS:
-        _inline_direction(document, way, file)
-    _default_all(document, _implied(profile))
+    profile = _present_profile(document)
+    if not _has_all_values(document):
+        source = document.source(("link", "profile"))
+        file = shipped.read("profile", name, source.folder)
+        profile = problems.validate(file, Profile, name)
+        if shipped.is_path(name):
+            document.set_value(("link", "profile"), str(source.absolute(name)), source)
+        for way in DIRECTIONS:
+            _inline_direction(document, way, file)
+    for path, value in _implied(profile).items():
+        _default(document, path, value)
 
 
 def _inline_direction(document: Document, way: str, profile: Document) -> None:
@@ -312,11 +294,6 @@ def _inline_direction(document: Document, way: str, profile: Document) -> None:
         if key[:1] == (way,) and not (key[1:2] and key[1] in own)
     }
     document.sources = inserted | kept | document.sources
-
-
-def _default_all(document: Document, values: dict[KeyPath, float]) -> None:
-    for path, value in values.items():
-        _default(document, path, value)
 
 
 def _present_profile(document: Document) -> Profile:
@@ -349,51 +326,33 @@ def _plan_max(document: Document) -> float:
     return PLAN_MAX_S if isinstance(plan, float | int) and plan > 0 else 0.0
 
 
-def _no_bounds(document: Document) -> Bounds | None:
-    """Return bounds that allow the limits that the file gives; None if it does not give all."""
-    speed, acceleration = (
-        document.get("guard", key) for key in ("speed_max_mps", "acceleration_max_mps2")
-    )
-    if not isinstance(speed, int | float) or not isinstance(acceleration, int | float):
-        return None
-    return Bounds(DEFAULT_LIMITS.model_copy(update={"acceleration_max_mps2": inf}), inf)
+def _bounds(draft: Experiment) -> Bounds:
+    """Return the bounds of an experiment.
 
-
-def _bounds(document: Document, found: list[ConfigProblem]) -> Bounds:
-    """Return the bounds of an experiment; those of a key that is wrong do not limit anything.
-
-    If the scene's file is wrong, add the problem to `found`. If the fence is not known without
-    MuJoCo, it limits nothing, as long as the file gives the speed.
+    If the fence is not known without MuJoCo, it limits nothing, as long as the file gives the
+    speed.
     """
-    given = {key: document.get("world", key) for key in ("robot", "scene", "fence_m")}
-    given = {key: value for key, value in given.items() if value is not None}
-    limits, room = DEFAULT_LIMITS, inf
-    with suppress(ValidationError):
-        world = World.model_validate_json(json.dumps(given))
-        with suppress(BadInputError):
-            limits = known_robot(world.robot).guard
-        if ("world", "scene") not in [problem.path for problem in found]:
-            with problems.collect(found, ("world", "scene")):
-                scene = scene_of(world)
-                if scene.own_fence or not document.get("guard", "speed_max_mps"):
-                    room = fence_of(scene).room(scene.spawn)
-    return Bounds(limits, room)
+    scene, room = scene_of(draft.world), inf
+    if scene.own_fence or draft.guard.speed_max_mps is None:
+        room = fence_of(scene).room(scene.spawn)
+    return Bounds(known_robot(draft.world.robot).guard, room)
 
 
-def _remove_derived(document: Document, *, new_profile: bool) -> None:
+def _remove_derived(document: Document, name: str, *, new_profile: bool) -> None:
     """Remove computed values from a resolved file.
 
     They are computed again after the user's settings have been applied. With `new_profile`, also
     remove the values that come from the file's link profile. Keep each value that differs from the
     computed value, because the user has set it.
     """
+    draft = problems.validate(document, Experiment, name)
+    guard = draft.guard
     derived: dict[KeyPath, float] = {("guard", "plan_max_s"): _plan_max(document)}
-    age_max: Any = document.get("guard", "command_age_max_ms")
-    plan_max: Any = document.get("guard", "plan_max_s")
-    bounds = _bounds(document, [])
-    derived["guard", "acceleration_max_mps2"] = bounds.robot.acceleration_max_mps2
-    if isinstance(age_max, int | float) and isinstance(plan_max, int | float):
-        derived["guard", "speed_max_mps"] = speed_cap(age_max, plan_max, bounds)
+    with suppress(BadInputError):  # another robot or scene may follow
+        bounds = _bounds(draft)
+        derived["guard", "acceleration_max_mps2"] = bounds.robot.acceleration_max_mps2
+        age_max = guard.command_age_max_ms or COMMAND_AGE_MAX_MS
+        derived["guard", "speed_max_mps"] = speed_cap(age_max, guard.plan_max_s or 0.0, bounds)
     if new_profile:
         derived |= _implied(_present_profile(document))
         for way in DIRECTIONS:

@@ -8,7 +8,7 @@ path, as in the paper's mission.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -17,10 +17,9 @@ import numpy as np
 
 from cloudrc.config.ground import check_heights
 from cloudrc.config.heading import Heading, check_yaws
-from cloudrc.config.problems import ConfigProblem
-from cloudrc.config.schema import GROUND, MissionConfig, Steps
+from cloudrc.config.problems import ConfigProblem, collect
+from cloudrc.config.schema import MissionConfig, Steps
 from cloudrc.config.setpoints import read_setpoints
-from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import Array, Spheres
 from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.obstacles import fence_of, obstacles, surface
@@ -34,9 +33,6 @@ from cloudrc.geometry.scene import FLOOR, Scene
 from cloudrc.messages import Vector
 from cloudrc.text import unknown_name_text
 
-FLIES = "a robot that flies needs a height: give three numbers, x, y and z"
-UNREACHED = "no waypoint brings the robot to it: they are for a longer robot, or too far away"
-"""Reason of the problem of a body to touch that the robot does not reach."""
 _REPORTED = 20
 """Largest number of problems of one kind in an error message."""
 TOUCHING = 1e-3
@@ -54,19 +50,16 @@ def check_scene(
     low, high = (*fence.inner_low[:2], fence.low[2]), fence.inner_high  # it stands on the ground
     axes = slice(2 if planar else 3)
     if (np.clip(spawn, low, high) != spawn)[0, axes].any():
-        reason = (
-            f"the spawn, {_point(spawn[0])}, is outside or too near to a wall; it may be at "
-            f"{_spans(low, high, planar=planar)}; move the spawn or the fence"
-        )
-        given = f"[{_point(np.array(fence.low))}, {_point(np.array(fence.high))}]"
-        return [ConfigProblem(("world", "fence_m"), given, reason)]
+        where = _spans(low, high, planar=planar)
+        reason = f"is too near to the spawn, {_point(scene.spawn)}; a spawn may be at {where}"
+        return [ConfigProblem(("world", "fence_m"), "", reason)]
     known = obstacles(scene, touch=touch)
     (hit,) = find_overlapped(known, robot, spawn, TOUCHING)
     if hit < 0:
         return []
     reason = (
-        f"at the spawn, {_point(spawn[0])}, the robot touches {surface(known[hit])}; every body "
-        "but floor is an obstacle: move the spawn, or put what the robot stands on into body floor"
+        f"at the spawn, {_point(scene.spawn)}, the robot touches {surface(known[hit])}; every body "
+        "but floor is an obstacle"
     )
     return [ConfigProblem(("world", "scene"), scene.name, reason)]
 
@@ -86,13 +79,15 @@ def check_mission(
     """
     if problem := _check_parts(mission) or _check_touch(mission, scene):
         return [problem]
-    if planar and (problems := check_heights(mission, scene)):
+    problems = [*check_heights(mission, scene)] if planar else []
+    problems += islice(check_yaws(mission, heading), _REPORTED)
+    if problems:
         return problems
     fence = fence_of(scene)
     if mission.setpoints is not None:
         steered = replace(fence, ground=scene.spawn[2]) if planar else fence
-        return _check_setpoints(Path(mission.setpoints), steered)
-    if problems := list(islice(check_yaws(mission, heading), _REPORTED)):
+        with collect(problems, ("setpoints",)):
+            read_setpoints(Path(mission.setpoints), steered)
         return problems
     if mission.steps is not None:
         reason = _check_steps(mission, mission.steps, scene, robot, planar=planar)
@@ -102,53 +97,33 @@ def check_mission(
 
 def _check_parts(mission: MissionConfig) -> ConfigProblem | None:
     """Return the first problem of parts that exclude or need each other."""
-    kinds = {"setpoints": mission.setpoints, "steps": mission.steps, "waypoints": mission.waypoints}
-    given = [key for key, value in kinds.items() if value]
-    if not given:
-        reason = "none given; give at least one, or steps or setpoints"
+    given = [key for key in ("waypoints", "steps", "setpoints") if getattr(mission, key)]
+    if len(given) != 1:
+        what = f"not both: {' and '.join(given)}" if given else "none given"
+        reason = f"{what}; give waypoints, or steps, or setpoints"
         return ConfigProblem(("waypoints",), "", reason)
-    if len(given) > 1:
-        reason = f"a mission has {' or '.join(given)}, not both; delete one"
-        return ConfigProblem((given[0],), "", reason)
     if mission.carrot is not None and not mission.waypoints:
-        reason = f"impossible with {given[0]}; delete it, or give waypoints"
-        return ConfigProblem(("carrot",), "", reason)
+        return ConfigProblem(("carrot",), "", f"needs waypoints, but there are {given[0]}")
     for index, waypoint in enumerate(mission.waypoints):
         if mission.carrot is None and waypoint.speed_mps is not None:
-            reason = "is the speed of a carrot; give the mission a carrot, or delete it"
             path = ("waypoints", str(index), "speed_mps")
-            return ConfigProblem(path, f"{waypoint.speed_mps:g}", reason)
+            return ConfigProblem(path, f"{waypoint.speed_mps:g}", "needs the key carrot")
     return None
 
 
 def _check_touch(mission: MissionConfig, scene: Scene) -> ConfigProblem | None:
     """Return the problem of a mission's touch, if it has one."""
-    body, others = mission.touched, [name for name in scene.bodies if name != FLOOR]
+    body = mission.touched
     if body is None:
         return None
     if mission.steps is not None:
-        return ConfigProblem(
-            ("touch",), "", "random steps lead to no body; set mission.touch to null"
-        )
-    if body == FLOOR:
-        reason = "the robot stands on it; name another body, or set mission.touch to null"
-    elif body in scene.intangible:
-        give = "give its geoms contype and conaffinity 1, or name another body"
-        reason = f"the robot flies through it; {give}"
-    elif body in others or scene.path is not None:
+        return ConfigProblem(("touch",), "", "random steps lead to no body; set it to null")
+    known = [name for name in scene.bodies if name not in (FLOOR, *scene.intangible)]
+    is_complete = scene.path is None or body in scene.bodies
+    if body in known or not is_complete:
         return None
-    else:
-        text = unknown_name_text(f"body of the scene {scene.name}", body, others[:_REPORTED])
-        reason = f"{text}; or set mission.touch to null"
-    return ConfigProblem(("touch", "body"), body, reason)
-
-
-def _check_setpoints(path: Path, fence: Fence) -> list[ConfigProblem]:
-    try:
-        read_setpoints(path, fence)
-    except BadInputError as error:
-        return [ConfigProblem(("setpoints",), "", str(error))]
-    return []
+    text = unknown_name_text(f"body that stops a robot in scene {scene.name}", body, known)
+    return ConfigProblem(("touch", "body"), "", f"{text}; null: nothing to touch")
 
 
 def _check_fence(mission: MissionConfig, fence: Fence, *, planar: bool) -> list[ConfigProblem]:
@@ -160,9 +135,7 @@ def _check_fence(mission: MissionConfig, fence: Fence, *, planar: bool) -> list[
     slack = np.array([0.5 * waypoint.tolerance_m for waypoint in mission.waypoints])
     found = []
     for index in np.flatnonzero(outside_fence(fence, positions, slack, planar=planar)).tolist():
-        flat = positions[index, 2] == GROUND and not planar
-        what = FLIES if flat else "beyond the fence, or too near to it"
-        reason = f"{what}; {_allowed(fence, planar=planar)}"
+        reason = f"beyond the fence, or too near to it; {_allowed(fence, planar=planar)}"
         found.append(_at_point(index, positions[index], reason))
     return found[:_REPORTED]
 
@@ -184,23 +157,6 @@ def _check_ways(mission: MissionConfig, scene: Scene, robot: Spheres) -> Iterato
             f"or within {CLEARANCE_MIN:g} m of it; add waypoints in between that lead around it"
         )
         yield _at_point(index, positions[index], reason)
-
-
-def check_reach(mission: MissionConfig, scene: Scene, robot: Spheres) -> list[ConfigProblem]:
-    """List the problem of a body to touch that the `robot` reaches on no way to a waypoint.
-
-    It must touch the body `CLEARANCE_MIN` before the end of a way: a controller may end so far off.
-    """
-    body = [each for each in obstacles(scene, touch=None) if each.name == mission.touched]
-    if not body or not mission.waypoints:
-        return []
-    points, starts = _positions(mission), _starts(mission, scene)
-    length = np.linalg.norm(points - starts, axis=1, keepdims=True)
-    ends = points - CLEARANCE_MIN * (points - starts) / np.maximum(length, CLEARANCE_MIN)
-    near = robot._replace(radii=robot.radii - CLEARANCE_MIN)  # touching is at a distance of 0
-    if (find_crossed(body, near, starts, ends) >= 0).any():
-        return []
-    return [ConfigProblem(("touch", "body"), body[0].name, UNREACHED)]
 
 
 def _positions(mission: MissionConfig) -> Array:
@@ -251,5 +207,5 @@ def _at_point(index: int, position: Array, reason: str) -> ConfigProblem:
     return ConfigProblem(("waypoints", str(index), "position_m"), _point(position), reason)
 
 
-def _point(position: Array) -> str:
+def _point(position: Iterable[float]) -> str:
     return f"[{', '.join(f'{value:g}' for value in position)}]"

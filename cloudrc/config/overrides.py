@@ -19,17 +19,16 @@ import json
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import lru_cache, reduce
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, create_model
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from cloudrc import plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.problems import ConfigProblem, ProblemsError
-from cloudrc.config.robot import RobotFacts, facts, find_robot, known_robot, parameters
-from cloudrc.config.schema import Cloud, Experiment, PlanTime, PlugIn, Steps, World
+from cloudrc.config.robot import RobotFacts, find_robot, parameters
+from cloudrc.config.schema import Cloud, Experiment, PlugIn, Steps, World
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.outside import code
@@ -65,7 +64,7 @@ Settings: TypeAlias = dict[KeyPath, Setting]
 def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
     """Make settings from triples of a key, such as `link.both.delay_ms`, its value and its source.
 
-    Raise a BadInputError if a key has an empty part or is set twice, also inside another's value.
+    Raise a BadInputError if a key has an empty part or is set twice.
     """
     found: Settings = {}
     for key, value, source in given:
@@ -76,24 +75,7 @@ def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
             if each in found:
                 raise BadInputError(f"{source.label} {key}: is set twice; keep one of them")
             found[each] = Setting(value, source._replace(is_setting=True))
-    for path in found:
-        _refuse_second(path, found)
     return {path: found[path] for path in sorted(found, key=len)}
-
-
-def _refuse_second(path: KeyPath, found: Settings) -> None:
-    """Raise a BadInputError if the value of a setting above `path` sets the key `path`, too.
-
-    Below a number there is no key, so one of both would be lost. Below a name are its parameters.
-    """
-    for depth in range(1, len(path)):
-        above = found.get(path[:depth])
-        if above is None:
-            continue
-        is_number = isinstance(above.value, int | float)
-        if is_number or reduce(child, path[depth:], above.value) is not None:
-            both = f"{'.'.join(path)}: is set twice, also by {'.'.join(path[:depth])}"
-            raise BadInputError(f"{found[path].source.label} {both}; keep one of them")
 
 
 def _directions(path: KeyPath) -> list[KeyPath]:
@@ -128,80 +110,57 @@ def apply_overrides(document: Document, settings: Settings, *, build: bool = Fal
     Without `build`, the defaults of plug-ins' parameters are unknown: they are not imported.
     """
     for path, (value, source) in settings.items():
-        default: Any = _DEFAULTS
-        for depth, (key, below) in enumerate(pairwise(path), start=1):
-            _check_index(document, path[:depth], source)
-            default = child(default, key)
-            present = document.get(*path[:depth])
-            node = present
-            if present is None:
-                node = _beginning(document, path[:depth], default, build=build)
+        for depth, below in enumerate(path[1:], start=1):
+            above = path[:depth]
+            _check_index(document, above, source)
+            present = document.get(*above)
+            node = _default_at(document, above, build=build) if present is None else present
             if path[0] == "cloud" and path[1] in KINDS and depth == 2 and isinstance(node, str):
                 node = {"name": node}  # not by `set_value`: the name keeps its source
-                document.tree["cloud"][key] = node
+                document.tree["cloud"][path[1]] = node
             elif not isinstance(node, dict | list):
-                document.set_value(path[:depth], [] if below == "0" else {}, source)
+                document.set_value(above, [] if below == "0" else {}, source)
             elif present is None:
-                document.set_value(path[:depth], node, document.source(path[:depth]))
+                document.set_value(above, node, document.source(above))
         _check_index(document, path, source)
         document.set_value(path, copy.deepcopy(value), source)
 
 
-def _beginning(document: Document, path: KeyPath, default: Any, *, build: bool) -> Any:
+def _default_at(document: Document, path: KeyPath, *, build: bool) -> Any:
     """Return what to change if the document has no value at `path`, from the value's default.
 
     A section begins empty: its defaults would look like values that somebody has set.
     """
-    if build and _is_parameter(path):
-        return _default_of_parameter(document, path)
-    return {} if isinstance(default, dict) else copy.deepcopy(default)
+    default: Any = reduce(child, path, _DEFAULTS)
+    if build and len(path) == 3:
+        # Who reads the experiment meets a problem of the plug-in or of the robot again.
+        with suppress(BadInputError, ValidationError):
+            default = _parameters_at(document, path[:2]).get(path[2], default)
+    if isinstance(default, tuple | list):
+        return json.loads(json.dumps(default))
+    return {} if isinstance(default, dict) else default
 
 
-def _is_parameter(path: KeyPath) -> bool:
-    """Return whether a key is the parameter of a plug-in, such as cloud.controller.gain_p."""
-    if len(path) != 3:
-        return False
-    section, key, parameter = path
-    is_of_cloud = section == "cloud" and key in KINDS and parameter != "name"
-    return is_of_cloud or (section, key) == ("world", "onboard")
-
-
-def _default_of_parameter(document: Document, path: KeyPath) -> Any:
-    """Return the default of a plug-in's parameter if it is a list or mapping, else None."""
-    section, key, parameter = path
-    # Who reads the experiment meets a problem of the plug-in or of its default again.
-    with suppress(BadInputError, TypeError, ValueError):
-        if section == "world":
-            default = _default_onboard(document, parameter)
-        else:
-            default = _default_in_cloud(document, key, parameter)
-        if isinstance(default, tuple | list | dict):
-            return json.loads(json.dumps(default))
-    return None
-
-
-def _default_in_cloud(document: Document, key: str, parameter: str) -> Any:
-    choice = document.get("cloud", key) or _DEFAULTS["cloud"][key]
-    name = choice.get("name") if isinstance(choice, dict) else choice
-    if not isinstance(name, str):
-        return None
-    if plugins.is_path(name):
-        place = ("cloud", key, "name") if isinstance(choice, dict) else ("cloud", key)
-        name = str(document.source(place).absolute(name))
-    return default_parameters(KINDS[key], name).get(parameter)
-
-
-def _default_onboard(document: Document, parameter: str) -> Any:
-    world = World(
-        robot=document.get("world", "robot") or World().robot,
-        tuning=document.get("world", "tuning"),
-    )
+def _parameters_at(document: Document, path: KeyPath) -> dict[str, Any]:
+    """Return the parameters with their defaults of the plug-in at a key; {} if there is none."""
+    kind = KINDS.get(path[1], "") if path[0] == "cloud" else ""
+    name = document.get(*path, "name")
+    if kind and isinstance(name, str):
+        return default_parameters(kind, _absolute(document, path, name))
+    if path != ("world", "onboard"):
+        return {}
+    given = {key: document.get("world", key) for key in ("robot", "tuning")}
+    world = World(**{key: value for key, value in given.items() if value is not None})
     folder = document.source(("world", "robot")).folder
     robot = find_robot(shipped.model_path("robot", world.robot, folder))
-    given = parameters(robot, world)
-    if parameter in given:
-        return given.get(parameter)
-    return default_parameters("onboard", robot.onboard.name).get(parameter)
+    return default_parameters("onboard", robot.onboard.name) | parameters(robot, world)
+
+
+def _absolute(document: Document, path: KeyPath, name: str) -> str:
+    """Return the name of the plug-in at a key, or the absolute path of its file."""
+    if not plugins.is_path(name):
+        return name
+    return str(document.source((*path, "name")).absolute(name))
 
 
 def _check_index(document: Document, path: KeyPath, source: Source) -> None:
@@ -215,90 +174,42 @@ def _check_index(document: Document, path: KeyPath, source: Source) -> None:
         )
 
 
-def resolve_plugins(document: Document, *, build: bool) -> list[ConfigProblem]:
+def name_plugins(document: Document, cloud: Cloud) -> dict[KeyPath, dict[str, Any]]:
     """Replace each plug-in of an experiment by a mapping with its name and its parameters.
 
-    With `build`, check the parameters, add defaults, and build each plug-in once as a test. Without
-    `build`, import no plug-in: importing runs its code, which may be somebody else's.
+    No plug-in is imported: importing runs its code, which may be somebody else's. Also return the
+    mappings; keys are those of `cloud`.
+    """
+    made: dict[KeyPath, dict[str, Any]] = {}
+    for key in KINDS:
+        choice, path = getattr(cloud, key), ("cloud", key)
+        given = {} if isinstance(choice, str) else dict(choice.model_extra)
+        name = _absolute(document, path, choice if isinstance(choice, str) else choice.name)
+        # Not by `set_value`: the parameters keep their sources.
+        document.tree["cloud"][key] = made[path] = {"name": name, **given}
+    return made
+
+
+def complete_plugins(document: Document, cloud: Cloud, robot: RobotFacts) -> list[ConfigProblem]:
+    """Do as `name_plugins`, check the parameters, add defaults, and build each plug-in as a test.
+
+    Return the problems.
     """
     found: list[ConfigProblem] = []
-    robot = _robot_of(document) if build else None
-    for key in KINDS:
-        path = ("cloud", key)
-        choice = document.get(*path)
-        given = {"name": choice} if isinstance(choice, str) else choice
-        if not isinstance(given, dict) or not isinstance(given.get("name"), str):
-            continue
-        name, parameters = given["name"], {k: v for k, v in given.items() if k != "name"}
-        if plugins.is_path(name):
-            name = str(document.source((*path, "name")).absolute(name))
+    for path, plugin in name_plugins(document, cloud).items():
+        name, given = plugin["name"], {key: plugin[key] for key in plugin if key != "name"}
         try:
-            if build:
-                parameters = _complete_once(document, path, name, parameters, robot)
+            document.tree["cloud"][path[1]] |= _complete(document, path, name, given, cloud, robot)
         except ProblemsError as error:
             found += [each._replace(path=path + each.path) for each in error.problems]
-        except _NoModelError as error:
-            found.append(_no_model(document, path, error))
-            document.tree["cloud"][key] = {"name": name, **parameters}
         except BadInputError as error:
             found.append(ConfigProblem(path, "", str(error), error))
-        else:
-            # Not by `set_value`: the parameters keep their sources.
-            document.tree["cloud"][key] = {"name": name, **parameters}
     return found
-
-
-class _NoModelError(BadInputError):
-    """A predictor has no model of the robot, which `cloud.plan_s` needs."""
-
-
-def _no_model(document: Document, path: KeyPath, error: _NoModelError) -> ConfigProblem:
-    """Return the problem of a predictor of a setting, else of `cloud.plan_s`, which needs more."""
-    if document.source(path).is_setting:
-        return ConfigProblem(path, "", str(error), error)
-    plan, default = ("cloud", "plan_s"), document.get(*path) == Cloud().predictor
-    what = "the default predictor" if default else "the predictor"
-    return ConfigProblem(plan, str(document.get(*plan)), f"{what} {error}", error)
-
-
-def _robot_of(document: Document) -> RobotFacts | None:
-    """Return what cloud knows of the experiment's robot; None if the experiment has no valid one.
-
-    Such an experiment is refused later.
-    """
-    with suppress(BadInputError, ValidationError):
-        world = World.model_validate_json(json.dumps(document.get("world") or {}))
-        limit = document.get("guard", "acceleration_max_mps2")
-        if not isinstance(limit, int | float):
-            limit = known_robot(world.robot).guard.acceleration_max_mps2
-        return facts(world, limit)
-    return None
 
 
 def _takes_robot(kind: str, name: str) -> bool:
     """Return whether a plug-in's `build` has the argument `robot`, which only predictors get."""
-    if kind != "predictors":
-        return False
-    return reuse(("takes", name), lambda: "robot" in plugins.signature(kind, name).parameters)
-
-
-def _complete_once(
-    document: Document,
-    path: KeyPath,
-    name: str,
-    given: dict[str, Any],
-    robot: RobotFacts | None,
-) -> dict[str, Any]:
-    """Call `_complete`, but once only for the points of a sweep that share the plug-in.
-
-    Leave the parameters of a plug-in that takes the robot as they are if there is none.
-    """
-    if robot is None and _takes_robot(KINDS[path[-1]], name):
-        return given
-    folders = [str(document.source((*path, parameter)).folder) for parameter in given]
-    plan = document.get("cloud", "plan_s")
-    key = ("plug-in", path, name, json.dumps([given, folders, plan]), repr(robot))
-    return copy.deepcopy(reuse(key, lambda: _complete(document, path, name, given, robot)))
+    return kind == "predictors" and "robot" in plugins.signature(kind, name).parameters
 
 
 def _complete(
@@ -306,65 +217,43 @@ def _complete(
     path: KeyPath,
     name: str,
     given: dict[str, Any],
-    robot: RobotFacts | None,
+    cloud: Cloud,
+    robot: RobotFacts,
 ) -> dict[str, Any]:
-    """Check the parameters `given` to a plug-in, and add defaults; build the plug-in as a test.
+    """Check the parameters `given` to a plug-in, and add defaults, once for the points of a sweep.
 
     `path` is the key of the plug-in, such as ("cloud", "predictor"). Raise a BadInputError about a
     wrong parameter or a plug-in that fails.
     """
-    kind = KINDS[path[-1]]
-    model = _parameters_of(kind, name)
-    parameters = dict(given)
-    for parameter in given:
-        if (kind, parameter) in GIVEN:
-            raise BadInputError(f"{parameter}: is no parameter of yours, cloudrc gives it")
-    for parameter, field in model.model_fields.items():
-        place = (*path, parameter)
-        if field.annotation == Path | None and isinstance(document.get(*place), str):
-            file = document.source(place).absolute(parameters[parameter])
-            parameters[parameter] = str(file)
-    checked = _check(kind, name, parameters)
-    with code.calling(f"{path[-1]} {name!r} has a default that YAML cannot contain"):
+    kind, plans = KINDS[path[1]], cloud.plan_s > 0
+    for parameter, field in parameter_model(kind, name).model_fields.items():
+        if field.annotation == Path | None and isinstance(given.get(parameter), str):
+            given[parameter] = str(document.source((*path, parameter)).absolute(given[parameter]))
+    key = ("plug-in", kind, name, json.dumps(given), plans, repr(robot))
+    return reuse(key, lambda: _try(kind, name, given, robot, plans=plans))
+
+
+def _try(
+    kind: str, name: str, given: dict[str, Any], robot: RobotFacts, *, plans: bool
+) -> dict[str, Any]:
+    """Build a plug-in, with `plans` for a cloud that sends plans; return all its parameters."""
+    checked = _check(kind, name, given)
+    with code.calling(f"{plugins.one(kind)} {name!r} has a default that YAML cannot contain"):
         values: dict[str, Any] = checked.model_dump(mode="json")
-    checked = _check(kind, name, values)  # as `build_plugin` will do
     more = {"robot": robot} if _takes_robot(kind, name) else {}
     plugin = plugins.load(kind, name, **dict(checked), **more)
-    if kind != "estimators":
-        what = f"{path[-1]} {name!r}: its reset() failed"
-        slow = plugins.slow_text(kind, name, f"reset() of {name} is still running")
-        with code.calling(what, slow=slow):
-            plugin.reset()
-    if _plans_ahead(document):
-        if kind == "predictors":
-            _check_model(plugin, name)
-        if kind == "controllers" and name in OUTSIDE:
-            raise BadInputError(f"'{name}' cannot plan ahead; set cloud.plan_s to 0")
+    if plans and name in OUTSIDE:
+        raise BadInputError(f"'{name}' cannot plan ahead; set cloud.plan_s to 0")
+    if plans and kind == "predictors":
+        with code.calling(f"predictor {name!r} cannot predict"):
+            plugin.predict(Odometry(0, ZERO, UPRIGHT, ZERO, ZERO), 0.0)
+            model = plugin.model()
+        if model is None:
+            raise BadInputError(
+                f"'{name}' has no model of the robot, which cloud.plan_s above 0 needs; choose "
+                "model_based, command_history or kalman, or set cloud.plan_s to 0"
+            )
     return values
-
-
-def _plans_ahead(document: Document) -> bool:
-    """Return whether cloud sends plans; a `cloud.plan_s` that is no valid one is refused later."""
-    with suppress(ValidationError):
-        return TypeAdapter(PlanTime).validate_python(document.get("cloud", "plan_s")) > 0
-    return False
-
-
-def _parameters_of(kind: str, name: str) -> type[BaseModel]:
-    return reuse(("parameters", kind, name), lambda: parameter_model(kind, name))
-
-
-def _check_model(predictor: Any, name: str) -> None:
-    """Raise a BadInputError if the predictor has no robot model, which `cloud.plan_s` needs."""
-    what = f"predictor {name!r} cannot predict"
-    with code.calling(what, slow=f"predict() of {name} is still running"):
-        predictor.predict(Odometry(0, ZERO, UPRIGHT, ZERO, ZERO), 0.0)
-        model = predictor.model()
-    if model is None:
-        raise _NoModelError(
-            f"'{name}' has no model of the robot, which cloud.plan_s above 0 needs; choose "
-            "model_based, command_history or kalman, or set cloud.plan_s to 0"
-        )
 
 
 def build_plugin(kind: str, choice: PlugIn, /, **given: Any) -> Any:
@@ -386,18 +275,19 @@ def build_predictor(choice: PlugIn, robot: RobotFacts) -> Any:
 
 def parameter_names(kind: str, name: str) -> list[str]:
     """List the parameters of a plug-in that a user may set, in the order of its `build`."""
-    return list(_parameters_of(kind, name).model_fields)
+    return list(parameter_model(kind, name).model_fields)
 
 
 def default_parameters(kind: str, name: str) -> dict[str, Any]:
     """Return parameter -> default of a plug-in, without the parameters that need a value."""
-    fields = _parameters_of(kind, name).model_fields
+    fields = parameter_model(kind, name).model_fields
     return {key: field.default for key, field in fields.items() if not field.is_required()}
 
 
 def parameter_model(kind: str, name: str) -> type[BaseModel]:
     """Create a pydantic model of a plug-in's parameters from the signature of its `build`."""
-    return _model_of(kind, name, plugins.builder(kind, name))
+    key = "parameters", kind, name
+    return reuse(key, lambda: _model_of(kind, name, plugins.builder(kind, name)))
 
 
 @lru_cache(maxsize=64)  # a pydantic model takes a millisecond
@@ -428,12 +318,10 @@ def _check(kind: str, name: str, parameters: dict[str, Any]) -> BaseModel:
 
     Raise a ProblemsError about wrong parameters, a BadInputError if a validator of the user fails.
     """
-    model, text = _parameters_of(kind, name), json.dumps(parameters)
-    what = f"{plugins.one(kind)} {name!r}: a check of a parameter failed"
-    slow = plugins.slow_text(kind, name, f"{name} still checks its parameters")
-    with code.calling(what, slow=slow):
+    model = parameter_model(kind, name)
+    with code.calling(f"{plugins.one(kind)} {name!r}: a check of a parameter failed"):
         try:
-            return model.model_validate_json(text)
+            return model.model_validate_json(json.dumps(parameters))
         except ValidationError as error:
             found = problems.from_pydantic(error, model)
     raise ProblemsError(found)

@@ -6,21 +6,19 @@ folders in `cloudrc/robots/`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from cloudrc.config import shipped
 from cloudrc.config.heading import Heading
-from cloudrc.config.problems import ConfigProblem, raise_problems, validate
+from cloudrc.config.problems import validate
 from cloudrc.config.schema import (
     Acceleration,
     Constants,
     DeadTimes,
-    NameOr,
     NotNegatives,
     Parameters,
     PlugIn,
@@ -28,12 +26,11 @@ from cloudrc.config.schema import (
     World,
 )
 from cloudrc.config.section import Section
-from cloudrc.errors import BadInputError
 from cloudrc.messages import SENSORS_MAX
 from cloudrc.outside.document import read_document
+from cloudrc.outside.refusal import check_names
 from cloudrc.outside.reuse import reuse
 from cloudrc.plugins import is_path
-from cloudrc.text import unknown_name_text
 
 Braking = Annotated[float, Field(ge=0.1, le=10)]
 Hull = Annotated[float, Field(gt=0, le=10)]
@@ -105,14 +102,18 @@ class SensorConfig(Section):
 Sensors = Annotated[dict[SensorName, SensorConfig], Field(max_length=SENSORS_MAX)]
 
 
+def _as_mapping(value: Any) -> Any:
+    return {"name": value} if isinstance(value, str) else value
+
+
 class RobotFile(Section):
     """The file `robot.yaml`."""
 
     description: str = ""
     """One line about the robot, for lists"""
-    model: str = "robot.xml"
+    model: Path = Path("robot.xml")
     """MJCF file (.xml) of the robot, in the same folder or a path. Its base has a free joint"""
-    onboard: NameOr[PlugIn]
+    onboard: Annotated[PlugIn, BeforeValidator(_as_mapping)]
     """Controller on board, which follows the velocity that the guard allows: the name of a plug-in,
     the path of a Python file, or a mapping with parameters"""
     tunings: dict[str, Tuning] = Field(default_factory=dict)
@@ -128,7 +129,7 @@ class RobotFile(Section):
     """Whether the robot stays on the ground. Then the guard limits x and y alone, HOLD and LAND
     brake the robot to rest, waypoints have the height of the spawn, and cloud commands no vertical
     velocity"""
-    heading: Heading | None = None
+    heading: Heading = Field(None, validate_default=True)
     """What decides about the robot's heading; free: the commanded yaw rate, so that waypoints may
     have a yaw_deg; fixed: nothing, the onboard controller holds the yaw at 0; velocity: the robot
     turns towards its velocity. null: velocity for a planar robot, else free"""
@@ -147,109 +148,68 @@ class RobotFile(Section):
     """Python file with spheres in place of the ball of hull_m: its function `few` returns rows x,
     y, z, radius [m], body frame, for the distance from obstacles. null: there is none"""
 
+    @field_validator("heading", mode="before")
+    @classmethod
+    def _complete(cls, given: Any, info: ValidationInfo) -> Any:
+        return given or ("velocity" if info.data.get("planar") else "free")
+
     @model_validator(mode="after")
-    def _check_stop(self) -> RobotFile:
+    def _agree(self) -> RobotFile:
         if self.planar and self.guard.stop == "land":
-            raise ValueError(
-                "guard.stop is land, but a planar robot does not leave the ground; leave it out"
-            )
+            raise ValueError("guard.stop is land, but planar robots stay on the ground")
+        if self.planar is not ON_GROUND.get(self.onboard.name, self.planar):
+            must_be = str(not self.planar).lower()
+            raise ValueError(f"the onboard controller {self.onboard.name} needs planar: {must_be}")
         return self
 
 
-@dataclass(frozen=True)
-class RobotFiles:
-    """A robot whose files are found."""
-
-    model: Path  # MJCF file
-    onboard: PlugIn  # with the absolute path of a Python file, or the name of a plug-in
-    planar: bool = False  # whether it stays on the ground
-    guard: RobotLimits = DEFAULT_LIMITS
-    hull: float | None = None  # radius about the base [m]; None: that of the model
-    hull_points: str | None = None  # path of a Python file with spheres in place of the ball
-    # Name -> parameters of the onboard controller, in place of those in `onboard`.
-    tunings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    response: Response | None = None  # first-order model of the velocity loop
-    responses: Mapping[str, Response] = field(default_factory=dict)  # those of tunings, by name
-    motion: str | None = None  # path of a Python file with a better model
-    probe: str | None = None  # site with which the robot touches; None: any part of it touches
-    sensors: Mapping[str, SensorConfig] = field(default_factory=dict)  # the robot's own
-    heading: Heading = "free"  # what decides about its heading
-
-
-def find_robot(name: str) -> RobotFiles:
-    """Return the files of a robot, given by the name of a shipped robot, or by an absolute path.
+def find_robot(name: str) -> RobotFile:
+    """Return a robot with absolute paths, given by its shipped name, or by an absolute path.
 
     Raise a BadInputError if its `robot.yaml` is invalid.
     """
     if name.endswith(".xml"):
-        return RobotFiles(Path(name), PlugIn(name=GENERAL), guard=OF_GENERAL)
+        return RobotFile(model=Path(name), onboard=PlugIn(name=GENERAL), guard=OF_GENERAL)
     folder = Path(name) if shipped.is_path(name) else shipped.FOLDERS["robot"] / name
     file = folder / shipped.ROBOT_FILE
     label = str(file) if shipped.is_path(name) else f"{name}/{shipped.ROBOT_FILE}"
-    document = read_document(file, label)
-    robot = validate(document, RobotFile, label)
-    onboard = _absolute(robot.onboard, folder)
-    raise_problems(document, list(_misplaced(robot.planar, onboard.name)), label)
-    stop = robot.guard.stop or ("brake" if robot.planar else "land")
+    robot = validate(read_document(file, label), RobotFile, label)
+    onboard = robot.onboard
     usual = OF_GENERAL if onboard.name == GENERAL else DEFAULT_LIMITS
-    given = robot.guard.model_dump(exclude_unset=True)
-    limits = usual.model_copy(update={**given, "stop": stop})
-    tunings = {key: tuning.model_extra or {} for key, tuning in robot.tunings.items()}
-    responses = {key: each.response for key, each in robot.tunings.items() if each.response}
-    return RobotFiles(
-        folder / robot.model,
-        onboard,
-        robot.planar,
-        limits,
-        robot.hull_m,
-        hull_points=robot.hull_points and str((folder / robot.hull_points).resolve()),
-        tunings=tunings,
-        response=robot.response,
-        responses=responses,
-        motion=robot.motion and str((folder / robot.motion).resolve()),
-        probe=robot.probe,
-        sensors=robot.sensors,
-        heading=robot.heading or ("velocity" if robot.planar else "free"),
-    )
+    given = robot.guard.model_dump(exclude_unset=True, exclude_none=True)
+    if is_path(onboard.name):
+        onboard = onboard.model_copy(update={"name": str((folder / onboard.name).resolve())})
+    found = {
+        "model": folder / robot.model,
+        "onboard": onboard,
+        "guard": usual.model_copy(update={"stop": "brake" if robot.planar else "land", **given}),
+    }
+    for key in ("motion", "hull_points"):
+        if named := getattr(robot, key):
+            found[key] = str((folder / named).resolve())
+    return robot.model_copy(update=found)
 
 
-def _misplaced(planar: bool, onboard: str) -> Iterator[ConfigProblem]:
-    """Yield the problem of a robot that flies on the ground, or that drives in the air."""
-    if planar is ON_GROUND.get(onboard, planar):
-        return
-    if planar:
-        reason = f"the onboard controller {onboard} flies; delete planar, or choose diff_drive"
-    else:
-        reason = f"the onboard controller {onboard} drives on the ground; set planar: true"
-    yield ConfigProblem(("planar",), str(planar).lower(), reason)
-
-
-def parameters(robot: RobotFiles, world: World) -> dict[str, Any]:
+def parameters(robot: RobotFile, world: World) -> dict[str, Any]:
     """Return the parameters that the onboard controller gets: of robot.yaml, tuning and world.
 
     Raises:
         BadInputError: If the robot has no such tuning.
     """
-    tuning: Mapping[str, Any] = {}
-    if world.tuning is not None:
-        if world.tuning not in robot.tunings:
-            what, known = f"tuning of {world.robot}", sorted(robot.tunings)
-            text = unknown_name_text(what, world.tuning, known)
-            raise BadInputError(f"{text}; leave world.tuning out, or set null, for no tuning")
-        tuning = robot.tunings[world.tuning]
-    return {**(robot.onboard.model_extra or {}), **tuning, **(world.onboard.model_extra or {})}
+    tuning = world.tuning
+    if tuning is not None:
+        check_names(f"tuning of {world.robot}", [tuning], sorted(robot.tunings))
+    chosen = (robot.onboard, robot.tunings.get(tuning or ""), world.onboard)
+    return {
+        key: value
+        for each in chosen
+        if each is not None
+        for key, value in (each.model_extra or {}).items()
+    }
 
 
-def _absolute(choice: str | PlugIn, folder: Path) -> PlugIn:
-    """Return a plug-in; a relative path of its file starts at `folder`."""
-    plugin = choice if isinstance(choice, PlugIn) else PlugIn(name=choice)
-    if is_path(plugin.name):
-        plugin = plugin.model_copy(update={"name": str((folder / plugin.name).resolve())})
-    return plugin
-
-
-def known_robot(name: str) -> RobotFiles:
-    """Return the files of a robot as `find_robot` does, but read them once for a whole sweep."""
+def known_robot(name: str) -> RobotFile:
+    """Return a robot as `find_robot` does, but read it once for a whole sweep."""
     return reuse(("robot", name), lambda: find_robot(name))
 
 
@@ -268,17 +228,22 @@ class RobotFacts:
     acceleration_max: float  # limit of the guard [m/s^2]
 
 
-def facts(world: World, acceleration_max: float) -> RobotFacts:
-    """Return what cloud knows of a robot; `acceleration_max` is the guard's limit [m/s^2].
+def facts(world: World, acceleration_max: float | None) -> RobotFacts:
+    """Return what cloud knows of a robot.
+
+    `acceleration_max` is the guard's limit [m/s^2], None for that of the robot.
 
     Raises:
         BadInputError: If the robot has no such tuning.
     """
     robot, motion = known_robot(world.robot), None
+    given = parameters(robot, world)
     if robot.motion is not None:
-        motion = PlugIn.model_validate({**parameters(robot, world), "name": robot.motion})
-    response = robot.responses.get(world.tuning or "", robot.response)
-    return RobotFacts(world.robot, response, motion, acceleration_max)
+        motion = PlugIn.model_validate({**given, "name": robot.motion})
+    tuned = robot.tunings.get(world.tuning or "")
+    response = tuned.response if tuned and tuned.response else robot.response
+    limit = acceleration_max or robot.guard.acceleration_max_mps2
+    return RobotFacts(world.robot, response, motion, limit)
 
 
 def files_of(name: str) -> list[Path]:

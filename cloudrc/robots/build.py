@@ -9,7 +9,7 @@ from cloudrc import plugins
 from cloudrc.config.overrides import BRAKING, build_plugin, default_parameters
 from cloudrc.config.problems import ConfigProblem, ProblemsError, problem_at
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.config.robot import RobotFiles, known_robot, parameters
+from cloudrc.config.robot import RobotFile, known_robot, parameters
 from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.config.schema import Plant, PlugIn, World
 from cloudrc.config.shipped import ROBOT_FILE, file_of
@@ -164,7 +164,7 @@ def make_parts(world: World) -> Parts:
     return Parts(true, plugin, onboard, actuators, sensors)
 
 
-def _build_onboard(world: World, where: str, robot: RobotFiles, model: Any) -> Onboard:
+def _build_onboard(world: World, where: str, robot: RobotFile, model: Any) -> Onboard:
     """Build an onboard controller for a compiled `MjModel`; errors name the files in `where`."""
     name = robot.onboard.name
     choice = PlugIn.model_validate({**parameters(robot, world), "name": name})
@@ -189,14 +189,15 @@ def _problem(world: World, path: KeyPath, reason: str) -> ConfigProblem:
     if path and path[0] in (world.onboard.model_extra or {}):
         return ConfigProblem(("world", "onboard", *path), "", reason)
     file = world.robot if world.robot.endswith(".xml") else f"{world.robot}/{ROBOT_FILE}"
-    if path and path[0] in known_robot(world.robot).tunings.get(world.tuning or "", ()):
+    tuning = known_robot(world.robot).tunings.get(world.tuning or "")
+    if path and tuning and path[0] in (tuning.model_extra or {}):
         key, place = "tuning", ("tunings", str(world.tuning), *path)
     else:
         key, place = "robot", ("onboard", *path)
     return ConfigProblem(("world", key), "", f"{file}: {'.'.join(place)}: {reason}")
 
 
-def _change(world: World, robot: RobotFiles, nominal: Any) -> Any:
+def _change(world: World, robot: RobotFile, nominal: Any) -> Any:
     """Return the model of the true robot, which may differ from the `nominal` one."""
     factors = world.plant.actuator_factor
     if world.plant == Plant():

@@ -68,15 +68,6 @@ def test_a_file_of_setpoints_needs_no_height_and_has_no_other_one(tmp_path, head
     assert flight["/ground_truth"]["position"][-1, :2] == pytest.approx((1.0, 0.5), abs=0.2)
 
 
-@pytest.mark.parametrize("robot", ["pelican"])
-def test_a_robot_that_flies_is_told_that_its_waypoints_need_a_height(robot):
-    where = [f"world.robot={robot}", "world.scene=pillars"]
-    with pytest.raises(BadInputError, match=r"\[1, 0, 0\]: a robot that flies needs a height"):
-        load_experiment("steps", [*with_points((1, 0))[2:], *where])
-    with pytest.raises(RefusedError, match="a robot that flies needs a height"):
-        RequestReader(SCENE, hull_of(robot), PLAN).goto(b'{"position_m": [1, 0]}')
-
-
 def test_the_rover_drives_through_the_pillars_without_a_vertical_command():
     flight = cloudrc.fly("pillars")
     assert flight.verdict == "success"

@@ -37,9 +37,9 @@ def test_limits_and_hull_are_read_and_have_defaults(read):
         "braking_mps2": 3.0,
         "stop": "land",
     }
-    assert read().hull is None
+    assert read().hull_m is None
     robot = read("guard: {braking_mps2: 2, speed_max_mps: 1.5}", "hull_m: 0.35")
-    assert (robot.guard.braking_mps2, robot.guard.speed_max_mps, robot.hull) == (2.0, 1.5, 0.35)
+    assert (robot.guard.braking_mps2, robot.guard.speed_max_mps, robot.hull_m) == (2.0, 1.5, 0.35)
 
 
 @pytest.mark.parametrize(
@@ -57,15 +57,15 @@ def test_a_wrong_value_is_one_line_with_file_line_and_key(read, tmp_path, keys, 
 
 
 def test_a_planar_robot_does_not_land(read):
-    with pytest.raises(BadInputError, match=r"guard\.stop is land, but a planar robot does not"):
+    with pytest.raises(BadInputError, match=r"guard\.stop is land, but planar"):
         read("planar: true", "guard: {stop: land}")
 
 
 @pytest.mark.parametrize(
     ("onboard", "key", "message"),
     [
-        ("multirotor", "planar: true", "planar: true: the onboard controller multirotor flies"),
-        ("diff_drive", "", "drives on the ground; set planar: true"),
+        ("multirotor", "planar: true", "multirotor needs planar: false"),
+        ("diff_drive", "", "diff_drive needs planar: true"),
     ],
 )
 def test_a_shipped_controller_that_does_not_fit_planar_is_refused_in_one_line(

@@ -14,7 +14,6 @@ from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
 from cloudrc.metrics.velocity_loop import identify, series
 from cloudrc.robots.build import check_robot, onboard_values
-from cloudrc.runs.experiment import load
 from cloudrc.trials.plan import read_plan
 from tests.conftest import nightly
 
@@ -53,32 +52,6 @@ def test_the_experiment_fast_flies_other_robots_faster(robot):
         axes = [identify(given[:, axis], measured[:, axis]) for axis in (0, 2)]
         fits.append([fit.values[0] + fit.values[1] for fit in axes])  # 63 % of a step is done
     assert all(fast < usual for usual, fast in zip(*fits, strict=True))
-
-
-@pytest.mark.parametrize("robot", ["nano", "rover"])
-def test_a_mission_for_another_robot_is_refused_in_one_line_with_a_command_that_flies(robot):
-    found = []
-    for experiment in ("fast", "paper"):
-        with pytest.raises(BadInputError) as error:
-            load(experiment, [f"world.robot={robot}"])
-        found.append(str(error.value).rpartition("; this flies: cloudrc run "))
-    assert found[0][2] == found[1][2]
-    text, _, command = found[0]
-    assert "\n" not in text
-    assert "mission.touch.body: board" in text or "mission.waypoints.0.position_m" in text
-    name, *words = command.split()
-    assert words[:2] == ["--set", f"world.robot={robot}"]
-    assert set(words[2::2]) <= {"--set"}
-    flight = cloudrc.fly(name, dict(word.split("=") for word in words[1::2]))
-    assert (flight.verdict, flight.failures) == ("success", ())
-
-
-def test_a_robot_reaches_what_it_touches_or_is_refused(own_robot):
-    """The board begins at x = 8.535; the last waypoint is at 8.235, 40 mm are in reserve."""
-    of_size = "onboard: multirotor\nhull_m: {}"
-    load("paper", [f"world.robot={own_robot(of_size.format(0.341))}"])
-    with pytest.raises(BadInputError, match="board: no waypoint brings the robot to it"):
-        load("paper", [f"world.robot={own_robot(of_size.format(0.339))}"])
 
 
 def test_an_experiment_goes_before_the_tuning_and_the_tuning_before_the_robot(own_robot):

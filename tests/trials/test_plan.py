@@ -147,10 +147,10 @@ def test_what_points_share_is_read_and_checked_once(write_sweep, tmp_path, monke
         ))  # fmt: skip
 
     for place, name in ((document, "parse_yaml"), (load, "check_mission"), (scene, "load_scene"),
-                        (overrides, "parameter_model")):  # fmt: skip
+                        (overrides, "_model_of")):  # fmt: skip
         count(place, name)
     axes = {"link.both.delay_ms": [*range(20)], "guard.hold_max_s": [1, 2]}
     sweep = read_plan(write_sweep(axes))
     assert len(sweep.points) == 40
     # The sweep, the experiment, the mission, the profile and the robot; three plug-ins.
-    assert counts == {"parse_yaml": 5, "check_mission": 1, "load_scene": 1, "parameter_model": 3}
+    assert counts == {"parse_yaml": 5, "check_mission": 1, "load_scene": 1, "_model_of": 3}
