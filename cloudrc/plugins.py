@@ -25,12 +25,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from cloudrc.errors import CloudrcError
+from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.outside.code import calling, load_file
 from cloudrc.outside.patience import telling_if_slow
-from cloudrc.outside.refusal import check_names, naming
-from cloudrc.outside.values import InvalidValueError
-from cloudrc.text import suggest_name
+from cloudrc.outside.refusal import check_names
 
 PACKAGES = {
     "estimators": "cloudrc.cloud.estimators",
@@ -72,15 +70,13 @@ class Found:
     @property
     def is_shipped(self) -> bool:
         """Whether it is a module of cloudrc, and not code of a user."""
-        is_module = isinstance(self._target, ModuleType)
-        return is_module and self._target.__name__.startswith("cloudrc.")
+        return f"{self.get('__name__')}".startswith("cloudrc.")
 
     @property
     def builder(self) -> Any:
         """What builds the plug-in: `build`, or the object of an entry point itself."""
-        build = self.get("build")
         is_module = isinstance(self._target, ModuleType)
-        return self._target if build is None and not is_module else build
+        return self.get("build") or (None if is_module else self._target)
 
     def get(self, name: str) -> Any:
         """Return what is called `name`; None if missing."""
@@ -94,9 +90,8 @@ class Found:
         """
         function = self.get(name)
         file = getattr(self._target, "__file__", None) or type(self._target).__name__
-        with naming(file):
-            if function is None:
-                raise InvalidValueError(f"has no function {name}(); write one")
+        if function is None:
+            raise BadInputError(f"{file}: has no function {name}(); write one")
         slow = "" if self.is_shipped else f"{name}() of {file} is still running"
         with calling(f"{file}: {name}() failed", slow=slow):
             yield function
@@ -118,8 +113,7 @@ def describe(kind: str, name: str) -> str:
 
     A plug-in of cloudrc is read, not imported: an onboard controller would import MuJoCo.
     """
-    is_shipped = name in _shipped(kind)
-    module = f"{PACKAGES[kind]}.{name}" if is_shipped else is_path(name) and _module_of(Path(name))
+    module = _own_module(kind, name)
     if module and (spec := find_spec(module)) is not None and spec.origin is not None:
         tree = ast.parse(Path(spec.origin).read_text("utf-8"))
         return (ast.get_docstring(tree) or "").partition("\n")[0]
@@ -133,51 +127,23 @@ def signature(kind: str, name: str) -> inspect.Signature:
     """Return the parameters of a plug-in's `build`; their annotations are types, not strings."""
     build = builder(kind, name)
     with calling(f"{one(kind)} {name!r} has a build() with annotations that cannot be read"):
-        found = inspect.signature(build, eval_str=True)
-    with naming(f"{one(kind)} {name!r}"):
-        if "name" in found.parameters:
-            text = "no parameter of build() may be called name: the key name is the plug-in itself"
-            raise InvalidValueError(f"{text}; call it something else")
-    return found
+        return inspect.signature(build, eval_str=True)
 
 
 def load(kind: str, name: str, /, **parameters: Any) -> Any:
     """Find a plug-in and build it."""
     build = builder(kind, name, look=False)
-    slow = slow_text(kind, name, f"{name} is still being built")
+    slow = "" if _own_module(kind, name) else f"{name} is still being built"
     with calling(f"{one(kind)} {name!r} cannot be built", slow=slow):
         plugin = build(**parameters)
-        _check_methods(kind, plugin)
+        for method in (METHODS[kind], *INHERITED.get(kind, ())):
+            found = getattr(plugin, method, None)
+            # The base class raises a NotImplementedError in the method that each plug-in defines.
+            is_base = getattr(found, "__module__", None) == PACKAGES[kind]
+            if not callable(found) or (is_base and method == METHODS[kind]):
+                returned = f"build() returned {type(plugin).__name__}"
+                raise ValueError(f"{returned}, which has no method {method}()")
     return plugin
-
-
-def slow_text(kind: str, name: str, text: str) -> str:
-    """Return what to log if a plug-in of a user takes long; "" for a shipped one."""
-    is_ours = name in _shipped(kind) or (is_path(name) and _module_of(Path(name)))
-    return "" if is_ours else text
-
-
-def _check_methods(kind: str, plugin: Any) -> None:
-    """Raise a ValueError if an object that `build` returned lacks a method of its kind."""
-    name = one(kind).capitalize()
-    base = getattr(importlib.import_module(PACKAGES[kind] or "cloudrc"), name, None)
-    for method in (METHODS[kind], *INHERITED.get(kind, ())):
-        found = getattr(plugin, method, None)
-        # The base class raises a NotImplementedError in the method that each plug-in defines.
-        is_described = (
-            method == METHODS[kind]
-            and found is not None
-            and (getattr(found, "__func__", None) is getattr(base, method, found))
-        )
-        if callable(found) and not is_described:
-            continue
-        own = [each for each in dir(plugin) if not hasattr(base, each)]
-        hint = suggest_name(method, own)
-        if not hint and method in INHERITED.get(kind, ()):
-            hint = f"; derive its class from {PACKAGES[kind]}.{name}"
-        raise ValueError(
-            f"build() returned {type(plugin).__name__}, which has no method {method}(){hint}"
-        )
 
 
 def find(kind: str, name: str, *, look: bool = True) -> Found:
@@ -185,28 +151,20 @@ def find(kind: str, name: str, *, look: bool = True) -> Found:
 
     With `look`, the caller only looks at what the file defines; it neither builds nor measures.
     """
+    own, what = _own_module(kind, name), f"{one(kind)} {name!r}"
     if is_path(name):
-        with naming(f"{one(kind)} {name!r}"):
-            if not Path(name).is_file():
-                near = suggest_name(Path(name).name, _files_beside(Path(name)))
-                raise InvalidValueError(f"there is no such file{near}")
-    elif name not in _shipped(kind):
+        if not Path(name).is_file():
+            raise BadInputError(f"{what}: there is no such file")
+    elif not own:
         check_names(one(kind), [name], names(kind))
-    with calling(f"{one(kind)} {name!r} cannot be imported"):
+    with calling(f"{what} cannot be imported"):
+        if own:
+            return Found(importlib.import_module(own))
         if is_path(name):
-            if (module := _module_of(Path(name))) is not None:
-                return Found(importlib.import_module(module))
             return Found(load_file(Path(name), look=look))
-        if name in _shipped(kind):
-            return Found(importlib.import_module(f"{PACKAGES[kind]}.{name}"))
         # Last, because the search of all installed packages takes milliseconds.
         with telling_if_slow(f"{name} is still being imported"):
             return Found(_installed(kind)[name].load())
-
-
-def _files_beside(path: Path) -> list[str]:
-    folder = path.parent
-    return [each.name for each in folder.iterdir()] if folder.is_dir() else []
 
 
 def is_path(name: str) -> bool:
@@ -217,15 +175,14 @@ def is_path(name: str) -> bool:
 def builder(kind: str, name: str, *, look: bool = True) -> Callable[..., Any]:
     """Return the function `build` of a plug-in, to `look` at it or to call it."""
     build = find(kind, name, look=look).builder
-    with naming(f"{one(kind)} {name!r}"):
-        if not callable(build):
-            raise InvalidValueError("has no function build(); write one that returns the plug-in")
+    if not callable(build):
+        text = "has no function build(); write one that returns the plug-in"
+        raise BadInputError(f"{one(kind)} {name!r}: {text}")
     return build  # type: ignore[no-any-return]
 
 
 @cache
 def _shipped(kind: str) -> list[str]:
-    check_names("kind of plug-in", [kind], PACKAGES)
     if not PACKAGES[kind]:
         return []
     # Not the package itself: that of executors imports gymnasium, which an image does not have.
@@ -234,11 +191,13 @@ def _shipped(kind: str) -> list[str]:
     return [module.name for module in modules if not module.name.startswith("_")]
 
 
-def _module_of(path: Path) -> str | None:
-    """Return the name of the module of cloudrc in a file; None for a file from elsewhere."""
-    package = Path(__file__).parent
+def _own_module(kind: str, name: str) -> str:
+    """Return the name of the module of cloudrc that is a plug-in; "" for one from elsewhere."""
+    if not is_path(name):
+        return f"{PACKAGES[kind]}.{name}" if name in _shipped(kind) else ""
+    path, package = Path(name), Path(__file__).parent
     if not path.is_relative_to(package):
-        return None
+        return ""
     return ".".join(["cloudrc", *path.relative_to(package).with_suffix("").parts])
 
 

@@ -51,7 +51,8 @@ def check_scene(
     axes = slice(2 if planar else 3)
     if (np.clip(spawn, low, high) != spawn)[0, axes].any():
         where = _spans(low, high, planar=planar)
-        reason = f"is too near to the spawn, {_point(scene.spawn)}; a spawn may be at {where}"
+        spawn_at = _point(scene.spawn)
+        reason = f"the spawn, {spawn_at}, is outside or too near to a wall; it may be at {where}"
         return [ConfigProblem(("world", "fence_m"), "", reason)]
     known = obstacles(scene, touch=touch)
     (hit,) = find_overlapped(known, robot, spawn, TOUCHING)

@@ -22,7 +22,7 @@ from pydantic_core import ErrorDetails
 
 from cloudrc.errors import BadInputError
 from cloudrc.outside.document import Document, KeyPath
-from cloudrc.outside.values import Quantity
+from cloudrc.outside.values import Quantity, shorten
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _TYPES = {
@@ -124,31 +124,18 @@ def _nearest_key(model: type[BaseModel], path: KeyPath) -> str:
     """Return a hint about the unknown key at `path`: a similar known key, or all known keys."""
     *above, key = path
     field = field_at(model, tuple(above))
-    siblings = _keys_of(field.annotation if field else None if above else model)
-    everywhere = {
-        leaf[n]: ".".join(leaf[: n + 1])
-        for leaf, _ in reversed(sorted(leaves(model), key=lambda each: len(each[0])))
-        for n in range(len(leaf))
-    }
-    if key not in everywhere and (near := _near(key, list(siblings))):
-        return f"did you mean {near} {_unit(siblings[near])}".strip() + "?"
-    here = f"known here: {', '.join(siblings)}" if siblings else "no keys are known here"
-    # Of so many keys some key is a little like any word.
-    near = _near(key, list(everywhere), cutoff=0.8)
-    return f"{here}; did you mean {everywhere[near]}?" if near else here
+    known = _keys_of(field.annotation if field else None if above else model)
+    # `delay` is nearest to `delay_ms`: a forgotten unit is more likely than a typo.
+    without_unit = [name for name in known if name.startswith(f"{key}_")]
+    near = without_unit or difflib.get_close_matches(key, known, n=1)
+    if near:
+        return f"did you mean {near[0]} {_unit(known[near[0]])}".strip() + "?"
+    return f"known here: {', '.join(known)}" if known else "no keys are known here"
 
 
 def _keys_of(annotation: Any) -> dict[str, FieldInfo]:
     """Return key -> field of all sections in an annotation."""
     return {key: info for one in _models(annotation) for key, info in one.model_fields.items()}
-
-
-def _near(key: str, known: list[str], cutoff: float = 0.6) -> str | None:
-    """Return the key that is nearest to an unknown one; `cutoff` is that of difflib [1]."""
-    # `delay` is nearest to `delay_ms`: a forgotten unit is more likely than a typo.
-    without_unit = [name for name in known if name.startswith(f"{key}_")]
-    near = without_unit or difflib.get_close_matches(key, known, n=1, cutoff=cutoff)
-    return next(iter(near), None)
 
 
 def _types(annotation: Any) -> Iterator[Any]:
@@ -244,13 +231,8 @@ def from_pydantic(
 
 
 def raise_problems(document: Document, problems: Iterable[ConfigProblem], name: str) -> None:
-    """If there are problems, raise a BadInputError that lists them with file and line.
-
-    If a value and a key below it both have problems, list only the problem of the key below.
-    """
+    """If there are problems, raise a BadInputError that lists them with file and line."""
     every = list(problems)
-    above = {problem.path[:n] for problem in every for n in range(1, len(problem.path))}
-    every = [problem for problem in every if problem.path not in above]
     lines = [f"{document.source(problem.path).label}: {problem}" for problem in every[:_LISTED]]
     if len(every) > _LISTED:
         lines.append(f"and {len(every) - _LISTED} more")
@@ -292,10 +274,8 @@ def in_words(value: Any) -> str:
         return "a mapping"
     if isinstance(value, list | tuple):
         return "a list" if len(value) > 4 else f"[{', '.join(map(in_words, value))}]"
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    words = {"None": "null", "True": "true", "False": "false"}
+    return words.get(repr(value), shorten(value))
 
 
 _INPUT = "Input should be "
@@ -315,21 +295,6 @@ _REASONS: Mapping[str, str] = {
 """Type of pydantic's error -> format of `ConfigProblem.reason`."""
 
 
-def _expected(detail: ErrorDetails, model: type[BaseModel], path: KeyPath) -> str:
-    """Describe which values are valid at `path`; of a type that we do not know, as pydantic does.
-
-    Such a type is in the signature of a user's `build`.
-    """
-    known, text = expectation(model, path), detail["msg"]
-    if known != INVALID:
-        field = field_at(model, path)
-        keys = ", ".join(_keys_of(field.annotation)) if field is not None else ""
-        return f"{known}: {keys}" if known.endswith("of keys") and keys else known
-    if text.startswith(_INPUT):
-        return f"must be {text.removeprefix(_INPUT)}"
-    return text[:1].lower() + text[1:]
-
-
 def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> ConfigProblem:
     kind, keys = detail["type"], tuple(map(str, detail["loc"]))
     # Drop the tags of unions, such as <name>, and the tag of names: they are not keys. Keep an
@@ -337,17 +302,15 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> C
     unknown = keys[-1:] if kind == "extra_forbidden" else ()
     known = keys[: len(keys) - len(unknown)]
     path = tuple(key for key in known if not key.startswith("<") and key != "[key]") + unknown
-    if kind == "unprintable":
-        reason = detail["msg"]
-    elif kind in _REASONS:
+    if kind in _REASONS:
         reason = _REASONS[kind].format_map(detail.get("ctx", {}))
     elif unknown:
         reason = f"unknown key; {_nearest_key(model, path)}"
     else:
-        reason = "is missing; " * (kind == "missing") + _expected(detail, model, path)
-    if kind == "literal_error" and (
-        near := _near(str(detail["input"]), re.findall(r"'([^']*)'", detail["ctx"]["expected"]))
-    ):
-        reason += f"; did you mean {near}?"
+        reason = expectation(model, path)
+        if reason == INVALID:  # a type in the signature of a user's `build`
+            reason = f"must be {detail['msg'].removeprefix(_INPUT)}"
+        if kind == "missing":
+            reason = f"is missing; {reason}"
     value = "" if kind in _WITHOUT_VALUE else in_words(detail["input"])
     return ConfigProblem(prefix + path, value, reason)

@@ -324,20 +324,6 @@ class World(Section):
     odometry_rate_hz: Literal[20, 25, 50, 100, 125, 250, 500] = 100
     """Rate of the odometry for cloud [Hz]. The true state is recorded at 100 Hz or more"""
 
-    @field_validator("fence_m", mode="before")
-    @classmethod
-    def _read_corners(cls, given: Any) -> Any:
-        if given is None:
-            return None
-        parts = given if isinstance(given, list | tuple) else []
-        sizes = [len(each) if isinstance(each, list | tuple) else 0 for each in parts]
-        if sizes == [3, 3]:
-            return tuple(map(tuple, parts))
-        example = "[x, y, z], [x, y, z]"
-        if sizes == [0] * 6:
-            example = f"{list(parts[:3])}, {list(parts[3:])}"
-        raise ValueError(f"must be two corners, [{example}], or null [m]")
-
     @field_validator("fence_m")
     @classmethod
     def _check_fence(cls, corners: Corners | None) -> Corners | None:

@@ -197,15 +197,12 @@ def test_an_index_keeps_the_defaults_of_plug_ins_by_path_and_of_steps(share, tmp
     assert experiment.mission.steps.centre_m == (0.1, 0.0, 1.2)
 
 
-def test_a_parameter_may_have_any_name_but_that_of_the_plug_in(share):
+def test_a_parameter_may_have_the_name_of_an_argument_of_ours(share):
     build = "def build(%s: float = 0.5):\n    return Share(%s, (True,) * 3)\n"
     source = SOURCE.partition("def build")[0]
     share.write_text(source + build % ("kind", "kind"))
     choice = load_experiment("hover", [f"cloud.predictor={share}", "cloud.predictor.kind=0.25"])
     assert build_plugin("predictors", choice.cloud.predictor).share == 0.25
-    share.write_text(source + build % ("name", "name"))
-    text = refused("hover", f"cloud.predictor={share}")
-    assert "no parameter of build() may be called name" in text
 
 
 @pytest.mark.parametrize("how", ["load", "calling"])

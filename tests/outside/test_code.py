@@ -124,15 +124,6 @@ def test_a_broken_helper_is_one_error_of_the_plug_in(write, helper, said):
         find("predictors", str(folder / "mine.py"))
 
 
-@pytest.mark.parametrize("near", ["Mine.py", "mine.py.txt", "mine.ipynb"])
-def test_a_missing_file_names_the_one_that_may_be_meant(tmp_path, near):
-    (tmp_path / near).write_text("value = 1")
-    with pytest.raises(BadInputError, match=rf"no such file; did you mean {near}\?"):
-        find("predictors", str(tmp_path / "mine.py"))
-    with pytest.raises(BadInputError, match=r"there is no such file$"):
-        find("predictors", str(tmp_path / "nowhere" / "mine.py"))
-
-
 def names(files, folder):
     return {str(Path(each).relative_to(folder)) for each in files}
 

@@ -12,7 +12,6 @@ import pytest
 from cloudrc.config import load, overrides, scene
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import SCENES
-from cloudrc.outside import document
 from cloudrc.trials.plan import pack, read_plan, unpack
 from tests.support.sweeps import SHORT
 
@@ -146,11 +145,13 @@ def test_what_points_share_is_read_and_checked_once(write_sweep, tmp_path, monke
             counts.update([name]) or real(*given, **words)
         ))  # fmt: skip
 
-    for place, name in ((document, "parse_yaml"), (load, "check_mission"), (scene, "load_scene"),
-                        (overrides, "_model_of")):  # fmt: skip
+    for place, name in (
+        (load, "check_mission"),
+        (scene, "load_scene"),
+        (overrides, "_model_of"),
+    ):
         count(place, name)
     axes = {"link.both.delay_ms": [*range(20)], "guard.hold_max_s": [1, 2]}
     sweep = read_plan(write_sweep(axes))
     assert len(sweep.points) == 40
-    # The sweep, the experiment, the mission, the profile and the robot; three plug-ins.
-    assert counts == {"parse_yaml": 5, "check_mission": 1, "load_scene": 1, "_model_of": 3}
+    assert counts == {"check_mission": 1, "load_scene": 1, "_model_of": 3}
