@@ -45,7 +45,7 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link pictures results meta-world docs dist images kind-load lock clean
+.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link results meta-world docs dist images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -228,13 +228,6 @@ bench: $(VENV)/all ## measure the closed loop against raw physics
 
 bench-link: $(VENV)/all ## compare the relay with its profiles
 	$(bin)/python -m tools.bench_link $(BENCH_LINK)
-
-# The end-to-end tests draw the dashboards, with the data of their Prometheus.
-# The film needs Chromium and flies in real time.
-pictures: $(VENV)/dev ## film the console for the README, and take the dashboards from 'make e2e'
-	$(bin)/python -m tools.console_picture
-	@if [ -f build/e2e/dashboards.webp ]; then cp build/e2e/dashboards.webp docs/; \
-		else echo "no build/e2e/dashboards.webp: 'make e2e' draws it"; fi
 
 results: $(VENV)/dev ## fly the README's results and write them into it: two minutes
 	$(bin)/python -m tools.results

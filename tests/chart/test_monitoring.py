@@ -12,7 +12,7 @@ import yaml
 from cloudrc.exposition import table
 from cloudrc.exposition.table import METRICS, MetricKind
 from tests.chart.conftest import CHART, OPERATOR, of_kind, render
-from tools.dashboards import draw, expressions, fetch
+from tools.dashboards import expressions
 
 KINDS = {"PodMonitor", "PrometheusRule"}
 needs_promtool = pytest.mark.skipif(
@@ -219,13 +219,3 @@ def test_promtool_accepts_the_queries_of_the_panels(tmp_path):
     path.write_text(yaml.safe_dump({"groups": [{"name": "panels", "rules": rules}]}))
     done = subprocess.run(["promtool", "check", "rules", path], capture_output=True, text=True)
     assert f"SUCCESS: {len(rules)} rules" in done.stdout, done.stdout + done.stderr
-
-
-def test_the_panels_are_drawn_without_grafana(tmp_path):
-    def ask(query):
-        labels = dict.fromkeys(("state", "cause", "limit"), "some")
-        return [{"metric": labels, "values": [[0, "NaN"], [5, "1"]]}]
-
-    guard = dashboards()[1]["lab-demo-cloudrc-guard.json"]
-    draw([(guard, fetch(guard, ask, 300))], tmp_path / "panels.webp")
-    assert (tmp_path / "panels.webp").read_bytes()[8:12] == b"WEBP"
