@@ -14,12 +14,11 @@ from __future__ import annotations
 import inspect
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import yaml
-from annotated_types import MaxLen
 from pydantic import BaseModel
 
 from cloudrc import plugins
@@ -30,6 +29,7 @@ from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import Experiment, MissionConfig
 from cloudrc.exposition.table import METRICS, ROLES
 from cloudrc.metrics.definitions import QUANTITIES, RecordQuantity
+from cloudrc.outside.values import to_plain
 from cloudrc.record.topics import TOPICS
 from tools.chart_values import make_schema, table_rows
 from tools.dashboards import UNITS
@@ -86,6 +86,17 @@ OPEN = {
 """Label of a metric that has too many values for a list -> description of the values."""
 GRAFANA = {symbol: name for name, symbol in UNITS.items()}
 """Symbol of a unit -> its name in Grafana."""
+TYPES = {
+    **{"number": "number", "integer": "whole number", "string": "text", "null": "null"},
+    **{"boolean": "true or false", "array": "list", "object": "mapping"},
+}
+"""Type in a JSON schema -> the page's word."""
+LIMITS = {
+    **{"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"},
+    "maxItems": "of at most",
+}
+"""Limit in a JSON schema -> the page's sign."""
+Key: TypeAlias = tuple[tuple[str, ...], dict[str, Any]]
 COPIED = ("profile", "mission")
 """Kinds of shipped files of which the chart has copies."""
 
@@ -132,18 +143,9 @@ def table(columns: str, rows: Iterable[Iterable[object]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def plain(value: Any) -> Any:
-    """Convert a default value to plain YAML values."""
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json", by_alias=True, exclude_none=True)
-    if isinstance(value, tuple | list):
-        return [plain(item) for item in value]
-    return value
-
-
 def flow(value: Any) -> str:
     """Format a default value as YAML on one line."""
-    text = yaml.safe_dump(plain(value), default_flow_style=True, sort_keys=False, width=10**6)
+    text = yaml.safe_dump(to_plain(value), default_flow_style=True, sort_keys=False, width=10**6)
     return text.removesuffix("...\n").strip()
 
 
@@ -186,45 +188,66 @@ def _summary(model: Any) -> str:
 
 def _keys(model: type[BaseModel], chosen: list[str] | None = None) -> str:
     """Format the table of a model's keys; with `chosen`, only these keys and those below them."""
-    paths = []
-    for leaf, _ in problems.leaves(model):
-        for path in (leaf[:depth] for depth in range(1, len(leaf) + 1)):
-            is_elsewhere = any(key in PARTS for key in path[:-1])
-            if path[-1] != "0" and path not in paths and not is_elsewhere:
-                paths.append(path)
-    rows = [_row(model, path) for path in paths if chosen is None or path[0] in chosen]
-    return table("key | value | unit | default | meaning", filter(None, rows))
+    defined = model.model_json_schema()
+    paths = keys_of(defined, defined)
+    rows = [_row(path, part, defined) for path, part in paths if not chosen or path[0] in chosen]
+    return table("key | value | unit | default | meaning", rows)
 
 
-def _row(model: type[BaseModel], path: tuple[str, ...]) -> tuple[str, ...] | None:
-    info = problems.field_at(model, path)
-    if info is None or not info.description:
-        return None  # a section without its own description
-    value, _, unit = problems.expectation(model, path).removeprefix("must be ").partition(" [")
-    unit = unit.removesuffix("]")
-    meaning = " ".join(info.description.split())
-    meaning = meaning.replace(f" [{unit}]", "") if unit else meaning
-    key = ".".join(path).replace(".0", "[]")
-    default = "required" if info.is_required() else f"`{_default(info.default)}`"
-    return f"`{key}`", _value(model, path, value), unit, default, meaning
+def keys_of(
+    defined: Any, section: Any, above: tuple[str, ...] = (), apart: Container[str] = PARTS
+) -> Iterator[Key]:
+    """Yield path and JSON schema of each key in a `section` of the schema `defined`.
+
+    In a list of sections, the path has "[]" behind the list. Keys below those of `apart` are left
+    out.
+    """
+    for key, part in section.get("properties", {}).items():
+        if "description" in part:
+            yield (*above, key), part
+        for form in forms(defined, part):
+            many = "[]" if "items" in form else ""
+            for inner in forms(defined, form.get("items", form)):
+                if key not in apart:
+                    yield from keys_of(defined, inner, (*above, key + many), apart)
 
 
-def _default(value: Any) -> str:
-    return "{}" if isinstance(value, BaseModel) else flow(value)
+def forms(defined: Any, part: Any) -> Iterator[Any]:
+    """Yield the schemas of the forms that a value may have."""
+    part = defined["$defs"][part["$ref"].rpartition("/")[2]] if "$ref" in part else part
+    choices = part.get("anyOf", part.get("oneOf"))
+    if choices is None:
+        yield part
+    for each in choices or ():
+        yield from forms(defined, each)
 
 
-def _value(model: type[BaseModel], path: tuple[str, ...], words: str) -> str:
-    """Shorten the error text about a value, and link it to the keys of the value."""
-    if words.startswith("a list of"):
-        item = problems.expectation(model, (*path, "0")).partition(" [")[0]
-        words += item.removeprefix("must be a number")
-    for limit in getattr(problems.field_at(model, path), "metadata", ()):
-        if isinstance(limit, MaxLen):
-            words += f" of at most {limit.max_length}"
-    words = re.sub(r">= (\S+) and <= (\S+)", r"\1 to \2", words)
-    words = re.sub(r"\b(?:an?|one of) ", "", words).replace(str(2**53), "2^53")
-    mapping = f"[mapping]({PARTS[path[-1]]})" if path[-1] in PARTS else "mapping"
-    return re.sub(r"'(\w+)'", r"`\1`", words).replace("mapping of keys", mapping)
+def _row(path: tuple[str, ...], part: Any, defined: Any) -> tuple[str, ...]:
+    words = dict.fromkeys(_words(each) for each in forms(defined, part))
+    value, meaning = " or ".join(words), " ".join(part["description"].split())
+    if path[-1] in PARTS:
+        value = value.replace("mapping", f"[mapping]({PARTS[path[-1]]})")
+    unit = problems.unit_in(part["description"])
+    meaning = meaning.replace(f" {unit}", "") if unit else meaning
+    default = "required"
+    if "default" in part:
+        default = f"`{'{}' if isinstance(part['default'], dict) else flow(part['default'])}`"
+    return f"`{'.'.join(path)}`", value, unit[1:-1], default, meaning
+
+
+def _words(form: Any) -> str:
+    """Say which values a JSON schema without choices allows."""
+    if "enum" in form:
+        return ", ".join(f"`{each}`" for each in form["enum"])
+    kind, size = form["type"], len(form.get("prefixItems", ()))
+    if size:
+        inner = _words(form["prefixItems"][0])
+        return f"list of {size} " + re.sub("number|list", r"\g<0>s", inner, count=1)
+    limits = {LIMITS[key]: form[key] for key in LIMITS if key in form}
+    text = " and ".join(f"{sign} {limit:.16g}" for sign, limit in limits.items())
+    text = re.sub(r">= (\S+) and <= (\S+)", r"\1 to \2", text)
+    text += " (1 % is 0.01)" * (text == "0 to 1")
+    return f"{TYPES[kind]} {text}".strip()
 
 
 def _plug_ins() -> str:

@@ -237,6 +237,9 @@ def _try(
     kind: str, name: str, given: dict[str, Any], robot: RobotFacts, *, plans: bool
 ) -> dict[str, Any]:
     """Build a plug-in, with `plans` for a cloud that sends plans; return all its parameters."""
+    for parameter in given:
+        if (kind, parameter) in GIVEN:
+            raise BadInputError(f"{parameter}: is no parameter of yours, cloudrc gives it")
     checked = _check(kind, name, given)
     with code.calling(f"{plugins.one(kind)} {name!r} has a default that YAML cannot contain"):
         values: dict[str, Any] = checked.model_dump(mode="json")

@@ -10,32 +10,17 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import is_dataclass
-from pathlib import Path
-from types import NoneType
 from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin
 
-from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from cloudrc.errors import BadInputError
 from cloudrc.outside.document import Document, KeyPath
-from cloudrc.outside.values import Quantity, shorten
+from cloudrc.outside.values import shorten
 
 _Model = TypeVar("_Model", bound=BaseModel)
-_TYPES = {
-    float: "a number",
-    int: "a whole number",
-    str: "text",
-    bool: "true or false",
-    NoneType: "null",
-    Path: "the path of a file",
-}
-_SIGNS = {Ge: ">=", Gt: ">", Le: "<=", Lt: "<"}
-INVALID = "is not valid"
-"""Expectation at a key that is not in the schema, or whose type has no words here."""
 _LISTED = 50
 """Largest number of problems in one error message."""
 
@@ -79,47 +64,6 @@ def field_at(model: type[BaseModel], path: KeyPath) -> FieldInfo | None:
     return field
 
 
-def expectation(model: type[BaseModel], path: KeyPath) -> str:
-    """Describe which values are valid at `path`, such as "must be a number >= 0 [ms]"."""
-    field = field_at(model, path)
-    if field is None:
-        return INVALID
-    kind = field.annotation
-    if get_origin(kind) is Literal:
-        return f"must be one of {', '.join(map(repr, get_args(kind)))}"
-    if _is_list(kind) and not path[-1].isdecimal():
-        words = [_list_words(kind)]
-    else:
-        types = dict.fromkeys(_types(kind))
-        words = [_TYPES[plain] for plain in types if plain in _TYPES]
-        if words and words[0].endswith("number"):
-            limits = " and ".join(dict.fromkeys(_limits(field)))
-            share = "(1 % is 0.01)" if limits == ">= 0 and <= 1" else ""
-            words[0] = " ".join([words[0], limits, share]).strip()
-        sections = [*_models(kind), *filter(is_dataclass, types)]
-        if sections:
-            words.append("a mapping of keys")
-        if types.keys() - _TYPES.keys() - set(sections):
-            return INVALID
-    return " ".join(["must be", " or ".join(words), _unit(field)]).strip()
-
-
-def _list_words(kind: Any) -> str:
-    """Describe a list, such as "a list of 3 numbers"; `kind` is its annotation."""
-    fixed = get_origin(kind) is tuple and Ellipsis not in get_args(kind)
-    words = ["a list"]
-    has_numbers = float in _types(kind)
-    if fixed or has_numbers:
-        words.append("of")
-    if fixed:
-        words.append(str(len(get_args(kind))))
-    if has_numbers:
-        words.append("numbers")
-    if not fixed and NoneType in get_args(kind):
-        words.append("or null")
-    return " ".join(words)
-
-
 def _nearest_key(model: type[BaseModel], path: KeyPath) -> str:
     """Return a hint about the unknown key at `path`: a similar known key, or all known keys."""
     *above, key = path
@@ -129,7 +73,7 @@ def _nearest_key(model: type[BaseModel], path: KeyPath) -> str:
     without_unit = [name for name in known if name.startswith(f"{key}_")]
     near = without_unit or difflib.get_close_matches(key, known, n=1)
     if near:
-        return f"did you mean {near[0]} {_unit(known[near[0]])}".strip() + "?"
+        return f"did you mean {near[0]} {unit_in(known[near[0]].description)}".strip() + "?"
     return f"known here: {', '.join(known)}" if known else "no keys are known here"
 
 
@@ -164,29 +108,9 @@ def _is_list(annotation: Any) -> bool:
     return any(get_origin(kind) in (tuple, list, set, frozenset, Sequence) for kind in kinds)
 
 
-def _limits(field: FieldInfo) -> Iterator[str]:
-    """Yield the limits of a field in words, such as ">= 0"."""
-    for bound in _bounds(field):
-        yield f"{_SIGNS[type(bound)]} {getattr(bound, type(bound).__name__.lower())}"
-
-
-def _bounds(part: Any) -> Iterator[Ge | Gt | Le | Lt]:
-    """Yield the limits in a field or an annotation."""
-    inner: Iterable[Any]
-    if isinstance(part, Quantity):
-        inner = part
-    elif isinstance(part, FieldInfo):
-        inner = (*part.metadata, part.annotation)
-    else:
-        inner = (*getattr(part, "__metadata__", ()), *get_args(part))
-    if isinstance(part, Ge | Gt | Le | Lt):
-        yield part
-    for item in inner:
-        yield from _bounds(item)
-
-
-def _unit(field: FieldInfo) -> str:
-    found = re.search(r"\[[^\],]+\]$|\[[^\],]+\](?=[,;.\s])", field.description or "")
+def unit_in(text: str | None) -> str:
+    """Return the unit in the description of a key, such as "[ms]"; "" if there is none."""
+    found = re.search(r"\[[^\],]+\]$|\[[^\],]+\](?=[,;.\s])", text or "")
     return found.group() if found else ""
 
 
@@ -278,21 +202,24 @@ def in_words(value: Any) -> str:
     return words.get(repr(value), shorten(value))
 
 
-_INPUT = "Input should be "
-"""Beginning of most of pydantic's messages."""
 _WITHOUT_VALUE = ("extra_forbidden", "missing", "value_error", "too_long")
 """Types of pydantic's errors whose message does not show the value."""
 _REASONS: Mapping[str, str] = {
     "value_error": "{error}",
     "too_long": "must have at most {max_length} entries",
-    "string_too_long": "must be text of at most {max_length} characters",
     "string_pattern_mismatch": "must be text without slashes",
-    "finite_number": "must be finite",
-    "literal_error": "must be {expected}",
-    "unexpected_keyword_argument": "unknown key",
+    "missing": "is missing",
     "needs_python_object": "must be an object of a class, which YAML cannot contain",
 }
 """Type of pydantic's error -> format of `ConfigProblem.reason`."""
+_WORDS = {
+    "Input should": "must",
+    **{"greater than or equal to": ">=", "less than or equal to": "<="},
+    **{"greater than": ">", "less than": "<"},
+    **{"integer": "whole number", "string": "text", "boolean": "true or false"},
+    **{"array": "list", "an object": "a mapping of keys"},
+}
+"""Words in pydantic's messages -> those of ours."""
 
 
 def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> ConfigProblem:
@@ -302,15 +229,15 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> C
     unknown = keys[-1:] if kind == "extra_forbidden" else ()
     known = keys[: len(keys) - len(unknown)]
     path = tuple(key for key in known if not key.startswith("<") and key != "[key]") + unknown
-    if kind in _REASONS:
-        reason = _REASONS[kind].format_map(detail.get("ctx", {}))
-    elif unknown:
+    if unknown:
         reason = f"unknown key; {_nearest_key(model, path)}"
+    elif kind in _REASONS:
+        reason = _REASONS[kind].format_map(detail.get("ctx", {}))
     else:
-        reason = expectation(model, path)
-        if reason == INVALID:  # a type in the signature of a user's `build`
-            reason = f"must be {detail['msg'].removeprefix(_INPUT)}"
-        if kind == "missing":
-            reason = f"is missing; {reason}"
+        reason, field = detail["msg"], field_at(model, path)
+        for old, new in _WORDS.items():
+            reason = reason.replace(old, new)
+        if field is not None:
+            reason = f"{reason} {unit_in(field.description)}".strip()
     value = "" if kind in _WITHOUT_VALUE else in_words(detail["input"])
     return ConfigProblem(prefix + path, value, reason)

@@ -31,9 +31,9 @@ def test_all_problems_are_listed_with_their_lines(mine):
     first, *rest = text.splitlines()
     assert first == "mine.yaml has 4 problems:"
     assert sorted(line.strip() for line in rest) == sorted([
-        "mine.yaml:1: seed: 'one': must be a whole number >= 0 and < 9007199254740992",
+        "mine.yaml:1: seed: 'one': must be a valid whole number",
         "mine.yaml:2: guard.speed_max: unknown key; did you mean speed_max_mps [m/s]?",
-        "mine.yaml:3: link.uplink.delay_ms: -3: must be a number >= 0 [ms]",
+        "mine.yaml:3: link.uplink.delay_ms: -3: must be >= 0 [ms]",
         "mine.yaml:4: world.scene: no scene named 'pipe'; available: empty, pillars, pipes; "
         "did you mean pipes?; for one of your own, give its path, such as ./pipe",
     ])  # fmt: skip
@@ -66,7 +66,7 @@ def test_fifty_problems_at_most_are_listed(mine):
         ("mission: {waypoints: []}",
          "mine.yaml:1: mission.waypoints: none given; give waypoints, or steps, or setpoints"),
         ("mission: {waypoints: [{tolerance_m: 1}]}",
-         "mission.waypoints.0.position_m: is missing; must be a list of 3 numbers [m]"),
+         "mission.waypoints.0.position_m: is missing"),
         ("mission: {waypoints: [{position_m: [0, 0, 3]}]}",
          "[0, 0, 3]: beyond the fence, or too near to it; the guard lets the robot fly at "
          "x -2.8 to 9, y -8.3 to 5.3, z 0.35 to 2.3 [m]"),
@@ -118,7 +118,7 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("world.robot=./no.xml", "no such folder with robot.yaml or .xml file"),
         # A limit of the guard cannot be switched off.
         ("guard.command_age_max_ms=true", "--set: guard.command_age_max_ms: "),
-        ("world.plant.actuator_factor=[1,9]", "actuator_factor.1: 9: must be a number >= 0.2"),
+        ("world.plant.actuator_factor=[1,9]", "actuator_factor.1: 9: must be <= 5"),
         ("world.tuning=none", "world.tuning: no tuning of pelican named 'none'; available: fast"),
         ("cloud.compute_deviation_ms=1", "needs compute_ms"),
     ],

@@ -31,7 +31,7 @@ def flown(robot, point=(0, 0, 1), **keys):
     [
         ("pelican", (0, 0, 1), {"yaw_deg": 90}, "90: the onboard controller of this robot holds"),
         ("rover", (1, 0), {"yaw_deg": 90}, "90: the heading of this robot follows its velocity"),
-        ("x2", (0, 0, 1), {"yaw_deg": 9, "yaw_tolerance_deg": 0}, "must be a number > 0"),
+        ("x2", (0, 0, 1), {"yaw_deg": 9, "yaw_tolerance_deg": 0}, "must be > 0"),
     ],
 )
 def test_a_yaw_that_the_robot_does_not_obey_is_refused_in_one_line(robot, point, keys, message):
@@ -94,7 +94,7 @@ def test_teleop_takes_and_refuses_yaws_as_a_mission_does():
     assert read.order(order).plan.legs[0].yaw == radians(90)
     assert read.goto(goto).yaw == radians(90)
     assert read.goto(b'{"position_m": [0, 0, 1]}').yaw is None
-    with pytest.raises(RefusedError, match=r"^yaw_deg: .*must be a number >= -360 and <= 360"):
+    with pytest.raises(RefusedError, match=r"^yaw_deg: .*must be <= 360"):
         read.goto(goto.replace(b"90", b"361"))
     with pytest.raises(RefusedError, match=r"^yaw_deg: 90: the onboard controller"):
         fixed.goto(goto)

@@ -57,7 +57,7 @@ def test_a_plug_in_is_loaded_by_path(share):
 @pytest.mark.parametrize(
     ("setting", "reason"),
     [
-        ("share=much", "cloud.predictor.share: 'much': must be a number"),
+        ("share=much", "cloud.predictor.share: 'much': must be a valid number"),
         ("shar=1", "cloud.predictor.shar: unknown key; did you mean share?"),
         ("share=2", "cannot be built: share.py:17: share: must be at most 1"),
     ],

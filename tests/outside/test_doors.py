@@ -6,17 +6,14 @@ The tests find flags and keys by walking them, so that a new one is tested by it
 import argparse
 import json
 from functools import partial
-from types import NoneType
 
 import gymnasium
 import pytest
-from annotated_types import Ge, Gt, Le
 
 from cloudrc import api
 from cloudrc.cli.parser import COMMANDS, NumberFlag, build_parser
 from cloudrc.cloud.controllers import ControlOutput
 from cloudrc.cloud.results import check_estimate, check_output
-from cloudrc.config import problems
 from cloudrc.config.profile import Profile
 from cloudrc.config.schema import Experiment
 from cloudrc.errors import BadInputError
@@ -29,6 +26,7 @@ from cloudrc.outside.document import parse_value, parse_yaml
 from cloudrc.outside.values import ANY, RESULT, WHOLE, InvalidValueError, Quantity
 from cloudrc.runs.experiment import load
 from tests.outside.values import OBJECTS, TEXTS, disagreements, taken_otherwise
+from tests.support.keys import forms_of, limits_of
 
 
 def flags(parser, command=""):
@@ -58,20 +56,14 @@ def test_a_flag_reads_what_the_table_says(name):
 
 def keys(model):
     """Yield path and quantity of each key of a model whose value is a number or null."""
-    for path, field in problems.leaves(model):
-        kinds = {*problems._types(field.annotation)}
+    for name, forms in forms_of(model).items():
+        path = tuple(name.split("."))
         # Below a loss there are keys that must be given, and the deviation needs a mean.
         is_alone = {"0", "loss", "touch"}.isdisjoint(path[:-1])
-        is_alone = is_alone and path[-1] != "compute_deviation_ms"
-        is_number = kinds - {NoneType} in ({float}, {int})
-        if not is_alone or not is_number or problems._is_list(field.annotation):
-            continue
-        limits = {"whole": float not in kinds}
-        for bound in problems._bounds(field):
-            for kind in (Ge, Gt, Le):
-                if isinstance(bound, kind):
-                    limits[kind.__name__.lower()] = getattr(bound, kind.__name__.lower())
-        yield path, Quantity(**limits)
+        one = [form for form in forms if form.get("type") != "null"]
+        is_number = len(one) == 1 and one[0].get("type") in ("number", "integer")
+        if is_alone and is_number and "enum" not in one[0] and path[-1] != "compute_deviation_ms":
+            yield path, Quantity(**limits_of(one[0]), whole=one[0]["type"] == "integer")
 
 
 EXPERIMENT, PROFILE = dict(keys(Experiment)), dict(keys(Profile))
