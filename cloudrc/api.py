@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,6 @@ from cloudrc.runs.requirements import MODES, require
 
 if TYPE_CHECKING:
     from cloudrc.report.document import Assessment
-    from cloudrc.trials.plan import SweepPlan
 
 
 SECONDS = Quantity("s", 1.0, 3600.0)
@@ -163,48 +162,29 @@ def fly(
     check_names("mode", [mode], MODES)
     require(f"mode {mode}", MODES[mode])
     seeds = {} if seed is None else {"seed": seed}
-    resolved = load(str(experiment), [*_texts(settings or {}), *_texts(seeds)])
+    resolved = load(str(experiment), _texts({**(settings or {}), **seeds}))
     check_mode(resolved, mode)
-    for text in advice_on(resolved):
-        warnings.warn(text, stacklevel=3)
+    _warn(resolved)
     if mode == "virtual" and out is None:
         return _result(fly_in_memory(resolved))
-    if mode == "cluster":
-        return _fly_in_cluster(resolved, _Place(context, namespace, release, timeout), out)
-    return _fly_here(resolved, mode, out)
+    folder = None if out is None else Path(out)
+    if mode != "cluster":
+        from cloudrc.runs.fly import fly
 
-
-class _Place(NamedTuple):
-    """Where a flight in a cluster takes place; the fields are arguments of `fly`."""
-
-    context: str | None
-    namespace: str | None
-    release: str
-    timeout: float  # [s]
-
-
-def _fly_in_cluster(
-    experiment: ResolvedExperiment, place: _Place, out: str | Path | None
-) -> Result:
+        folder = run_folder(resolved, mode, folder)
+        return _read(resolved, folder, fly(resolved, mode, folder))
     from cloudrc.cluster.client import connect
     from cloudrc.cluster.flight import check_can_begin, fly_in_cluster
     from cloudrc.cluster.own_files import check_experiment
 
-    check_experiment(experiment)
-    release = connect(place.context, place.namespace, place.release)
-    check_can_begin(release)
-    folder = run_folder(experiment, "cluster", None if out is None else Path(out))
-    report = fly_in_cluster(experiment, folder, release, place.timeout)
+    check_experiment(resolved)
+    place = connect(context, namespace, release)
+    check_can_begin(place)
+    folder = run_folder(resolved, mode, folder)
+    report = fly_in_cluster(resolved, folder, place, timeout)
     if out is None:
         point_to(folder, "latest")
-    return _read(experiment, folder, report)
-
-
-def _fly_here(experiment: ResolvedExperiment, mode: str, out: str | Path | None) -> Result:
-    from cloudrc.runs.fly import fly
-
-    folder = run_folder(experiment, mode, None if out is None else Path(out))
-    return _read(experiment, folder, fly(experiment, mode, folder))
+    return _read(resolved, folder, report)
 
 
 def _read(experiment: ResolvedExperiment, folder: Path, report: Mapping[str, Any]) -> Result:
@@ -248,7 +228,9 @@ def sweep(
             belongs to another sweep.
     """
     require("a sweep", ("world", "record"))
+    from cloudrc.studies import sweep as work
     from cloudrc.trials.plan import read_plan
+    from cloudrc.trials.play import run
 
     jobs = _count(jobs, "jobs")
     if isinstance(grid, Mapping):
@@ -257,17 +239,11 @@ def sweep(
         plan = read_plan(plain)
     else:
         plan = read_plan(Path(grid))
-    for text in advice_on(*plan.points):
-        warnings.warn(text, stacklevel=3)
-    with TemporaryDirectory(prefix="cloudrc-sweep-") as temporary:
-        return _fly_sweep(plan, None if out is None else Path(out), Path(temporary), jobs)
-
-
-def _fly_sweep(plan: SweepPlan, out: Path | None, temporary: Path, jobs: int) -> SweepTable:
-    from cloudrc.studies import sweep as work
-    from cloudrc.trials.play import run
-
-    with work.open_folder(out or temporary, "sweep") as folder:
+    _warn(*plan.points)
+    with (
+        TemporaryDirectory(prefix="cloudrc-sweep-") as temporary,
+        work.open_folder(Path(out or temporary), "sweep") as folder,
+    ):
         rows = work.begin(folder, plan)
         stopped = run(plan.flights.values(), rows, jobs, in_order=False)
         flown = work.finish(folder, plan)
@@ -280,7 +256,7 @@ def _fly_sweep(plan: SweepPlan, out: Path | None, temporary: Path, jobs: int) ->
         for name, values in columns.items()
     }
     units = {name: plan.units[name] for name in arrays if name in plan.units}
-    return SweepTable(arrays, units, out)
+    return SweepTable(arrays, units, None if out is None else Path(out))
 
 
 def compare(
@@ -312,8 +288,7 @@ def compare(
     seeds, jobs = _count(seeds, "seeds"), _count(jobs, "jobs")
     first, second = (pairs.split_settings(x) if isinstance(x, str) else _texts(x) for x in (a, b))
     plan = pairs.plan_sides(of, _texts(settings or {}), first, second, seeds, numbers)
-    for text in advice_on(*plan.points):
-        warnings.warn(text, stacklevel=3)
+    _warn(*plan.points)
     flown, stopped = pairs.fly_pairs(plan, jobs)
     if stopped:
         raise _as_exception(stopped)
@@ -425,6 +400,11 @@ def verify(
     place = choose_release(context, namespace, release)
     with work.forwarded_pods(place) as pods:
         return work.verify_release(place.name, pods, limit)
+
+
+def _warn(*experiments: ResolvedExperiment) -> None:
+    for text in advice_on(*experiments):
+        warnings.warn(text, stacklevel=4)
 
 
 def _as_exception(stopped: CloudrcError) -> BaseException:

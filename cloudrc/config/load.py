@@ -26,7 +26,6 @@ from cloudrc.config.profile import (
     DIRECTIONS,
     DirectionConfig,
     Profile,
-    check_file,
     check_profile,
     load_profile,
     resolve_files,
@@ -365,25 +364,21 @@ def _remove_derived(document: Document, name: str, *, new_profile: bool) -> None
 def _resolve_paths(document: Document) -> list[ConfigProblem]:
     """Make all paths in an experiment absolute, and check the files; return problems."""
     found = resolve_files(document, ("link",))
-    for path in _places_of_files(document):
-        name, key, source = document.get(*path), path[-1], document.source(path)
-        with problems.collect(found, path):
-            if not isinstance(name, str) or (key.isdecimal() and not plugins.is_path(name)):
-                continue
-            if key in ("robot", "scene"):
-                name = shipped.model_path(key, name, source.folder)
-                if key == "robot":
-                    known_robot(name)
-            else:
-                name = str(source.absolute(name))
-                check_file(key, name)
-            document.set_value(path, name, source)
-    return found
-
-
-def _places_of_files(document: Document) -> list[KeyPath]:
-    """Return the paths of all keys that may name a file, but those of the link."""
     paths: list[KeyPath] = [("mission", "setpoints"), ("world", "robot"), ("world", "scene")]
     metrics = document.get("report", "metrics")
-    count = len(metrics) if isinstance(metrics, list) else 0
-    return paths + [("report", "metrics", str(index)) for index in range(count)]
+    if isinstance(metrics, list):
+        named = [n for n, name in enumerate(metrics) if plugins.is_path(str(name))]
+        paths += [("report", "metrics", str(n)) for n in named]
+    for path in paths:
+        name, key, source = document.get(*path), path[-1], document.source(path)
+        with problems.collect(found, path):
+            if not isinstance(name, str):
+                continue
+            if path[0] == "world":
+                name = shipped.model_path(key, name, source.folder)
+            else:
+                name = str(source.absolute(name))
+            if key == "robot":
+                known_robot(name)
+            document.set_value(path, name, source)
+    return found

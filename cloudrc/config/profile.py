@@ -108,12 +108,12 @@ def resolve_files(document: Document, above: KeyPath = ()) -> list[ConfigProblem
         name, source = document.get(*path), document.source(path)
         if isinstance(name, str):
             with problems.collect(found, path):
-                file = str(source.absolute(name))
-                check_file(path[-1], file)
-                document.set_value(path, file, source)
+                file = source.absolute(name)
+                _check_file(path[-1], file)
+                document.set_value(path, str(file), source)
     return found
 
 
-def check_file(key: str, path: str) -> None:
+def _check_file(key: str, path: Path) -> None:
     """Read a data file, or raise an error; a large trace takes long, so read it once a sweep."""
-    reuse(("file", key, path), lambda: bool(FILE_READERS.get(key, Path)(Path(path))))
+    reuse(("file", key, path), lambda: bool(FILE_READERS[key](path)))

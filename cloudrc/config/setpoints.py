@@ -10,7 +10,7 @@ import numpy as np
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import Fence
-from cloudrc.link.traces import Row, read_lines, read_rows
+from cloudrc.link.traces import read_lines, read_rows
 from cloudrc.messages import Vector
 
 COLUMNS = ["time_s", "x_m", "y_m", "z_m"]
@@ -33,40 +33,22 @@ def read_setpoints(path: Path, fence: Fence) -> tuple[TimedPosition, ...]:
     if columns not in (COLUMNS, fits):
         given = ",".join(columns)[:80] or "missing"
         raise BadInputError(f"{name}: the header is {given}; it must be {','.join(fits)}")
-    found = _take_each(rows, columns, fence)
-    if len(found) < 2:
-        raise BadInputError(f"{name}: has {len(found)} rows; give at least two")
-    return tuple((time - found[0][0], position) for time, position in found)
-
-
-def _take_each(rows: Iterable[Row], columns: Sequence[str], fence: Fence) -> list[TimedPosition]:
-    """Return the setpoint of each row; raise a BadInputError about the first that does not fit."""
     found = list[TimedPosition]()
     for row in rows:
         time, *place = map(row.number, columns)
+        x, y, z = (*place, fence.inner_low[2])[:3]
         if found and time <= found[-1][0]:
-            raise BadInputError(
-                f"{row.where}: time_s {time:g} does not rise; sort the rows by time"
-            )
-        found.append((time, _position(place, fence, row.where)))
-    return found
-
-
-def _position(place: Sequence[float], fence: Fence, where: str) -> Vector:
-    """Return the position [m] in the row at `where`; `place` is x and y, and z if it is given."""
-    x, y, *heights = place
-    z = heights[0] if heights else fence.inner_low[2]
-    if fence.ground is not None and abs(z - fence.ground) > ROUNDING:
-        raise BadInputError(
-            f"{where}: z_m is {z:g}, but the robot stays on the ground, at {fence.ground:g}; "
-            "leave the column z_m out"
-        )
-    sides = zip(COLUMNS[1:], fence.inner_low, (x, y, z), fence.inner_high, strict=True)
-    for column, low, at, high in sides:
-        if not low - ROUNDING <= at <= high + ROUNDING:
-            reason = f"the guard flies from {low:g} to {high:g}"
-            raise BadInputError(f"{where}: {column} is {at:g}; {reason}; stay inside")
-    return x, y, z
+            raise BadInputError(f"{row.where}: time_s {time:g} does not rise")
+        for column, low, at, high in zip(
+            COLUMNS[1:], fence.inner_low, (x, y, z), fence.inner_high, strict=True
+        ):
+            if not low - ROUNDING <= at <= high + ROUNDING:
+                reason = f"{column} is {at:g}; the guard moves the robot from {low:g} to {high:g}"
+                raise BadInputError(f"{row.where}: {reason}")
+        found.append((time, (x, y, z)))
+    if len(found) < 2:
+        raise BadInputError(f"{name}: has {len(found)} rows; give at least two")
+    return tuple((time - found[0][0], position) for time, position in found)
 
 
 def write_setpoints(setpoints: Iterable[tuple[float, Sequence[float]]], fence: Fence) -> str:

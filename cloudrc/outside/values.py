@@ -84,19 +84,32 @@ class Quantity:
         """Convert numbers in an array or in nested lists; an array of numbers keeps its type."""
         import numpy as np
 
-        if type(values) is not np.ndarray or values.dtype.kind not in "iuf":
-            for place, value in _leaves_of(values):
-                self.of(value, _at(place, name))
+        found: NDArray[Any] = self._numbers(values, (), name)
         try:
-            found = np.asarray(values)
+            found = np.asarray(found)
         except ValueError:  # rows of unequal lengths
-            found = np.array(None)
-        if found.dtype.kind not in "iuf":
-            found = np.array([self.of(each, name) for each in found.flat]).reshape(found.shape)
+            self.of(values, name)
         if found.size and not self._contains(found.min()) & self._contains(found.max()):
             place = np.argwhere(~self._contains(found))[0].tolist()
             self.of(found[tuple(place)].item(), _at(place, name))
         return found
+
+    def _numbers(self, values: Any, place: tuple[int, ...], name: str) -> Any:
+        """Return an array, or nested lists with numbers alone."""
+        import numpy as np
+
+        if hasattr(values, "__array__") and not isinstance(values, np.ma.MaskedArray):
+            values = np.asarray(values)
+            if values.dtype.kind in "iuf":
+                return values
+        if isinstance(values, np.ndarray):
+            values = values.tolist()  # a masked value is None
+        if not isinstance(values, Sequence) or isinstance(values, str | bytes):
+            number = self.of(values, _at(place, name))
+            return values if type(values) is int else number  # a whole number stays one
+        if {*map(type, values)} == {float}:  # the usual case, which must be fast
+            return values
+        return [self._numbers(each, (*place, n), name) for n, each in enumerate(values)]
 
     def _contains(self, numbers: Any) -> Any:
         """Return whether a number, or each of an array, is in the range and finite."""
@@ -209,24 +222,6 @@ def to_arrays(value: Any) -> Any:
         return tensor.numpy()
     except TypeError:
         return tensor.float().numpy()
-
-
-def _leaves_of(values: Any, place: tuple[int, ...] = ()) -> Iterator[tuple[Sequence[int], Any]]:
-    """Yield place and value of what may be no number in nested lists and arrays."""
-    import numpy as np
-
-    if isinstance(values, np.ma.MaskedArray):
-        values = values.tolist()  # in which a masked value is None
-    if isinstance(values, Sequence) and not isinstance(values, str | bytes):
-        if {*map(type, values)} == {float}:  # the usual case, which must be fast
-            return
-        for number, each in enumerate(values):
-            yield from _leaves_of(each, (*place, number))
-    elif not hasattr(values, "__array__"):
-        yield place, values
-    elif (array := np.asarray(values)).dtype.kind not in "iuf":
-        for inside, each in np.ndenumerate(array):
-            yield (*place, *inside), each
 
 
 def _named(name: str, value: Any) -> str:

@@ -149,7 +149,7 @@ def test_an_invalid_profile_is_refused_with_the_reason(mine, text, reason):
     ("rows", "said"),
     [
         ("0,0,0,1\n0,0,0,1\n", "line 3: time_s 0 does not rise"),
-        ("0,0,0,1\n1,0,0,9\n", "line 3: z_m is 9; the guard flies from 0.35 to 2.3"),
+        ("0,0,0,1\n1,0,0,9\n", "line 3: z_m is 9; the guard moves the robot from 0.35 to 2.3"),
         (None, "the header is time_s,delay_ms; it must be time_s,x_m,y_m,z_m"),
     ],
 )

@@ -50,7 +50,7 @@ def test_a_mission_that_leads_off_the_ground_or_away_is_refused_in_one_line(sett
     ("head", "z", "message"),
     [
         ("time_s,x_m,y_m,z_m", ",0.1", ""),
-        ("time_s,x_m,y_m,z_m", ",1", "line 2: z_m is 1, but the robot stays on the ground, at 0.1"),
+        ("time_s,x_m,y_m,z_m", ",1", "line 2: z_m is 1; the guard moves the robot from 0.1"),
         ("time_s,x_m", "", "the header is time_s,x_m; it must be time_s,x_m,y_m$"),
     ],
 )
