@@ -39,26 +39,6 @@ def test_a_change_of_a_public_name_is_told_if_it_breaks_a_caller(source, told):
     assert not list(breaking_changes(before, now, {"cloudrc.other"}))
 
 
-@pytest.mark.parametrize(
-    ("package", "defined", "told"),
-    [
-        ("from own.api import fly\n", "def fly(): ...\n", 0),
-        ("", "def fly(): ...\n", 1),
-        ("from own.api import fly\n", "def fly(mode): ...\n", 1),
-    ],
-)
-def test_a_name_that_a_package_hands_on_is_compared(package, defined, told):
-    def packed(source, api):
-        return griffe.temporary_visited_package("own", {"__init__.py": source, "api.py": api})
-
-    exported = '__all__ = ["fly"]\n'
-    with (
-        packed(f"from own.api import fly\n{exported}", "def fly(): ...\n") as before,
-        packed(package + exported * bool(package), defined) as after,
-    ):
-        assert len(list(breaking_changes(before, after, {"own.fly"}))) == told
-
-
 def test_the_page_lists_names_that_exist_and_all_that_examples_of_the_docs_import():
     listed = public_names(PAGE.read_text())
     package = griffe.load("cloudrc", search_paths=[ROOT])

@@ -8,8 +8,6 @@ import tomllib
 from collections import Counter
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "cloudrc"
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -24,25 +22,10 @@ ROS = (
 # clocks, sockets, threads, signals, chance, and calls such as `eval` and `print` (pyproject.toml).
 RESERVED: dict[str, tuple[str, ...]] = {
     "mujoco": ("sim/",),
-    # The simulator packs forces into MuJoCo's buffers; this is the fastest way.
-    "struct": (
-        *("tunnel/codec", "record/", "sim/simulator", "sim/memory", "robots/pelican/native/robot"),
-        "link/exec/namespace",
-    ),
     "yaml": ("outside/", "config/", "record/", "report/", "cli/", "cluster/"),
     "pydantic": (
         *("config/", "link/", "cli/", "teleop/", "trials/plan", "report/folder"),
         *("drivers/process", "faults/schedule"),
-    ),
-    "fastapi": ("teleop/api", "teleop/auth"),
-    "starlette": ("console/access", "console/door", "teleop/api", "teleop/auth"),
-    "uvicorn": ("console/door", "teleop/server"),
-    "fcntl": (
-        "drivers/local",
-        "console/serve",
-        "link/exec/namespace",
-        "record/writer",
-        "runs/lock",
     ),
     "matplotlib": ("report/",),
     "viser": ("console/", "report/replay"),
@@ -53,18 +36,11 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "kubernetes": ("cluster/",),
     "prometheus_client": ("drivers/",),
     "argparse": ("cli/",),
-    "importlib.metadata": ("plugins", "cli/", "report/"),
-    "pkgutil": ("plugins",),
     # A compiler makes the machine code of the usual step.
     "subprocess": (
         *("drivers/", "cli/", "cluster/", "robots/pelican/native/library"),
         *("exercise/scoring", "link/exec/holder", "runs/links/under_test"),
     ),
-    "multiprocessing": ("drivers/", "trials/workers"),
-    "concurrent": ("cli/", "trials/workers", "cluster/", "teleop/", "policy/serve"),
-    **dict.fromkeys(("secrets", "uuid"), ("console/", "drivers/", "cluster/", "cli/")),
-    "websockets": ("console/door", "policy/"),
-    "msgpack": ("policy/codec",),
     **dict.fromkeys(ROS, ("bridges/ros2/",)),
     **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),
 }
@@ -180,34 +156,3 @@ def test_only_robots_have_the_words_of_one_robot():
     outside = {place: tree for place, tree in trees.items() if not place.startswith("robots/")}
     found = {place: words for place, tree in outside.items() if (words := a_robots_words(tree))}
     assert found == {place: words for place, (words, _) in MAY_SAY.items()}
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("def stop(rotor_speeds): pass", {"rotor"}),
-        ("class TipForce: pass", {"tip"}),
-        ("say(f'the {name} touched the BOARD')", {"board"}),
-        ("robot.find(tips=3)", {"tip"}),
-        ("'''The Pelican's tip.'''\nonboard = multirotor + tipping  # a pipe", set()),
-        ("subprocess.run(stdout=subprocess.PIPE)", set()),
-    ],
-)
-def test_words_of_one_robot_are_found(text, words):
-    assert a_robots_words(ast.parse(text)) == words
-
-
-SIGNALS_ITSELF = re.compile(
-    r"raise_signal|os\.kill\(os\.getpid\(\), (?!signal\.SIGKILL)|default_int_handler"
-)
-
-
-def test_tests_that_signal_their_own_process_do_so_in_a_child():
-    here = Path(__file__).parent
-    files = {
-        path.relative_to(here).as_posix(): path.read_text() for path in here.rglob("test_*.py")
-    }
-    signals = {name: text for name, text in files.items() if SIGNALS_ITSELF.search(text)}
-    signals.pop(Path(__file__).name)
-    assert signals
-    assert [name for name, text in signals.items() if "mark.child" not in text] == []

@@ -1,7 +1,6 @@
 """Whose a file is: nobody else may own or write it, its folder, or a folder above."""
 
 import os
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -79,11 +78,6 @@ def test_a_group_that_has_only_this_user_may_write(file, monkeypatch):
         group = SimpleNamespace(gr_name=name, gr_mem=members)
         monkeypatch.setattr("grp.getgrgid", lambda gid, group=group: group)
         assert who_may_write(file)[:1] == found
-
-
-def test_nothing_belongs_to_nobody(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        who_may_write(Path(tmp_path, "nothing"))
 
 
 @pytest.mark.parametrize("umask", [0, 0o22])

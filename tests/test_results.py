@@ -6,15 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloudrc import plugins
 from cloudrc.statistics import median_interval
 from tests.conftest import nightly
 from tests.flights.conftest import both_ways, fly, numbers
 from tools.results import fly as fly_sweep
 from tools.results import results
 
-LINKS = "paper-p1", "paper-p2", "paper-p3"
-PREDICTORS = plugins.names("predictors")
 STEPPED = (
     "link.profile=ideal",
     *both_ways(
@@ -45,28 +42,11 @@ def test_the_mission_over_a_satellite_needs_a_predictor(predictor, done):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("profile", LINKS)
-def test_the_mission_with_low_gains_needs_no_predictor(profile):
-    settings = f"link.profile={profile}", "cloud.predictor=last_sample"
-    flights = [fly("paper", *settings, f"seed={n}") for n in range(1, 11)]
-    assert [flight.verdict.outcome for flight in flights] == ["success"] * 10
-
-
-@pytest.mark.full
 @pytest.mark.parametrize(("limit", "error_mm"), [(0.10, 32.5), (0.30, 0.07)])
 def test_the_hover_is_as_far_from_its_setpoint_as_the_readme_says(limit, error_mm):
     flight = fly("hover", f"world.onboard.integral_limit_xy={limit}")
     error = numbers(flight)["steady_error_x"] * 1e3
     assert error == pytest.approx(error_mm, abs=0.005 if error_mm < 1 else 0.05)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("profile", LINKS)
-@pytest.mark.parametrize("predictor", PREDICTORS)
-def test_the_steps_succeed_with_every_predictor(profile, predictor):
-    settings = f"link.profile={profile}", f"cloud.predictor={predictor}"
-    flights = [fly("steps", *settings, f"seed={n}") for n in range(1, 11)]
-    assert [flight.verdict.failures for flight in flights] == [()] * 10
 
 
 @pytest.mark.parametrize("seed", [1, *nightly(*range(2, 11))])

@@ -3,8 +3,6 @@
 import shutil
 import subprocess
 import sys
-import time
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -64,22 +62,6 @@ def test_names_count_and_unreadable_files_are_other_code(copy, hash_of, monkeypa
     (copy / "missions/other.yaml").unlink()
     (copy / "missions/other.yaml").symlink_to("lost.yaml")
     assert len({source.code_hash(), renamed, hash_of(copy)}) == 3
-
-
-def test_a_package_in_a_zip_file_has_the_same_hash(copy, hash_of, tmp_path):
-    with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
-        for path in sorted(copy.rglob("*")):
-            archive.write(path, path.relative_to(tmp_path))
-    assert hash_of(zipfile.Path(tmp_path / "all.zip", "cloudrc/")) == source.code_hash()
-
-
-def test_the_hash_takes_milliseconds(hash_of, figure):
-    def measure():
-        began = time.perf_counter()
-        hash_of(PACKAGE)
-        return time.perf_counter() - began
-
-    figure("hash of the code", min(measure() for _ in range(5)), "<=", 0.1, "s", count=5)
 
 
 def test_a_flight_runs_nothing_from_the_folders_that_do_not_count():

@@ -55,21 +55,6 @@ def test_a_direction_in_which_no_packet_arrives_is_named(settings, words):
     assert all(words in text for text in told)
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        (both(45_000, 0), "no command arrives within"),
-        (["link.uplink.rate_kbit=0.05"], "rate_kbit 0.05 is below the 185.6 kbit/s that telemetry"),
-        (["link.uplink.changes=[{at_s: 3, rate_kbit: 1}]"], "rate_kbit 1 is at times below"),
-        (both(6000, 0), "guard.command_age_max_ms is at most 10000"),
-    ],
-)
-def test_a_link_that_no_setting_fits_is_named_without_one(settings, words):
-    texts = list(advise(load_experiment("steps", settings)))
-    assert words in texts[0]
-    assert "--set" not in " ".join(texts)
-
-
 def test_setpoints_with_times_in_milliseconds_are_named(tmp_path):
     rows = [f"{time},0,0,1" for time in (0, 5000, 9900)]
     (tmp_path / "d.csv").write_text("\n".join(["time_s,x_m,y_m,z_m", *rows]))

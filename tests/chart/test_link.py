@@ -4,7 +4,7 @@ import pytest
 
 from cloudrc.cli.parser import build_parser
 from cloudrc.runs.links.verify import RELEASE_TIMEOUT
-from tests.chart.conftest import a_namespace, containers, notes, nothing, of_kind, pod_specs, render
+from tests.chart.conftest import a_namespace, containers, nothing, of_kind, pod_specs, render
 
 
 def modes(lookup, values=None):
@@ -30,14 +30,6 @@ def test_an_upgrade_keeps_the_mode_unless_the_label_is_new():
     assert render(lookup=a_namespace(objects=installed)) == installed
     installed = render(lookup=a_namespace())
     assert modes(a_namespace("restricted", installed)) == {"--mode=relay"}
-
-
-def test_the_notes_show_mode_and_label_command():
-    label = "kubectl label namespace lab pod-security.kubernetes.io/enforce=privileged --overwrite"
-    assert label not in notes()
-    text = notes({"link": {"mode": "netem"}}, lookup=a_namespace())
-    assert "mode netem" in text
-    assert label in text
 
 
 def test_helm_test_verifies_the_link_of_this_release():

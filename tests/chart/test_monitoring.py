@@ -122,33 +122,6 @@ def promtool(folder, rule_files, tests):
         assert "SUCCESS" in done.stdout, done.stdout + done.stderr
 
 
-@needs_promtool
-def test_of_two_releases_only_the_lost_one_is_absent_and_each_alert_comes_once(tmp_path):
-    """Prometheus evaluates the rules of both releases over the series of both."""
-    series = {}
-    for release, world in (("demo", "1x60"), ("other", "1x10 stale _x50")):
-        (tmp_path / f"{release}.yaml").write_text(yaml.safe_dump(rendered_rules(release)))
-        for role, values in (("world", world), ("cloud", "1x60")):
-            series[series_in_release(f'cloudrc_build_info{{role="{role}"}}', release)] = values
-        slow = series_in_release('cloudrc_real_time_factor{pod="slow"}', release)
-        series[slow] = "0.5x60" if release == "demo" else "1x60"
-    lost = {"namespace": "lab", "role": "world", "release": "other"}
-    slow = in_release({"pod": "slow"}) | {"release": "demo"}
-
-    def expect(name, labels):
-        labels = labels | {"severity": ALERTS[name]["labels"]["severity"]}
-        texts = ALERTS[name]["annotations"]
-        only = [{"exp_labels": labels, "exp_annotations": texts}]
-        return {"eval_time": "4m", "alertname": name, "exp_alerts": only}
-
-    case = {
-        "interval": "5s",
-        "input_series": [{"series": name, "values": values} for name, values in series.items()],
-        "alert_rule_test": [expect("CloudrcAbsent", lost), expect("CloudrcNotRealTime", slow)],
-    }
-    promtool(tmp_path, ["demo.yaml", "other.yaml"], [case])
-
-
 def dashboards(values=None, **where):
     """Render the ConfigMaps of dashboards, and the dashboards in them by name of the file."""
     objects = render({"dashboards": {"enabled": True, **(values or {})}}, **where)

@@ -88,15 +88,6 @@ def test_the_notes_are_three_commands_for_this_release():
     assert logs[logs.index("--container") + 1] == "link"
 
 
-def test_the_notes_of_an_upgrade_give_the_same_commands_and_say_what_restarts():
-    def commands(text):
-        return [line for line in text.splitlines() if line.startswith("  ")]
-
-    assert commands(notes(upgrade=True)) == commands(notes())
-    assert "restarts its pod" in notes(upgrade=True)
-    assert "restarts" not in notes()
-
-
 SLOW = "experiment.guard.command_age_max_ms=800"
 CLOSED = "No Prometheus may scrape"
 KEEP = "teleop.journal.keep=true"

@@ -33,7 +33,6 @@ kubernetes_validate = pytest.importorskip("kubernetes_validate", reason="comes w
 
 RENDERED = Path(__file__).parent / "rendered"
 OLDEST = re.match(r">=(\d+\.\d+)\.0-0 ", METADATA["kubeVersion"])[1]
-NAMES_IN_LAB = ("lab-cloudrc", "lab-robot-b")
 NEWEST = ".".join(kubernetes_validate.latest_version().split(".")[:2])
 ON = {"enabled": True}
 MINE = {"prometheus.io/scrape": "false", "example.org/owner": "me"}
@@ -207,26 +206,6 @@ def test_helm_renders_the_same_objects(path):
     done = helm("lint", "--strict", *flags, str(CHART))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "WARNING" not in done.stdout
-
-
-def test_a_larger_chart_switches_its_parts_by_conditions(tmp_path):
-    def render_lab(*flags):
-        done = helm("template", "lab", str(tmp_path), "--kube-version", OLDEST, *flags)
-        assert (done.returncode, done.stderr) == (0, "")
-        found = (thing for thing in yaml.safe_load_all(done.stdout) if thing)
-        return {x["metadata"]["name"] for x in found if x["kind"] == "Deployment"}
-
-    shutil.copytree(CHART, tmp_path / "charts" / "cloudrc")
-    part = {"name": "cloudrc", "version": METADATA["version"], "condition": "cloudrc.enabled"}
-    other = {**part, "alias": "robot_B", "condition": "robot_B.enabled", "tags": ["more"]}
-    lab = {"apiVersion": "v2", "name": "lab", "version": "1.0.0", "dependencies": [part, other]}
-    (tmp_path / "Chart.yaml").write_text(yaml.safe_dump(lab))
-    (tmp_path / "values.yaml").write_text("global: {imageRegistry: registry.example.org}")
-    one, two = ({f"{name}-{end}" for end in ("world", "cloud")} for name in NAMES_IN_LAB)
-    assert render_lab() == one | two
-    assert render_lab("--set", "cloudrc.enabled=true,robot_B.enabled=false") == one
-    assert render_lab("--set", "cloudrc.enabled=false,robot_B.enabled=true") == two
-    assert render_lab("--set", "cloudrc.enabled=false,tags.more=false") == set()
 
 
 def test_helm_keeps_a_large_seed():

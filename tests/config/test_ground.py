@@ -68,14 +68,6 @@ def test_a_file_of_setpoints_needs_no_height_and_has_no_other_one(tmp_path, head
     assert flight["/ground_truth"]["position"][-1, :2] == pytest.approx((1.0, 0.5), abs=0.2)
 
 
-def test_the_rover_drives_through_the_pillars_without_a_vertical_command():
-    flight = cloudrc.fly("pillars")
-    assert flight.verdict == "success"
-    assert flight.numbers["obstacle_contacts"] == 0
-    assert (flight["/cmd_vel"]["command"][:, 2] == 0.0).all()
-    assert "limited_vertical" not in set(flight["/count"]["name"])
-
-
 def test_a_silent_link_makes_the_rover_hold_and_then_stop_for_good():
     silent = [{"start_s": 3.0, "duration_s": 30.0}]
     flight = cloudrc.fly("pillars", {"link.both.blackouts": silent, "guard.hold_max_s": 3.0})

@@ -51,11 +51,6 @@ def test_a_yaw_of_a_robot_that_obeys_reaches_the_plan(robot):
     assert build_plan(flown(robot)).legs[0].yaw is None
 
 
-def test_the_time_limit_of_a_waypoint_includes_the_turn():
-    limits = [build_plan(flown("x2", **keys)).legs[0].time_limit for keys in ({}, {"yaw_deg": 9})]
-    assert limits[1] - limits[0] == pytest.approx(3 * 3.14159, abs=0.11)
-
-
 def test_a_yaw_of_0_is_what_the_pelican_holds_anyway(tmp_path):
     experiment = flown("pelican", yaw_deg=0.0)
     assert experiment == flown("pelican")

@@ -123,14 +123,3 @@ def test_null_means_again_what_the_profile_gives(tmp_path):
     keys = ("cloud.horizon_max_s", "cloud.freeze_after_s", "guard.command_age_max_ms")
     before, after = load(path), load(path, *((key, None) for key in keys))
     assert (after.cloud, after.guard) == (before.cloud, before.guard)
-
-
-def test_a_setting_of_another_section_leaves_the_link_to_its_profile(tmp_path):
-    path = tmp_path / "own.yaml"
-    path.write_text(OWN)
-    profile = ("link.profile", "satellite")
-    alone = load(path, profile)
-    assert alone.uplink.delay_ms == 300
-    for one in valid_settings(path):
-        if not one[0].startswith(("link", "mission")):
-            assert load(path, profile, one).link == alone.link, one

@@ -1,7 +1,5 @@
 """The limits of the guard come from the robot; an experiment may lower them."""
 
-import re
-
 import pytest
 
 from cloudrc.config.load import load_experiment
@@ -44,35 +42,12 @@ def test_limits_are_those_of_the_robot_unless_the_experiment_lowers_them(
     assert guard.acceleration_max_mps2 == acceleration
 
 
-@pytest.mark.parametrize(
-    ("limits", "most"),
-    [
-        ("{}", 4.0),
-        ("{braking_mps2: 2}", 4.0),
-        ("{acceleration_max_mps2: 6}", 6.0),
-    ],
-)
-def test_a_multirotor_may_accelerate_as_a_model_alone_unless_it_says_more(own_robot, limits, most):
-    guard = load_experiment("steps", [own_robot(limits), *FLIES]).guard
-    assert guard.acceleration_max_mps2 == most
-
-
 def test_a_robot_that_brakes_less_gets_a_lower_speed_cap(own_robot):
     settings = [own_robot("{braking_mps2: 1.5}"), *FLIES]
     # v 0.45 s + v^2 / 3 = 8.7 m
     assert load_experiment("steps", settings).guard.speed_max_mps == pytest.approx(4.478, abs=1e-3)
     with pytest.raises(BadInputError, match=r"must be at most 4\.47\d* m/s: above it the robot"):
         load_experiment("steps", [*settings, "guard.speed_max_mps=5"])
-
-
-@pytest.mark.parametrize("age_ms", [500, 700, 1100])
-def test_the_largest_speed_that_a_refusal_names_is_allowed(age_ms):
-    settings = [*FLIES, f"guard.command_age_max_ms={age_ms}"]
-    with pytest.raises(BadInputError) as refusal:
-        load_experiment("steps", [*settings, "guard.speed_max_mps=9.9"])
-    named = re.search(r"at most (\S+) m/s", str(refusal.value))[1]
-    guard = load_experiment("steps", [*settings, f"guard.speed_max_mps={named}"]).guard
-    assert guard.speed_max_mps == float(named)
 
 
 @pytest.mark.parametrize(("robot", "most"), [(FLIES, "12"), (DRIVES, "2")])
