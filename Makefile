@@ -45,7 +45,7 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link results meta-world docs dist images kind-load lock clean
+.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link results docs dist images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -139,7 +139,7 @@ mutants: $(VENV)/dev ## mutate guard, tunnel and store, list the mutants that te
 NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults.json \
 	search-adversarial.json $(ROBOTS:%=search-%.json) search-random.json \
 	link.json mujoco-oldest.json mujoco-newest.json gym-sb3.json) \
-	mutants night-meta-world night-tun night-ros2 night-netem e2e-full
+	mutants night-tun night-ros2 night-netem e2e-full
 
 nightly: $(VENV)/dev ## run every test, search and bench; writes build/evidence (needs what e2e needs)
 	rm -rf $(EVIDENCE) && mkdir -p $(EVIDENCE)
@@ -180,10 +180,7 @@ $(EVIDENCE)/gym-sb3.json:
 	build/sb3/bin/pip install --quiet '.[gym]' stable-baselines3
 	build/sb3/bin/python -m tools.train > $@
 
-.PHONY: night-meta-world night-tun night-ros2 night-netem
-night-meta-world: build/meta-world/done
-	build/meta-world/bin/python -m tools.meta_world --seeds 2 > $(EVIDENCE)/meta-world.txt
-
+.PHONY: night-tun night-ros2 night-netem
 night-tun:
 	$(bin)/pytest -m tun tests/link/exec
 
@@ -231,15 +228,6 @@ bench-link: $(VENV)/all ## compare the relay with its profiles
 
 results: $(VENV)/dev ## fly the README's results and write them into it: two minutes
 	$(bin)/python -m tools.results
-
-# Meta-World pins an old MuJoCo, and forgets two packages that it imports.
-meta-world: build/meta-world/done ## run Meta-World's experts over a network, for docs/eval.md: minutes
-	build/meta-world/bin/python -m tools.meta_world $(META_WORLD)
-
-build/meta-world/done: pyproject.toml
-	rm -rf build/meta-world && $(PYTHON) -m venv build/meta-world
-	build/meta-world/bin/pip install --quiet '.[gym,report]' metaworld==3.1.1 packaging imageio
-	@touch $@
 
 docs: $(VENV)/dev ## write the generated tables of docs/, and the chart's schema, table and copied files
 	$(bin)/python -m tools.docs

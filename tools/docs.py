@@ -14,15 +14,16 @@ from __future__ import annotations
 import inspect
 import json
 import re
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import yaml
 from pydantic import BaseModel
 
 from cloudrc import plugins
-from cloudrc.config import problems, shipped
+from cloudrc.config import shipped
+from cloudrc.config.keys import forms, keys_of, unit_in
 from cloudrc.config.overrides import KINDS, default_parameters
 from cloudrc.config.profile import DirectionConfig, Profile
 from cloudrc.config.robot import find_robot
@@ -96,7 +97,6 @@ LIMITS = {
     "maxItems": "of at most",
 }
 """Limit in a JSON schema -> the page's sign."""
-Key: TypeAlias = tuple[tuple[str, ...], dict[str, Any]]
 COPIED = ("profile", "mission")
 """Kinds of shipped files of which the chart has copies."""
 
@@ -189,37 +189,9 @@ def _summary(model: Any) -> str:
 def _keys(model: type[BaseModel], chosen: list[str] | None = None) -> str:
     """Format the table of a model's keys; with `chosen`, only these keys and those below them."""
     defined = model.model_json_schema()
-    paths = keys_of(defined, defined)
+    paths = keys_of(defined, defined, apart=PARTS)
     rows = [_row(path, part, defined) for path, part in paths if not chosen or path[0] in chosen]
     return table("key | value | unit | default | meaning", rows)
-
-
-def keys_of(
-    defined: Any, section: Any, above: tuple[str, ...] = (), apart: Container[str] = PARTS
-) -> Iterator[Key]:
-    """Yield path and JSON schema of each key in a `section` of the schema `defined`.
-
-    In a list of sections, the path has "[]" behind the list. Keys below those of `apart` are left
-    out.
-    """
-    for key, part in section.get("properties", {}).items():
-        if "description" in part:
-            yield (*above, key), part
-        for form in forms(defined, part):
-            many = "[]" if "items" in form else ""
-            for inner in forms(defined, form.get("items", form)):
-                if key not in apart:
-                    yield from keys_of(defined, inner, (*above, key + many), apart)
-
-
-def forms(defined: Any, part: Any) -> Iterator[Any]:
-    """Yield the schemas of the forms that a value may have."""
-    part = defined["$defs"][part["$ref"].rpartition("/")[2]] if "$ref" in part else part
-    choices = part.get("anyOf", part.get("oneOf"))
-    if choices is None:
-        yield part
-    for each in choices or ():
-        yield from forms(defined, each)
 
 
 def _row(path: tuple[str, ...], part: Any, defined: Any) -> tuple[str, ...]:
@@ -227,7 +199,7 @@ def _row(path: tuple[str, ...], part: Any, defined: Any) -> tuple[str, ...]:
     value, meaning = " or ".join(words), " ".join(part["description"].split())
     if path[-1] in PARTS:
         value = value.replace("mapping", f"[mapping]({PARTS[path[-1]]})")
-    unit = problems.unit_in(part["description"])
+    unit = unit_in(part)
     meaning = meaning.replace(f" {unit}", "") if unit else meaning
     default = "required"
     if "default" in part:

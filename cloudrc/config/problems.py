@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import difflib
 import json
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin
+from typing import Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
-from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from cloudrc.config.keys import known_at, unit_at, unit_in
 from cloudrc.errors import BadInputError
 from cloudrc.outside.document import Document, KeyPath
 from cloudrc.outside.values import shorten
@@ -34,84 +33,15 @@ def collect(found: list[ConfigProblem], path: KeyPath) -> Iterator[None]:
         found.append(ConfigProblem(path, "", str(error)))
 
 
-def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPath, FieldInfo]]:
-    """Yield path and schema field of each key of `model` that has a plain value.
-
-    The paths begin with `above`. In a list of sections, the path has the index "0".
-    """
-    for key, info in model.model_fields.items():
-        inner = list(_models(info.annotation))
-        many = ("0",) if _is_list(info.annotation) else ()
-        is_open = any(not section.model_fields for section in inner)
-        if not inner or is_open or {str, float} & {*_types(info.annotation)}:
-            yield (*above, key), info
-        for section in inner:
-            yield from leaves(section, (*above, key, *many))
-
-
-def field_at(model: type[BaseModel], path: KeyPath) -> FieldInfo | None:
-    """Find the field of the schema at `path`; None if there is no such field.
-
-    Below a mapping of any names, the field is that of the mapping.
-    """
-    field, models, is_name = None, [model], False
-    for key in path:
-        is_name = not is_name and field is not None and get_origin(field.annotation) is dict
-        if not key.isdecimal() and not is_name:
-            found = [inner.model_fields[key] for inner in models if key in inner.model_fields]
-            field = found[0] if found else None
-            models = [inner for info in found for inner in _models(info.annotation)]
-    return field
-
-
 def _nearest_key(model: type[BaseModel], path: KeyPath) -> str:
     """Return a hint about the unknown key at `path`: a similar known key, or all known keys."""
-    *above, key = path
-    field = field_at(model, tuple(above))
-    known = _keys_of(field.annotation if field else None if above else model)
+    key, known = path[-1], known_at(model, path[:-1])
     # `delay` is nearest to `delay_ms`: a forgotten unit is more likely than a typo.
     without_unit = [name for name in known if name.startswith(f"{key}_")]
     near = without_unit or difflib.get_close_matches(key, known, n=1)
     if near:
-        return f"did you mean {near[0]} {unit_in(known[near[0]].description)}".strip() + "?"
-    return f"known here: {', '.join(known)}" if known else "no keys are known here"
-
-
-def _keys_of(annotation: Any) -> dict[str, FieldInfo]:
-    """Return key -> field of all sections in an annotation."""
-    return {key: info for one in _models(annotation) for key, info in one.model_fields.items()}
-
-
-def _types(annotation: Any) -> Iterator[Any]:
-    """Yield all plain types and models in an annotation, also inside aliases and unions."""
-    if get_origin(annotation) is Literal:
-        return
-    arguments = [argument for argument in get_args(annotation) if argument is not Ellipsis]
-    if hasattr(annotation, "__metadata__"):
-        arguments = arguments[:1]
-    if get_origin(annotation) is dict:  # the keys are names
-        arguments = arguments[1:]
-    if not arguments:
-        yield annotation
-    for argument in arguments:
-        yield from _types(argument)
-
-
-def _models(annotation: Any) -> Iterator[type[BaseModel]]:
-    for kind in _types(annotation):
-        if isinstance(kind, type) and issubclass(kind, BaseModel):
-            yield kind
-
-
-def _is_list(annotation: Any) -> bool:
-    kinds = (annotation, *get_args(annotation))
-    return any(get_origin(kind) in (tuple, list, set, frozenset, Sequence) for kind in kinds)
-
-
-def unit_in(text: str | None) -> str:
-    """Return the unit in the description of a key, such as "[ms]"; "" if there is none."""
-    found = re.search(r"\[[^\],]+\]$|\[[^\],]+\](?=[,;.\s])", text or "")
-    return found.group() if found else ""
+        return f"did you mean {near[0]} {unit_in(known[near[0]])}".strip() + "?"
+    return f"known here: {', '.join(known)}"
 
 
 class ConfigProblem(NamedTuple):
@@ -234,10 +164,9 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> C
     elif kind in _REASONS:
         reason = _REASONS[kind].format_map(detail.get("ctx", {}))
     else:
-        reason, field = detail["msg"], field_at(model, path)
+        reason = detail["msg"]
         for old, new in _WORDS.items():
             reason = reason.replace(old, new)
-        if field is not None:
-            reason = f"{reason} {unit_in(field.description)}".strip()
+        reason = f"{reason} {unit_at(model, path)}".strip()
     value = "" if kind in _WITHOUT_VALUE else in_words(detail["input"])
     return ConfigProblem(prefix + path, value, reason)

@@ -78,7 +78,8 @@ def settings() -> Iterator[str]:
     Keys of plug-ins' parameters are left out.
     """
     from cloudrc import plugins
-    from cloudrc.config import problems, shipped
+    from cloudrc.config import shipped
+    from cloudrc.config.keys import plain_keys
     from cloudrc.config.overrides import KINDS as PLUGIN_KINDS
     from cloudrc.config.schema import Experiment
 
@@ -88,7 +89,7 @@ def settings() -> Iterator[str]:
         "link.profile": shipped.names("profile"),
         "mission": shipped.names("mission"),
     }
-    keys = {".".join(path) for path, _ in problems.leaves(Experiment) if "0" not in path}
+    keys = plain_keys(Experiment)
     keys |= {key.replace("uplink", "both") for key in keys if key.startswith("link.uplink.")}
     yield from (f"{key}=" for key in sorted(keys - set(named)) if not key.endswith(".name"))
     yield from sorted(f"{key}={name}" for key, names in named.items() for name in names)

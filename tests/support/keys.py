@@ -1,6 +1,6 @@
 """The keys of an experiment or a profile, as their JSON schemas describe them."""
 
-from tools.docs import forms, keys_of
+from cloudrc.config.keys import forms, keys_of
 
 
 def forms_of(model):
@@ -8,7 +8,7 @@ def forms_of(model):
     defined = model.model_json_schema()
     return {
         ".".join(path).replace("[]", ".0"): [*forms(defined, part)]
-        for path, part in keys_of(defined, defined, apart=())
+        for path, part in keys_of(defined, defined)
     }
 
 
