@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, closing, nullcontext
+from itertools import pairwise
 from math import degrees, dist, inf, pi, radians
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -317,11 +318,12 @@ def mission_plan(
         legs = _step_legs(mission.steps, seed)
         needed = LEG_FACTOR * mission.steps.count * mission.steps.period_s
     else:
-        starts = (None, *mission.waypoints)
-        ways = zip(starts, mission.waypoints, strict=False)  # no way starts at the last waypoint
-        carrot = mission.carrot
         limits = speed_max, turn_rate_max
-        legs = tuple(_leg(way, fence, limits, carrot) for way in ways)
+        legs = tuple(
+            _leg(before, waypoint, fence, limits, mission.carrot)
+            for before, waypoint in pairwise((None, *mission.waypoints))
+            if waypoint is not None
+        )
         needed = sum(leg.time_limit for leg in legs)
     start = Start.SPAWN if mission.start == "spawn" else Start.HERE
     limit = time_limit or max(LIMIT_MIN, needed)
@@ -365,32 +367,35 @@ def with_order(
 
 
 def _leg(
-    ends: tuple[schema.Waypoint | None, schema.Waypoint],
+    before: schema.Waypoint | None,
+    waypoint: schema.Waypoint,
     fence: Fence,
     limits: tuple[float, float],
     carrot: schema.Carrot | None,
 ) -> Leg:
     """Convert the waypoint at the end of a way; `limits` are those of `mission_plan`."""
-    (start, waypoint), (speed_max, turn_rate_max) = ends, limits
-    limit = waypoint.time_limit_s
-    speed, acceleration = 0.0, 1.0
+    (speed_max, turn_rate_max), speed, acceleration = limits, 0.0, 1.0
     if carrot is not None:
-        speed, acceleration = waypoint.speed_mps or carrot.speed_mps, carrot.acceleration_mps2
-        speed = min(speed, speed_max)
-        speed_max = min(speed_max, speed)
+        speed_max = speed = min(waypoint.speed_mps or carrot.speed_mps, speed_max)
+        acceleration = carrot.acceleration_mps2
+    limit = waypoint.time_limit_s
     if limit is None:
-        # The start of the way is unknown: assume the longest way.
-        longest = fence.low, fence.high
-        way = longest if start is None else (start.position_m, waypoint.position_m)
-        expected = dist(*way) / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
+        # If the start of the way is unknown, assume the longest way.
+        start, end = (before or waypoint).position_m, waypoint.position_m
+        way = dist(fence.low, fence.high) if before is None else dist(start, end)
+        expected = way / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
         if waypoint.yaw_deg is not None:
             expected += pi / min(TURN_RATE, turn_rate_max)  # the longest turn
         limit = round(LEG_FACTOR * expected, 1)
-    yaw = None if waypoint.yaw_deg is None else radians(waypoint.yaw_deg)
-    tolerance, dwell = waypoint.tolerance_m, waypoint.dwell_s
-    yaw_tolerance = radians(waypoint.yaw_tolerance_deg or schema.YAW_TOLERANCE_DEG)
     return Leg(
-        waypoint.position_m, yaw, tolerance, dwell, limit, speed, acceleration, yaw_tolerance
+        waypoint.position_m,
+        None if waypoint.yaw_deg is None else radians(waypoint.yaw_deg),
+        waypoint.tolerance_m,
+        waypoint.dwell_s,
+        limit,
+        speed,
+        acceleration,
+        radians(waypoint.yaw_tolerance_deg or schema.YAW_TOLERANCE_DEG),
     )
 
 

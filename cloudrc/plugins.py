@@ -43,16 +43,15 @@ PACKAGES = {
 """Kind of plug-in -> package that contains cloudrc's plug-ins of this kind; "" if there is none:
 cloudrc's metrics are functions, models of motion are files of robots, policies those of users."""
 METHODS = {
-    **{"estimators": "horizon", "predictors": "predict", "controllers": "update"},
-    **{"onboard": "update", "motion": "__call__", "executors": "action"},
+    "estimators": ("horizon", "update", "add_applied"),
+    "predictors": ("predict", "observe", "commanded", "applied", "reset"),
+    "controllers": ("update", "reset"),
+    "onboard": ("update",),
+    "motion": ("__call__",),
+    "executors": ("action",),
 }
-"""Kind of plug-in -> the method that every plug-in of this kind defines."""
-INHERITED = {
-    "estimators": ("update", "add_applied"),
-    "predictors": ("observe", "commanded", "applied", "reset"),
-    "controllers": ("reset",),
-}
-"""Kind of plug-in -> further methods that cloud calls; the base class of the kind has them."""
+"""Kind of plug-in -> the method that every plug-in of this kind defines, and further ones that are
+called; the base class of the kind has them."""
 
 
 class Found:
@@ -136,11 +135,11 @@ def load(kind: str, name: str, /, **parameters: Any) -> Any:
     slow = "" if _own_module(kind, name) else f"{name} is still being built"
     with calling(f"{one(kind)} {name!r} cannot be built", slow=slow):
         plugin = build(**parameters)
-        for method in (METHODS[kind], *INHERITED.get(kind, ())):
+        for method in METHODS[kind]:
             found = getattr(plugin, method, None)
             # The base class raises a NotImplementedError in the method that each plug-in defines.
             is_base = getattr(found, "__module__", None) == PACKAGES[kind]
-            if not callable(found) or (is_base and method == METHODS[kind]):
+            if not callable(found) or (is_base and method == METHODS[kind][0]):
                 returned = f"build() returned {type(plugin).__name__}"
                 raise ValueError(f"{returned}, which has no method {method}()")
     return plugin

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import pairwise
-from math import ceil, dist
+from math import ceil, dist, inf
 from typing import TYPE_CHECKING
 
 from cloudrc.outside.reuse import reuse_results
@@ -108,24 +108,19 @@ def _slow(experiment: ResolvedExperiment, plan: Plan) -> Iterator[str]:
     from cloudrc.config.scene import scene_of
 
     mission, controller = experiment.mission, experiment.cloud.controller
-    settle, legs = experiment.criteria.settle_m, plan.legs
-    if mission.steps and settle is None:
-        return
+    settle, legs = experiment.criteria.settle_m or inf, plan.legs
     speeds = {"guard.speed_max_mps": experiment.guard.speed_max_mps}
     own = (controller.model_extra or {}).get("speed_max")
     if controller.name == "pid" and own is not None:
         speeds["cloud.controller.speed_max"] = own
     key = min(speeds, key=lambda name: speeds[name])
     time = dwell = sum(leg.dwell for leg in legs)
+    places = [(leg.position, settle if mission.steps else leg.tolerance) for leg in legs]
     if mission.waypoints:
         time = min(plan.time_limit, sum(leg.time_limit for leg in legs)) - dwell
-    way = 0.0
-    if mission.waypoints and mission.start == "spawn":
-        spawn = scene_of(experiment.world).spawn
-        way = max(0.0, dist(spawn, legs[0].position) - legs[0].tolerance)
-    for before, leg in pairwise(legs):
-        near = 2 * settle if mission.steps and settle else before.tolerance + leg.tolerance
-        way += max(0.0, dist(before.position, leg.position) - near)
+        if mission.start == "spawn":
+            places.insert(0, (scene_of(experiment.world).spawn, 0.0))
+    way = sum(max(0.0, dist(a, b) - near - far) for (a, near), (b, far) in pairwise(places))
     if time > 0 and way > speeds[key] * time:
         yield (
             f"{key} is {speeds[key]:g} m/s, too slow for the {way:.3g} m of the mission's way in "

@@ -274,11 +274,6 @@ class Plant(Section):
     """True force of the actuators as a multiple of the model's: a number for all, or a list with a
     number for each, in the order of the model"""
 
-    @field_validator("actuator_factor")
-    @classmethod
-    def _forget_ones(cls, value: float | tuple[float, ...]) -> float | tuple[float, ...]:
-        return value if isinstance(value, float) or {*value} != {1.0} else 1.0
-
 
 class WindConfig(Section):
     """Horizontal wind: a mean velocity and gusts."""

@@ -99,11 +99,7 @@ def parse_value(text: str, name: str) -> Any:
         return parse_yaml(text, name)[0]
     quoted = len(stripped) > 1 and stripped[0] in "'\"" and stripped[0] == stripped[-1]
     if quoted or stripped.startswith(("[", "{")):
-        # If text follows the value, the list has a second entry. A comment hides the last bracket.
-        value, *rest = parse_yaml(f"[{stripped}, ]", name)[0]
-        if rest:
-            raise BadInputError(f"{name}: {stripped}: text after the value; delete or quote it")
-        return value
+        return parse_yaml(stripped, name)[0]
     loader = _Loader("")
     node = yaml.ScalarNode(loader.resolve(yaml.ScalarNode, stripped, (True, False)), stripped)
     return text if node.tag.endswith(":str") else loader.construct_object(node)

@@ -88,7 +88,7 @@ def test_a_broken_plug_in_is_one_line(share, text, reason):
 
 @pytest.mark.parametrize("kind", ["predictor", "estimator", "controller"])
 def test_a_plug_in_that_lacks_a_method_is_refused_before_the_flight(share, kind):
-    lacking, *others = plugins.METHODS[f"{kind}s"], *plugins.INHERITED[f"{kind}s"]
+    lacking, *others = plugins.METHODS[f"{kind}s"]
     lines = [f"    def {name}(self, *given): ..." for name in others]
     share.write_text("\n".join(["class Own:", *lines, "build = Own"]))
     found = refused("paper", f"cloud.{kind}={share}")
