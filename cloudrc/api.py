@@ -36,6 +36,7 @@ from cloudrc.runs.folder import point_to, run_folder
 from cloudrc.runs.requirements import MODES, require
 
 if TYPE_CHECKING:
+    from cloudrc.cluster.client import Release
     from cloudrc.report.document import Assessment
 
 
@@ -161,30 +162,40 @@ def fly(
     """
     check_names("mode", [mode], MODES)
     require(f"mode {mode}", MODES[mode])
-    seeds = {} if seed is None else {"seed": seed}
-    resolved = load(str(experiment), _texts({**(settings or {}), **seeds}))
+    own = {} if seed is None else {"seed": seed}
+    resolved = load(str(experiment), [*_texts(settings or {}), *_texts(own)])
     check_mode(resolved, mode)
     _warn(resolved)
     if mode == "virtual" and out is None:
         return _result(fly_in_memory(resolved))
-    folder = None if out is None else Path(out)
     if mode != "cluster":
-        from cloudrc.runs.fly import fly
-
-        folder = run_folder(resolved, mode, folder)
-        return _read(resolved, folder, fly(resolved, mode, folder))
+        return _fly_here(resolved, mode, out)
     from cloudrc.cluster.client import connect
+
+    place = connect(context, namespace, release)
+    return _fly_in(place, resolved, None if out is None else Path(out), timeout)
+
+
+def _fly_here(experiment: ResolvedExperiment, mode: str, out: str | Path | None) -> Result:
+    from cloudrc.runs.fly import fly
+
+    folder = run_folder(experiment, mode, None if out is None else Path(out))
+    return _read(experiment, folder, fly(experiment, mode, folder))
+
+
+def _fly_in(
+    place: Release, experiment: ResolvedExperiment, out: Path | None, timeout: float
+) -> Result:
     from cloudrc.cluster.flight import check_can_begin, fly_in_cluster
     from cloudrc.cluster.own_files import check_experiment
 
-    check_experiment(resolved)
-    place = connect(context, namespace, release)
+    check_experiment(experiment)
     check_can_begin(place)
-    folder = run_folder(resolved, mode, folder)
-    report = fly_in_cluster(resolved, folder, place, timeout)
+    folder = run_folder(experiment, "cluster", out)
+    report = fly_in_cluster(experiment, folder, place, timeout)
     if out is None:
         point_to(folder, "latest")
-    return _read(resolved, folder, report)
+    return _read(experiment, folder, report)
 
 
 def _read(experiment: ResolvedExperiment, folder: Path, report: Mapping[str, Any]) -> Result:

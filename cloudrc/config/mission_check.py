@@ -123,8 +123,8 @@ def _check_touch(mission: MissionConfig, scene: Scene) -> ConfigProblem | None:
     is_complete = scene.path is None or body in scene.bodies
     if body in known or not is_complete:
         return None
-    text = unknown_name_text(f"body that stops a robot in scene {scene.name}", body, known)
-    return ConfigProblem(("touch", "body"), "", f"{text}; null: nothing to touch")
+    text = unknown_name_text(f"body of the scene {scene.name}", body, known)
+    return ConfigProblem(("touch", "body"), body, f"{text}; null: nothing to touch")
 
 
 def _check_fence(mission: MissionConfig, fence: Fence, *, planar: bool) -> list[ConfigProblem]:

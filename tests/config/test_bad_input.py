@@ -113,7 +113,7 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ),
         (
             "world.scene=empty",
-            "mission.touch.body: no body that stops a robot in scene empty named 'board'",
+            "mission.touch.body: board: no body of the scene empty named 'board'",
         ),
         ("world.robot=./no.xml", "no such folder with robot.yaml or .xml file"),
         # A limit of the guard cannot be switched off.

@@ -109,7 +109,7 @@ def test_a_touch_of_a_body_that_the_robot_flies_through_is_refused(tmp_path):
         shipped.file_of("empty").read_text().replace("</worldbody>", f"{ghost}</worldbody>")
     )
     chosen = [f"world.scene={path}", "mission.touch.body=ghost"]
-    with pytest.raises(BadInputError, match=r"mission\.touch\.body: no body that stops a robot"):
+    with pytest.raises(BadInputError, match=r"mission\.touch\.body: ghost: no body of the scene"):
         load_experiment("hover", chosen)
 
 
