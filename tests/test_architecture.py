@@ -120,39 +120,3 @@ def test_no_two_public_classes_share_a_name():
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
     )
     assert {name for name, count in found.items() if count > 1} == set()
-
-
-A_ROBOTS_WORDS = {"pelican", "rotor", "pipe", "board", "tip"}
-# Words of one robot and its scene, as singular and plural; only `robots/` may use them. File -> its
-# words, and why it has them.
-MAY_SAY = {
-    "config/schema.py": ({"pelican", "pipe"}, "shipped robot, scene and mission are defaults"),
-    "cli/mission.py": ({"pipe"}, "a shipped mission is an example"),
-    "gym/registration.py": ({"pipe"}, "an environment has the name of a shipped mission"),
-}
-OPERATING_SYSTEM = {"PIPE", "BrokenPipeError"}
-
-
-def said(tree):
-    """Yield the identifiers and strings of a file, except docstrings."""
-    alone = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
-        if id(node) in alone and isinstance(node, ast.Constant):
-            continue
-        for _, value in ast.iter_fields(node):
-            texts = value if isinstance(value, list) else [value]
-            yield from (text for text in texts if isinstance(text, str))
-
-
-def a_robots_words(tree):
-    """Return the words of one robot in a file; words end at `_`, at capitals and where they end."""
-    texts = " ".join(text for text in said(tree) if text not in OPERATING_SYSTEM)
-    found = re.findall("[A-Z]?[a-z]+|[A-Z]+(?![a-z])", texts)
-    return {word.lower().removesuffix("s") for word in found} & A_ROBOTS_WORDS
-
-
-def test_only_robots_have_the_words_of_one_robot():
-    trees = {place_of(path): tree for path, tree in TREES.items()}
-    outside = {place: tree for place, tree in trees.items() if not place.startswith("robots/")}
-    found = {place: words for place, tree in outside.items() if (words := a_robots_words(tree))}
-    assert found == {place: words for place, (words, _) in MAY_SAY.items()}

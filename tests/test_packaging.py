@@ -102,16 +102,6 @@ def test_two_builds_of_one_tree_are_byte_equal(copied, tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(not shutil.which("helm"), reason="no helm here")
-def test_two_packed_charts_are_byte_equal_and_helm_reads_them(copied, tmp_path):
-    for root, name in ((ROOT, "a"), (copied, "b")):
-        pack(root / "charts" / "cloudrc", tmp_path / name, 1700000000)
-    assert contents(tmp_path / "a") == contents(tmp_path / "b")
-    (chart,) = (tmp_path / "a").iterdir()
-    read = subprocess.run(["helm", "template", "x", chart], check=True, capture_output=True)
-    assert b"kind: Deployment" in read.stdout
-
-
-@pytest.mark.skipif(not shutil.which("helm"), reason="no helm here")
 def test_every_image_of_a_releases_chart_is_in_the_registry_that_it_publishes_to(copied, tmp_path):
     set_registry(copied / "charts" / "cloudrc", "ghcr.io/me")
     build(copied, tmp_path, "wheel")

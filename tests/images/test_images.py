@@ -60,20 +60,3 @@ def test_dependabot_looks_at_every_lock_and_dockerfile():
         (seen,) = (each["directories"] for each in entries if each["package-ecosystem"] == kind)
         folders = {f"/{path.parent.relative_to(ROOT)}" for path in paths}
         assert folders == {*seen} - {"/"}, kind
-
-
-def test_the_build_context_has_only_what_images_need():
-    lines = (ROOT / ".dockerignore").read_text().splitlines()
-    kept = {line[1:] for line in lines if line.startswith("!")}
-    assert "*" in lines
-    copied = set()
-    for path in DOCKERFILES:
-        for words in re.findall(r"^COPY (?!--from)(.*) \S+$", path.read_text(), re.MULTILINE):
-            sources = [re.sub(r"\$\{\w+\}", "*", word) for word in words.split()]
-            copied |= {source for source in sources if not source.startswith("--")}
-    assert all(any(is_in(name, folder) for folder in kept) for name in copied), copied
-    assert all(any(is_in(name, folder) for name in copied) for folder in kept), kept
-
-
-def is_in(name, folder):
-    return f"{name}/".startswith(f"{folder}/")
