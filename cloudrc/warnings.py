@@ -7,10 +7,12 @@ prevents the flight.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib.util import find_spec
 from itertools import pairwise
 from math import ceil, dist, inf
 from typing import TYPE_CHECKING
 
+from cloudrc.messages import ZERO
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.rounding import exceeds, format_limit
 
@@ -43,6 +45,12 @@ def _advise(experiment: ResolvedExperiment) -> Iterator[str]:
     yield from _time(experiment, plan)
     yield from _fast_track(experiment, plan) if plan.track else _slow(experiment, plan)
     yield from slow
+    if not experiment.world.is_nominal and find_spec("mujoco") is not None:
+        from cloudrc.robots.build import advise as advise_on_robot
+
+        controller = experiment.cloud.controller
+        gains = (controller.model_extra or {}).get("gain_p", ZERO)
+        yield from advise_on_robot(experiment.world, gains if controller.name == "pid" else ZERO)
     ages, echoes = simulate_ages(experiment)
     if ages and not slow:  # else the queue fills, so the delays depend on the simulated time
         yield from _long_link(experiment, ages, echoes)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from cloudrc import plugins
-from cloudrc.config.robot import RobotFile, known_robot
+from cloudrc.config.robot import RobotFiles, known_robot
 from cloudrc.config.shipped import ROBOT_FILE
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry.clearance import Spheres, ball
@@ -56,7 +56,7 @@ def doubts(name: str) -> Iterator[str]:
         yield f"{name}/{ROBOT_FILE}: {text}"
 
 
-def _read_hull(name: str, robot: RobotFile) -> Spheres:
+def _read_hull(name: str, robot: RobotFiles) -> Spheres:
     if robot.hull_points is not None:
         return _spheres(plugins.find("hull", robot.hull_points, look=False))
     if robot.hull_m is not None:

@@ -32,6 +32,17 @@ def keys_of(
                     yield from keys_of(defined, inner, (*above, key + many), apart)
 
 
+def plain_keys(model: type[BaseModel]) -> set[str]:
+    """Return the dotted keys whose values are no sections, without those in lists."""
+    defined = model.model_json_schema()
+    return {
+        ".".join(path)
+        for path, part in keys_of(defined, defined)
+        for form in forms(defined, part)
+        if form.get("type") != "null" and not form.get("properties") and "[]" not in "".join(path)
+    }
+
+
 def forms(defined: Schema, part: Schema) -> Iterator[Schema]:
     """Yield the schemas of the forms that a value may have."""
     part = defined["$defs"][part["$ref"].rpartition("/")[2]] if "$ref" in part else part

@@ -106,8 +106,8 @@ def _as_mapping(value: Any) -> Any:
     return {"name": value} if isinstance(value, str) else value
 
 
-class RobotFile(Section):
-    """The file `robot.yaml`."""
+class RobotFiles(Section):
+    """The file `robot.yaml`; `find_robot` makes its paths absolute."""
 
     description: str = ""
     """One line about the robot, for lists"""
@@ -154,7 +154,7 @@ class RobotFile(Section):
         return given or ("velocity" if info.data.get("planar") else "free")
 
     @model_validator(mode="after")
-    def _agree(self) -> RobotFile:
+    def _agree(self) -> RobotFiles:
         if self.planar and self.guard.stop == "land":
             raise ValueError("guard.stop is land, but planar robots stay on the ground")
         if self.planar is not ON_GROUND.get(self.onboard.name, self.planar):
@@ -163,17 +163,17 @@ class RobotFile(Section):
         return self
 
 
-def find_robot(name: str) -> RobotFile:
+def find_robot(name: str) -> RobotFiles:
     """Return a robot with absolute paths, given by its shipped name, or by an absolute path.
 
     Raise a BadInputError if its `robot.yaml` is invalid.
     """
     if name.endswith(".xml"):
-        return RobotFile(model=Path(name), onboard=PlugIn(name=GENERAL), guard=OF_GENERAL)
+        return RobotFiles(model=Path(name), onboard=PlugIn(name=GENERAL), guard=OF_GENERAL)
     folder = Path(name) if shipped.is_path(name) else shipped.FOLDERS["robot"] / name
     file = folder / shipped.ROBOT_FILE
     label = str(file) if shipped.is_path(name) else f"{name}/{shipped.ROBOT_FILE}"
-    robot = validate(read_document(file, label), RobotFile, label)
+    robot = validate(read_document(file, label), RobotFiles, label)
     onboard = robot.onboard
     usual = OF_GENERAL if onboard.name == GENERAL else DEFAULT_LIMITS
     given = robot.guard.model_dump(exclude_unset=True, exclude_none=True)
@@ -190,7 +190,7 @@ def find_robot(name: str) -> RobotFile:
     return robot.model_copy(update=found)
 
 
-def parameters(robot: RobotFile, world: World) -> dict[str, Any]:
+def parameters(robot: RobotFiles, world: World) -> dict[str, Any]:
     """Return the parameters that the onboard controller gets: of robot.yaml, tuning and world.
 
     Raises:
@@ -208,7 +208,7 @@ def parameters(robot: RobotFile, world: World) -> dict[str, Any]:
     }
 
 
-def known_robot(name: str) -> RobotFile:
+def known_robot(name: str) -> RobotFiles:
     """Return a robot as `find_robot` does, but read it once for a whole sweep."""
     return reuse(("robot", name), lambda: find_robot(name))
 

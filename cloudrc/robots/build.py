@@ -9,7 +9,7 @@ from cloudrc import plugins
 from cloudrc.config.overrides import BRAKING, build_plugin, default_parameters
 from cloudrc.config.problems import ConfigProblem, ProblemsError, problem_at
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.config.robot import RobotFile, known_robot, parameters
+from cloudrc.config.robot import RobotFiles, known_robot, parameters
 from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.config.schema import Plant, PlugIn, World
 from cloudrc.config.shipped import ROBOT_FILE, file_of
@@ -164,7 +164,7 @@ def make_parts(world: World) -> Parts:
     return Parts(true, plugin, onboard, actuators, sensors)
 
 
-def _build_onboard(world: World, where: str, robot: RobotFile, model: Any) -> Onboard:
+def _build_onboard(world: World, where: str, robot: RobotFiles, model: Any) -> Onboard:
     """Build an onboard controller for a compiled `MjModel`; errors name the files in `where`."""
     name = robot.onboard.name
     choice = PlugIn.model_validate({**parameters(robot, world), "name": name})
@@ -197,7 +197,7 @@ def _problem(world: World, path: KeyPath, reason: str) -> ConfigProblem:
     return ConfigProblem(("world", key), "", f"{file}: {'.'.join(place)}: {reason}")
 
 
-def _change(world: World, robot: RobotFile, nominal: Any) -> Any:
+def _change(world: World, robot: RobotFiles, nominal: Any) -> Any:
     """Return the model of the true robot, which may differ from the `nominal` one."""
     factors = world.plant.actuator_factor
     if world.plant == Plant():

@@ -16,7 +16,7 @@ import numpy as np
 from cloudrc.config.hull import doubts, hull_of
 from cloudrc.config.problems import ProblemsError
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.config.robot import RobotFile, find_robot
+from cloudrc.config.robot import RobotFiles, find_robot
 from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.vectors import step_towards
@@ -84,7 +84,7 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
     return facts, [*changes, *_judge(robot, facts, rest)]
 
 
-def _read_facts(world: World, robot: RobotFile, model: Any) -> dict[str, Any]:
+def _read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
     """Return the facts that need no motion."""
     base = model.jnt_bodyid[0]
     ratio = thrust_to_weight(model) if not robot.planar else None
@@ -108,7 +108,7 @@ def _read_facts(world: World, robot: RobotFile, model: Any) -> dict[str, Any]:
     }
 
 
-def _judge_tunings(robot: RobotFile, world: World) -> Iterator[str]:
+def _judge_tunings(robot: RobotFiles, world: World) -> Iterator[str]:
     """Yield what must change in the tunings, which an experiment may choose."""
     for name in robot.tunings:
         try:
@@ -119,7 +119,7 @@ def _judge_tunings(robot: RobotFile, world: World) -> Iterator[str]:
             yield str(error)
 
 
-def _move(body: Robot, robot: RobotFile) -> dict[str, Any]:
+def _move(body: Robot, robot: RobotFiles) -> dict[str, Any]:
     """Let the robot hover or stand, follow a step along x, brake, and turn if it can.
 
     Return what it did: largest distance from its place at rest [m], commanded speed of the step
@@ -153,7 +153,7 @@ def _move(body: Robot, robot: RobotFile) -> dict[str, Any]:
     }
 
 
-def _turn(body: Robot, robot: RobotFile) -> float | None:
+def _turn(body: Robot, robot: RobotFiles) -> float | None:
     """Let the robot turn, and return the part of the turn that it did [1].
 
     None: its heading is not free.
@@ -165,7 +165,7 @@ def _turn(body: Robot, robot: RobotFile) -> float | None:
     return remainder(_yaw(body) - start, tau) / (TURN * TURNING)
 
 
-def _follow_aside(body: Robot, robot: RobotFile, speed: float) -> float | None:
+def _follow_aside(body: Robot, robot: RobotFiles, speed: float) -> float | None:
     """Let the robot follow a velocity to its left, and return the part that it reached [1].
 
     None: its heading does not follow its velocity.
@@ -181,7 +181,7 @@ def _follow_aside(body: Robot, robot: RobotFile, speed: float) -> float | None:
 
 def _follow(
     body: Robot,
-    robot: RobotFile,
+    robot: RobotFiles,
     reference: Vector | None,
     wanted: Vector,
     duration: float,
@@ -216,7 +216,7 @@ def _yaw(body: Robot) -> float:
     return atan2(axes[1], axes[0])
 
 
-def _judge(robot: RobotFile, facts: Mapping[str, Any], rest: float) -> Iterator[str]:
+def _judge(robot: RobotFiles, facts: Mapping[str, Any], rest: float) -> Iterator[str]:
     """Yield what must change because of the motion; `rest` is the robot's last speed [m/s]."""
     drift, speed, reached = facts["drift_m"], facts["step_mps"], facts["step_reached"]
     braking, turned = facts["braking_measured_mps2"], facts.get("turn_reached", 1.0)
