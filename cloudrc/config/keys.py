@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Container, Iterator
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 from pydantic import BaseModel
@@ -55,15 +56,20 @@ def forms(defined: Schema, part: Schema) -> Iterator[Schema]:
 
 def known_at(model: type[BaseModel], path: KeyPath) -> Schema:
     """Return key -> schema of all keys in the section at a path; {} if nothing is known of it."""
-    try:
-        defined = model.model_json_schema()
-    except PydanticInvalidForJsonSchema:  # a class of a user
-        return {}
+    defined = _schema(model)
     found = [defined]
     for key in path:
         parts = [_below(form, key) for form in found]
         found = [form for part in parts if part for form in forms(defined, part)]
     return {key: part for form in found for key, part in form.get("properties", {}).items()}
+
+
+@lru_cache(maxsize=16)  # a file may have thousands of problems
+def _schema(model: type[BaseModel]) -> Schema:
+    try:
+        return model.model_json_schema()
+    except PydanticInvalidForJsonSchema:  # a class of a user
+        return {}
 
 
 def _below(form: Schema, key: str) -> Any:
