@@ -69,7 +69,7 @@ GRACE = 30.0
 VIRTUAL_CLOCK = bytes(16)
 """Identity of the virtual clock, which world and cloud share."""
 VIRTUAL_RING = KeyRing(KeySet(Key(b"nothing is secret in one process")))
-"""Keys of world and cloud in virtual time; with them both ends refuse damaged datagrams."""
+"""Keys of world and cloud in virtual time; with them both ends drop damaged datagrams."""
 
 
 @reuse_results()

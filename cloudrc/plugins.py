@@ -25,7 +25,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import CloudrcError
 from cloudrc.outside.code import calling, load_file
 from cloudrc.outside.patience import telling_if_slow
 from cloudrc.outside.refusal import check_names
@@ -89,10 +89,10 @@ class Found:
         """
         function = self.get(name)
         file = getattr(self._target, "__file__", None) or type(self._target).__name__
-        if function is None:
-            raise BadInputError(f"{file}: has no function {name}(); write one")
         slow = "" if self.is_shipped else f"{name}() of {file} is still running"
         with calling(f"{file}: {name}() failed", slow=slow):
+            if function is None:
+                raise ValueError("there is no such function; write one")
             yield function
 
 
@@ -151,11 +151,11 @@ def find(kind: str, name: str, *, look: bool = True) -> Found:
     With `look`, the caller only looks at what the file defines; it neither builds nor measures.
     """
     own, what = _own_module(kind, name), f"{one(kind)} {name!r}"
-    if is_path(name):
-        if not Path(name).is_file():
-            raise BadInputError(f"{what}: there is no such file")
-    elif not own:
+    if not own and not is_path(name):
         check_names(one(kind), [name], names(kind))
+    if is_path(name) and not Path(name).is_file():
+        with calling(what):
+            raise ValueError("there is no such file")
     with calling(f"{what} cannot be imported"):
         if own:
             return Found(importlib.import_module(own))
@@ -175,8 +175,8 @@ def builder(kind: str, name: str, *, look: bool = True) -> Callable[..., Any]:
     """Return the function `build` of a plug-in, to `look` at it or to call it."""
     build = find(kind, name, look=look).builder
     if not callable(build):
-        text = "has no function build(); write one that returns the plug-in"
-        raise BadInputError(f"{one(kind)} {name!r}: {text}")
+        with calling(f"{one(kind)} {name!r}"):
+            raise ValueError("has no function build(); write one that returns the plug-in")
     return build  # type: ignore[no-any-return]
 
 

@@ -157,7 +157,7 @@ def _long_link(
     if min(ages) > age_max or longest > lasts + GUARD_STEP:
         how = "never flies" if min(ages) > age_max else "holds again and again"
         fits = _fit("guard.command_age_max_ms", longest, COMMAND_AGE_MS[1], 1e3)
-        why = f"the guard refuses commands after {age_max * 1e3:.0f} ms"
+        why = f"the guard takes commands up to {age_max * 1e3:.0f} ms old"
         yield f"{delay}, and {why}, so the robot {how}; {fits}"
     silence = max(echoes, default=0.0) - min(mean, cloud.horizon_max_s)
     if mean > cloud.horizon_max_s:
