@@ -55,7 +55,7 @@ def test_what_is_wrong_with_a_robot_is_one_problem_by_name(own_robot, text, mess
 
 
 def test_a_folder_without_its_file_is_no_robot(tmp_path):
-    with pytest.raises(BadInputError, match=r"has no robot\.yaml, so it is no robot"):
+    with pytest.raises(BadInputError, match=r"no such folder with robot\.yaml"):
         load_experiment("hover", [f"world.robot={tmp_path}"])
 
 
