@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import inspect
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 from cloudrc import plugins
 from cloudrc.config.overrides import BRAKING, build_plugin, default_parameters
-from cloudrc.config.problems import ConfigProblem, ProblemsError, problem_at
+from cloudrc.config.problems import ProblemsError, problem_at
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotFiles, known_robot, parameters
 from cloudrc.config.scene import scene_of, steered_in
@@ -17,15 +18,14 @@ from cloudrc.errors import BadInputError
 from cloudrc.messages import ZERO, Vector
 from cloudrc.outside.document import KeyPath
 from cloudrc.outside.refusal import naming
+from cloudrc.outside.values import RESULT
 from cloudrc.sim.airframe import thrust_to_weight
 from cloudrc.sim.onboard import Accelerator, Actuators, Direct, Onboard
 from cloudrc.sim.plant import Wind
-from cloudrc.sim.scene import OwnSensor, compile_model, compile_true, find_part, find_sensors
+from cloudrc.sim.scene import compile_model, compile_true, find_part, find_sensors
 from cloudrc.sim.simulator import Simulator, rest_height
-from cloudrc.world.accelerated import AcceleratedRobot
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.robot import STEP, Robot
-from cloudrc.world.watched import WatchedActuators, WatchedOnboard
+from cloudrc.world.robot import STEP, AcceleratedRobot, Robot
 
 KIND = "onboard"
 """Kind of plug-in."""
@@ -37,54 +37,72 @@ THRUST_TO_WEIGHT_MIN = 1.5
 """Smallest ratio of the largest thrust to the weight [1]: a tilted robot still climbs."""
 
 
-class Parts(NamedTuple):
-    """The parts of a robot in its scene, before they are connected."""
-
-    model: Any  # compiled `MjModel` of the true robot
-    plugin: plugins.Found  # file of the onboard controller
-    onboard: Onboard
-    actuators: Actuators
-    sensors: tuple[OwnSensor, ...]
-
-    @property
-    def obeys_yaw(self) -> bool:
-        """Whether the onboard controller follows a yaw rate."""
-        return bool(getattr(self.onboard, "obeys_yaw", True))
-
-
 def check_robot(world: World, *, turns: bool = False) -> None:
     """Check that the robot compiles and can move as `world` says, and with `turns` obeys a yaw."""
-    parts = make_parts(world)
-    connect(world, parts, ResolvedGuard.model_validate({}))
+    onboard = build_robot(world, ResolvedGuard.model_validate({})).onboard
     advise(world, ZERO)
-    if turns and not parts.obeys_yaw:
+    if turns and not getattr(onboard, "obeys_yaw", True):
         reason = f"the onboard controller of {world.robot} does not obey a yaw; leave yaw_deg out"
         raise problem_at("mission.waypoints", reason)
 
 
 def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -> Robot:
-    """Build the robot that flies or drives in a scene, guarded by `limits`."""
-    return connect(world, make_parts(world), limits, wind)
+    """Compile the robot that flies or drives in a scene, and build it, guarded by `limits`."""
+    robot, scene = known_robot(world.robot), file_of(world.scene)
+    with naming(f"robot {world.robot}"):
+        nominal = compile_model(robot.model, scene)
+    try:
+        # The build below uses the same import of the file.
+        plugin = plugins.find(KIND, robot.onboard.name)
+    except BadInputError as error:
+        raise _problem(world, (), str(error)) from error
+    onboard = _build_onboard(world, robot, nominal)
+    model = _change(world, robot, nominal)
+    actuators = _build_actuators(plugin, nominal, parameters(robot, world))
+    is_direct = isinstance(actuators, Direct)
+    if is_direct and not plugin.is_shipped:
+        with plugin.calling("build"):
+            RESULT.row(onboard.stopped, nominal.nu, "stopped")
+    if robot.planar:
+        _check_rest(world, model, onboard.stopped if is_direct else (0.0,) * model.nu)
+    else:
+        _check_lift(world, model)
+    if world.wind.blows and is_direct:
+        reason = (
+            f"{world.robot} has actuators without drag, so wind would not move it; leave the wind "
+            "out, or give them drag (multirotor has the parameter drag_s_per_m)"
+        )
+        raise problem_at("world.wind", reason)
+    with naming(f"{world.robot}/{ROBOT_FILE}"):
+        sensors = find_sensors(nominal, robot.sensors)
+        if robot.probe is not None:
+            find_part(nominal, "site", robot.probe, "probe")
+    judges = not (is_direct or plugin.is_shipped)
+    with plugin.calling("actuators" if judges else "build"):
+        simulator = Simulator(model, actuators, wind, robot.probe, sensors, judges=judges)
+    return _connect(world, plugin, simulator, onboard, limits)
 
 
-def connect(world: World, parts: Parts, limits: ResolvedGuard, wind: Wind | None = None) -> Robot:
-    """Connect the parts of a robot, guarded by `limits`."""
-    model, plugin, onboard, actuators, sensors = parts
-    robot = known_robot(world.robot)
-    guard = Guard(limits, steered_in(world), robot.guard)
-    faster = _accelerator(world, plugin)
-    make = None if faster is None else faster.make
-    if make is not None and plugin.is_shipped:
-        simulator = Simulator(model, actuators, wind, robot.probe, sensors)
-        return make(simulator, onboard, guard)  # type: ignore[no-any-return]
-    with plugin.calling("build"):
-        if not isinstance(actuators, Direct):
-            actuators = WatchedActuators(actuators, model.nu)
-        simulator = Simulator(model, actuators, wind, robot.probe, sensors)
-        if make is None:
-            return Robot(simulator, WatchedOnboard(onboard), guard)
+def _connect(
+    world: World,
+    plugin: plugins.Found,
+    simulator: Simulator,
+    onboard: Onboard,
+    limits: ResolvedGuard,
+) -> Robot:
+    """Make the robot of its parts, with the code that runs its usual steps faster if there is any.
+
+    A shipped accelerator runs no code of a user.
+    """
+    robot, faster = known_robot(world.robot), accelerator(world, plugin)
+    guard, name = Guard(limits, steered_in(world), robot.guard), Path(robot.onboard.name).name
+    if faster is None or faster.make is None:
+        with plugin.calling("build"):
+            return Robot(simulator, onboard, guard, name)
+    if plugin.is_shipped:
+        return faster.make(simulator, onboard, guard)  # type: ignore[no-any-return]
     with plugin.calling("accelerator"):
-        return AcceleratedRobot(simulator, onboard, guard, make)
+        return AcceleratedRobot(simulator, onboard, guard, name, faster.make)
 
 
 def onboard_values(world: World) -> dict[str, Any]:
@@ -107,9 +125,16 @@ def advise(world: World, gains: Vector) -> tuple[str, ...]:
         return tuple(map(str, function(world, values, gains)))
 
 
-def accelerator(world: World) -> Accelerator | None:
-    """Return what can run the usual steps of a robot faster; None if nothing can."""
-    return _accelerator(world, plugins.find(KIND, known_robot(world.robot).onboard.name))
+def accelerator(world: World, plugin: plugins.Found | None = None) -> Accelerator | None:
+    """Return what can run the usual steps of a robot faster; None if nothing can.
+
+    `plugin` is the file of its onboard controller, if it is loaded.
+    """
+    plugin = plugin or plugins.find(KIND, known_robot(world.robot).onboard.name)
+    if not world.is_nominal or plugin.get("accelerator") is None:
+        return None
+    with plugin.calling("accelerator") as function:
+        return function()  # type: ignore[no-any-return]
 
 
 def describe_steps(world: World) -> str:
@@ -120,81 +145,35 @@ def describe_steps(world: World) -> str:
     return faster.text
 
 
-def _accelerator(world: World, plugin: plugins.Found) -> Accelerator | None:
-    if not world.is_nominal or plugin.get("accelerator") is None:
-        return None
-    with plugin.calling("accelerator") as function:
-        return function()  # type: ignore[no-any-return]
-
-
-def make_parts(world: World) -> Parts:
-    """Compile a robot in its scene, and build its onboard controller and its actuators."""
-    robot, scene = known_robot(world.robot), file_of(world.scene)
-    where = f"{robot.model} in {scene}"
-    with naming(f"robot {world.robot}"):
-        nominal = compile_model(robot.model, scene)
-    try:
-        # The build below uses the same import of the file.
-        plugin = plugins.find(KIND, robot.onboard.name)
-    except BadInputError as error:
-        raise ProblemsError([_problem(world, (), str(error))]) from error
-    onboard = _build_onboard(world, where, robot, nominal)
-    true = _change(world, robot, nominal)
-    if not robot.planar:
-        _check_lift(world, where, true)
-    actuators = _build_actuators(plugin, nominal, parameters(robot, world))
-    is_direct = isinstance(actuators, Direct)
-    if is_direct and not plugin.is_shipped:
-        with plugin.calling("build"):
-            count = len(WatchedOnboard(onboard).stopped)  # which needs all methods, too
-            if count != nominal.nu:
-                raise ValueError(f"its stopped has {count} numbers, not {nominal.nu}")
-    if robot.planar:
-        _check_rest(world, where, true, onboard.stopped if is_direct else (0.0,) * true.nu)
-    if world.wind.blows and is_direct:
-        reason = (
-            f"{world.robot} has actuators without drag, so wind would not move it; leave the wind "
-            "out, or give them drag (multirotor has the parameter drag_s_per_m)"
-        )
-        raise problem_at("world.wind", reason)
-    with naming(f"{world.robot}/{ROBOT_FILE}"):
-        sensors = find_sensors(nominal, robot.sensors)
-        if robot.probe is not None:
-            find_part(nominal, "site", robot.probe, "probe")
-    return Parts(true, plugin, onboard, actuators, sensors)
-
-
-def _build_onboard(world: World, where: str, robot: RobotFiles, model: Any) -> Onboard:
-    """Build an onboard controller for a compiled `MjModel`; errors name the files in `where`."""
-    name = robot.onboard.name
+def _build_onboard(world: World, robot: RobotFiles, model: Any) -> Onboard:
+    """Build the onboard controller for a compiled `MjModel`."""
+    name, more = robot.onboard.name, {}
     choice = PlugIn.model_validate({**parameters(robot, world), "name": name})
     try:
-        more = {}
         if BRAKING in plugins.signature(KIND, name).parameters:
             more = {BRAKING: robot.guard.braking_mps2}
         return build_plugin(KIND, choice, model=model, **more)  # type: ignore[no-any-return]
     except ProblemsError as error:  # about its parameters
-        found, by = error.problems, f" (controller of {world.robot}: {name})"
-        named = [_problem(world, p.path, f"{p._replace(path=())}{by}") for p in found]
-        raise ProblemsError(named) from error
+        first = error.problems[0]
+        raise _problem(world, first.path, f"{first._replace(path=())} ({name})") from error
     except BadInputError as error:
+        where = f"{robot.model} in {file_of(world.scene)}"
         raise problem_at("world.robot", f"{where}: {error}") from error
 
 
-def _problem(world: World, path: KeyPath, reason: str) -> ConfigProblem:
-    """Return a problem at the key that gives a parameter of the onboard controller.
+def _problem(world: World, path: KeyPath, reason: str) -> ProblemsError:
+    """Return the error at the key that gives a parameter of the onboard controller.
 
     `path` is the parameter, and the keys inside its value; () means the controller itself.
     """
     if path and path[0] in (world.onboard.model_extra or {}):
-        return ConfigProblem(("world", "onboard", *path), "", reason)
+        return problem_at(".".join(("world.onboard", *path)), reason)
     file = world.robot if world.robot.endswith(".xml") else f"{world.robot}/{ROBOT_FILE}"
     tuning = known_robot(world.robot).tunings.get(world.tuning or "")
+    where, key = ".".join(("onboard", *path)), "world.robot"
     if path and tuning and path[0] in (tuning.model_extra or {}):
-        key, place = "tuning", ("tunings", str(world.tuning), *path)
-    else:
-        key, place = "robot", ("onboard", *path)
-    return ConfigProblem(("world", key), "", f"{file}: {'.'.join(place)}: {reason}")
+        where, key = ".".join(("tunings", str(world.tuning), *path)), "world.tuning"
+    return problem_at(key, f"{file}: {where}: {reason}")
 
 
 def _change(world: World, robot: RobotFiles, nominal: Any) -> Any:
@@ -212,38 +191,31 @@ def _change(world: World, robot: RobotFiles, nominal: Any) -> Any:
         return compile_true(robot.model, file_of(world.scene), nominal, world.plant)
 
 
-def _check_rest(world: World, where: str, model: Any, stopped: tuple[float, ...]) -> None:
+def _check_rest(world: World, model: Any, stopped: tuple[float, ...]) -> None:
     """Check that a planar robot stands at the height of the spawn.
 
     Missions have this height, and the robot cannot change it. `model` is the compiled `MjModel`,
     `stopped` the commands of the robot at rest.
     """
     base, spawn = rest_height(model, stopped, SETTLING), scene_of(world).spawn[2]
-    if abs(base - spawn) <= REST_ERROR_MAX:
-        return
-    move = f"{abs(base - spawn):.3f} m {'down' if base < spawn else 'up'}"
-    reason = (
-        f"the base of {world.robot} rests at a height of {base:.3f} m, but the spawn of the "
-        f"scene {world.scene} is at {spawn:.3f} m: move all parts inside the base {move}, or "
-        "set this height in the frame spawn of a scene of your own"
-    )
-    raise ProblemsError([ConfigProblem(("world", "robot"), where, reason)])
+    if abs(base - spawn) > REST_ERROR_MAX:
+        raise problem_at(
+            "world.robot",
+            f"the base of {world.robot} rests at a height of {base:.3f} m, but the spawn of the "
+            f"scene {world.scene} is at {spawn:.3f} m: move all parts inside the base, or set "
+            "this height in the frame spawn of a scene of your own",
+        )
 
 
-def _check_lift(world: World, where: str, model: Any) -> None:
+def _check_lift(world: World, model: Any) -> None:
     """Check that the true robot, a compiled `MjModel`, can lift off safely."""
     ratio = thrust_to_weight(model)
-    if ratio is None or ratio >= THRUST_TO_WEIGHT_MIN:
-        return
-    key, hint = "robot", "give it more thrust or less mass"
-    if not world.is_nominal:
-        key, where = "plant", ""
-        hint = "lower mass_factor or payload_kg, or raise actuator_factor"
-    reason = (
-        f"the thrust-to-weight ratio of {world.robot} is {ratio:.2f}, so it cannot lift "
-        f"off safely; it must be at least {THRUST_TO_WEIGHT_MIN:g}: {hint}"
-    )
-    raise ProblemsError([ConfigProblem(("world", key), where, reason)])
+    if ratio is not None and ratio < THRUST_TO_WEIGHT_MIN:
+        raise problem_at(
+            "world.robot" if world.is_nominal else "world.plant",
+            f"the thrust-to-weight ratio of {world.robot} is {ratio:.2f}, so it cannot lift off "
+            f"safely; give it more thrust or less mass, to at least {THRUST_TO_WEIGHT_MIN:g}",
+        )
 
 
 def _build_actuators(plugin: plugins.Found, model: Any, given: dict[str, Any]) -> Actuators:
@@ -253,8 +225,4 @@ def _build_actuators(plugin: plugins.Found, model: Any, given: dict[str, Any]) -
     with plugin.calling("actuators") as function:
         known = inspect.signature(function).parameters
         own = {name: value for name, value in given.items() if name in known}
-        actuators = function(model, STEP, **own)
-        if not callable(getattr(actuators, "step", None)):
-            raise ValueError(f"{type(actuators).__name__} has no method step()")
-        actuators.reset()
-        return actuators  # type: ignore[no-any-return]
+        return function(model, STEP, **own)  # type: ignore[no-any-return]

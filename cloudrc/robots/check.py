@@ -14,21 +14,20 @@ from typing import Any
 import numpy as np
 
 from cloudrc.config.hull import doubts, hull_of
-from cloudrc.config.problems import ProblemsError
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotFiles, find_robot
 from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Vector
-from cloudrc.robots.build import advise, check_robot, connect, make_parts, onboard_values
+from cloudrc.outside.code import calling
+from cloudrc.robots.build import advise, build_robot, check_robot, onboard_values
 from cloudrc.sim.airframe import thrust_to_weight
 from cloudrc.sim.bodies import reach_of
 from cloudrc.sim.scene import ROBOT_PREFIX
 from cloudrc.text import table
 from cloudrc.world.guard.limits import REACTION
 from cloudrc.world.robot import STEP, Robot
-from cloudrc.world.watched import OnboardFailedError
 
 SCENE = "empty"
 """Scene of the check."""
@@ -63,19 +62,15 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
     """
     world = World.model_validate({"robot": name, "scene": SCENE})
     robot = find_robot(name)
-    if robot.hull_points is not None:
-        hull_of(name)
-    try:
-        advise(world, ZERO)
-        parts = make_parts(world)
-        body = connect(world, parts, ResolvedGuard.model_validate({}))
-    except ProblemsError as error:  # no experiment has chosen the robot
-        raise BadInputError("; ".join(problem.reason for problem in error.problems)) from error
-    facts = _read_facts(world, robot, parts.model)
+    hull_of(name)
+    advise(world, ZERO)
+    body = build_robot(world, ResolvedGuard.model_validate({}))
+    facts = _read_facts(world, robot, body.simulator.model)
     changes = [*doubts(name), *_judge_tunings(robot, world)]
     try:
-        motion = _move(body, robot)
-    except OnboardFailedError as error:
+        with calling(f"the onboard controller of {name} failed", keep=BadInputError):
+            motion = _move(body, robot)
+    except BadInputError as error:
         return facts, [*changes, str(error)]
     rest = motion.pop("rest")
     facts |= {key: value for key, value in motion.items() if value is not None}
@@ -113,8 +108,6 @@ def _judge_tunings(robot: RobotFiles, world: World) -> Iterator[str]:
     for name in robot.tunings:
         try:
             check_robot(world.model_copy(update={"tuning": name}))
-        except ProblemsError as error:
-            yield from (problem.reason for problem in error.problems)
         except BadInputError as error:
             yield str(error)
 
@@ -191,18 +184,15 @@ def _follow(
 
     The reference starts at `reference` and changes as fast as the guard allows; None: brake.
     """
-    simulator, onboard = body.simulator, body.onboard
+    simulator = body.simulator
     change = robot.guard.acceleration_max_mps2 * STEP
     for _ in range(round(duration / STEP)):
-        readings = simulator.readings
-        if reference is None:
-            commands = onboard.brake(readings, wanted)
-        else:
+        if reference is not None:
             reference = step_towards(reference, wanted, change)
-            commands = onboard.update(readings, reference, yaw_rate)
-        simulator.step(commands)
+        goal, brakes = reference or wanted, reference is None
+        simulator.step(body.steer(simulator.readings, goal, yaw_rate, brakes=brakes))
         if simulator.readings.axes[8] < UPRIGHT_MIN:
-            raise OnboardFailedError("the robot turns over: check the onboard controller's gains")
+            raise BadInputError("the robot turns over: check the onboard controller's gains")
     return reference or ZERO
 
 

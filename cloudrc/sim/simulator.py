@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cloudrc.messages import ZERO, Odometry, Quaternion, Vector
+from cloudrc.outside.values import RESULT
 from cloudrc.records import Contact, SensorLabel
 from cloudrc.sim.engine import mujoco
 from cloudrc.sim.onboard import Actuators, Commands, Inputs
@@ -66,11 +67,13 @@ class Simulator:
         wind: Wind | None = None,
         probe: str | None = None,
         sensors: Sequence[OwnSensor] = (),
+        *,
+        judges: bool = False,
     ) -> None:
         """Put the robot of a compiled `MjModel` at its spawn; without `wind` the air is at rest.
 
         `probe` is the name of the site with which the robot touches; None: any part touches.
-        `sensors` are the robot's own sensors.
+        `sensors` are the robot's own sensors. With `judges`, refuse wrong inputs of the actuators.
 
         Raises:
             ValueError: If the model has no such site.
@@ -82,6 +85,8 @@ class Simulator:
         self.data = data = mujoco.MjData(model)
         self.actuators = actuators
         self._inputs: int = model.nu
+        self._nothing: Inputs = (0.0,) * (model.nu + 6)
+        self._judges = judges
         self._pack_ctrl = Struct(f"{model.nu}d").pack_into
 
         self._qpos, self._qvel = memoryview(data.qpos), memoryview(data.qvel)
@@ -106,7 +111,6 @@ class Simulator:
         """Reset the robot to its spawn, at rest, with still actuators."""
         mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_forward(self.model, self.data)
-        self.actuators.reset()
         self.steps = self.contacts = 0
         self.force_peak = self.impulse = 0.0
         if self.tape is not None:
@@ -115,16 +119,21 @@ class Simulator:
         # The robot stands on the floor: only after a flight is the next contact a new contact.
         self._last_touch: dict[tuple[str, bool], int] = {("floor", self._probe < 0): 0}
         self._readings: Readings | None = None
+        self.actuators.reset()
 
-    def step(self, commands: Commands) -> None:
-        """Advance by `dt` with these commands to the actuators.
+    def step(self, commands: Commands | None) -> None:
+        """Advance by `dt` with these commands to the actuators; None: they push nothing.
 
         The physics uses what the actuators do at the end of the step. The actuators get the
         readings at the beginning of the step, with the velocity relative to the air.
         """
         before, data, wind = self.readings, self.data, self._wind
-        in_air = before if wind is None else wind.seen_from(before, self.dt)
-        inputs, count = self.actuators.step(commands, in_air), self._inputs
+        count, inputs = self._inputs, self._nothing
+        if commands is not None:
+            in_air = before if wind is None else wind.seen_from(before, self.dt)
+            inputs = self.actuators.step(commands, in_air)
+        if self._judges:
+            inputs = RESULT.row(inputs, count + 6, "input of the actuators")
         self._pack_ctrl(self._ctrl, 0, *inputs[:count])
         _pack_applied(self._applied, 0, *inputs[count:])
         if self.tape is not None:

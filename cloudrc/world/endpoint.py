@@ -231,8 +231,7 @@ class WorldEndpoint(TunnelEnd):
         """Record a failure of the onboard controller, changes of the guard's state and contacts."""
         simulator, guard, records = self.robot.simulator, self.robot.guard, self._records
         if (failure := self.robot.failure) is not None:
-            text = f"{failure}; the guard stopped the robot; fix the file"
-            self._tell("onboard_failed", text, failure.stamp_ns, failure.trace)
+            self._tell(failure.code, failure.text, failure.stamp_ns, failure.traceback)
             self.robot.failure = None
         if guard.changes:
             records += guard.take_changes()

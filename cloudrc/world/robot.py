@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
-from cloudrc.messages import Command, GuardState, OperatorRequest
+from cloudrc.errors import describe_error
+from cloudrc.messages import Command, GuardState, OperatorRequest, Vector
+from cloudrc.outside.code import FAILURES, check_failure, locate, stack_of
+from cloudrc.outside.values import RESULT, InvalidValueError
+from cloudrc.records import Fault
 from cloudrc.sim.onboard import Commands, Onboard
 from cloudrc.sim.readings import Readings
 from cloudrc.sim.simulator import Simulator
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.watched import OnboardFailedError
 
 STEP_NS = 2_000_000
 """Duration of one step of physics, onboard controller and guard [ns].
@@ -38,16 +42,22 @@ class Observer(Protocol):
 class Robot:
     """Runs physics, guard and onboard controller step by step, and informs `observers`.
 
+    Onboard controller and actuators may be code of a user. If it fails in flight, the guard stops
+    the robot.
+
     Attributes:
         failure: Why the guard stopped the robot, until a caller sets None; None: no failure.
     """
 
-    def __init__(self, simulator: Simulator, onboard: Onboard, guard: Guard) -> None:
-        self.simulator = simulator
-        self.onboard = onboard
-        self.guard = guard
+    def __init__(
+        self, simulator: Simulator, onboard: Onboard, guard: Guard, name: str = ""
+    ) -> None:
+        """Connect the parts; `name` is that of a user's onboard controller, whose results count."""
+        self.simulator, self.onboard, self.guard = simulator, onboard, guard
         self.observers: list[Observer] = []
-        self.failure: OnboardFailedError | None = None
+        self.failure: Fault | None = None
+        self._name, self._size = name, len(onboard.stopped)
+        self._update, self._brake = onboard.update, onboard.brake
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
         """Reset the robot to its spawn, stopped, and record the reason `cause`."""
@@ -55,8 +65,21 @@ class Robot:
         try:
             self.simulator.reset()
             self.onboard.reset()
-        except OnboardFailedError as failure:
-            self._fail(failure, now_ns)
+        except FAILURES as error:
+            self._fail(error, now_ns)
+
+    def steer(
+        self, readings: Readings, velocity: Vector, yaw_rate: float, *, brakes: bool = False
+    ) -> Commands:
+        """Return the onboard controller's commands for a velocity [m/s] and a yaw rate [rad/s].
+
+        `brakes` tells whether the robot brakes to this velocity.
+        """
+        if brakes:
+            commands = self._brake(readings, velocity)
+        else:
+            commands = self._update(readings, velocity, yaw_rate)
+        return RESULT.row(commands, self._size, "result") if self._name else commands
 
     def run(self, tick_ns: int, until_ns: int) -> int:
         """Run steps from `tick_ns` up to `until_ns`; return the time of the next step [ns]."""
@@ -70,27 +93,75 @@ class Robot:
                 if reference is None:
                     onboard.reset()
                     commands = onboard.stopped
-                elif guard.state is TRACK or not guard.brakes:
-                    commands = onboard.update(readings, reference, guard.yaw_rate)
                 else:
-                    commands = onboard.brake(readings, reference)
+                    brakes = guard.state is not TRACK and guard.brakes
+                    commands = self.steer(readings, reference, guard.yaw_rate, brakes=brakes)
                 simulator.step(commands)
-            except OnboardFailedError as failure:  # before the physics of this step
-                commands = self._step_stopped(failure, now_ns)
+            except FAILURES as error:  # before the physics of this step
+                commands = self._step_stopped(error, now_ns)
             for observer in observers:
                 observer.see_step(now_ns, readings, commands)
         return tick_ns + len(ticks) * STEP_NS
 
-    def _step_stopped(self, failure: OnboardFailedError, now_ns: int) -> Commands:
-        """Stop the robot because of `failure`, and run the step with stopped actuators."""
-        self._fail(failure, now_ns)
+    def _step_stopped(self, error: BaseException, now_ns: int) -> Commands:
+        """Stop the robot because of `error`, and run the step with stopped actuators."""
+        self._fail(error, now_ns)
         try:
             self.simulator.step(self.onboard.stopped)
-        except OnboardFailedError as more:  # only once: then the actuators push nothing
-            return self._step_stopped(more, now_ns)
+        except FAILURES:  # the actuators fail
+            self.simulator.step(None)
         return self.onboard.stopped
 
-    def _fail(self, failure: OnboardFailedError, now_ns: int) -> None:
+    def _fail(self, error: BaseException, now_ns: int) -> None:
+        """Let the guard stop the robot because of `error` in the code of a user."""
+        check_failure(error, "the onboard controller")
         if self.guard.state is not ESTOP:  # a stopped robot may fail in every step
-            self.failure, failure.stamp_ns = failure, now_ns
+            place = self._name if isinstance(error, InvalidValueError) else locate(error)
+            what = f"the onboard controller failed ({describe_error(error)}, {place})"
+            text = f"{what}; the guard stopped the robot; fix the file"
+            self.failure = Fault(now_ns, "onboard_failed", text, stack_of(error))
         self.guard.fail(now_ns)
+
+
+class AcceleratedRobot(Robot):
+    """A `Robot` whose steps run in code of a user, until this code fails.
+
+    Then the guard stops the robot, and Python runs all steps until the robot is on the ground.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        onboard: Onboard,
+        guard: Guard,
+        name: str,
+        make: Callable[..., Any],
+    ) -> None:
+        """Make the other code, a `Robot`, with `make`; `name` is that of the user's file."""
+        super().__init__(simulator, onboard, guard, name)
+        self._faster: Robot = make(simulator, onboard, guard)
+        self._faster.observers = self.observers
+        self._has_failed = False
+
+    def put_on_ground(self, now_ns: int, cause: str) -> None:
+        """Reset the robot to its spawn, stopped, and record the reason `cause`."""
+        self._has_failed = False
+        try:
+            self._faster.put_on_ground(now_ns, cause)
+        except FAILURES as error:
+            self._fail(error, now_ns)
+
+    def run(self, tick_ns: int, until_ns: int) -> int:
+        """Run steps from `tick_ns` up to `until_ns`; return the time of the next step [ns]."""
+        if self._has_failed:
+            return super().run(tick_ns, until_ns)
+        try:
+            ended_ns = self._faster.run(tick_ns, until_ns)
+            RESULT.array(self.simulator.data.qpos, "position")
+            RESULT.array(self.simulator.data.qvel, "velocity")
+        except FAILURES as error:
+            self._has_failed = True
+            self._fail(error, tick_ns)
+            return super().run(tick_ns, until_ns)
+        self.failure, self._faster.failure = self._faster.failure or self.failure, None
+        return ended_ns

@@ -95,7 +95,7 @@ def test_a_shipped_robot_needs_no_change(robot, call, tmp_path):
     [
         ("hull_m: 0.34", "hull_m: 0.1", "hull_m is 0.1, but the geoms reach 0.333 m from the base"),
         ("braking_mps2: 3", "braking_mps2: 9", "guard.braking_mps2 is 9, but"),
-        ("onboard: multirotor", "onboard: ./own.py", "own.py:10 in update"),
+        ("onboard: multirotor", "onboard: ./own.py", "own.py:10: NameError"),
         ("onboard: multirotor", "onboard: ./turns.py", "the robot turns over"),
     ],
 )

@@ -45,10 +45,12 @@ def test_the_controller_may_lie_in_the_folder_and_takes_parameters(own_robot):
     [
         ("onbord: x", "robot.yaml:1: onbord: unknown key; did you mean onboard?"),
         (f"{{model: other.xml, onboard: {CONTROLLER}}}", "other.xml"),
+        (f"onboard: {CONTROLLER}", "a mass of 1.06 +- 0.1 kg, not 4 and 1.325 kg"),
     ],
 )
 def test_what_is_wrong_with_a_robot_is_one_problem_by_name(own_robot, text, message):
-    mine = own_robot(text)
+    model = find_robot("pelican").model.read_text().replace('mass="1.0"', 'mass="1.265"')
+    mine = own_robot(text, model)
     with pytest.raises(BadInputError) as error:
         cloudrc.fly("hover", HOVER | {"world.robot": str(mine)})
     assert message in str(error.value)

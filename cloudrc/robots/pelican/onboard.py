@@ -1,7 +1,7 @@
 """Onboard controller: the published one, for the Pelican with its arm and four rotors.
 
-Only models that differ little from the Pelican are accepted, because gains and allocation are those
-of its mass, inertia and rotors.
+Only robots of about its mass are accepted, because gains and allocation are those of its mass,
+inertia and rotors.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import Any
 
 from cloudrc.config.schema import NotNegative, NotNegatives, World
 from cloudrc.messages import Vector
-from cloudrc.robots.pelican.fit import check_fit
 from cloudrc.robots.pelican.low_level import (
     GAIN_D,
     GAIN_I,
@@ -26,9 +25,11 @@ from cloudrc.robots.pelican.low_level import (
     ROBOT_MASS,
     LowLevel,
 )
-from cloudrc.robots.pelican.rotors import Rotors
+from cloudrc.robots.pelican.rotors import STOPPED, Rotors
 from cloudrc.sim.onboard import Accelerator
 
+MASS_SLACK = 0.1
+"""Largest difference of the mass [kg]: the velocity loop compensates for a weight of 1 N."""
 SAG_MAX = 0.05
 """Largest steady error of the position that needs no warning [m]."""
 WIND_FORCE = 0.24
@@ -55,9 +56,14 @@ def build(
         integral_limit_z: Limit of the integrated velocity error in z [m].
 
     Raises:
-        ValueError: If the model differs too much from the Pelican.
+        ValueError: If the model has another mass or number of rotors than the Pelican.
     """
-    check_fit(model)
+    mass = model.body_mass[model.jnt_bodyid[0]]
+    if model.nu != len(STOPPED) or abs(mass - ROBOT_MASS) > MASS_SLACK:
+        raise ValueError(
+            f"needs 4 rotors and a mass of {ROBOT_MASS:g} +- {MASS_SLACK:g} kg, not {model.nu} "
+            f"and {mass:g} kg; fly the model with the onboard controller multirotor"
+        )
     return LowLevel(gain_p, gain_i, gain_d, integral_limit_xy, integral_limit_z)
 
 

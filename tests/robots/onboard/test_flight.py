@@ -28,7 +28,7 @@ def test_the_drag_of_robot_yaml_reaches_the_rotors(own_robot):
     mine = own_robot("onboard: {name: multirotor, drag_s_per_m: 0.02}", MODEL)
     experiment = load_experiment("hover", ["world.scene=empty", f"world.robot={mine}"])
     robot = build_robot(experiment.world, experiment.guard)
-    assert isinstance(robot.simulator.actuators._actuators, RotorDrag)
+    assert isinstance(robot.simulator.actuators, RotorDrag)
 
 
 @pytest.mark.parametrize(
