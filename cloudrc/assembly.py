@@ -237,8 +237,7 @@ def build_cloud(
     controller = build_controller(experiment)
     remote = controller if isinstance(controller, OutsideController) else None
     if is_planar(experiment.world.robot):
-        name = Path(experiment.world.robot).name
-        controller = Planar(controller, cloud.controller.name, f"the robot {name}")
+        controller = Planar(controller, cloud.controller.name)
     loop = make_loop(
         lambda: build_plugin("estimators", cloud.estimator),
         build_predictor(

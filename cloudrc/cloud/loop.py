@@ -22,7 +22,7 @@ from copy import deepcopy
 from math import nan
 from typing import Any
 
-from cloudrc.cloud.controllers import Controller, ControlOutput
+from cloudrc.cloud.controllers import STAND_STILL, Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.plan_log import PlanLog
 from cloudrc.cloud.predictors import Predictor
@@ -32,7 +32,6 @@ from cloudrc.messages import (
     FRESH_ECHO_PERIODS,
     NEVER_NS,
     PLAN_STEP_NS,
-    ZERO,
     Command,
     Odometry,
     Setpoint,
@@ -52,7 +51,6 @@ Source: docs/reference/plant.md, "Commands"."""
 ECHOES, ECHOES_NS = 32, 320_000_000
 """Smallest number of stored echoes, and the time for which echoes are stored [ns]. With the stored
 echoes, the loop calls `add_applied` only once per command."""
-STAND_STILL = ControlOutput(ZERO, 0.0)
 INSTEAD = {
     "estimator": "cloud uses the last good horizon",
     "predictor": "cloud uses the last sample without a prediction",
@@ -325,6 +323,8 @@ class ControlLoop:
             return basis
 
     def _steer(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
+        if self.lost is not None:
+            return STAND_STILL
         try:
             output = self._controller.update(estimate, setpoint, dt)
             return output if self._trusts_controller else check_output(output)

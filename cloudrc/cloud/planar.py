@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
-from cloudrc.cloud.controllers.remote import STAND_STILL, OutsideController
+from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.cloud.results import check_output
 from cloudrc.errors import ControllerLostError
 from cloudrc.messages import Odometry, Setpoint
@@ -17,10 +17,9 @@ ROUNDING = 1e-9
 class Planar(Controller):
     """Lets a controller see and steer the plane alone, and refuses its vertical velocities."""
 
-    def __init__(self, controller: Controller, name: str, robot: str) -> None:
-        """Wrap `controller`; errors call it `name`, and the robot `robot`."""
-        self._controller, self._name, self._robot = controller, name, robot
-        self._lost = False
+    def __init__(self, controller: Controller, name: str) -> None:
+        """Wrap `controller`; errors call it `name`."""
+        self._controller, self._name = controller, name
 
     def reset(self) -> None:
         """Reset the controller."""
@@ -34,27 +33,19 @@ class Planar(Controller):
 
         Raises:
             InvalidValueError: If the controller commands a vertical velocity.
-            ControllerLostError: Once, if a program outside does so.
+            ControllerLostError: If a program outside does so.
         """
-        if self._lost:
-            return STAND_STILL
         x, y, _ = estimate.position
         vx, vy, _ = estimate.velocity
         level = estimate._replace(position=(x, y, setpoint.position[2]), velocity=(vx, vy, 0.0))
-        rx, ry, rz = setpoint.velocity
-        if rz:
+        rx, ry, _ = setpoint.velocity
+        if setpoint.velocity[2]:
             setpoint = setpoint._replace(velocity=(rx, ry, 0.0))
         output = check_output(self._controller.update(level, setpoint, dt))
         x, y, z = output.velocity
-        if abs(z) > ROUNDING:
-            self._refuse(z)
-        return output._replace(velocity=(x, y, 0.0))
-
-    def _refuse(self, z: float) -> None:
-        text = f"its velocity in z is {z:.4g} m/s, but {self._robot} stays on the ground: give 0"
+        if abs(z) <= ROUNDING:
+            return output._replace(velocity=(x, y, 0.0))
+        text = f"{self._name}: its velocity in z is {z:.4g} m/s, but the robot stays on the ground"
         if isinstance(self._controller, OutsideController):
-            self._lost = True
-            _, invalid = CONTROLLER_LOST
-            place = self._controller.place or self._name  # ROS without a namespace has no place
-            raise ControllerLostError(invalid, f"{place}: {text}")
-        raise InvalidValueError(f"{self._name}: {text}")
+            raise ControllerLostError(CONTROLLER_LOST[1], text)
+        raise InvalidValueError(text)

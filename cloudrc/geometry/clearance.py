@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cloudrc.geometry.obstacles import Obstacle
-from cloudrc.geometry.scene import Scene, Tube
+from cloudrc.geometry.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -71,25 +71,6 @@ def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) ->
     return placed
 
 
-def distance_to_tube(tube: Tube, points: Array) -> Array:
-    """Compute the distance of points from a tube's wall [m], shape (...); negative inside the wall.
-
-    `points` are in [m], world frame, shape (..., 3). With s the position along the axis and r the
-    distance from the axis, the wall is a rectangle in the (s, r) plane.
-    """
-    relative = points - np.asarray(tube.centre)
-    s = relative @ np.asarray(tube.axis)
-    r_squared = np.einsum("...i,...i->...", relative, relative) - s * s
-    r = np.sqrt(np.maximum(r_squared, 0.0))
-    beyond_end = np.abs(s) - 0.5 * tube.length
-    beyond_face = np.abs(r - 0.5 * (tube.inner + tube.outer)) - 0.5 * (tube.outer - tube.inner)
-    nearest: Array = np.minimum(np.maximum(beyond_end, beyond_face), 0.0)
-    np.maximum(beyond_end, 0.0, out=beyond_end)
-    np.maximum(beyond_face, 0.0, out=beyond_face)
-    nearest += np.sqrt(beyond_end * beyond_end + beyond_face * beyond_face)
-    return nearest
-
-
 def clearance_per_obstacle(
     obstacles: Sequence[Obstacle],
     positions: ArrayLike,
@@ -108,11 +89,7 @@ def clearance_per_obstacle(
         part = slice(start, start + _CHUNK)
         placed = place_points(points, at[part], facing[part])
         for index, obstacle in enumerate(obstacles):
-            if isinstance(obstacle, Tube):
-                distance = distance_to_tube(obstacle, placed)
-            else:
-                distance = obstacle.distance(placed)
-            result[part, index] = (distance - points.radii).min(axis=1)
+            result[part, index] = (obstacle.distance(placed) - points.radii).min(axis=1)
     return result
 
 

@@ -16,16 +16,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeAlias
 from xml.etree import ElementTree
 
+import numpy as np
+
 from cloudrc.geometry.fence import Corners, Fence, order_of
-from cloudrc.geometry.solids import Solid
+from cloudrc.geometry.solids import Array, Solid
 from cloudrc.messages import Vector
 from cloudrc.outside.values import InvalidValueError
 
-Numerics: TypeAlias = dict[str, str]
-"""Name of a `<numeric>` -> its data."""
 SPAWN: Vector = (0.0, 0.0, 0.1)
 """Position of the base at the start of a mission in the shipped scenes [m], world frame."""
 FLOOR, WORLD = "floor", "world"
@@ -45,6 +44,24 @@ class Tube:
     length: float  # [m]
     inner: float  # inner radius [m]
     outer: float  # outer radius [m]
+
+    def distance(self, points: Array) -> Array:
+        """Compute the distance of points from the wall [m], shape (...); negative inside the wall.
+
+        `points` are in [m], world frame, shape (..., 3). With s the position along the axis and r
+        the distance from the axis, the wall is a rectangle in the (s, r) plane.
+        """
+        relative = points - np.asarray(self.centre)
+        s = relative @ np.asarray(self.axis)
+        r_squared = np.einsum("...i,...i->...", relative, relative) - s * s
+        r = np.sqrt(np.maximum(r_squared, 0.0))
+        beyond_end = np.abs(s) - 0.5 * self.length
+        beyond_face = np.abs(r - 0.5 * (self.inner + self.outer)) - 0.5 * (self.outer - self.inner)
+        nearest: Array = np.minimum(np.maximum(beyond_end, beyond_face), 0.0)
+        np.maximum(beyond_end, 0.0, out=beyond_end)
+        np.maximum(beyond_face, 0.0, out=beyond_face)
+        nearest += np.sqrt(beyond_end * beyond_end + beyond_face * beyond_face)
+        return nearest
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,12 +108,8 @@ def load_scene(name: str, corners: Corners | None = None) -> Scene:
     path = SCENES / f"{name}.xml" if is_shipped else Path(name)
     try:
         scene = _read(_parse(path), path, is_shipped=is_shipped)
-    except OSError as error:
-        raise InvalidValueError(f"scene {path.name}: cannot be read: {error.strerror}") from error
-    except ElementTree.ParseError as error:
-        raise InvalidValueError(f"scene {path.name}: not readable as XML: {error}") from error
-    except (ValueError, RecursionError) as error:
-        raise InvalidValueError(f"scene {path.name}: {error}") from None
+    except (OSError, ElementTree.ParseError, ValueError) as error:
+        raise InvalidValueError(f"scene {path.name}: {error}") from error
     return replace(scene, own_fence=Fence(*corners)) if corners else scene
 
 
@@ -131,34 +144,22 @@ def _parse(path: Path) -> ElementTree.Element:
 def _read(root: ElementTree.Element, path: Path, *, is_shipped: bool) -> Scene:
     """Read the scene in the file `path`, whose element is `root`."""
     numerics = {n.get("name", ""): n.get("data", "") for n in root.iterfind("custom/numeric")}
-    shapes = _shapes(root, numerics)
-    (floor,) = _numbers(FLOOR, numerics.get(FLOOR, "0"), 1)
+    names = {body.get("name") for body in root.iter("body")} - {FLOOR, FENCE}
+    shapes = [_shape(name, data) for name, data in numerics.items() if name in names]
+    frame = root.find("./worldbody/frame[@name='spawn']")
+    spawn = SPAWN if frame is None else _numbers("spawn", frame.get("pos", "0 0 0"), 3)
     bodies = {body.get("name") for body in root.iterfind("worldbody/body")}
     is_complete = is_shipped and bodies <= {FLOOR, *numerics}
     return Scene(
         path.stem,
         tuple(shape for shape in shapes if isinstance(shape, Tube)),
         tuple(shape for shape in shapes if isinstance(shape, Plate)),
-        floor,
-        _spawn(root),
+        _numbers(FLOOR, numerics.get(FLOOR, "0"), 1)[0],
+        (spawn[0], spawn[1], spawn[2]),
         None if is_complete else path,
         _fence(_numbers(FENCE, numerics[FENCE], 6)) if FENCE in numerics else None,
         bodies=(FLOOR, *(shape.name for shape in shapes)),
     )
-
-
-def _shapes(root: ElementTree.Element, numerics: Numerics) -> list[Tube | Plate]:
-    """Return the tubes and plates of a scene in the order of its file."""
-    names = {body.get("name") for body in root.iter("body")} - {FLOOR, FENCE}
-    return [_shape(name, data) for name, data in numerics.items() if name in names]
-
-
-def _spawn(root: ElementTree.Element) -> Vector:
-    frame = root.find("./worldbody/frame[@name='spawn']")
-    if frame is None:
-        return SPAWN
-    x, y, z = _numbers("spawn", frame.get("pos", "0 0 0"), 3)
-    return x, y, z
 
 
 def _fence(numbers: list[float]) -> Fence:

@@ -9,16 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array: TypeAlias = NDArray[np.float64]
-Shape: TypeAlias = Literal[
-    "box", "sphere", "capsule", "cylinder", "ellipsoid", "plane", "hull", "outline"
-]
+Shape: TypeAlias = Literal["box", "sphere", "capsule", "cylinder", "plane", "hull", "outline"]
 
-_TINY = 1e-12
-"""Smallest distance of a point from the planes of an ellipsoid's axes [half-axes]."""
-_NEWTON_MAX = 100
-"""Largest number of steps to find the nearest point of an ellipsoid; most points need 5."""
-_CONVERGED = 1e-12
-"""Relative size of the last of these steps."""
 _CELLS_MAX = 1 << 16
 """Largest number of pairs of points and faces, or edges, at a time: it bounds the memory."""
 _ON_HULL = 1e-5
@@ -30,10 +22,10 @@ float32."""
 class Solid:
     """A convex body, or the space below a plane.
 
-    `size` is half the edges of a box, or of an outline, the box around a shape that is not convex,
-    such as a height field; the radius of a sphere; the radius, and half the length of
-    the axis of a capsule (without its ends) or cylinder; the half-axes of an ellipsoid. The axis of
-    a capsule or cylinder and the normal of a plane are along z.
+    `size` is half the edges of a box, or of an outline, the box around any other shape, such as a
+    height field; the radius of a sphere; the radius, and half the length of the axis of a capsule
+    (without its ends) or cylinder. The axis of a capsule or cylinder and the normal of a plane are
+    along z.
     """
 
     name: str  # of the body in the scene
@@ -78,33 +70,6 @@ def _to_cylinder(solid: Solid, local: Array) -> Array:
     outside: Array = np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0))
     outside += np.minimum(np.maximum(along, across), 0.0)
     return outside
-
-
-def _to_ellipsoid(solid: Solid, local: Array) -> Array:
-    """Compute the distance with Newton's method.
-
-    With the half-axes e and the smallest of them, c, the nearest point of the surface to y is
-    x = r y / (w + r - 1), r = (e / c)^2, for the one w > 0 that puts x on the surface. The sum
-    below is convex and falls with w, so w grows towards its value without passing it.
-    Source: D. Eberly, "Distance from a Point to an Ellipse, an Ellipsoid, or a Hyperellipsoid",
-    Geometric Tools, 2013.
-    """
-    ratios = (solid.size / solid.size.min()) ** 2
-    # On the plane of two axes the nearest point may be beside it: there w would be 0.
-    scaled = np.maximum(np.abs(local) / solid.size, _TINY)
-    numerators, shifts = ratios * scaled, ratios - 1.0
-    w = (numerators - shifts).max(axis=-1, keepdims=True)
-    for _ in range(_NEWTON_MAX):
-        squares = (numerators / (w + shifts)) ** 2
-        slope = (squares / (w + shifts)).sum(axis=-1, keepdims=True)
-        step = (squares.sum(axis=-1, keepdims=True) - 1.0) / (2.0 * slope)
-        w = w + step
-        if (step <= _CONVERGED * w).all():
-            break
-    nearest = numerators / (w + shifts) * solid.size
-    distance: Array = np.linalg.norm(scaled * solid.size - nearest, axis=-1)
-    inside = np.linalg.norm(scaled, axis=-1) < 1.0
-    return np.where(inside, -distance, distance)
 
 
 def _to_plane(solid: Solid, local: Array) -> Array:
@@ -154,7 +119,6 @@ _DISTANCES = {
     "sphere": _to_sphere,
     "capsule": _to_capsule,
     "cylinder": _to_cylinder,
-    "ellipsoid": _to_ellipsoid,
     "plane": _to_plane,
     "hull": _to_hull,
     "outline": _to_box,

@@ -69,11 +69,10 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
     changes = [*doubts(name), *_judge_tunings(robot, world)]
     try:
         with calling(f"the onboard controller of {name} failed", keep=BadInputError):
-            motion = _move(body, robot)
+            motion, rest = _move(body, robot)
     except BadInputError as error:
         return facts, [*changes, str(error)]
-    rest = motion.pop("rest")
-    facts |= {key: value for key, value in motion.items() if value is not None}
+    facts |= motion
     if body.simulator.bad_values():
         return facts, [*changes, "the simulation diverged: check masses and inertias of the model"]
     return facts, [*changes, *_judge(robot, facts, rest)]
@@ -112,64 +111,44 @@ def _judge_tunings(robot: RobotFiles, world: World) -> Iterator[str]:
             yield str(error)
 
 
-def _move(body: Robot, robot: RobotFiles) -> dict[str, Any]:
+def _move(body: Robot, robot: RobotFiles) -> tuple[dict[str, float], float]:
     """Let the robot hover or stand, follow a step along x, brake, and turn if it can.
 
-    Return what it did: largest distance from its place at rest [m], commanded speed of the step
+    Return facts about it: largest distance from its place at rest [m], commanded speed of the step
     [m/s], part of it at the end of the step [1], least deceleration that explains the braking
-    distance [m/s^2], speed at the end of braking [m/s], part of the turn and of a velocity to its
-    side [1]; None: its heading is another.
+    distance [m/s^2], and the part of a yaw rate or of a velocity to its side [1]; and its speed at
+    the end of braking [m/s].
     """
-    climb = (0.0, 0.0, 0.0 if robot.planar else CLIMB)
-    body.simulator.reset()
+    simulator = body.simulator
+    simulator.reset()
     body.onboard.reset()
+    climb = (0.0, 0.0, 0.0 if robot.planar else CLIMB)
     reference = _follow(body, robot, ZERO, climb, RISE)
     reference = _follow(body, robot, reference, ZERO, 1.0)
-    place = body.simulator.readings.position
+    place = simulator.readings.position
     reference = _follow(body, robot, reference, ZERO, STEADY)
-    drift = dist(place, body.simulator.readings.position)
+    drift = dist(place, simulator.readings.position)
     speed = min(robot.guard.speed_max_mps or SPEED, SPEED)
     _follow(body, robot, reference, (speed, 0.0, 0.0), FAST)
-    start, before = body.simulator.readings.position, _speed(body)
+    start, before = simulator.readings.position, _speed(body)
     _follow(body, robot, None, ZERO, STOP)
-    way = hypot(*np.subtract(body.simulator.readings.position, start)[:2]) - REACTION * before
-    braking = min(before * before / (2.0 * max(way, 1e-9)), BRAKING_MAX)
-    rest = _speed(body)
-    return {
+    way = hypot(*np.subtract(simulator.readings.position, start)[:2]) - REACTION * before
+    rest, yaw = _speed(body), _yaw(body)
+    facts = {
         "drift_m": drift,
         "step_mps": speed,
         "step_reached": before / speed,
-        "braking_measured_mps2": braking,
-        "rest": rest,
-        "turn_reached": _turn(body, robot),
-        "side_reached": _follow_aside(body, robot, speed),
+        "braking_measured_mps2": min(before * before / (2.0 * max(way, 1e-9)), BRAKING_MAX),
     }
-
-
-def _turn(body: Robot, robot: RobotFiles) -> float | None:
-    """Let the robot turn, and return the part of the turn that it did [1].
-
-    None: its heading is not free.
-    """
-    if robot.heading != "free":
-        return None
-    start = _yaw(body)
-    _follow(body, robot, ZERO, ZERO, TURNING, TURN)
-    return remainder(_yaw(body) - start, tau) / (TURN * TURNING)
-
-
-def _follow_aside(body: Robot, robot: RobotFiles, speed: float) -> float | None:
-    """Let the robot follow a velocity to its left, and return the part that it reached [1].
-
-    None: its heading does not follow its velocity.
-    """
-    if robot.heading != "velocity":
-        return None
-    yaw = _yaw(body)
-    x, y = -sin(yaw), cos(yaw)
-    _follow(body, robot, ZERO, (speed * x, speed * y, 0.0), FAST)
-    reached = body.simulator.readings.velocity
-    return (reached[0] * x + reached[1] * y) / speed
+    if robot.heading == "free":
+        _follow(body, robot, ZERO, ZERO, TURNING, TURN)
+        facts["turn_reached"] = remainder(_yaw(body) - yaw, tau) / (TURN * TURNING)
+    elif robot.heading == "velocity":
+        x, y = -sin(yaw), cos(yaw)  # to its left
+        _follow(body, robot, ZERO, (speed * x, speed * y, 0.0), FAST)
+        reached = simulator.readings.velocity
+        facts["side_reached"] = (reached[0] * x + reached[1] * y) / speed
+    return facts, rest
 
 
 def _follow(
@@ -179,7 +158,7 @@ def _follow(
     wanted: Vector,
     duration: float,
     yaw_rate: float = 0.0,
-) -> Vector:
+) -> Vector | None:
     """Follow `wanted` [m/s] and `yaw_rate` [rad/s] for a time [s]; return the last reference [m/s].
 
     The reference starts at `reference` and changes as fast as the guard allows; None: brake.
@@ -193,7 +172,7 @@ def _follow(
         simulator.step(body.steer(simulator.readings, goal, yaw_rate, brakes=brakes))
         if simulator.readings.axes[8] < UPRIGHT_MIN:
             raise BadInputError("the robot turns over: check the onboard controller's gains")
-    return reference or ZERO
+    return reference
 
 
 def _speed(body: Robot) -> float:
@@ -208,31 +187,23 @@ def _yaw(body: Robot) -> float:
 
 def _judge(robot: RobotFiles, facts: Mapping[str, Any], rest: float) -> Iterator[str]:
     """Yield what must change because of the motion; `rest` is the robot's last speed [m/s]."""
-    drift, speed, reached = facts["drift_m"], facts["step_mps"], facts["step_reached"]
-    braking, turned = facts["braking_measured_mps2"], facts.get("turn_reached", 1.0)
-    aside = facts.get("side_reached", 1.0)
-    if drift > DRIFT_MAX:
-        verb = "stand" if robot.planar else "hover"
-        yield f"the robot does not {verb}: it drifts {drift:.2f} m in {STEADY:g} s"
-    reaches = "the robot reaches {:.0%} of a velocity of {:g} m/s {} in {:g} s: "
-    if abs(reached - 1.0) > SHORT:
-        yield (
-            reaches.format(reached, speed, "along x", FAST)
-            + "check the onboard controller, or set guard.speed_max_mps"
-        )
+    speed, braking = facts["step_mps"], facts["braking_measured_mps2"]
+    turned, aside = facts.get("turn_reached", 1.0), facts.get("side_reached", 1.0)
+    if facts["drift_m"] > DRIFT_MAX:
+        yield f"the robot does not keep its place: it drifts {facts['drift_m']:.2f} m"
+    reaches = "the robot reaches {:.0%} of a velocity of {:g} m/s {}: {}"
+    if abs(facts["step_reached"] - 1.0) > SHORT:
+        hint = "check the onboard controller, or set guard.speed_max_mps"
+        yield reaches.format(facts["step_reached"], speed, "along x", hint)
         return
     if turned < 1.0 - SHORT:
         yield (
-            "robot.yaml: heading is free, but the robot follows "
-            f"{max(turned, 0.0):.0%} of a yaw rate of {TURN:g} rad/s: let the onboard "
-            "controller follow it, or set heading: fixed"
+            f"robot.yaml: heading is free, but the robot follows {max(turned, 0.0):.0%} of a yaw "
+            f"rate of {TURN:g} rad/s: let it follow, or set heading: fixed"
         )
     if abs(aside - 1.0) > SHORT:
-        yield (
-            reaches.format(aside, speed, "to its left", FAST)
-            + "let it turn faster, with diff_drive by turn_rate_max or turn_gain; wheels that skid "
-            "sideways in a turn need a larger turn_gain"
-        )
+        hint = "raise turn_rate_max or turn_gain, also of wheels that skid sideways in a turn"
+        yield reaches.format(aside, speed, "to its left", hint)
     if rest > REST:
         yield f"the robot still moves at {rest:.2f} m/s, {STOP:g} s after it brakes"
     if braking < robot.guard.braking_mps2:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from cloudrc.geometry.fence import SPACE, Fence
-from cloudrc.geometry.model_files import model_files
 from cloudrc.geometry.scene import FLOOR, WORLD, Scene
 from cloudrc.geometry.solids import Array, Shape, Solid
 from cloudrc.outside.values import InvalidValueError
@@ -23,7 +21,6 @@ _SHAPES: dict[Any, Shape] = {
     _GEOM.mjGEOM_SPHERE: "sphere",
     _GEOM.mjGEOM_CAPSULE: "capsule",
     _GEOM.mjGEOM_CYLINDER: "cylinder",
-    _GEOM.mjGEOM_ELLIPSOID: "ellipsoid",
     _GEOM.mjGEOM_PLANE: "plane",
     _GEOM.mjGEOM_MESH: "hull",
 }
@@ -81,32 +78,8 @@ def complete(scene: Scene) -> Scene:
     Raises:
         InvalidValueError: If the file cannot be flown in.
     """
-    assert scene.path is not None
-    try:
-        states = [(str(file), file.stat()) for file in model_files(scene.path)]
-    except OSError as error:
-        raise InvalidValueError(f"{scene.path}: cannot be read: {error.strerror}") from None
-    version = [(file, state.st_mtime_ns, state.st_size) for file, state in states]
-    names, solids, fence = _read_bodies(scene.path, *version)
-    tangible = {FLOOR, *(solid.name for solid in solids)}
-    return replace(
-        scene,
-        path=None,
-        own_fence=scene.own_fence or fence,
-        solids=solids,
-        bodies=names,
-        intangible=tuple(name for name in names if name not in tangible),
-    )
-
-
-@lru_cache(maxsize=16)
-def _read_bodies(
-    path: Path, *version: tuple[str, int, int]
-) -> tuple[tuple[str, ...], tuple[Solid, ...], Fence]:
-    """Return the names of the bodies, what the robot can touch but the floor, and the fence.
-
-    `version` differs between contents of the scene's files.
-    """
+    path = scene.path
+    assert path is not None
     try:
         spec = read_scene(path)
         spec.compiler.fusestatic = False
@@ -123,7 +96,15 @@ def _read_bodies(
         for geom, name in enumerate(names)
         if name != FLOOR and touchable[geom]
     )
-    return tuple(dict.fromkeys(names)), solids, _fence_around(model, data, spawn, touchable)
+    bodies, tangible = tuple(dict.fromkeys(names)), {FLOOR, *(solid.name for solid in solids)}
+    return replace(
+        scene,
+        path=None,
+        own_fence=scene.own_fence or _fence_around(model, data, spawn, touchable),
+        solids=solids,
+        bodies=bodies,
+        intangible=tuple(name for name in bodies if name not in tangible),
+    )
 
 
 def _fence_around(model: Any, data: Any, spawn: Array, touchable: Any) -> Fence:

@@ -26,7 +26,7 @@ SMALLEST = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldb
 MARK = 0x6E636F6E
 """Number that no other part of `mjData` contains."""
 UNUSED_WITHOUT_CONTACTS = sum(
-    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{part}", 0))  # old versions lack the last two
+    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{part}"))
     for part in ("CONTACT", "CONSTRAINT", "SENSOR", "SPRING", "DAMPER")
 )
 """Parts of MuJoCo that do nothing while the robot touches nothing: its usual sensor is a touch

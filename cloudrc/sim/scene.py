@@ -39,8 +39,6 @@ MARGIN_MAX = 0.001
 BITS = "give its geoms contype and conaffinity 1 and 1, or 0 and 0 if they are only seen"
 INSIDE_MAX = 0.001
 """Largest depth by which a robot may start inside the floor [m]; the floor pushes it out gently."""
-FUSES_WRONG = tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 11)
-"""Whether MuJoCo computes a wrong inertia when it fuses static bodies, as it does up to 3.10."""
 
 
 class OwnSensor(NamedTuple):
@@ -67,10 +65,6 @@ def compile_model(robot: Path, scene: Path) -> Any:
     # Attached to a scene, an element that names a missing one would vanish without a word.
     compile_alone(robot)
     _check_parts(model, robot, scene)
-    if FUSES_WRONG:
-        apart = _compile(robot, scene, fuse=False)
-        # The inertia of a wheel with parts cannot be corrected on the base.
-        model = apart if _has_joints(apart) else _compile(robot, scene, _inertia(apart))
     return model
 
 
@@ -79,41 +73,29 @@ def compile_true(robot: Path, scene: Path, nominal: Any, plant: Plant) -> Any:
 
     `nominal` is the result of `compile_model` for the same files.
     """
-    fuse = not (FUSES_WRONG and _has_joints(nominal))
-    model = _compile(robot, scene, true_inertia(plant, _inertia(nominal)), fuse=fuse)
-    _scale_moving_parts(model, plant)
+    model = _compile(robot, scene, true_inertia(plant, _inertia(nominal)))
+    base = model.jnt_bodyid[0]
+    parts = (model.body_rootid == base) & (model.body_weldid != base)  # that move, such as wheels
+    model.body_mass[parts] *= plant.mass_factor
+    model.body_inertia[parts] *= plant.inertia_factor
+    mujoco.mj_setConst(model, mujoco.MjData(model))
     scale = np.broadcast_to(np.array(plant.actuator_factor), (model.nu,))[:, None]
     for values in (model.actuator_gainprm, model.actuator_biasprm, model.actuator_forcerange):
         values *= scale  # the force is gain times control plus bias, in this range
     return model
 
 
-def _scale_moving_parts(model: Any, plant: Plant) -> None:
-    """Scale mass and inertia of the robot's parts that move, such as wheels, as `plant` says."""
-    base = model.jnt_bodyid[0]
-    parts = (model.body_rootid == base) & (model.body_weldid != base)
-    model.body_mass[parts] *= plant.mass_factor
-    model.body_inertia[parts] *= plant.inertia_factor
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-
-
-def _compile(
-    robot_path: Path, scene_path: Path, inertia: Inertia | None = None, *, fuse: bool = True
-) -> Any:
-    """Compile the robot in the scene; `fuse` tells whether MuJoCo fuses static bodies.
-
-    `inertia` replaces that of the robot's base; None keeps it.
-    """
+def _compile(robot_path: Path, scene_path: Path, inertia: Inertia | None = None) -> Any:
+    """Compile the robot in the scene; `inertia` replaces that of the robot's base, if given."""
     try:
         spec = read_scene(scene_path)
-        # An empty prefix would make MuJoCo write MUJOCO_LOG.TXT into the working directory, and
-        # MuJoCo 3.3 crashes if a variable keeps the robot.
+        # An empty prefix would make MuJoCo write MUJOCO_LOG.TXT into the working directory.
         robot = mujoco.MjSpec.from_file(str(robot_path))
         _take_options(robot, spec)
         spec.attach(robot, prefix=ROBOT_PREFIX, frame="spawn")
         for number, geom in enumerate(spec.worldbody.geoms):
             geom.name = f"{WORLD}/{number}"  # also geoms in the worldbody of the robot's file
-        spec.compiler.fusestatic = fuse
+        spec.compiler.fusestatic = True
         if inertia is not None:
             _set_inertia(_base(spec), *inertia)
         with warnings.catch_warnings():
@@ -130,16 +112,13 @@ def _put_on_floor(model: Any) -> None:
     """Raise the start of a robot that reaches further down than the spawn is above the floor."""
     if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
         return
-    robot, data = is_of_robot(model), mujoco.MjData(model)
+    bodies, data = bodies_of_geoms(model), mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_collision(model, data)
-    depths = [
-        -contact.dist
-        for contact in data.contact
-        if {"" if robot[geom] else body_of(model, geom) for geom in contact.geom.tolist()}
-        == {"", FLOOR}
-    ]
-    depth = max(depths, default=0.0)
+    depth = 0.0
+    for contact in data.contact:
+        if {bodies[geom] for geom in contact.geom.tolist()} == {"", FLOOR}:
+            depth = max(depth, -contact.dist)
     if depth > INSIDE_MAX:
         model.qpos0[2] += depth
         model.body_pos[model.jnt_bodyid[0], 2] += depth
@@ -161,15 +140,9 @@ def is_of_robot(model: Any) -> Any:
 def bodies_of_geoms(model: Any) -> list[str]:
     """Return the name of the body of each geom in a compiled model, "" for geoms of the robot."""
     return [
-        "" if is_robot else body_of(model, number)
+        "" if is_robot else model.geom(number).name.rpartition("/")[0]
         for number, is_robot in enumerate(is_of_robot(model).tolist())
     ]
-
-
-def body_of(model: Any, geom: int) -> str:
-    """Return the name of the body of a scene to which a geom belongs."""
-    name: str = model.geom(geom).name
-    return name.rpartition("/")[0]
 
 
 def find_part(model: Any, kind: str, name: str, key: str) -> int:
@@ -178,14 +151,11 @@ def find_part(model: Any, kind: str, name: str, key: str) -> int:
     Raises:
         ValueError: If the robot has no such part.
     """
-    number: int = mujoco.mj_name2id(
-        model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), f"{ROBOT_PREFIX}{name}"
-    )
-    if number < 0:
-        parts = (getattr(model, kind)(each).name for each in range(getattr(model, f"n{kind}")))
-        own = [each.removeprefix(ROBOT_PREFIX) for each in parts if each.startswith(ROBOT_PREFIX)]
-        raise InvalidValueError(f"{key}: {unknown_name_text(f'{kind} of the model', name, own)}")
-    return number
+    names = [getattr(model, kind)(each).name for each in range(getattr(model, f"n{kind}"))]
+    if f"{ROBOT_PREFIX}{name}" in names:
+        return names.index(f"{ROBOT_PREFIX}{name}")
+    own = [each.removeprefix(ROBOT_PREFIX) for each in names if each.startswith(ROBOT_PREFIX)]
+    raise InvalidValueError(f"{key}: {unknown_name_text(f'{kind} of the model', name, own)}")
 
 
 def find_sensors(model: Any, asked: Mapping[str, SensorConfig]) -> tuple[OwnSensor, ...]:
@@ -196,24 +166,15 @@ def find_sensors(model: Any, asked: Mapping[str, SensorConfig]) -> tuple[OwnSens
     Raises:
         ValueError: If the robot has no such sensor, or if the sensor shows several numbers.
     """
-    return tuple(
-        OwnSensor(name, each.unit, _address(model, f"sensors.{name}.sensor", each.sensor))
-        for name, each in asked.items()
-    )
-
-
-def _address(model: Any, key: str, name: str) -> int:
-    number = find_part(model, "sensor", name, key)
-    if (count := int(model.sensor_dim[number])) != 1:
-        raise InvalidValueError(
-            f"{key}: {name} shows {count} numbers; name a sensor that shows one"
-        )
-    return int(model.sensor_adr[number])
-
-
-def _has_joints(model: Any) -> bool:
-    """Return whether the robot has joints besides that of its base."""
-    return bool(model.njnt > 1)
+    found = []
+    for name, each in asked.items():
+        key = f"sensors.{name}.sensor"
+        number = find_part(model, "sensor", each.sensor, key)
+        if (count := int(model.sensor_dim[number])) != 1:
+            text = f"{key}: {each.sensor} shows {count} numbers; name a sensor that shows one"
+            raise InvalidValueError(text)
+        found.append(OwnSensor(name, each.unit, int(model.sensor_adr[number])))
+    return tuple(found)
 
 
 def _base(spec: Any) -> Any:
@@ -258,10 +219,10 @@ def _set_inertia(base: Any, mass: float, centre: Array, inertia: Array) -> None:
 def _check_parts(model: Any, robot_path: Path, scene_path: Path) -> None:
     base = mujoco.mjtJoint.mjJNT_FREE
     joints = model.jnt_type.tolist()
+    where = f"{robot_path} in {scene_path}"
     if joints[:1] != [base] or joints.count(base) != 1:
         raise InvalidValueError(
-            f"{robot_path} in {scene_path}: the robot's base must have a freejoint, "
-            "and nothing else may move freely"
+            f"{where}: the robot's base must have a freejoint, and nothing else may move freely"
         )
     off = [flag for flag, bit in NEEDED.items() if model.opt.disableflags & bit]
     if off:
@@ -274,42 +235,30 @@ def _check_parts(model: Any, robot_path: Path, scene_path: Path) -> None:
         raise InvalidValueError(
             f"{scene_path}: option timestep is {model.opt.timestep}, not {TIMESTEP}"
         )
-    _check_margins(model, robot_path, scene_path)
-    _check_bits(model, robot_path, scene_path)
+    _check_geoms(model, where)
 
 
-def _check_margins(model: Any, robot_path: Path, scene_path: Path) -> None:
-    """Refuse contacts that begin at a distance from the surface: clearances would be wrong.
+def _check_geoms(model: Any, where: str) -> None:
+    """Refuse contacts that path checks, clearances and notes do not know.
 
-    Before MuJoCo 3.9 a contact pushes from `margin` - `gap`, since then from `margin`. A model
-    with neither flies alike in all versions.
-    """
-    far = np.maximum(np.abs(model.geom_margin), np.abs(model.geom_gap)) > MARGIN_MAX
-    for geom in np.flatnonzero(far & ((model.geom_contype | model.geom_conaffinity) > 0))[:1]:
-        body = bodies_of_geoms(model)[geom]
-        where = f"{scene_path}: body {body}" if body else f"{robot_path}: the robot"
-        raise InvalidValueError(
-            f"{where} has a geom with margin {model.geom_margin[geom]:g} and gap "
-            f"{model.geom_gap[geom]:g}, so that contacts do not begin at the surface; remove "
-            f"both, or give at most {MARGIN_MAX}"
-        )
-
-
-def _check_bits(model: Any, robot_path: Path, scene_path: Path) -> None:
-    """Refuse a robot that meets other geoms than the path checks, clearances and notes say.
-
-    These know the scene alone: for them, a robot meets the geoms that have one of ROBOT_BITS.
+    With a margin, contacts do not begin at the surface. The checks know the scene alone: for them,
+    a robot meets the geoms that have one of ROBOT_BITS.
     """
     types, affinities, robot = model.geom_contype, model.geom_conaffinity, is_of_robot(model)
+    touching = (types | affinities) > 0
+    far = np.maximum(np.abs(model.geom_margin), np.abs(model.geom_gap)) > MARGIN_MAX
+    for geom in np.flatnonzero(far & touching):
+        raise InvalidValueError(
+            f"{where}: a geom of {model.geom(geom).name or 'the robot'} has a margin or gap, so "
+            f"that contacts do not begin at the surface; give at most {MARGIN_MAX}"
+        )
+    if not (robot & touching).any():
+        raise InvalidValueError(f"{where}: no geom of the robot can touch anything; {BITS}")
     expected = ((types | affinities) & ROBOT_BITS) > 0
-    meeting = np.flatnonzero(robot & ((types | affinities) > 0)).tolist()
-    if not meeting:
-        raise InvalidValueError(f"{robot_path}: no geom of the robot can touch anything; {BITS}")
-    for geom in meeting:
+    for geom in np.flatnonzero(robot & touching):
         meets = ((types[geom] & affinities) | (types & affinities[geom])) > 0
         if ((meets != expected) & ~robot).any():
-            name = model.geom(geom).name.removeprefix(ROBOT_PREFIX) or geom
             raise InvalidValueError(
-                f"{robot_path}: geom {name} has contype {types[geom]} and conaffinity "
-                f"{affinities[geom]}, which do not fit those of {scene_path}; {BITS}"
+                f"{where}: a geom of the robot has contype {types[geom]} and conaffinity "
+                f"{affinities[geom]}, which do not fit those of the scene; {BITS}"
             )

@@ -86,11 +86,9 @@ def test_a_plugin_is_built_and_documented_as_the_contract_says(module, kind):
         else:
             assert parameter.default is not parameter.empty, parameter
         assert f"    {name}: " in inspect.getdoc(module.build)
-    assert issubclass(signature.return_annotation, kind)
-    assert isinstance(build(module), signature.return_annotation)
+    assert isinstance(build(module), kind)
     assert build(module) is not build(module)
     assert "Source:" in module.__doc__
-    assert inspect.getdoc(signature.return_annotation)
 
 
 @pytest.mark.parametrize(

@@ -237,7 +237,7 @@ def test_values_of_a_file_replace_the_parameters(tmp_path):
 @pytest.mark.parametrize(
     ("build", "parameters", "text"),
     [
-        (kalman.build, {"parameters": {"model": "m.yaml"}}, "parameters: .* as model_file, beside"),
+        (kalman.build, {"parameters": {"model": "m.yaml"}}, "parameters: choose the model beside"),
         (kalman.build, {"parameters": {"gain": 1}}, "gain: unknown key"),
     ],
 )
@@ -247,11 +247,10 @@ def test_a_bad_parameter_is_named(build, parameters, text, tmp_path, monkeypatch
         build(robot=PELICAN, **parameters)
 
 
-@pytest.mark.parametrize("value", ["[1, 2, -3]"])
-def test_a_file_with_a_wrong_value_is_refused(value, tmp_path):
+def test_a_file_with_a_wrong_value_is_refused(tmp_path):
     path = tmp_path / "model.yaml"
-    path.write_text(f"time_constant: {value}\n")
-    with pytest.raises(ValueError, match=r"model.yaml: time_constant is .*; 'cloudrc identify' wr"):
+    path.write_text("time_constant: [1, 2, -3]\n")
+    with pytest.raises(BadInputError, match=r"model.yaml:1: time_constant.2: -3: must be"):
         command_history.build(robot=PELICAN, model=path)
 
 

@@ -15,7 +15,6 @@ from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.geometry.clearance import (
     clearance,
     clearance_per_obstacle,
-    distance_to_tube,
     least_clearance,
     place_points,
     tube_index,
@@ -43,7 +42,7 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)
     ],
 )
 def test_distance_to_a_hollow_cylinder(point, distance):
-    found = distance_to_tube(ALONG_X, np.array([point], dtype=float))
+    found = ALONG_X.distance(np.array([point], dtype=float))
     assert found == pytest.approx([distance], abs=1e-9)
 
 

@@ -58,7 +58,7 @@ def test_spawn_and_numbers_of_included_files_count(tmp_path):
         ),
         ('<numeric name="pipe_1" data="0 0 0 1 0 0 5 .7 .6"/>', "0 < inner < outer"),
         ('<numeric name="floor" data="nan"/>', "floor: data must be 1 numbers"),
-        ("<numeric", "not readable as XML"),
+        ("<numeric", "not well-formed"),
     ],
 )
 def test_bad_numbers_are_named(tmp_path, numbers, reason):

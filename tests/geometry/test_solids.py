@@ -6,7 +6,6 @@ import pytest
 from cloudrc.geometry import solids
 from cloudrc.geometry.scene import SCENES, load_scene
 from cloudrc.geometry.solids import Solid
-from cloudrc.outside.values import InvalidValueError
 from cloudrc.sim.bodies import complete
 from cloudrc.sim.engine import mujoco
 
@@ -15,7 +14,6 @@ GEOMS = {
     "sphere": '<geom size=".3"/>',
     "capsule": '<geom type="capsule" size=".1 .4"/>',
     "cylinder": '<geom type="cylinder" size=".2 .4"/>',
-    "ellipsoid": '<geom type="ellipsoid" size=".2 .3 .4"/>',
     "plane": '<geom type="plane" size="0 0 1"/>',
     "hull": '<geom type="mesh" mesh="m"/>',
 }
@@ -87,17 +85,6 @@ def test_a_box_of_a_mesh_is_as_far_away_as_a_box(tmp_path, monkeypatch):
     assert mesh.distance(np.ones((4, 2, 3))).shape == (4, 2)
 
 
-@pytest.mark.parametrize("size", [(0.25, 0.25, 0.12), (0.2, 0.3, 0.4), (0.5, 0.02, 0.1)])
-def test_an_ellipsoid_is_as_far_away_as_the_nearest_of_its_points(size):
-    polar, round_ = np.meshgrid(np.linspace(0, np.pi, 201), np.linspace(0, 2 * np.pi, 401))
-    ball = (np.sin(polar) * np.cos(round_), np.sin(polar) * np.sin(round_), np.cos(polar))
-    surface = np.stack(ball, axis=-1).reshape(-1, 3) * size
-    points = near(size)[-300:]
-    true = np.array([np.linalg.norm(surface - point, axis=1).min() for point in points])
-    true[np.linalg.norm(points / size, axis=1) < 1] *= -1
-    assert solid_of("ellipsoid", size).distance(points) == pytest.approx(true, abs=4e-3)
-
-
 def test_only_what_the_robot_can_touch_is_a_solid(tmp_path):
     path = scene(
         tmp_path,
@@ -113,13 +100,3 @@ def test_only_what_the_robot_can_touch_is_a_solid(tmp_path):
         ("half", "sphere"),
         ("hills", "outline"),
     ]
-
-
-def test_a_changed_file_is_read_again(tmp_path):
-    path = scene(tmp_path, '<body name="a"><geom size=".1"/></body>')
-    assert read_bodies(path).bodies == ("floor", "a")
-    scene(tmp_path, '<body name="another"><geom size=".1"/></body>')
-    assert read_bodies(path).bodies == ("floor", "another")
-    path.unlink()
-    with pytest.raises(InvalidValueError, match=r"mine\.xml: cannot be read"):
-        read_bodies(path)

@@ -13,7 +13,6 @@ from cloudrc.config.schema import Plant, World
 from cloudrc.config.shipped import file_of
 from cloudrc.errors import BadInputError
 from cloudrc.robots.build import build_robot, check_robot
-from cloudrc.sim import scene
 from cloudrc.sim.scene import compile_model, compile_true
 
 MODEL = find_robot("rover").model
@@ -139,9 +138,7 @@ def test_the_cloud_drives_the_rover_to_its_waypoints_and_twice_alike():
     assert flights[0].records_sha256 == flights[1].records_sha256
 
 
-@pytest.mark.parametrize("wrong", [False, True])
-def test_factors_scale_base_and_wheels_and_the_payload_is_on_the_base(wrong, monkeypatch):
-    monkeypatch.setattr(scene, "FUSES_WRONG", wrong)
+def test_factors_scale_base_and_wheels_and_the_payload_is_on_the_base():
     nominal = compile_model(MODEL, EMPTY)
     plant = Plant(mass_factor=1.1, inertia_factor=1.2, payload_kg=0.5)
     heavy = compile_true(MODEL, EMPTY, nominal, plant)

@@ -29,6 +29,9 @@ class ControlOutput(NamedTuple):
     derivative: Vector = ZERO
 
 
+STAND_STILL = ControlOutput(ZERO, 0.0)
+
+
 class Controller:
     """Computes the velocity commands that lead the robot to a setpoint."""
 

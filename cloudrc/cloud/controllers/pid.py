@@ -33,25 +33,42 @@ class Pid(Controller):
     - The integral term, the velocity per axis and the speed are limited; the published code has no
       limits. While the output of an axis is limited, the axis does not integrate an error that
       would push the output further (conditional anti-windup).
+
+    The default gains are the published ones.
+    Source: docs/reference/plant.md, "Cloud controller": P .8, .8, 1.5; I 0; D 0; no saturation.
+
+    Args:
+        gain_p: Proportional gain per axis [1/s], shape (3,).
+        gain_i: Integral gain per axis [1/s^2], shape (3,).
+        gain_d: Derivative gain per axis [1], shape (3,).
+        gain_yaw: Gain of the yaw [1/s], always; None: 0.8 if a waypoint asks for a yaw, else 0. The
+            published low-level controller ignores the yaw rate.
+        integral_limit: Largest integral term per axis [m/s], shape (3,); None: no limit.
+        velocity_max: Largest velocity per axis [m/s], shape (3,); None: no limit.
+        speed_max: Largest speed [m/s]; the limit keeps the direction. None: no limit. With an
+            integral gain, `speed_max` should not exceed the guard's speed cap, because the
+            anti-windup does not take the guard into account.
     """
 
     def __init__(
         self,
-        gain_p: Vector,
-        gain_i: Vector,
-        gain_d: Vector,
-        gain_yaw: float | None,
-        integral_limit: Vector,
-        velocity_max: Vector,
-        speed_max: float,
+        gain_p: NotNegatives = (0.8, 0.8, 1.5),
+        gain_i: NotNegatives = ZERO,
+        gain_d: NotNegatives = ZERO,
+        gain_yaw: NotNegative | None = None,
+        integral_limit: NotNegatives | None = None,
+        velocity_max: NotNegatives | None = None,
+        speed_max: NotNegative | None = None,
     ) -> None:
         self._gain_p, self._gain_d = gain_p, gain_d
         self._gain_yaw = GAIN_YAW if gain_yaw is None else gain_yaw
-        self._always_turns, self._integral_limit = bool(gain_yaw), integral_limit
-        self._velocity_max, self._speed_max = velocity_max, speed_max
+        self._always_turns = bool(gain_yaw)
+        self._integral_limit = integral_limit or UNLIMITED
+        self._velocity_max = velocity_max or UNLIMITED
+        self._speed_max = inf if speed_max is None else speed_max
         self._gain_i = ZERO if gain_i == ZERO else gain_i
         self._proportional_only = gain_i == ZERO and gain_d == ZERO
-        self._limited = velocity_max != UNLIMITED or speed_max != inf
+        self._limited = velocity_max is not None or speed_max is not None
         self._integral = ZERO
 
     def reset(self) -> None:
@@ -114,37 +131,4 @@ class Pid(Controller):
         self._integral = (x, y, z)
 
 
-def build(
-    gain_p: NotNegatives = (0.8, 0.8, 1.5),
-    gain_i: NotNegatives = ZERO,
-    gain_d: NotNegatives = ZERO,
-    gain_yaw: NotNegative | None = None,
-    integral_limit: NotNegatives | None = None,
-    velocity_max: NotNegatives | None = None,
-    speed_max: NotNegative | None = None,
-) -> Pid:
-    """Make the controller; the defaults are the published gains.
-
-    Source: docs/reference/plant.md, "Cloud controller": P .8, .8, 1.5; I 0; D 0; no saturation.
-
-    Args:
-        gain_p: Proportional gain per axis [1/s], shape (3,).
-        gain_i: Integral gain per axis [1/s^2], shape (3,).
-        gain_d: Derivative gain per axis [1], shape (3,).
-        gain_yaw: Gain of the yaw [1/s], always; None: 0.8 if a waypoint asks for a yaw, else 0. The
-            published low-level controller ignores the yaw rate.
-        integral_limit: Largest integral term per axis [m/s], shape (3,); None: no limit.
-        velocity_max: Largest velocity per axis [m/s], shape (3,); None: no limit.
-        speed_max: Largest speed [m/s]; the limit keeps the direction. None: no limit. With an
-            integral gain, `speed_max` should not exceed the guard's speed cap, because the
-            anti-windup does not take the guard into account.
-    """
-    return Pid(
-        gain_p,
-        gain_i,
-        gain_d,
-        gain_yaw,
-        integral_limit or UNLIMITED,
-        velocity_max or UNLIMITED,
-        inf if speed_max is None else speed_max,
-    )
+build = Pid

@@ -13,10 +13,9 @@ from collections.abc import Callable, Sequence
 from math import nan
 from typing import Any, Protocol, TypeAlias
 
-from cloudrc.cloud.controllers import Controller, ControlOutput
+from cloudrc.cloud.controllers import STAND_STILL, Controller, ControlOutput
 from cloudrc.config.schema import Positive, ServerUrl
-from cloudrc.errors import ControllerLostError
-from cloudrc.messages import ZERO, Odometry, Setpoint
+from cloudrc.messages import Odometry, Setpoint
 
 Answer: TypeAlias = tuple[float, Sequence[Sequence[float]]]
 """Age of the answered observation [s], and the rows vx, vy, vz [m/s], world frame, yaw rate [rad/s]
@@ -24,14 +23,8 @@ for its period and the following ones."""
 Surroundings: TypeAlias = Callable[[], tuple[int, Odometry | None, float, float]]
 """Function that returns cloud's time [ns], the newest odometry as it has arrived, the newest loop
 delay [s], NaN before the first, and the horizon [s]."""
-STAND_STILL = ControlOutput(ZERO, 0.0)
 ROUNDING = 1e-6
 """Part of a period by which an answer may be younger than a whole period, and count as one [1]."""
-
-
-def no_surroundings() -> tuple[int, Odometry | None, float, float]:
-    """Return that nothing is known."""
-    return 0, None, nan, 0.0
 
 
 class ControllerChannel(Protocol):
@@ -59,24 +52,24 @@ class OutsideController(Controller):
 
     def __init__(self, place: str, start_limit: float) -> None:
         self.place, self.start_limit = place, start_limit
-        self.surroundings: Surroundings = no_surroundings
+        self.surroundings: Surroundings = lambda: (0, None, nan, 0.0)  # nothing is known
         self._channel: ControllerChannel | None = None
         self._period = 0.0
         self._counts: Counter[str] = Counter()
-        self._lost = self._flies = False
+        self._flies = False
 
     def connect(
         self,
         channel: ControllerChannel,
         period: float,
         counts: Counter[str],
-        surroundings: Surroundings = no_surroundings,
+        surroundings: Surroundings | None = None,
     ) -> None:
         """Use `channel` for the flight.
 
         `period` is the time between two commands [s]. Gaps between answers are counted in `counts`.
         """
-        self.surroundings = surroundings
+        self.surroundings = surroundings or self.surroundings
         self._channel, self._period, self._counts = channel, period, counts
         counts["controller_gaps"] += 0  # so that a recording tells that there was none
 
@@ -90,18 +83,13 @@ class OutsideController(Controller):
         """Return the command of the newest answer for this period; `dt` is the period [s].
 
         Raises:
-            ControllerLostError: Once, if the program is lost: the flight has to end.
+            ControllerLostError: If the program is lost: the flight has to end.
         """
-        if self._lost or self._channel is None:
+        if self._channel is None:
             return STAND_STILL
-        try:
-            answer = self._channel.exchange(self.observe(estimate, setpoint, dt))
-        except ControllerLostError:
-            self._lost = True
-            raise
+        answer = self._channel.exchange(self.observe(estimate, setpoint, dt))
         if answer is None:
-            if self._flies:
-                self._counts["controller_gaps"] += 1
+            self._counts["controller_gaps"] += self._flies
             self._flies = False
             return STAND_STILL
         self._flies = True

@@ -15,9 +15,13 @@ from cloudrc.config.schema import Count
 
 
 class Earliest(Estimator):
-    """Estimator: the odometry's age plus the smallest delay of the last `count` commands."""
+    """Estimator: the odometry's age plus the smallest delay of the last `count` commands.
 
-    def __init__(self, count: int) -> None:
+    Args:
+        count: Number of recent commands whose smallest delay is used [1]; at least 1.
+    """
+
+    def __init__(self, count: Count = 200) -> None:
         self._offsets: deque[float] = deque(maxlen=count)
 
     def add_applied(self, applied_minus_stamp: float) -> None:
@@ -33,10 +37,4 @@ class Earliest(Estimator):
         return max(0.0, age + min(self._offsets)) if self._offsets else 0.0
 
 
-def build(count: Count = 200) -> Earliest:
-    """Make the estimator.
-
-    Args:
-        count: Number of recent commands whose smallest delay is used [1]; at least 1.
-    """
-    return Earliest(count)
+build = Earliest

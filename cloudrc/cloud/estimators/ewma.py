@@ -11,10 +11,13 @@ from cloudrc.config.schema import Gain
 
 
 class Ewma(Estimator):
-    """Exponentially weighted moving average of the loop delay; it starts at the first sample."""
+    """Exponentially weighted moving average of the loop delay; it starts at the first sample.
 
-    def __init__(self, gain: float) -> None:
-        """Set `gain`, the weight of a new sample, in [0, 1]."""
+    Args:
+        gain: Weight of a new sample [1]; 0.05 forgets within about 20 samples, 0.2 s at 100 Hz.
+    """
+
+    def __init__(self, gain: Gain = 0.05) -> None:
         self._gain = gain
         self._average: float | None = None
 
@@ -30,10 +33,4 @@ class Ewma(Estimator):
         return 0.0 if self._average is None else max(0.0, self._average)
 
 
-def build(gain: Gain = 0.05) -> Ewma:
-    """Make the estimator.
-
-    Args:
-        gain: Weight of a new sample [1]; 0.05 forgets within about 20 samples, 0.2 s at 100 Hz.
-    """
-    return Ewma(gain)
+build = Ewma

@@ -21,10 +21,12 @@ class Split(Estimator):
     """Estimates the delay: age of the newest odometry plus the average of `applied_minus_stamp`.
 
     `applied_minus_stamp` is the downlink delay of a command minus the clock offset cloud - world.
+
+    Args:
+        gain: Weight of a new sample in the average of the downlink delay [1].
     """
 
-    def __init__(self, gain: float) -> None:
-        """Set `gain`, in [0, 1]: the weight of the newest command in the average of the delays."""
+    def __init__(self, gain: Gain = 0.05) -> None:
         self._gain = gain
         self._applied_minus_stamp: float | None = None
 
@@ -47,10 +49,4 @@ class Split(Estimator):
         return max(0.0, age + self._applied_minus_stamp)
 
 
-def build(gain: Gain = 0.05) -> Split:
-    """Make the estimator.
-
-    Args:
-        gain: Weight of a new sample in the average of the downlink delay [1].
-    """
-    return Split(gain)
+build = Split

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from copy import copy
 
 from cloudrc.cloud.motion import Body
-from cloudrc.cloud.predictors import Model, Predictor
+from cloudrc.cloud.predictors import Model, Predictor, moved
 from cloudrc.messages import NEVER_NS, PLAN_STEP_NS, ZERO, Command, Odometry, Vector
 
 PERIOD_NS = 10_000_000
@@ -191,8 +191,10 @@ class Replay(Predictor):
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Predict, by the sent commands, the odometry `horizon` [s] after the sample `odometry`."""
-        self._last = self.roll(odometry, horizon)
-        return self._last.odometry() if horizon else odometry
+        self._last = body = self.roll(odometry, horizon)
+        if not horizon:
+            return odometry
+        return moved(body.basis, body.horizon, body.position, body.velocity)
 
     def model(self) -> Model | None:
         """Return a copy of the model in the state of the last prediction; None before the first."""

@@ -6,17 +6,16 @@ Source: docs/reference/control.md, "Predictors", (e1).
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable
 from copy import copy
-from math import ceil, exp, inf
+from math import ceil, exp
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from cloudrc.cloud.motion import Body
 from cloudrc.cloud.predictors._history import COUNT, PERIOD_NS, Replay
-from cloudrc.config.robot import DEFAULT_LIMITS, RobotFacts
+from cloudrc.config.problems import validate
+from cloudrc.config.robot import DEFAULT_LIMITS, Response, RobotFacts
 from cloudrc.config.schema import Constants, DeadTimes, NotNegatives, Positive
-from cloudrc.errors import CloudrcError
 from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Command, Odometry, Vector
 from cloudrc.outside.document import read_document
@@ -142,15 +141,15 @@ def build(
         robot: What is known of the robot.
 
     Raises:
-        ValueError: If neither robot nor parameters tell the response, or if the file is no model.
+        ValueError: If neither robot nor parameters tell the response.
+        BadInputError: If the file is no model.
     """
     response = robot.response if robot else None
     given = {"time_constant": time_constant, "dead_time": dead_time, "gain": gain}
     if model is not None:
-        given |= _read_model(Path(model), given)
-    found = [
-        getattr(response, name, None) if value is None else value for name, value in given.items()
-    ]
+        given = {}
+        response = validate(read_document(Path(model), str(model)), Response, str(model))
+    found = [given.get(name) or getattr(response, name, None) for name in Response.model_fields]
     if None in found:
         raise ValueError(
             f"the robot {robot.name if robot else 'is unknown and'} has no response in its "
@@ -158,23 +157,3 @@ def build(
         )
     limit = acceleration_max or (robot.acceleration_max if robot else ACCELERATION_MAX)
     return CommandHistory(tuple(zip(*found, strict=True)), limit)
-
-
-def _read_model(path: Path, names: Iterable[str]) -> dict[str, Vector]:
-    """Read the values `names`, each for three axes, from a file that `cloudrc identify` wrote."""
-    hint = "'cloudrc identify' writes a file that fits"
-    try:
-        tree = read_document(path, str(path)).tree
-    except CloudrcError as error:
-        raise ValueError(f"model: {error}; {hint}") from error
-    for name in names:
-        value = tree.get(name)
-        if not (isinstance(value, list) and len(value) == 3 and all(map(_fits, value))):
-            raise ValueError(f"model: {path}: {name} is {value}, not three numbers >= 0; {hint}")
-    if min(tree["time_constant"]) == 0.0:
-        raise ValueError(f"model: {path}: time_constant is 0, but must be above 0; {hint}")
-    return {name: tuple(map(float, tree[name])) for name in names}  # type: ignore[misc]
-
-
-def _fits(value: Any) -> bool:
-    return isinstance(value, int | float) and 0.0 <= value < inf

@@ -6,7 +6,7 @@ paper, eq. (3), multiplies the delay by the measured velocity.
 
 from __future__ import annotations
 
-from cloudrc.cloud.predictors import Predictor, rotate_ahead
+from cloudrc.cloud.predictors import Predictor, moved
 from cloudrc.messages import ZERO, Command, Odometry
 
 
@@ -37,16 +37,8 @@ class CommandedVelocity(Predictor):
         """
         px, py, pz = odometry.position
         ux, uy, uz = self._commanded
-        rate = odometry.angular_velocity_body
-        return Odometry(
-            odometry.stamp_ns + round(horizon * 1e9),
-            (px + ux * horizon, py + uy * horizon, pz + uz * horizon),
-            rotate_ahead(odometry.orientation_wxyz, rate, horizon),
-            odometry.velocity,
-            rate,
-        )
+        position = (px + ux * horizon, py + uy * horizon, pz + uz * horizon)
+        return moved(odometry, horizon, position, odometry.velocity)
 
 
-def build() -> CommandedVelocity:
-    """Make the predictor; it has no parameters."""
-    return CommandedVelocity()
+build = CommandedVelocity

@@ -8,16 +8,21 @@ from __future__ import annotations
 
 from collections import deque
 
-from cloudrc.cloud.predictors import Predictor, rotate_ahead
+from cloudrc.cloud.predictors import Predictor, moved
 from cloudrc.config.schema import Positive
 from cloudrc.messages import ZERO, Odometry, Vector
 
 
 class ConstantAcceleration(Predictor):
-    """Predicts with the measured velocity and the mean acceleration in a short time window."""
+    """Predicts with the measured velocity and the mean acceleration in a short time window.
 
-    def __init__(self, window: float) -> None:
-        """Set `window`, the longest time between the samples that give the acceleration [s]."""
+    Args:
+        window: Longest time between the two samples that give the acceleration [s]; at least one
+            period of the odometry. A longer window reduces the noise, but the acceleration lags by
+            half the window.
+    """
+
+    def __init__(self, window: Positive = 0.05) -> None:
         self._window_ns = round(window * 1e9)
         self._recent: deque[Odometry] = deque()
         self._acceleration = ZERO
@@ -51,20 +56,14 @@ class ConstantAcceleration(Predictor):
         px, py, pz = odometry.position
         vx, vy, vz = odometry.velocity
         ax, ay, az = self._acceleration
-        rate = odometry.angular_velocity_body
         # From here on, a is the change of the velocity over the horizon [m/s].
         ax, ay, az = ax * horizon, ay * horizon, az * horizon
-        return Odometry(
-            odometry.stamp_ns + round(horizon * 1e9),
-            (
-                px + (vx + 0.5 * ax) * horizon,
-                py + (vy + 0.5 * ay) * horizon,
-                pz + (vz + 0.5 * az) * horizon,
-            ),
-            rotate_ahead(odometry.orientation_wxyz, rate, horizon),
-            (vx + ax, vy + ay, vz + az),
-            rate,
+        position = (
+            px + (vx + 0.5 * ax) * horizon,
+            py + (vy + 0.5 * ay) * horizon,
+            pz + (vz + 0.5 * az) * horizon,
         )
+        return moved(odometry, horizon, position, (vx + ax, vy + ay, vz + az))
 
 
 def _mean_acceleration(start: Odometry, end: Odometry) -> Vector:
@@ -74,12 +73,4 @@ def _mean_acceleration(start: Odometry, end: Odometry) -> Vector:
     return ((bx - ax) * per_second, (by - ay) * per_second, (bz - az) * per_second)
 
 
-def build(window: Positive = 0.05) -> ConstantAcceleration:
-    """Make the predictor.
-
-    Args:
-        window: Longest time between the two samples that give the acceleration [s]; at least one
-            period of the odometry. A longer window reduces the noise, but the acceleration lags by
-            half the window.
-    """
-    return ConstantAcceleration(window)
+build = ConstantAcceleration

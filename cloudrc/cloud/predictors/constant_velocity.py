@@ -5,7 +5,7 @@ Source: the paper, eqs. (2) and (3).
 
 from __future__ import annotations
 
-from cloudrc.cloud.predictors import Predictor, rotate_ahead
+from cloudrc.cloud.predictors import Predictor, moved
 from cloudrc.messages import Odometry
 
 
@@ -20,16 +20,8 @@ class ConstantVelocity(Predictor):
         """
         px, py, pz = odometry.position
         vx, vy, vz = velocity = odometry.velocity
-        rate = odometry.angular_velocity_body
-        return Odometry(
-            odometry.stamp_ns + round(horizon * 1e9),
-            (px + vx * horizon, py + vy * horizon, pz + vz * horizon),
-            rotate_ahead(odometry.orientation_wxyz, rate, horizon),
-            velocity,
-            rate,
-        )
+        position = (px + vx * horizon, py + vy * horizon, pz + vz * horizon)
+        return moved(odometry, horizon, position, velocity)
 
 
-def build() -> ConstantVelocity:
-    """Make the predictor of the paper's eq. (3); it has no parameters."""
-    return ConstantVelocity()
+build = ConstantVelocity

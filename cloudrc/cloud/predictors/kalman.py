@@ -123,33 +123,15 @@ def build(
         ValueError: If `white_box` has a `model_file`, or `parameters` has the key name or model.
             Also if the robot has no such model.
     """
-    choice = _replay_of(model, parameters or {}, model_file, robot)
-    replay = build_plugin("predictors", choice, robot=robot)
-    return Kalman(replay, position_noise, velocity_noise, acceleration_error)
-
-
-def _replay_of(
-    model: str | None,
-    parameters: dict[str, Any],
-    model_file: Path | None,
-    robot: RobotFacts | None,
-) -> PlugIn:
-    """Return the predictor whose model the filter uses; the arguments are those of `build`."""
-    if model == "white_box":
-        _check_white_box(model_file, robot)
-    if "name" in parameters:
-        raise ValueError("parameters: no 'name'; choose the model with model")
-    if "model" in parameters:  # the experiment file makes a relative model_file absolute
-        raise ValueError("parameters: give the file of a model as model_file, beside parameters")
-    given = parameters if model_file is None else {**parameters, "model": str(model_file)}
+    given = parameters or {}
+    if model == "white_box" and (model_file or robot is None or robot.motion is None):
+        raise ValueError("model: white_box needs a robot with motion, and no model_file; omit it")
+    if {"name", "model"} & given.keys():
+        raise ValueError("parameters: choose the model beside them, with model or model_file")
     is_first_order = model == "first_order" or model_file is not None
     name = "command_history" if is_first_order else "model_based"
-    return PlugIn.model_validate({**given, "name": name})
-
-
-def _check_white_box(model_file: Path | None, robot: RobotFacts | None) -> None:
     if model_file is not None:
-        raise ValueError("model_file: needs `model: first_order`; set that, or omit model_file")
-    if robot is None or robot.motion is None:
-        name = robot.name if robot else "the robot"
-        raise ValueError(f"model: {name} has no white_box (motion in robot.yaml); omit model")
+        given = {**given, "model": str(model_file)}
+    choice = PlugIn.model_validate({**given, "name": name})
+    replay = build_plugin("predictors", choice, robot=robot)
+    return Kalman(replay, position_noise, velocity_noise, acceleration_error)

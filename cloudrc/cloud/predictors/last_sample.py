@@ -17,6 +17,4 @@ class LastSample(Predictor):
         return odometry._replace(stamp_ns=odometry.stamp_ns + round(horizon * 1e9))
 
 
-def build() -> LastSample:
-    """Make the predictor; it has no parameters."""
-    return LastSample()
+build = LastSample
