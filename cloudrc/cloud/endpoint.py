@@ -39,7 +39,6 @@ from cloudrc.tunnel.channel import LATE, REPEATED, USED
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
 from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake
-from cloudrc.tunnel.keys import Key
 from cloudrc.tunnel.session import NO_EPOCH
 
 LATE_NS, LATE_WINDOW_NS = 500_000_000, 10_000_000_000
@@ -186,9 +185,7 @@ class CloudEndpoint(TunnelEnd):
         self._session.follow_keys()
         if self._session.is_outdated or self._wants_session(now_ns):
             self._ask_for_session_if_due(now_ns)
-        self._follow_teleop(now_ns)
-        if self._session.epoch:
-            self._send_command_or_alive(now_ns)
+        self._act(now_ns)
         if now_ns >= self._count_ns:
             self._count_ns = max(self._count_ns, now_ns - COUNT_PERIOD_NS) + COUNT_PERIOD_NS
             self._record_counts(now_ns)
@@ -205,17 +202,18 @@ class CloudEndpoint(TunnelEnd):
             self._hellos = 0  # the next hello has the new key
             self._say_hello_if_due(now_ns, KEY_PERIOD_NS)
 
-    def _follow_teleop(self, now_ns: int) -> None:
-        """Take teleop's messages; repeat an emergency stop that the robot has not confirmed."""
+    def _act(self, now_ns: int) -> None:
+        """Take teleop's messages; send the command of this period or, without one, ALIVE if due.
+
+        Repeat an emergency stop that the robot has not confirmed.
+        """
         self.teleop.handle_deadline(now_ns)
         if self.teleop.outputs:
             self._take_from_teleop()
-        if self._alarm.sounds and self._session.epoch:
-            if (alarm := self._alarm.due(self._asked, now_ns)) is not None:
-                self._relay(alarm)
-
-    def _send_command_or_alive(self, now_ns: int) -> None:
-        """Send the command of this period; while there is none, send ALIVE if it is due."""
+        if not self._session.epoch:
+            return
+        if self._alarm.sounds and (alarm := self._alarm.due(self._asked, now_ns)) is not None:
+            self._relay(alarm)
         if self._loop.ready and self._setpoint is not None:
             self._send_command(self._setpoint, now_ns)
         elif now_ns >= self._alive_ns:
@@ -244,7 +242,7 @@ class CloudEndpoint(TunnelEnd):
         hello = self._handshake.answer_challenge(cookie)
         asks = self._wants_session(now_ns) or self._session.is_outdated
         if hello is not None and asks:
-            self._greet(hello, self._session.greeting_key)
+            self._queue(self._session.greet(Kind.HELLO, hello, self._session.greeting_key))
 
     def _receive_busy(self, nonce: bytes, now_ns: int) -> None:
         """Tell the user that another cloud has the session, if cloud's hello was refused."""
@@ -277,13 +275,10 @@ class CloudEndpoint(TunnelEnd):
         self._hellos += 1
         if self._session.epoch == NO_EPOCH:  # the key of the last session was dropped
             self._handshake.leave()
-        self._greet(self._handshake.make_hello(), key)
+        self._queue(self._session.greet(Kind.HELLO, self._handshake.make_hello(), key))
 
     def _wants_session(self, now_ns: int) -> bool:
         return self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS
-
-    def _greet(self, hello: bytes, key: Key) -> None:
-        self._queue(self._session.greet(Kind.HELLO, hello, key))
 
     def _receive_accept(self, epoch: int, accept: Accept, now_ns: int) -> None:
         asks = self._wants_session(now_ns)
@@ -357,15 +352,10 @@ class CloudEndpoint(TunnelEnd):
             else:
                 self._records.append(message)
                 if isinstance(message, MissionEvent):
-                    self._follow_mission(message)
-
-    def _follow_mission(self, event: MissionEvent) -> None:
-        """Prepare the loop for a mission; record the counters as a mission begins and ends."""
-        if event.event == "started":
-            self._loop.start_mission()
-        elif event.event in UNDER_WAY:
-            return
-        self._record_counts(event.stamp_ns)
+                    if message.event == "started":
+                        self._loop.start_mission()
+                    if message.event == "started" or message.event not in UNDER_WAY:
+                        self._record_counts(message.stamp_ns)
 
     def _relay(self, request: OperatorRequest) -> None:
         """Relay an operator's request to world, or drop it; teleop repeats a dropped request.
@@ -380,10 +370,9 @@ class CloudEndpoint(TunnelEnd):
         may_start = self._loop.ready and not self._alarm.sounds
         if request.number == 0 and request.request is Request.ESTOP:
             self._alarm.sound()
-        elif self._session.epoch and (may_start or request.request is not Request.START):
-            self._send_request(request)
-
-    def _send_request(self, request: OperatorRequest) -> None:
+            return
+        if not self._session.epoch or (request.request is Request.START and not may_start):
+            return
         if request.request is Request.ACKNOWLEDGE:
             self._alarm.acknowledge()
         elif request.request is Request.START and request.number > self._asked:

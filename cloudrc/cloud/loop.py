@@ -51,14 +51,15 @@ Source: docs/reference/plant.md, "Commands"."""
 ECHOES, ECHOES_NS = 32, 320_000_000
 """Smallest number of stored echoes, and the time for which echoes are stored [ns]. With the stored
 echoes, the loop calls `add_applied` only once per command."""
+UNUSED = Predictor.observe, Predictor.commanded, Predictor.applied
+"""Methods of the base class, which need not be called."""
 INSTEAD = {
     "estimator": "cloud uses the last good horizon",
     "predictor": "cloud uses the last sample without a prediction",
     "controller": "cloud commands zero velocity",
 }
 """Kind of plug-in -> what cloud does when a plug-in of this kind fails."""
-
-
+GOES_ON = "cloud goes on using it"
 PLAN_STEP = PLAN_STEP_NS * 1e-9
 """Time between two velocities of a plan [s]."""
 PLANNED_MAX = 1000.0
@@ -69,17 +70,12 @@ Source: docs/reference/faults.md, "F23"."""
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
-def _does_nothing(predictor: Predictor, name: str) -> bool:
-    """Return whether a method is that of the base class, which need not be called."""
-    method = getattr(predictor, name, None)
-    return getattr(method, "__func__", None) is getattr(Predictor, name)
-
-
 class ControlLoop:
     """Runs estimator, predictor and controller in the sessions of one cloud.
 
     Attributes:
         period_ns: Time between two commands [ns].
+        ready: Whether telemetry has arrived in this session.
         faults: Faults since the last `take_faults`.
         lost: Why the flight has to end, if a controller outside is lost; else None.
         plans: The plans that the robot may still follow.
@@ -108,9 +104,9 @@ class ControlLoop:
         self._build_estimator, self._predictor = build_estimator, predictor
         self._controller = controller
         self._trusts_predictor, self._trusts_controller = is_ours(predictor), is_ours(controller)
+        methods = (getattr(predictor, name) for name in ("observe", "commanded", "applied"))
         self._observe, self._commanded, self._applied = (
-            None if _does_nothing(predictor, name) else getattr(predictor, name)
-            for name in ("observe", "commanded", "applied")
+            None if getattr(each, "__func__", None) in UNUSED else each for each in methods
         )
         self._horizon_max, self._freeze_after_ns = horizon_max, freeze_after * 1e9
         self.period_ns = period_ns
@@ -149,6 +145,7 @@ class ControlLoop:
         # Newest round trip, without and with the hold time on world [s]; NaN before the first.
         self._rtt = self._loop_delay = nan
         self._basis: Odometry | None = None
+        self.ready = False
         self._basis_arrival_ns = 0
         self._horizon, self._echoed_ns = 0.0, NEVER_NS
         self.plans = PlanLog()
@@ -178,16 +175,14 @@ class ControlLoop:
         """
         return self._now_ns, self._basis, self._loop_delay, self._horizon
 
-    @property
-    def ready(self) -> bool:
-        """Whether telemetry has arrived in this session."""
-        return self._basis is not None
-
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
         """Process telemetry that arrived at `now_ns` [ns], cloud's clock."""
         self._basis, self._basis_arrival_ns = telemetry.odometry, now_ns
-        self._now_ns = now_ns
-        self._call("estimator", self._observe_delay, telemetry, now_ns)
+        self._now_ns, self.ready = now_ns, True
+        try:
+            self._observe_delay(telemetry, now_ns)
+        except FAILURES as error:
+            self._note("estimator", error, GOES_ON)
         if self._observe is not None:
             self._call("predictor", self._observe, telemetry.odometry)
 
@@ -393,7 +388,7 @@ class ControlLoop:
         try:
             call(*arguments)
         except FAILURES as error:
-            self._note(kind, error, "cloud goes on using it")
+            self._note(kind, error, GOES_ON)
 
     def _note(self, kind: str, error: BaseException, instead: str = "") -> None:
         """Count a failure of the plug-in `kind`, such as "estimator"; report a mission's first one.

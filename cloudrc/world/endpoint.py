@@ -32,7 +32,6 @@ from cloudrc.records import (
     REAL_TIME_FACTOR_MIN,
     Arrival,
     CommandApplied,
-    Contact,
     ContactForce,
     Counted,
     GroundTruth,
@@ -200,9 +199,16 @@ class WorldEndpoint(TunnelEnd):
 
     def _sample(self, now_ns: int) -> None:
         """Record the true state and new guard changes and contacts; send telemetry if it is due."""
-        robot = self.robot
-        truth, shown = self._record_state(now_ns)
-        if robot.guard.changes or robot.simulator.touches or robot.failure is not None:
+        robot, records = self.robot, self._records
+        simulator, guard = robot.simulator, robot.guard
+        truth = simulator.truth(now_ns)
+        shown = simulator.read_sensors() if self._shows else ()
+        records.append(_new(GroundTruth, (now_ns, truth, guard.reference)))
+        if (force := simulator.take_contact_force()) is not None:
+            records.append(_new(ContactForce, (now_ns, *force, simulator.force_sensor)))
+        for number, name, unit in self._recorded:
+            records.append(_new(SensorRead, (now_ns, name, unit, shown[number])))
+        if guard.changes or simulator.touches or robot.failure is not None:
             self._record_events(now_ns)
         if now_ns >= self._odometry_ns:
             self._odometry_ns += self._odometry_period_ns
@@ -211,21 +217,6 @@ class WorldEndpoint(TunnelEnd):
         if now_ns >= self._count_ns:
             self._record_counts(now_ns)
         self._sample_ns += self._sample_period_ns
-
-    def _record_state(self, now_ns: int) -> tuple[Odometry, tuple[float, ...]]:
-        """Record true state, contact force and sensors; return the state and the sensors' values.
-
-        The values are those of the robot's own sensors, each in its unit.
-        """
-        simulator, records = self.robot.simulator, self._records
-        truth = simulator.truth(now_ns)
-        shown = simulator.read_sensors() if self._shows else ()
-        records.append(_new(GroundTruth, (now_ns, truth, self.robot.guard.reference)))
-        if (force := simulator.take_contact_force()) is not None:
-            records.append(_new(ContactForce, (now_ns, *force, simulator.force_sensor)))
-        for number, name, unit in self._recorded:
-            records.append(_new(SensorRead, (now_ns, name, unit, shown[number])))
-        return truth, shown
 
     def _record_events(self, now_ns: int) -> None:
         """Record a failure of the onboard controller, changes of the guard's state and contacts."""
@@ -238,7 +229,9 @@ class WorldEndpoint(TunnelEnd):
         if simulator.touches:
             for touch in simulator.take_contacts():
                 records.append(touch._replace(stamp_ns=now_ns))
-                self._note_touch(touch)
+                self._obstacles += is_obstacle(touch.body, touch=self._touch)
+                if touch.body == self._touch and touch.by_probe and isnan(self._touch_speed):
+                    self._touch_speed = hypot(*touch.touch_velocity)
 
     def _send_telemetry(
         self, now_ns: int, epoch: int, truth: Odometry, shown: tuple[float, ...]
@@ -299,12 +292,6 @@ class WorldEndpoint(TunnelEnd):
         for observer in self.robot.observers:
             observer.see_session(now_ns)
 
-    def _note_touch(self, touch: Contact) -> None:
-        if is_obstacle(touch.body, touch=self._touch):
-            self._obstacles += 1
-        if touch.body == self._touch and touch.by_probe and isnan(self._touch_speed):
-            self._touch_speed = hypot(*touch.touch_velocity)
-
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
         """Carry out an operator request; ignore repeated and old requests.
 
@@ -321,7 +308,10 @@ class WorldEndpoint(TunnelEnd):
                 return
             self._number = request.number
         if starts:
-            self._note_mission(request)
+            if request.mission_id != self._mission_id or request.start is Start.SPAWN:
+                self._mission_id, self._reached = request.mission_id, 0
+                self._obstacles, self._touch_speed = 0, nan
+            self._touch = request.touch
         if request.mission_id == self._mission_id:  # stored on board for a restarted cloud
             self._reached = max(self._reached, request.reached)
         if not is_progress:
@@ -329,19 +319,17 @@ class WorldEndpoint(TunnelEnd):
 
     def _may_start(self, request: OperatorRequest, now_ns: int) -> bool:
         """Return whether the robot may start a mission; count a refusal, raise DecodeErrors."""
-        self._refuse_old(self._tick_ns - request.basis_stamp_ns, now_ns)
+        age_ns = self._tick_ns - request.basis_stamp_ns
+        age_max_ns = max(START_AGE_MAX_NS, self._command_age_max_ns)
+        if now_ns == self._stalled_wake_ns or age_ns > age_max_ns:
+            raise DecodeError("stale")
+        if age_ns < 0:
+            raise DecodeError("future")
         if not self.robot.guard.latched:
             return True
         # Telemetry does not confirm this request: the operator has to acknowledge first.
         self.counts["start_refused"] += 1
         return False
-
-    def _note_mission(self, request: OperatorRequest) -> None:
-        """Store which mission starts; for a new mission, forget what the last one touched."""
-        if request.mission_id != self._mission_id or request.start is Start.SPAWN:
-            self._mission_id, self._reached = request.mission_id, 0
-            self._obstacles, self._touch_speed = 0, nan
-        self._touch = request.touch
 
     def _obey(self, request: OperatorRequest, now_ns: int) -> None:
         """Carry out a request other than PROGRESS, and inform the observers."""
@@ -362,40 +350,28 @@ class WorldEndpoint(TunnelEnd):
         for observer in self.robot.observers:
             observer.see_request(request, tick_ns)
 
-    def _refuse_old(self, age_ns: int, now_ns: int) -> None:
-        age_max_ns = max(START_AGE_MAX_NS, self._command_age_max_ns)
-        if now_ns == self._stalled_wake_ns or age_ns > age_max_ns:
-            raise DecodeError("stale")
-        if age_ns < 0:
-            raise DecodeError("future")
-
     def _receive_command(
         self, epoch: int, counter: int, command: Command, now_ns: int, world_ns: int
     ) -> None:
-        guard = self.robot.guard
+        """Simulate up to `world_ns` [ns], and offer a command to the guard."""
+        robot = self.robot
         outcome = self._channel.take(counter, bool(command.plan))
         if outcome != REPEATED:
             self._door.hear(now_ns)
         if outcome == USED:
-            outcome = self._offer_command(command, now_ns, world_ns)
+            self._advance(world_ns)
+            if now_ns == self._stalled_wake_ns:  # it may have waited in the socket
+                outcome = "stale"
+            else:
+                rejection = robot.guard.accept_command(command, self._tick_ns)
+                for observer in robot.observers:
+                    observer.see_command(command, rejection, self._tick_ns)
+                outcome = rejection or USED
         used = outcome == USED
         delay = (now_ns - command.stamp_ns) * 1e-9 if self._clock_is_shared else nan
         if outcome != REPEATED or not self._channel.is_flooded:
             fields = world_ns, False, epoch, counter, delay, used, NEVER_NS, 0, False
             self._records.append(_new(Arrival, fields))
-        if used and guard.state is TRACK:
+        if used and robot.guard.state is TRACK:
             self._waiting = (epoch, counter, command)
         self.counts[outcome] += 1
-
-    def _offer_command(self, command: Command, now_ns: int, world_ns: int) -> str:
-        """Simulate up to `world_ns` [ns], and offer a command to the guard; return its outcome.
-
-        A command that may have waited in the socket during a stall is "stale".
-        """
-        self._advance(world_ns)
-        if now_ns == self._stalled_wake_ns:
-            return "stale"
-        rejection = self.robot.guard.accept_command(command, self._tick_ns)
-        for observer in self.robot.observers:
-            observer.see_command(command, rejection, self._tick_ns)
-        return rejection or USED

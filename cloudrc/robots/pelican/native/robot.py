@@ -17,7 +17,7 @@ from cloudrc.config.robot import find_robot
 from cloudrc.config.shipped import file_of
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.geometry.scene import load_scene
-from cloudrc.messages import Command, Vector
+from cloudrc.messages import Command
 from cloudrc.robots.pelican import low_level, rotors
 from cloudrc.robots.pelican.low_level import LowLevel
 from cloudrc.robots.pelican.native.library import Library, library
@@ -157,11 +157,18 @@ class NativeRobot(Robot):
         C runs the steps while the robot follows a fresh command that the guard need not limit.
         Python runs the first other step, and all steps after it.
         """
-        simulator, guard = self.simulator, self.guard
+        simulator, guard, law = self.simulator, self.guard, self._low_level
         in_c = not self.observers and simulator.tape is None
         while in_c and (track := guard.plain_track(tick_ns)):
-            self._give(*track[1:])
-            stop_ns = track[0] if track[0] < until_ns else until_ns
+            next_ns, reference, wanted, track_ns = track
+            stop_ns = next_ns if next_ns < until_ns else until_ns
+            force = simulator.force_peak, simulator.impulse
+            counts = simulator.contacts, simulator.steps
+            _pack_track(self._flight, _TRACK, *reference, *wanted, track_ns, *force, *counts)
+            if not self._in_c:
+                integral, error = law.integral, law.error
+                memory = (*integral, *(error or integral), error is not None)
+                _pack_memory(self._flight, _MEMORY, 0, *simulator.actuators.speeds, *memory)
             while steps := self._run_steps(self._address, tick_ns, stop_ns):
                 tick_ns += steps * STEP_NS
                 self._in_c = True
@@ -171,8 +178,10 @@ class NativeRobot(Robot):
                 ) = _unpack_track(self._flight, _TRACK)
                 # fmt: on
                 guard.reference = (x, y, z)
-                before = self._before() if news else None
-                speeds = (front, left, back, right)
+                before, speeds = None, (front, left, back, right)
+                if news:
+                    numbers = _unpack_before(self._flight, _BEFORE)
+                    before = Readings.of(numbers[:7], numbers[7:])
                 simulator.take_over(speeds, peak, impulse, contacts, total, before)
                 if tick_ns >= stop_ns:
                     break
@@ -181,24 +190,9 @@ class NativeRobot(Robot):
             in_c = tick_ns >= stop_ns  # else C has left a step to Python
         if self._in_c:
             numbers = _unpack_memory(self._flight, _MEMORY)
-            self._low_level.integral, self._low_level.error = numbers[:3], numbers[3:]
+            law.integral, law.error = numbers[:3], numbers[3:]
             self._in_c = False
         return super().run(tick_ns, until_ns)
-
-    def _give(self, reference: Vector, wanted: Vector, track_ns: int) -> None:
-        """Copy the robot's state and the arguments to the C structure, before steps in C."""
-        simulator = self.simulator
-        force = simulator.force_peak, simulator.impulse
-        counts = simulator.contacts, simulator.steps
-        _pack_track(self._flight, _TRACK, *reference, *wanted, track_ns, *force, *counts)
-        if not self._in_c:
-            integral, error = self._low_level.integral, self._low_level.error
-            memory = (*integral, *(error or integral), error is not None)
-            _pack_memory(self._flight, _MEMORY, 0, *simulator.actuators.speeds, *memory)
-
-    def _before(self) -> Readings:
-        numbers = _unpack_before(self._flight, _BEFORE)
-        return Readings.of(numbers[:7], numbers[7:])
 
 
 @cache
