@@ -8,7 +8,7 @@ import numpy as np
 
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.geometry.fence import Fence
-from cloudrc.geometry.scene import WORLD, Plate, Scene, Tube, is_obstacle
+from cloudrc.geometry.scene import Plate, Scene, Tube, is_obstacle
 from cloudrc.geometry.solids import Solid
 
 Obstacle: TypeAlias = Tube | Solid
@@ -36,8 +36,6 @@ def surface(obstacle: Obstacle) -> str:
     """Return how messages name what the robot would touch."""
     if isinstance(obstacle, Tube):
         return f"the wall of {obstacle.name}"
-    if obstacle.name == WORLD:
-        return "world, the geoms in the worldbody of the scene"
     return obstacle.name
 
 

@@ -61,6 +61,12 @@ class Shapes:
     scene: tuple[Surface, ...] = ()  # without infinite planes
     planar: bool = False  # whether the robot stays on the ground
 
+    @staticmethod
+    def of(surfaces: Sequence[Surface], planar: bool) -> Shapes:
+        """Sort surfaces by their bodies; `planar` is whether the robot stays on the ground."""
+        robot = tuple(surface for surface in surfaces if not surface.body)
+        return Shapes(robot, tuple(surface for surface in surfaces if surface.body), planar)
+
     @property
     def size(self) -> float:
         """Diameter of the smallest ball around the robot's base that holds the robot [m]."""
@@ -81,14 +87,11 @@ class Shapes:
             convex=np.array([surface.convex for surface in surfaces], bool),
             sizes=np.array([(len(each.corners), 1) for each in surfaces], np.int32),
             corners=np.concatenate(
-                [np.zeros((0, 3)), *(each.corners for each in surfaces)], 0, dtype=np.float32
+                [np.zeros((0, 3)), *(each.corners for each in surfaces)], dtype=np.float32
             ),
             faces=np.array([each.triangles.shape for each in surfaces], np.int32).reshape(-1, 2),
             indices=np.concatenate(
-                [np.zeros(0), *(each.triangles.ravel() for each in surfaces)],
-                0,
-                dtype=np.int32,
-                casting="unsafe",
+                [np.zeros(0, np.int32), *(each.triangles.ravel() for each in surfaces)]
             ),
         )
         return file.getvalue()
@@ -122,9 +125,7 @@ def _read(file: dict[str, NDArray[Any]]) -> Shapes:
         )
         for number, (body, end) in enumerate(zip(file["bodies"], ends, strict=True))
     ]
-    robot = tuple(surface for surface in found if not surface.body)
-    scene = tuple(surface for surface in found if surface.body)
-    return Shapes(robot, scene, bool(file["planar"]))
+    return Shapes.of(found, bool(file["planar"]))
 
 
 def _fan(polygons: NDArray[np.int32]) -> NDArray[np.int32]:

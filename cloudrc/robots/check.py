@@ -215,10 +215,7 @@ def _judge(robot: RobotFiles, facts: Mapping[str, Any], rest: float) -> Iterator
 
 def facts_table(facts: Mapping[str, Any]) -> str:
     """Format the facts that `check` returns for people."""
-    rows = [(key, _shown(value)) for key, value in facts.items() if key != "parameters"]
-    at = next(number for number, row in enumerate(rows) if row[0] == "onboard") + 1
-    own = [(f"  {key}", _shown(value)) for key, value in facts["parameters"].items()]
-    return table([*rows[:at], *own, *rows[at:]])
+    return table([(key, _shown(value)) for key, value in facts.items()])
 
 
 def _shown(value: Any) -> str:

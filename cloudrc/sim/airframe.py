@@ -39,11 +39,10 @@ class Airframe:
     inertia: Array  # about the centre of mass [kg m^2], shape (3, 3)
     gravity: float  # acceleration that hover must balance [m/s^2]
     # Torques about x and y, force along z, torque about z, per unit of each control; the torques
-    # are about the centre of mass.
-    wrench: Array  # [N] and [N m] per unit, shape (4, n)
+    # are about the centre of mass. Without the last row, the controller leaves the yaw alone.
+    wrench: Array  # [N] and [N m] per unit, shape (4, n) or (3, n)
     low: Array  # smallest value of each control, in its own unit [any unit], shape (n,)
     high: Array  # largest value of each control, in its own unit [any unit], shape (n,)
-    steers_yaw: bool  # False: the controller leaves the yaw alone
     lag: float  # largest time constant of an actuator [s]; 0: none
 
 
@@ -75,10 +74,9 @@ def read_airframe(model: Any, *, steers_yaw: bool = True) -> Airframe:
         centre=centre,
         inertia=inertia,
         gravity=float(weight[2]) / mass,
-        wrench=_wrench(model, data, centre),
+        wrench=_wrench(model, data, centre)[: 4 if steers_yaw else 3],
         low=low,
         high=high,
-        steers_yaw=steers_yaw,
         lag=float(max(lags, default=0.0)),
     )
     _check_directions(frame)
@@ -172,18 +170,20 @@ def span(frame: Airframe) -> Array:
 def _check_actuator(model: Any, number: int, name: str) -> None:
     """Refuse an actuator that does not push at a site of the robot by gain times control."""
     site, reference = model.actuator_trnid[number]
-    at_site = model.actuator_trntype[number] == mujoco.mjtTrn.mjTRN_SITE and reference < 0
-    if not at_site or model.body_rootid[model.site_bodyid[site]] != model.jnt_bodyid[0]:
-        raise ValueError(f"actuator {name} must act at a site of the robot, without a refsite")
-    if (
-        model.actuator_gaintype[number] != mujoco.mjtGain.mjGAIN_FIXED
-        or model.actuator_biastype[number] != mujoco.mjtBias.mjBIAS_NONE
-        or model.actuator_gainprm[number, 0] == 0.0
-        or model.actuator_dyntype[number] not in DYNAMICS
-    ):
+    pushes = (
+        model.actuator_trntype[number] == mujoco.mjtTrn.mjTRN_SITE
+        and reference < 0
+        and model.body_rootid[model.site_bodyid[site]] == model.jnt_bodyid[0]
+        and model.actuator_gaintype[number] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[number] == mujoco.mjtBias.mjBIAS_NONE
+        and model.actuator_gainprm[number, 0] != 0.0
+        and model.actuator_dyntype[number] in DYNAMICS
+    )
+    if not pushes:
         raise ValueError(
-            f"actuator {name} must push by gain times control: use <motor>, or <general> with a "
-            "fixed gain other than 0, without a bias, and with dyntype none, filter or filterexact"
+            f"actuator {name} must push at a site of the robot by gain times control: use <motor>, "
+            "or <general> with a fixed gain other than 0, without refsite and bias, and with "
+            "dyntype none, filter or filterexact"
         )
 
 
@@ -205,7 +205,7 @@ def _limits(model: Any, number: int) -> tuple[float, float]:
 def _check_directions(frame: Airframe) -> None:
     """Refuse a robot whose actuators cannot make each force and torque by itself."""
     known = np.empty((0, len(frame.names)))
-    rows = (frame.wrench if frame.steers_yaw else frame.wrench[:3]) * span(frame)
+    rows = frame.wrench * span(frame)
     for (direction, hint), row in zip(HINTS.items(), rows, strict=False):
         size = np.linalg.norm(row)
         rest = row - row @ np.linalg.pinv(known) @ known

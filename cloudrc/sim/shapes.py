@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -35,8 +36,7 @@ def shapes_of(model: Any, *, planar: bool) -> Shapes:
     places, turns = data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3)
     position, axes = data.xpos[base], data.xmat[base].reshape(3, 3)
     bodies = bodies_of_geoms(model)
-    robot: list[Surface] = []
-    scene: list[Surface] = []
+    found: list[Surface] = []
     for geom in _shown(model, bodies):
         body = bodies[geom]
         surface = _surface(model, geom)
@@ -45,11 +45,8 @@ def shapes_of(model: Any, *, planar: bool) -> Shapes:
             continue
         surface = replace(surface, body=body, rgba=_rgba(model, geom))
         surface = surface.placed(places[geom], turns[geom])
-        if body:
-            scene.append(surface)
-        else:
-            robot.append(surface.placed(-position @ axes, axes.T))
-    return Shapes(tuple(robot), tuple(scene), planar)
+        found.append(surface if body else surface.placed(-position @ axes, axes.T))
+    return Shapes.of(found, planar)
 
 
 def _shown(model: Any, bodies: list[str]) -> list[int]:
@@ -80,25 +77,22 @@ def _rgba(model: Any, geom: int) -> Rgba:
 
 def _surface(model: Any, geom: int) -> Surface | None:
     """Return the surface of a geom in its own frame; None for a type without one."""
-    kind, size = _GEOM(model.geom_type[geom]), model.geom_size[geom].tolist()
-    number = model.geom_dataid[geom]
-    if kind == _GEOM.mjGEOM_BOX:
-        return shapes.box(size)
-    if kind == _GEOM.mjGEOM_CYLINDER:
-        return shapes.cylinder(*size[:2])
-    if kind == _GEOM.mjGEOM_CAPSULE:
-        return shapes.globe(size[:1] * 3, size[1])
-    if kind == _GEOM.mjGEOM_SPHERE:
-        return shapes.globe(size[:1] * 3)
-    if kind == _GEOM.mjGEOM_ELLIPSOID:
-        return shapes.globe(size)
-    if kind == _GEOM.mjGEOM_PLANE:
-        return shapes.sheet(*(each or WIDE for each in size[:2]))
+    kind, number = _GEOM(model.geom_type[geom]), model.geom_dataid[geom]
+    if kind in _SURFACES:
+        return _SURFACES[kind](model.geom_size[geom].tolist())
     if kind == _GEOM.mjGEOM_HFIELD:
         return _terrain(model, number)
-    if number >= 0:  # a mesh, or the mesh of a signed distance field
-        return _mesh(model, number)
-    return None
+    return _mesh(model, number) if number >= 0 else None  # also of a signed distance field
+
+
+_SURFACES: dict[Any, Callable[[list[float]], Surface]] = {
+    _GEOM.mjGEOM_BOX: shapes.box,
+    _GEOM.mjGEOM_CYLINDER: lambda size: shapes.cylinder(*size[:2]),
+    _GEOM.mjGEOM_CAPSULE: lambda size: shapes.globe(size[:1] * 3, size[1]),
+    _GEOM.mjGEOM_SPHERE: lambda size: shapes.globe(size[:1] * 3),
+    _GEOM.mjGEOM_ELLIPSOID: shapes.globe,
+    _GEOM.mjGEOM_PLANE: lambda size: shapes.sheet(*(each or WIDE for each in size[:2])),
+}
 
 
 def _mesh(model: Any, number: int) -> Surface:

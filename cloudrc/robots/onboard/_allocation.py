@@ -37,8 +37,7 @@ class Allocation:
         `braking` [m/s^2].
         """
         width = span(frame)
-        wrench = frame.wrench if frame.steers_yaw else frame.wrench[:3]
-        turn_x, turn_y, lift, *turn_z = width * np.linalg.pinv(wrench * width).T
+        turn_x, turn_y, lift, *turn_z = width * np.linalg.pinv(frame.wrench * width).T
         thrust = frame.mass * lift
         still = np.zeros_like(lift)
         turns = np.array((turn_x, turn_y, *(turn_z or [still]))).T @ frame.inertia

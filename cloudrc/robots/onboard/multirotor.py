@@ -258,7 +258,8 @@ def build(
     Raises:
         ValueError: If the controller cannot fly the model, or a value does not fit.
     """
-    frame = read_airframe(model, steers_yaw=yaw_bandwidth_radps != 0.0)
+    steers_yaw = yaw_bandwidth_radps != 0.0
+    frame = read_airframe(model, steers_yaw=steers_yaw)
     allocation = Allocation(frame, braking_mps2)
     lag = frame.lag or TINY
     if lag > LAG_MAX:
@@ -271,7 +272,7 @@ def build(
     velocity = min(VELOCITY_RADPS, 0.25 * attitude)
     velocity = _checked("velocity", velocity_bandwidth_radps, velocity, 0.5 * attitude)
     yaw = min(YAW_RADPS, 2.0 * sqrt(allocation.yaw_max), 0.5 * attitude)
-    yaw = _checked("yaw", yaw_bandwidth_radps, yaw, attitude) if frame.steers_yaw else 0.0
+    yaw = _checked("yaw", yaw_bandwidth_radps, yaw, attitude) if steers_yaw else 0.0
     gains = Gains(velocity, attitude, yaw, radians(tilt_max_deg))
     return Multirotor(frame, allocation, gains, model.opt.timestep, drag_s_per_m)
 

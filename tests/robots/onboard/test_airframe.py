@@ -64,7 +64,7 @@ REFUSED = {
     "mass in g": (robot(ROTORS, 1300, INERTIA), "hover needs 39853 % of the thrust; above 77 %"),
     "one direction": (with_spins(1, 1, 1, 1), r"torque about z \(yaw\).*spin direction"),
     "one of four": (with_spins(1, -1, 1, 1), "from actuator r0, which has no room"),
-    "servo": (changed("<general", '<general biastype="affine"'), "r0 must push by gain times"),
+    "servo": (changed("<general", '<general biastype="affine"'), "r0 must push at a site"),
 }
 
 

@@ -15,7 +15,6 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -96,39 +95,21 @@ def _load() -> Library:
     if POD in os.environ:
         return Library(None, "the image has no built file")
     found = Library(None, ADVICE)
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "cloudrc")
     for name, command in compilers():
         try:
-            with _folder() as (folder, note):
-                file = built_file(folder, name)
-                if not file.exists() or who_may_write(file):
-                    compile_to(file, command)
-                found = _open(file, f"compiled by {name}{note}")
-        except (OSError, subprocess.SubprocessError) as error:
+            if lack := make_own_folder(folder):
+                raise OSError(f"no cache: {lack}")
+            file = built_file(folder, name)
+            if not file.exists() or who_may_write(file):
+                compile_to(file, command)
+            found = _open(file, f"compiled by {name}")
+        except (OSError, RuntimeError, subprocess.SubprocessError) as error:
             said = getattr(error, "stderr", None) or str(error)
             found = Library(None, f"{name}: {' '.join(said.split())[:100]}")
         if found.run is not None:
             break
     return found
-
-
-@contextmanager
-def _folder() -> Iterator[tuple[Path, str]]:
-    """Yield the folder of the cache, or a new one if the cache cannot be used.
-
-    The new folder is removed after the `with` block. The text says why the cache is not used.
-    """
-    root = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    folder, lack = Path(root, "cloudrc"), "no cache folder; set XDG_CACHE_HOME"
-    if folder.is_absolute():
-        try:
-            lack = make_own_folder(folder)
-        except OSError as error:
-            lack = f"{folder}: {error.strerror}"
-    if not lack:
-        yield folder, ""
-        return
-    with tempfile.TemporaryDirectory(prefix="cloudrc-") as own:
-        yield Path(own), f", not kept: {lack}"
 
 
 def _open(file: Path, origin: str) -> Library:
