@@ -13,11 +13,9 @@ from cloudrc.cloud import controllers, estimators, predictors
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.predictors import Predictor
-from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import OUTSIDE
 from cloudrc.config.robot import facts
 from cloudrc.config.schema import World
-from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Command, Odometry, Setpoint
 
 PELICAN = facts(World(), 12.0)
@@ -89,19 +87,6 @@ def test_a_plugin_is_built_and_documented_as_the_contract_says(module, kind):
     assert isinstance(build(module), kind)
     assert build(module) is not build(module)
     assert "Source:" in module.__doc__
-
-
-@pytest.mark.parametrize(
-    ("key", "plugin", "reason"),
-    [
-        ("estimator", "name: ewma, gain: 0", "cloud.estimator.gain"),
-        ("predictor", "name: constant_acceleration, window: 0", "cloud.predictor.window"),
-        ("controller", "name: pid, gain_p: [0.8, -0.8, 1.5]", "cloud.controller.gain_p"),
-    ],
-)
-def test_a_wrong_parameter_is_named(key, plugin, reason):
-    with pytest.raises(BadInputError, match=reason):
-        load_experiment("hover", [f"cloud.{key}={{{plugin}}}"])
 
 
 @every_estimator

@@ -1,7 +1,5 @@
 """The PID controller by hand-worked numbers."""
 
-from math import pi
-
 import pytest
 
 from cloudrc.cloud.controllers import pid
@@ -83,10 +81,3 @@ def test_without_a_gain_the_yaw_turns_only_to_a_waypoint_with_a_yaw():
         for turns in (False, True)
     ]
     assert rates == pytest.approx([0.0, 0.4, 1.0, 1.0, 0.0, 0.0])
-
-
-def test_yaw_turns_the_short_way_round():
-    # Heading 170 deg, wanted -170 deg: 20 deg to the left, not 340 to the right.
-    heading = Odometry(0, ZERO, (0.08715574274765817, 0.0, 0.0, 0.9961946980917455), ZERO, ZERO)
-    output = pid.build(gain_yaw=2.0).update(heading, Setpoint(ZERO, yaw=-170 * pi / 180), DT)
-    assert output.yaw_rate == pytest.approx(2.0 * 20 * pi / 180)

@@ -46,7 +46,3 @@ def test_the_plan_is_that_of_the_echoed_command(log):
 @pytest.mark.parametrize("guard", [state for state in GuardState if state is not GuardState.TRACK])
 def test_only_in_track_the_robot_follows_a_plan(log, guard):
     assert log.look_up(told(115, 60, guard), 0) is None
-
-
-def test_without_commands_there_is_nothing_to_look_up():
-    assert PlanLog().look_up(told(115, -1), 0) is None

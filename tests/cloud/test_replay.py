@@ -53,14 +53,6 @@ def test_the_echoes_show_the_past(echoes, start_ms, end_ms, parts):
     assert in_ms(history.past(start_ms * MS, end_ms * MS)) == parts
 
 
-def test_commands_ahead_begin_at_their_stamps_and_the_last_stays():
-    history = History()
-    for k in range(3):
-        history.add(command(10 * k, float(k + 1)))
-    parts = history.ahead(45 * MS, 95 * MS, 50 * MS - AHEAD)
-    assert in_ms(parts) == [(0, 5), (1, 10), (2, 10), (3, 25)]
-
-
 @pytest.mark.parametrize(
     ("every", "period_ms", "odometry_ms", "expected"),
     [(1, 10, 10, 50), (2, 10, 10, 55), (1, 20, 10, 50), (1, 2, 10, 50), (1, 10, 50, 50)],
@@ -76,20 +68,6 @@ def test_the_shift_gives_commands_their_mean_age(every, period_ms, odometry_ms, 
             history.note_applied(command(period_ms * k, 0).stamp_ns, begins_ms * MS)
     shift_ms = (history.shift_ns(sample(0), 0.1) + AHEAD) / MS
     assert shift_ms == pytest.approx(expected, abs=1.5)
-
-
-def test_echoes_of_late_telemetry_change_no_shift():
-    history = History()
-    history.add(command(0, 0.0))
-    history.note_applied(command(20, 0).stamp_ns, 70 * MS)
-    history.note_applied(command(10, 0).stamp_ns, 65 * MS)
-    assert history.shift_ns(sample(0), 0.1) + AHEAD == 50 * MS
-
-
-def test_before_the_first_echo_the_horizon_gives_the_shift():
-    history = History()
-    history.add(command(100, 0.0))
-    assert history.shift_ns(sample(60), 0.090) + AHEAD == 40 * MS
 
 
 def test_a_history_forgets_the_oldest_commands():
@@ -165,17 +143,6 @@ def test_the_past_has_the_steps_of_the_applied_plans():
     assert along_x(history.past(114 * MS, 134 * MS)) == [
         *((2.0, 0.006), (3.0, 0.004), (6.0, 0.006), (7.0, 0.004)),
     ]
-
-
-def test_a_plan_begins_at_its_own_time_however_late_it_is():
-    history = History()
-    for k in range(3):
-        history.add(planned(10 * k, 100 + 10 * k, 1.0 + k, 2.0 + k))
-    history.note_applied(0, 130 * MS)
-    basis = Odometry(100 * MS, ZERO, UPRIGHT, ZERO, ZERO)
-    assert history.shift_ns(basis, 0.02) == 100 * MS
-    ahead = history.ahead(100 * MS, 120 * MS, 100 * MS)
-    assert along_x(ahead) == [(1.0, 0.01), (2.0, 0.01)]
 
 
 def test_command_history_knows_the_plan_between_two_commands():
@@ -281,14 +248,6 @@ def fly(predictor, push=0.0, noise=0.0, seconds=6.0, speed=0.5):
 
 def rms(errors):
     return float(np.sqrt((errors**2).mean()))
-
-
-@pytest.mark.parametrize(("velocity", "limit"), [(ZERO, 0.1), ((2.0, -1.0, 0.5), 0.3)])
-def test_a_velocity_command_is_reached_without_a_steady_error(velocity, limit):
-    flying = at_rest(integral_limit_xy=limit)
-    for _ in range(400):
-        state = flying.step(velocity, 0.01)
-    assert state.velocity == pytest.approx(velocity, abs=0.1 if any(velocity) else 0.02)
 
 
 def test_a_sinking_reference_leads_by_half_a_metre_per_second():

@@ -42,19 +42,6 @@ def refusals(*positions, start="spawn", scene="pipes", **more):
 
 
 @pytest.mark.parametrize(
-    ("position", "pipe"),
-    [
-        # The arm's tip is at x + .40, z + .17: from x = -.81 on it is within .04 m of the wall.
-        ((-0.82, 0.0, 0.8), -1),
-        ((-0.80, 0.0, 0.8), 0),
-        ((0.0, 0.0, 0.8), 0),  # the rear rotor is in the outside of pipe 1
-    ],
-)
-def test_overlaps(position, pipe):
-    assert hit(position) == pipe
-
-
-@pytest.mark.parametrize(
     ("start", "end", "pipe"),
     [
         ((-1.0, 0.0, 0.8), (0.5, 0.0, 0.8), 0),  # out of the bore, sideways

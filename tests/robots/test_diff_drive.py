@@ -129,15 +129,6 @@ def test_a_model_without_such_wheels_is_refused_in_one_line(own_robot, changes, 
     assert str(folder / "robot.xml") in str(error.value)
 
 
-def test_the_cloud_drives_the_rover_to_its_waypoints_and_twice_alike():
-    points = [{"position_m": [x, y], "tolerance_m": 0.3} for x, y in ((1.5, 0), (1.5, -1))]
-    settings = {"world.robot": "rover", "mission": {"waypoints": points}}
-    flights = [cloudrc.fly("steps", settings) for _ in range(2)]
-    assert flights[0].verdict == "success"
-    assert flights[0].numbers["waypoints_reached"] == 2
-    assert flights[0].records_sha256 == flights[1].records_sha256
-
-
 def test_factors_scale_base_and_wheels_and_the_payload_is_on_the_base():
     nominal = compile_model(MODEL, EMPTY)
     plant = Plant(mass_factor=1.1, inertia_factor=1.2, payload_kg=0.5)

@@ -5,9 +5,8 @@ import json
 import pytest
 
 import cloudrc
-from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import build_predictor
-from cloudrc.config.robot import facts, find_robot, known_robot
+from cloudrc.config.robot import facts, known_robot
 from cloudrc.config.schema import PlugIn, World
 from cloudrc.errors import BadInputError
 from cloudrc.robots.build import onboard_values
@@ -74,37 +73,6 @@ def test_the_response_belongs_to_a_tuning(own_robot):
     }
     assert constants == {None: 2.0, "a": 3.0, "b": 2.0}
     assert onboard_values(World(robot=str(mine), tuning="a"))["tilt_max_deg"] == 20
-
-
-@pytest.mark.parametrize(
-    ("robot", "predictor", "said"),
-    [
-        ("nano", "{name: model_based, gain_p: [1, 1, 1]}", "gain_p: nano has no model with"),
-        ("pelican", "{name: model_based, robot: nano}", "robot: is no parameter of yours"),
-    ],
-)
-def test_a_parameter_that_the_model_does_not_have_is_one_line(robot, predictor, said):
-    with pytest.raises(BadInputError) as error:
-        load_experiment("steps", [f"world.robot={robot}", f"cloud.predictor={predictor}"])
-    assert said in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        (
-            "response: {time_constant: [220, 220, 68], dead_time: [0, 0, 0], gain: [1, 1, 1]}",
-            "time_constant.0: 220: must be <= 30",
-        ),
-    ],
-)
-def test_a_wrong_response_is_one_line_with_its_key(own_robot, text, said):
-    mine = own_robot(f"onboard: multirotor\n{text}\n")
-    with pytest.raises(BadInputError) as error:
-        find_robot(str(mine))
-    assert said in str(error.value)
-    assert "robot.yaml:2: " in str(error.value)
 
 
 def test_a_model_of_ones_own_may_lie_in_the_folder_and_gets_the_parameters(own_robot):

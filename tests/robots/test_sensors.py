@@ -64,13 +64,6 @@ def test_a_robot_without_a_probe_has_no_contact_force_and_no_number_about_it(see
     assert not [name for name in found.numbers if "force" in name or "impulse" in name]
 
 
-def test_the_contact_force_needs_no_entry_in_sensors(seeing):
-    found = cloudrc.fly("hover", HOVER | {"world.robot": seeing("probe: tip")})
-    assert len(found["/contact_force"]) == len(found["/ground_truth"])
-    assert len(found["/sensor"]) == 0
-    assert len(found["/sensor"]) == 0
-
-
 def test_the_pelican_tells_the_force_on_its_probe_as_its_own_sensor():
     found = cloudrc.fly("hover", HOVER)
     sensor, force = found["/sensor"], found["/contact_force"]

@@ -6,8 +6,6 @@ import pytest
 from cloudrc.config.schema import World
 from cloudrc.robots.shapes import read_shapes
 from cloudrc.sim.engine import mujoco
-from cloudrc.sim.scene import compile_model
-from cloudrc.sim.shapes import shapes_of
 
 SCENE = """<mujoco>
   <option timestep=".002"/>
@@ -73,12 +71,3 @@ def test_the_robot_is_in_the_frame_of_its_base(scene, robot):
     for one, other in zip(turned.robot, level.robot, strict=True):
         assert one.rgba == other.rgba
         np.testing.assert_allclose(one.corners, other.corners, atol=1e-9)
-
-
-def test_a_robot_with_hidden_shapes_for_contacts_shows_the_others(tmp_path, scene):
-    (tmp_path / "robot.xml").write_text("""<mujoco><worldbody><body name="base"><freejoint/>
-      <geom type="box" size=".1 .1 .1" group="2" contype="0" conaffinity="0"/>
-      <geom type="sphere" size=".5" group="3"/><site name="s"/></body></worldbody>
-      <actuator><motor site="s" gear="0 0 1 0 0 0"/></actuator></mujoco>""")
-    found = shapes_of(compile_model(tmp_path / "robot.xml", scene), planar=False)
-    assert found.size == pytest.approx(2 * np.sqrt(0.03))

@@ -44,15 +44,6 @@ def test_torques_are_about_the_centre_of_mass():
     assert frame.wrench[2] == pytest.approx((1.0, 1.0, 1.0, 1.0))
 
 
-def test_a_fused_model_is_the_same_robot():
-    more = '<body pos=".1 0 .3"><geom size=".05" mass=".2"/></body>'
-    text = big(base=more)
-    fused = changed("<mujoco>", '<mujoco><compiler fusestatic="true"/>', text)
-    first, second = read_airframe(compiled(text)), read_airframe(compiled(fused))
-    assert first.inertia == pytest.approx(second.inertia)
-    assert first.wrench == pytest.approx(second.wrench)
-
-
 def test_the_force_range_and_the_gain_limit_a_control():
     more = 'gainprm="2" forcelimited="true" forcerange="1 9"'
     frame = read_airframe(compiled(robot(x_layout(0.14, 0.17, 0.02, 8.0, more=more), 1.3, INERTIA)))
@@ -87,13 +78,3 @@ def test_a_value_that_does_not_fit_is_refused_by_its_name(parameter):
     (name,) = parameter
     with pytest.raises(ValueError, match=name):
         multirotor.build(compiled(nano()), **parameter)
-
-
-def test_a_bandwidth_that_is_too_fast_for_the_lag_is_refused():
-    lagging = changed("<general", '<general dyntype="filter" dynprm=".04"')
-    with pytest.raises(ValueError, match=r"attitude_bandwidth_radps: 30 is not .* up to 25"):
-        multirotor.build(compiled(lagging), attitude_bandwidth_radps=30.0)
-
-
-def test_the_yaw_can_be_left_alone():
-    assert multirotor.build(compiled(with_spins(1, -1, -1, 1)), yaw_bandwidth_radps=0.0)

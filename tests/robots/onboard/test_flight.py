@@ -17,13 +17,6 @@ WEAK = robot(x_layout(0.14, 0.17, 0.02, 6.0), 1.3, ".03 .025 .05").replace('pos=
 """Its thrust is 1.9 times its weight."""
 
 
-def test_a_nano_flies_also_if_it_is_heavier_than_its_model(own_robot):
-    mine = own_robot("onboard: multirotor", MODEL)
-    for factor in (1.0, 1.3):
-        changes = {"world.robot": str(mine), "world.plant.mass_factor": factor}
-        assert cloudrc.fly("hover", HOVER | changes).verdict == "success"
-
-
 def test_the_drag_of_robot_yaml_reaches_the_rotors(own_robot):
     mine = own_robot("onboard: {name: multirotor, drag_s_per_m: 0.02}", MODEL)
     experiment = load_experiment("hover", ["world.scene=empty", f"world.robot={mine}"])

@@ -3,14 +3,11 @@
 from math import inf, nan, nextafter
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.messages import Cause, GuardState
-from cloudrc.tunnel.codec import PLAN_MAX
 from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX
-from tests.world.guard.conftest import DT, MS, TICK, armed, command, run, sensed
+from tests.world.guard.conftest import MS, TICK, armed, command, run
 from tests.world.guard.test_state import told
 
 TRACK, HOLD = GuardState.TRACK, GuardState.HOLD
@@ -74,22 +71,6 @@ def test_a_plan_is_fresh_while_it_lasts(steps, planned_ms, arrival_ms, plan_max_
     assert told(guard) == (until_ms * MS + TICK, HOLD, text)
     assert guard.cause is Cause.SILENCE
     assert guard.accept_command(plan, until_ms * MS + 2 * TICK) == "stale"
-
-
-@pytest.mark.promise("brakes-without-commands")
-@given(
-    ahead_ns=st.integers(0, AGE_MAX_NS),
-    age_ns=st.integers(0, 250 * MS),
-    count=st.integers(1, PLAN_MAX),
-)
-@settings(max_examples=100, deadline=None)
-def test_no_plan_is_flown_longer_than_the_cap_allows(ahead_ns, age_ns, count):
-    arrival_ns = 1000 * MS
-    basis_ns = arrival_ns - age_ns
-    sent = planned([0.1] * (count + 1), basis_ns, basis_ns + ahead_ns)
-    guard = following(sent, now_ns=arrival_ns)
-    guard.step(arrival_ns + 800 * MS + 1, sensed(), DT)
-    assert guard.state is not TRACK
 
 
 def with_a_bad_value(bad, place, axis):

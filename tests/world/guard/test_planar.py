@@ -140,17 +140,6 @@ def test_the_braking_of_the_robot_sets_how_fast_a_hold_slows_down_and_speeds_up(
     assert max(b - a for a, b in pairwise(found)) == pytest.approx(braking * DT)
 
 
-def test_a_robot_that_brakes_less_approaches_the_fence_more_slowly():
-    near = (FENCE.inner_high[0] - 1.0, 0.0, 0.1)
-    speeds = []
-    for braking in (1.0, 3.0):
-        guard = tracking(braking=braking)
-        speeds.append(commanded(guard, (5.0, 0.0, 0.0), SECOND, near)[0])
-        v = speeds[-1]
-        assert v * (0.6 + v / (2.0 * braking)) == pytest.approx(1.0)
-    assert speeds[0] < speeds[1]
-
-
 def test_a_robot_in_the_air_or_water_may_brake_instead_of_landing():
     guard = Guard(LIMITS, FENCE, RobotLimits(stop="brake"))
     guard.start_mission(0)
