@@ -39,11 +39,13 @@ def read_wheels(model: Any, radius: float | None) -> list[Wheel]:
     frame = data.xmat[base].reshape(3, 3)
     wheels = []
     for number in range(model.nu):
-        joint = _wheel_joint(model, number)
+        turns = model.actuator_trntype[number] == mujoco.mjtTrn.mjTRN_JOINT
+        joint = int(model.actuator_trnid[number, 0]) if turns else 0  # joint 0 is no hinge
+        size = radius or _radius(model, joint)
+        if wrong := _what_is_wrong(model, number, joint, data.xaxis[joint] @ frame, size):
+            name = model.actuator(number).name.removeprefix(ROBOT_PREFIX) or number
+            raise ValueError(f"actuator '{name}': {wrong}")
         axis = data.xaxis[joint] @ frame
-        if hypot(axis[0], axis[2]) > LEVEL:
-            raise _refusal(model, number, "its axis must point along the base's y")
-        size = radius or _radius(model, number, joint)
         gear = float(model.actuator_gear[number, 0] * np.sign(axis[1]))
         most = model.actuator_ctrlrange[number] if model.actuator_ctrllimited[number] else [inf]
         speed_max = float(np.abs(most).min()) * size / abs(gear)
@@ -54,27 +56,20 @@ def read_wheels(model: Any, radius: float | None) -> list[Wheel]:
     return wheels
 
 
-def _wheel_joint(model: Any, number: int) -> int:
-    """Return the hinge that an actuator turns; raise a ValueError if it is no wheel's servo."""
-    joint = int(model.actuator_trnid[number, 0])
-    kind = model.actuator_trntype[number]
-    if kind != mujoco.mjtTrn.mjTRN_JOINT or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
-        raise _refusal(model, number, "it must turn the hinge of a wheel")
+def _what_is_wrong(model: Any, number: int, joint: int, axis: Any, radius: float) -> str:
+    """Return why an actuator is no servo of a wheel with this joint, axis [1] and radius [m]."""
     gain, bias = model.actuator_gainprm[number, 0], model.actuator_biasprm[number]
+    if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
+        return "it must turn the hinge of a wheel"
     if not gain > 0.0 or bias[2] != -gain or bias[:2].any() or not model.actuator_gear[number, 0]:
-        raise _refusal(model, number, "it must be a velocity servo, in MJCF: <velocity kv=...>")
-    return joint
+        return "it must be a velocity servo, in MJCF: <velocity kv=...>"
+    if hypot(axis[0], axis[2]) > LEVEL:
+        return "its axis must point along the base's y"
+    return "" if radius else "its wheel has no round geom; set onboard.wheel_radius_m"
 
 
-def _radius(model: Any, number: int, joint: int) -> float:
-    body = model.jnt_bodyid[joint]
-    geoms = np.flatnonzero(model.geom_bodyid == body)
-    radii = [model.geom_size[geom, 0] for geom in geoms if model.geom_type[geom] in ROUND]
-    if not radii:
-        raise _refusal(model, number, "its wheel has no round geom; set onboard.wheel_radius_m")
-    return float(max(radii))
-
-
-def _refusal(model: Any, number: int, reason: str) -> ValueError:
-    name = model.actuator(number).name.removeprefix(ROBOT_PREFIX) or number
-    return ValueError(f"actuator '{name}': {reason}")
+def _radius(model: Any, joint: int) -> float:
+    """Return the radius of the largest round geom at a joint [m]; 0 without one."""
+    geoms = np.flatnonzero(model.geom_bodyid == model.jnt_bodyid[joint])
+    round_ = (model.geom_size[geom, 0] for geom in geoms if model.geom_type[geom] in ROUND)
+    return float(max(round_, default=0.0))

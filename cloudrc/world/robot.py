@@ -157,7 +157,6 @@ class AcceleratedRobot(Robot):
             return super().run(tick_ns, until_ns)
         try:
             ended_ns = self._faster.run(tick_ns, until_ns)
-            RESULT.array(self.simulator.data.qpos, "position")
             RESULT.array(self.simulator.data.qvel, "velocity")
         except FAILURES as error:
             self._has_failed = True

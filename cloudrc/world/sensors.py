@@ -28,9 +28,9 @@ class Errors(NamedTuple):
         """Return the vector `true` plus these errors, shape (3,), any unit."""
         if self == NONE:
             return true
-        (x, y, z), (bias_x, bias_y, bias_z) = true, self.bias
-        more_x, more_y, more_z = rng.normal(0.0, self.noise, 3).tolist() if self.noise else ZERO
-        return (x + bias_x + more_x, y + bias_y + more_y, z + bias_z + more_z)
+        more = rng.normal(0.0, self.noise, 3) if self.noise else ZERO
+        x, y, z = (np.add(true, self.bias) + more).tolist()
+        return (x, y, z)
 
 
 NONE = Errors()
