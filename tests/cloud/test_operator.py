@@ -3,10 +3,9 @@
 import pytest
 
 from cloudrc import assembly
-from cloudrc.cloud.operator import REPEAT_NS, EmergencyStopRepeater, make_robot_status
+from cloudrc.cloud.operator import REPEAT_NS, EmergencyStopRepeater
 from cloudrc.config.load import load_experiment
-from cloudrc.messages import NEVER_NS, Cause, GuardState, OperatorRequest, Request
-from tests.exposition.test_live import told
+from cloudrc.messages import GuardState, OperatorRequest, Request
 
 ESTOP, TRACK = GuardState.ESTOP, GuardState.TRACK
 
@@ -36,28 +35,6 @@ def test_an_alarm_stays_above_all_other_requests():
     alarm.see(TRACK, 4)  # a start with a number of teleop
     assert alarm.due(4, REPEAT_NS).number == 5
     assert alarm.due(7, 2 * REPEAT_NS).number == 8
-
-
-def test_a_status_has_the_values_of_its_telemetry():
-    values = {
-        "slip_ns": 5,
-        "mission": 6,
-        "guard": ESTOP,
-        "obstacle_contacts": 8,
-        "touch_speed": 0.9,
-        "sensors": (11.9,),
-    }
-    values |= {"mission_id": 10, "reached": 11, "cause": Cause.STOPPED}
-    telemetry = told(0.1, velocity=(1.0, 2.0, 3.0), **values, echo_hold_ns=7).telemetry
-    status = make_robot_status(telemetry, 12, "world", 0.03, None)
-    assert {name: getattr(status, name) for name in values} == values
-    assert (status.epoch, status.world, status.stamp_ns) == (12, "world", 100_000_000)
-    odometry = telemetry.odometry
-    assert (status.position, status.velocity) == (odometry.position, odometry.velocity)
-    assert status.orientation_wxyz == odometry.orientation_wxyz
-    assert (status.command_age_ns, status.uplink_delay) == (NEVER_NS, 0.03)
-    applied = telemetry._replace(echo_stamp_ns=1)
-    assert make_robot_status(applied, 12, "world", 0.03, None).command_age_ns == 7
 
 
 def test_round_trip_and_uplink_of_a_status_give_the_downlink():

@@ -9,8 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.config.hull import hull_of, known_hull
-from cloudrc.config.scene import scene_of
-from cloudrc.config.schema import World
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.geometry.clearance import (
     clearance,
@@ -19,7 +17,6 @@ from cloudrc.geometry.clearance import (
     place_points,
     tube_index,
 )
-from cloudrc.geometry.obstacles import obstacles
 from cloudrc.geometry.scene import Tube, load_scene
 
 PIPES = load_scene("pipes")
@@ -91,23 +88,6 @@ def test_the_least_clearance_is_that_of_all_poses_to_the_bit(seed, count, step):
     facing /= np.linalg.norm(facing, axis=1)[:, None]
     every = clearance(TUBES, positions, facing, FEW)
     assert least_clearance(TUBES, positions, facing, FEW) == every.min(initial=math.inf)
-
-
-@pytest.mark.parametrize(
-    ("robot", "at", "expected"),
-    [
-        # A pillar of 0.2 m radius at x = 1.5 m; the ball of the robot reaches to the wall.
-        ("nano", (0.5, 0.0, 1.0), 0.8),
-        ("rover", (0.5, 0.0, 0.1), 0.8),
-        ("rover", (-2.5, 0.0, 0.1), 3.8),  # also where it is far
-        ("pelican", (0.5, 0.0, 1.0), 0.39),  # the tip of its arm
-    ],
-)
-def test_clearance_is_known_for_every_robot_and_scene(robot, at, expected):
-    hull = hull_of(robot)
-    reach = 0.0 if robot == "pelican" else hull.radii[0]
-    found = clearance(obstacles(scene_of(World(scene="pillars")), touch=None), [at], [LEVEL], hull)
-    assert found == pytest.approx([expected - reach], abs=0.01)
 
 
 def test_the_ball_of_a_robot_holds_its_geoms(tmp_path, monkeypatch):

@@ -83,21 +83,6 @@ def test_a_waypoint_that_the_guard_forbids_is_refused(position, tolerance, outsi
 
 
 @pytest.mark.parametrize(
-    ("positions", "start", "reason"),
-    [
-        ([(0.5, 0.0, 1.2)], "spawn", ""),  # the example of goto
-        ([(0.0, 0.0, 1.2)], "spawn", "the spawn leads through"),
-        ([(0.0, 0.0, 1.2)], "here", ""),
-        ([(0.0, 0.0, 0.8)], "here", "the robot would be within 0.04 m"),
-        ([(-1.0, 0.0, 0.7), (0.5, 0.0, 0.7)], "here", "from waypoint 0 leads through the wall"),
-    ],
-)
-def test_a_mission_with_a_wall_on_its_way_is_refused(positions, start, reason):
-    said = refusals(*positions, start=start)
-    assert reason in said if reason else said == ""
-
-
-@pytest.mark.parametrize(
     ("steps", "scene", "reason"),
     [
         ({"centre_m": (1e308, 0, 1), "range_m": (1e308, 0, 0)}, "empty", "beyond the fence"),

@@ -13,7 +13,7 @@ from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
 from cloudrc.metrics.velocity_loop import identify, series
-from cloudrc.robots.build import check_robot, onboard_values
+from cloudrc.robots.build import check_robot
 from tests.conftest import nightly
 
 
@@ -53,16 +53,6 @@ def test_the_experiment_fast_flies_other_robots_faster(robot):
     assert all(fast < usual for usual, fast in zip(*fits, strict=True))
 
 
-def test_an_experiment_goes_before_the_tuning_and_the_tuning_before_the_robot(own_robot):
-    mine = own_robot(
-        "onboard: {name: multirotor, tilt_max_deg: 20, velocity_bandwidth_radps: 1}\n"
-        "tunings: {fast: {tilt_max_deg: 30, velocity_bandwidth_radps: 2}}"
-    )
-    keys = {"robot": str(mine), "tuning": "fast", "onboard": {"tilt_max_deg": 40.0}}
-    values = onboard_values(world(**keys))
-    assert (values["tilt_max_deg"], values["velocity_bandwidth_radps"]) == (40.0, 2)
-    assert values["drag_s_per_m"] == 0.0  # default of the plug-in
-    assert onboard_values(world(robot=str(mine)))["tilt_max_deg"] == 20
 
 
 @pytest.mark.parametrize(

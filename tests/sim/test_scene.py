@@ -113,8 +113,6 @@ def test_each_geom_has_the_name_of_its_body_and_the_robot_none(tmp_path):
         ("scene", '<body name="floor">', "<body>", "needs a body named floor"),
         ("robot", 'size=".05 .05 .10"', 'size=".05 .05 .10" margin=".3"',
                   "has a margin or gap"),
-        ("robot", 'size=".05 .05 .10"', 'size=".05 .05 .10" contype="2" conaffinity="2"',
-                  "has contype 2 and conaffinity 2, which"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_flown_is_refused_by_name(tmp_path, monkeypatch, kind, old, new, message):

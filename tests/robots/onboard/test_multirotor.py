@@ -1,7 +1,5 @@
 """One controller flies multirotors of any size and layout; how well, and how it saturates."""
 
-from math import radians
-
 import numpy as np
 import pytest
 
@@ -162,21 +160,6 @@ def test_a_robot_that_turns_only_with_its_roll_flies_with_its_yaw_left_alone():
     assert velocities[-1] == pytest.approx((-1.0, 1.0, -0.5), abs=0.02)
     assert abs(flight.yaw) < 0.3
     assert flight.tilt < 36.0
-
-
-def test_a_slow_robot_has_slower_defaults():
-    def gains(inertia, more=""):
-        rotors = x_layout(0.14, 0.17, 0.02, 8.0, more=more)
-        return multirotor.build(compiled(robot(rotors, 1.3, inertia))).gains
-
-    quick, slow = gains(".03 .025 .05"), gains(".12 .1 .2")
-    assert (quick.attitude, quick.velocity, quick.yaw) == (20.0, 5.0, 4.0)
-    # Large turns saturate the actuators: twice the inertia takes 2^.5 times as long.
-    assert slow.attitude * 2**0.5 == pytest.approx(gains(".06 .05 .1").attitude)
-    assert slow.velocity == pytest.approx(slow.attitude / 4.0)
-    lagging = gains(".03 .025 .05", 'dyntype="filter" dynprm=".04"')
-    assert lagging.attitude == pytest.approx(10.0)
-    assert quick.tilt_max == pytest.approx(radians(35.0))
 
 
 def test_drag_slows_the_hubs_across_the_axes_of_their_rotors():
