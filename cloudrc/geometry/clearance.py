@@ -110,12 +110,12 @@ def clearance(
 
 
 def least_clearance(
-    obstacles: Sequence[Obstacle],
-    positions: ArrayLike,
-    orientations_wxyz: ArrayLike,
-    points: Spheres,
+    obstacles: Sequence[Obstacle], at: Array, facing: Array, points: Spheres
 ) -> float:
     """Compute the smallest `clearance` of n poses along a path [m]; infinite without poses.
+
+    `at` has the positions of the base [m], shape (n, 3), `facing` the orientations (unit
+    quaternions), shape (n, 4).
 
     The result is exactly that of all poses, although most poses are skipped. Between two poses no
     point of the robot moves further than s = |dp| + 2 R |dq| (base position p, quaternion q, and
@@ -123,8 +123,6 @@ def least_clearance(
     b the clearance is at least (a + b - s) / 2. An interval is halved only if this bound is below
     the smallest clearance found so far.
     """
-    at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
-    facing = np.asarray(orientations_wxyz, dtype=np.float64).reshape(-1, 4)
     if not len(at) or not obstacles:
         return np.inf
     reach = np.linalg.norm(points.positions, axis=1).max()
@@ -144,18 +142,16 @@ def least_clearance(
     return float(found.min())
 
 
-def tube_index(scene: Scene, positions: ArrayLike) -> NDArray[np.int64]:
-    """Return the index of the first tube whose bore contains the base, or -1; shape (n,).
+def inside_tube(scene: Scene, positions: Array) -> NDArray[np.bool_]:
+    """Return whether the base is in the bore of a tube, shape (n,).
 
-    The base is in the bore if it is between both ends and nearer to the axis than the inner radius.
-    `positions` are those of the base [m], world frame, shape (n, 3).
+    That is between both ends, and nearer to the axis than the inner radius. `positions` are those
+    of the base [m], world frame, shape (n, 3).
     """
-    at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
-    result = np.full(len(at), -1, dtype=np.int64)
-    for index in reversed(range(len(scene.tubes))):
-        tube = scene.tubes[index]
-        relative = at - np.asarray(tube.centre)
+    result = np.zeros(len(positions), dtype=np.bool_)
+    for tube in scene.tubes:
+        relative = positions - np.asarray(tube.centre)
         s = relative @ np.asarray(tube.axis)
         r = np.linalg.norm(relative - s[:, None] * np.asarray(tube.axis), axis=1)
-        result[(np.abs(s) <= 0.5 * tube.length) & (r < tube.inner)] = index
+        result |= (np.abs(s) <= 0.5 * tube.length) & (r < tube.inner)
     return result

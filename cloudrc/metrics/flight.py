@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.config.schema import Criteria, MissionConfig
-from cloudrc.geometry.clearance import Spheres, clearance, least_clearance, tube_index
+from cloudrc.geometry.clearance import Spheres, clearance, inside_tube, least_clearance
 from cloudrc.geometry.obstacles import Obstacle, has_surface, obstacles
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
@@ -207,7 +207,7 @@ class Flight:
     @cached_property
     def inside(self) -> Array:
         """Whether the robot's base is inside a tube, per row of `truth`."""
-        return tube_index(self.scene, self.truth["position"]) >= 0
+        return inside_tube(self.scene, self.truth["position"])
 
     def count(self, number: float) -> float | None:
         """Return `number` [any unit] as the value of a metric; None if the robot never flew."""

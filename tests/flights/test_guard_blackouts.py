@@ -8,7 +8,7 @@ import pytest
 from cloudrc.faults import measures
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.schedule import FaultEvent, Schedule
-from cloudrc.geometry.clearance import tube_index
+from cloudrc.geometry.clearance import inside_tube
 from cloudrc.geometry.scene import load_scene
 from tests.conftest import nightly
 
@@ -30,9 +30,10 @@ def mid_pipe(*settings):
     """200 instants [s], evenly over the time in which the undisturbed robot is in a pipe."""
     flight = undisturbed(*settings)
     path = flight.trajectory()
-    pipes = tube_index(load_scene("pipes"), [record.odometry.position for record in path])
+    places = np.array([record.odometry.position for record in path])
+    pipes = inside_tube(load_scene("pipes"), places)
     ended = flight.events("done")[0].stamp_ns * 1e-9 - 0.1
-    inside = [r.stamp_ns * 1e-9 for r, pipe in zip(path, pipes, strict=True) if pipe >= 0]
+    inside = [r.stamp_ns * 1e-9 for r, pipe in zip(path, pipes, strict=True) if pipe]
     early = [time for time in inside if time < ended]
     return [early[round(k)] for k in np.linspace(0, len(early) - 1, COUNT)]
 

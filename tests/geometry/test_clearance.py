@@ -13,9 +13,9 @@ from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.geometry.clearance import (
     clearance,
     clearance_per_obstacle,
+    inside_tube,
     least_clearance,
     place_points,
-    tube_index,
 )
 from cloudrc.geometry.scene import Tube, load_scene
 
@@ -74,8 +74,8 @@ def test_points_are_those_of_the_plant_and_turn_with_the_robot():
 def test_inside_a_pipe_is_in_its_bore_and_between_its_ends():
     inside = [(-1, 2.5, 0.8), (-1, 0, 1.461), (5.66, -6.42, 0.8)]
     outside = [(-1, 2.501, 0.8), (-1, 0, 1.463), (0.5, 0, 0.7)]
-    assert tube_index(PIPES, [*inside, *outside]).tolist() == [0, 0, 2, -1, -1, -1]
-    assert set(tube_index(load_scene("empty"), inside)) == {-1}
+    assert inside_tube(PIPES, np.array([*inside, *outside])).tolist() == [True] * 3 + [False] * 3
+    assert not inside_tube(load_scene("empty"), np.array(inside)).any()
 
 
 @settings(max_examples=30, deadline=None)
