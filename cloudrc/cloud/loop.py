@@ -63,7 +63,7 @@ GOES_ON = "cloud goes on using it"
 PLAN_STEP = PLAN_STEP_NS * 1e-9
 """Time between two velocities of a plan [s]."""
 PLANNED_MAX = 1000.0
-"""Largest component of a planned velocity [m/s]; the guard refuses a plan with a larger one.
+"""Largest component of a planned velocity [m/s]; the guard takes no plan with a larger one.
 Source: docs/reference/faults.md, "F23"."""
 
 
@@ -343,7 +343,7 @@ class ControlLoop:
 
         Returns:
             One velocity [m/s] per PLAN_STEP after the command, and the position [m] for which it
-            was computed. The plan ends before the first velocity that the guard would refuse. It is
+            was computed. The plan ends before the first velocity that the guard rejects. It is
             empty if the predictor has no model, or if a plug-in fails.
         """
         plan, positions, plug_in = list[Vector](), list[Vector](), "predictor"

@@ -15,7 +15,7 @@ ROUNDING = 1e-9
 
 
 class Planar(Controller):
-    """Lets a controller see and steer the plane alone, and refuses its vertical velocities."""
+    """Lets a controller see and steer the plane alone; a vertical velocity is a failure."""
 
     def __init__(self, controller: Controller, name: str) -> None:
         """Wrap `controller`; errors call it `name`."""

@@ -116,7 +116,7 @@ def load_scene(name: str, corners: Corners | None = None) -> Scene:
 def _parse(path: Path) -> ElementTree.Element:
     """Read an MJCF file; each `<include>` has become the content of its file, as in MuJoCo.
 
-    A file that is missing or included twice is left out: MuJoCo refuses it with its reason.
+    A file that is missing or included twice is left out: MuJoCo says why it is wrong.
     """
     root, known = ElementTree.parse(path).getroot(), {path}
 

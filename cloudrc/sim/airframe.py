@@ -168,7 +168,7 @@ def span(frame: Airframe) -> Array:
 
 
 def _check_actuator(model: Any, number: int, name: str) -> None:
-    """Refuse an actuator that does not push at a site of the robot by gain times control."""
+    """Raise an error if an actuator does not push at a site by gain times control."""
     site, reference = model.actuator_trnid[number]
     pushes = (
         model.actuator_trntype[number] == mujoco.mjtTrn.mjTRN_SITE
@@ -203,7 +203,7 @@ def _limits(model: Any, number: int) -> tuple[float, float]:
 
 
 def _check_directions(frame: Airframe) -> None:
-    """Refuse a robot whose actuators cannot make each force and torque by itself."""
+    """Raise an error if the actuators cannot make each force and torque by itself."""
     known = np.empty((0, len(frame.names)))
     rows = frame.wrench * span(frame)
     for (direction, hint), row in zip(HINTS.items(), rows, strict=False):

@@ -27,7 +27,7 @@ _SHAPES: dict[Any, Shape] = {
 """Type of a geom -> shape of its solid; all other types become an outline."""
 ROBOT_BITS = 1
 """Value of contype and conaffinity of the robot's geoms, as far as a scene is concerned: a flight
-whose robot meets other geoms is refused."""
+whose robot meets other geoms does not begin."""
 
 
 def read_scene(path: Path) -> Any:

@@ -239,7 +239,7 @@ def _check_parts(model: Any, robot_path: Path, scene_path: Path) -> None:
 
 
 def _check_geoms(model: Any, where: str) -> None:
-    """Refuse contacts that path checks, clearances and notes do not know.
+    """Raise an error about contacts that path checks, clearances and notes do not know.
 
     With a margin, contacts do not begin at the surface. The checks know the scene alone: for them,
     a robot meets the geoms that have one of ROBOT_BITS.

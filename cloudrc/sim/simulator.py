@@ -73,7 +73,7 @@ class Simulator:
         """Put the robot of a compiled `MjModel` at its spawn; without `wind` the air is at rest.
 
         `probe` is the name of the site with which the robot touches; None: any part touches.
-        `sensors` are the robot's own sensors. With `judges`, refuse wrong inputs of the actuators.
+        `sensors` are the robot's own sensors. With `judges`, wrong inputs are errors.
 
         Raises:
             ValueError: If the model has no such site.

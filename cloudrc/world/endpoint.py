@@ -150,7 +150,7 @@ class WorldEndpoint(TunnelEnd):
 
         If the simulation lags by more than CATCH_UP_NS, add the excess to the slip. If it lags by
         more than the largest age of a command, world has stalled, and datagrams read at this
-        `now_ns` may have waited in the socket. Then store `now_ns`, to refuse them as stale.
+        `now_ns` may have waited in the socket. Then store `now_ns`: they are stale.
         """
         world_ns = now_ns - self._slip_ns
         behind_ns = world_ns - self._tick_ns

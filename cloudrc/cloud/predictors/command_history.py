@@ -142,7 +142,7 @@ def build(
 
     Raises:
         ValueError: If neither robot nor parameters tell the response.
-        BadInputError: If the file is no model.
+        CloudrcError: If the file is no model.
     """
     response = robot.response if robot else None
     given = {"time_constant": time_constant, "dead_time": dead_time, "gain": gain}

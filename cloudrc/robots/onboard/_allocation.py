@@ -125,7 +125,7 @@ class Allocation:
 
 
 def _check_hover(frame: Airframe, hover: Array, braking: float) -> float:
-    """Return the share [1] of the largest thrust that hover needs; refuse a robot without room."""
+    """Return the share [1] of the largest thrust that hover needs; there must be room."""
     share = 0.0
     for name, value, low, high in zip(frame.names, hover, frame.low, frame.high, strict=True):
         # A control that lifts when it is negative is the mirror image of a usual one.

@@ -253,7 +253,7 @@ def build(
             force: force relative to the thrust of a rotor and to the velocity of its hub across its
             axis [s/m]. Default: no drag. The robots nano and x2 have 0.0258 and 0.0282.
         braking_mps2: Deceleration that the guard expects [m/s^2]; a robot without the thrust to
-            stop a descent with it is refused. It comes from `guard` in robot.yaml.
+            stop a descent with it cannot be flown. It comes from `guard` in robot.yaml.
 
     Raises:
         ValueError: If the controller cannot fly the model, or a value does not fit.

@@ -48,7 +48,7 @@ DRAG = 0.155
 """Deceleration per velocity across the thrust axis, with the rotors at hover speed [1/s].
 Source: docs/reference/plant.md, "Rotor drag"."""
 FLOOR_MARGIN = 0.35
-"""Height below which the guard refuses to descend [m]. Source: docs/safety.md, "Limits"."""
+"""Height below which the guard does not descend [m]. Source: docs/safety.md, "Limits"."""
 THRUST_MAX = 134.9
 """Largest thrust of the four rotors [N]. Source: docs/reference/plant.md, "Rotor speed"."""
 GAIN_ACCELERATION, GAIN_TORQUE = 0.3, 0.1
