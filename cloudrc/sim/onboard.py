@@ -76,7 +76,7 @@ class Accelerator(NamedTuple):
     A plug-in of an onboard controller may have a function `accelerator()` that returns it.
     """
 
-    # Makes a robot of simulator, onboard controller and guard; None: this machine cannot run it.
+    # Makes a `Robot` of simulator, onboard controller and guard; None: this machine cannot run it.
     make: Callable[..., Any] | None
     text: str  # language of the steps, and where the code is from or why it is missing
     code: str = ""  # hash of the machine code
