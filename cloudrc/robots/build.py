@@ -59,7 +59,7 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     onboard = _build_onboard(world, robot, nominal)
     model = _change(world, robot, nominal)
     actuators = _build_actuators(plugin, nominal, parameters(robot, world))
-    is_direct = isinstance(actuators, Direct)
+    is_direct = type(actuators) is Direct  # RotorDrag has drag
     if is_direct and not plugin.is_shipped:
         with plugin.calling("build"):
             RESULT.row(onboard.stopped, nominal.nu, "stopped")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cloudrc.cloud.predictors import command_history, kalman, model_based
-from cloudrc.cloud.predictors._history import History
+from cloudrc.cloud.predictors._history import Replay
 from cloudrc.config.robot import facts
 from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
@@ -45,11 +45,11 @@ def in_ms(parts):
     ],
 )
 def test_the_echoes_show_the_past(echoes, start_ms, end_ms, parts):
-    history = History()
+    history = Replay()
     for k in range(10):
-        history.add(command(10 * k, float(k)))
+        history.commanded(command(10 * k, float(k)))
     for k, at_ms in echoes:
-        history.note_applied(command(10 * k, 0).stamp_ns, at_ms * MS)
+        history.applied(command(10 * k, 0).stamp_ns, at_ms * MS)
     assert in_ms(history.past(start_ms * MS, end_ms * MS)) == parts
 
 
@@ -59,13 +59,13 @@ def test_the_echoes_show_the_past(echoes, start_ms, end_ms, parts):
 )
 def test_the_shift_gives_commands_their_mean_age(every, period_ms, odometry_ms, expected):
     """Commands take 50 ms, and each `every`-th arrives: without its successor it acts longer."""
-    history = History()
+    history = Replay()
     for k in range(400):
-        history.add(command(period_ms * k, 0.0))
+        history.commanded(command(period_ms * k, 0.0))
         begins_ms = period_ms * k + 50
-        history.seen_ns = (begins_ms - 1) // odometry_ms * odometry_ms * MS
+        history.observe(sample((begins_ms - 1) // odometry_ms * odometry_ms))
         if k % every == 0 and begins_ms % odometry_ms < period_ms:
-            history.note_applied(command(period_ms * k, 0).stamp_ns, begins_ms * MS)
+            history.applied(command(period_ms * k, 0).stamp_ns, begins_ms * MS)
     shift_ms = (history.shift_ns(sample(0), 0.1) + AHEAD) / MS
     assert shift_ms == pytest.approx(expected, abs=1.5)
 
@@ -74,7 +74,7 @@ def test_a_history_forgets_the_oldest_commands():
     predictor = command_history.build(robot=PELICAN)
     for k in range(5000):
         predictor.commanded(command(10 * k, 1.0))
-    assert len(predictor.history.stamps) < 4096
+    assert len(predictor.stamps) < 4096
     predictor.applied(command(49_940, 0).stamp_ns, 49_990 * MS)
     at_speed = predictor.predict(sample(49_990, v=1.0), 0.05)
     assert at_speed.position[0] == pytest.approx(0.05, abs=1e-6)
@@ -135,11 +135,11 @@ def along_x(segments):
 
 
 def test_the_past_has_the_steps_of_the_applied_plans():
-    history = History()
-    history.add(planned(0, 100, 1.0, 2.0, 3.0))
-    history.add(planned(10, 110, 5.0, 6.0, 7.0))
-    history.note_applied(0, 112 * MS)
-    history.note_applied(10 * MS, 124 * MS)
+    history = Replay()
+    history.commanded(planned(0, 100, 1.0, 2.0, 3.0))
+    history.commanded(planned(10, 110, 5.0, 6.0, 7.0))
+    history.applied(0, 112 * MS)
+    history.applied(10 * MS, 124 * MS)
     assert along_x(history.past(114 * MS, 134 * MS)) == [
         *((2.0, 0.006), (3.0, 0.004), (6.0, 0.006), (7.0, 0.004)),
     ]

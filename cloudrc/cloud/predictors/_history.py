@@ -29,48 +29,54 @@ FOLLOWED_NS = 1_000_000_000
 NO_COMMAND = Command(0, 0, 0, ZERO, 0.0)
 
 
-class History:
-    """The `commands` of a session, oldest first, and their `stamps` [ns], cloud's clock.
+class Replay(Predictor):
+    """Base of the predictors that feed the sent commands to a model of the robot.
 
-    `seen_ns` is the stamp of the newest odometry [ns], world's clock.
+    Attributes:
+        commands: Those of the session, oldest first.
+        stamps: Theirs [ns], cloud's clock.
+        newest: The newest odometry sample.
     """
 
     def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all samples, commands and echoes."""
         self.stamps: list[int] = []
         self.commands: list[Command] = []
-        self.seen_ns = NEVER_NS
+        self.newest: Odometry | None = None
         self._applied: deque[tuple[int, int]] = deque(maxlen=COUNT)  # beginning and stamp [ns]
         self._shift_ns = 0.0
+        self._last: Body | None = None
 
-    def add(self, command: Command) -> bool:
-        """Store a sent command and return True.
-
-        If the command is not newer than the last stored command, ignore it and return False.
-        """
+    def commanded(self, command: Command) -> None:
+        """Store a sent command, unless it is not newer than the last one."""
         if self.stamps and command.stamp_ns <= self.stamps[-1]:
-            return False
+            return
         self.stamps.append(command.stamp_ns)
         self.commands.append(command)
         if len(self.stamps) == 2 * COUNT:
             del self.stamps[:COUNT], self.commands[:COUNT]
-        return True
 
     @property
     def _period_ns(self) -> int:
         return self.stamps[-1] - self.stamps[-2] if len(self.stamps) > 1 else PERIOD_NS
 
-    def note_applied(self, stamp_ns: int, began_ns: int) -> None:
+    def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
         """Update the mean shift: the mean time from a command's stamp to its application.
 
-        World applied the command with the stamp `stamp_ns` (cloud's clock) at `began_ns` (world's
-        clock), both [ns].
+        World applied the command with the stamp `command_stamp_ns` (cloud's clock) at `applied_ns`
+        (world's clock), both [ns].
         """
+        stamp_ns, began_ns = command_stamp_ns, applied_ns
         last_began_ns, last_stamp_ns = self._applied[-1] if self._applied else (NEVER_NS, 0)
         lasted_ns = began_ns - last_began_ns
         if lasted_ns <= 0:
             return  # from late telemetry
         # The echoes of other commands since the newest odometry may be late or lost.
-        lasted_ns = min(lasted_ns, max(self.seen_ns - last_began_ns, 0) + self._period_ns)
+        seen_ns = self.newest.stamp_ns if self.newest else NEVER_NS
+        lasted_ns = min(lasted_ns, max(seen_ns - last_began_ns, 0) + self._period_ns)
         if not self._applied or lasted_ns > SILENCE_NS:
             self._shift_ns = began_ns - stamp_ns
         else:
@@ -148,33 +154,9 @@ class History:
             start_ns = until_ns
         return parts
 
-
-class Replay(Predictor):
-    """Base of the predictors that feed the sent commands to a model of the robot."""
-
-    def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all samples, commands and echoes."""
-        self.history = History()
-        self.newest: Odometry | None = None
-        self._last: Body | None = None
-
-    def commanded(self, command: Command) -> None:
-        """Store the command."""
-        self.history.add(command)
-
-    def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
-        """Store the time `applied_ns` from which the robot follows the command with this stamp.
-
-        The time is on world's clock [ns], `command_stamp_ns` is on cloud's clock [ns].
-        """
-        self.history.note_applied(command_stamp_ns, applied_ns)
-
     def observe(self, odometry: Odometry) -> None:
         """Store the newest odometry sample."""
-        self.newest, self.history.seen_ns = odometry, odometry.stamp_ns
+        self.newest = odometry
 
     def roll(self, odometry: Odometry, horizon: float) -> Body:
         """Return a model of the robot in the state `horizon` [s] after `odometry`."""

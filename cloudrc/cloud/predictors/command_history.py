@@ -87,27 +87,27 @@ class CommandHistory(Replay):
     def commanded(self, command: Command) -> None:
         """Store a command, and the state of the predictor's model at the command's stamp."""
         body = self._at(command.stamp_ns)
-        if self.history.add(command):
-            if len(self._bodies) >= len(self.history.stamps):
+        super().commanded(command)
+        if len(self._bodies) != len(self.stamps):  # it is stored
+            if len(self._bodies) > len(self.stamps):  # the oldest are forgotten
                 del self._bodies[:COUNT]
             self._bodies.append(body)
 
     def _at(self, time_ns: int) -> FirstOrder:
         """Return the predictor's model of the robot at `time_ns`, on cloud's clock [ns]."""
-        history = self.history
-        if not history.stamps:
+        if not self.stamps:
             return FirstOrder(*self._loop)
-        index = max(bisect_right(history.stamps, time_ns) - 1, 0)
-        body, since_ns = copy(self._bodies[index]), history.commands[index].planned_ns
-        end_ns = since_ns + time_ns - history.stamps[index]
-        for velocity, duration in history.followed(index + 1, since_ns, end_ns):
+        index = max(bisect_right(self.stamps, time_ns) - 1, 0)
+        body, since_ns = copy(self._bodies[index]), self.commands[index].planned_ns
+        end_ns = since_ns + time_ns - self.stamps[index]
+        for velocity, duration in self.followed(index + 1, since_ns, end_ns):
             if duration > 0.0:
                 body.advance(velocity, duration)
         return body
 
     def roll(self, odometry: Odometry, horizon: float) -> FirstOrder:
         """Return the model in its predicted state, `horizon` [s] after the sample `odometry`."""
-        start_ns = odometry.stamp_ns - self.history.shift_ns(odometry, horizon)
+        start_ns = odometry.stamp_ns - self.shift_ns(odometry, horizon)
         start, body = self._at(start_ns), self._at(start_ns + round(horizon * 1e9))
         axes = []
         for v, p, v0, p0, v1, p1, (constant, _, _) in zip(

@@ -43,9 +43,9 @@ class ModelBased(Replay):
         body = copy(self._body)
         if body is None or not 0 < stamp_ns - body.basis.stamp_ns < GAP_NS:
             return None
-        if self.history.is_silent(stamp_ns):  # the guard holds the robot
+        if self.is_silent(stamp_ns):  # the guard holds the robot
             return None
-        for velocity, duration in self.history.past(body.basis.stamp_ns, stamp_ns):
+        for velocity, duration in self.past(body.basis.stamp_ns, stamp_ns):
             body.advance(velocity, duration)
         return body
 
@@ -61,9 +61,9 @@ class ModelBased(Replay):
             self.observe(odometry)
         assert self._body is not None
         body = copy(self._body)
-        start_ns, shift_ns = odometry.stamp_ns, self.history.shift_ns(odometry, horizon)
+        start_ns, shift_ns = odometry.stamp_ns, self.shift_ns(odometry, horizon)
         end_ns = start_ns + round(horizon * 1e9)
-        for velocity, duration in self.history.ahead(start_ns, end_ns, shift_ns):
+        for velocity, duration in self.ahead(start_ns, end_ns, shift_ns):
             body.advance(velocity, duration)
         body.horizon = horizon
         return body

@@ -7,25 +7,19 @@ from typing import Any
 import numpy as np
 
 from cloudrc.sim.airframe import read_thrusters
-from cloudrc.sim.onboard import Commands, Inputs
+from cloudrc.sim.onboard import Commands, Direct, Inputs
 from cloudrc.sim.readings import Readings
 
 
-class RotorDrag:
-    """Actuators that MuJoCo simulates, with rotors whose drag is added.
-
-    Attributes:
-        speeds: The commands of the last step.
-    """
-
-    speeds: Commands
+class RotorDrag(Direct):
+    """Actuators that MuJoCo simulates, with rotors whose drag is added."""
 
     def __init__(self, model: Any, drag: float) -> None:
         """Read the rotors from a compiled `MjModel`.
 
         `drag` is the drag force relative to the thrust and to the velocity [s/m].
         """
-        self._rest: Commands = (0.0,) * model.nu
+        super().__init__(model.nu)
         # Place of each rotor, its axis, and its drag per control and velocity.
         self._rotors: list[tuple[float, ...]] = []
         places, forces = read_thrusters(model)
@@ -33,11 +27,6 @@ class RotorDrag:
             thrust = float(np.linalg.norm(force))
             axis = force / thrust if thrust else force
             self._rotors.append((*place.tolist(), *axis.tolist(), drag * thrust))
-        self.reset()
-
-    def reset(self) -> None:
-        """Stand still."""
-        self.speeds = self._rest
 
     def step(self, commands: Commands, readings: Readings) -> Inputs:
         """Return the commands, and the drag as a force [N] and a torque [N m].
