@@ -214,7 +214,7 @@ def _check_lift(world: World, model: Any) -> None:
         raise problem_at(
             "world.robot" if world.is_nominal else "world.plant",
             f"the thrust-to-weight ratio of {world.robot} is {ratio:.2f}, so it cannot lift off "
-            f"safely; give it more thrust or less mass, to at least {THRUST_TO_WEIGHT_MIN:g}",
+            f"safely; it must be at least {THRUST_TO_WEIGHT_MIN:g}: more thrust or less mass",
         )
 
 
