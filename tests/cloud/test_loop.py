@@ -12,7 +12,7 @@ from cloudrc.cloud.estimators.running_mean import RunningMean
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.cloud.predictors.last_sample import LastSample
 from cloudrc.drivers.process import from_line, to_line
-from cloudrc.errors import OutOfMemoryError
+from cloudrc.errors import ControllerLostError, OutOfMemoryError
 from cloudrc.messages import ZERO
 from tests.cloud.conftest import HERE, MS, Integrating, command, loop, telemetry
 
@@ -190,6 +190,12 @@ def test_ctrl_c_and_a_lack_of_memory_end_the_flight(kind, error, raised):
     with pytest.raises(raised):
         fly()
     assert a_loop.counts == {}
+
+
+def test_a_lost_program_is_asked_no_more_and_told_once():
+    a_loop = loop(controller=raises(ControllerLostError("controller_silent", "gone"))(), heard_ms=9)
+    assert [command(a_loop, now_ms)[0].velocity for now_ms in (10, 20)] == [ZERO, ZERO]
+    assert [fault.code for fault in a_loop.take_faults()] == ["controller_silent"]
 
 
 def test_a_failing_reset_is_reported():
