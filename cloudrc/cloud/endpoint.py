@@ -183,8 +183,10 @@ class CloudEndpoint(TunnelEnd):
             self._note_missed(missed, now_ns)
         self._tick_ns += (missed + 1) * self._period_ns
         self._session.follow_keys()
-        if self._session.is_outdated or self._wants_session(now_ns):
-            self._ask_for_session_if_due(now_ns)
+        session = self._session
+        lacks = session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS
+        if lacks or session.is_outdated:
+            self._ask_for_session_if_due(now_ns, lacks=lacks)
         self._act(now_ns)
         if now_ns >= self._count_ns:
             self._count_ns = max(self._count_ns, now_ns - COUNT_PERIOD_NS) + COUNT_PERIOD_NS
@@ -192,13 +194,13 @@ class CloudEndpoint(TunnelEnd):
         if self._loop.faults:
             self._records += self._loop.take_faults()
 
-    def _ask_for_session_if_due(self, now_ns: int) -> None:
-        """Ask for a session while there is none, and for a new one after a change of the key."""
-        if self._wants_session(now_ns):
+    def _ask_for_session_if_due(self, now_ns: int, *, lacks: bool) -> None:
+        """Ask for a session while cloud `lacks` one, and for a new one after the key changed."""
+        if lacks:
             self._say_hello_if_due(now_ns)
             if now_ns - self._heard_ns > PATIENCE_NS:
                 self._tell("no_session", SILENCE_TEXT, now_ns)
-        elif self._session.is_outdated:
+        else:
             self._hellos = 0  # the next hello has the new key
             self._say_hello_if_due(now_ns, KEY_PERIOD_NS)
 

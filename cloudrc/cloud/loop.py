@@ -278,7 +278,11 @@ class ControlLoop:
         horizon = self._horizon
         estimate = self._predict(basis, horizon)
         plan, positions = list[Vector](), list[Vector]()
-        if self._is_echo_silent(now_ns, horizon):
+        if self._echoed_ns < self._newest_echo_ns:
+            self._echoed_ns = self._newest_echo_ns
+        elif self._echoed_ns == NEVER_NS:
+            self._echoed_ns = now_ns
+        if now_ns - self._echoed_ns > horizon * 1e9 + self._freeze_after_ns:  # no new echo
             self.counts["frozen"] += 1
             output = STAND_STILL
         else:
@@ -374,14 +378,6 @@ class ControlLoop:
             self._note(plug_in, error, "cloud sends this command without a plan")
             return [], []
         return plan, positions
-
-    def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
-        """Whether the newest echoed command is older than `horizon` + `freeze_after` [s]."""
-        if self._echoed_ns < self._newest_echo_ns:
-            self._echoed_ns = self._newest_echo_ns
-        elif self._echoed_ns == NEVER_NS:
-            self._echoed_ns = now_ns
-        return now_ns - self._echoed_ns > horizon * 1e9 + self._freeze_after_ns
 
     def _call(self, kind: str, call: Callable[..., None], *arguments: Any) -> None:
         """Call a plug-in's method that has no result; count and report an exception."""

@@ -240,7 +240,7 @@ class WorldEndpoint(TunnelEnd):
         guard = self.robot.guard
         known = (
             now_ns,
-            self._sensors.measure(truth),
+            truth if self._sensors.exact else self._sensors.measure(truth),
             shown,
             self._echo_stamp_ns,
             now_ns - self._applied_ns if self._applied_ns >= 0 else 0,

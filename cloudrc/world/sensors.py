@@ -37,7 +37,11 @@ NONE = Errors()
 
 
 class Sensors:
-    """Measure the robot's pose and twist for cloud, with errors."""
+    """Measure the robot's pose and twist for cloud, with errors.
+
+    Attributes:
+        exact: Whether there are no errors.
+    """
 
     def __init__(
         self, errors: schema.SensorsConfig, rng: np.random.Generator, turn_rng: np.random.Generator
@@ -53,12 +57,10 @@ class Sensors:
         self._attitude = Errors(radians(errors.attitude_noise_deg), (roll, pitch, yaw))
         self._rate = Errors(errors.rate_noise_radps, errors.rate_bias_radps)
         self._rng, self._turn_rng = rng, turn_rng
-        self._exact = errors == schema.SensorsConfig()
+        self.exact = errors == schema.SensorsConfig()
 
     def measure(self, truth: Odometry) -> Odometry:
         """Return the odometry that cloud gets: the true odometry plus the configured errors."""
-        if self._exact:
-            return truth
         turn, orientation = self._attitude.add(ZERO, self._turn_rng), truth.orientation_wxyz
         return truth._replace(
             position=self._position.add(truth.position, self._rng),

@@ -50,7 +50,7 @@ def bare_world(ring, nonce=b"w", start_ns=0):
     """Make world's end of the tunnel with a robot that flies every command."""
     return WorldEndpoint(
         bare_robot(),
-        SimpleNamespace(measure=lambda truth: truth),
+        SimpleNamespace(exact=False, measure=lambda truth: truth),
         Identity(CLOCK, nonce.ljust(16), ring),
         newest_wins=True,
         start_ns=start_ns,
