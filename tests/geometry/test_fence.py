@@ -91,13 +91,3 @@ def test_a_robot_on_the_ground_needs_no_height():
     low = "world.fence_m=[[-1, -1, 0], [2, 1, .3]]"
     way = "mission.waypoints=[{position_m: [1, 0]}]"
     load_experiment("pillars", ["world.scene=empty", low, way])
-
-
-def test_waypoints_steps_and_setpoints_stay_inside_the_fence_of_the_scene(own, tmp_path):
-    scene = f"world.scene={own(fence='-2 -2 0 2 2 2')}"
-    for mission in ("{waypoints: [{position_m: [3, 0, 1]}]}", "{steps: {range_m: [3, 1, .5]}}"):
-        with pytest.raises(BadInputError, match=r"guard lets the robot fly at x -1\.8 to 1\.8, y"):
-            load_experiment("steps", [scene, f"mission={mission}"])
-    (tmp_path / "drive.csv").write_text("time_s,x_m,y_m,z_m\n0,0,0,1\n1,3,0,1\n")
-    with pytest.raises(BadInputError, match=r"line 3: x_m is 3; the guard flies from -1\.8"):
-        load_experiment("steps", [scene, f"mission={{setpoints: {tmp_path}/drive.csv}}"])

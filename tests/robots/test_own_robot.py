@@ -6,7 +6,6 @@ import cloudrc
 from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
-from cloudrc.trials.plan import read_plan
 from tests.robots.conftest import CONTROLLER
 
 HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
@@ -54,24 +53,6 @@ def test_what_is_wrong_with_a_robot_is_one_problem_by_name(own_robot, text, mess
     with pytest.raises(BadInputError) as error:
         cloudrc.fly("hover", HOVER | {"world.robot": str(mine)})
     assert message in str(error.value)
-
-
-def test_a_folder_without_its_file_is_no_robot(tmp_path):
-    with pytest.raises(BadInputError, match=r"no such folder with robot\.yaml"):
-        load_experiment("hover", [f"world.robot={tmp_path}"])
-
-
-def test_the_key_of_a_flight_has_the_meshes_of_its_robot(own_robot, tmp_path):
-    cube = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
-    mesh = '<asset><mesh name="skin" file="skin.obj" scale=".01 .01 .01"/></asset><worldbody>'
-    text = find_robot("x2").model.read_text().replace("<worldbody>", mesh, 1)
-    mine = own_robot("onboard: multirotor", text)
-    sweep, keys = tmp_path / "sweep.yaml", []
-    sweep.write_text(f"experiment: hover\nset: {{world.robot: {mine}}}\nseeds: 1\n")
-    for more in ("", "v 2 0 0\n"):
-        (mine / "skin.obj").write_text(cube + more)
-        keys.append(list(read_plan(sweep).flights))
-    assert keys[0] != keys[1]
 
 
 def test_a_folder_named_like_a_shipped_robot_is_a_robot_of_its_own(own_robot, tmp_path):

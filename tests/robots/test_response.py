@@ -36,18 +36,6 @@ def test_a_predictor_with_the_robots_model_predicts_far_better_than_none(robot):
     assert max(errors.values()) < 0.3 * without, errors
 
 
-@pytest.mark.parametrize("robot", ["pelican", "nano", "x2", "rover"])
-def test_command_history_has_the_response_of_the_robot_and_the_limit_of_the_guard(robot):
-    response = known_robot(robot).response
-    predictor = build(robot, {"name": "command_history"})
-    assert predictor._axes == tuple(
-        zip(response.time_constant, response.dead_time, response.gain, strict=True)
-    )
-    assert predictor._loop[1] == 7.0
-    assert build(robot, {"name": "command_history"}, tuning=None)._axes == predictor._axes
-    assert type(build(robot, {"name": "model_based"})) is not type(predictor) or robot != "pelican"
-
-
 def test_the_model_of_the_pelican_follows_its_onboard_controller():
     """Its parameters are those of tuning and world.onboard, unless the predictor has its own."""
 

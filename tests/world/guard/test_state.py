@@ -391,23 +391,16 @@ def test_only_an_acknowledgement_leads_out_of_a_latch(make):
 
 
 @pytest.mark.parametrize("make", [lambda: Guard(LIMITS, FENCE), armed, tracking, holding, landing])
-def test_the_emergency_stop_works_from_everywhere_at_once(make):
-    guard = stopped(make(), 3 * SECOND)
-    assert run(guard, 3 * SECOND, 3 * SECOND + 10 * MS) == [None] * 5
-    assert guard.reference == ZERO
-    assert told(guard) == (3 * SECOND, ESTOP, "emergency stop")
-    stopped(guard, 4 * SECOND)
-    assert guard.take_changes() == []
-
-
-@pytest.mark.parametrize("make", [lambda: Guard(LIMITS, FENCE), armed, tracking, holding, landing])
-def test_a_failed_onboard_controller_stops_the_robot_in_every_state(make):
+@pytest.mark.parametrize(
+    ("event", "text"), [("stop", "emergency stop"), ("fail", "onboard controller failed")]
+)
+def test_a_stop_and_a_failure_on_board_work_from_everywhere_at_once(make, event, text):
     guard = make()
     for now_ns in (3 * SECOND, 4 * SECOND):
-        guard.fail(now_ns)
-    assert told(guard) == (3 * SECOND, ESTOP, "onboard controller failed")
+        getattr(guard, event)(now_ns)
+    assert told(guard) == (3 * SECOND, ESTOP, text)
     assert run(guard, 4 * SECOND, 4 * SECOND + 10 * MS) == [None] * 5
-    assert (guard.latched, guard.armed) == (True, False)
+    assert (guard.latched, guard.armed, guard.reference) == (True, False, ZERO)
 
 
 @pytest.mark.parametrize(
