@@ -95,7 +95,8 @@ def _connect(
     A shipped accelerator runs no code of a user.
     """
     robot, faster = known_robot(world.robot), accelerator(world, plugin)
-    guard, name = Guard(limits, steered_in(world), robot.guard), Path(robot.onboard.name).name
+    guard = Guard(limits, steered_in(world), robot.guard)
+    name = "" if plugin.is_shipped else Path(robot.onboard.name).name
     if faster is None or faster.make is None:
         with plugin.calling("build"):
             return Robot(simulator, onboard, guard, name)

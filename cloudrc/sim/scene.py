@@ -112,12 +112,14 @@ def _put_on_floor(model: Any) -> None:
     """Raise the start of a robot that reaches further down than the spawn is above the floor."""
     if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
         return
-    bodies, data = bodies_of_geoms(model), mujoco.MjData(model)
+    robot, data = is_of_robot(model), mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_collision(model, data)
     depth = 0.0
     for contact in data.contact:
-        if {bodies[geom] for geom in contact.geom.tolist()} == {"", FLOOR}:
+        first, second = contact.geom.tolist()
+        other = second if robot[first] else first
+        if robot[first] != robot[second] and model.geom(other).name.startswith(f"{FLOOR}/"):
             depth = max(depth, -contact.dist)
     if depth > INSIDE_MAX:
         model.qpos0[2] += depth

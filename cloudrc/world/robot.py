@@ -52,7 +52,7 @@ class Robot:
     def __init__(
         self, simulator: Simulator, onboard: Onboard, guard: Guard, name: str = ""
     ) -> None:
-        """Connect the parts; `name` is that of a user's onboard controller, whose results count."""
+        """Connect the parts; `name` is that of a user's onboard controller, which is judged."""
         self.simulator, self.onboard, self.guard = simulator, onboard, guard
         self.observers: list[Observer] = []
         self.failure: Fault | None = None
