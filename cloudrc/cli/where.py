@@ -112,23 +112,19 @@ def find_run_here(run: Path | None, *, steers: bool, links: bool = False) -> Run
 
 def need_run_here(run: Path | None, *, steers: bool = True) -> RunInFlight:
     """Find a run as `find_run_here` does; raise a BadInputError if none flies."""
-    from cloudrc.runs.under_way import not_found
-
     if (found := find_run_here(run, steers=steers)) is None:
-        raise BadInputError(not_found("no run flies here; start one: cloudrc up"))
+        raise BadInputError("no run flies here; start one: cloudrc up")
     return found
 
 
 def need_release(options: Options) -> Release:
     """Return the release in flight, for a command that has found no run on this machine."""
-    from cloudrc.runs.under_way import not_found
-
     try:
         return flown_release(options)
     except MissingPrerequisiteError as error:
         if options.context or options.namespace:
             raise
-        text = not_found("no run flies here; start one: cloudrc up")
+        text = "no run flies here; start one: cloudrc up"
         raise MissingPrerequisiteError(f"{text}; and {error}") from None
 
 

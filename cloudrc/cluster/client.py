@@ -16,7 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
-from cloudrc.drivers.children import await_or_kill
+from cloudrc.drivers.machine import await_or_kill
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError, TimedOutError
 
 DEFAULT_RELEASE = "cloudrc"

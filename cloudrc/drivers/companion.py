@@ -13,7 +13,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from cloudrc.drivers.children import await_or_kill, signal_group
+from cloudrc.drivers.machine import await_or_kill, signal_group
 from cloudrc.errors import ControllerLostError, to_one_line
 from cloudrc.records import CONTROLLER_LOST
 

@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler
-from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +21,7 @@ from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.exposition.live import LinkMetrics, LiveMetrics
 from cloudrc.exposition.parts import Histogram, Readings, samples
 from cloudrc.exposition.table import Labels, LiveMetric, MetricKind, of_role
+from cloudrc.link.state import LinkState
 from cloudrc.records import Counted, Record
 from cloudrc.version import __version__
 
@@ -32,8 +32,6 @@ CLIENT_WAIT_MAX = 5.0
 CONNECTIONS_MAX = 16
 """Largest number of open connections. A further connection closes the oldest one, so that idle
 clients cannot use up the files or threads of the process."""
-KEPT = 0.25
-"""Time for which a page of metrics is reused [s], because making one may delay the control loop."""
 CONFIG_DIGITS = 12
 """Number of hexadecimal digits of the configuration's hash in the metrics."""
 STILL_MAX = 5.0
@@ -145,8 +143,6 @@ class Exporter:
         self._said_ready, self._config = False, config[:CONFIG_DIGITS]
         self._seen_at: float | None = None  # time of the newest records; None before the first
         self._server: _Server | None = None
-        self._page_lock = threading.Lock()
-        self._made_at, self._made_page = -inf, Answer(503, "")
         self._registry = CollectorRegistry()
         self._registry.register(self)
         ProcessCollector(registry=self._registry)
@@ -169,6 +165,15 @@ class Exporter:
         """The metrics of the emulated link; only an exporter with the role "link" has them."""
         assert self._live.link is not None, "only a link is shaped"
         return self._live.link
+
+    def shaped(self, state: LinkState) -> None:
+        """Take the state of the direction that this process shapes: now it is ready."""
+        self.link.shaped(state.shaper, state.direction, state.mode, state.asked["delay"] or 0.0)
+        self.ready(True)
+
+    def counted(self, counts: Mapping[str, int]) -> None:
+        """Update the counters of the emulated link; `counts`: name -> value."""
+        self.see(Counted(0, "link", name, number) for name, number in counts.items())
 
     def unresolved(self, count: int) -> None:
         """Set the number of failed DNS queries for the peer's name. Any thread may call this."""
@@ -226,13 +231,7 @@ class Exporter:
         return generate_latest(self._registry).decode()
 
     def _page(self) -> Answer:
-        """Return the metrics as text; make a new text if the last one is 0.25 s old."""
-        with self._page_lock:
-            now = time.monotonic()
-            if now - self._made_at >= KEPT:
-                self._made_at = now
-                self._made_page = Answer(200, self.text(), TEXT_FORMAT)
-            return self._made_page
+        return Answer(200, self.text(), TEXT_FORMAT)
 
     def _readiness(self) -> Answer:
         return Answer(200, "ready\n") if self.is_ready else Answer(503, "no peer yet\n")

@@ -27,12 +27,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from cloudrc.drivers.children import await_or_kill
-from cloudrc.drivers.machine import Deadline, interpreter
+from cloudrc.drivers.machine import AwakeClock, await_or_kill, interpreter
 from cloudrc.drivers.process import PARENT, READY, from_line
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.errors import ControllerLostError, InvalidRunError, TimedOutError
-from cloudrc.files import make_own_folder, who_may_write
+from cloudrc.errors import (
+    ControllerLostError,
+    InvalidRunError,
+    MissingPrerequisiteError,
+    TimedOutError,
+)
+from cloudrc.files import make_own_folder
 from cloudrc.link.follow import PROFILE
 from cloudrc.link.state import STATE_FILE
 from cloudrc.records import CONTROLLER_LOST, Fault, Record
@@ -57,12 +61,6 @@ API_FILE = "api.json"
 LINK_FOLDER, ROUTE_FILE = "link", "route"
 """Folder in a run's folder, during the flight: the link's profile, and a folder per direction with
 the address of the relay (`ROUTE_FILE`) and the state of the link."""
-UNSEEN = (
-    "warning: other commands do not find this flight ({unseen}): 'cloudrc mission' needs --api"
-    " {url}; 'console', 'link set', 'ros bridge' and 'down' need a folder of your own in"
-    " XDG_RUNTIME_DIR, here and there"
-)
-"""Text if a flight has no flight file."""
 JOURNAL_FILE = "missions.journal"
 """File in a session's folder: teleop's store of the missions."""
 LINK_LOG = "uplink.log"
@@ -78,14 +76,19 @@ link between two programs (`cloudrc link exec`) is no flight, but commands find 
 def flights_folder() -> Path:
     """Return the folder for flight files, which tell other commands about flights under way.
 
-    It is in XDG_RUNTIME_DIR if only this user can write to that folder, otherwise in the home
-    folder.
+    It is the first of these in which only this user can write: one in XDG_RUNTIME_DIR, one in the
+    home folder, one below /tmp. Otherwise other users could name any process and address.
 
     Source: XDG Base Directory Specification.
     """
-    root = os.environ.get("XDG_RUNTIME_DIR", "")
-    is_own = os.path.isabs(root) and os.access(root, os.W_OK) and not who_may_write(Path(root))
-    return Path(root if is_own else os.path.expanduser("~/.local/state"), "cloudrc", "flights")
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    homes = os.path.expanduser("~/.local/state"), f"/tmp/cloudrc-{os.geteuid()}"
+    for root in (runtime if os.path.isdir(runtime) else "", *homes):
+        folder = Path(root, "cloudrc", "flights")
+        with contextlib.suppress(OSError):
+            if os.path.isabs(root) and not make_own_folder(folder):
+                return folder
+    raise MissingPrerequisiteError(f"{folder}: others may write there; set XDG_RUNTIME_DIR")
 
 
 class FlightFile(NamedTuple):
@@ -97,8 +100,8 @@ class FlightFile(NamedTuple):
 
 
 @contextlib.contextmanager
-def announced(run: Path, api: str, kind: str = RUN) -> Iterator[str]:
-    """Keep a flight file during the `with` block; yield "", or the reason if this is impossible.
+def announced(run: Path, api: str, kind: str = RUN) -> Iterator[None]:
+    """Keep a flight file during the `with` block.
 
     The file tells other commands `run`, the folder of the run; `api`, the address of the operator's
     API; and `kind`, RUN, SESSION or LINK.
@@ -106,46 +109,17 @@ def announced(run: Path, api: str, kind: str = RUN) -> Iterator[str]:
     about = FlightFile(api, kind, os.getpid())._asdict()
     flight = json.dumps({"schemaVersion": 1, "run": str(run.resolve()), **about})
     path = flights_folder() / f"{os.getpid()}-{secrets.token_hex(4)}.json"
-    with contextlib.ExitStack() as stack:
-        try:
-            _write_flight_file(path, flight, stack)
-            reason = ""
-        except OSError as error:
-            reason = f"{path.parent}: {error.strerror or error}"
-        yield reason
-
-
-def _write_flight_file(path: Path, flight: str, stack: contextlib.ExitStack) -> None:
-    """Write and lock a flight file, until `stack` is closed; raise an OSError if it fails."""
-    if reason := _make_flights_folder(path.parent):
-        raise OSError(reason)
     new = path.with_suffix(".new")  # renamed after it is locked
-    # Other users could lock a file that they can open.
-    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    file = stack.enter_context(open(descriptor, "wb", buffering=0))
-    for name in (path, new):
-        stack.callback(name.unlink, missing_ok=True)
-    fcntl.flock(file, fcntl.LOCK_EX)
-    file.write(flight.encode())
-    new.rename(path)
-
-
-def _make_flights_folder(folder: Path) -> str:
-    """Make the folder for flight files if it is missing; return why it is unusable, or ""."""
-    if not folder.is_absolute():
-        return "there is no home folder"
     try:
-        return make_own_folder(folder)
-    except OSError as error:
-        return error.strerror or str(error)
-
-
-def say_unused() -> str:
-    """Say why commands here find no flight, even if one is under way; "" if they find it."""
-    folder = flights_folder()
-    if reason := _make_flights_folder(folder):
-        return f"flight files in {folder} are not used: {reason}"
-    return ""
+        new.touch(0o600)
+        with new.open("wb", buffering=0) as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            file.write(flight.encode())
+            new.rename(path)
+            yield
+    finally:
+        for name in (path, new):
+            name.unlink(missing_ok=True)
 
 
 def under_way(*, links: bool = False) -> dict[Path, str]:
@@ -159,26 +133,18 @@ def under_way(*, links: bool = False) -> dict[Path, str]:
 
 
 def flight_files() -> dict[Path, FlightFile]:
-    """Return the flights of this user under way: folder of the run -> its flight file.
-
-    A folder in which another user could write is ignored: its files could name any process and
-    address.
-    """
+    """Return the flights of this user under way: folder of the run -> its flight file."""
     found = dict[Path, FlightFile]()
-    folder = flights_folder()
-    if not folder.is_dir() or who_may_write(folder):
-        return found
-    for path in folder.glob("*.json"):
+    for path in flights_folder().glob("*.json"):
         with contextlib.suppress(FileNotFoundError), path.open() as file:  # it has just ended
+            flight = json.load(file)
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:  # locked: the flight is under way
-                flight = json.load(file)
                 about = FlightFile(flight["api"], flight["kind"], flight["pid"])
                 found[Path(flight["run"])] = about
             else:  # not locked: the process of this flight was killed
                 path.unlink()
-                _remove_sockets(json.load(file)["api"])
     return found
 
 
@@ -204,15 +170,15 @@ class Child:
     process: subprocess.Popen[bytes]
     log: Path  # file with the process's standard error
     unread: bytes = b""  # start of a line of output whose end has not arrived yet
-    heard: float = 0.0  # time at which the last line arrived [s], monotonic clock
+    heard: float = 0.0  # time at which the last line arrived [s], the run's clock
     ready: bool = False  # whether the process can receive datagrams
 
-    def take(self, data: bytes) -> list[Record]:
-        """Parse the next bytes of the process's output; return the records in complete lines."""
+    def take(self, data: bytes, now: float) -> list[Record]:
+        """Parse output that arrives at `now` [s]; return the records in complete lines."""
         records: list[Record] = []
         *lines, self.unread = (self.unread + data).split(b"\n")
         for line in lines:
-            self.heard = time.monotonic()
+            self.heard = now
             if line == READY.encode():
                 self.ready = True
             else:
@@ -259,6 +225,7 @@ class LocalRun:
         self.announcement = contextlib.ExitStack()
         self._children: list[Child] = []
         self._selector = selectors.DefaultSelector()
+        self._clock = AwakeClock(PAUSE)
         self.notes: tuple[str, ...] = ()
 
     def fly(self, limit: float) -> None:
@@ -274,9 +241,7 @@ class LocalRun:
         with tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder()) as sockets:
             url = f"unix:{sockets}/api.sock"
             kind = SESSION if self._session else RUN
-            unseen = self.announcement.enter_context(announced(self._folder, url, kind))
-            if unseen:
-                self._see([Fault(0, "supervisor", UNSEEN.format(unseen=unseen, url=url))])
+            self.announcement.enter_context(announced(self._folder, url, kind))
             try:
                 key = Path(sockets, "key")
                 key.touch(0o600)
@@ -353,34 +318,35 @@ class LocalRun:
         self._selector.register(process.stdout, selectors.EVENT_READ, self._children[-1])
 
     def _wait_until_ready(self) -> None:
-        deadline = Deadline(START_LIMIT, PAUSE)
+        until = self._clock() + START_LIMIT
         while waiting := [child.name for child in self._children if not child.ready]:
-            if deadline.passed():
+            if self._clock() > until:
                 raise TimedOutError(f"{' and '.join(waiting)}: not ready within {START_LIMIT:g} s")
             self._see(self._listen())
             self._check_alive()
 
     def _watch(self, limit: float, sockets: Path) -> None:
-        deadline, paused = Deadline(limit, PAUSE), 0.0
+        until, paused = self._clock() + limit, self._clock.pause
         teleop = next(child for child in self._children if child.name == "teleop")
-        heard_from = time.monotonic()
         while teleop.process.poll() is None:
             records = self._listen()
             self._see(records)
             self._lost(records)
             if self._remote and self._gone():
-                _tell_ended(sockets)
-            now = time.monotonic()  # before the deadline looks for a pause: `now` contains none
-            if deadline.passed():
+                from cloudrc.drivers.remote import tell_ended  # needs an extra
+
+                tell_ended(sockets)
+            now = self._clock()
+            if now > until:
                 raise TimedOutError(f"the flight was ended after {limit:g} s, its limit")
-            if deadline.pause > paused:
-                stood = f"stood still for {deadline.pause - paused:.1f} s; the flight went on"
+            if self._clock.pause > paused:
+                stood = f"stood still for {self._clock.pause - paused:.1f} s; the flight went on"
                 self.notes += (f"the supervisor of this run {stood}",)
                 self._see([Fault(0, "supervisor", self.notes[-1])])
-                heard_from, paused = time.monotonic(), deadline.pause
+                paused = self._clock.pause
             self._check_alive()
             for child in self._children:
-                if now - max(child.heard, heard_from) > SILENCE_LIMIT:
+                if now - child.heard > SILENCE_LIMIT:
                     raise TimedOutError(
                         f"the {child.name} process was silent for {SILENCE_LIMIT:g} s and was "
                         f"ended; see {child.log}"
@@ -390,12 +356,12 @@ class LocalRun:
 
     def _listen(self) -> list[Record]:
         records: list[Record] = []
-        for key, _ in self._selector.select(0.05):
-            child: Child = key.data
+        ready, now = self._selector.select(0.05), self._clock()
+        for key, _ in ready:
             data = os.read(key.fd, 65_536)
             if not data:
                 self._selector.unregister(key.fileobj)
-            records += child.take(data)
+            records += key.data.take(data, now)
         return records
 
     def _check_alive(self) -> None:
@@ -422,12 +388,6 @@ class LocalRun:
             await_or_kill(child.process, max(0.0, deadline - time.monotonic()))
             child.process.communicate()
         self._selector.close()
-
-
-def _tell_ended(sockets: Path) -> None:
-    from cloudrc.drivers.remote import tell_ended  # needs an extra
-
-    tell_ended(sockets)
 
 
 def start_process(
@@ -472,16 +432,5 @@ def socket_folder() -> str:
     Some machines clean /tmp during a flight; then no command could stop the robot. Therefore the
     folder is beside the flight files, if their path is short enough.
     """
-    own = flights_folder().parent
-    is_own = own.is_absolute() and not _make_flights_folder(own)
-    for folder in (str(own) if is_own else "", tempfile.gettempdir()):
-        if folder and len(os.fsencode(folder)) + len(SOCKET_NAME) <= PATH_MAX:
-            return folder
-    return "/tmp"
-
-
-def _remove_sockets(api: str) -> None:
-    """Remove the socket folder of a killed run, if it is beside the flight files."""
-    folder = Path(api.removeprefix("unix:")).parent
-    if folder.parent == flights_folder().parent and folder.name.startswith("cloudrc-"):
-        shutil.rmtree(folder, ignore_errors=True)
+    folder = str(flights_folder().parent)
+    return folder if len(os.fsencode(folder)) + len(SOCKET_NAME) <= PATH_MAX else "/tmp"

@@ -1,4 +1,4 @@
-"""Find clock, usable cores and Python of the machine; time limits that exclude suspended time."""
+"""Find clock, usable cores and Python of the machine; end child processes."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import sys
 import time
 import uuid
 from collections.abc import Callable
+from contextlib import suppress
 from math import ceil
 from pathlib import Path
+from typing import Any
 
 LINUX_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 CGROUP, CGROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
@@ -60,31 +62,41 @@ def interpreter(*words: str) -> list[str]:
     return [sys.executable, *(() if here else ("-P",)), *words]
 
 
-class Deadline:
-    """A time limit that excludes the time for which this process was suspended.
+class AwakeClock:
+    """A monotonic clock that stands still while this process is suspended.
 
     Attributes:
         pause: Total time for which this process was suspended [s].
     """
 
-    def __init__(
-        self, limit: float, turn_max: float, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        """Start a time limit of `limit` [s] by a monotonic `clock` [s].
+    def __init__(self, turn_max: float, clock: Callable[[], float] = time.monotonic) -> None:
+        """Begin at 0 s; `clock` is the machine's [s].
 
-        If more than `turn_max` [s] pass between two calls of `passed`, this process was suspended,
-        and the limit excludes this time.
+        If more than `turn_max` [s] pass between two calls, this process was suspended meanwhile.
         """
-        self._left, self._turn_max, self._clock = limit, turn_max, clock
-        self._before = clock()
-        self.pause = 0.0
+        self._turn_max, self._clock, self._before = turn_max, clock, clock()
+        self._now = self.pause = 0.0
 
-    def passed(self) -> bool:
-        """Return whether the time limit has passed; the caller's loop calls this in every turn."""
-        now = self._clock()
-        turn, self._before = now - self._before, now
+    def __call__(self) -> float:
+        """Return the time [s]; the caller's loop calls this in every turn."""
+        before, self._before = self._before, self._clock()
+        turn = self._before - before
         if turn > self._turn_max:
             self.pause += turn
         else:
-            self._left -= turn
-        return self._left < 0.0
+            self._now += turn
+        return self._now
+
+
+def signal_group(process: subprocess.Popen[Any], number: int) -> None:
+    """Send a signal to the process group that a process leads, if some of it still runs."""
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, number)
+
+
+def await_or_kill(process: subprocess.Popen[Any], limit: float) -> None:
+    """Wait at most `limit` [s] for the end of a process, then kill it."""
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(limit)
+    process.kill()
+    process.wait()

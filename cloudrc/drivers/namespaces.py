@@ -14,10 +14,10 @@ import socketserver
 import subprocess
 import threading
 from contextlib import ExitStack, suppress
+from functools import partial
 from typing import IO, Any, NamedTuple
 
-from cloudrc.drivers.children import await_or_kill
-from cloudrc.drivers.machine import interpreter
+from cloudrc.drivers.machine import await_or_kill, interpreter
 from cloudrc.errors import InvalidRunError, MissingPrerequisiteError
 from cloudrc.files import at_place
 from cloudrc.link.exec import namespace
@@ -155,23 +155,11 @@ class ProgramEnd:
 def print_lines(source: IO[bytes], target: IO[bytes], prefix: str) -> threading.Thread:
     """Start a thread that copies lines from `source` to `target`, each behind a prefix."""
 
-    def write(lines: bytes) -> None:
-        with suppress(OSError, ValueError):  # nobody reads any more
-            target.write(b"".join(mark + line for line in lines.splitlines(keepends=True)))
-            target.flush()
-
     def work() -> None:
-        unread = b""
-        while data := os.read(source.fileno(), CHUNK):
-            whole, end, rest = (unread + data).rpartition(b"\n")
-            unread = rest
-            if end:
-                write(whole + end)
-            if len(unread) > LINE_MAX:
-                write(unread + b"\n")
-                unread = b""
-        if unread:
-            write(unread + b"\n")
+        for line in iter(partial(source.readline, LINE_MAX), b""):
+            with suppress(OSError, ValueError):  # nobody reads any more
+                target.write(mark + line.removesuffix(b"\n") + b"\n")
+                target.flush()
 
     mark = prefix.encode()
     thread = threading.Thread(target=work, daemon=True)

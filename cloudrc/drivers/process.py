@@ -78,8 +78,7 @@ class StopSignal:
     def __init__(self) -> None:
         self._asked = False
         # If the supervisor has ended before this line runs, getppid() is not the supervisor's id.
-        parent = os.environ.pop(PARENT, "")
-        self._parent = int(parent) if parent.isdecimal() else os.getppid()
+        self._parent = int(os.environ.pop(PARENT, os.getppid()))
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._ask)
 

@@ -14,8 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
-from cloudrc.drivers.children import signal_group
-from cloudrc.drivers.machine import interpreter
+from cloudrc.drivers.machine import interpreter, signal_group
 from cloudrc.errors import to_one_line
 from cloudrc.exercise import hand_in
 from cloudrc.exercise.files import FILES

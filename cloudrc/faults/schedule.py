@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
@@ -19,53 +19,37 @@ def generator(seed: int, use: int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64([seed, use]))
 
 
-class FaultKind(NamedTuple):
-    """A kind of fault: what happens, and the limits of its random duration and value."""
-
-    text: str
-    longest: float = 0.0  # longest duration [s]; 0 for an instant
-    low: float = 0.0  # smallest `value` [any unit]
-    high: float = 0.0  # largest `value` [any unit]
-
-
 KINDS = {
-    "blackout": FaultKind("no datagram passes", 8.0),
-    "delay": FaultKind("one-way delay rises by value [s]", 10.0, 0.01, 0.3),
-    "jitter": FaultKind("jitter rises to value [s]", 10.0, 0.01, 0.15),
-    "loss": FaultKind("a share of value is lost", 10.0, 0.05, 0.9),
-    "bursts": FaultKind("loss in bursts of value packets", 15.0, 3.0, 60.0),
-    "corruption": FaultKind("a share of value has 1 to 8 flipped bits", 10.0, 0.01, 1.0),
-    "garbage": FaultKind("value random datagrams arrive before every honest one", 5.0, 1.0, 20.0),
-    "replay": FaultKind("value captured datagrams arrive before every honest one", 5.0, 1.0, 20.0),
-    "cloud_killed": FaultKind("the cloud process is down", 5.0),
-    "pod_killed": FaultKind("the cloud pod with teleop is down", 8.0),
-    "teleop_killed": FaultKind("teleop is down", 6.0),
-    "teleop_shut_down": FaultKind(
-        "teleop pauses, and is down after a share of value", 6.0, 0.0, 1.0
-    ),
-    "pod_shut_down": FaultKind(
-        "teleop pauses, the pod is down after a share of value", 8.0, 0.0, 1.0
-    ),
-    "cloud_paused": FaultKind("the cloud process is stopped", 5.0),
-    "cloud_throttled": FaultKind(
-        "the cloud process gets a share of value of the CPU", 8.0, 0.05, 0.9
-    ),
-    "world_paused": FaultKind("the world process is stopped", 1.0),
-    "world_killed": FaultKind("the world process is down, then restarts", 3.0),
-    "world_throttled": FaultKind(
-        "the world process gets a share of value of the CPU", 8.0, 0.1, 0.95
-    ),
-    "teleop_paused": FaultKind("the teleop process is stopped", 5.0),
-    "second_cloud": FaultKind("another cloud with the same key joins", 15.0),
-    "key_rotated": FaultKind("world reads a new key, cloud reads it after the duration", 10.0),
-    "key_wrong": FaultKind("cloud has a wrong key", 10.0),
-    "values_invalid": FaultKind("value commands a second have NaN or infinity", 10.0, 1.0, 12.0),
-    "values_huge": FaultKind("value commands a second are 1e308 m/s", 10.0, 1.0, 4.0),
-    "second_order": FaultKind("another mission is ordered"),
-    "stopped": FaultKind("the operator stops the robot, and acknowledges later"),
-    "held": FaultKind("the operator holds the mission, resumes it after the duration", 5.0),
+    "blackout": (8.0, 0.0, 0.0),  # no datagram passes
+    "delay": (10.0, 0.01, 0.3),  # one-way delay rises by value [s]
+    "jitter": (10.0, 0.01, 0.15),  # jitter rises to value [s]
+    "loss": (10.0, 0.05, 0.9),  # a share of value is lost
+    "bursts": (15.0, 3.0, 60.0),  # loss in bursts of value packets
+    "corruption": (10.0, 0.01, 1.0),  # a share of value has 1 to 8 flipped bits
+    "garbage": (5.0, 1.0, 20.0),  # value random datagrams arrive before every honest one
+    "replay": (5.0, 1.0, 20.0),  # value captured datagrams arrive before every honest one
+    "cloud_killed": (5.0, 0.0, 0.0),  # the cloud process is down
+    "pod_killed": (8.0, 0.0, 0.0),  # the cloud pod with teleop is down
+    "teleop_killed": (6.0, 0.0, 0.0),  # teleop is down
+    "teleop_shut_down": (6.0, 0.0, 1.0),  # teleop pauses, and is down after a share of value
+    "pod_shut_down": (8.0, 0.0, 1.0),  # teleop pauses, the pod is down after a share of value
+    "cloud_paused": (5.0, 0.0, 0.0),  # the cloud process is stopped
+    "cloud_throttled": (8.0, 0.05, 0.9),  # the cloud process gets a share of value of the CPU
+    "world_paused": (1.0, 0.0, 0.0),  # the world process is stopped
+    "world_killed": (3.0, 0.0, 0.0),  # the world process is down, then restarts
+    "world_throttled": (8.0, 0.1, 0.95),  # the world process gets a share of value of the CPU
+    "teleop_paused": (5.0, 0.0, 0.0),  # the teleop process is stopped
+    "second_cloud": (15.0, 0.0, 0.0),  # another cloud with the same key joins
+    "key_rotated": (10.0, 0.0, 0.0),  # world reads a new key, cloud reads it after the duration
+    "key_wrong": (10.0, 0.0, 0.0),  # cloud has a wrong key
+    "values_invalid": (10.0, 1.0, 12.0),  # value commands a second have NaN or infinity
+    "values_huge": (10.0, 1.0, 4.0),  # value commands a second are 1e308 m/s
+    "second_order": (0.0, 0.0, 0.0),  # another mission is ordered
+    "stopped": (0.0, 0.0, 0.0),  # the operator stops the robot, and acknowledges later
+    "held": (5.0, 0.0, 0.0),  # the operator holds the mission, resumes it after the duration
 }
-"""Name of a fault in a schedule's file -> kind of fault."""
+"""Name of a fault in a schedule's file -> longest random duration [s], 0 for an instant; smallest
+and largest random value [unit of the comment]."""
 SHARES = ("loss", "corruption", "cloud_throttled", "world_throttled", "teleop_shut_down",
           "pod_shut_down")  # fmt: skip
 """Kinds of fault whose value is a share, in [0, 1]."""
@@ -82,7 +66,7 @@ WAYS: tuple[Way, ...] = ("both", "up", "down")
 class FaultEvent:
     """One fault, from `at` [s] for `duration` [s]; link faults hit one direction or both.
 
-    The meaning and the unit of `value` depend on the kind of fault; the texts in `KINDS` tell them.
+    The meaning and the unit of `value` depend on the kind of fault: see the comments of `KINDS`.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
@@ -198,7 +182,7 @@ def compose(seed: int) -> Schedule:
 
 
 def _event(kind: str, rng: np.random.Generator) -> FaultEvent:
-    _, longest, low, high = KINDS[kind]
+    longest, low, high = KINDS[kind]
     at, way = float(rng.uniform(0.5, CALM - 1.0)), WAYS[int(rng.integers(3))]
     duration = 0.0
     if longest:  # short ones are as likely as long ones: 20 ms find as much as 5 s

@@ -20,7 +20,6 @@ from typing import Literal
 
 from cloudrc.config.load import load_link, read_experiment
 from cloudrc.drivers.link_control import ControlServer
-from cloudrc.drivers.link_metrics import export_counts, export_state
 from cloudrc.drivers.process import Feed, StopSignal
 from cloudrc.drivers.programs import Programs, run_tool
 from cloudrc.drivers.realtime import Address
@@ -82,8 +81,8 @@ def run_link(settings: LinkSettings, stop: StopSignal) -> None:
             direction=settings.direction,
             route=settings.route,
             origin_ns=settings.origin,
-            tell=partial(export_state, exporter),
-            count=partial(export_counts, exporter),
+            tell=exporter.shaped if exporter else lambda state: None,
+            count=exporter.counted if exporter else lambda counts: None,
         )
 
         def poll_profile() -> None:

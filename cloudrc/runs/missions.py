@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cloudrc.drivers.machine import Deadline
+from cloudrc.drivers.machine import AwakeClock
 from cloudrc.errors import BadInputError, TimedOutError
 from cloudrc.teleop.client import Api, UnreachableError, describe_mission, mission_path
 
@@ -87,12 +87,12 @@ class MissionFollower:
 
     def _retry(self, request: Callable[[], _Answer]) -> _Answer:
         """Repeat a request until the API answers; raise a TimedOutError if this takes too long."""
-        deadline, reported = Deadline(self._patience, TURN_MAX), False
+        clock, reported = AwakeClock(TURN_MAX), False
         while True:
             try:
                 return request()
             except UnreachableError as error:
-                if deadline.passed():
+                if clock() > self._patience:
                     raise TimedOutError(f"{error}; gave up after {self._patience:g} s") from None
                 if not reported:
                     self._tell(f"{error}; waiting")

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
-from cloudrc.drivers.local import LINK_LOG, SESSION, flight_files, say_unused, under_way
+from cloudrc.drivers.local import LINK_LOG, SESSION, flight_files, under_way
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.runs.folder import RUNS
 
@@ -51,18 +51,11 @@ def find_run(run: Path | None, *, steers: bool = True, links: bool = False) -> R
     if run is not None:
         url = flights.get(Path(os.path.realpath(run)))
         if url is None:
-            raise BadInputError(f"{run}: {not_found('no run flies there; name another folder')}")
+            raise BadInputError(f"{run}: no run flies there; name another folder")
         return RunInFlight(run, url)
     without_flight = bool(flights) and flights.keys().isdisjoint(under_way())
     note = ask_if_unclear(flights, steers=steers and not without_flight)
     return next((RunInFlight(Path(short(run)), url, note) for run, url in flights.items()), None)
-
-
-def not_found(text: str) -> str:
-    """Return `text`, which says that nothing flies; or why a flight under way cannot be found."""
-    if unused := say_unused():
-        return f"{unused}; flight and command need a folder of your own in XDG_RUNTIME_DIR"
-    return text
 
 
 def find_session(run: Path | None) -> tuple[Path, str]:
@@ -77,11 +70,11 @@ def find_session(run: Path | None) -> tuple[Path, str]:
     sessions = [folder for folder, flight in flight_files().items() if flight.kind == SESSION]
     if run is not None:
         if run.resolve() not in sessions:
-            raise BadInputError(f"--run {run}: {not_found('no session runs there')}")
+            raise BadInputError(f"--run {run}: no session runs there")
         return run.resolve(), ""
     if not sessions:
         text = "start one: cloudrc up; a flight of 'cloudrc run' ends by Ctrl-C there"
-        raise MissingPrerequisiteError(not_found(f"no session runs here; {text}"))
+        raise MissingPrerequisiteError(f"no session runs here; {text}")
     note = ask_if_unclear(sessions, steers=True)
     return sessions[0], note
 
@@ -101,5 +94,5 @@ def ask_if_unclear(candidates: Collection[Path], *, steers: bool) -> str:
     if steers and not is_mine and (latest / LINK_LOG).exists():  # this user steered that flight
         others = names or "--release NAME (in a cluster)"
         text = f"has ended, or does not take this command; name another flight: {others}"
-        raise BadInputError(f"{short(latest)}: {not_found(text)}; or start one: cloudrc up")
+        raise BadInputError(f"{short(latest)}: {text}; or start one: cloudrc up")
     return f"using the run in {names}" if candidates and not is_mine else ""

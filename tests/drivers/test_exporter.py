@@ -129,8 +129,7 @@ def get(port, path, host=HOST):
             return error.code, error.read().decode()
 
 
-def test_metrics_and_probes_are_on_one_port(served, monkeypatch):
-    monkeypatch.setattr(exporters, "KEPT", 0.0)
+def test_metrics_and_probes_are_on_one_port(served):
     exporter, port = served
     assert get(port, "/healthz") == (200, "alive\n")
     assert get(port, "/readyz") == (503, "no peer yet\n")

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.drivers.link_metrics import export_counts, export_state
 from cloudrc.drivers.namespaces import Forwarder, ProgramEnd, ProgramState, print_lines
 from cloudrc.drivers.realtime import show_address
 from cloudrc.errors import (
@@ -158,7 +157,7 @@ class _Run:
         exporter = self._exporter = Exporter("link")
         exporter.link.tell = self._link.status_page
         exporter.serve(("127.0.0.1", port))
-        self._link.export = partial(export_state, exporter)
+        self._link.export = exporter.shaped
         self._stack.callback(exporter.close)
 
     def run(self, commands: Mapping[str, str], wait: float) -> ExecOutcome:
@@ -231,7 +230,7 @@ class _Run:
         now = time.monotonic()
         if self._exporter and now - self._counted_at >= COUNT_PERIOD:
             self._counted_at = now
-            export_counts(self._exporter, self._link.counts())
+            self._exporter.counted(self._link.counts())
 
 
 def _describe(link: LiveLink, end: ProgramEnd) -> str:
