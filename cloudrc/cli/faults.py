@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.cli.output import output_argument, paint, print_line, print_result, tell
 from cloudrc.cli.parser import Options, Parser, add_verbs, flags, number, read_count, whole_number
 from cloudrc.errors import BadInputError
+from cloudrc.outside.refusal import check_names
 from cloudrc.text import table
 from cloudrc.trials.workers import map_in_order, take_each
 
@@ -79,7 +80,7 @@ def print_faults(options: Options) -> None:
     from cloudrc.faults.scenarios import SCENARIOS
 
     names = ("id", "name", "injects", "expects")
-    faults = [{name: getattr(each, name) for name in names} for each in SCENARIOS]
+    faults = [{name: getattr(each, name) for name in names} for each in SCENARIOS.values()]
     head = "fault", "name", "injection", "expected reaction"
     text = table([head, *(tuple(each.values()) for each in faults)])
     print_result(options.output, {"faults": faults}, text)
@@ -88,22 +89,25 @@ def print_faults(options: Options) -> None:
 def run(options: Options) -> int:
     """Run one fault, all faults, or the schedule of faults in a file; return the exit code."""
     from cloudrc.cli.progress import Progress
-    from cloudrc.faults.scenarios import SCENARIOS, find
+    from cloudrc.faults.scenarios import SCENARIOS
     from cloudrc.faults.search import run_fault
 
     if isinstance(options.name, Path):
         return run_file(options)
-    chosen = SCENARIOS if options.all else (find(options.name),)
+    names = {each.id.lower(): each.name for each in SCENARIOS.values()}
+    name = str(options.name).lower()
+    chosen = [*SCENARIOS] if options.all else [names.get(name, name)]
+    check_names("fault", chosen, SCENARIOS)
     faults: list[dict[str, Any]] = []
 
     def take(outcome: Outcome) -> None:
-        scenario = chosen[len(faults)]
+        scenario = SCENARIOS[chosen[len(faults)]]
         faults.append(scenario.as_json(outcome))
         if options.output == "table":
             print("\n".join(scenario.as_lines(outcome, paint, briefly=options.all)))
 
     run_seed = partial(run_fault, seed=options.seed)
-    flown = map_in_order(run_seed, [each.name for each in chosen], options.jobs)
+    flown = map_in_order(run_seed, chosen, options.jobs)
     with Progress("flies with the faults"):
         stopped = take_each(flown, take)
     done, failed = len(faults), sum(each["result"] == "failed" for each in faults)
@@ -119,12 +123,17 @@ def run(options: Options) -> int:
 def run_file(options: Options) -> int:
     """Fly the schedule of faults in a file; return 1 if the flight breaks a safety invariant."""
     from cloudrc.cli.progress import Progress
-    from cloudrc.faults.trial import fly_file
+    from cloudrc.faults.schedule import load
+    from cloudrc.faults.trial import fly
 
     if options.seed != 1:
         raise BadInputError("--seed belongs to named faults, not to a schedule's file")
     with Progress(f"flies {options.name}"):
-        finding = fly_file(options.name)
+        schedule = load(options.name)
+        try:
+            finding = fly(schedule, keep=True)
+        except (BadInputError, ValueError) as error:  # an unknown profile or policy
+            raise BadInputError(f"{options.name}: {error}") from error
     breaches = [breach._asdict() for breach in finding.breaches]
     document = {"records_sha256": finding.sha256, "breaches": breaches}
     print_result(options.output, document, finding.as_text())

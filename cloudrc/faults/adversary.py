@@ -30,6 +30,7 @@ from cloudrc.messages import (
     Start,
     Vector,
 )
+from cloudrc.outside.refusal import check_names
 from cloudrc.records import Control, Fault
 from cloudrc.teleop.wire import Output, RobotStatus
 from cloudrc.world.robot import STEP_NS
@@ -72,41 +73,36 @@ class HostileOperator:
 
     def __init__(self, honest: Operator, words: Words) -> None:
         self._honest, self._words = honest, words
-        self.outputs: Sequence[Output | Fault] = []
+        self.outputs: list[Output | Fault] = []
         self._seen: RobotStatus | None = None
         self._has_setpoint = False
         self._number = 0  # of the last request in this session
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Pass telemetry to teleop; keep the largest request number seen in this session."""
-        if self._seen is None or self._seen.epoch != seen.epoch:
-            self._number = 0
-        self._seen, self._number = seen, max(self._number, seen.mission)
+        is_known = self._seen is not None and self._seen.epoch == seen.epoch
+        self._seen, self._number = seen, max(self._number * is_known, seen.mission)
         self._honest.see(seen, now_ns)
-        self._collect()
 
     def handle_deadline(self, now_ns: int) -> None:
         """Forward teleop's outputs at `now_ns` [ns]; after the first setpoint, forge requests."""
         self._honest.handle_deadline(now_ns)
-        self._collect()
+        for output in self._honest.take_outputs():
+            self._has_setpoint |= isinstance(output, Setpoint)
+            if isinstance(output, OperatorRequest):
+                if self._has_setpoint:
+                    continue
+                self._number = max(self._number, output.number)
+            self.outputs.append(output)
         if self._has_setpoint and self._seen is not None:
             if (request := self._words(now_ns, self._seen)) is not None:
                 self._number += 1
-                self.outputs = [*self.outputs, request._replace(number=self._number)]
+                self.outputs.append(request._replace(number=self._number))
 
     def take_outputs(self) -> Sequence[Output | Fault]:
         """Return and remove the forwarded and the forged messages since the last call."""
         outputs, self.outputs = self.outputs, []
         return outputs
-
-    def _collect(self) -> None:
-        for output in self._honest.take_outputs():
-            self._has_setpoint = self._has_setpoint or isinstance(output, Setpoint)
-            if isinstance(output, OperatorRequest):
-                if self._has_setpoint:
-                    continue
-                self._number = max(self._number, output.number)
-            self.outputs = [*self.outputs, output]
 
 
 BEGIN = OperatorRequest(0, Request.START, Start.HERE)
@@ -165,15 +161,10 @@ def dishonesty(schedule: Schedule, fence: Fence) -> tuple[list[Lie], Words | Non
     The functions in the list change commands. The function after the list forges operator requests;
     it is None if the policy forges no requests. `fence` is that of the scene. Most clouds send no
     vertical velocity to a robot that stays on the ground, because its guard drops such commands.
-
-    Raises:
-        ValueError: If the policy does not exist; the message lists all policies.
     """
     if not schedule.policy:
         return [], None
-    if schedule.policy not in POLICIES:
-        names = ", ".join(POLICIES)
-        raise ValueError(f"no policy '{schedule.policy}' of a cloud; there are: {names}")
+    check_names("policy of a cloud", [schedule.policy], POLICIES)
     lies = [POLICIES[schedule.policy](generator(schedule.seed, 666), fence)]
     if fence.ground is not None and generator(schedule.seed, 668).random() < FLAT_SHARE:
         lies.append(_flat)

@@ -22,11 +22,11 @@ from cloudrc.drivers.teleop import PERIOD_NS as WAKE_NS
 from cloudrc.drivers.virtual import Clock, VirtualRun
 from cloudrc.endpoint import Endpoint
 from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, dishonesty
-from cloudrc.faults.facts import Facts
 from cloudrc.faults.inject import BUGS, SECRET, bugs, inject, shaped
-from cloudrc.faults.invariants import Watch
+from cloudrc.faults.invariants import RobotInvariants
 from cloudrc.faults.models import RestartableEndpoint, TeleopModel
 from cloudrc.faults.schedule import OFFSET_MAX, Schedule, generator
+from cloudrc.faults.watch import Watch
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
 from cloudrc.messages import GuardState
@@ -86,7 +86,7 @@ class FaultRun:
         self.generations = {"world": 0, "cloud": 0}
         self.of_world, self.of_cloud = list[Record](), list[Record]()
         self.changes = list[GuardChange]()
-        self.watch = Watch(Facts.of(self.experiment))
+        self.watch = Watch(self.experiment)
         self.listeners: list[Callable[[list[Record], int], None]] = [self.watch.see]
         phase_ns = int(generator(self.experiment.seed, 45).integers(WAKE_NS))
         self.teleop = TeleopModel(self._fence, phase_ns)
@@ -95,7 +95,13 @@ class FaultRun:
         self.world = RestartableEndpoint(self._build_world, Clock())
         self.cloud = RestartableEndpoint(self._build_cloud, self._clock)
         self.teleop.run_on(self.cloud)
-        self.uplink, self.downlink = self._make_link("up"), self._make_link("down")
+        ends = {"up": self.experiment.uplink, "down": self.experiment.downlink}
+        self.uplink, self.downlink = (
+            LinkDirection(
+                shaped(schedule, link_profile(end), way), self.experiment.seed, way == "up"
+            )
+            for way, end in ends.items()
+        )
         self.run = VirtualRun(self.world, self.cloud, self.uplink, self.downlink)
         inject(self)
 
@@ -183,7 +189,7 @@ class FaultRun:
     def _build_world(self, start_ns: int) -> list[Endpoint]:
         identity = self._begin("world", SHARED)
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
-        self.watch.attach(world.robot, start_ns, honest=self._honest)
+        RobotInvariants(world.robot, self.watch, start_ns, self._honest)
         return [world]
 
     def _build_cloud(self, start_ns: int) -> list[Endpoint]:
@@ -206,11 +212,6 @@ class FaultRun:
         teleop.start(start_ns, MissionRecord("rival", self.make_order(), 0))
         identity = Identity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, teleop, lambda: start_ns)
-
-    def _make_link(self, way: str) -> LinkDirection:
-        ends = {"up": self.experiment.uplink, "down": self.experiment.downlink}
-        profile = shaped(self.schedule, link_profile(ends[way]), way)
-        return LinkDirection(profile, self.experiment.seed, uplink=way == "up")
 
     def _begin(self, end: str, clock_id: bytes) -> Identity:
         """Make key ring and identity of a new process of `end`, "world" or "cloud"."""

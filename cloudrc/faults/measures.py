@@ -11,7 +11,6 @@ from itertools import pairwise
 from math import dist, hypot, isfinite, nan
 from typing import Any, Literal, TypeAlias
 
-from cloudrc.errors import describe_error
 from cloudrc.faults.adversary import Lie
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.schedule import Schedule, generator
@@ -166,15 +165,6 @@ class Scenario:
     def id(self) -> str:
         """Number of the fault with its letter, such as F13."""
         return f"F{self.number}"
-
-    def run(self, seed: int) -> Outcome:
-        """Inject the fault, and check the reaction; an exception becomes the outcome's `error`."""
-        outcome = Outcome(seed=seed)
-        try:
-            self.inject(outcome)
-        except Exception as error:  # the other scenarios still run
-            outcome.error = describe_error(error)
-        return outcome
 
     def as_lines(self, outcome: Outcome, paint: Paint = plain, *, briefly: bool) -> Iterator[str]:
         """Describe one result of this scenario in lines, `briefly` without the checks it passed."""

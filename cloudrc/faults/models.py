@@ -6,6 +6,7 @@ from bisect import insort
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from operator import itemgetter
 from typing import TypeAlias, TypeVar
 
 from cloudrc.drivers.teleop import PERIOD_NS, RemoteTeleop, TeleopLoop, UnixPeer
@@ -49,12 +50,11 @@ class RestartableEndpoint:
         """Start a process; `build` makes its members, given the time on `clock` [ns]."""
         self._build, self.clock = build, clock
         self.tamper: Tamper | None = None  # changes the datagrams that arrive
-        self._scheduled, self._frozen_until_ns = 0, -1
+        self._frozen_until_ns = -1
         self._waiting: list[bytes] = []
         self._left: list[Record] = []
-        self._actions: list[tuple[int, int, Action]] = []
+        self._actions: list[tuple[int, Action]] = []
         self.members, self.others = build(clock.at(0)), list[Record]()
-        self._set_deadline()
 
     @property
     def inner(self) -> Endpoint | None:
@@ -63,20 +63,16 @@ class RestartableEndpoint:
 
     def at(self, seconds: float, action: Action) -> None:
         """Schedule an action at the virtual time `seconds` [s]."""
-        self._scheduled += 1
-        insort(self._actions, (round(seconds * 1e9), self._scheduled, action))
-        self._set_deadline()
+        insort(self._actions, (round(seconds * 1e9), action), key=itemgetter(0))
 
     def kill(self, now_ns: int) -> None:
         """Kill the process as with SIGKILL; its records so far are kept."""
         self._left = self.take_records()
         self.members, self._waiting, self._frozen_until_ns = [], [], -1
-        self._set_deadline()
 
     def start(self, now_ns: int) -> None:
         """Start a new process of world or cloud at `now_ns` [ns, virtual time]."""
         self.members = self._build(self.clock.at(now_ns))
-        self._set_deadline()
 
     def restart(self, now_ns: int, down: float) -> None:
         """Kill the process at `now_ns` [ns]; start a new one after `down` [s]."""
@@ -86,7 +82,6 @@ class RestartableEndpoint:
     def freeze(self, now_ns: int, duration: float) -> None:
         """Stop the process as with SIGSTOP, from `now_ns` [ns] for `duration` [s]."""
         self._frozen_until_ns = max(self._frozen_until_ns, now_ns + round(duration * 1e9))
-        self._set_deadline()
 
     def throttle(self, start: float, duration: float, share: float) -> None:
         """Throttle the process: it runs for a `share` [1] of each CFS period, then it is stopped.
@@ -109,16 +104,19 @@ class RestartableEndpoint:
         """Receive a datagram at `now_ns` [ns]; `tamper`, if set, changes the datagram first."""
         for each in [data] if self.tamper is None else self.tamper(data, now_ns):
             self.receive_now(each, now_ns)
-        self._set_deadline()
 
     def next_deadline_ns(self) -> int:
         """Implement `Endpoint.next_deadline_ns`."""
-        return self._due_ns
+        due_ns = self._actions[0][0] if self._actions else FAR_NS
+        if self.members and self._frozen_until_ns >= 0:
+            return min(due_ns, self._frozen_until_ns)
+        wakes_ns = [self.clock.when(member.next_deadline_ns()) for member in self.members]
+        return min([due_ns, *wakes_ns])
 
     def handle_deadline(self, now_ns: int) -> None:
         """Implement `Endpoint.handle_deadline`: inject due faults, then run the process."""
         while self._actions and self._actions[0][0] <= now_ns:
-            self._actions.pop(0)[2](now_ns)
+            self._actions.pop(0)[1](now_ns)
         if 0 <= self._frozen_until_ns <= now_ns:
             self._frozen_until_ns = -1
             waiting, self._waiting = self._waiting, []
@@ -128,7 +126,6 @@ class RestartableEndpoint:
         for member in self.members if self._frozen_until_ns < 0 else ():
             if own_ns >= member.next_deadline_ns():
                 member.handle_deadline(own_ns)
-        self._set_deadline()
 
     def take_datagrams(self) -> list[bytes]:
         """Return the datagrams of the process; none while it is frozen or does not run."""
@@ -145,14 +142,6 @@ class RestartableEndpoint:
         for n, member in enumerate(self.members):
             (self.others if n else records).extend(member.take_records())
         return records
-
-    def _set_deadline(self) -> None:
-        due_ns = self._actions[0][0] if self._actions else FAR_NS
-        if self.members:
-            frozen = self._frozen_until_ns >= 0
-            wake_ns = min(member.next_deadline_ns() for member in self.members)
-            due_ns = min(due_ns, self._frozen_until_ns if frozen else self.clock.when(wake_ns))
-        self._due_ns = due_ns
 
 
 class _Peer(UnixPeer):

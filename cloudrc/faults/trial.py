@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
-from cloudrc.errors import BadInputError, describe_error
-from cloudrc.faults.facts import LATCHED
+from cloudrc.errors import describe_error
 from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.invariants import Breach
 from cloudrc.faults.measures import events_of_missions, held
-from cloudrc.faults.schedule import Schedule, load
+from cloudrc.faults.schedule import Schedule
+from cloudrc.faults.watch import LATCHED, Breach
 from cloudrc.messages import GuardState
 from cloudrc.records import GuardChange, Record
 from cloudrc.teleop.service import MissionService
@@ -69,15 +67,6 @@ class TrialResult:
         return "\n".join([*lines, f"{word}  records {self.sha256[:16]}"])
 
 
-def fly_file(path: Path) -> TrialResult:
-    """Fly the schedule of faults in a file; raise a BadInputError that names it if it is wrong."""
-    schedule = load(path)
-    try:
-        return fly(schedule, keep=True)
-    except (BadInputError, ValueError) as error:  # an unknown profile or policy
-        raise BadInputError(f"{path}: {error}") from error
-
-
 def fly(schedule: Schedule, *, keep: bool = False) -> TrialResult:
     """Fly with a schedule of faults.
 
@@ -93,7 +82,7 @@ def fly(schedule: Schedule, *, keep: bool = False) -> TrialResult:
     try:
         flight.fly(schedule.duration)
     except Exception as error:  # world and cloud must survive every fault
-        watch.note(flight.run.now_ns, "error", describe_error(error))
+        watch.note("error", describe_error(error))
     checks: dict[str, Callable[[], None]] = {
         "waypoint": lambda: _check_waypoints(flight),
         "stuck": operator.check_stuck,
@@ -137,13 +126,13 @@ class TrialOperator:
             state, cause = flight.guard_now()
             mission = flight.mission.state if flight.teleop.missions else "none"
             text = f"not flown in {BACK:g} s of calm: guard {state.name} ({cause}), mission"
-            flight.watch.note(now_ns, "stuck", f"{text} {mission}")
+            flight.watch.note("stuck", f"{text} {mission}")
 
     def check_stops(self) -> None:
         """Check that each emergency stop of the operator led to ESTOP."""
         for at_ns in self._unmet_ns:
             text = f"the operator's stop at {at_ns * 1e-9:.2f} s has stopped nothing"
-            self._flight.watch.note(self._flight.run.now_ns, "obeyed", text)
+            self._flight.watch.note("obeyed", text)
 
     def _look(self, records: list[Record], now_ns: int) -> None:
         """Note what the guard did in the last 100 ms, then act as an operator would."""
@@ -179,11 +168,11 @@ def _check_waypoints(flight: FaultRun) -> None:
     for mission, waypoints in reached.items():
         if waypoints != list(range(len(waypoints))):
             text = f"{mission} reached its waypoints as {waypoints}"
-            flight.watch.note(flight.run.now_ns, "waypoint", text)
+            flight.watch.note("waypoint", text)
 
 
 def _check_alarms(flight: FaultRun) -> None:
     latched = [change for change in flight.changes if change.state in LATCHED]
     for change in (*held(flight), *latched):
         text = f"{change.state.name} in a flight without faults: {change.cause}"
-        flight.watch.note(change.stamp_ns, "alarm", text)
+        flight.watch.note("alarm", text, change.stamp_ns)

@@ -30,7 +30,6 @@ from cloudrc.records import (
     MissionEvent,
     TelemetrySent,
 )
-from tests.conftest import needs_ipv6
 from tests.flights.conftest import records
 
 HOST = "127.0.0.1"
@@ -120,9 +119,9 @@ def served():
     exporter.close()
 
 
-def get(port, path, host=HOST):
+def get(port, path):
     try:
-        with urllib.request.urlopen(f"http://{host}:{port}{path}", timeout=10) as answer:
+        with urllib.request.urlopen(f"http://{HOST}:{port}{path}", timeout=10) as answer:
             return answer.status, answer.read().decode()
     except urllib.error.HTTPError as error:
         with error:
@@ -142,26 +141,15 @@ def test_metrics_and_probes_are_on_one_port(served):
     assert get(port, "/") == (404, "there are /metrics, /healthz, /readyz, /link.json\n")
 
 
-def test_a_loop_that_stands_still_is_not_alive(served, monkeypatch):
+def test_a_loop_that_stands_still_is_not_alive(served):
     """Liveness does not depend on the other end, nor on the loop before its start."""
     exporter, port = served
     exporter.unresolved(7)  # another thread than the loop's calls this
-    assert "cloudrc_dns_errors_total 7.0" in exporter.text()
     assert exporter._seen_at is None
-    assert get(port, "/healthz") == (200, "alive\n")
     exporter.see([])
-    monkeypatch.setattr(exporters, "STILL_MAX", 60.0)
     assert get(port, "/healthz") == (200, "alive\n")
     exporter._seen_at -= 61.0
     assert get(port, "/healthz") == (503, "the loop has stood still for 61 s\n")
-
-
-@needs_ipv6
-def test_probes_of_both_address_families_are_answered():
-    exporter = Exporter("link")
-    port = exporter.serve(("::", 0))
-    assert {get(port, "/healthz", host)[0] for host in ("127.0.0.1", "[::1]")} == {200}
-    exporter.close()
 
 
 def test_a_burst_of_clients_that_hang_blocks_no_probe(served):

@@ -56,14 +56,6 @@ def test_a_reader_gets_records_and_telemetry_in_order(sender, reader):
     assert (reader.take(0), reader.dropped) == ([], 0)
 
 
-def test_a_second_of_records_waits_for_a_reader(sender, reader):
-    for number in range(100):
-        sender.see(1, number, TELEMETRY)
-        sender.put([arrival(number)])
-    assert len(reader.take(0)) == 200
-    assert reader.dropped == 0
-
-
 def test_a_slow_reader_knows_how_many_records_it_has_lost(sender, reader):
     for number in range(10_000):
         sender.put([arrival(number)])

@@ -13,7 +13,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from cloudrc.drivers.recording import AFTERWARDS_NS, TROUBLE, FlightsOnly, Recorder
+from cloudrc.drivers.recording import AFTERWARDS_NS, FlightsOnly, Recorder
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
@@ -46,23 +46,6 @@ def record_all(recorder, records, every):
     recorder._close()
 
 
-def test_the_oldest_are_dropped_and_counted(monkeypatch):
-    shelf, records = Shelf(), counted(25)
-    monkeypatch.setattr("cloudrc.drivers.recording.CAPACITY", 10)
-    recorder = Recorder(Path("x"), lambda path: shelf)
-    for record in records:
-        recorder.put([record])
-    assert recorder.dropped == 15
-    monkeypatch.setattr("cloudrc.drivers.recording.BATCH", 4)
-    assert recorder._drain() == 4
-    recorder.put(records[:5])
-    assert recorder.dropped == 16
-    recorder._close()
-    assert shelf.closed
-    assert shelf.records == [*records[15:19], *records[20:], *records[:5]]
-    assert recorder.error == ""
-
-
 def test_records_that_a_slow_disk_drops_are_told_and_leave_a_hole(tmp_path, monkeypatch):
     path, records = tmp_path / "world.mcap", world_records(600)
     monkeypatch.setattr("cloudrc.drivers.recording.CAPACITY", 200)
@@ -83,7 +66,7 @@ def test_records_that_a_slow_disk_drops_are_told_and_leave_a_hole(tmp_path, monk
 
 
 @pytest.mark.promise("a-bad-disk-spares-the-flight")
-@pytest.mark.parametrize("room", [0, 100, 1500, *range(20_000, 60_800, 8_160)])
+@pytest.mark.parametrize("room", [0, 1500, 20_000, 52_640])
 def test_on_a_full_disk_all_is_kept_or_counted(tmp_path, room):
     path, records = tmp_path / "w.mcap", counted(3000)
     disk = Disk(room)
@@ -111,9 +94,8 @@ def failing(step, error):
 
 @pytest.mark.promise("a-bad-disk-spares-the-flight")
 @pytest.mark.parametrize("step", ["flush", "sync", "close"])
-@pytest.mark.parametrize(("code", "words"), [*TROUBLE.items(), (errno.EIO, "Input/output error")])
-def test_disk_errors_are_reported_and_never_raised(step, code, words):
-    shelf = failing(step, OSError(code, "Input/output error"))
+def test_disk_errors_are_reported_and_never_raised(step):
+    shelf = failing(step, OSError(errno.EROFS, "Read-only file system"))
     recorder = Recorder(Path("w.mcap"), lambda path: shelf)
     recorder.put(counted(3))
     recorder._drain()
@@ -121,7 +103,7 @@ def test_disk_errors_are_reported_and_never_raised(step, code, words):
     recorder._flush()
     recorder.put(counted(2))
     recorder._close()
-    assert f"w.mcap: recording stopped: {words};" in recorder.error
+    assert "w.mcap: recording stopped: disk is read-only;" in recorder.error
     assert recorder.dropped == (0 if step == "close" else 2)
 
 
@@ -132,20 +114,6 @@ def test_a_recording_at_its_size_limit_ends_complete(tmp_path):
     assert recorder.dropped > 0
     assert 20_000 <= path.stat().st_size < 100_000
     assert Recording.read(path).note == said
-
-
-@pytest.mark.parametrize("error", [None, OSError(errno.EIO, "broken"), ValueError("closed file")])
-def test_a_sync_by_another_thread_reports_its_error_later(tmp_path, error):
-    shelf = failing("sync", error)
-    recorder = Recorder(tmp_path / "w.mcap", lambda path: shelf)
-    recorder.put(counted(1))
-    recorder._drain()
-    recorder._sync()
-    assert (recorder.sync_age() is None) == (error is not None)
-    assert not shelf.closed
-    recorder._flush()
-    failed = isinstance(error, OSError)  # the other one means that the file was closed meanwhile
-    assert (shelf.closed, recorder.error != "") == (failed, failed)
 
 
 class Slow(Shelf):

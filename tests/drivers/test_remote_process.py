@@ -93,14 +93,6 @@ def test_a_program_has_ended_once_its_children_have(tmp_path):
         assert not gone()
 
 
-@pytest.mark.parametrize(
-    ("command", "text"),
-    [("no-such-program x", "no program")],
-)
-def test_a_command_that_cannot_start_is_refused(command, text, refused):
-    assert text in refused("run hover --mode virtual --with", command)
-
-
 def test_a_program_that_ends_before_it_listens_is_named_with_its_last_line(tmp_path):
     url = f"ws://127.0.0.1:{free_ports(1)[0]}"
     command = "sh -c 'echo no weights; exit 3'"

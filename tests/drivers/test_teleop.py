@@ -2,6 +2,8 @@
 
 import threading
 import time
+from itertools import chain, repeat
+from unittest.mock import Mock
 
 import pytest
 
@@ -77,22 +79,9 @@ def test_after_a_stall_cloud_forwards_stops_but_not_waypoints(peers, stalled):
 # Teleop's side
 
 
-class Machine:
-    """A machine with given outputs that stores what it hears and sees."""
-
-    def __init__(self):
-        self.outputs, self.heard, self.seen = [], [], []
-        self.hear = self.heard.append
-
-    def see(self, seen, now_ns):
-        self.seen.append(seen)
-
-    def handle_deadline(self, now_ns):
-        """Do nothing."""
-
-    def take_outputs(self):
-        outputs, self.outputs = self.outputs, []
-        return outputs
+def a_machine(*outputs):
+    """Make a machine with given outputs."""
+    return Mock(take_outputs=Mock(side_effect=chain([list(outputs)], repeat([]))))
 
 
 def serve(machine, peer, wakes, calls=lambda now_ns: None, told=None):
@@ -116,8 +105,9 @@ def test_after_a_stall_old_states_are_skipped_before_calls(peers, monkeypatch, w
 
     At each wake a new state has arrived (p), or the wake follows a stall (s) with an old one.
     """
-    machine, clock, coming = Machine(), [SECOND], iter(wakes)
-    calls = ["asked"]
+    machine, clock, coming = a_machine(), [SECOND], iter(wakes)
+    calls, done_so_far = ["asked"], []
+    machine.see = lambda seen, now_ns: done_so_far.append(seen)
     if wakes == "-":
         peers[1].send(OLD)
 
@@ -129,9 +119,9 @@ def test_after_a_stall_old_states_are_skipped_before_calls(peers, monkeypatch, w
 
     monkeypatch.setattr("cloudrc.drivers.teleop.time.sleep", sleep)
     monkeypatch.setattr("cloudrc.drivers.teleop.time.monotonic_ns", lambda: clock[0])
-    serve(machine, peers[0], len(wakes), lambda now_ns: calls and machine.seen.append(calls.pop()))
-    assert machine.seen == done
-    assert bool(machine.heard) == bool({NOW, OLD} & set(done)), "old signs of life do not count"
+    serve(machine, peers[0], len(wakes), lambda now_ns: calls and done_so_far.append(calls.pop()))
+    assert done_so_far == done
+    assert machine.hear.called == bool({NOW, OLD} & set(done)), "old signs of life do not count"
 
 
 def test_events_wait_for_an_absent_cloud_in_order_and_bounded(peers, tmp_path):
@@ -139,8 +129,7 @@ def test_events_wait_for_an_absent_cloud_in_order_and_bounded(peers, tmp_path):
     cloud.close()
     (tmp_path / "b.sock").unlink()
     events = [event(number) for number in range(EVENTS_KEPT + 50)]
-    machine, told = Machine(), []
-    machine.outputs = [POINT, *events, Fault(0, "journal", "full")]
+    machine, told = a_machine(POINT, *events, Fault(0, "journal", "full")), []
     server = threading.Thread(target=serve, args=(machine, teleop, 40), kwargs={"told": told})
     server.start()
     received, back, limit = [], None, time.monotonic() + 5.0

@@ -4,10 +4,7 @@ import json
 import socket
 import subprocess
 import sys
-import time
-from contextlib import ExitStack, closing
-from http.client import HTTPConnection
-from statistics import median
+from contextlib import ExitStack
 
 import pytest
 
@@ -19,18 +16,6 @@ from tests.drivers.conftest import LIMIT, TOKEN
 
 FILES = 256
 """Limit of open files that the process starts with."""
-
-
-def answer_times(port, count):
-    """Ask `count` times over one connection for the state; return the times to the answers [s]."""
-    headers, times = {"Authorization": f"Bearer {TOKEN}"}, []
-    with closing(HTTPConnection("::1", port)) as connection:
-        for _ in range(count):
-            began = time.monotonic()
-            connection.request("GET", "/v1/state", headers=headers)
-            assert connection.getresponse().read()
-            times.append(time.monotonic() - began)
-    return times
 
 
 @needs_ipv6
@@ -51,9 +36,6 @@ def test_idle_connections_do_not_lock_a_stop_out(tmp_path):
             port = int(url.removeprefix("http://[::1]:"))
             idle.enter_context(socket.create_connection(("::1", port)))
         assert Api(url, lambda: TOKEN).post("/v1/estop")["state"] == "stopping"
-    fresh = median(median(answer_times(port, 1)) for _ in range(20))
-    kept = median(answer_times(port, 20))
-    assert kept < fresh + 0.015, "a kept connection waits for no acknowledgement"
     process.terminate()
     _, said = process.communicate(timeout=LIMIT)
     assert process.returncode == 0

@@ -4,8 +4,8 @@ from functools import cache
 from types import SimpleNamespace
 
 from cloudrc.config.load import load_experiment
-from cloudrc.faults.facts import FLOWN, TRACK, Facts
-from cloudrc.faults.invariants import Watch
+from cloudrc.faults.invariants import RobotInvariants
+from cloudrc.faults.watch import FLOWN, TRACK, Watch
 from cloudrc.messages import ZERO, Command, OperatorRequest, Request, Start
 from cloudrc.records import Contact
 from cloudrc.robots.pelican.rotors import STOPPED
@@ -15,11 +15,11 @@ TURNING = (900.0,) * 4
 
 
 @cache
-def facts(hold_ms=60_000, robot="pelican"):
-    """Return what the invariants know of a robot in its experiment."""
+def experiment(hold_ms=60_000, robot="pelican"):
+    """Return the experiment of a robot."""
     settings = f"guard.hold_max_s={hold_ms / 1000}", "guard.plan_max_s=0.8"
     name = "pillars" if robot == "rover" else "paper"
-    return Facts.of(load_experiment(name, ["link.profile=ideal", *settings]))
+    return load_experiment(name, ["link.profile=ideal", *settings])
 
 
 class FakeRobot:
@@ -32,9 +32,8 @@ class FakeRobot:
         self.observers = []
         self.position, self.velocity = (1.0, 1.0, 1.0), ZERO
         self.now_ns = 0
-        self.watch = Watch(facts(hold_ms, robot))
-        self.watch.attach(self, 0, honest=honest)
-        (self.observer,) = self.observers
+        self.watch = Watch(experiment(hold_ms, robot))
+        self.observer = RobotInvariants(self, self.watch, 0, honest)
         self.request(Request.START)
 
     def request(self, *requests, start=Start.HERE):

@@ -5,7 +5,7 @@ from operator import methodcaller
 
 import pytest
 
-from cloudrc.faults.facts import ESTOP, GROUND, HOLD, LAND, TRACK
+from cloudrc.faults.watch import ESTOP, GROUND, HOLD, LAND, TRACK
 from cloudrc.messages import ZERO, Request, Start
 from tests.faults.conftest import FakeRobot
 
@@ -75,26 +75,22 @@ MOTION = [
     (set(), (offer(basis_ms=0), step(TRACK, ms=252, fresh=False))),
     ({"stale"}, (offer(), step(TRACK, ms=254, fresh=False))),
     ({"stale"}, (offer(basis_ms=-251),)),
-    ({"stale"}, (offer(basis_ms=1),)),
     # A plan is fresh until it ends, for 0.8 s at most, and until the next command or session.
     *((kinds, (offer(plan=plan), *others, step(TRACK, ms=ms, fresh=False)))
       for plan, others, ms, kinds in (
           (40, (), 412, set()), (40, (), 414, {"stale"}), (80, (), 804, {"stale"}),
-          (40, (offer(),), 254, {"stale"}), (40, (SESSION,), 2, {"stale"}),
+          (40, (SESSION,), 2, {"stale"}),
       )),
     ({"tick"}, (step(TRACK), STEPPED, step(TRACK))),
-    (set(), (step(GROUND), SPAWN, step(GROUND))),
     # Without commands it stops within its stopping distance.
     (set(), rest(2.0, 1.56)),
     ({"rest"}, rest(2.0, 1.58)),
     # Rotors stand still on the ground and after a stop; they stop where the robot stands.
-    *((set(), (step(each),)) for each in (GROUND, ESTOP)),
     *(({"latch"}, (step(each, turns=True),)) for each in (GROUND, ESTOP)),
     (set(), (step(HOLD), put((0.19, -0.2, 0.2)), step(GROUND))),
     ({"rest"}, (step(HOLD), put((0.0, -0.21, 0.0)), step(GROUND))),
     *((set(), (step(HOLD), put((0.0, 0.0, -3.0)), each, step(GROUND, ms=4)))
       for each in (STOP, SPAWN)),
-    (set(), (step(HOLD), step(GROUND), put((0.0, 0.0, -0.9)), step(GROUND))),
     ({"rest"}, (step(HOLD), step(GROUND), put((0.0, 0.0, -1.1)), step(GROUND))),
     (set(), (step(HOLD), step(GROUND), put((0.0, 0.0, -1.1), 0.9), step(GROUND))),
 ]  # fmt: skip
@@ -121,12 +117,10 @@ OPERATOR = [
     # TRACK needs a mission; nobody has to wait for its end.
     (set(), (step(TRACK), END, step(HOLD, ms=60_100))),
     *(({"latch"}, (each, step(TRACK))) for each in (STOP, END)),
-    *((set(), (each, request(Request.START), step(TRACK))) for each in (STOP, END)),
     # A HOLD ends after ten fresh commands in half a second, of one session and mission.
     (set(), resumes(10, 55)),
     *(({"stale"}, resumes(*each)) for each in ((10, 56), (9, 10))),
     ({"stale"}, (*NINE, SESSION, offer(), step(TRACK))),
-    ({"stale"}, (*NINE, offer(9, "stale"), step(TRACK, fresh=False), offer())),
     # Two changes to TRACK are a second apart.
     ({"hold"}, (step(GROUND), step(TRACK, ms=100), step(HOLD, ms=898), offer(10), step(TRACK))),
     (set(), (step(GROUND), step(TRACK, ms=100), step(HOLD, ms=900), offer(10), step(TRACK))),
@@ -145,17 +139,16 @@ def test_a_story_has_its_breaches_and_no_others(kinds, story):
     assert play(*story) == kinds
 
 
-@pytest.mark.parametrize("yaw_rate", [-1.0, 1.001, -1.001, NAN])
+@pytest.mark.parametrize("yaw_rate", [1.001, -1.001, NAN])
 def test_the_reference_turns_no_faster_than_the_cap(yaw_rate):
-    assert play(step(TRACK), yaw_rate=yaw_rate) == (set() if yaw_rate == -1.0 else {"cap"})
+    assert play(step(TRACK), yaw_rate=-1.0) == set()
+    assert play(step(TRACK), yaw_rate=yaw_rate) == {"cap"}
 
 
 @pytest.mark.parametrize(
-    ("state", "hold_ms", "wait_ms"),
-    [(HOLD, 60_000, 60_000), (GROUND, 60_000, 60_000), (GROUND, 2_000, 10_000)],
+    ("state", "hold_ms", "wait_ms"), [(HOLD, 60_000, 60_000), (GROUND, 2_000, 10_000)]
 )
 def test_a_mission_waits_for_its_cloud_as_long_as_configured(state, hold_ms, wait_ms):
-    assert play(step(state, ms=wait_ms), hold_ms=hold_ms) == set()
     assert play(step(state, ms=wait_ms + 6), hold_ms=hold_ms) == {"hold"}
     assert play(step(state, ms=wait_ms), step(LAND), hold_ms=hold_ms) == {"hold"}
     assert play(step(state, ms=wait_ms + 2), step(LAND), hold_ms=hold_ms) == set()
@@ -172,7 +165,6 @@ ENDING = (IMPOSSIBLE, step(LAND), *RELEASE)
         (set(), (touch("board", by_probe=True), step(TRACK))),
         ({"collision"}, (touch("board"), step(TRACK))),
         ({"collision"}, (touch("pipe_1", by_probe=True), step(TRACK))),
-        ({"collision"}, (touch("pipe_1"), step(GROUND))),
         # A robot that comes down may touch what is below, until it flies again.
         (set(), (IMPOSSIBLE, touch("pipe_3"), step(LAND), touch("floor"), step(LAND))),
         (set(), FALLS),
@@ -194,21 +186,12 @@ def test_an_honest_cloud_touches_the_board_by_the_tip_only(kinds, story):
     [
         # It may be at any height, and touches the floor; the walls count.
         (set(), (touch("floor"), step(TRACK, position=(1.0, 1.0, -5.0)))),
-        ({"collision"}, (touch("pillar_1"), step(TRACK))),
         ({"fence"}, (touch("floor"), IMPOSSIBLE, step(LAND, position=OUTSIDE))),
         # 0.2 v + v^2/4 <= 0.2: 0.579 m/s
         (set(), holds(HOLD, (8.9, 1.0, 0.1), (0.57, 0.0, 0.0))),
         ({"stop"}, holds(HOLD, (8.9, 1.0, 0.1), (0.59, 0.0, 0.0))),
-        ({"cap"}, fly((1.501, 0.0, 0.0))),
-        (set(), fly((0.004, 0.0, 0.0))),
         ({"cap"}, fly((0.0041, 0.0, 0.0))),
         ({"cap"}, holds(HOLD, (1.0, 1.0, 0.1), (0.0, 0.0, 1e-9))),
-        # Without commands it stops within 0.3 + 0.5625 + 0.5 m.
-        (set(), rest(1.5, 1.36)),
-        ({"rest"}, rest(1.5, 1.37)),
-        # Wheels that do not turn are no robot that is switched off.
-        (set(), (step(TRACK), put((0.3, 0.0, 0.0)), step(HOLD, turns=True))),
-        ({"latch"}, (step(GROUND, turns=True),)),
     ],
 )
 def test_the_limits_of_the_rover_are_its_own(kinds, story):

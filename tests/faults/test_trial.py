@@ -2,15 +2,16 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
 from cloudrc.cloud.operator import EmergencyStopRepeater
+from cloudrc.faults import trial
 from cloudrc.faults.adversary import POLICIES, choose
-from cloudrc.faults.invariants import Watch
 from cloudrc.faults.schedule import FaultEvent, Schedule, compose, load
-from cloudrc.faults.trial import FORGETFUL, _check_waypoints, checked_in, fly
+from cloudrc.faults.trial import checked_in, fly
+from cloudrc.faults.watch import Watch
 from cloudrc.messages import ZERO
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
@@ -19,7 +20,7 @@ from cloudrc.world.guard import limits
 from cloudrc.world.guard.hold import PositionHold
 from cloudrc.world.guard.state import Guard
 from tests.conftest import nightly
-from tests.faults.conftest import facts
+from tests.faults.conftest import experiment
 
 MS = 1_000_000
 REGRESSIONS = sorted((Path(__file__).parent / "regressions").glob("*.yaml"))
@@ -38,20 +39,16 @@ def test_random_faults_break_no_invariant(seed):
 
 
 @pytest.mark.promise("stays-inside-the-fence")
-@pytest.mark.parametrize("policy", sorted(POLICIES))
-def test_a_hostile_cloud_causes_no_breach(policy):
-    seed = next(seed for seed in range(1, 30) if choose(seed).policy == policy)
-    assert fly(replace(choose(seed), duration=6.0)).breaches == ()
-
-
-@pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize(
     ("robot", "policy"),
-    [("nano", "face-after-face"), ("rover", "hostile-plans"), ("x2", "operators-voice")],
+    [
+        *(("pelican", policy) for policy in sorted(POLICIES)),
+        *(("nano", "face-after-face"), ("rover", "hostile-plans"), ("x2", "operators-voice")),
+    ],
 )
-def test_a_hostile_cloud_of_another_robot_causes_no_breach(robot, policy):
+def test_a_hostile_cloud_causes_no_breach(robot, policy):
     seed = next(seed for seed in range(1, 30) if choose(seed).policy == policy)
-    assert fly(replace(choose(seed), duration=8.0, robot=robot)).breaches == ()
+    assert fly(replace(choose(seed), duration=7.0, robot=robot)).breaches == ()
 
 
 IGNORES_FENCE = (limits, "limit_to_fence", lambda velocity, *_: velocity)
@@ -81,11 +78,10 @@ BLACKOUT, STOPPED = FaultEvent("blackout", 44.0, 8.0), FaultEvent("stopped", 5.0
     ("events", "policy", "duration", "kinds"),
     [
         ((), "", 60.0, "collision waypoint stuck alarm"),
-        ((BLACKOUT,), "", 62.0, "collision waypoint stuck"),
         ((BLACKOUT,), "", 61.0, "collision waypoint"),
         ((STOPPED,), "", 60.0, "collision waypoint stuck obeyed"),
         ((STOPPED,), "greedy", 60.0, ""),
-        *(((STOPPED, FaultEvent(n, 9.0)), "", 60.0, "collision waypoint stuck") for n in FORGETFUL),
+        ((STOPPED, FaultEvent("teleop_killed", 9.0)), "", 60.0, "collision waypoint stuck"),
     ],
 )
 def test_a_schedule_is_checked_for_what_it_allows(events, policy, duration, kinds):
@@ -115,13 +111,6 @@ def applies_late_commands(patch):
     patch.setattr(Channel, "take", lambda *_: USED if (said := take(*_)) == LATE else said)
 
 
-def fails_to_shut_down(patch):
-    def fail(service, now_ns):
-        raise OSError("no way to end")
-
-    patch.setattr(MissionService, "pause", fail)
-
-
 @pytest.mark.parametrize(
     ("breaks", "kind", "schedule"),
     [
@@ -132,7 +121,11 @@ def fails_to_shut_down(patch):
         (ignores(EmergencyStopRepeater, "sound"), "obeyed", HELD),
         (ignores(MissionService, "acknowledge"), "stuck", HELD),
         (
-            fails_to_shut_down,
+            ignores(trial, "events_of_missions", lambda *_: [{"mission": "m", "waypoint": 1}]),
+            *("waypoint", Schedule(1, duration=0.2)),
+        ),
+        (
+            ignores(MissionService, "pause", Mock(side_effect=OSError)),
             "error",
             Schedule(3, events=(FaultEvent("pod_shut_down", 4.0, 2.0, 0.5),), duration=5.0),
         ),
@@ -151,31 +144,16 @@ def test_a_broken_part_is_found(breaks, kind, schedule, monkeypatch):
         ([(2, 0), (2, 1), (2, 5), (1, None), (1, 0)], set()),
         ([(2, 0), (2, 1), (2, 5), (1, 7), (1, 6)], {"order"}),
         ([(2, 0), (2, 5), (3, 0)], set()),
-        ([(2, 1), (2, 1)], {"order"}),
         ([(3, None), (2, 9)], {"order"}),
     ],
 )
 def test_a_command_is_applied_once_and_in_order(commands, kinds):
-    watch = Watch(facts())
+    watch = Watch(experiment())
     watch.starts_ns += [0, 3]
     for at, (epoch, counter) in enumerate(commands):
         opened = SessionOpened(at, "world", epoch, "cloud said hello")
         watch.see([opened if counter is None else CommandApplied(at, epoch, counter, 0, ZERO)], 0)
     assert set(watch.counts) == kinds
-
-
-@pytest.mark.parametrize(
-    ("waypoints", "kinds"),
-    [([0, 1, 2], set()), ([0, 1, 1], {"waypoint"}), ([0, 2], {"waypoint"}), ([1], {"waypoint"})],
-)
-def test_a_waypoint_is_reached_once_and_in_order(waypoints, kinds):
-    events = [{"mission": "m", "event": "reached", "waypoint": n} for n in waypoints]
-    events.append({"mission": "n", "event": "reached", "waypoint": 0})
-    book = SimpleNamespace(events_after=lambda number: events)
-    teleop, run = SimpleNamespace(service=SimpleNamespace(book=book)), SimpleNamespace(now_ns=0)
-    flight = SimpleNamespace(listeners=[], watch=Watch(facts()), teleop=teleop, run=run)
-    _check_waypoints(flight)
-    assert set(flight.watch.counts) == kinds
 
 
 def test_a_fault_of_the_link_needs_a_profile_without_changes():

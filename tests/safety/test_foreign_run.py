@@ -3,7 +3,6 @@
 import json
 import os
 import subprocess
-from pathlib import Path
 
 import pytest
 
@@ -19,7 +18,6 @@ from tests.metrics.conftest import flown
 from tests.record.conftest import write_mission
 
 pytestmark = pytest.mark.promise("foreign-files-run-nothing")
-PACKAGE = Path(ends.__file__).parents[1]
 CONFIG = """\
 cloud:
   estimator: {spy}
