@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.faults.invariants import Breach
 from cloudrc.faults.measures import Outcome
 from cloudrc.faults.scenarios import SCENARIOS
 from cloudrc.faults.schedule import FaultEvent, Schedule, dump, load
 from cloudrc.faults.search import run_fault
 from cloudrc.faults.trial import TrialResult
+from cloudrc.faults.watch import Breach
 from cloudrc.trials.workers import WorkerDiedError
 
 KILLED = WorkerDiedError("a worker was killed")
@@ -35,8 +35,9 @@ def test_a_failed_check_ends_in_exit_code_1(monkeypatch, call):
         if number == 2:
             raise ValueError("broken")
 
-    fakes = [replace(each, inject=partial(run, number=each.number)) for each in SCENARIOS]
-    monkeypatch.setattr("cloudrc.faults.scenarios.SCENARIOS", fakes)
+    for name, each in SCENARIOS.items():
+        fake = replace(each, inject=partial(run, number=each.number))
+        monkeypatch.setitem(SCENARIOS, name, fake)
     out = call("faults run --all", code=1).out
     for said in ("x collisions: 2 (0)", "22 of 24 passed, 2 failed", "ValueError: broken"):
         assert said in out
