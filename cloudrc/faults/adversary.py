@@ -130,7 +130,7 @@ def at_bad_moments(rng: Generator, fence: Fence) -> Words:
 
     Half of the requests wait until the robot is near `fence`.
     """
-    pause, near = float(rng.choice([0.05, 0.3, 1.0])), float(rng.uniform(0.2, 1.5))
+    pause, near = float(rng.choice([0.05, 0.3, 1.0])), rng.uniform(0.2, 1.5)
     due_ns, waits = 0, False
 
     def words(now_ns: int, seen: RobotStatus) -> OperatorRequest | None:
@@ -212,7 +212,7 @@ def _towards_a_face(rng: Generator, fence: Fence) -> Lie:
 def _face_after_face(rng: Generator, fence: Fence) -> Lie:
     """Fly at full speed between opposite sides of the fence; sometimes change the axis."""
     axis, way = int(rng.integers(3)), 1.0
-    near = float(rng.uniform(0.1, 2.0))
+    near = rng.uniform(0.1, 2.0)
 
     def lie(command: Command, control: Control) -> Command:
         nonlocal axis, way
@@ -228,7 +228,7 @@ def _face_after_face(rng: Generator, fence: Fence) -> Lie:
 
 def _greedy(rng: Generator, fence: Fence) -> Lie:
     """Fly towards the nearest wall or the ceiling, sometimes with a random velocity along it."""
-    decoy = float(rng.uniform(0.0, 0.2))
+    decoy = rng.uniform(0.0, 0.2)
 
     def lie(command: Command, control: Control) -> Command:
         _, axis, way = min(_faces(fence, control.measured))
@@ -241,7 +241,7 @@ def _greedy(rng: Generator, fence: Fence) -> Lie:
 
 def _on_the_limit(rng: Generator, fence: Fence) -> Lie:
     """Fly towards the fence slightly faster than the guard's stop rule allows."""
-    more = float(rng.uniform(1.0, 1.5))
+    more = rng.uniform(1.0, 1.5)
     way: list[int] = rng.choice([-1, 1], 3).tolist()
 
     def lie(command: Command, control: Control) -> Command:
@@ -259,7 +259,7 @@ def _on_the_limit(rng: Generator, fence: Fence) -> Lie:
 
 def _shaking(rng: Generator, fence: Fence) -> Lie:
     """Command velocities that oscillate at a frequency at which the onboard loops may resonate."""
-    frequency, plane = float(rng.uniform(0.2, 10.0)), rng.permutation(3).tolist()
+    frequency, plane = rng.uniform(0.2, 10.0), rng.permutation(3).tolist()
     bias: list[float] = rng.uniform(-3.0, 3.0, 3).tolist()
 
     def lie(command: Command, control: Control) -> Command:
@@ -280,7 +280,7 @@ def _random(rng: Generator, fence: Fence) -> Lie:
         if control.stamp_ns >= until_ns:
             velocity = rng.normal(0.0, 5.0, 3).tolist()
             until_ns = control.stamp_ns + int(rng.exponential(0.7e9))
-        return _fly(command, velocity, yaw_rate=float(rng.normal(0.0, 3.0)))
+        return _fly(command, velocity, yaw_rate=rng.normal(0.0, 3.0))
 
     return lie
 

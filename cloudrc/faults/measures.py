@@ -91,7 +91,7 @@ class Outcome:
 
     def instant(self, first: float = 4.0, last: float = 24.0) -> float:
         """Choose a time from `first` to `last` [s]; by default, the robot is among the tubes."""
-        return float(generator(self.seed, 77).uniform(first, last))
+        return generator(self.seed, 77).uniform(first, last)
 
     def prepare(
         self, *settings: str, lies: Sequence[Lie] = (), honest: bool = True, **faults: Any

@@ -173,23 +173,23 @@ def compose(seed: int) -> Schedule:
         tuple(sorted(events, key=lambda event: event.at)),
         duplicate=_sometimes(rng, 1.0),
         reorder=_sometimes(rng, 0.5),
-        cloud_offset=round(float(rng.uniform(-1e5, 1e5)), 3) if rng.random() < 0.5 else 0.0,
+        cloud_offset=round(rng.uniform(-1e5, 1e5), 3) if rng.random() < 0.5 else 0.0,
         cloud_drift=int(rng.integers(-500, 501)) if rng.random() < 0.3 else 0,
         duration=DURATION,
         # In a third of the schedules it is shorter than most silences, so the robot lands.
-        hold_max=round(float(rng.uniform(*HOLDS)), 1) if rng.random() < 1 / 3 else 60.0,
+        hold_max=round(rng.uniform(*HOLDS), 1) if rng.random() < 1 / 3 else 60.0,
     )
 
 
 def _event(kind: str, rng: np.random.Generator) -> FaultEvent:
     longest, low, high = KINDS[kind]
-    at, way = float(rng.uniform(0.5, CALM - 1.0)), WAYS[int(rng.integers(3))]
+    at, way = rng.uniform(0.5, CALM - 1.0), WAYS[int(rng.integers(3))]
     duration = 0.0
     if longest:  # short ones are as likely as long ones: 20 ms find as much as 5 s
-        duration = min(max(longest * float(rng.uniform()) ** 3, 0.02), CALM - at)
-    value = float(rng.uniform(low, high))
+        duration = min(max(longest * rng.uniform() ** 3, 0.02), CALM - at)
+    value = rng.uniform(low, high)
     return FaultEvent(kind, round(at, 3), round(duration, 3), round(value, 4), way)
 
 
 def _sometimes(rng: np.random.Generator, most: float) -> float:
-    return round(float(rng.uniform(0.0, most)), 3) if rng.random() < 0.25 else 0.0
+    return round(rng.uniform(0.0, most), 3) if rng.random() < 0.25 else 0.0

@@ -1,6 +1,6 @@
 """Flood teleop's API with requests, as a separate process.
 
-    python api_flood.py URL TOKEN SECONDS RATE
+    python api_flood.py URL TOKEN RATE
 
 Half of the requests read with a token, a quarter has none, a quarter sends commands that are
 refused. Each request is sent when it is due, even if earlier ones have no answer yet. It prints the
@@ -39,13 +39,13 @@ async def receive(reader, count, found):
         found[head[9:12].decode()] += 1
 
 
-async def flood(url, token, seconds, rate):
+async def flood(url, token, rate):
     host, _, port = url.removeprefix("http://").partition(":")
     look, order = request("GET", "/v1/state", token), request("POST", "/v1/resume", token)
     mixed, found = [look, request("GET", "/v1/state"), look, order], Counter()
     opened = [await asyncio.open_connection(host, int(port)) for _ in range(CONNECTIONS)]
     began = time.monotonic()
-    due = [began + number / rate for number in range(int(seconds * rate))]
+    due = [began + number / rate for number in range(rate)]
     each = [due[number::CONNECTIONS] for number in range(CONNECTIONS)]
     pairs = list(zip(opened, each, strict=True))
     answers = [asyncio.create_task(receive(reader, len(own), found)) for (reader, _), own in pairs]
@@ -58,5 +58,5 @@ async def flood(url, token, seconds, rate):
 
 
 if __name__ == "__main__":
-    url, token, seconds, rate = sys.argv[1:]
-    print(json.dumps(asyncio.run(flood(url, token, float(seconds), float(rate)))))
+    url, token, rate = sys.argv[1:]
+    print(json.dumps(asyncio.run(flood(url, token, int(rate)))))

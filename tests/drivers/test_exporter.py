@@ -100,7 +100,6 @@ OLD = "nr_periods 4\nnr_throttled 2\nthrottled_time 500000000\n"
         ("cpu.stat", LIMITED, [120, 17, 1.25]),
         ("cpu,cpuacct/cpu.stat", OLD, [4, 2, 0.5]),
         ("cpu.stat", "usage_usec 4402130\n", []),  # without a limit
-        ("none", "", []),
     ],
 )
 def test_throttling_is_read_from_the_kernel(file, text, counts, tmp_path):

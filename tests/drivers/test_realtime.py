@@ -19,7 +19,6 @@ from cloudrc.drivers.realtime import (
     show_address,
 )
 from tests.conftest import needs_ipv6
-from tests.flights.conftest import bare_world, ring
 
 MANY = 300
 MS = 1_000_000
@@ -52,11 +51,10 @@ def test_a_peer_follows_its_route_twice_a_second(tmp_path):
         assert peer.address == ("10.1.2.3", 7400)
 
 
-@pytest.mark.parametrize(
-    ("listen", "other"), [pytest.param("::", "::1", marks=needs_ipv6), ("::", "127.0.0.1")]
-)
-def test_ends_meet_over_ipv6_and_at_both_families(listen, other, tmp_path):
-    far, own = Peer(bind((other, 0)), tmp_path / "far"), Peer(bind((listen, 0)), tmp_path / "own")
+@needs_ipv6
+@pytest.mark.parametrize("other", ["::1", "127.0.0.1"])
+def test_ends_meet_over_ipv6_and_at_both_families(other, tmp_path):
+    far, own = Peer(bind((other, 0)), tmp_path / "far"), Peer(bind(("::", 0)), tmp_path / "own")
     with closing(own.socket), closing(far.socket):
         for peer, to in ((far, own), (own, far)):
             peer.route.write_text(show_address((other, to.socket.getsockname()[1])))
@@ -113,14 +111,3 @@ def test_what_waited_through_a_stall_is_taken_in_one_wake(late_ns, arrive, wakes
 
         serve(end, Peer(udp, Path("absent")), end="world", sink=list, stop=over)
         assert end.wakes == wakes
-
-
-def test_an_end_does_not_answer_strangers(tmp_path):
-    with bind(("127.0.0.1", 0)) as stranger:
-        stranger.settimeout(0.06)
-        peer, asked = Peer(bind(("127.0.0.1", 0)), tmp_path / "route"), iter([False] * 3)
-        peer.route.write_text(show_address(stranger.getsockname()))
-        with closing(peer.socket):
-            serve(bare_world(ring()), peer, end="world", sink=list, stop=lambda: next(asked, 1))
-        with pytest.raises(TimeoutError):
-            stranger.recv(2048)

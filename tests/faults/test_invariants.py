@@ -51,7 +51,6 @@ MOTION = [
     (set(), (step(TRACK), STOP, step(ESTOP, position=OUTSIDE))),
     ({"fence"}, (step(TRACK), STOP, step(ESTOP, position=FAR))),
     (set(), (touch("pipe_1"), step(TRACK), step(TRACK, ms=4000, position=OUTSIDE))),
-    ({"fence"}, (touch("pipe_1"), step(TRACK, ms=4000), step(TRACK, position=OUTSIDE))),
     # After a stop it takes off only where it lies still inside.
     *(
         (kinds, (step(TRACK), STOP, put(velocity), step(ESTOP, ms=2000, position=position),
@@ -64,11 +63,9 @@ MOTION = [
     # The reference grows slowly, may drop at once, and can be stopped before the fence.
     (set(), fly((0.02, 0.013, 0.0))),
     ({"cap"}, fly((0.02, 0.014, 0.0))),
-    ({"cap"}, fly((0.02, 0.0, 0.0), (-0.025, 0.0, 0.0))),
     (set(), holds(HOLD, (8.9, 1.0, 1.0), (0.64, 0.0, 0.0))),  # 0.2 v + v^2/6 <= 0.2: 0.647 m/s
     ({"stop"}, holds(HOLD, (8.9, 1.0, 1.0), (0.66, 0.0, 0.0))),
     ({"cap"}, fly((6.001, 0.0, 0.0))),
-    ({"stop"}, holds(HOLD, (1.0, 1.0, 0.5), (0.0, 0.0, -1.07))),  # <= 0.4: 1.061 m/s
     (set(), holds(LAND, (1.0, 1.0, 0.5), (0.0, 0.0, -1.07))),
     ({"fence"}, holds(LAND, (1.0, 1.0, -0.01), ZERO)),
     # Commands are fresh; each step has its tick.
@@ -87,7 +84,6 @@ MOTION = [
     ({"rest"}, rest(2.0, 1.58)),
     # Rotors stand still on the ground and after a stop; they stop where the robot stands.
     *(({"latch"}, (step(each, turns=True),)) for each in (GROUND, ESTOP)),
-    (set(), (step(HOLD), put((0.19, -0.2, 0.2)), step(GROUND))),
     ({"rest"}, (step(HOLD), put((0.0, -0.21, 0.0)), step(GROUND))),
     *((set(), (step(HOLD), put((0.0, 0.0, -3.0)), each, step(GROUND, ms=4)))
       for each in (STOP, SPAWN)),
@@ -123,9 +119,7 @@ OPERATOR = [
     ({"stale"}, (*NINE, SESSION, offer(), step(TRACK))),
     # Two changes to TRACK are a second apart.
     ({"hold"}, (step(GROUND), step(TRACK, ms=100), step(HOLD, ms=898), offer(10), step(TRACK))),
-    (set(), (step(GROUND), step(TRACK, ms=100), step(HOLD, ms=900), offer(10), step(TRACK))),
     # After a HOLD the reference grows slowly at first.
-    (set(), ramp(RAMP)),
     ({"cap"}, ramp(1.01 * RAMP)),
     # Five impossible commands just now justify a landing.
     *((kinds, (step(TRACK, ms=100), step(HOLD, ms=100), offer(count, "range"),
@@ -164,16 +158,13 @@ ENDING = (IMPOSSIBLE, step(LAND), *RELEASE)
     [
         (set(), (touch("board", by_probe=True), step(TRACK))),
         ({"collision"}, (touch("board"), step(TRACK))),
-        ({"collision"}, (touch("pipe_1", by_probe=True), step(TRACK))),
         # A robot that comes down may touch what is below, until it flies again.
         (set(), (IMPOSSIBLE, touch("pipe_3"), step(LAND), touch("floor"), step(LAND))),
-        (set(), FALLS),
         ({"collision"}, (*FALLS, *RELEASE, step(TRACK), touch("pipe_3"), step(TRACK))),
         (set(), (*ENDING, step(HOLD, ms=198), touch("pipe_3"), step(HOLD))),
         ({"collision"}, (*ENDING, step(HOLD, ms=204), touch("pipe_3"), step(HOLD))),
         # No hit is felt without a touch.
         ({"collision"}, (step(TRACK), put(touch_age=9.0), step(ESTOP))),
-        (set(), (step(TRACK), put(touch_age=0.5), step(ESTOP))),
     ],
 )
 def test_an_honest_cloud_touches_the_board_by_the_tip_only(kinds, story):
@@ -187,8 +178,6 @@ def test_an_honest_cloud_touches_the_board_by_the_tip_only(kinds, story):
         # It may be at any height, and touches the floor; the walls count.
         (set(), (touch("floor"), step(TRACK, position=(1.0, 1.0, -5.0)))),
         ({"fence"}, (touch("floor"), IMPOSSIBLE, step(LAND, position=OUTSIDE))),
-        # 0.2 v + v^2/4 <= 0.2: 0.579 m/s
-        (set(), holds(HOLD, (8.9, 1.0, 0.1), (0.57, 0.0, 0.0))),
         ({"stop"}, holds(HOLD, (8.9, 1.0, 0.1), (0.59, 0.0, 0.0))),
         ({"cap"}, fly((0.0041, 0.0, 0.0))),
         ({"cap"}, holds(HOLD, (1.0, 1.0, 0.1), (0.0, 0.0, 1e-9))),

@@ -13,9 +13,19 @@ from cloudrc.config.load import read_experiment
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import MissionConfig
-from cloudrc.faults import measures
 from cloudrc.faults.adversary import Lie
-from cloudrc.faults.measures import Outcome, scenario
+from cloudrc.faults.measures import (
+    AGE_MAX,
+    Outcome,
+    changes_into,
+    drift,
+    epochs,
+    events_of_missions,
+    first_into,
+    resumed_after,
+    scenario,
+    told,
+)
 from cloudrc.faults.schedule import FaultEvent, Way, generator
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.geometry.scene import Tube
@@ -48,8 +58,8 @@ def _cloud_killed(outcome: Outcome) -> None:
     commands = [r.stamp_ns * 1e-9 - at for r in flight.applied()]
     again = min((t for t in commands if t > down), default=nan)
     outcome.most("the new process commands after", again, 2.0, "s")
-    outcome.most("TRACK again after its start", measures.resumed_after(flight, at + down), 1.0, "s")
-    outcome.least("epochs opened", len(measures.epochs(flight)), 3)
+    outcome.most("TRACK again after its start", resumed_after(flight, at + down), 1.0, "s")
+    outcome.least("epochs opened", len(epochs(flight)), 3)
 
 
 @scenario(
@@ -62,7 +72,7 @@ def _cloud_paused(outcome: Outcome) -> None:
     paused = FaultEvent("cloud_paused", outcome.instant(), 5.0)
     flight = outcome.fly(events=(paused,))
     outcome.held_in_time(flight)
-    old = [r for r in flight.applied() if r.stamp_ns - r.basis_stamp_ns > measures.AGE_MAX * 1e9]
+    old = [r for r in flight.applied() if r.stamp_ns - r.basis_stamp_ns > AGE_MAX * 1e9]
     outcome.same("commands applied that were too old", len(old), 0)
 
 
@@ -83,11 +93,10 @@ def _world_restarted(outcome: Outcome) -> None:
     path = [r for r in flight.trajectory() if r.stamp_ns * 1e-9 > at]
     moved = max((hypot(*r.odometry.velocity) for r in path), default=nan)
     outcome.most("speed on the ground", moved, 0.01, "m/s")
-    raised = measures.drift(flight, at, flight.now)
+    raised = drift(flight, at, flight.now)
     outcome.most("distance from its place after the restart", raised, 0.01, "m")
     outcome.true("mission failed", flight.mission.state == "failed")
-    coded = "world_restarted" in str(flight.mission.verdict)
-    outcome.true("with the code world_restarted", coded)
+    outcome.true("with the code world_restarted", "world_restarted" in str(flight.mission.verdict))
     outcome.rejected(flight, "old_epoch")  # commands for the old world
 
 
@@ -102,8 +111,7 @@ def _two_clouds(outcome: Outcome) -> None:
     at = outcome.instant(4.0, 12.0)
     flight = outcome.prepare(events=(FaultEvent("second_cloud", at, 60.0),))
     flight.fly(at + 5.0)
-    opened = max(measures.epochs(flight), default=-1)
-    outcome.same("epochs while both clouds run", opened, 2)
+    outcome.same("epochs while both clouds run", max(epochs(flight), default=-1), 2)
     flight.fly(at + 6.0)
     outcome.no_hold(flight, "HOLDs while both clouds run")
     faults = [record for record in flight.of_cloud if isinstance(record, Fault)]
@@ -112,12 +120,12 @@ def _two_clouds(outcome: Outcome) -> None:
     flight.fly(at + 14.0)
     outcome.safe(flight)
     outcome.rejected(flight, "busy")
-    told = measures.told(flight.cloud.others, "busy")
-    outcome.true("the second reports once why it waits", [r.text for r in told] == [BUSY_TEXT])
-    said = min((r.stamp_ns * 1e-9 for r in told), default=nan)
+    busy = told(flight.cloud.others, "busy")
+    outcome.true("the second reports once why it waits", [r.text for r in busy] == [BUSY_TEXT])
+    said = min((r.stamp_ns * 1e-9 for r in busy), default=nan)
     outcome.most("the second cloud reports it after", said - at, 1.0, "s")
     outcome.held_in_time(flight, "HOLD after the first cloud has left")
-    later = [epoch for epoch in measures.epochs(flight) if epoch > 2]
+    later = [epoch for epoch in epochs(flight) if epoch > 2]
     outcome.true("the second cloud then gets a higher epoch", bool(later))
 
 
@@ -144,8 +152,8 @@ def _swizzle(outcome: Outcome) -> None:
     flight = outcome.fly("criteria.time_limit_s=120", events=events)
     outcome.held_in_time(flight)
     for end, records in (("cloud", flight.of_cloud), ("world", flight.of_world)):
-        outcome.least(f"times that {end} reports: late", len(measures.told(records, "late")), 1)
-    restarted = measures.events_of_missions(flight, "restarted")
+        outcome.least(f"times that {end} reports: late", len(told(records, "late")), 1)
+    restarted = events_of_missions(flight, "restarted")
     outcome.least("events restarted in teleop's log", len(restarted), 1)
 
 
@@ -160,12 +168,12 @@ def _invalid_values(outcome: Outcome) -> None:
     for name, changes in IMPOSSIBLE.items():
         flight = outcome.prepare(lies=[_for_a_while(at, 1.0, changes)]).fly(40.0)
         outcome.safe(flight)
-        landed = measures.first_into(flight, GuardState.LAND)
+        landed = first_into(flight, GuardState.LAND)
         outcome.most(f"{name}: LAND after", landed - at, 1.0, "s")
-        tracked = measures.changes_into(flight, GuardState.TRACK)
+        tracked = changes_into(flight, GuardState.TRACK)
         again = [change for change in tracked if change.stamp_ns * 1e-9 > landed]
         outcome.same(f"{name}: flown again without the operator", len(again), 0)
-        causes = [change.cause for change in measures.changes_into(flight, GuardState.LAND)]
+        causes = [change.cause for change in changes_into(flight, GuardState.LAND)]
         outcome.true(f"{name}: the cause is reported", "impossible commands" in " ".join(causes))
         outcome.rejected(flight, "range")
     for limit, changes in EXCESSIVE.items():
@@ -178,7 +186,7 @@ def _invalid_values(outcome: Outcome) -> None:
     one = outcome.prepare(lies=[_for_a_while(at, 0.005, IMPOSSIBLE["NaN"])]).fly(40.0)
     outcome.safe(one)
     outcome.done(one)
-    outcome.same("a single NaN: LAND", len(measures.changes_into(one, GuardState.LAND)), 0)
+    outcome.same("a single NaN: LAND", len(changes_into(one, GuardState.LAND)), 0)
 
 
 def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
@@ -264,5 +272,4 @@ def _unreachable(outcome: Outcome) -> None:
     outcome.most("deviation of the leg's end from its limit", off, 0.05, "s")
     flight.fly(flight.now + 10.0)
     outcome.true("the robot holds", flight.guard_now()[0] is GuardState.HOLD)
-    drift = measures.drift(flight, ended, flight.now)
-    outcome.most("drift from where the leg ended", drift, 0.10, "m")
+    outcome.most("drift from where the leg ended", drift(flight, ended, flight.now), 0.10, "m")

@@ -7,11 +7,10 @@ from functools import partial
 from itertools import islice
 from typing import TypeAlias
 
-from cloudrc.faults import measures
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.inject import flipped
-from cloudrc.faults.measures import Outcome, scenario
-from cloudrc.faults.schedule import Schedule, generator
+from cloudrc.faults.measures import Outcome, epochs, scenario, told
+from cloudrc.faults.schedule import FaultEvent, Schedule, generator
 from cloudrc.tunnel import codec
 
 Make: TypeAlias = Callable[[bytes], Iterable[bytes]]
@@ -45,33 +44,22 @@ def _check_no_effect(
     outcome.true("the same path, bit by bit", same)
     outcome.rejected(flight, *refusals)
     outcome.least("hostile datagrams", sum(sent), 1000)
-    same = measures.epochs(clean) == measures.epochs(flight)
-    outcome.true("hostile datagrams opened no session", same)
+    outcome.true("hostile datagrams opened no session", epochs(clean) == epochs(flight))
 
 
 @scenario(
     8,
     "corruption",
-    injects="one bit flips in 1 % of the datagrams; for 1 s, 1 % of all bits flip",
+    injects="1 to 8 bits flip in 1 % of the datagrams, for 1 s in all of them",
     expects="corrupted datagrams are dropped",
 )
 def _corruption(outcome: Outcome) -> None:
-    at, rng, sent = outcome.instant(), generator(outcome.seed, 8), list[bytes]()
-
-    def tamper(data: bytes, now_ns: int) -> list[bytes]:
-        storm = at <= now_ns * 1e-9 < at + 1.0
-        flips = int(rng.binomial(8 * len(data), 0.01)) if storm else int(rng.random() < 0.01)
-        if flips:
-            sent.append(data := flipped(data, rng, flips))
-        return [data]
-
-    flight = outcome.prepare()
-    flight.world.tamper = flight.cloud.tamper = tamper
-    outcome.fly_safely(flight)
+    some = FaultEvent("corruption", 0.0, 120.0, 0.01)
+    storm = FaultEvent("corruption", outcome.instant(), 1.0, 1.0)
+    flight = outcome.fly(events=(some, storm))
     outcome.held_in_time(flight)
-    outcome.rejected(flight, "tag")
-    outcome.least("corrupted datagrams", len(sent), 100)
-    outcome.same("epochs opened", len(measures.epochs(flight)), 2)
+    outcome.least("corrupted datagrams", flight.count("tag"), 100)
+    outcome.same("epochs opened", len(epochs(flight)), 2)
 
 
 @scenario(
@@ -155,8 +143,8 @@ def _malformed(outcome: Outcome) -> None:
     flight.world.tamper = lambda data, now_ns: [newer + data[1:]]
     flight.fly(2.0)
     flight.world.tamper = None
-    outcome.same("a cloud of another version: sessions", len(measures.epochs(flight)), 0)
+    outcome.same("a cloud of another version: sessions", len(epochs(flight)), 0)
     outcome.fly_safely(flight)
-    told = [fault.text for fault in measures.told(flight.of_world, "version")]
+    texts = [fault.text for fault in told(flight.of_world, "version")]
     text = f"peer speaks v{codec.VERSION + 1}, we speak v{codec.VERSION}"
-    outcome.true(f"reported once: {text}", len(told) == 1 and told[0].startswith(text))
+    outcome.true(f"reported once: {text}", len(texts) == 1 and texts[0].startswith(text))

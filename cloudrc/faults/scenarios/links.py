@@ -4,9 +4,18 @@ from __future__ import annotations
 
 from math import isnan, nan
 
-from cloudrc.faults import measures
 from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.measures import Outcome, scenario
+from cloudrc.faults.measures import (
+    Outcome,
+    busiest_second,
+    calm_after,
+    drift,
+    first_into,
+    held,
+    number,
+    resumed_after,
+    scenario,
+)
 from cloudrc.faults.schedule import WAYS, FaultEvent
 from cloudrc.messages import Cause, GuardState
 from cloudrc.records import Arrival, Control
@@ -52,12 +61,10 @@ def _silence(outcome: Outcome) -> None:
         flight = outcome.fly(*slow, limit=150.0, events=(cut,))
         outcome.held_in_time(flight, f"{what}: HOLD after")
         if duration >= 3.0:
-            began = measures.first_into(flight, GuardState.HOLD)
-            calm = measures.calm_after(flight, began, back)
-            outcome.most(f"{what}: below 0.05 m/s after", calm, 1.0, "s")
-            drift = measures.drift(flight, began + 2.0, back)
-            outcome.most(f"{what}: drift", drift, 0.10, "m")
-        outcome.most(f"{what}: resumed after", measures.resumed_after(flight, back), 1.0, "s")
+            began = first_into(flight, GuardState.HOLD)
+            outcome.most(f"{what}: below 0.05 m/s after", calm_after(flight, began, back), 1.0, "s")
+            outcome.most(f"{what}: drift", drift(flight, began + 2.0, back), 0.10, "m")
+        outcome.most(f"{what}: resumed after", resumed_after(flight, back), 1.0, "s")
 
 
 @scenario(
@@ -70,8 +77,7 @@ def _long_silence(outcome: Outcome) -> None:
     """Interrupt the link for 75 s in two flights: above the free floor, and among obstacles."""
     flight = _landed(outcome, outcome.instant(1.6, 2.6), "over the floor")
     first, last = (flight.trajectory()[n].odometry.position for n in (0, -1))
-    text = "over the floor: base above where it took off"
-    outcome.most(text, abs(last[2] - first[2]), 0.02, "m")
+    outcome.most("over the floor: base above where it took off", abs(last[2] - first[2]), 0.02, "m")
     _landed(outcome, outcome.instant(8.0), "amid obstacles")
 
 
@@ -84,10 +90,10 @@ def _landed(outcome: Outcome, at: float, where: str) -> FaultRun:
     flight = outcome.prepare("criteria.time_limit_s=200", events=(cut,))
     flight.fly(at + 80.0)
     outcome.safe(flight)
-    held = measures.first_into(flight, GuardState.HOLD)
-    landed = measures.first_into(flight, GuardState.LAND)
+    began = first_into(flight, GuardState.HOLD)
+    landed = first_into(flight, GuardState.LAND)
     outcome.most(
-        f"{where}: deviation of LAND from 60 s after HOLD", abs(landed - held - 60.0), 0.01, "s"
+        f"{where}: deviation of LAND from 60 s after HOLD", abs(landed - began - 60.0), 0.01, "s"
     )
     fallen = [-r.odometry.velocity[2] for r in flight.trajectory() if r.stamp_ns >= landed * 1e9]
     fastest = max(fallen, default=nan)
@@ -112,9 +118,9 @@ def _loss(outcome: Outcome) -> None:
     clean = outcome.prepare().fly_mission()
     flight = outcome.fly("link.both.loss=0.3")
     outcome.no_hold(flight)
-    error, usual = (measures.number(each, "tracking_rms_measured") for each in (flight, clean))
+    error, usual = (number(each, "tracking_rms_measured") for each in (flight, clean))
     outcome.most("tracking error, relative to that without loss", error / usual, 1.5)
-    outcome.least("loss in the report", measures.number(flight, "loss_uplink"), 0.25)
+    outcome.least("loss in the report", number(flight, "loss_uplink"), 0.25)
 
 
 @scenario(
@@ -131,10 +137,10 @@ def _bursts(outcome: Outcome) -> None:
         if packets < 50:  # else it hardly ever rests on the body for 4 s, and a leg may time out
             outcome.done(flight)
         outcome.true("the mission has ended", flight.mission.ended)
-        text, busiest = f"bursts of {packets * 10} ms", measures.busiest_second(flight.changes)
+        text, busiest = f"bursts of {packets * 10} ms", busiest_second(flight.changes)
         outcome.most(f"{text}: changes of the guard in any second", busiest, 2)
-        told, held = measures.number(flight, "hold_count"), len(measures.held(flight))
-        outcome.same(f"{text}: HOLDs that the report leaves out", held - told, 0)
+        left_out = len(held(flight)) - number(flight, "hold_count")
+        outcome.same(f"{text}: HOLDs that the report leaves out", left_out, 0)
 
 
 @scenario(
@@ -145,8 +151,7 @@ def _bursts(outcome: Outcome) -> None:
 )
 def _disorder(outcome: Outcome) -> None:
     link = STEADY, "link.both.delay_ms=50"
-    flight = outcome.fly(*link, reorder=0.25)
-    outcome.least("late commands dropped", flight.count("late"), 100)
+    outcome.least("late commands dropped", outcome.fly(*link, reorder=0.25).count("late"), 100)
 
 
 @scenario(
@@ -209,7 +214,7 @@ def _asymmetry(outcome: Outcome) -> None:
     delays = "link.uplink.delay_ms=10", "link.downlink.delay_ms=190"
     flight = outcome.fly(*delays, profile="ideal", cloud_offset=HOUR)
     outcome.no_hold(flight)
-    rtt = measures.number(flight, "rtt_mean")
+    rtt = number(flight, "rtt_mean")
     outcome.most("deviation of the mean round trip from 0.2 s", abs(rtt - 0.2), 0.01, "s")
     arrivals = [r for r in (*flight.of_world, *flight.of_cloud) if isinstance(r, Arrival)]
     outcome.true("no one-way delay is reported", all(isnan(r.delay) for r in arrivals))
@@ -222,10 +227,9 @@ def _asymmetry(outcome: Outcome) -> None:
     expects="first no HOLD; then at most 2 changes between TRACK and HOLD in any second",
 )
 def _jitter(outcome: Outcome) -> None:
-    flight = outcome.fly(profile="paper-p3")
-    outcome.no_hold(flight, "jitter 40 ms: HOLDs")
+    outcome.no_hold(outcome.fly(profile="paper-p3"), "jitter 40 ms: HOLDs")
     link = "link.both.delay_ms=150", "link.both.jitter_ms=150"
     flight = outcome.prepare(*link).fly(60.0)
     outcome.safe(flight)
-    busiest = measures.busiest_second(flight.changes)
+    busiest = busiest_second(flight.changes)
     outcome.most("jitter 150 ms: changes of the guard in any second", busiest, 2)
