@@ -33,6 +33,26 @@ def version(path: Path | str) -> tuple[int, int, int] | None:
     return status.st_ctime_ns, status.st_ino, status.st_size
 
 
+class Watched:
+    """A file that another process replaces; tells whether it is new."""
+
+    def __init__(self, path: Path, period_ns: int) -> None:
+        """Watch `path`, which may not exist yet, with `period_ns` [ns] between two looks."""
+        self.path, self._period_ns, self._due_ns = path, period_ns, 0
+        self._seen: tuple[int, int, int] | None = None
+
+    def is_new(self, now_ns: int, *, at_once: bool = False) -> bool:
+        """Return whether there is another content since the last look; look if it is time.
+
+        `now_ns` is the time [ns]. With `at_once`, look before the period is over, too.
+        """
+        if now_ns < self._due_ns and not at_once:
+            return False
+        self._due_ns = now_ns + self._period_ns
+        before, self._seen = self._seen, version(self.path)
+        return self._seen not in (None, before)
+
+
 def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
     """Read a whole file of at most `size_max` bytes; never block, even if the file is a pipe.
 

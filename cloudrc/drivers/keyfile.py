@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from cloudrc.errors import CloudrcError
-from cloudrc.files import version, write_atomically
+from cloudrc.files import Watched, write_atomically
 from cloudrc.outside.paths import read_secret
 from cloudrc.records import Fault
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeyRing, KeySet, parse, write
@@ -22,8 +22,8 @@ class KeyFile:
 
     def __init__(self, path: Path, now_ns: int) -> None:
         """Read the file at `now_ns` [ns, monotonic clock]; raise the errors of `read_keys`."""
-        self._path, self._due_ns = path, now_ns
-        self._seen = version(path)
+        self._file = Watched(path, PERIOD_NS)
+        self._file.is_new(now_ns)
         self.ring = KeyRing(read_keys(path))
 
     def follow(self, now_ns: int) -> list[Fault]:
@@ -32,15 +32,11 @@ class KeyFile:
         If the keys have changed, return a record that names the new key. If the file is invalid,
         keep the old keys until it changes again, and return a record of the error.
         """
-        if now_ns < self._due_ns:
+        if not self._file.is_new(now_ns):
             return []
-        self._due_ns = now_ns + PERIOD_NS
-        seen, before = version(self._path), self.ring.keys
-        if seen == self._seen or seen is None:  # ignore a file that is missing for a moment
-            return []
-        self._seen = seen
+        before = self.ring.keys
         try:
-            keys = read_keys(self._path)
+            keys = read_keys(self._file.path)
         except CloudrcError as error:
             return [Fault(now_ns, "key", f"the old keys stay in use: {error}")]
         if keys == before:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.errors import to_one_line
+from cloudrc.files import Watched
 from cloudrc.files import read as read_file
-from cloudrc.files import version
 from cloudrc.link.state import STATE_MAX, LinkState, from_text
 
 LOOK_NS = 500_000_000
@@ -23,20 +23,15 @@ class LinkNews:
 
     def __init__(self, path: Path) -> None:
         """Follow the file at `path`, which may not exist yet."""
-        self._path, self._due_ns = path, 0
-        self._seen: tuple[int, int, int] | None = None
+        self._file = Watched(path, LOOK_NS)
         self._state: LinkState | None = None
 
     def look(self, now_ns: int) -> str:
         """Return a sentence about a change since the last look; "" without a change."""
-        if now_ns < self._due_ns:
+        if not self._file.is_new(now_ns):
             return ""
-        self._due_ns = now_ns + LOOK_NS
-        if (seen := version(self._path)) == self._seen:
-            return ""
-        self._seen = seen  # do not read a malformed file again and again
         try:
-            before, self._state = self._state, from_text(read_file(self._path, STATE_MAX))
+            before, self._state = self._state, from_text(read_file(self._file.path, STATE_MAX))
         except (OSError, ValueError):  # missing or malformed, which a link process repairs
             return ""
         return describe_change(before, self._state)

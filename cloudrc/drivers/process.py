@@ -10,7 +10,7 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -25,7 +25,7 @@ from cloudrc.drivers.recording import FlightsOnly, Recorder
 from cloudrc.endpoint import Endpoint
 from cloudrc.errors import to_one_line
 from cloudrc.exposition.live import CLOCK_SET
-from cloudrc.files import TooLongError, read, version
+from cloudrc.files import TooLongError, Watched, read
 from cloudrc.link.state import RELEASED, RELEASED_SUFFIX, STATE_MAX, from_text
 from cloudrc.records import (
     Control,
@@ -247,10 +247,9 @@ class LinkNotes:
 
         `check` gets each new profile.
         """
-        self._path, self._uplink, self._check = path, uplink, check
-        self._seen: tuple[int, int, int] | None = None
+        self._state, self._uplink, self._check = Watched(path, PERIOD_NS), uplink, check
+        self._released = Watched(path.with_suffix(RELEASED_SUFFIX), RELEASED_PERIOD_NS)
         self._since_ns: int | None = None
-        self._due_ns = self._released_ns = 0
 
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
         """Return records of the link's state and of its datagrams' lateness, if they are due.
@@ -261,19 +260,16 @@ class LinkNotes:
         """
         noted: list[Record] = []
         begins = not BEGINNINGS.isdisjoint(map(type, records))
-        if begins or now_ns >= self._due_ns:
-            self._due_ns = now_ns + PERIOD_NS
-            seen = version(self._path)
-            if begins or seen != self._seen:
-                self._seen = seen  # do not read a malformed file again and again
-                noted += _if_readable(lambda: self._read_state(begins, now_ns, slip_ns))
-        if now_ns >= self._released_ns:
-            self._released_ns = now_ns + RELEASED_PERIOD_NS
-            noted += _if_readable(lambda: self._read_lateness(now_ns - slip_ns))
+        with suppress(OSError, ValueError):  # a missing or malformed file
+            if self._state.is_new(now_ns, at_once=begins) or begins:
+                noted += self._read_state(begins, now_ns, slip_ns)
+        with suppress(OSError, ValueError):
+            if self._released.is_new(now_ns):
+                noted += self._read_lateness(now_ns - slip_ns)
         return noted
 
     def _read_lateness(self, stamp_ns: int) -> list[Counted]:
-        found = json.loads(read(self._path.with_suffix(RELEASED_SUFFIX), STATE_MAX))
+        found = json.loads(read(self._released.path, STATE_MAX))
         counts = {name: int(n) for name, n in found.items() if name in RELEASED}
         way = "uplink" if self._uplink else "downlink"
         return [Counted(stamp_ns, "link", f"{way}_{name}", n) for name, n in counts.items()]
@@ -281,7 +277,7 @@ class LinkNotes:
     def _read_state(self, begins: bool, now_ns: int, slip_ns: int) -> list[LinkChanged]:
         """Return the link's state as a record if it is new or a mission `begins`, else []."""
         try:
-            state = from_text(read(self._path, STATE_MAX).decode())
+            state = from_text(read(self._state.path, STATE_MAX).decode())
         except TooLongError:  # a long time line
             self._since_ns = None
             self._check.request(None)
@@ -301,13 +297,6 @@ class LinkNotes:
             conditions=json.dumps(state.profile.get(state.direction, {})),
         )
         return [changed] if begins or since_ns != state.since_ns else []
-
-
-def _if_readable(read: Callable[[], Sequence[Record]]) -> Sequence[Record]:
-    try:
-        return read()
-    except (OSError, ValueError):  # a missing or malformed file
-        return []
 
 
 @dataclass

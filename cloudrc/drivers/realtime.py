@@ -13,13 +13,12 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from ipaddress import ip_address
 from pathlib import Path
 
 from cloudrc.endpoint import Endpoint
 from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.files import read, version
+from cloudrc.files import Watched, read
 from cloudrc.link.carry.datagrams import send_or_lose
 from cloudrc.records import Lateness, Record
 from cloudrc.tunnel.codec import DATAGRAM_MAX
@@ -51,15 +50,11 @@ ROUTE_PERIOD_NS = 500_000_000
 def split_address(text: str) -> Address:
     """Parse HOST:PORT, with an IPv6 address in brackets; raise a ValueError for other text."""
     host, _, port = text.strip().rpartition(":")
-    bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
-    if not bare or not port.isdecimal() or not 0 < int(port) < 65_536:
-        raise ValueError(f"'{text}' is not HOST:PORT")
-    if (":" in bare) == (bare == host):
-        raise ValueError(f"'{text}': put an IPv6 address in brackets, [::1]:7400")
-    try:
-        bare.encode("idna")
-    except UnicodeError:  # an empty label, or one that is too long
-        raise ValueError(f"'{text}' has no name of a host") from None
+    bare = host.removeprefix("[").removesuffix("]")
+    is_port = port.isdecimal() and 0 < int(port) < 65_536
+    if not (bare and is_port) or (":" in bare) != host.startswith("["):
+        raise ValueError(f"'{text}' is not HOST:PORT, such as world:7400 or [::1]:7400")
+    bare.encode("idna")  # raises if a label is too long
     return bare, int(port)
 
 
@@ -69,21 +64,18 @@ def show_address(where: Address) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-@dataclass
 class Peer:
     """A UDP socket and the address to which it sends.
 
     Attributes:
         socket: The socket, bound and not blocking.
-        route: File from which `follow` reads `address` as HOST:PORT; the link process writes it.
         address: Address of the peer: world, cloud or the relay; None while it is unknown.
     """
 
-    socket: socket.socket
-    route: Path
-    address: Address | None = None
-    _seen: tuple[int, int, int] | None = field(default=None, init=False)
-    _due_ns: int = field(default=0, init=False)
+    def __init__(self, socket: socket.socket, route: Path) -> None:
+        """Use a bound socket; the link process writes HOST:PORT to the file `route`."""
+        self.socket, self._route = socket, Watched(route, ROUTE_PERIOD_NS)
+        self.address: Address | None = None
 
     def follow(self, now_ns: int) -> None:
         """Update the address from the route file, if a check is due at `now_ns` [ns].
@@ -92,17 +84,11 @@ class Peer:
         incomplete, or contains a host name, keep the last address: a query to a name server would
         block the loop.
         """
-        if self.address is not None and now_ns < self._due_ns:
-            return
-        self._due_ns = now_ns + ROUTE_PERIOD_NS
-        seen = version(self.route)
-        if seen == self._seen:
-            return
-        self._seen = None
-        with suppress(OSError, ValueError):
-            address = split_address(read(self.route).decode("ascii"))
-            ip_address(address[0])
-            self.address, self._seen = _reachable(self.socket, address), seen
+        if self._route.is_new(now_ns, at_once=self.address is None):
+            with suppress(OSError, ValueError):
+                address = split_address(read(self._route.path).decode("ascii"))
+                ip_address(address[0])
+                self.address = _reachable(self.socket, address)
 
     def receive(self, most: int = DRAIN_MAX) -> list[bytes]:
         """Return at most `most` of the datagrams that have arrived.

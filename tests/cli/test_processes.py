@@ -50,8 +50,10 @@ def test_an_address_in_use_is_reported_with_its_flag(taken, key, refused):
 def test_an_address_of_ipv6_is_in_brackets(monkeypatch):
     for text in ("127.0.0.1:7400", "[::1]:7400", "[::]:1"):
         assert show_address(read_address(text)) == text
-    with pytest.raises(argparse.ArgumentTypeError, match=r"put an IPv6 address in brackets"):
+    with pytest.raises(argparse.ArgumentTypeError, match=r"such as .* \[::1\]:7400"):
         read_address("::1:7400")
+    with pytest.raises(argparse.ArgumentTypeError, match="label"):
+        read_address("a..b:5")
     monkeypatch.setattr(socket, "socket", Mock(side_effect=OSError("Address family")))
     assert read_address("[::]:7400") == ("0.0.0.0", 7400), "on a machine without IPv6"
 

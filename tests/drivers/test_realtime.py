@@ -54,10 +54,11 @@ def test_a_peer_follows_its_route_twice_a_second(tmp_path):
 @needs_ipv6
 @pytest.mark.parametrize("other", ["::1", "127.0.0.1"])
 def test_ends_meet_over_ipv6_and_at_both_families(other, tmp_path):
-    far, own = Peer(bind((other, 0)), tmp_path / "far"), Peer(bind(("::", 0)), tmp_path / "own")
+    routes = tmp_path / "far", tmp_path / "own"
+    far, own = Peer(bind((other, 0)), routes[0]), Peer(bind(("::", 0)), routes[1])
     with closing(own.socket), closing(far.socket):
-        for peer, to in ((far, own), (own, far)):
-            peer.route.write_text(show_address((other, to.socket.getsockname()[1])))
+        for peer, to, route in zip((far, own), (own, far), routes, strict=True):
+            route.write_text(show_address((other, to.socket.getsockname()[1])))
             peer.follow(0)
         own.send([b"there"])
         far.send([b"back"])

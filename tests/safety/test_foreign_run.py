@@ -27,6 +27,8 @@ report:
   metrics: ./spy.py
 """
 
+PACKAGE = Path(cloudrc.__file__).parent
+
 
 @pytest.fixture
 def trace(tmp_path):
