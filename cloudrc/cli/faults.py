@@ -16,6 +16,7 @@ from cloudrc.trials.workers import map_in_order, take_each
 
 if TYPE_CHECKING:
     from cloudrc.faults.measures import Outcome
+    from cloudrc.faults.trial import TrialResult
 
 EPILOG = """\
 examples:
@@ -145,24 +146,27 @@ def search(options: Options) -> int:
     from cloudrc.cli.progress import Progress
     from cloudrc.config import shipped
     from cloudrc.config.schema import World
-    from cloudrc.faults.search import SearchSettings, search, search_rows, search_summary
+    from cloudrc.faults.search import fly_seed, search, search_rows, search_summary, store
 
     options.store.mkdir(parents=True, exist_ok=True)
     robot = shipped.model_path("robot", options.robot or World().robot, Path())
-    seeds = options.first, options.minutes, options.jobs
-    settings = SearchSettings(options.adversarial, *seeds, options.store, robot)
+    kind = "adversarial" if options.adversarial else "random"
     shown = options.output == "table"
     if shown:
-        about = f"{settings.kind} schedules of {robot} from seed {options.first} on"
+        about = f"{kind} schedules of {robot} from seed {options.first} on"
         print_line(f"{about}, for {options.minutes:g} min")
 
-    def see(failure: dict[str, Any]) -> None:
+    def see(finding: TrialResult) -> dict[str, Any]:
+        failure = store(finding, options.store)
         if shown:
             print_line(f"FAILED seed {failure['seed']}: {failure['breaches'][0]['text']}")
             print_line(f"  again: cloudrc faults run {failure['file']}")
+        return failure
 
+    fly = partial(fly_seed, adversarial=options.adversarial, robot=robot)
     with Progress("flies schedules"):
-        found, stopped = search(settings, see)
+        found, stopped = search(fly, options.first, options.minutes, options.jobs, see)
+    found = {"kind": kind, "robot": robot} | found
     again = f"to continue, add --first {found['next']}"
     lines = "", table(search_rows(found), right=(1, 2)), "", search_summary(found), again
     print_result(options.output, found, "\n".join(lines))

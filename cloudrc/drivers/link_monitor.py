@@ -167,32 +167,21 @@ class LinkMonitor:
             rows = [row._replace(verdict="open") if row.name in off else row for row in rows]
             self._forget()
         self._suspects = off
-        checked = [LinkChecked(now_ns, self._uplink, *row, count) for row in rows]
-        return [*checked, *self._complain(rows, now_ns)]
-
-    def _complain(self, rows: list[Judgement], now_ns: int) -> list[Record]:
-        """Report a link that differs from its profile, when the verdict becomes "off"."""
+        checked: list[Record] = [LinkChecked(now_ns, self._uplink, *row, count) for row in rows]
         before, self._complained = self._complained, verdict_of(rows) == "off"
-        if before or not self._complained:
-            return []
-        way = "uplink" if self._uplink else "downlink"
-        wrong = ", ".join(describe(row) for row in rows if row.verdict == "off")
-        text = f"the {way} differs from its profile: {wrong}; see 'cloudrc link verify'"
-        return [Fault(now_ns, "link", text)]
+        if self._complained and not before:
+            way = "uplink" if self._uplink else "downlink"
+            wrong = ", ".join(describe(row) for row in rows if row.verdict == "off")
+            text = f"the {way} differs from its profile: {wrong}; see 'cloudrc link verify'"
+            checked.append(Fault(now_ns, "link", text))
+        return checked
 
     def _rows(self) -> list[Judgement]:
-        """Judge all quantities; the row "time_line" tells that a profile changes over time."""
-        stream, first, timed = _in_order(self._arrivals, self._period)
-        rows = self._rows_of_flow(stream, first, timed)
-        if not timed and not self._computes and len(self._trips) >= FEWEST:
-            rows.append(self._round_trip())
-        rows = [self._excuse(row) for row in rows]
-        if any(Timeline(one).only() is None for one in self._asked or ()):
-            rows.append(told("time_line", 1))
-        return rows
+        """Judge all quantities; the row "time_line" tells that a profile changes over time.
 
-    def _rows_of_flow(self, stream: Stream, first: int, timed: bool) -> list[Judgement]:
-        """Judge the received flow; its delays only if they are `timed` and without compute time."""
+        Delays are judged only if world and cloud share a clock, and without compute time.
+        """
+        stream, first, timed = _in_order(self._arrivals, self._period)
         rows, skipped = list[Judgement](), UNJUDGED
         if not timed or (self._computes and not self._uplink):
             skipped = UNJUDGED | DELAYS
@@ -200,7 +189,13 @@ class LinkMonitor:
             rows = self._plans[0].judge(stream, self._epoch, first)
         elif self._arrivals:  # a new session or profile ends the old verdict
             rows = [told("loss", nan)._replace(verdict="open")]
-        return [row for row in rows if row.name not in skipped]
+        rows = [row for row in rows if row.name not in skipped]
+        if not timed and not self._computes and len(self._trips) >= FEWEST:
+            rows.append(self._round_trip())
+        rows = [self._excuse(row) for row in rows]
+        if any(Timeline(one).only() is None for one in self._asked or ()):
+            rows.append(told("time_line", 1))
+        return rows
 
     def _round_trip(self) -> Judgement:
         """Judge the mean round trip; datagrams that a later datagram overtook are left out."""
@@ -223,24 +218,17 @@ class LinkMonitor:
         return row._replace(verdict="open") if slow and row.measured <= row.high + added else row
 
 
-def _decided(arrivals: Sequence[Arrival]) -> tuple[list[Arrival], int, int]:
-    """Select the arrivals in the range of counters in which a missing one counts as lost.
-
-    Also return the first and the last counter of the range.
-    """
-    last = max((one.counter for one in arrivals), default=0) - WINDOW
-    known = [one for one in arrivals if last - KEPT < one.counter <= last]
-    first = known[0].counter if known else last + 1
-    return [one for one in known if one.counter >= first], first, last
-
-
 def _in_order(arrivals: Sequence[Arrival], period: float) -> tuple[Stream, int, bool]:
     """Sort arrivals by counter, and mark missing counters between them as lost.
 
     Return the stream, the first counter, and whether world and cloud share a clock. Without a
     shared clock, the delays have an unknown constant offset.
     """
-    arrivals, first, last = _decided(arrivals)
+    # Only in this range of counters a missing datagram counts as lost.
+    last = max((one.counter for one in arrivals), default=0) - WINDOW
+    known = [one for one in arrivals if last - KEPT < one.counter <= last]
+    first = known[0].counter if known else last + 1
+    arrivals = [one for one in known if one.counter >= first]
     count = last - first + 1
     delays, copies = np.full(count, nan), np.zeros(count, int)
     if not arrivals:
@@ -252,8 +240,8 @@ def _in_order(arrivals: Sequence[Arrival], period: float) -> tuple[Stream, int, 
     # Datagrams read in one wake have the same time: 1 ns apart they keep their order.
     stamps_ns = [one.stamp_ns - begin_ns + place for place, one in enumerate(arrivals)]
     stamps = np.array(stamps_ns)[index] * 1e-9
-    known = np.array([one.delay for one in arrivals])[index]
-    delays[numbers] = known if timed else stamps - numbers * period
+    measured = np.array([one.delay for one in arrivals])[index]
+    delays[numbers] = measured if timed else stamps - numbers * period
     copies[numbers] = times
     sent = np.interp(np.arange(count), numbers, stamps - delays[numbers])
     return Stream(sent, delays, copies), first, timed

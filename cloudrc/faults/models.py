@@ -172,6 +172,8 @@ class TeleopModel:
         events: Events of all missions, oldest first.
     """
 
+    _host: RestartableEndpoint  # the machine of cloud, from `run_on` on
+
     def __init__(self, fence: Fence, phase_ns: int) -> None:
         """Start teleop.
 
@@ -183,9 +185,8 @@ class TeleopModel:
         self._phase_ns, self._starts = phase_ns, 0
         self._disk = b""  # the bytes of its database
         self.events: list[MissionEvent] = []
-        self._host: RestartableEndpoint | None = None
         self._peer = _Peer(lambda: self.service is not None)
-        self._clouds = _Peer(lambda: self._host is not None and self._host.inner is not None)
+        self._clouds = _Peer(lambda: self._host.inner is not None)
         self._peer.other, self._clouds.other = self._clouds, self._peer
         self.start()
 
@@ -252,7 +253,7 @@ class TeleopModel:
 
     def freeze(self, now_ns: int, duration: float) -> None:
         """Freeze the process as with SIGSTOP, from `now_ns` [ns] for `duration` [s]."""
-        if self.service is not None and self._host is not None:
+        if self.service is not None:
             self._free_ns = max(self._free_ns, now_ns + round(duration * 1e9))
             self._host.at(self._free_ns * 1e-9, self._turn)  # a late process wakes at once
 
@@ -260,12 +261,11 @@ class TeleopModel:
         self.events += [each for each in news if isinstance(each, MissionEvent)]
 
     def _wake(self, now_ns: int) -> None:
-        assert self._host is not None
         self._turn(now_ns)
         self._host.at((now_ns + PERIOD_NS) * 1e-9, self._wake)
 
     def _turn(self, now_ns: int) -> None:
-        if self.service is None or self._host is None or now_ns < self._free_ns:
+        if self.service is None or now_ns < self._free_ns:
             return
         late_ns = max(0, now_ns - self._turn_ns - PERIOD_NS) if self._turn_ns >= 0 else 0
         self._turn_ns = now_ns

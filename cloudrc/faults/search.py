@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import asdict, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -20,35 +19,21 @@ from cloudrc.faults.trial import INVARIANTS, TrialResult, checked_in
 from cloudrc.trials.workers import map_in_order, take_each
 
 
-@dataclass(frozen=True)
-class SearchSettings:
-    """What a search flies, and for how long."""
-
-    adversarial: bool  # whether the cloud has valid keys and tries to break the invariants
-    first: int  # first seed; the search counts up from it
-    minutes: float  # duration [min]
-    jobs: int  # number of parallel processes
-    store: Path  # folder for schedules that break an invariant
-    robot: str  # name or path of the robot
-
-    @property
-    def kind(self) -> str:
-        """Kind of the schedules in words."""
-        return "adversarial" if self.adversarial else "random"
-
-
 def search(
-    settings: SearchSettings, see: Callable[[dict[str, Any]], None]
+    fly: Callable[[int], TrialResult],
+    first: int,
+    minutes: float,
+    jobs: int,
+    see: Callable[[TrialResult], dict[str, Any]],
 ) -> tuple[dict[str, Any], CloudrcError | None]:
-    """Fly a schedule per seed; call `see` with each failure, which is stored as a file.
+    """Fly the schedules of seeds from `first` on, for `minutes` [min], in `jobs` processes.
 
+    Call `see` with each finding that has breaches; it returns the failure as values for JSON.
     Return the result of the search as values for JSON; and why it ended early, or None.
     """
     found: dict[str, Any] = {
-        "kind": settings.kind,
-        "robot": settings.robot,
-        "first": settings.first,
-        "next": settings.first,
+        "first": first,
+        "next": first,
         "count": 0,
         "seconds": 0.0,
         "invariants": {name: {"judged": 0, "broken": 0} for name in INVARIANTS},
@@ -59,25 +44,20 @@ def search(
     }
     began = time.monotonic()
 
+    def flown() -> Generator[TrialResult]:
+        for finding in map_in_order(fly, count(first), jobs):
+            yield finding
+            if time.monotonic() - began >= 60.0 * minutes:
+                return
+
     def take(finding: TrialResult) -> None:
         found["seconds"] = time.monotonic() - began
         _count(found, finding)
         if finding.breaches:
-            failure = _store(finding, settings.store)
-            found["failures"].append(failure)
-            see(failure)
+            found["failures"].append(see(finding))
 
-    stopped = take_each(_fly_seeds(settings, began), take)
+    stopped = take_each(flown(), take)
     return found, stopped
-
-
-def _fly_seeds(settings: SearchSettings, began: float) -> Generator[TrialResult]:
-    """Fly one flight per seed, until the time of the search has passed since `began` [s]."""
-    fly = partial(fly_seed, adversarial=settings.adversarial, robot=settings.robot)
-    for finding in map_in_order(fly, count(settings.first), settings.jobs):
-        yield finding
-        if time.monotonic() - began >= 60.0 * settings.minutes:
-            return
 
 
 def fly_seed(seed: int, adversarial: bool, robot: str) -> TrialResult:
@@ -98,7 +78,7 @@ def _count(found: dict[str, Any], finding: TrialResult) -> None:
     found["missions_done"] += finding.missions
 
 
-def _store(finding: TrialResult, folder: Path) -> dict[str, Any]:
+def store(finding: TrialResult, folder: Path) -> dict[str, Any]:
     """Write a schedule that broke an invariant into `folder`; return the failure for JSON."""
     schedule, seed = finding.schedule, finding.schedule.seed
     name = f"{'-'.join(sorted(finding.kinds))}-{schedule.policy or 'seed'}-{seed}.yaml"

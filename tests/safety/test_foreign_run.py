@@ -3,6 +3,7 @@
 import json
 import os
 import subprocess
+from pathlib import Path
 
 import pytest
 
@@ -27,7 +28,7 @@ report:
   metrics: ./spy.py
 """
 
-PACKAGE = Path(cloudrc.__file__).parent
+PACKAGE = Path(ends.__file__).parents[1]
 
 
 @pytest.fixture
