@@ -64,17 +64,6 @@ def test_simulated_compute_time_is_no_delay_of_the_link():
     assert not {"mean", "deviation"} & moments[-1].keys()
 
 
-def test_a_new_session_starts_undecided():
-    monitor = hearing(PAPER, PAPER)
-    assert is_believed(checked(monitor, arrivals(PAPER, 20.0))[0][-1])
-    (few,) = [one._replace(epoch=2, stamp_ns=one.stamp_ns + 20_000_000_000)
-              for one in arrivals(PAPER, 0.01)]  # fmt: skip
-    monitor.after([few], few.stamp_ns)
-    later_ns = few.stamp_ns + 7_000_000_000
-    (row,) = monitor.after([few._replace(counter=1, stamp_ns=later_ns)], later_ns)
-    assert (row.quantity, row.verdict) == ("loss", "open")
-
-
 def test_late_wakes_of_the_ends_are_no_fault_of_the_link():
     slow = arrivals(changed(PAPER, delay_ms=PAPER.delay_ms + 4.5))
     assert checked(hearing(PAPER, PAPER), slow)[1], "of punctual ends it is"

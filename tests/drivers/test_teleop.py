@@ -93,7 +93,6 @@ def serve(machine, peer, wakes, calls=lambda now_ns: None, told=None):
 @pytest.mark.parametrize(
     ("wakes", "done"),
     [
-        ("-", [OLD, "asked"]),
         ("s--p", [NOW, "asked"]),
         ("s" + "-" * (BLIND_WAKES - 1), []),
         ("s" + "-" * BLIND_WAKES, ["asked"]),
@@ -108,8 +107,6 @@ def test_after_a_stall_old_states_are_skipped_before_calls(peers, monkeypatch, w
     machine, clock, coming = a_machine(), [SECOND], iter(wakes)
     calls, done_so_far = ["asked"], []
     machine.see = lambda seen, now_ns: done_so_far.append(seen)
-    if wakes == "-":
-        peers[1].send(OLD)
 
     def sleep(seconds):
         what = next(coming)

@@ -15,33 +15,30 @@ TURNING = (900.0,) * 4
 
 
 @cache
-def experiment(hold_ms=60_000, robot="pelican"):
+def experiment(robot="pelican"):
     """Return the experiment of a robot."""
-    settings = f"guard.hold_max_s={hold_ms / 1000}", "guard.plan_max_s=0.8"
     name = "pillars" if robot == "rover" else "paper"
-    return load_experiment(name, ["link.profile=ideal", *settings])
+    return load_experiment(name, ["link.profile=ideal", "guard.plan_max_s=0.8"])
 
 
 class FakeRobot:
     """A robot in a mission; it is in whatever state and place a test puts it."""
 
-    def __init__(self, *, yaw_rate=0.0, honest=False, hold_ms=60_000, robot="pelican"):
+    def __init__(self, *, yaw_rate=0.0, honest=False, robot="pelican"):
         self.guard = SimpleNamespace(state=TRACK, reference=ZERO, yaw_rate=yaw_rate)
         self.simulator = SimpleNamespace(steps=0, touch_age=float("inf"), touches=[])
         self.onboard = SimpleNamespace(stopped=STOPPED)
         self.observers = []
         self.position, self.velocity = (1.0, 1.0, 1.0), ZERO
         self.now_ns = 0
-        self.watch = Watch(experiment(hold_ms, robot))
+        self.watch = Watch(experiment(robot))
         self.observer = RobotInvariants(self, self.watch, 0, honest)
         self.request(Request.START)
 
-    def request(self, *requests, start=Start.HERE):
+    def request(self, *requests):
         """Carry out operator requests; the guard's state stays what a test says."""
         for request in requests:
-            if start is Start.SPAWN:
-                self.simulator.steps = 0
-            self.observer.see_request(OperatorRequest(1, request, start), self.now_ns)
+            self.observer.see_request(OperatorRequest(1, request, Start.HERE), self.now_ns)
 
     def offer(self, count=1, rejection=None, basis_ms=None, plan=0):
         """Let commands come now; without `basis_ms` they are fresh. `plan` is its length."""

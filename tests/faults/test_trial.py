@@ -143,7 +143,6 @@ def test_a_broken_part_is_found(breaks, kind, schedule, monkeypatch):
         # The stamps are 0, 1, 2...; a new process of world starts at 3.
         ([(2, 0), (2, 1), (2, 5), (1, None), (1, 0)], set()),
         ([(2, 0), (2, 1), (2, 5), (1, 7), (1, 6)], {"order"}),
-        ([(2, 0), (2, 5), (3, 0)], set()),
         ([(3, None), (2, 9)], {"order"}),
     ],
 )
