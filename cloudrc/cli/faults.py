@@ -130,10 +130,9 @@ def run_file(options: Options) -> int:
     if options.seed != 1:
         raise BadInputError("--seed belongs to named faults, not to a schedule's file")
     with Progress(f"flies {options.name}"):
-        schedule = load(options.name)
         try:
-            finding = fly(schedule, keep=True)
-        except (BadInputError, ValueError) as error:  # an unknown profile or policy
+            finding = fly(load(options.name), keep=True)
+        except ValueError as error:
             raise BadInputError(f"{options.name}: {error}") from error
     breaches = [breach._asdict() for breach in finding.breaches]
     document = {"records_sha256": finding.sha256, "breaches": breaches}

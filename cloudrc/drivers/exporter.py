@@ -130,7 +130,11 @@ def read_throttling(root: Path = CGROUP) -> Readings:
 
 
 class Exporter:
-    """Collects the metrics of one process and serves them over HTTP."""
+    """Collects the metrics of one process and serves them over HTTP.
+
+    Attributes:
+        sync_age: Returns the time since the recording's last sync to disk [s], None if unknown.
+    """
 
     def __init__(self, role: str, config: str = "") -> None:
         """Set the role of the process: "world", "cloud", "teleop" or "link".
@@ -139,7 +143,7 @@ class Exporter:
         """
         self._role, self._metrics = role, of_role(role)
         self._live = LiveMetrics(role)
-        self._sync_age: Callable[[], float | None] = lambda: None
+        self.sync_age: Callable[[], float | None] = lambda: None
         self._said_ready, self._config = False, config[:CONFIG_DIGITS]
         self._seen_at: float | None = None  # time of the newest records; None before the first
         self._server: _Server | None = None
@@ -179,10 +183,6 @@ class Exporter:
         """Set the number of failed DNS queries for the peer's name. Any thread may call this."""
         self._live.see([Counted(0, "link", "unresolved", count)])
 
-    def recording(self, sync_age: Callable[[], float | None]) -> None:
-        """Set the function that returns the time since the recording's last sync to disk [s]."""
-        self._sync_age = sync_age
-
     @property
     def is_ready(self) -> bool:
         """Whether this process is ready: world or cloud if the peer sends, others by `ready`."""
@@ -220,7 +220,7 @@ class Exporter:
         readings: Readings = self._live.read() | read_throttling()
         readings["cloudrc_build_info"] = {(__version__, self._role, self._config): 1.0}
         readings["cloudrc_ready"] = samples(self.is_ready)
-        if (age := self._sync_age()) is not None:
+        if (age := self.sync_age()) is not None:
             readings["cloudrc_recorder_sync_age_seconds"] = samples(age)
         for metric in self._metrics:
             if reading := readings.get(metric.name):

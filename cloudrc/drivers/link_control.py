@@ -11,7 +11,7 @@ from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
-from cloudrc.errors import BadInputError
+from cloudrc.errors import CloudrcError
 from cloudrc.link.control import APPLY_LIMIT, OK, REFUSED, read_answer
 from cloudrc.link.state import LinkState, to_text
 
@@ -22,7 +22,7 @@ LOOK_PERIOD = 0.01
 
 Change = Callable[[bytes], str]
 """Function that takes the body of a request as the new profile; returns the number of the change.
-Raises a BadInputError or a ValueError if the body is no valid change."""
+Raises a CloudrcError or a ValueError if the body is no valid change."""
 State = Callable[[], LinkState | None]
 """Function that returns the present state of the direction."""
 
@@ -57,7 +57,7 @@ class _Handler(BaseHTTPRequestHandler):
         size = int(self.headers.get("Content-Length") or 0)
         try:
             number = self.server.change(self.rfile.read(size))
-        except (BadInputError, ValueError, OSError) as error:
+        except (CloudrcError, ValueError, OSError) as error:
             self._answer(REFUSED, str(error))
             return
         until = time.monotonic() + APPLY_LIMIT
@@ -84,7 +84,7 @@ class _Handler(BaseHTTPRequestHandler):
 def ask(path: Path, request: bytes) -> LinkState:
     """Send a request to the socket of a direction; return the state of the direction.
 
-    Raise an OSError if nothing listens there, a ValueError or a BadInputError as `read_answer`.
+    Raise an OSError if nothing listens there, a ValueError or a CloudrcError as `read_answer`.
     """
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(2 * APPLY_LIMIT)

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from cloudrc.errors import BadInputError
+from cloudrc.errors import CloudrcError
 from cloudrc.link.profile import DirectionProfile, Timeline, settled
 from cloudrc.link.profile_file import read_keys
 from cloudrc.link.streams import Stream
@@ -107,7 +107,7 @@ class LinkMonitor:
             uplink, downlink = (
                 link_profile(k, self._file_max) for k in (keys.uplink, keys.downlink)
             )
-        except BadInputError:  # a file is too large, or deleted since
+        except CloudrcError:  # a file is too large, or deleted since
             return None
         return uplink, downlink
 

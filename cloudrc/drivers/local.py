@@ -36,7 +36,7 @@ from cloudrc.errors import (
     MissingPrerequisiteError,
     TimedOutError,
 )
-from cloudrc.files import make_own_folder
+from cloudrc.files import make_own_folder, who_may_write
 from cloudrc.link.follow import PROFILE
 from cloudrc.link.state import STATE_FILE
 from cloudrc.records import CONTROLLER_LOST, Fault, Record
@@ -82,12 +82,15 @@ def flights_folder() -> Path:
     Source: XDG Base Directory Specification.
     """
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    is_own = os.path.isdir(runtime) and not who_may_write(Path(runtime))
     homes = os.path.expanduser("~/.local/state"), f"/tmp/cloudrc-{os.geteuid()}"
-    for root in (runtime if os.path.isdir(runtime) else "", *homes):
+    for root in filter(os.path.isabs, (runtime if is_own else "", *homes)):
         folder = Path(root, "cloudrc", "flights")
-        with contextlib.suppress(OSError):
-            if os.path.isabs(root) and not make_own_folder(folder):
+        try:
+            if not make_own_folder(folder) and os.access(folder, os.W_OK):
                 return folder
+        except OSError:  # it cannot be made
+            continue
     raise MissingPrerequisiteError(f"{folder}: others may write there; set XDG_RUNTIME_DIR")
 
 

@@ -260,12 +260,13 @@ class LinkNotes:
         """
         noted: list[Record] = []
         begins = not BEGINNINGS.isdisjoint(map(type, records))
-        with suppress(OSError, ValueError):  # a missing or malformed file
+        try:
             if self._state.is_new(now_ns, at_once=begins) or begins:
                 noted += self._read_state(begins, now_ns, slip_ns)
-        with suppress(OSError, ValueError):
             if self._released.is_new(now_ns):
                 noted += self._read_lateness(now_ns - slip_ns)
+        except (OSError, ValueError):
+            pass  # a missing or malformed file
         return noted
 
     def _read_lateness(self, stamp_ns: int) -> list[Counted]:
@@ -333,7 +334,7 @@ class EndProcess:
         """
         choose = FlightsOnly(flies) if self.flights_only else list
         if self.exporter is not None:
-            self.exporter.recording(self.recorder.sync_age)
+            self.exporter.sync_age = self.recorder.sync_age
 
         def sink(records: list[Record]) -> None:
             records = records + self.look_around(records, slip_ns())

@@ -93,7 +93,7 @@ class Peer:
     def receive(self, most: int = DRAIN_MAX) -> list[bytes]:
         """Return at most `most` of the datagrams that have arrived.
 
-        A datagram longer than DATAGRAM_MAX is cut to DATAGRAM_MAX + 1 bytes; decoding refuses it.
+        A datagram longer than DATAGRAM_MAX is cut to DATAGRAM_MAX + 1 bytes; decoding rejects it.
         """
         datagrams: list[bytes] = []
         while len(datagrams) < most:
@@ -106,7 +106,7 @@ class Peer:
         return datagrams
 
     def send(self, datagrams: list[bytes]) -> None:
-        """Send datagrams; drop them if the address is unknown or the socket refuses them."""
+        """Send datagrams; drop them if the address is unknown or the socket rejects them."""
         if self.address is not None:
             for data in datagrams:
                 send_or_lose(self.socket, data, self.address)

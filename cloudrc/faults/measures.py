@@ -124,9 +124,9 @@ class Outcome:
         self.true("each waypoint reached once, in order", reached == list(range(len(reached))))
 
     def rejected(self, flight: FaultRun, *reasons: str) -> None:
-        """Check that world has refused at least one datagram or command for each reason."""
+        """Check that world has rejected at least one datagram or command for each reason."""
         for reason in reasons:
-            self.least(f"refused as {reason}", flight.count(reason), 1)
+            self.least(f"rejected as {reason}", flight.count(reason), 1)
 
     def no_hold(self, flight: FaultRun, text: str = "HOLDs") -> None:
         """Check that the guard never changed to HOLD before the mission's end."""

@@ -7,6 +7,7 @@ from math import hypot, inf, sqrt
 from cloudrc.faults.watch import ESTOP, FLOWN, LAND, REELS_NS, TRACK, Watch
 from cloudrc.messages import ZERO, GuardState, Vector
 from cloudrc.sim.readings import Readings
+from cloudrc.text import describe_point
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.robot import STEP
 
@@ -57,7 +58,7 @@ class MotionChecks:
         if self.falls and state in FLOWN:
             self._check_take_off(readings)
         if readings.position[2] < self._watch.low[2]:
-            text = f"base at {_show(readings.position)}, below the floor"
+            text = f"base at {describe_point(readings.position)}, below the floor"
             self._note("fence", text)
         self._check_margin(readings.position)
 
@@ -69,7 +70,7 @@ class MotionChecks:
         may_leave = self.falls or self._is_thrown
         if margin < (-FALL_MAX if may_leave else 0.0):
             how = "fell to" if may_leave else "at"
-            self._note("fence", f"base {how} {_show(position)}")
+            self._note("fence", f"base {how} {describe_point(position)}")
         if not self.falls and (margin >= 0.0 or not self._is_thrown):
             self._watch.margin = min(self._watch.margin, margin)
 
@@ -83,7 +84,7 @@ class MotionChecks:
         self.falls = False
         at, speed = readings.position, hypot(*readings.velocity)
         if speed > STILL or self._margin(at) < 0.0 or at[2] < self._watch.low[2]:
-            text = f"took off after a stop, base at {_show(at)} at {speed:.2f} m/s"
+            text = f"took off after a stop, base at {describe_point(at)} at {speed:.2f} m/s"
             self._note("fence", text)
 
     def check_reference(self, guard: Guard, position: Vector, ramped: bool) -> None:
@@ -109,7 +110,7 @@ class MotionChecks:
             and self._can_stop(vy, y - yl, yh - y)
             and (self._can_stop(vz, z - zl, zh - z) or (lands and vz < 0.0))
         ):
-            text = f"reference ({vx:.3f}, {vy:.3f}, {vz:.3f}) m/s at {_show(position)}"
+            text = f"reference ({vx:.3f}, {vy:.3f}, {vz:.3f}) m/s at {describe_point(position)}"
             self._note("stop", text)
 
     def _can_stop(self, speed: float, below: float, above: float) -> bool:
@@ -171,7 +172,3 @@ def _grown(before: float, after: float) -> float:
     if before * after < 0.0:
         return abs(after)
     return max(abs(after) - abs(before), 0.0)
-
-
-def _show(position: Vector) -> str:
-    return f"({', '.join(f'{each:.2f}' for each in position)})"

@@ -10,7 +10,6 @@ import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from cloudrc.config.schema import World
-from cloudrc.errors import BadInputError
 from cloudrc.outside.document import read_document, write_yaml
 
 
@@ -20,36 +19,51 @@ def generator(seed: int, use: int) -> np.random.Generator:
 
 
 KINDS = {
-    "blackout": (8.0, 0.0, 0.0),  # no datagram passes
-    "delay": (10.0, 0.01, 0.3),  # one-way delay rises by value [s]
-    "jitter": (10.0, 0.01, 0.15),  # jitter rises to value [s]
-    "loss": (10.0, 0.05, 0.9),  # a share of value is lost
-    "bursts": (15.0, 3.0, 60.0),  # loss in bursts of value packets
-    "corruption": (10.0, 0.01, 1.0),  # a share of value has 1 to 8 flipped bits
-    "garbage": (5.0, 1.0, 20.0),  # value random datagrams arrive before every honest one
-    "replay": (5.0, 1.0, 20.0),  # value captured datagrams arrive before every honest one
-    "cloud_killed": (5.0, 0.0, 0.0),  # the cloud process is down
-    "pod_killed": (8.0, 0.0, 0.0),  # the cloud pod with teleop is down
-    "teleop_killed": (6.0, 0.0, 0.0),  # teleop is down
-    "teleop_shut_down": (6.0, 0.0, 1.0),  # teleop pauses, and is down after a share of value
-    "pod_shut_down": (8.0, 0.0, 1.0),  # teleop pauses, the pod is down after a share of value
-    "cloud_paused": (5.0, 0.0, 0.0),  # the cloud process is stopped
-    "cloud_throttled": (8.0, 0.05, 0.9),  # the cloud process gets a share of value of the CPU
-    "world_paused": (1.0, 0.0, 0.0),  # the world process is stopped
-    "world_killed": (3.0, 0.0, 0.0),  # the world process is down, then restarts
-    "world_throttled": (8.0, 0.1, 0.95),  # the world process gets a share of value of the CPU
-    "teleop_paused": (5.0, 0.0, 0.0),  # the teleop process is stopped
-    "second_cloud": (15.0, 0.0, 0.0),  # another cloud with the same key joins
-    "key_rotated": (10.0, 0.0, 0.0),  # world reads a new key, cloud reads it after the duration
-    "key_wrong": (10.0, 0.0, 0.0),  # cloud has a wrong key
-    "values_invalid": (10.0, 1.0, 12.0),  # value commands a second have NaN or infinity
-    "values_huge": (10.0, 1.0, 4.0),  # value commands a second are 1e308 m/s
-    "second_order": (0.0, 0.0, 0.0),  # another mission is ordered
-    "stopped": (0.0, 0.0, 0.0),  # the operator stops the robot, and acknowledges later
-    "held": (5.0, 0.0, 0.0),  # the operator holds the mission, resumes it after the duration
+    "blackout": 8.0,  # no datagram passes
+    "delay": 10.0,  # one-way delay rises by value [s]
+    "jitter": 10.0,  # jitter rises to value [s]
+    "loss": 10.0,  # a share of value is lost
+    "bursts": 15.0,  # loss in bursts of value packets
+    "corruption": 10.0,  # a share of value has 1 to 8 flipped bits
+    "garbage": 5.0,  # value random datagrams arrive before every honest one
+    "replay": 5.0,  # value captured datagrams arrive before every honest one
+    "cloud_killed": 5.0,  # the cloud process is down
+    "pod_killed": 8.0,  # the cloud pod with teleop is down
+    "teleop_killed": 6.0,  # teleop is down
+    "teleop_shut_down": 6.0,  # teleop pauses, and is down after a share of value
+    "pod_shut_down": 8.0,  # teleop pauses, the pod is down after a share of value
+    "cloud_paused": 5.0,  # the cloud process is stopped
+    "cloud_throttled": 8.0,  # the cloud process gets a share of value of the CPU
+    "world_paused": 1.0,  # the world process is stopped
+    "world_killed": 3.0,  # the world process is down, then restarts
+    "world_throttled": 8.0,  # the world process gets a share of value of the CPU
+    "teleop_paused": 5.0,  # the teleop process is stopped
+    "second_cloud": 15.0,  # another cloud with the same key joins
+    "key_rotated": 10.0,  # world reads a new key, cloud reads it after the duration
+    "key_wrong": 10.0,  # cloud has a wrong key
+    "values_invalid": 10.0,  # value commands a second have NaN or infinity
+    "values_huge": 10.0,  # value commands a second are 1e308 m/s
+    "second_order": 0.0,  # another mission is ordered
+    "stopped": 0.0,  # the operator stops the robot, and acknowledges later
+    "held": 5.0,  # the operator holds the mission, resumes it after the duration
 }
-"""Name of a fault in a schedule's file -> longest random duration [s], 0 for an instant; smallest
-and largest random value [unit of the comment]."""
+"""Name of a fault in a schedule's file -> longest random duration [s]; 0 for an instant."""
+VALUES = {
+    "delay": (0.01, 0.3),
+    "jitter": (0.01, 0.15),
+    "loss": (0.05, 0.9),
+    "bursts": (3.0, 60.0),
+    "corruption": (0.01, 1.0),
+    "garbage": (1.0, 20.0),
+    "replay": (1.0, 20.0),
+    "teleop_shut_down": (0.0, 1.0),
+    "pod_shut_down": (0.0, 1.0),
+    "cloud_throttled": (0.05, 0.9),
+    "world_throttled": (0.1, 0.95),
+    "values_invalid": (1.0, 12.0),
+    "values_huge": (1.0, 4.0),
+}
+"""Name of a fault -> smallest and largest random value, in the unit of the comment in `KINDS`."""
 SHARES = ("loss", "corruption", "cloud_throttled", "world_throttled", "teleop_shut_down",
           "pod_shut_down")  # fmt: skip
 """Kinds of fault whose value is a share, in [0, 1]."""
@@ -127,22 +141,17 @@ def dump(schedule: Schedule, note: str = "") -> str:
 
 
 def load(path: Path) -> Schedule:
-    """Read a schedule from a file.
-
-    Raises:
-        BadInputError: If the file is no valid schedule.
-    """
-    document = read_document(path, str(path))
+    """Read a schedule from a file; raise a ValueError if it is no valid schedule."""
     try:
-        schedule = _SCHEDULE.validate_python(document.tree)
+        schedule = _SCHEDULE.validate_python(read_document(path, str(path)).tree)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        text = ": ".join(filter(None, [".".join(map(str, first["loc"])), first["msg"]]))
-        raise BadInputError(f"{path}: is no schedule of faults: {text}") from error
+        place = ".".join(map(str, first["loc"]))
+        raise ValueError(f"is no schedule of faults: {place}: {first['msg']}") from error
     for each in schedule.events:
         if each.at >= schedule.duration:
             late = f"the fault {each.kind} at {each.at:g} s never begins"
-            raise BadInputError(f"{path}: {late}: duration is {schedule.duration:g} s")
+            raise ValueError(f"{late}: duration is {schedule.duration:g} s")
     return schedule
 
 
@@ -182,7 +191,7 @@ def compose(seed: int) -> Schedule:
 
 
 def _event(kind: str, rng: np.random.Generator) -> FaultEvent:
-    longest, low, high = KINDS[kind]
+    longest, (low, high) = KINDS[kind], VALUES.get(kind, (0.0, 0.0))
     at, way = rng.uniform(0.5, CALM - 1.0), WAYS[int(rng.integers(3))]
     duration = 0.0
     if longest:  # short ones are as likely as long ones: 20 ms find as much as 5 s

@@ -72,9 +72,8 @@ def fly(schedule: Schedule, *, keep: bool = False) -> TrialResult:
     With `keep` the records are kept and hashed, which doubles the time.
 
     Raises:
-        BadInputError: If the schedule names an unknown link profile.
-        ValueError: If it names an unknown policy of a dishonest cloud, or if its faults do not fit
-            the profile.
+        CloudrcError: If the schedule names an unknown link profile or policy.
+        ValueError: If its faults do not fit the profile.
     """
     flight = FaultRun(schedule, keep=keep)
     watch, operator = flight.watch, TrialOperator(flight)

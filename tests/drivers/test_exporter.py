@@ -60,7 +60,7 @@ def exporter(role, flight):
     made = Exporter(role)
     made.see(flight[role])
     if role in ENDS:
-        made.recording(lambda: 0.3)
+        made.sync_age = lambda: 0.3
     if role == "link":
         made.link.shaped("netem", "uplink", "auto", 0.045)
         made.link.shaped("relay", "uplink", "auto", 0.045)  # takes the place of netem

@@ -203,7 +203,7 @@ def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
     27,
     "impossible-mission",
     injects="waypoints of NaN, in a wall, behind a wall, beyond the fence; 10,001 waypoints",
-    expects="the whole mission is refused before the flight",
+    expects="the whole mission is rejected before the flight",
 )
 def _impossible(outcome: Outcome) -> None:
     experiment, first = read_experiment("paper"), (0.5, 0.0, 0.8)
@@ -229,7 +229,7 @@ def _impossible(outcome: Outcome) -> None:
             problems = [str(each) for each in check_mission(mission, scene, robot)]
         except ValueError as error:
             problems = [str(error)]
-        outcome.true(f"{name}: refused", bool(problems))
+        outcome.true(f"{name}: rejected", bool(problems))
         if name in points:
             values = (f"{value:g}" in problems[0] for value in points[name])
             told = "waypoints.1" in problems[0] and all(values)
