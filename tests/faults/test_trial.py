@@ -51,26 +51,6 @@ def test_a_hostile_cloud_causes_no_breach(robot, policy):
     assert fly(replace(choose(seed), duration=7.0, robot=robot)).breaches == ()
 
 
-IGNORES_FENCE = (limits, "limit_to_fence", lambda velocity, *_: velocity)
-NEVER_BRAKES = (PositionHold, "_brake", lambda hold, reference, *_: reference)
-
-
-@pytest.mark.parametrize(
-    ("robot", "policy", "broken", "kind"),
-    [
-        ("nano", "random", NEVER_BRAKES, "rest"),
-        ("rover", "towards-a-face", IGNORES_FENCE, "fence"),
-    ],
-)
-def test_a_guard_that_does_not_brake_another_robot_is_found(
-    monkeypatch, robot, policy, broken, kind
-):
-    monkeypatch.setattr(*broken)
-    blackout = FaultEvent("blackout", 4.0, 3.0)
-    found = fly(Schedule(1, "ideal", (blackout,), policy=policy, robot=robot, duration=9.0))
-    assert kind in found.kinds
-
-
 BLACKOUT, STOPPED = FaultEvent("blackout", 44.0, 8.0), FaultEvent("stopped", 5.0)
 
 
@@ -102,6 +82,9 @@ HELD = Schedule(
 """Several HOLDs, a stop, and a LAND."""
 
 
+AWAY = Schedule(1, "ideal", (FaultEvent("blackout", 4.0, 3.0),), duration=9.0)
+
+
 def ignores(owner, name, value=lambda *_: None):
     return lambda patch: patch.setattr(owner, name, value)
 
@@ -120,6 +103,14 @@ def applies_late_commands(patch):
         (applies_late_commands, "order", Schedule(1, reorder=0.5, duration=4.0)),
         (ignores(EmergencyStopRepeater, "sound"), "obeyed", HELD),
         (ignores(MissionService, "acknowledge"), "stuck", HELD),
+        (
+            ignores(limits, "limit_to_fence", lambda velocity, *_: velocity),
+            *("fence", replace(AWAY, policy="towards-a-face", robot="rover")),
+        ),
+        (
+            ignores(PositionHold, "_brake", lambda hold, reference, *_: reference),
+            *("rest", replace(AWAY, policy="random", robot="nano")),
+        ),
         (
             ignores(trial, "events_of_missions", lambda *_: [{"mission": "m", "waypoint": 1}]),
             *("waypoint", Schedule(1, duration=0.2)),
