@@ -266,8 +266,7 @@ class ControlLoop:
             epoch: Number of the session, for the record.
             counter: Counter of the command's datagram, for the record.
         """
-        basis, moving = self._basis, setpoint
-        self._now_ns = now_ns
+        basis, moving, self._now_ns = self._basis, setpoint, now_ns
         if moving.motion is not None:
             setpoint = setpoint_at(moving, now_ns)
         assert basis is not None, "check `ready` first"
@@ -290,22 +289,20 @@ class ControlLoop:
             if self._planned:
                 plan, positions = self._plan(moving, output.velocity, now_ns)
         velocity, yaw_rate, proportional, integral, derivative = output
-        hold_ns = now_ns - self._basis_arrival_ns
+        held_ns = now_ns - self._basis_arrival_ns
         planned_ns = basis.stamp_ns + round(horizon * 1e9) if plan else NEVER_NS
-        fields = (now_ns, basis.stamp_ns, hold_ns, velocity, yaw_rate, tuple(plan), planned_ns)
+        fields = (now_ns, basis.stamp_ns, held_ns, velocity, yaw_rate, tuple(plan), planned_ns)
         command = _new(Command, fields)
         if plan:
             self.plans.add(command, [estimate.position, *positions])
         if self._commanded is not None:
             self._call("predictor", self._commanded, command)
         _, position, orientation, predicted_velocity, _ = estimate
-        # fmt: off
         control = _new(Control, (
             now_ns, epoch, counter, basis.stamp_ns, horizon, self._rtt, self._loop_delay,
             basis.position, position, orientation, predicted_velocity, setpoint.position,
             setpoint.waypoint, velocity, yaw_rate, proportional, integral, derivative,
-        ))
-        # fmt: on
+        ))  # fmt: skip
         return command, control
 
     def take_faults(self) -> list[Fault]:

@@ -95,15 +95,18 @@ class FaultRun:
         self.world = RestartableEndpoint(self._build_world, Clock())
         self.cloud = RestartableEndpoint(self._build_cloud, self._clock)
         self.teleop.run_on(self.cloud)
+        self._connect()
+        inject(self)
+
+    def _connect(self) -> None:
+        """Put the links between world and cloud."""
+        schedule, seed = self.schedule, self.experiment.seed
         ends = {"up": self.experiment.uplink, "down": self.experiment.downlink}
         self.uplink, self.downlink = (
-            LinkDirection(
-                shaped(schedule, link_profile(end), way), self.experiment.seed, way == "up"
-            )
+            LinkDirection(shaped(schedule, link_profile(end), way), seed, way == "up")
             for way, end in ends.items()
         )
         self.run = VirtualRun(self.world, self.cloud, self.uplink, self.downlink)
-        inject(self)
 
     @property
     def robot(self) -> Robot:

@@ -153,7 +153,7 @@ def shifted(data: bytes, offset_ns: int) -> bytes:
 def rotate(orientation_wxyz: Quaternion, vector: Sequence[float]) -> Vector:
     """Rotate a vector from the body frame to the world frame: v + 2 · u x (u x v + w · v).
 
-    This is Rodrigues' formula for the unit quaternion (w, u).
+    `orientation_wxyz` is a unit quaternion (w, u), body to world, shape (4,); Rodrigues' formula.
     """
     w, x, y, z = orientation_wxyz
     a, b, c = vector

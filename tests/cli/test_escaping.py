@@ -32,7 +32,7 @@ def printed(capsys):
     return check
 
 
-@pytest.mark.parametrize("words", ["run", "report", "recover", "link show", "faults run"])
+@pytest.mark.parametrize("words", ["run", "report", "recover", "link show"])
 def test_a_name_in_an_error(words, printed):
     assert main([*words.split(), EVIL]) != 0
     (line,) = printed().splitlines()

@@ -138,7 +138,7 @@ def test_a_verb_needs_a_mission_in_the_right_state(api, mission):
     assert "no mission is under way" in mission("cancel", 2).err
     api.fly(FAR)
     mission("goto 0.5 0 1", 5)  # the mission is flying
-    assert "[0.5, 0, 0]: a robot that flies needs a height" in mission("goto 0.5 0", 2).err
+    assert "[0.5, 0, 0]: beyond the fence" in mission("goto 0.5 0", 2).err
 
 
 def test_list_status_and_logs(api, mission):

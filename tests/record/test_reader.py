@@ -292,6 +292,6 @@ def test_the_command_says_what_is_copied_and_missing(path, call, refused):
     assert account["notes"] == [Recording.read(new).note]
     for target, reason in (
         (new, "already there; name another file with --to"),
-        (new / "none", "Not a directory; check the path"),
+        (new / "none", "Not a directory"),
     ):
         assert f"{target}: {reason}" in refused("recover", path, "-t", target)

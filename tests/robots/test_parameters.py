@@ -53,8 +53,6 @@ def test_the_experiment_fast_flies_other_robots_faster(robot):
     assert all(fast < usual for usual, fast in zip(*fits, strict=True))
 
 
-
-
 @pytest.mark.parametrize(
     ("keys", "said"),
     [

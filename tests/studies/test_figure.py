@@ -76,13 +76,9 @@ def test_a_figure_is_three_files_whose_text_is_text(tmp_path, call):
     assert ">delay (ms)</text>" in (tmp_path / "one.svg").read_text()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [(["--x", "delay"], "no axis named 'delay'"),
-     (["--x", "gain", "--by", "gain"], "--x and --by are both gain; name two axes")],
-)  # fmt: skip
-def test_a_figure_of_unknown_names_is_refused(arguments, text, tmp_path, refused):
-    assert text in refused("sweep figure", sweep(tmp_path / "s"), *arguments)
+def test_a_figure_of_unknown_names_is_refused(tmp_path, refused):
+    said = refused("sweep figure", sweep(tmp_path / "s"), "--x", "delay")
+    assert "no axis named 'delay'" in said
 
 
 def test_a_sweep_without_rows_has_no_figure(tmp_path):
