@@ -27,7 +27,7 @@ ROBOTS := x2 nano rover
 T ?=
 PART = $(if $(T),$(if $(wildcard tests/$(T)),tests/$(T),$(T)))
 # Tests of guard, tunnel and store that take seconds.
-SLOW := %_any_input.py %_flight.py %_machine.py %_hostile.py
+SLOW := %_any_input.py %_flight.py %_machine.py %_proof.py %_hostile.py
 CORE := $(filter-out $(SLOW),$(wildcard \
 	tests/world/guard/test_*.py tests/tunnel/test_*.py tests/teleop/test_store.py))
 BUILD_ARGS := $(BASE:%=--build-arg BASE=%) $(ROS:%=--build-arg ROS=%) --build-arg VERSION=$(VERSION) \
