@@ -56,8 +56,14 @@ def build(
         integral_limit_z: Limit of the integrated velocity error in z [m].
 
     Raises:
-        ValueError: If the model has another mass or number of rotors than the Pelican.
+        ValueError: If the model has another mass or number of rotors than the Pelican, or if the
+            scene has air, whose drag the rotors would count twice.
     """
+    if model.opt.density or model.opt.viscosity:
+        raise ValueError(
+            "the scene has the option density or viscosity, but the rotors of this robot have a "
+            "drag of their own; fly another robot there"
+        )
     mass = model.body_mass[model.jnt_bodyid[0]]
     if model.nu != len(STOPPED) or abs(mass - ROBOT_MASS) > MASS_SLACK:
         raise ValueError(

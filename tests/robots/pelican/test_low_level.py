@@ -7,7 +7,11 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+from cloudrc.config.schema import World
+from cloudrc.config.shipped import file_of
+from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO
+from cloudrc.robots.build import check_robot
 from cloudrc.robots.pelican.low_level import (
     NOSE_COSINE_MIN,
     YAW_SINE_MAX,
@@ -117,3 +121,12 @@ def test_allocation_gives_thrust_and_torque(thrust, roll, pitch, yaw):
 @pytest.mark.parametrize(("thrust", "speed"), [(-5.0, 0.0), (0.0, 0.0), (200.0, 1838.0)])
 def test_rotor_speeds_stay_within_their_range(thrust, speed):
     assert allocate((thrust, *ZERO)) == (speed,) * 4
+
+
+def test_a_scene_with_air_is_for_other_robots(tmp_path):
+    """The rotors would count the drag twice."""
+    scene = tmp_path / "air.xml"
+    scene.write_text(file_of("empty").read_text().replace("<option ", '<option density="1.2" '))
+    check_robot(World(scene=str(scene), robot="x2"))
+    with pytest.raises(BadInputError, match="the rotors of this robot have a drag of their own"):
+        check_robot(World(scene=str(scene)))
