@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +44,8 @@ def arguments(parser: Parser) -> None:
     add("--rtt", "MS,...", about, (None,), _round_trips)
     about = "ways to execute answers, such as newest,prefix (default: newest)"
     add("--executor", "NAME,...", about, "newest")
+    about = "parameters of the executors, such as share=.5"
+    add("--set", "KEY=VALUE", about, nargs="+")
     about = "time for an answer in s: a number, MEAN,DEVIATION, a file, 'measured'"
     add("--compute", "TIME", f"{about} (default: 0)", "0")
     about = "how long the robot waits in a step for an answer, in s (default: 5 %% of it)"
@@ -152,8 +155,9 @@ def _read(options: Options) -> tuple[EvalSetup, list[Episode]]:
     )
     values.check_policy(setup.policy)
     values.check_round_trips(setup.link, options.rtt)
+    given = values.read_parameters([*chain(*options.set)], executors)
     episodes = [
-        Episode(rtt, executor, seed)
+        Episode(rtt, executor, seed, given[executor])
         for executor in executors
         for rtt in options.rtt
         for seed in range(1, options.seeds + 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,9 @@ from cloudrc.eval.setup import FILE, MEASURED, SEED, Compute
 from cloudrc.link.library import read_profile
 from cloudrc.link.traces import read_lines
 from cloudrc.outside.document import parse_value, read_document
+from cloudrc.outside.refusal import check_names
 from cloudrc.outside.values import ANY
-from cloudrc.plugins import is_path
+from cloudrc.plugins import is_path, signature
 from cloudrc.policy.address import check_url
 from cloudrc.policy.observation import Mapped
 
@@ -91,14 +92,38 @@ def read_times(path: str) -> tuple[float, ...]:
 
 def read_env_args(texts: list[str]) -> tuple[tuple[str, Any], ...]:
     """Read arguments of an environment, given as KEY=VALUE; a value is YAML, also with None."""
+    return tuple(sorted(_pairs("--env-arg", texts, "env_name=reach-v3").items()))
+
+
+def read_parameters(
+    texts: list[str], executors: list[str]
+) -> dict[str, tuple[tuple[str, Any], ...]]:
+    """Read parameters of executors, given as KEY=VALUE: executor -> those that it has."""
+    given = _pairs("--set", texts, "share=.5")
+    known = {each: _parameters_of(each) if given else () for each in executors}
+    check_names("parameter", given, [key for each in known.values() for key in each], "--set: ")
+    return {
+        each: tuple((key, value) for key, value in given.items() if key in known[each])
+        for each in executors
+    }
+
+
+def _parameters_of(executor: str) -> Collection[str]:
+    from cloudrc.gym.options import full_name  # here, because it imports gymnasium
+
+    return signature("executors", full_name(executor)).parameters
+
+
+def _pairs(flag: str, texts: list[str], example: str) -> dict[str, Any]:
+    """Read KEY=VALUE: key -> value."""
     found = dict[str, Any]()
     for text in texts:
         key, equals, value = text.partition("=")
         if not (equals and key.isidentifier()):
-            raise BadInputError(f"--env-arg {text}: give KEY=VALUE, such as env_name=reach-v3")
+            raise BadInputError(f"{flag} {text}: give KEY=VALUE, such as {example}")
         value = "null" if value == "None" else value
-        found[key] = value if value == SEED else parse_value(value, f"--env-arg {key}")
-    return tuple(sorted(found.items()))
+        found[key] = value if value == SEED else parse_value(value, f"{flag} {key}")
+    return found
 
 
 def read_mapped(path: Path | None) -> tuple[Mapped, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import cache
@@ -91,7 +91,7 @@ def play(episode: Episode, setup: EvalSetup, key: str = "") -> dict[str, Any]:
     """Play an episode; return its row. Raise a CloudrcError if policy or environment fail."""
     played = episode
     if episode.is_baseline:
-        setup, played = replace(setup, **BARE), replace(episode, executor="newest")
+        setup, played = replace(setup, **BARE), Episode(episode.rtt_ms, "newest", episode.seed)
     with make_env(setup, episode.seed) as env, asking(setup) as ask:
         ended, success, digest, numbers = _play(played, setup, env, ask)
     judged = {None: "done", True: "success", False: "failure"}
@@ -169,12 +169,19 @@ class _Policy:
         self.duration = 0.0  # of the last answer [s]
         self.size = 0  # of the last observation on the wire [bytes]
 
-    def __call__(self, observation: Any, prefix: list[Any]) -> NDArray[Any]:
-        """Return the chunk of actions for an observation."""
+    def __call__(
+        self, observation: Any, prefix: Sequence[Any] = (), delay: int = 0
+    ) -> NDArray[Any]:
+        """Return the chunk of actions for an observation.
+
+        The policy finds the actions that the robot has, and how many it will have executed, beside
+        its observation.
+        """
         asked = observe(observation, self._setup.mapped)
         self.size = size_of(asked)
         if prefix:
             asked["prefix"] = np.array(prefix).reshape(len(prefix), -1)
+            asked["delay"] = delay
         start = time.perf_counter()
         answer = self._ask(asked)
         self.duration = time.perf_counter() - start
@@ -232,7 +239,7 @@ def _play(
     """
     witness, policy = _Witness(env), _Policy(ask, setup, env.action_space)
     observation, _ = witness.reset(seed=episode.seed)
-    chunk = policy(observation, [])  # the first answer, whose size the link has to know
+    chunk = policy(observation)  # the first answer, whose size the link has to know
     world = _connect(witness, episode, setup, policy, len(chunk))
     witness.digest = sha256()
     observation, info = world.reset(seed=episode.seed)
@@ -243,7 +250,7 @@ def _play(
     while steps < setup.max_steps and ended == "limit":
         about = info["cloudrc"]
         if about["asked"] and steps:
-            chunk = policy(observation, about.get("prefix", []))
+            chunk = policy(observation, about.get("prefix", ()), about.get("delay", 0))
         if setup.is_measured:
             world.compute = policy.duration
         observation, reward, terminated, truncated, info = world.step(chunk)
@@ -287,7 +294,7 @@ def _connect(
         compute=policy.duration if setup.is_measured else setup.compute_times,
         answer_within=setup.answer_within,
         chunk=count,
-        executor=episode.executor,
+        executor=episode.chosen,
         observation_bytes=policy.size if sent is None else sent,
         start="answer",  # a robot does nothing before its policy has answered
     )
@@ -312,9 +319,9 @@ def check_environment(setup: EvalSetup, episodes: list[Episode]) -> EvalSetup:
             width_of(env.action_space)
             step = find_step(env, setup.dt)
         code = environment_code(env, setup)
-        for executor in dict.fromkeys(each.executor for each in episodes):
+        for episode in {each.point["executor"]: each for each in episodes}.values():
             wait = setup.answer_within
-            Networked(env, dt=setup.dt, chunk=1, executor=executor, answer_within=wait)
+            Networked(env, dt=setup.dt, chunk=1, executor=episode.chosen, answer_within=wait)
     if not setup.is_remote:
         _load(setup.policy)
     digests = {_first_observation(setup) for _ in range(2)}

@@ -89,11 +89,18 @@ class Episode:
     rtt_ms: float | None  # mean round trip [ms]; None: that of the profile
     executor: str
     seed: int
+    parameters: tuple[tuple[str, Any], ...] = ()  # of the executor
 
     @property
     def point(self) -> dict[str, Any]:
         """The condition without its seed."""
-        return {"rtt_ms": self.rtt_ms, "executor": self.executor}
+        given = [f"{key}={value}" for key, value in self.parameters]
+        return {"rtt_ms": self.rtt_ms, "executor": " ".join([self.executor, *given])}
+
+    @property
+    def chosen(self) -> dict[str, Any]:
+        """The executor with its parameters, as `Networked` takes it."""
+        return {"name": self.executor, **dict(self.parameters)}
 
     @property
     def is_baseline(self) -> bool:

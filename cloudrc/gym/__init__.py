@@ -1,6 +1,7 @@
 """Environments of gymnasium whose policy is at the other end of a link, in virtual time.
 
-The import registers `cloudrc/Networked-v0`, `cloudrc/Steps-v0` and `cloudrc/Pipes-v0`.
+The import registers `cloudrc/Networked-v0`, `cloudrc/Steps-v0`, `cloudrc/Pipes-v0` and
+`cloudrc/Linear-v0`.
 """
 
 from cloudrc.errors import MissingPrerequisiteError

@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 from gymnasium.error import ResetNeeded
 
-from cloudrc.gym.executors import Chunk, Executor
-from cloudrc.gym.values import copied
+from cloudrc.gym.executors import Chunk, Committed, Executor
+from cloudrc.gym.values import copied, size_of
 from cloudrc.link.draws import Floats, stream_key
 from cloudrc.link.library import LinkProfile, OneWay
 from cloudrc.link.profile import DirectionProfile
@@ -80,10 +80,10 @@ class Lane:
         self._episode, self.queue = episode, PacketQueue()
         self.sent = self._delays_ns = 0
 
-    def send(self, number: int, now_ns: int, message: Any) -> None:
-        """Send a message at `now_ns` [ns], or lose it."""
+    def send(self, number: int, now_ns: int, message: Any, more: int = 0) -> None:
+        """Send a message at `now_ns` [ns] with `more` bytes than usual, or lose it."""
         self.sent += 1
-        arrivals = self._way.send(self._episode, number, self._size, now_ns)
+        arrivals = self._way.send(self._episode, number, self._size + more, now_ns)
         if len(arrivals) > 1:
             arrivals = (min(arrivals),)  # of two copies
         if arrivals:
@@ -111,6 +111,7 @@ class RemoteLoop:
 
     Attributes:
         seen: The newest observation that the policy has taken, and the environment's info about it.
+        is_asked: Whether this observation is new, so that the policy's next answer is sent.
         compute: Time for the next answers [s], or a function that returns it for the tick of an
             observation; None: that of the settings.
     """
@@ -147,8 +148,8 @@ class RemoteLoop:
         self._up.begin(self._episode)
         self._down.begin(self._episode)
         self._tick = self._now_ns = self._seen_tick = 0
-        self.seen = [copied(observation), info]
-        self._is_asked = True
+        self.seen, self._committed = [copied(observation), info], Committed()
+        self.is_asked = True
         self._begin_ns = self._free_ns = 0  # when the policy began its last answer, and has it
         self._held = 0
         self._last, self._basis = self._settings.start, -1.0
@@ -171,7 +172,7 @@ class RemoteLoop:
         tick, executor = self._tick, self._executor
         if tick < 0:
             raise ResetNeeded("call reset() before step()")
-        if self._is_asked:
+        if self.is_asked:
             self._answer(actions)
         self._receive(self._now_ns + self._within_ns)
         action = executor.action(tick)
@@ -192,7 +193,6 @@ class RemoteLoop:
     def _answer(self, actions: tuple[Any, ...]) -> None:
         """Send the answer to the newest observation that the policy has taken."""
         chunk = Chunk(self._seen_tick, actions)
-        self._executor.sent(chunk)
         if self._settings.waits and not self._tick:
             self._executor.receive(chunk, 0)  # the episode begins when this answer has arrived
             return
@@ -213,23 +213,25 @@ class RemoteLoop:
         self._tick = tick = self._tick + 1
         self._now_ns = now_ns = round(tick * self._settings.dt * 1e9)
         self._receive(now_ns)
-        if self._executor.asks(tick):
-            self._up.send(tick, now_ns, (tick, copied(observation), dict(info)))
+        if self._executor.asks(tick, observation):
+            committed = self._executor.committed(tick)
+            message = (tick, committed, copied(observation), dict(info))
+            self._up.send(tick, now_ns, message, size_of(committed.actions))
         self._ask(now_ns + self._within_ns)
         if self._seen_tick:
             self._observation_ages.append(tick - self._seen_tick)
 
     def _ask(self, limit_ns: int) -> None:
         """Let the policy begin with the observations that have arrived by `limit_ns` [ns]."""
-        queue, self._is_asked = self._up.queue, False
+        queue, self.is_asked = self._up.queue, False
         while (begin_ns := max(queue.next_ns, self._free_ns)) <= limit_ns:
             before = self._seen_tick
             while queue.next_ns <= begin_ns:
                 _, _, message = queue.pop()
                 if message[0] > self._seen_tick:
-                    self._seen_tick, *self.seen = message
+                    self._seen_tick, self._committed, *self.seen = message
             if self._seen_tick > before:
-                self._is_asked, self._begin_ns = True, begin_ns
+                self.is_asked, self._begin_ns = True, begin_ns
                 self._free_ns = begin_ns + self._time_to_compute()
 
     def _time_to_compute(self) -> int:
@@ -250,15 +252,15 @@ class RemoteLoop:
         """Return what the policy may know about the loop, as `info["cloudrc"]`."""
         dt = self._settings.dt
         found: dict[str, Any] = {
-            "asked": self._is_asked,
+            "asked": self.is_asked,
             "observation_age": (self._tick - self._seen_tick) * dt,
             "action_age": (self._tick - 1 - self._basis) * dt if self._basis >= 0 else inf,
             "held": self._is_held,
             "lost_uplink": self._up.queue.lost,
             "lost_downlink": self._down.queue.lost,
         }
-        if prefix := self._executor.prefix(self._seen_tick):
-            found["prefix"] = prefix
+        if self._committed.actions:
+            found["prefix"], found["delay"] = self._committed
         return found
 
     def summary(self, deadline: float | None = None) -> dict[str, Any]:

@@ -8,7 +8,9 @@ from typing import Any, Unpack
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
+from cloudrc.gym.memory import Remembering
 from cloudrc.gym.options import (
+    ANSWER,
     Options,
     Profile,
     answer_space,
@@ -17,7 +19,7 @@ from cloudrc.gym.options import (
     read_options,
 )
 from cloudrc.gym.step import find_step
-from cloudrc.gym.values import checker, copied
+from cloudrc.gym.values import checker, copied, neutral
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import to_arrays
 
@@ -51,6 +53,8 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         *,
         dt: float | None = None,
         stream: str = "",
+        observe_age: bool = False,
+        observe_actions: int = 0,
         **options: Unpack[Options],
     ) -> None:
         """Wrap an environment.
@@ -74,12 +78,17 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             action_bytes: Size of an answer on the wire [bytes]; likewise.
             dt: Time of a step [s]; None: that of the environment.
             stream: Name of the robot; robots with one seed and two names share no random numbers.
+            observe_age: Whether the policy also observes the age of its observation.
+            observe_actions: How many of its own last actions the policy also observes; of a chunk,
+                the first. With either, an observation is a mapping, see `Remembering`.
 
         Raises:
             cloudrc.errors.CloudrcError: If a value cannot be used; the text says what to change.
         """
         options = read_options("Networked", options)
-        RecordConstructorArgs.__init__(self, link=link, seed=seed, dt=dt, stream=stream, **options)
+        given: dict[str, Any] = {"dt": dt, "stream": stream, **options}
+        given |= {"observe_age": observe_age, "observe_actions": observe_actions}
+        RecordConstructorArgs.__init__(self, link=link, seed=seed, **given)
         gymnasium.Wrapper.__init__(self, env)
         self.dt, _ = find_step(env, dt)
         both, chunk = (env.observation_space, env.action_space), options["chunk"]
@@ -87,6 +96,13 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.action_space, self._split = answer_space(env.action_space, chunk)
         self._check = checker(self.action_space, describe_answer(chunk))
         self.world_info: dict[str, Any] = {}
+        self._memory: Remembering | None = None
+        if observe_age or observe_actions:
+            start = options.get("start")
+            is_given = start is not None and not (isinstance(start, str) and start == ANSWER)
+            idle = start if is_given else neutral(env.action_space)
+            self._memory = Remembering(*both, observe_age, observe_actions, idle)
+            self.observation_space = self._memory.space
 
     @property
     def compute(self) -> float | Callable[[int], float] | None:
@@ -114,14 +130,18 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Begin an episode; the policy has the first observation at once."""
         observation, self.world_info = self.env.reset(seed=seed, options=options)
         self._loop.begin(seed, observation, self.world_info)
+        if self._memory:
+            self._memory.begin()
         return self._seen()
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Send the policy's answer, and step the world with what the robot executes."""
         action = to_arrays(action)
         self._check(action)
-        loop = self._loop
-        executed = loop.act(self._split(action))
+        loop, answer = self._loop, self._split(action)
+        if self._memory and loop.is_asked:
+            self._memory.add(answer[0])
+        executed = loop.act(answer)
         observation, reward, terminated, truncated, self.world_info = self.env.step(executed)
         loop.observe(observation, self.world_info)
         seen, info = self._seen()
@@ -131,4 +151,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _seen(self) -> tuple[Any, dict[str, Any]]:
         observation, info = self._loop.seen
-        return copied(observation), {**info, "cloudrc": self._loop.told()}
+        observation, told = copied(observation), self._loop.told()
+        if self._memory:
+            observation = self._memory.beside(observation, told["observation_age"])
+        return observation, {**info, "cloudrc": told}

@@ -41,7 +41,7 @@ class Options(TypedDict, total=False):
     compute: float | tuple[float, float]
     answer_within: float | None
     chunk: int | None
-    executor: str | Path
+    executor: str | Path | Mapping[str, Any]
     hold: str
     start: Any
     observation_bytes: int | None
@@ -52,13 +52,15 @@ DEFAULTS: Options = {
     **{"compute": 0.0, "answer_within": None, "chunk": None, "executor": "newest"},
     **{"hold": "repeat", "start": None, "observation_bytes": None, "action_bytes": None},
 }
-ARGUMENTS = ("env", "link", "seed", "dt", "stream", *DEFAULTS)
-"""Names of the arguments of `Networked` and `NetworkedVector`."""
+VECTOR = ("env", "link", "seed", "dt", "stream", *DEFAULTS)
+"""Names of the arguments of `NetworkedVector`."""
+ARGUMENTS = (*VECTOR, "observe_age", "observe_actions")
+"""Names of the arguments of `Networked`."""
 
 
 def read_options(what: str, given: Options) -> Options:
     """Read the options of the environment `what`; those that are not given have their defaults."""
-    check_names(f"argument of {what}", given, ARGUMENTS)
+    check_names(f"argument of {what}", given, VECTOR)
     read: dict[str, Any] = {**DEFAULTS, **given}
     check_names("hold", [read["hold"]], ("repeat", "start"))
     for name, (quantity, wanted) in COUNTS.items():
@@ -144,16 +146,23 @@ def describe_answer(chunk: int | None) -> str:
     return "one action" if chunk is None else f"a chunk of {chunk} actions"
 
 
-def find_executor(name: str | Path, *, chunked: bool) -> tuple[Executor, bool]:
-    """Build an executor by name or path.
+def full_name(executor: str | Path) -> str:
+    """Return the name of an executor, of which "time-indexed" is a form, or its path."""
+    name = str(executor)
+    return name if plugins.is_path(name) else name.replace("-", "_")
+
+
+def find_executor(given: str | Path | Mapping[str, Any], *, chunked: bool) -> tuple[Executor, bool]:
+    """Build an executor by name or path, or by a mapping with its `name` and its parameters.
 
     Also return whether cloudrc ships it, so that its actions need no judge.
     """
-    found = str(name)
-    if not plugins.is_path(found):
-        found = found.replace("-", "_")
-    executor = plugins.load("executors", found)
+    parameters = dict(given) if isinstance(given, Mapping) else {"name": given}
+    found = full_name(parameters.pop("name", ""))
     with naming(f"executor {found!r}"):
+        known = plugins.signature("executors", found).parameters
+        check_names("parameter", parameters, known)
+        executor = plugins.load("executors", found, **parameters)
         if not isinstance(executor, Executor):
             returned = f"build() returned {type(executor).__name__}"
             raise InvalidValueError(f"{returned}; return an Executor of cloudrc.gym.executors")

@@ -24,6 +24,7 @@ IDS: dict[str, dict[str, Any]] = {
         "entry_point": "cloudrc.gym.testbed:RobotEnv",
         "kwargs": {"experiment": "paper"},
     },
+    "cloudrc/Linear-v0": {"entry_point": "cloudrc.gym.linear:Linear"},
 }
 """Name of an environment -> arguments of `gymnasium.register`."""
 

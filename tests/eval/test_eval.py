@@ -255,6 +255,33 @@ def run(*words):
     return main(["eval", "--env", "CartPole-v1", "--jobs", "1", *map(str, words)])
 
 
+SEES = """
+import numpy as np
+def infer(observation):
+    prefix, delay = observation.get("prefix"), observation.get("delay")
+    with open(__file__ + ".seen", "a") as file:
+        if prefix is not None:
+            print(*prefix.shape, delay, file=file)
+    return {"actions": np.zeros((8, 1))}
+"""
+
+
+def test_executors_have_parameters_and_the_policy_sees_what_the_robot_has(law, tmp_path, capsys):
+    path, folder = law(SEES), tmp_path / "out"
+    words = ("--policy", path, "--rtt", "50", "--seeds", "1", "--max-steps", "20", "--out", folder)
+    law_of = ("--env", "Pendulum-v1", *words)
+    assert run(*law_of, "--executor", "rtc,async", "--set", "execute=2", "share=.25") == 0
+    assert run(*law_of, "--executor", "async", "--set", "share=.75", "-o", "json") == 0
+    rows = [json.loads(line) for line in (folder / "rows.jsonl").read_text().splitlines()]
+    names = {row["point"]["executor"] for row in rows}
+    assert names == {"no network", "rtc execute=2", "async share=0.25", "async share=0.75"}
+    seen = Path(path + ".seen").read_text().splitlines()
+    assert {*seen} == {"6 1 1"}  # after 2 of 8 actions; 50 ms are a step
+    capsys.readouterr()
+    assert run(*law_of, "--executor", "async", "--set", "shore=.5") == 2
+    assert "--set: no parameter named 'shore'; " in capsys.readouterr().err
+
+
 def test_an_evaluation_has_a_table_a_page_and_rows_and_continues(law, tmp_path, capsys):
     words = ["--policy", law(), "--rtt", "0,200", "--success-at", 500, "--out", tmp_path / "e"]
     assert run(*words, "--seeds", 2) == 0

@@ -30,6 +30,89 @@ def test_the_broker_asks_again_after_a_loss():
     assert found[104] == 104
 
 
+def test_the_policy_learns_the_actions_before_its_answer():
+    """Those that the robot had when the observation left."""
+    env = Networked(Counter(), both_ways(15, 20), chunk=8, executor="prefix", start="answer")
+    observation, info = env.reset()
+    assert "prefix" not in info["cloudrc"]
+    for tick in range(30):
+        told = info["cloudrc"]
+        if told["asked"] and tick:
+            basis = int(observation[0])
+            newest = max(0, basis - 4)  # 35 ms are 4 ticks
+            assert [float(each[0]) for each in told["prefix"]] == [newest] * 4
+            assert told["delay"] == 4
+        observation, *_, info = env.step(np.full((8, 1), observation[0], np.float32))
+
+
+def test_committed_actions_count_as_bytes_of_the_observation():
+    link = {"uplink": {"rate_kbit": 1024}, "downlink": {}}  # 128 bytes take 1 ms
+    executor = {"name": "rtc", "execute": 4}
+    env = Networked(
+        Counter(), link, chunk=8, executor=executor, start="answer", observation_bytes=100
+    )
+    env.reset()
+    for _ in range(30):
+        env.step(np.zeros((8, 1), np.float32))
+    sent = env.summary()["uplink"]["delay_measured"]  # with 28 bytes of headers and 4 actions left
+    assert sent == pytest.approx((128 + 4 * 4) / 128e3, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("aggregate", "share_of_new"),
+    [("latest", 1.0), ("weighted", 0.7), ("average", 0.5), ("conservative", 0.3)],
+)
+def test_async_merges_what_two_answers_mean_for_one_action(aggregate, share_of_new):
+    late = both_ways(0, 20)
+    executor = {"name": "async", "share": 0.5, "aggregate": aggregate}
+    found = flown(executor, late, steps=6, start="answer")
+    # Two of four actions are left after tick 2: the answer to this observation acts in tick 4.
+    assert found[:4] == [0, 0.001, 0.002, 0.003]
+    assert found[4:] == [2.002, 2.003]
+    found = flown(executor, both_ways(0, 10), steps=4, start="answer")
+    assert found[3] == pytest.approx((1 - share_of_new) * 0.003 + share_of_new * 2.001, abs=6e-4)
+
+
+def test_async_skips_nothing_after_it_had_no_action():
+    executor = {"name": "async", "share": 0.0, "aggregate": "latest"}
+    found = flown(executor, both_ways(0, 30), steps=12, start="answer")
+    assert found == [0, 0.001, 0.002, 0.003, *[0.003] * 3, 4, 4.001, 4.002, 4.003, 4.003]
+
+
+def test_async_takes_means_only_of_numbers_with_a_point():
+    env = Networked(Counter(spaces.Discrete(5)), both_ways(0, 10), chunk=4, executor="async")
+    env.reset()
+    answers = (env.step(np.ones(4, int)) for _ in range(9))
+    with pytest.raises(ValueError, match="give aggregate=latest"):
+        list(answers)
+
+
+@pytest.mark.parametrize("name", ["async", "rtc", "broker"])
+def test_executors_with_one_open_question_ask_again_after_a_loss(name):
+    deaf = {"uplink": {"blackouts": [{"start_s": 0.0, "duration_s": 0.045}]}}
+    executor = {"name": name, "patience": 0.05}
+    found = flown(executor, deaf, steps=14, start="answer")
+    assert max(found) > 4
+
+
+def test_rtc_tells_what_is_left_and_the_largest_delay_of_late():
+    executor = {"name": "rtc", "execute": 4, "memory": 2}
+    ways = both_ways(0, 0)
+    ways["downlink"] = {"delay_ms": 20, "changes": [{"at_s": 0.15, "delay_ms": 5}]}
+    env = Networked(Counter(), ways, chunk=8, executor=executor, start="answer")
+    observation, info = env.reset()
+    told = {}
+    for _ in range(30):
+        about = info["cloudrc"]
+        if about["asked"] and observation[0]:
+            told[int(observation[0])] = [float(each[0]) for each in about["prefix"]], about["delay"]
+        answer = (observation[0] + np.arange(8) / 1000)[:, None].astype(np.float32)
+        observation, *_, info = env.step(answer)
+    assert told[4][0] == pytest.approx([0.004, 0.005, 0.006, 0.007], abs=1e-6)
+    assert list(told) == [4, 8, 12, 16, 20, 24, 28]
+    assert [each for _, each in told.values()] == [1, 2, 2, 2, 2, 1, 1]  # the first is expected
+
+
 PLUGIN = '''
 """Executor: the last action of the newest answer."""
 from cloudrc.gym.executors import Executor

@@ -269,3 +269,30 @@ def test_the_neutral_action_is_in_its_space():
     env.reset()
     env.step("xyz")
     assert env.unwrapped.executed == ["xyz"]
+
+
+@pytest.mark.parametrize("space", [spaces.Discrete(5), spaces.Box(-9.0, 9.0, (2,))])
+def test_the_policy_may_observe_the_age_and_its_own_last_actions(space):
+    env = Networked(
+        Counter(space), both_ways(10, 20), observe_age=True, observe_actions=3, start="answer"
+    )
+    answers = [np.full(space.shape, n + 1, space.dtype)[()] for n in range(4)]
+    seen, _ = env.reset()
+    assert seen["actions"].tolist() == np.zeros((3, *space.shape)).tolist()
+    for answer in answers[:2]:  # the first observation is asked for, and none in the next tick
+        seen, *_ = env.step(answer)
+        assert env.observation_space.contains(seen)
+    assert seen["actions"][-1].tolist() == answers[0].tolist()
+    assert seen["observation"] == [1.0]
+    assert seen["age"] == pytest.approx(0.01)
+    for answer in answers[2:]:
+        seen, *_ = env.step(answer)
+    assert seen["actions"].tolist() == [answers[n].tolist() for n in (0, 2, 3)]
+    assert env.reset()[0]["actions"].tolist() == np.zeros((3, *space.shape)).tolist()
+
+
+def test_without_memory_an_observation_is_that_of_the_environment():
+    env = Networked(Counter())
+    assert env.observation_space == Counter().observation_space
+    env = Networked(Counter(), observe_age=True)
+    assert set(env.reset()[0]) == {"observation", "age"}

@@ -122,11 +122,10 @@ def simulate(env, setup, seed, answer, neutral):
     number, late = (seed + 1) * EPISODES, ticks_late(setup)
     observations, executed = [env.reset(seed=seed)[0]], neutral
     at_policy, taken, free = {0: 0}, -1, 0  # arrivals [ns] of observations not yet taken
-    flying, got, sent, asked, basis = [], [], {}, 0, None
+    flying, got, told_with, asked, basis = [], [], {0: []}, 0, None
     rewards, is_over, rows, loop = 0.0, False, [], []
     if setup.start == "answer":
         got, at_policy, taken = [Answer(0, 0, answer(observations[0], []))], {}, 0
-        sent = dict(enumerate(got[0].actions))
 
     def receive(until_ns, tick):
         for packet in sorted(each for each in flying if each[0] <= until_ns):
@@ -138,8 +137,12 @@ def simulate(env, setup, seed, answer, neutral):
         now_ns = round(tick * setup.dt * 1e9)
         receive(now_ns, tick)
         if tick and asks(setup, got, asked, tick):
-            asked = tick
-            if arrivals := up.send(number, tick, BYTES["observation_bytes"], now_ns):
+            asked, told_with[tick] = tick, []
+            if got:
+                newest = max(got)
+                told_with[tick] = newest.actions[tick - newest.basis :][:late]
+            size = BYTES["observation_bytes"] + sum(np.asarray(n).nbytes for n in told_with[tick])
+            if arrivals := up.send(number, tick, size, now_ns):
                 at_policy[tick] = min(arrivals)
         question = None
         while at_policy and max(min(at_policy.values()), free) <= now_ns + setup.wait_ns:
@@ -153,11 +156,7 @@ def simulate(env, setup, seed, answer, neutral):
             break
         if question:
             of, leaves_ns = question
-            known = []
-            while len(known) < late and of + len(known) in sent:
-                known.append(sent[of + len(known)])
-            actions = answer(observations[of], known)
-            sent.update({of + place: action for place, action in enumerate(actions)})
+            actions = answer(observations[of], told_with[of])
             if arrivals := down.send(number, of, BYTES["action_bytes"], leaves_ns):
                 flying.append((min(arrivals), of, actions))
         receive(now_ns + setup.wait_ns, tick)
@@ -207,7 +206,7 @@ def mean_delay(link, dt):
 
 
 def ticks_late(setup):
-    """Return how many actions the executor `prefix` tells."""
+    """Return how many actions the executor `prefix` sends with an observation."""
     if setup.executor != "prefix":
         return 0
     late = mean_delay(setup.link, setup.dt) + setup.compute - setup.wait_ns * 1e-9

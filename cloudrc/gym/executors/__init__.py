@@ -17,8 +17,17 @@ class Chunk(NamedTuple):
     actions: tuple[Any, ...]  # as the environment takes them
 
 
+class Committed(NamedTuple):
+    """What the robot executes while it waits for an answer; the policy gets it."""
+
+    actions: tuple[Any, ...] = ()  # for the ticks from that of the observation on
+    delay: int = 0  # how many of them it executes, as it expects, before the answer arrives
+
+
 class Executor:
-    """Chooses the robot's action; it runs on the robot, but for `sent` and `prefix`.
+    """Chooses the robot's action; it runs on the robot.
+
+    In each tick, the robot receives what has arrived, asks, receives again, and acts.
 
     Attributes:
         needs_chunk: Whether single actions make no sense.
@@ -37,19 +46,13 @@ class Executor:
             period_ns: Time of a tick [ns].
         """
 
-    def asks(self, tick: int) -> bool:
+    def asks(self, tick: int, observation: Any) -> bool:
         """Return whether the robot sends the observation of this tick; by default, of each."""
         return True
 
-    def sent(self, chunk: Chunk) -> None:
-        """Note, on the side of the policy, that it has sent an answer."""
-
-    def prefix(self, basis: int) -> list[Any]:
-        """Return, on the side of the policy, the actions before its answer to an observation.
-
-        They are for the ticks from `basis` on, that of the observation. By default, none are known.
-        """
-        return []
+    def committed(self, tick: int) -> Committed:
+        """Return what travels with the observation of this tick; by default, nothing."""
+        return Committed()
 
     def receive(self, chunk: Chunk, tick: int) -> None:
         """Take an answer that arrived before or at this tick. An older one may come later."""

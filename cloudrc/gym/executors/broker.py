@@ -5,6 +5,8 @@ This is what a client does that asks only when its chunk is used up.
 
 from __future__ import annotations
 
+from typing import Any
+
 from cloudrc.gym.executors.newest import Newest
 
 
@@ -22,7 +24,7 @@ class Broker(Newest):
         super().begin(ticks_late, period_ns)
         self._asked, self._waits = 0, self._patience * 1e9 / period_ns
 
-    def asks(self, tick: int) -> bool:
+    def asks(self, tick: int, observation: Any) -> bool:
         """Return whether the chunk is used up and no question is under way."""
         is_used_up = tick >= self._start + len(self._chunk.actions)
         is_open = self._asked > self._chunk.basis and tick - self._asked < self._waits

@@ -1,0 +1,64 @@
+"""A linear plant, and the closed forms that it reproduces."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from cloudrc.errors import BadInputError
+from examples import canon
+
+ROWS = {row.name: row for row in canon.rows()}
+
+
+@pytest.mark.parametrize("name", [name for name in ROWS if name != canon.HEAVY])
+@pytest.mark.parametrize("scale", [0.1, pytest.param(1.0, marks=pytest.mark.full)])
+def test_a_closed_form_is_measured(name, scale):
+    exact, mean, error = ROWS[name].at(scale)
+    assert error < 0.04 * exact
+    assert abs(mean - exact) < 3.0 * error
+
+
+def test_a_step_follows_the_matrices():
+    a, b, c = np.array([[1.0, 0.5], [0.0, 0.9]]), np.array([[0.0], [2.0]]), np.array([[1.0, 1.0]])
+    env = gymnasium.make("cloudrc/Linear-v0", A=a, B=b, C=c, Q=2.0, R=[[3.0]], W=0.0, x0=[1.0, 4.0])
+    first, info = env.reset(seed=1)
+    assert first == 5.0
+    seen, reward, terminated, truncated, after = env.step(np.array([0.5]))
+    assert after["x"] == pytest.approx(a @ info["x"] + b @ [0.5])
+    assert seen == pytest.approx(c @ after["x"])
+    assert reward == -(2.0 * (1.0 + 16.0) + 3.0 * 0.25)
+    assert (terminated, truncated) == (False, False)
+
+
+def test_noise_has_its_covariance_and_a_large_state_ends_the_episode():
+    covariance = np.array([[2.0, 1.0], [1.0, 1.0]])
+    env = gymnasium.make("cloudrc/Linear-v0", A=np.zeros((2, 2)), W=covariance, V=0.25, limit=4.0)
+    env.reset(seed=1)
+    steps = [env.step(np.zeros(2)) for _ in range(4000)]
+    states = np.array([info["x"] for *_, info in steps])
+    outputs = np.array([seen for seen, *_ in steps])
+    assert np.cov(states.T) == pytest.approx(covariance, abs=0.1)
+    assert np.cov((outputs - states).T) == pytest.approx(0.25 * np.eye(2), abs=0.02)
+    assert [over for _, _, over, *_ in steps] == (abs(states).max(axis=1) > 4.0).tolist()
+
+
+@pytest.mark.filterwarnings("ignore:.*Box:UserWarning")  # it advises finite, symmetric bounds
+def test_gymnasium_accepts_it():
+    check_env(gymnasium.make("cloudrc/Linear-v0", A=np.eye(2)).unwrapped)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ({"A": [[1, 2]]}, "A has the shape"),
+        ({"A": "x"}, "its A is 'x', not"),
+        ({"A": np.eye(2), "B": [[1]]}, "B has the shape"),
+        ({"A": np.eye(2), "W": [[1, 2], [2, 1]]}, "W is no covariance"),
+        ({"x0": [1, 2]}, "x0 has the shape"),
+        ({"dt": 0}, "its dt is 0, not"),
+    ],
+)
+def test_wrong_matrices_are_named(wrong, text):
+    with pytest.raises(BadInputError, match=text):
+        gymnasium.make("cloudrc/Linear-v0", **wrong)
