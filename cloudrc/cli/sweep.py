@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from argparse import ArgumentTypeError
+
 from cloudrc.cli.output import output_argument
 from cloudrc.cli.parser import (
     COUNT_MAX,
@@ -76,11 +79,11 @@ def arguments(parser: Parser) -> None:
 
 
 def shard(text: str) -> tuple[int, int]:
-    """Parse "I/N", shard I of N shards, counted from 1; raise a ValueError."""
-    index, count = map(int, text.split("/"))
-    if not 1 <= index <= count:
-        raise ValueError(text)
-    return index, count
+    """Parse "I/N", shard I of N shards, counted from 1."""
+    found = re.fullmatch(r"(\d+)/(\d+)", text, re.ASCII)
+    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+        raise ArgumentTypeError(f"{text!r} is not I/N with I from 1 to N")
+    return int(found[1]), int(found[2])
 
 
 def execute(options: Options) -> int:
