@@ -14,11 +14,25 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
-from cloudrc.gym.values import copied
+from cloudrc.gym.options import ANSWER
+from cloudrc.gym.values import copied, neutral
 from cloudrc.outside.values import Quantity, to_boolean
 
 ACTIONS = Quantity(ge=0, le=1000, whole=True)
 """Number of actions."""
+
+
+def remember(
+    both: tuple[spaces.Space[Any], spaces.Space[Any]], age: bool, count: int, start: Any
+) -> Remembering | None:
+    """Make the memory of `count` actions, and of the age if asked; None if nothing is asked.
+
+    `both` are the spaces of observations and actions, `start` is the option of this name.
+    """
+    if not age and not count:
+        return None
+    is_given = start is not None and not (isinstance(start, str) and start == ANSWER)
+    return Remembering(*both, age, count, start if is_given else neutral(both[1]))
 
 
 class Remembering:

@@ -8,9 +8,8 @@ from typing import Any, Unpack
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
-from cloudrc.gym.memory import Remembering
+from cloudrc.gym.memory import remember
 from cloudrc.gym.options import (
-    ANSWER,
     Options,
     Profile,
     answer_space,
@@ -19,7 +18,7 @@ from cloudrc.gym.options import (
     read_options,
 )
 from cloudrc.gym.step import find_step
-from cloudrc.gym.values import checker, copied, neutral
+from cloudrc.gym.values import checker, copied
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import to_arrays
 
@@ -96,12 +95,8 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.action_space, self._split = answer_space(env.action_space, chunk)
         self._check = checker(self.action_space, describe_answer(chunk))
         self.world_info: dict[str, Any] = {}
-        self._memory: Remembering | None = None
-        if observe_age or observe_actions:
-            start = options.get("start")
-            is_given = start is not None and not (isinstance(start, str) and start == ANSWER)
-            idle = start if is_given else neutral(env.action_space)
-            self._memory = Remembering(*both, observe_age, observe_actions, idle)
+        self._memory = remember(both, observe_age, observe_actions, options["start"])
+        if self._memory:
             self.observation_space = self._memory.space
 
     @property
