@@ -78,24 +78,29 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             dt: Time of a step [s]; None: that of the environment.
             stream: Name of the robot; robots with one seed and two names share no random numbers.
             observe_age: Whether the policy also observes the age of its observation.
-            observe_actions: How many of its own last actions the policy also observes; of a chunk,
-                the first. With either, an observation is a mapping, see `Remembering`.
+            observe_actions: How many of its own last actions the policy also observes; of chunks,
+                the first. With either, observations are mappings, as those of `Remembering`.
 
         Raises:
             cloudrc.errors.CloudrcError: If a value cannot be used; the text says what to change.
         """
         options = read_options("Networked", options)
-        given: dict[str, Any] = {"dt": dt, "stream": stream, **options}
-        given |= {"observe_age": observe_age, "observe_actions": observe_actions}
+        memory = {"observe_age": observe_age, "observe_actions": observe_actions}
+        given: dict[str, Any] = {"dt": dt, "stream": stream, **memory, **options}
         RecordConstructorArgs.__init__(self, link=link, seed=seed, **given)
         gymnasium.Wrapper.__init__(self, env)
         self.dt, _ = find_step(env, dt)
-        both, chunk = (env.observation_space, env.action_space), options["chunk"]
+        both = env.observation_space, env.action_space
         (self._loop,) = connect(both, self.dt, link, seed, (stream,), options)
-        self.action_space, self._split = answer_space(env.action_space, chunk)
-        self._check = checker(self.action_space, describe_answer(chunk))
+        self._set_spaces(options, observe_age, observe_actions)
         self.world_info: dict[str, Any] = {}
-        self._memory = remember(both, observe_age, observe_actions, options["start"])
+
+    def _set_spaces(self, options: Options, age: bool, count: int) -> None:
+        """Set the spaces of answers, and of observations with memory if it is asked for."""
+        both, chunk = (self.env.observation_space, self.env.action_space), options["chunk"]
+        self.action_space, self._split = answer_space(both[1], chunk)
+        self._check = checker(self.action_space, describe_answer(chunk))
+        self._memory = remember(both, age, count, options["start"])
         if self._memory:
             self.observation_space = self._memory.space
 
