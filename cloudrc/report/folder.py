@@ -9,13 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from pydantic import TypeAdapter
 
-from cloudrc.config.load import read_attached, read_experiment
+from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import BadInputError
-from cloudrc.files import read_json
+from cloudrc.files import read, read_json
+from cloudrc.outside.document import parse_yaml
 from cloudrc.outside.paths import check_there
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
@@ -26,7 +28,7 @@ from cloudrc.report.views import views
 
 REPORT_BYTES_MAX = 16 << 20
 """Largest size of a report.json that cloudrc reads [bytes]; large enough for many notes."""
-JUDGEMENT = {"criteria", "description", "name", "report"}
+JUDGEMENT = ("criteria", "description", "name", "report")
 """Keys of an experiment that affect the report, but not the flight."""
 
 
@@ -42,7 +44,7 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     before = _read_merged(folder)
     recording = before or merge(folder / "world.mcap", folder / "cloud.mcap")
     whole = read_json(folder / "report.json", REPORT_BYTES_MAX).get("complete") is True
-    for lack in _lacking(recording, experiment, whole=whole):
+    for lack in _lacking(recording, config, whole=whole):
         raise BadInputError(f"{merged}: {lack}; no report is written")
     run = _read_facts(recording)
     if before is None:
@@ -70,10 +72,10 @@ def _read_merged(folder: Path) -> Recording | None:
     return None if recording.unread and all(ends) else recording
 
 
-def _lacking(recording: Recording, experiment: ResolvedExperiment, *, whole: bool) -> Iterator[str]:
+def _lacking(recording: Recording, config: Path, *, whole: bool) -> Iterator[str]:
     """Yield the reasons why a recording is not sufficient for a report, the best explanation first.
 
-    `experiment` is that of the run's config.yaml. `whole` tells whether the run already has a
+    `config` is the path of the run's config.yaml. `whole` tells whether the run already has a
     report, made from a complete recording.
     """
     if not sum(len(recording[topic]) for topic in TOPICS):  # all topics: each must be readable
@@ -84,11 +86,17 @@ def _lacking(recording: Recording, experiment: ResolvedExperiment, *, whole: boo
             " is left, move report.json away"
         )
     if "config.yaml" in recording.attachments:
-        flown = read_attached(recording.attachments, recording.source)
-        keys = experiment.model_fields_set | flown.model_fields_set
-        others = {key for key in keys if getattr(flown, key) != getattr(experiment, key)}
-        if names := sorted(others - JUDGEMENT):
+        there = _flown(recording.attachments["config.yaml"], "config.yaml")
+        here = _flown(read(config), str(config))
+        if names := sorted(key for key in there | here if there.get(key) != here.get(key)):
             yield f"is the recording of an experiment with other values for: {', '.join(names)}"
+
+
+def _flown(data: bytes, name: str) -> dict[str, Any]:
+    """Parse a configuration; return only the keys that affect the flight."""
+    document, _ = parse_yaml(data.decode("utf-8", "replace"), name)
+    values = document if isinstance(document, dict) else {}
+    return {key: value for key, value in values.items() if key not in JUDGEMENT}
 
 
 def _read_facts(recording: Recording) -> Run:
