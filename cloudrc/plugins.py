@@ -28,7 +28,8 @@ from typing import Any
 from cloudrc.errors import CloudrcError
 from cloudrc.outside.code import calling, load_file
 from cloudrc.outside.patience import telling_if_slow
-from cloudrc.outside.refusal import check_names
+from cloudrc.outside.refusal import check_names, naming
+from cloudrc.outside.values import InvalidValueError
 
 PACKAGES = {
     "estimators": "cloudrc.cloud.estimators",
@@ -154,8 +155,8 @@ def find(kind: str, name: str, *, look: bool = True) -> Found:
     if not own and not is_path(name):
         check_names(one(kind), [name], names(kind))
     if is_path(name) and not Path(name).is_file():
-        with calling(what):
-            raise ValueError("there is no such file")
+        with naming(what):
+            raise InvalidValueError("there is no such file")
     with calling(f"{what} cannot be imported"):
         if own:
             return Found(importlib.import_module(own))
