@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import logging
 import os
 import secrets
 import selectors
@@ -33,7 +34,6 @@ from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import (
     ControllerLostError,
     InvalidRunError,
-    MissingPrerequisiteError,
     TimedOutError,
 )
 from cloudrc.files import make_own_folder, who_may_write
@@ -73,11 +73,12 @@ link between two programs (`cloudrc link exec`) is no flight, but commands find 
 """
 
 
-def flights_folder() -> Path:
+def flights_folder() -> Path | None:
     """Return the folder for flight files, which tell other commands about flights under way.
 
     It is the first of these in which only this user can write: one in XDG_RUNTIME_DIR, one in the
-    home folder, one below /tmp. Otherwise other users could name any process and address.
+    home folder, one below /tmp. Otherwise other users could name any process and address. None if
+    there is no such folder, as in a pod.
 
     Source: XDG Base Directory Specification.
     """
@@ -91,7 +92,7 @@ def flights_folder() -> Path:
                 return folder
         except OSError:  # it cannot be made
             continue
-    raise MissingPrerequisiteError(f"{folder}: others may write there; set XDG_RUNTIME_DIR")
+    return None
 
 
 class FlightFile(NamedTuple):
@@ -111,7 +112,13 @@ def announced(run: Path, api: str, kind: str = RUN) -> Iterator[None]:
     """
     about = FlightFile(api, kind, os.getpid())._asdict()
     flight = json.dumps({"schemaVersion": 1, "run": str(run.resolve()), **about})
-    path = flights_folder() / f"{os.getpid()}-{secrets.token_hex(4)}.json"
+    folder = flights_folder()
+    if folder is None:
+        text = "other commands do not find this flight: others may write into /tmp, and there is"
+        logging.getLogger("cloudrc").warning("%s no home folder; set XDG_RUNTIME_DIR", text)
+        yield
+        return
+    path = folder / f"{os.getpid()}-{secrets.token_hex(4)}.json"
     new = path.with_suffix(".new")  # renamed after it is locked
     try:
         new.touch(0o600)
@@ -138,7 +145,8 @@ def under_way(*, links: bool = False) -> dict[Path, str]:
 def flight_files() -> dict[Path, FlightFile]:
     """Return the flights of this user under way: folder of the run -> its flight file."""
     found = dict[Path, FlightFile]()
-    for path in flights_folder().glob("*.json"):
+    folder = flights_folder()
+    for path in folder.glob("*.json") if folder else ():
         with contextlib.suppress(FileNotFoundError), path.open() as file:  # it has just ended
             flight = json.load(file)
             try:
@@ -435,5 +443,6 @@ def socket_folder() -> str:
     Some machines clean /tmp during a flight; then no command could stop the robot. Therefore the
     folder is beside the flight files, if their path is short enough.
     """
-    folder = str(flights_folder().parent)
+    beside = flights_folder()
+    folder = str(beside.parent) if beside else "/tmp"
     return folder if len(os.fsencode(folder)) + len(SOCKET_NAME) <= PATH_MAX else "/tmp"
