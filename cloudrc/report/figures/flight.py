@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from cloudrc.geometry.clearance import CLEARANCE_SHOWN
 from cloudrc.geometry.tubes import wall
 from cloudrc.metrics.flight import Array
-from cloudrc.report.figures.style import BLACK, NARROW, Subject, new_figure, panel
+from cloudrc.report.figures.style import BLACK, GREY, LIGHT, NARROW, Subject, new_figure, panel
 
 CEILING = 2 * CLEARANCE_SHOWN
 """Upper end of the clearance axis [m]."""
@@ -96,7 +96,7 @@ def _draw_obstacles(axes: Axes, subject: Subject, sides: tuple[int, int]) -> Non
     bodies = [each for each in subject.shapes.scene if each.body not in names]
     for surface in [*(wall(tube, NO_COLOUR) for tube in tubes), *bodies]:
         triangles: Any = surface.corners[surface.triangles][..., sides]
-        colour = "0.6" if surface.body == subject.touch else "0.87"
+        colour = GREY if surface.body == subject.touch else LIGHT
         shadow = PolyCollection(triangles, color=colour, rasterized=True, zorder=1.5)
         shadow.set(lw=0, antialiased=False)  # else the edges of the triangles show
         axes.add_collection(shadow, autolim=False)
