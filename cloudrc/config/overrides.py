@@ -276,11 +276,6 @@ def build_predictor(choice: PlugIn, robot: RobotFacts) -> Any:
     return build_plugin("predictors", choice, **more)
 
 
-def parameter_names(kind: str, name: str) -> list[str]:
-    """List the parameters of a plug-in that a user may set, in the order of its `build`."""
-    return list(parameter_model(kind, name).model_fields)
-
-
 def default_parameters(kind: str, name: str) -> dict[str, Any]:
     """Return parameter -> default of a plug-in, without the parameters that need a value."""
     fields = parameter_model(kind, name).model_fields

@@ -10,6 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from cloudrc.gym.memory import remember
 from cloudrc.gym.options import (
+    MEMORY,
     Options,
     Profile,
     answer_space,
@@ -84,7 +85,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         Raises:
             cloudrc.errors.CloudrcError: If a value cannot be used; the text says what to change.
         """
-        options = read_options("Networked", options)
+        options = read_options("Networked", options, MEMORY)
         memory = {"observe_age": observe_age, "observe_actions": observe_actions}
         given: dict[str, Any] = {"dt": dt, "stream": stream, **memory, **options}
         RecordConstructorArgs.__init__(self, link=link, seed=seed, **given)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias, TypedDict, cast
@@ -52,15 +52,18 @@ DEFAULTS: Options = {
     **{"compute": 0.0, "answer_within": None, "chunk": None, "executor": "newest"},
     **{"hold": "repeat", "start": None, "observation_bytes": None, "action_bytes": None},
 }
-VECTOR = ("env", "link", "seed", "dt", "stream", *DEFAULTS)
-"""Names of the arguments of `NetworkedVector`."""
-ARGUMENTS = (*VECTOR, "observe_age", "observe_actions")
-"""Names of the arguments of `Networked`."""
+ARGUMENTS = ("env", "link", "seed", "dt", "stream", *DEFAULTS)
+"""Names of the arguments of `Networked` and `NetworkedVector`."""
+MEMORY = ("observe_age", "observe_actions")
+"""Names of those that only `Networked` has."""
 
 
-def read_options(what: str, given: Options) -> Options:
-    """Read the options of the environment `what`; those that are not given have their defaults."""
-    check_names(f"argument of {what}", given, VECTOR)
+def read_options(what: str, given: Options, more: Sequence[str] = ()) -> Options:
+    """Read the options of the environment `what`; those that are not given have their defaults.
+
+    `more` are names of further arguments of it.
+    """
+    check_names(f"argument of {what}", given, (*ARGUMENTS, *more))
     read: dict[str, Any] = {**DEFAULTS, **given}
     check_names("hold", [read["hold"]], ("repeat", "start"))
     for name, (quantity, wanted) in COUNTS.items():

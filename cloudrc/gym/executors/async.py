@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.gym.executors import Chunk, Executor
+from cloudrc.gym.executors import Chunk
+from cloudrc.gym.executors._question import OneQuestion
 from cloudrc.outside.refusal import check_names
 from cloudrc.outside.values import Quantity
 
@@ -20,49 +21,52 @@ AGGREGATES = {"latest": 1.0, "weighted": 0.7, "average": 0.5, "conservative": 0.
 """Way to merge two actions of one number -> weight of the newer one [1]."""
 SHARE = Quantity(ge=0.0, le=1.0)
 """Share of a chunk."""
-PATIENCE = Quantity("s", gt=0.0, le=3600.0)
-"""Time without an answer after which the robot asks again."""
 
 
-class Asynchronous(Executor):
-    """Plays a queue of numbered actions; one question is open at a time."""
+class Asynchronous(OneQuestion):
+    """Plays a queue of numbered actions."""
 
     def __init__(self, share: float, aggregate: str, patience: float) -> None:
         """See `build`; `share` [1], `patience` [s]."""
+        super().__init__(patience)
         check_names("aggregate", [aggregate], AGGREGATES)
-        self._share, self._weight = SHARE.of(share, "share"), AGGREGATES[aggregate]
-        self._patience = PATIENCE.of(patience, "patience")
+        self._share: float = SHARE.of(share, "share")
+        self._weight = AGGREGATES[aggregate]
 
     def begin(self, ticks_late: int, period_ns: int) -> None:
-        """Forget the last episode; the observation of tick 0 is the first question."""
-        self._queue = dict[int, tuple[Any, int]]()  # number -> action, and tick of its observation
+        """Forget the last episode."""
+        super().begin(ticks_late, period_ns)
+        self._queue = dict[int, Any]()  # number -> action, all of the newest answer
         self._next = 0  # number of the next action
         self._numbers = {0: 0}  # tick of a question -> number of the first action of its answer
-        self._asked, self._answered = 0, -1
-        self._size = 1
-        self._waits = self._patience * 1e9 / period_ns
+        self._size, self._answered = 1, -1
+
+    def answered(self) -> int:
+        """Return the tick of the observation to which the newest answer belongs."""
+        return self._answered
+
+    def wants(self, tick: int) -> bool:
+        """Return whether few actions are left."""
+        return len(self._queue) <= self._share * self._size
 
     def asks(self, tick: int, observation: Any) -> bool:
-        """Return whether few actions are left, and no question is under way."""
-        is_open = self._asked > self._answered and tick - self._asked < self._waits
-        if is_open or len(self._queue) > self._share * self._size:
-            return False
-        self._asked, self._numbers[tick] = tick, self._next
-        return True
+        """Return whether the robot sends the observation; then note the number of its action."""
+        is_asked = super().asks(tick, observation)
+        if is_asked:
+            self._numbers[tick] = self._next
+        return is_asked
 
     def receive(self, chunk: Chunk, tick: int) -> None:
         """Merge an answer with the actions that are left, unless it is older than they are."""
         if chunk.basis <= self._answered:
             return
         first, self._size = self._numbers.pop(chunk.basis), len(chunk.actions)
-        merged = {}
+        had, self._queue = self._queue, {}
         for number, action in enumerate(chunk.actions, first):
-            if number in self._queue:
-                before, _ = self._queue[number]
-                action = self._merge(before, action)
             if number >= self._next:
-                merged[number] = action, chunk.basis
-        self._queue, self._answered = merged, chunk.basis
+                is_new = number not in had
+                self._queue[number] = action if is_new else self._merge(had[number], action)
+        self._answered = chunk.basis
 
     def _merge(self, before: Any, action: Any) -> Any:
         """Return an action between an older and a newer one."""
@@ -79,9 +83,9 @@ class Asynchronous(Executor):
         """Return the next action of the queue."""
         if self._next not in self._queue:
             return None
-        action, self.basis = self._queue.pop(self._next)
+        self.basis = self._answered
         self._next += 1
-        return action
+        return self._queue.pop(self._next - 1)
 
 
 def build(share: float = 0.5, aggregate: str = "weighted", patience: float = 1.0) -> Asynchronous:

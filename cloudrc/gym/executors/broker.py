@@ -5,33 +5,27 @@ This is what a client does that asks only when its chunk is used up.
 
 from __future__ import annotations
 
-from typing import Any
-
+from cloudrc.gym.executors._question import OneQuestion
 from cloudrc.gym.executors.newest import Newest
 
 
-class Broker(Newest):
+class Broker(OneQuestion, Newest):
     """One observation leaves per chunk. If no answer comes, the robot asks again."""
 
     needs_chunk = True
 
-    def __init__(self, patience: float) -> None:
-        """Wait for `patience` [s] before asking again."""
-        self._patience = patience
-
     def begin(self, ticks_late: int, period_ns: int) -> None:
-        """Forget the last episode; the observation of tick 0 is the first question."""
-        super().begin(ticks_late, period_ns)
-        self._asked, self._waits = 0, self._patience * 1e9 / period_ns
+        """Forget the last episode."""
+        OneQuestion.begin(self, ticks_late, period_ns)
+        Newest.begin(self, ticks_late, period_ns)
 
-    def asks(self, tick: int, observation: Any) -> bool:
-        """Return whether the chunk is used up and no question is under way."""
-        is_used_up = tick >= self._start + len(self._chunk.actions)
-        is_open = self._asked > self._chunk.basis and tick - self._asked < self._waits
-        if is_used_up and not is_open:
-            self._asked = tick
-            return True
-        return False
+    def answered(self) -> int:
+        """Return the tick of the observation to which the chunk is the answer."""
+        return self._chunk.basis
+
+    def wants(self, tick: int) -> bool:
+        """Return whether the chunk is used up."""
+        return tick >= self._start + len(self._chunk.actions)
 
 
 def build(patience: float = 1.0) -> Broker:

@@ -11,41 +11,39 @@ Source: K. Black, M. Y. Galliker, S. Levine, "Real-Time Execution of Action Chun
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
 
 from cloudrc.gym.executors import Chunk, Committed
+from cloudrc.gym.executors._question import OneQuestion
 from cloudrc.gym.executors.time_indexed import TimeIndexed
 from cloudrc.outside.values import Quantity
 
 STEPS = Quantity(ge=1, le=10_000, whole=True)
 """Number of steps."""
-PATIENCE = Quantity("s", gt=0.0, le=3600.0)
-"""Time without an answer after which the robot asks again."""
 
 
-class RealTimeChunking(TimeIndexed):
-    """Asks when `execute` actions of a chunk are executed; one question is open at a time."""
+class RealTimeChunking(OneQuestion, TimeIndexed):
+    """Asks when `execute` actions of a chunk are executed."""
 
     def __init__(self, execute: int | None, memory: int, patience: float) -> None:
         """See `build`; `patience` [s]."""
+        super().__init__(patience)
         self._execute = None if execute is None else STEPS.of(execute, "execute")
         self._memory = STEPS.of(memory, "memory")
-        self._patience = PATIENCE.of(patience, "patience")
 
     def begin(self, ticks_late: int, period_ns: int) -> None:
-        """Forget the last episode; the observation of tick 0 is the first question."""
-        super().begin(ticks_late, period_ns)
+        """Forget the last episode."""
+        OneQuestion.begin(self, ticks_late, period_ns)
+        TimeIndexed.begin(self, ticks_late, period_ns)
         self._delays = deque([ticks_late], maxlen=self._memory)
-        self._asked, self._waits = 0, self._patience * 1e9 / period_ns
 
-    def asks(self, tick: int, observation: Any) -> bool:
-        """Return whether enough is executed, and no question is under way."""
+    def answered(self) -> int:
+        """Return the tick of the observation to which the chunk is the answer."""
+        return self._chunk.basis
+
+    def wants(self, tick: int) -> bool:
+        """Return whether enough of the chunk is executed."""
         basis, actions = self._chunk
-        is_open = self._asked > basis and tick - self._asked < self._waits
-        if is_open or tick - basis < (self._execute or max(len(actions) // 2, 1)):
-            return False
-        self._asked = tick
-        return True
+        return tick - basis >= (self._execute or max(len(actions) // 2, 1))
 
     def committed(self, tick: int) -> Committed:
         """Return all that is left of the chunk, and the largest delay of late."""
@@ -56,7 +54,7 @@ class RealTimeChunking(TimeIndexed):
         """Take the answer, and note how long it took."""
         if chunk.basis:  # the first answer may be there from the start
             self._delays.append(tick - chunk.basis)
-        super().receive(chunk, tick)
+        TimeIndexed.receive(self, chunk, tick)
 
 
 def build(execute: int | None = None, memory: int = 10, patience: float = 1.0) -> RealTimeChunking:
