@@ -114,8 +114,8 @@ def announced(run: Path, api: str, kind: str = RUN) -> Iterator[None]:
     flight = json.dumps({"schemaVersion": 1, "run": str(run.resolve()), **about})
     folder = flights_folder()
     if folder is None:
-        text = "other commands do not find this flight: others may write into /tmp, and there is"
-        logging.getLogger("cloudrc").warning("%s no home folder; set XDG_RUNTIME_DIR", text)
+        text = "other commands do not find this flight: no folder is for this user alone"
+        logging.getLogger("cloudrc").warning("%s; set XDG_RUNTIME_DIR", text)
         yield
         return
     path = folder / f"{os.getpid()}-{secrets.token_hex(4)}.json"

@@ -4,8 +4,8 @@
     irtt client -i 10ms -l 204 -d 1m -o irtt.json HOST
 
 Every reader collects the packets of its log, and `packets_of` checks them. An InvalidValueError
-says why a log cannot be used. `Packets.notes` counts
-the packets that are left out or sorted. docs/traces.md describes the formats.
+says why a log cannot be used. `Packets.notes` counts the packets that are left out or sorted.
+docs/traces.md describes the formats.
 
 Source: ping(8) of iputils; irtt-client(1), JSON format 1.
 """
