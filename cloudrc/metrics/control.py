@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-from math import sqrt
+from functools import lru_cache, partial
+from math import inf, sqrt
 
 import numpy as np
 
 from cloudrc.messages import FRESH_ECHO_PERIODS, NEVER_NS, GuardState
+from cloudrc.metrics.age import Ages, describe, most_missed, sawtooth
 from cloudrc.metrics.definitions import (
     GAP_MAX_NS,
     age,
@@ -83,46 +84,47 @@ def _age_of_information(flight: Flight) -> float | None:
     return mean(age(flight.control["stamp_ns"], flight.control["basis_stamp_ns"]))
 
 
-STEP_NS = 2_000_000
-"""Time between two steps of the low-level controller [ns]."""
-
-
-def ages_at_actuator(flight: Flight) -> Array:
-    """Compute the age of information at the actuator in each step of the low-level controller [s].
-
-    It is the age of the odometry on which the command in use is based: world's clock alone gives
-    it. Steps without a command in use, as in HOLD, have none.
-    Source: S. Kaul, R. Yates, M. Gruteser, "Real-time status: how often should one update?",
-    IEEE INFOCOM 2012: the age of the newest information that a receiver uses.
-    """
+def _command_in_use(flight: Flight, at_ns: Array) -> Array:
+    """Return the row of the command that the robot follows at each instant [ns]; -1: none."""
     applied, guard = flight.during("/command_applied"), flight.during("/guard")
-    if flight.start_ns is None or flight.end_ns is None:
-        return np.zeros(0)
-    steps_ns = np.arange(flight.start_ns, flight.end_ns, STEP_NS)
-    newest = applied["stamp_ns"].searchsorted(steps_ns, "right") - 1
-    state = guard["state"][guard["stamp_ns"].searchsorted(steps_ns, "right") - 1]
-    in_use = (newest >= 0) & (state == GuardState.TRACK)
-    return np.asarray(age(steps_ns[in_use], applied["basis_stamp_ns"][newest[in_use]]))
+    newest = applied["stamp_ns"].searchsorted(at_ns, "right") - 1
+    state = guard["state"][guard["stamp_ns"].searchsorted(at_ns, "right") - 1]
+    return np.where(state == GuardState.TRACK, newest, -1)
 
 
-def peak_ages(flight: Flight) -> Array:
-    """Compute the age at the actuator just before each command that lowers it [s].
+@lru_cache(maxsize=1)  # five metrics and a figure ask for the same flight
+def ages_at_actuator(flight: Flight) -> Ages:
+    """Compute the age of information at the actuator: of the odometry behind the command in use.
 
-    Only commands that end the use of another one count, so none that ends a HOLD. A step of the
-    low-level controller is up to `STEP_NS` earlier, and its age lower by as much.
-    Source: M. Costa, M. Codreanu, A. Ephremides, "On the age of information in status update
-    systems with packet management", IEEE Transactions on Information Theory 60 (4), 2014.
+    World's clock alone gives it. While no command is in use, as in HOLD, there is no age.
     """
-    applied, guard = flight.during("/command_applied"), flight.during("/guard")
-    stamps_ns, bases_ns = applied["stamp_ns"][1:], applied["basis_stamp_ns"]
-    before = guard["stamp_ns"].searchsorted(stamps_ns) - 1
-    lowers = (np.diff(bases_ns) > 0) & (guard["state"][before] == GuardState.TRACK)
-    return np.asarray(age(stamps_ns[lowers], bases_ns[:-1][lowers]))
+    applied, changes = flight.during("/command_applied"), flight.during("/guard")["stamp_ns"]
+    stamps_ns = applied["stamp_ns"]
+    if not len(stamps_ns):
+        return Ages(*np.zeros((4, 0)))
+    edges_ns = np.unique(np.concatenate([stamps_ns, changes, [flight.end_ns]]))
+    edges_ns = edges_ns[edges_ns >= stamps_ns[0]]
+    ages = sawtooth(edges_ns, stamps_ns, applied["basis_stamp_ns"])
+    in_use = _command_in_use(flight, ages.begin_ns) >= 0
+    return Ages(*(column[in_use] for column in ages))
 
 
-def _age_violation(flight: Flight) -> float | None:
-    limit = flight.criteria.age_deadline_s
-    return None if limit is None else mean(differences(limit, ages_at_actuator(flight)) > 0.0)
+def _age(name: str, flight: Flight) -> float | None:
+    return describe(ages_at_actuator(flight), flight.criteria.age_deadline_s).get(name)
+
+
+def _most_missed(flight: Flight) -> float | None:
+    """Count missed command periods: those that begin without a command in use, or with a late one.
+
+    Only with a deadline, a command can be late.
+    """
+    if flight.span_ns is None:
+        return None
+    steps_ns = np.arange(*flight.span_ns, round(1e9 / flight.command_rate_hz))
+    used = _command_in_use(flight, steps_ns)
+    bases_ns = np.append(flight.during("/command_applied")["basis_stamp_ns"], NEVER_NS)[used]
+    limit = flight.criteria.age_deadline_s or inf
+    return float(most_missed((used < 0) | (differences(limit, age(steps_ns, bases_ns)) > 0.0)))
 
 
 def compare_with_truth(
@@ -242,15 +244,17 @@ add_metrics(
     ("age_of_information_mean", "s", "Mean age of cloud's newest odometry when it computes a "
      "command.", _age_of_information),
     ("age_at_actuator_mean", "s", "Mean age of information at the actuator: of the odometry behind "
-     "the command that the robot follows.", ages_at_actuator, "mean"),
-    ("age_at_actuator_p99", "s", "Age of information at the actuator: 99th percentile.",
-     ages_at_actuator, "p99"),
+     "the command that the robot follows.", partial(_age, "mean")),
+    ("age_at_actuator_p99", "s", "Age of information at the actuator: in 99 % of the time, it is "
+     "lower.", partial(_age, "p99")),
     ("age_at_actuator_max", "s", "Largest age of information at the actuator.",
-     ages_at_actuator, "max"),
+     partial(_age, "max")),
     ("peak_age_mean", "s", "Mean peak age: age of information at the actuator just before each "
-     "command that lowers it.", peak_ages, "mean"),
+     "command that lowers it.", partial(_age, "peak_mean")),
     ("age_violation", "1", "Share of the time with a command in use whose age of information is "
-     "above criteria.age_deadline_s.", _age_violation),
+     "above criteria.age_deadline_s.", partial(_age, "violation")),
+    ("misses_in_10", "1", "Of any 10 successive command periods, the most that began in HOLD or "
+     "with an age of information above criteria.age_deadline_s.", _most_missed),
     ("commands_applied", "1", "Number of commands that reached the low-level controller.",
      lambda flight: flight.count(len(flight.during("/command_applied")["epoch"]))),
     rtt_mean="round trip, mean",

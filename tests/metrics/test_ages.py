@@ -41,18 +41,29 @@ def test_a_peak_is_the_age_just_before_a_command_that_lowers_it():
     assert peak == pytest.approx((0.15 + 0.25 + 0.14) / 3)
 
 
-@pytest.mark.parametrize("limit_ms", [60, 198, 200])
-def test_the_violation_is_the_share_of_the_steps_with_a_command_in_use(limit_ms):
-    ages = []
-    for now in range(0, 1000, 2):  # [ms]
-        if not 500 <= now < 700:
-            basis = next(b for time, b in reversed(APPLIED) if round(1000 * time) <= now)
-            ages.append(now - round(1000 * basis))
-    share = sum(age > limit_ms for age in ages) / len(ages)
+# Begin and end of the use of each command, and stamp of its odometry [ms].
+USED = [(0, 100, -50), (100, 140, 60), (140, 300, 50), (300, 500, 250), (700, 800, 660)]
+USED += [(800, 1000, 780)]
+
+
+@pytest.mark.parametrize("limit_ms", [60, 111.5, 198])
+def test_ages_are_averages_over_the_time_with_a_command_in_use(limit_ms):
+    ages = [(begin - basis, end - basis) for begin, end, basis in USED]
+    time = sum(high - low for low, high in ages)
+    above = sum(max(0, high - max(low, limit_ms)) for low, high in ages)
+    mean = sum((high - low) * (high + low) / 2 for low, high in ages) / time
     found = flight(APPLIED, 1.0, CHANGES, limit_ms / 1000)
-    assert measured(found, "age_violation") == pytest.approx(share)
-    assert measured(found, "age_at_actuator_max") == pytest.approx(max(ages) / 1000)
-    assert measured(found, "age_at_actuator_mean") == pytest.approx(sum(ages) / len(ages) / 1000)
+    assert measured(found, "age_violation") == pytest.approx(above / time)
+    assert measured(found, "age_at_actuator_mean") == pytest.approx(mean / 1000)
+    assert measured(found, "age_at_actuator_max") == pytest.approx(0.25)
+    assert measured(found, "age_at_actuator_p99") == pytest.approx(0.25 - time / 2 / 100 / 1000)
+
+
+@pytest.mark.parametrize(("limit", "misses"), [(0.25, 4), (0.235, 5), (0.1, 10), (None, 3)])
+def test_the_worst_window_counts_periods_in_hold_and_those_with_a_late_command(limit, misses):
+    held = [*CHANGES[:1], (0.47, GuardState.HOLD), (0.492, GuardState.TRACK)]
+    found = flight(APPLIED[:4], 0.52, held, limit)
+    assert measured(found, "misses_in_10") == misses
 
 
 @pytest.mark.parametrize("loss", [0.3])
@@ -63,7 +74,7 @@ def test_a_constant_delay_with_losses_gives_the_closed_forms(loss):
         (n * period + delay, n * period) for n in range(count) if not n or rng.random() >= loss
     ]
     start = [(delay, GuardState.TRACK)]
-    found = flight(applied, count * period, start, delay + 2 * period - 1e-6)
+    found = flight(applied, count * period, start, delay + 2 * period)
     assert measured(found, "peak_age_mean") == pytest.approx(delay + period / (1 - loss), rel=1e-3)
     assert measured(found, "age_violation") == pytest.approx(loss**2, rel=0.05)
 
