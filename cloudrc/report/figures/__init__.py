@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cloudrc.record import wall_time
-from cloudrc.report.figures import curves, flight, marks
+from cloudrc.report.figures import curves, flight, marks, tails
 from cloudrc.report.figures.style import Look, Subject
 
 FIGURES: dict[str, tuple[Callable[[Subject], Figure], str, str]] = {
@@ -22,6 +22,7 @@ FIGURES: dict[str, tuple[Callable[[Subject], Figure], str, str]] = {
     "delay": (curves.draw_delay, curves.DELAY, curves.DELAY_ALT),
     "odom": (curves.draw_odom, curves.ODOM, curves.ODOM_ALT),
     "error": (curves.draw_error, curves.ERROR, curves.ERROR_ALT),
+    "age": (tails.draw_age, tails.AGE, tails.AGE_ALT),
 }
 """Name of a figure -> function that draws the figure, caption, text for readers who cannot see the
 figure. The figures of the paper are delay, odom and error."""

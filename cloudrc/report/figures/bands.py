@@ -11,14 +11,11 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from cloudrc.report.figures import PRINT_KINDS, own_settings, save, style
-from cloudrc.report.figures.style import Look, new_figure, panel
+from cloudrc.report.figures.style import COLOURS, DASHES, Look, new_figure, panel
 
 UNITS = {"ms": "ms", "s": "s", "m": "m", "mps": "m/s", "kbit": "kbit/s", "deg": "deg"}
 """Suffix of a configuration key -> unit."""
-_FIRST = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE)
-COLOURS = (*_FIRST, style.ORANGE, style.BLACK, style.SKY)
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
-DASHES = ("-", "--", "-.", ":")
 """Lines take them in turn. The counts of colours and markers have no common factor: only after 56
 lines does a pair of both come again."""
 

@@ -27,6 +27,8 @@ ORANGE, VERMILION, PURPLE = "#E69F00", "#D55E00", "#CC79A7"
 UPLINK, DOWNLINK = BLUE, ORANGE
 NOTHING = Shapes()
 REFERENCE, MEASURED, ESTIMATED = BLACK, ORANGE, BLUE
+COLOURS, DASHES = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, BLACK, SKY), ("-", "--", "-.", ":")
+"""Lines of equal kind take them in turn."""
 
 RC: dict[Any, Any] = {
     "font.family": "serif",  # the first one is shipped with matplotlib, the others for an SVG
