@@ -33,10 +33,13 @@ from cloudrc.link.draws import Floats, stream_key
 from cloudrc.link.library import LinkProfile, OneWay
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.queue import PacketQueue
+from cloudrc.metrics.age import most_missed
 from cloudrc.outside.values import Quantity
 
 EPISODES = 1 << 20
 """Number of episodes that belong to a seed of the environment."""
+AGES = 100
+"""Ages of actions that are counted apart [ticks]."""
 _COMPUTE = 129  # kind of the random numbers of the compute time
 
 
@@ -156,6 +159,7 @@ class RemoteLoop:
         self._is_held = False
         self._observation_ages = list[int]()  # [ticks], as the others
         self._action_ages, self._loop_ages = list[float](), list[int]()
+        self._fresh_ages = list[float]()  # of new actions since the first of _action_ages, else NaN
         self._executor.basis = -1
         self._executor.begin(self._ticks_late(), round(self._settings.dt * 1e9))
 
@@ -188,6 +192,8 @@ class RemoteLoop:
                 self._last, self._basis = self._settings.start, -1.0
         if self._basis > 0:
             self._action_ages.append(tick - self._basis)
+        if self._action_ages:
+            self._fresh_ages.append(nan if self._is_held else tick - self._basis)
         return self._last
 
     def _answer(self, actions: tuple[Any, ...]) -> None:
@@ -266,7 +272,8 @@ class RemoteLoop:
     def summary(self, deadline: float | None = None) -> dict[str, Any]:
         """Return what the loop was like in this episode: asked and measured.
 
-        `late_share` is the share of steps whose action is older than `deadline` [s].
+        `late_share` is the share of steps whose action is older than `deadline` [s]. `age_counts`
+        has the steps by the action's age in ticks, rounded up; the last possible, all older ones.
         """
         ticks, dt = self._tick, self._settings.dt
         if ticks < 0:
@@ -275,12 +282,16 @@ class RemoteLoop:
         late = nan
         if deadline is not None and len(actions):
             late = float(np.mean(actions > deadline + 1e-9))
+        is_new = np.array(self._fresh_ages) * dt <= (inf if deadline is None else deadline) + 1e-9
+        rounded = np.ceil(np.array(self._action_ages) - 1e-9).clip(max=AGES - 1)
         return {
             "ticks": ticks,
             "loop_age": float(np.mean(self._loop_ages)) * dt if self._loop_ages else nan,
             **_describe("observation_age", np.array(self._observation_ages) * dt),
             **_describe("action_age", actions),
+            "age_counts": np.bincount(rounded.astype(int)).tolist(),
             "late_share": late,
+            "misses_in_10": most_missed(~is_new) if len(is_new) else nan,
             "held_share": self._held / ticks if ticks else nan,
             "uplink": self._up.summary(dt),
             "downlink": self._down.summary(dt),

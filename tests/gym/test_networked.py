@@ -122,6 +122,19 @@ def test_the_end_of_an_episode_is_told_at_once_with_asked_against_measured():
     assert summary["action_age_mean"] > 0.09
 
 
+def test_the_worst_window_counts_steps_that_are_late_or_without_a_new_action():
+    """Steps 14 and 15 have no answer; others act on an observation that is one or two steps old."""
+    silent = {"delay_ms": 10, "blackouts": [{"start_s": 0.13, "duration_s": 0.02}]}
+    late = {"changes": [{"at_s": 0.3, "delay_ms": 20}]}
+    env = Networked(Counter(limit=40), {"downlink": {**silent, **late}}, 1)
+    env.reset()
+    for _ in range(40):
+        _, _, _, _, info = env.step(np.zeros(1, np.float32))
+    counts = info["cloudrc"]["episode"]["age_counts"]
+    assert (len(counts), sum(counts), counts[0]) == (4, 38, 0)
+    assert [env.summary(limit)["misses_in_10"] for limit in (None, 0.015, 0.005)] == [2, 9, 10]
+
+
 def test_a_bottleneck_sees_the_sizes_of_observations_and_answers():
     slow = both_ways(0, 0, rate_kbit=1000)
     env = Networked(Counter(), slow, observation_bytes=10_000 - 28, action_bytes=2_500 - 28)

@@ -181,6 +181,8 @@ def told(setup, rewards, rows, loop):
     for name, found in (("observation_age", ages), ("action_age", acted), ("loop_age", crossed)):
         key = name if name == "loop_age" else f"{name}_mean"
         means[key] = setup.dt * float(np.mean(found)) if found else None
+    rounded = [ceil(age - 1e-9) for age in acted]
+    means["age_counts"] = [rounded.count(age) for age in range(max(rounded, default=-1) + 1)]
     return Episode(
         rewards,
         [setup.dt * age for age, _ in after],
