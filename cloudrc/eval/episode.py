@@ -93,7 +93,8 @@ def play(episode: Episode, setup: EvalSetup, key: str = "") -> dict[str, Any]:
     if episode.is_baseline:
         setup, played = replace(setup, **BARE), Episode(episode.rtt_ms, "newest", episode.seed)
     with make_env(setup, episode.seed) as env, asking(setup) as ask:
-        ended, success, digest, numbers = _play(played, setup, env, ask)
+        ended, success, digest, numbers, loop = _play(played, setup, env, ask)
+    numbers |= _numbers_of(loop)
     judged = {None: "done", True: "success", False: "failure"}
     return {
         "key": key,
@@ -104,6 +105,7 @@ def play(episode: Episode, setup: EvalSetup, key: str = "") -> dict[str, Any]:
         "text": "",
         "ended": ended,
         "numbers": {k: v for k, v in numbers.items() if v is not None and isfinite(v)},
+        "age_counts": loop["age_counts"],
         "records_sha256": digest if setup.is_repeatable else "",
         "code": source.code_hash(),
     }
@@ -115,7 +117,7 @@ def _numbers_of(loop: Mapping[str, Any]) -> dict[str, float]:
     for name in ("observation_age", "action_age"):
         parts = {name: "mean", f"{name}_p99": "p99", f"{name}_of": "of"}
         found |= {key: loop[f"{name}_{part}"] for key, part in parts.items()}
-    found["late_share"] = loop["late_share"]
+    found |= {name: loop[name] for name in ("late_share", "misses_in_10")}
     for way in ("uplink", "downlink"):
         found |= {f"{name}_{way}": loop[way][name] for name in ("delay_asked", "delay_measured")}
     return {**found, **{f"loss_{w}": loop[w]["loss_measured"] for w in ("uplink", "downlink")}}
@@ -231,8 +233,8 @@ def as_actions(actions: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
 
 def _play(
     episode: Episode, setup: EvalSetup, env: gymnasium.Env[Any, Any], ask: Ask
-) -> tuple[str, bool | None, str, dict[str, float | None]]:
-    """Play an episode; return how it ended, whether it succeeded, its hash and its numbers.
+) -> tuple[str, bool | None, str, dict[str, float | None], dict[str, Any]]:
+    """Play an episode; return how it ended, its success, hash and numbers, and what the loop was.
 
     It ends "terminated" or "truncated" by the environment, or by its "limit". The success is None
     if the environment does not tell.
@@ -276,9 +278,8 @@ def _play(
         "success": None if success is None else int(success),
         "stale_share": stale / steps,
         "seam_jump": fmean(jumps) if jumps else None,
-        **_numbers_of(world.summary(setup.deadline)),
     }
-    return ended, success, witness.digest.hexdigest(), numbers
+    return ended, success, witness.digest.hexdigest(), numbers, world.summary(setup.deadline)
 
 
 def _connect(

@@ -6,7 +6,7 @@ All rows have equal seeds. Those without a network come first, the others by ris
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import combinations, pairwise
+from itertools import combinations, pairwise, zip_longest
 from statistics import fmean, median
 from typing import Any, TypeAlias
 
@@ -51,7 +51,8 @@ def summarize(rtt_ms: float | None, executor: str, rows: Sequence[Row]) -> dict[
     """Summarise a condition, of the mean round trip `rtt_ms` [ms], in plain values.
 
     Medians and rates have their 95 % interval: `_low` and `_high`. Means of steps are pooled, and
-    `_of` is the number of steps. Ages and delays are in ms. What is not known is left out.
+    `_of` is the number of steps. Of the missed steps, the worst window counts. Ages and delays are
+    in ms, `age_counts` has steps. What is not known is left out.
     """
     numbers: list[Mapping[str, float]] = [row["numbers"] for row in rows]
     ends, count = [row["ended"] for row in rows], len(rows)
@@ -62,6 +63,10 @@ def summarize(rtt_ms: float | None, executor: str, rows: Sequence[Row]) -> dict[
     if all("success" in each for each in numbers):
         found["successes"] = done = int(sum(each["success"] for each in numbers))
         found |= _estimate("success", done / count, exact_interval(done, count))
+    if misses := [each["misses_in_10"] for each in numbers if "misses_in_10" in each]:
+        found["misses_in_10"] = int(max(misses))
+    counts = (row.get("age_counts", ()) for row in rows)
+    found["age_counts"] = list(map(sum, zip_longest(*counts, fillvalue=0)))
     found |= {end: ends.count(end) for end in ("terminated", "truncated", "limit")}
     return {**found, "terminated_share": found["terminated"] / count, **dict(_means(numbers))}
 
@@ -103,10 +108,10 @@ def survivals(groups: Groups) -> list[dict[str, Any]]:
             kept = len(base & _seeds(rows))
             each |= {"tried_ms": rtt, "kept": kept, "p": tail(len(base) - kept, len(base))}
             if each["p"] >= LEVEL:
-                text += f"; at {_place(rtt)} it keeps {kept} of {len(base)} successes"
+                text += f"; at {place(rtt)} it keeps {kept} of {len(base)} successes"
                 break
             each["up_to_ms"] = rtt
-            text = f"{executor} survives up to {_place(rtt)}"
+            text = f"{executor} survives up to {place(rtt)}"
         found.append({**each, "text": text})
     return found[1:]
 
@@ -115,7 +120,8 @@ def _seeds(rows: Sequence[Row]) -> set[int]:
     return {row["seed"] for row in rows if row["verdict"] == "success"}
 
 
-def _place(rtt_ms: float | None) -> str:
+def place(rtt_ms: float | None) -> str:
+    """Name the round trip `rtt_ms` [ms] in words; None is that of the profile."""
     return "the profile's round trip" if rtt_ms is None else f"{rtt_ms:g} ms"
 
 
@@ -190,7 +196,7 @@ def doubts(outcomes: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     for before, each in pairwise(outcomes):
         others = (outcomes[0], before if before["executor"] == each["executor"] else outcomes[0])
         if any(_flatters(each, other) for other in others):
-            found.append(f"{each['executor']} at {_place(each['rtt_ms'])}")
+            found.append(f"{each['executor']} at {place(each['rtt_ms'])}")
     if found:
         yield (
             "the return improves while the episodes get shorter, as if a crash ended the costs: "

@@ -9,16 +9,22 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+import numpy as np
+
+from cloudrc.eval.evidence import place
 from cloudrc.eval.results import COLUMNS, LEGEND, SEEDLESS, TESTS
 from cloudrc.eval.setup import BASELINE, EvalSetup
 from cloudrc.files import write_atomically
+from cloudrc.gym.loop import AGES
 from cloudrc.outside.document import write_yaml
+from cloudrc.report.figures import PRINT_KINDS, own_settings, save
 from cloudrc.report.figures.bands import Panel, Point, draw
-from cloudrc.report.figures.style import Look
+from cloudrc.report.figures.style import Look, new_figure, panel
+from cloudrc.report.figures.tails import draw_tails
 from cloudrc.text import cells
 
-FIGURE, PAGE = "figure", "report.html"
-WIDTH = 5.0  # of the figure [in]
+FIGURE, TAILS, PAGE = "figure", "ages", "report.html"
+WIDTH = 5.0  # of a figure [in]
 CAPTION = (
     "Each point: all episodes of a condition, at the measured time from an observation to its "
     "action. Dashed: without a network. Success: share, with the 95 % interval of Clopper and "
@@ -26,6 +32,11 @@ CAPTION = (
     "the steps, up to the mean of the episodes' p99. All conditions have the same seeds, so that "
     "they meet the same environments and networks. A condition without any answer has no age: "
     "it is in the table alone."
+)
+TAILS_CAPTION = (
+    "Age of the observation behind an action, a line for each round trip: the share of the steps "
+    "in which it is higher, from the first observation that has crossed the link on. Dashed and "
+    "grey: --deadline."
 )
 AGE = "age of the observation behind an action"
 PANELS = (
@@ -56,6 +67,8 @@ pre { white-space: pre-wrap }
 $warning
 $figure
 <p>$caption</p>
+$tails
+<p>$tails_caption</p>
 <table>$table</table>
 <p>$legend</p>
 $notes
@@ -69,15 +82,17 @@ $notes
 
 
 def write_page(folder: Path, setup: EvalSetup, document: Mapping[str, Any]) -> Path:
-    """Write the figure and the page into `folder`; return the path of the page.
+    """Write the figures and the page into `folder`; return the path of the page.
 
     `document` is the content of the file of the evaluation.
     """
-    pictures = draw_outcomes(document["outcomes"])
-    for kind, data in pictures.items():
-        write_atomically(folder / f"{FIGURE}.{kind}", data)
-    svg = pictures["svg"].decode()
-    count = document["outcomes"][0]["episodes"]
+    outcomes = document["outcomes"]
+    figure = draw_outcomes(outcomes)
+    tails = draw_ages(outcomes, document["step"]["seconds"], setup.deadline)
+    for name, pictures in ((FIGURE, figure), (TAILS, tails)):
+        for kind, data in pictures.items():
+            write_atomically(folder / f"{name}.{kind}", data)
+    count = outcomes[0]["episodes"]
     made = {key: document[key] for key in ("date", "versions", "compute", "link", "profile")}
     warnings = [MEASURED_TIME] * setup.is_measured + [SEEDLESS] * (not setup.follows_seed)
     page = TEMPLATE.substitute(
@@ -86,9 +101,11 @@ def write_page(folder: Path, setup: EvalSetup, document: Mapping[str, Any]) -> P
             f"{count} episodes per condition; step {setup.step}; success: {document['success']}."
         ),
         warning=_paragraphs(warnings, ' class="warning"'),
-        figure=svg[svg.index("<svg") :],
+        figure=_inline(figure),
         caption=CAPTION,
-        table=_table(cells(document["outcomes"], COLUMNS)),
+        tails=_inline(tails),
+        tails_caption=TAILS_CAPTION,
+        table=_table(cells(outcomes, COLUMNS)),
         legend=LEGEND,
         notes=_paragraphs(document["notes"]),
         tests=_table(cells(document["tests"], TESTS)),
@@ -97,6 +114,11 @@ def write_page(folder: Path, setup: EvalSetup, document: Mapping[str, Any]) -> P
     )
     write_atomically(folder / PAGE, page.encode())
     return folder / PAGE
+
+
+def _inline(pictures: Mapping[str, bytes]) -> str:
+    svg = pictures["svg"].decode()
+    return svg[svg.index("<svg") :]
 
 
 def _paragraphs(texts: Sequence[str], kind: str = "") -> str:
@@ -126,3 +148,31 @@ def _panel(outcomes: Sequence[Mapping[str, Any]], title: str, unit: str, *keys: 
         point = Point(each.get("loop_age_ms", nan), middle, low, high, False)
         lines.setdefault(each["executor"], []).append(point)
     return Panel(title, unit, lines, lines.pop(BASELINE)[0].middle)
+
+
+def draw_ages(
+    outcomes: Sequence[Mapping[str, Any]], dt: float, deadline: float | None
+) -> dict[str, bytes]:
+    """Draw the distribution of the actions' ages: a panel per executor, a line per round trip.
+
+    `dt` is the time of a step [s]. A `deadline` [s] is a dashed line.
+    Return the figure as PDF, PNG and SVG by suffix.
+    """
+    panels = dict[str, dict[str, Any]]()
+    for each in outcomes[1:]:
+        counts = np.array(each["age_counts"])
+        share = np.append(1.0, 1.0 - counts.cumsum() / counts.sum())
+        ages = np.append(0.0, np.arange(len(counts)) * dt)
+        tail = ages[:AGES], share[:AGES]  # the last count has older ones, too
+        panels.setdefault(each["executor"], {})[place(each["rtt_ms"])] = tail
+    with own_settings(Look(width=WIDTH)):
+        figure = new_figure(1.0 + 1.5 * len(panels), WIDTH)
+        column = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+        for n, (axes, (name, lines)) in enumerate(zip(column, panels.items(), strict=True)):
+            draw_tails(axes, lines, deadline, drawstyle="steps-post")
+            panel(axes, chr(ord("a") + n), name)
+        column[-1].set_xlabel("age, x (ms)")
+        handles = column[0].get_legend_handles_labels()
+        shape = {"ncols": 4, "alignment": "left"}
+        figure.legend(*handles, loc="outside upper left", title="round trip", **shape)
+        return {kind: save(figure, kind) for kind in PRINT_KINDS}

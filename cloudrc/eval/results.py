@@ -36,7 +36,8 @@ PAIRED = (
 """What two evaluations must share for a comparison of their policies."""
 LEGEND = (
     "loop: time from an observation to its action; ended: terminated/truncated/by --max-steps; "
-    "held: steps without a\nnew action; age: of the observation behind an action, in so many steps"
+    "held: steps without a\nnew action; age: of the observation behind an action, in so many "
+    "steps; worst: of any 10 steps,\nthe most that were held or late"
 )
 COLUMNS = {
     "round trip": "{rtt_ms:g} ms",
@@ -53,6 +54,7 @@ COLUMNS = {
     "p99": "{action_age_p99_ms:.0f} ms",
     "late": "{late_share:.1%}",
     "of steps": "{action_age_of:.0f}",
+    "worst": "{misses_in_10}/10",
 }
 """Head -> cell of the table of outcomes."""
 TESTS = {

@@ -25,7 +25,7 @@ class Ages(NamedTuple):
     begin_ns: Array  # when a piece begins [ns]
     low: Array  # age at its beginning [s]
     high: Array  # age at its end [s]
-    is_peak: Array  # whether a fresher update ends it
+    is_peak: Array  # whether a fresher update ends it [1]
 
 
 def sawtooth(edges_ns: Array, arrived_ns: Array, basis_ns: Array) -> Ages:
@@ -67,7 +67,7 @@ def describe(ages: Ages, limit: float | None = None) -> dict[str, float]:
     With a `limit` [s], also return the share of the time in which the age is above: violation.
     What is unknown is left out.
     """
-    if not (ages.high > ages.low).any():
+    if not len(ages.low):
         return {}
     found, above = tail(ages)
     numbers = {

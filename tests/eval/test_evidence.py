@@ -87,6 +87,13 @@ def test_means_of_steps_are_those_of_all_steps_and_say_of_how_many():
     assert (found["steps"], found["successes"], found["success"]) == (260, 1, 0.5)
 
 
+def test_ages_are_counted_over_all_episodes_and_the_worst_window_is_that_of_any():
+    some_rows = rows("newest", 50.0, [True, True], misses_in_10=(2.0, 3.0))
+    some_rows[0]["age_counts"], some_rows[1]["age_counts"] = [0, 5, 1], [0, 6]
+    found = summarize(50.0, "newest", some_rows)
+    assert (found["age_counts"], found["misses_in_10"]) == ([0, 11, 1], 3)
+
+
 def test_executors_are_tested_in_pairs_of_equal_seeds():
     world = flight(20)
     world += rows("broker", 0.0, some(13))

@@ -64,6 +64,7 @@ def test_the_page_has_figure_tests_notes_and_how_it_was_made(law, tmp_path, caps
     for text in (
         "no network",
         "<svg",
+        "P(age &gt;",
         "0/2/0",
         document["cite"][:20],
         document["command"],

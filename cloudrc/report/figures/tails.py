@@ -29,7 +29,8 @@ def draw_age(subject: Subject) -> Figure:
     figure, flight = new_figure(2.6, subject.look.width), subject.flight
     axes, ages = figure.subplots(), ages_at_actuator(flight)
     draw_tails(axes, {"": tail(ages)} if len(ages.low) else {}, flight.criteria.age_deadline_s)
-    axes.set_xlabel("age at the actuator, $x$ (ms)")
+    legend_above(axes)
+    axes.set_xlabel("age at the actuator, x (ms)")
     return figure
 
 
@@ -44,10 +45,11 @@ def draw_tails(
     least = 1.0
     for (name, (ages, share)), colour, dashes in styles:
         axes.plot(1e3 * ages, share, color=colour, ls=dashes, label=name or "_", **look)
-        least = min(least, share[share > 0.0].min())
+        least = min(least, share[share > 0.0].min(initial=1.0))
     if limit is not None:
         axes.axvline(1e3 * limit, color=style.GREY, lw=0.9, ls=(0, (5, 3)), label="deadline")
     axes.set_yscale("log")
-    axes.set_ylim(max(10.0 ** np.floor(np.log10(least)), 1e-4), 1.1)
-    axes.set_ylabel("P(age > $x$)")
-    legend_above(axes)
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.minorticks_off()
+    axes.set_ylim(max(10.0 ** (np.ceil(np.log10(least)) - 1.0), 1e-4), 1.1)
+    axes.set_ylabel("P(age > x)")
