@@ -56,8 +56,8 @@ TEMPLATE = Template("""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>$title</title>
 <style>
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem }
-table { border-collapse: collapse; margin: 1rem 0 }
-td, th { padding: .2rem .7rem; border-bottom: 1px solid #ccc; text-align: right }
+table { border-collapse: collapse; margin: 1rem 0; font-size: 13px; white-space: nowrap }
+td, th { padding: .2rem .4rem; border-bottom: 1px solid #ccc; text-align: right }
 svg { max-width: 100%; height: auto }
 pre { white-space: pre-wrap }
 .warning { color: #7a5200 }
