@@ -260,7 +260,7 @@ def sweep(
         flown = work.finish(folder, plan)
     if stopped:
         raise _as_exception(stopped)
-    columns = work.columns_of([flown[key] for key in plan.flights], plan)
+    columns = work.columns_of(flown, plan)
     numbers = {name for name in plan.axes if {*map(type, columns[name])} <= work.NUMBERS}
     arrays = {
         name: np.array(values, dtype=float if name in numbers or None in values else None)
@@ -279,6 +279,7 @@ def compare(
     seeds: int = 10,
     numbers: Sequence[str] = (),
     jobs: int = 1,
+    cost: bool = False,
 ) -> Comparison:
     """Fly an experiment with the settings A and with the settings B, with equal seeds, and compare.
 
@@ -290,6 +291,7 @@ def compare(
         seeds: Fly the seeds 1 to `seeds`.
         numbers: Metrics to compare; by default those that matter first.
         jobs: Number of processes.
+        cost: Whether to fly both also without a network, which gives the number J/J0.
 
     Raises:
         cloudrc.errors.BadInputError: If a setting is invalid, or if no pair has a metric.
@@ -298,7 +300,7 @@ def compare(
 
     seeds, jobs = _count(seeds, "seeds"), _count(jobs, "jobs")
     first, second = (pairs.split_settings(x) if isinstance(x, str) else _texts(x) for x in (a, b))
-    plan = pairs.plan_sides(of, _texts(settings or {}), first, second, seeds, numbers)
+    plan = pairs.plan_sides(of, _texts(settings or {}), first, second, seeds, numbers, cost=cost)
     _warn(*plan.points)
     flown, stopped = pairs.fly_pairs(plan, jobs)
     if stopped:

@@ -36,6 +36,8 @@ def arguments(parser: Parser) -> None:
     add("--in", "DIR", "compare flights of this sweep", dest="sweep")
     about = "compare this metric instead of the default ones; repeatable"
     add("--number", "NAME", about, many=True)
+    about = "fly each seed once more without a network; compare J/J0, the cost of control relative"
+    add("--cost", "", f"{about} to that flight, and the bytes")
     output_argument(parser, forms=TABLES)
 
 
@@ -57,6 +59,10 @@ def execute(options: Options) -> int:
     stopped = None
     if options.set and options.sweep:
         raise BadInputError(f"--set {options.set[0]}: these flights are finished; leave it out")
+    if options.cost and options.sweep:
+        raise BadInputError(
+            "--cost: these flights are finished; give the sweep's file 'cost: true'"
+        )
     if options.sweep:
         with Progress(f"reads {options.sweep}"):
             found = of_sweep(options.sweep, options.a, options.b)
@@ -95,10 +101,12 @@ def _fly_both(options: Options) -> tuple[Pairs, CloudrcError | None]:
         if "=" not in text:
             raise BadInputError(f"{text}: is not KEY=VALUE; for a value of a sweep, add --in DIR")
     sides = split_settings(options.a), split_settings(options.b)
-    plan = plan_sides(options.experiment, options.set, *sides, options.seeds, options.number)
+    asked = options.experiment, options.set, *sides, options.seeds, options.number
+    plan = plan_sides(*asked, cost=options.cost)
     warn(*plan.points)
     count = len(plan.flights)
-    head = f"{plan.name}: A and B, each with seeds 1 to {options.seeds}, {count} flights"
+    flown = "A, B and both without a network" if options.cost else "A and B"
+    head = f"{plan.name}: {flown}, each with seeds 1 to {options.seeds}, {count} flights"
     with SweepView(head, count) as view:
         pairs, stopped = fly_pairs(plan, count, view.see)
     return Pairs(pairs, plan.units, f"experiment {options.experiment}"), stopped

@@ -66,6 +66,7 @@ def _head(
     """Say what the command flies."""
     seeds = len(plan.draft.seeds)
     part = ", shard {} of {}".format(*options.shard) if options.shard else ""
+    part = ", also without a network" * plan.draft.cost + part
     head = f"{plan.name}: {len(plan.points)} points x {seeds} seeds{part}: {len(mine)} flights"
     done = len(mine) - len(missing)
     return f"{head}, {done} done before" if done else head

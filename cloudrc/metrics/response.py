@@ -181,6 +181,25 @@ def _tracking_errors(flight: Flight) -> Array:
     return np.asarray(np.linalg.norm(errors, axis=1))
 
 
+def _control_cost(flight: Flight) -> float | None:
+    """Integrate the squared distance from setpoint to true position over the mission [m^2 s].
+
+    It is the quadratic cost of networked control, x'Qx + u'Ru, with Q = 1 for this distance and
+    R = 0: a moving setpoint asks for a velocity, so a velocity costs nothing. The time in which the
+    robot waits for its first command counts, because the network makes it longer.
+    Source: L. Schenato, B. Sinopoli, M. Franceschetti, K. Poolla, S. S. Sastry, "Foundations of
+    control and estimation over lossy networks", Proceedings of the IEEE 95 (1), 2007.
+    """
+    if flight.mission_ns is None or flight.end_ns is None:
+        return None
+    rows = between(flight.recording["/setpoint_position"].columns, flight.mission_ns, flight.end_ns)
+    errors = rows["setpoint"] - flight.true_position(rows["stamp_ns"])
+    squares = np.square(errors).sum(axis=1)
+    known = np.isfinite(squares)
+    times = flight.seconds(rows["stamp_ns"][known])
+    return _integral(squares[known], times) if known.any() else None
+
+
 add_metrics(
     "Steps",
     ("overshoot_mean", "1", "Mean overshoot of the steps, as a share of the step.",
@@ -210,4 +229,6 @@ add_metrics(
      _tracking_errors, "p95"),
     ("tracking_error_peak", "m", "Largest distance from the setpoint to the true position.",
      _tracking_errors, "max"),
+    ("control_cost", "m^2 s", "Cost of control J: integral over the mission of the squared "
+     "distance from the setpoint to the true position.", _control_cost),
 )  # fmt: skip

@@ -17,11 +17,12 @@ from cloudrc.trials.plan import SweepPlan, check, draft_of
 from cloudrc.trials.play import run
 from cloudrc.trials.rows import Row, Rows
 from cloudrc.trials.summary import (
-    NUMBERS,
     Pair,
     adjust,
     compare_number,
     compare_success,
+    default_numbers,
+    normalise,
     pair,
     values_of,
 )
@@ -57,9 +58,14 @@ def plan_sides(
     b: Sequence[str],
     seeds: int,
     names: Sequence[str] = (),
+    *,
+    cost: bool = False,
 ) -> SweepPlan:
-    """SweepPlan the flights of an experiment with the settings `a` and `b`, both after `common`."""
-    plan = check(draft_of(experiment, common, seeds, {"A": a, "B": b}))
+    """SweepPlan the flights of an experiment with the settings `a` and `b`, both after `common`.
+
+    With `cost`, also plan those without a network.
+    """
+    plan = check(draft_of(experiment, common, seeds, {"A": a, "B": b})._replace(cost=cost))
     _check_numbers(names, plan.units)
     return plan
 
@@ -67,20 +73,26 @@ def plan_sides(
 def fly_pairs(
     plan: SweepPlan, jobs: int, see: Callable[[Row], None] = lambda row: None
 ) -> tuple[list[Pair], CloudrcError | None]:
-    """Fly both sides in `jobs` processes; call `see` with each row, whose key is "A" or "B".
+    """Fly both sides in `jobs` processes; call `see` with each row, its key "A", "B" or "J0".
 
     Return the pairs of flights, and why the work ended early, or None.
     """
     rows = Rows()
     flights = sorted(plan.flights.values(), key=lambda each: each.seed)
-    stopped = run(flights, rows, jobs, lambda row: see({**row, "key": row["point"]["side"]}))
-    return pair(rows.kept.values(), "side", "A", "B"), stopped
+
+    def tell(row: Row) -> None:
+        see({**row, "key": row["point"].get("side", "J0")})
+
+    stopped = run(flights, rows, jobs, tell)
+    return pair(normalise(rows.kept, plan.baselines).values(), "side", "A", "B"), stopped
 
 
 def compare(
     pairs: Sequence[Pair], units: Mapping[str, str], names: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Evaluate success and the metrics `names` (default: `NUMBERS`); return a JSON document.
+    """Evaluate success and the metrics `names`; return a JSON document.
+
+    Without names, they are those that matter first.
 
     A pair is left out if one of its flights did not end or had a plug-in that failed. Where one
     flight of a pair lacks a metric, the pair is left out for this metric. `units`: metric -> unit.
@@ -89,7 +101,7 @@ def compare(
     known = {n for _, a, b in flown for n in a["numbers"].keys() | b["numbers"].keys()}
     if not {*names} <= {*units, *SHIPPED}:
         _check_numbers(names, known)
-    chosen = names or [name for name in NUMBERS if name in known]
+    chosen = names or default_numbers(known)
     lacking = {name: _lacking(flown, name) for name in chosen}
     having = [name for name in chosen if lacking[name]["left_out"] < len(flown)]
     success = compare_success(flown)

@@ -14,7 +14,7 @@ from cloudrc.report.figures.style import Look
 from cloudrc.runs.flight import counts
 from cloudrc.statistics import exact_interval, median_interval
 from cloudrc.trials.rows import Row
-from cloudrc.trials.summary import NUMBERS, count_successes, values_of
+from cloudrc.trials.summary import RATIO, count_successes, default_numbers, values_of
 
 COLUMN = Look(width=3.5)
 """Look of a figure in one column of a page. Source: IEEE conference template."""
@@ -43,7 +43,7 @@ def draw_sweep(
     Args:
         rows: All flights of the sweep.
         units: Metric -> unit.
-        names: Metrics to show; by default the first three of `compare.NUMBERS`.
+        names: Metrics to show; by default the three that matter first.
         x: Axis of the sweep along x; by default the first numeric axis, else the first axis.
         by: Axis with one line per value; by default another axis, preferably not numeric.
         look: Size of the figure.
@@ -66,6 +66,7 @@ def draw_sweep(
         panels.append(Panel("success", "%", _lines(groups, at, _rate)))
     pooled = [axis for axis, each in values.items() if len(each) > 1 and axis not in (x, by)]
     more = f" Each point pools all values of {', '.join(pooled)}." if pooled else ""
+    more += f" {RATIO}: cost of control relative to that without a network." * (RATIO in shown)
     return draw(
         panels, x, [] if is_numeric else list(map(str, along)), by, look=look
     ), CAPTION + more
@@ -75,7 +76,7 @@ def _shown(rows: Sequence[Row], names: Sequence[str]) -> Sequence[str]:
     """Return the metrics to show, of which some flight has each."""
     known = sorted({name for row in rows if counts(row) for name in row["numbers"]})
     check_names("number", names, known, "--number: ")
-    return names or [name for name in NUMBERS if name in known][:SHOWN]
+    return names or default_numbers(known)[:SHOWN]
 
 
 def _choose(

@@ -26,7 +26,7 @@ from cloudrc.runs.lock import LOCK, lock_folder
 from cloudrc.text import csv_table, table
 from cloudrc.trials.plan import PlannedFlight, SweepPlan, read_plan
 from cloudrc.trials.rows import Row, Rows, read_rows
-from cloudrc.trials.summary import count_verdicts
+from cloudrc.trials.summary import count_verdicts, normalise
 from cloudrc.trials.workers import map_in_order, take_each
 from cloudrc.version import __version__
 
@@ -103,7 +103,7 @@ def finish(folder: Path, plan: SweepPlan) -> dict[str, Row]:
     rows = Rows(folder)
     _write_summary(folder, plan, rows)
     if rows.kept.keys() == plan.flights.keys():
-        columns = columns_of([rows.kept[key] for key in plan.flights], plan)
+        columns = columns_of(rows.kept, plan)
         write_atomically(folder / TABLE, as_csv(columns, plan.units).encode())
         if find_spec("pyarrow"):
             parquet, tables = import_module("pyarrow.parquet"), import_module("pyarrow")
@@ -124,6 +124,7 @@ def _write_summary(folder: Path, plan: SweepPlan, rows: Rows) -> None:
         "flights": len(plan.flights),
         "counts": dict(sorted(Counter(row["verdict"] for row in rows.kept.values()).items())),
         "units": plan.units,
+        **({"baselines": plan.baselines} if plan.baselines else {}),
         "files": plan.files,
     }
     write_atomically(folder / SUMMARY, f"{json.dumps(summary, indent=2)}\n".encode())
@@ -146,8 +147,10 @@ def as_csv(columns: Mapping[str, Sequence[Any]], unit_of: Mapping[str, str]) -> 
     return csv_table([dict(zip(head, row, strict=True)) for row in rows]) + "\n"
 
 
-def columns_of(rows: list[Row], plan: SweepPlan) -> dict[str, list[Any]]:
+def columns_of(kept: Mapping[str, Row], plan: SweepPlan) -> dict[str, list[Any]]:
     """Return the columns of a sweep's tables; an axis of numbers and other values becomes text."""
+    known = normalise(kept, plan.baselines)
+    rows = [known[key] for key in plan.flights if key in known]
 
     def column(name: str) -> list[Any]:
         return [row.get(name, "") for row in rows]
@@ -259,6 +262,8 @@ def read_sweep(folder: Path) -> Flown:
     of more than one code, whose difference may be what the rows show.
     """
     summary, rows = read_summary(folder), read_rows(folder)
+    baselines = summary.get("baselines", {})
+    rows = normalise(rows, baselines)
     codes = {str(row.get("code")) for row in rows.values()}
     if len(codes) > 1:
         text = f"{folder}: its flights are of different code: {' and '.join(sorted(codes))}"
@@ -274,7 +279,8 @@ def read_sweep(folder: Path) -> Flown:
         text = f"has rows of another grid than that in {SUMMARY}; name the folder of one sweep"
         raise BadInputError(f"{folder}: {text}") from None
     unknown = dict.fromkeys((name for row in ordered for name in row["numbers"]), "")
-    return Flown(ordered, {**unknown, **summary["units"]}, axes, summary["flights"])
+    count = len(baselines) or summary["flights"]
+    return Flown(ordered, {**unknown, **summary["units"]}, axes, count)
 
 
 def read_flights(folder: Path) -> Flown:

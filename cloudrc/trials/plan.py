@@ -24,6 +24,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import Settings, collect_settings, parse_settings
 from cloudrc.config.problems import ConfigProblem, ProblemsError, validate
 from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.schema import Link
 from cloudrc.config.section import Section
 from cloudrc.errors import BadInputError
 from cloudrc.metrics import measure
@@ -33,6 +34,7 @@ from cloudrc.runs import flight
 from cloudrc.runs.experiment import check_world
 from cloudrc.trials.fingerprint import experiment_facts, fingerprint
 from cloudrc.trials.rows import Row
+from cloudrc.trials.summary import RATIO
 
 SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
 """Largest seed, and largest number of seeds."""
@@ -55,6 +57,8 @@ class SweepFile(Section):
     """Axes: a key and a list of its values, or a name and a mapping of named settings"""
     seeds: Any = 1
     """Number of seeds, which begin with 1, or a list of seeds"""
+    cost: bool = False
+    """Whether to fly every point without a network, too, which gives the number J/J0"""
     folder: str | None = None
     """Folder in which relative paths start (default: that of the file)"""
 
@@ -93,7 +97,8 @@ class SweepPlan:
 
     draft: Draft
     points: list[ResolvedExperiment]
-    flights: dict[str, PlannedFlight]  # key -> flight, in the order of the grid
+    flights: dict[str, PlannedFlight]  # key -> flight, in the order of the grid, then those for J0
+    baselines: dict[str, str]  # key of each flight of the grid -> key of the one for J0; or {}
     units: dict[str, str]  # metric -> unit
     files: dict[str, str]  # path of each of the user's files on which a flight depends -> its hash
 
@@ -117,6 +122,7 @@ class Draft(NamedTuple):
     common: list[Entry]
     axes: dict[str, list[Choice]]
     seeds: tuple[int, ...]
+    cost: bool = False
 
     @property
     def flights(self) -> int:
@@ -177,6 +183,7 @@ def read_plan(given: Path | Mapping[str, Any]) -> SweepPlan:
 def check(draft: Draft) -> SweepPlan:
     """Check the points of a draft; raise a BadInputError."""
     points, flights = list[ResolvedExperiment](), dict[str, PlannedFlight]()
+    baselines = dict[str, PlannedFlight]()
     own_files = dict[str, str]()
     with reuse_results():
         for point, entries in draft.points():
@@ -189,8 +196,21 @@ def check(draft: Draft) -> SweepPlan:
                 raise BadInputError(f"{draft.name}: {text}")
             every = [first._replace(seed=seed) for seed in draft.seeds]
             flights |= {each.key: each for each in every}
+            if draft.cost:
+                bare = _without_network(first)
+                baselines |= {each.key: bare._replace(seed=each.seed) for each in every}
+    for each in baselines.values():
+        flights.setdefault(each.key, each)
     own_metrics = {metric for point in points for metric in point.report.metrics}
-    return SweepPlan(draft, points, flights, flight.units(own_metrics), own_files)
+    units = flight.units(own_metrics) | ({RATIO: "1"} if draft.cost else {})
+    keys = {key: each.key for key, each in baselines.items()}
+    return SweepPlan(draft, points, flights, keys, units, own_files)
+
+
+def _without_network(flown: PlannedFlight) -> PlannedFlight:
+    """Return a flight with the same settings and seed over an ideal link; it is of no point."""
+    resolved = flown.resolved.model_copy(update={"link": Link(profile="ideal")})
+    return PlannedFlight(fingerprint(experiment_facts(resolved)), {}, flown.seed, resolved)
 
 
 def draft_of(
@@ -238,7 +258,7 @@ def read_draft(given: Path | Mapping[str, Any], flights_max: int | None = None) 
     is_path = shipped.is_path(file.experiment)
     experiment = str(folder / file.experiment) if is_path else file.experiment
     content = document.tree | {"folder": str(folder)}
-    draft = Draft(name, content, experiment, common, axes, seeds)
+    draft = Draft(name, content, experiment, common, axes, seeds, file.cost)
     if flights_max is not None and draft.flights > flights_max:
         text = f"{draft.size} are more than {flights_max:,}; take fewer values or seeds, or give "
         raise BadInputError(f"{name}: {text}--max-flights {draft.flights}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from statistics import median
 from typing import Any, NamedTuple
@@ -26,6 +26,10 @@ NUMBERS = (
     *("unsettled_steps", "overshoot_mean", "delay_estimate_error_rms", "min_clearance"),
 )
 """Metrics that are compared and drawn by default."""
+COST, RATIO = "control_cost", "J/J0"
+"""Number of a flight: its `control_cost` relative to that of the same flight without a network."""
+COSTS = (RATIO, "bytes_sent_uplink", "bytes_sent_downlink")
+"""Metrics that come first where J/J0 is known: what control costs, and what it sends for that."""
 METHOD = "95 % interval of the median, by order statistics"
 
 
@@ -44,6 +48,26 @@ def values_of(rows: Sequence[Row]) -> dict[str, list[Any]]:
     """Return a mapping: axis -> its different values in `rows`, in the order of `rows`."""
     axes = rows[0]["point"]
     return {axis: list(dict.fromkeys(row["point"][axis] for row in rows)) for axis in axes}
+
+
+def default_numbers(known: Container[str]) -> list[str]:
+    """Return those of the `known` metrics that matter first."""
+    first = COSTS if RATIO in known else ()
+    return [name for name in (*first, *NUMBERS) if name in known]
+
+
+def normalise(rows: Mapping[str, Row], baselines: Mapping[str, str]) -> dict[str, Row]:
+    """Return the rows of the grid, with J/J0 where the flight without a network succeeded.
+
+    Both are the arguments of a plan: key -> row, and key -> key of the flight without a network.
+    """
+    for key, base in baselines.items():
+        own, bare = rows.get(key), rows.get(base)
+        if not own or not bare or bare["verdict"] != "success" or COST not in own["numbers"]:
+            continue
+        if bare_cost := bare["numbers"].get(COST):
+            own["numbers"][RATIO] = own["numbers"][COST] / bare_cost
+    return {key: row for key, row in rows.items() if not baselines or key in baselines}
 
 
 # Medians.

@@ -87,6 +87,7 @@ def test_the_table_is_also_one_of_csv_or_latex_alone(form, start, fly_with, call
         (f"seed=1 {B}", "seed: each flight has its own seed; give the seeds with --seeds"),
         ("last_sample nonsense",
          "last_sample: is not KEY=VALUE; for a value of a sweep, add --in DIR"),
+        ("last_sample kalman --cost --in .", "--cost: these flights are finished"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_compared_is_refused(arguments, text, refused):

@@ -49,6 +49,8 @@ def test_a_step_of_a_second_order_system(damping):
     assert step.settling_time == pytest.approx(outside[-1], abs=0.05)
     # Integral of the squared error of a unit step: (1 + 4 damping^2) / (4 damping frequency).
     assert step.ise == pytest.approx((1 + 4 * damping**2) / (12 * damping), rel=0.03)
+    cost = SHIPPED["control_cost"].measure(flight(path))
+    assert cost == pytest.approx(step.ise, rel=0.02)
     assert step.last_error < 0.05
     assert not step.unstable
 

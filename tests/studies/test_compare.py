@@ -8,6 +8,7 @@ from cloudrc.studies.compare_text import as_text
 from tests.support.sweeps import flown
 
 UNITS = {"iae_mean": "m", "rtt_mean": "s"}
+BYTES = {"J/J0": "1", "bytes_sent_uplink": "B"}
 
 
 def pairs(*both):
@@ -52,6 +53,14 @@ def test_incomplete_pairs_are_left_out_and_counted():
         1,
     )
     assert [one["seed"] for one in found["flights"]] == [1, 2, 3]
+
+
+def test_the_relative_cost_and_the_bytes_come_first_where_they_are_known():
+    a = flown(iae_mean=1.0, bytes_sent_uplink=2.0)
+    assert list(compare(pairs((a, a)), {**UNITS, **BYTES})["numbers"]) == ["iae_mean"]
+    a["numbers"]["J/J0"] = 1.5
+    found = compare(pairs((a, a)), {**UNITS, **BYTES})["numbers"]
+    assert list(found) == ["J/J0", "bytes_sent_uplink", "iae_mean"]
 
 
 def test_no_pairs_are_refused():

@@ -1,6 +1,7 @@
 """A folder has one sweep; its tables follow the order of the grid, whatever flew first."""
 
 import csv
+import json
 
 import pytest
 
@@ -70,6 +71,27 @@ def test_a_folder_holds_one_sweep_that_may_grow(write_sweep, folder):
     for other in (write_sweep({"link.both.delay_ms": [7]}), write_sweep({}, seeds=2)):
         with pytest.raises(BadInputError, match=r"has another sweep, see sweep\.yaml.*new folder"):
             fly(other, folder)
+
+
+def test_flights_without_a_network_are_rows_that_only_give_the_relative_cost(write_sweep, folder):
+    """A sweep without them grows by them; a baseline that failed gives no number."""
+    plan = fly(write_sweep(), folder)
+    plan = read_plan(write_sweep(cost=True))
+    rows = sweep.begin(folder, plan)
+    bare = [each for key, each in plan.flights.items() if key not in plan.baselines]
+    assert [each.key for each in sweep.flights_of(plan) if each.key not in rows.kept] == [
+        each.key for each in bare
+    ]
+    for each, result in zip(bare, (flown(control_cost=0.5), flown("failure")), strict=True):
+        rows.add(each.row(result))
+    for key in plan.baselines:
+        rows.kept[key]["numbers"]["control_cost"] = 2.0
+    (folder / "rows.jsonl").write_text("".join(f"{json.dumps(r)}\n" for r in rows.kept.values()))
+    sweep.finish(folder, plan)
+    table = [*csv.DictReader((folder / "table.csv").read_text().splitlines())]
+    assert [row["J/J0 [1]"] for row in table] == ["4.0", "4.0", "", ""]
+    found = sweep.read_sweep(folder)
+    assert (len(found.rows), found.flights, found.units["J/J0"]) == (4, 4, "1")
 
 
 @pytest.mark.parametrize("changed", PLUG_IN)

@@ -29,6 +29,25 @@ def test_every_point_is_flown_with_every_seed(write_sweep):
     assert read_plan(write_sweep(seeds=2)).draft.seeds == (1, 2)
 
 
+def test_points_that_differ_in_the_network_share_their_flights_without_one(write_sweep):
+    links = {"here": {"link.both.delay_ms": 0}, "far": {"link.both.delay_ms": 40}}
+    grid = {"cloud.predictor": ["last_sample", "kalman"], "link": links}
+    short = {**SHORT, "link.profile": "ideal"}
+    sweep = read_plan(write_sweep(grid, seeds=2, cost=True, set=short))
+    assert len(sweep.baselines) == len(sweep.flights) == 8
+    grid["link"] = {"near": {"link.both.delay_ms": 20}, "far": {"link.both.delay_ms": 40}}
+    path = write_sweep(grid, seeds=2, cost=True, set={**short, "guard.command_age_max_ms": 900})
+    sweep = read_plan(path)
+    assert (len(sweep.baselines), len({*sweep.baselines.values()}), len(sweep.flights)) == (
+        8,
+        4,
+        12,
+    )
+    bare = sweep.flights[sweep.baselines[[*sweep.baselines][-1]]].experiment
+    assert (bare.seed, bare.cloud.predictor.name, bare.link.profile) == (2, "kalman", "ideal")
+    assert (bare.uplink.delay_ms, bare.guard.command_age_max_ms) == (0.0, 900.0)
+
+
 def test_an_axis_may_have_named_settings(write_sweep):
     grid = {"gains": {"low": {"cloud.controller.gain_p": [1, 1, 1]}, "default": {}}}
     sweep = read_plan(write_sweep(grid))
