@@ -106,6 +106,16 @@ class GroundTruth(NamedTuple):
         return self.odometry.velocity
 
 
+class EnergyUsed(NamedTuple):
+    """Made by world once a second and at each change of the guard's state. Topic /energy.
+
+    Only a robot whose robot.yaml tells the thrust of its rotors has this record.
+    """
+
+    stamp_ns: int
+    energy: Annotated[float, "J", "mechanical energy of all rotors since world began"]
+
+
 class SensorLabel(NamedTuple):
     """What robot.yaml says of a sensor."""
 
@@ -329,6 +339,7 @@ class Lateness(NamedTuple):
 
 Record: TypeAlias = (
     (TelemetrySent | GroundTruth | ContactForce | SensorRead | Arrival | CommandApplied)
+    | EnergyUsed
     | (GuardChange | Contact | SessionOpened | Control | PlanFollowed | MissionEvent)
     | (Fault | Counted | LinkChanged | LinkChecked | Lateness)
 )

@@ -22,6 +22,7 @@ from cloudrc.config.schema import (
     NotNegatives,
     Parameters,
     PlugIn,
+    Positive,
     Speed,
     World,
 )
@@ -138,6 +139,9 @@ class RobotFiles(Section):
     hull_m: Hull | None = None
     """Radius of the ball about the base that contains the robot [m], for the distance from
     obstacles. null: the smallest ball that contains the geoms of the model"""
+    thrust_n_s2: Positive | None = None
+    """Thrust of a rotor per squared speed [N s^2], for the energy of the rotors. Their torque is in
+    the gear of the model's actuators. null: the energy is not known"""
     probe: Annotated[str, Field(min_length=1)] | None = None
     """Name of a sphere, a site of the model: with it the robot touches what a mission has to touch.
     A touch sensor at this site measures the force. null: any part of the robot touches"""

@@ -279,6 +279,19 @@ def _recorder_dropped(flight: Flight) -> float | None:
     return float(sum(last.values())) if last else None
 
 
+def _rotor_energy(flight: Flight) -> float | None:
+    """Return the mechanical energy that the rotors used in the flight [J]; None if not recorded.
+
+    Source: that of `EnergyMeter`. Between two records, about a second, it is taken to rise evenly.
+    """
+    rows = flight.recording["/energy"]
+    if flight.span_ns is None or not len(rows):
+        return None
+    first_ns, span_ns = rows["stamp_ns"][0], np.array(flight.span_ns)
+    begin, end = np.interp(span_ns - first_ns, rows["stamp_ns"] - first_ns, rows["energy"])
+    return float(end - begin)
+
+
 add_metrics(
     "Mission",
     ("waypoints_reached", "1", "Number of waypoints at which the true position stayed within the "
@@ -303,6 +316,8 @@ add_metrics(
      _steady_force),
     *((f"steady_error_{name}", "m", f"Mean distance from the setpoint along {name} over the last "
        "5 s of a hover.", partial(_steady_error, axis=axis)) for axis, name in enumerate("xyz")),
+    ("rotor_energy", "J", "Mechanical energy of the rotors in the flight, from their thrusts and "
+     "speeds.", _rotor_energy),
     waypoints_reached="waypoints reached",
     final_error="from the last setpoint, at the end",
     contact_time="first touch at",

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from cloudrc.record.content import Content
 from cloudrc.record.content import Message as Message  # callers take it from here, too
-from cloudrc.record.topics import ADDED, BY_SOURCE, TOPICS, Kind, Topic
+from cloudrc.record.topics import ADDED, BY_SOURCE, TOPICS, UNHASHED, Kind, Topic
 from cloudrc.records import Record
 
 Column: TypeAlias = NDArray[Any]
@@ -117,12 +117,12 @@ class Recording(Content):
 
         The topics are hashed column by column. If both ends write a topic, its rows are hashed in
         the order of their stamps. Numbers are little-endian. The hash omits the column `ROTATED`,
-        and topics in `ADDED` without rows.
+        the topics in `UNHASHED`, and those in `ADDED` without rows.
         """
         total = hashlib.sha256()
         for topic in TOPICS.values():
             table = self[topic.name]
-            if topic.name in ADDED and not len(table):
+            if topic.name in UNHASHED or (topic.name in ADDED and not len(table)):
                 continue
             mixed = topic.end == "either"
             rows = np.argsort(table["stamp_ns"], kind="stable") if mixed else slice(None)

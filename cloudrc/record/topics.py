@@ -120,6 +120,8 @@ _TABLE = (
         also=(rec.ContactForce, "stamp_ns sensor.name sensor.unit force")),
     Topic("/reference", "geometry_msgs/msg/TwistStamped", rec.GroundTruth, "world",
         "Velocity that the guard lets the onboard controller follow, world's clock", "reference"),
+    Topic("/energy", "cloudrc_msgs/msg/EnergyUsed", rec.EnergyUsed, "world",
+        "Mechanical energy of the robot's rotors, world's clock. Only if their speeds are known"),
     Topic("/uplink_delay", "cloudrc_msgs/msg/Arrival", rec.Arrival, "cloud",
         "A telemetry datagram arrived at cloud, in time or late, cloud's clock",
         "epoch counter delay used"),
@@ -172,6 +174,8 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 
 ADDED = ("/plan", "/sensor")
 """Topics that came later than the others; without rows they do not change a hash."""
+UNHASHED = ("/energy",)
+"""Topics that never change a hash: flights from before them keep theirs."""
 
 VIEWS: dict[str, str] = {
     "/tf": "tf2_msgs/msg/TFMessage",

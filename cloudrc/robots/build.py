@@ -20,6 +20,7 @@ from cloudrc.outside.document import KeyPath
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import RESULT
 from cloudrc.sim.airframe import thrust_to_weight
+from cloudrc.sim.energy import EnergyMeter, power_factors
 from cloudrc.sim.onboard import Accelerator, Actuators, Direct, Onboard
 from cloudrc.sim.plant import Wind
 from cloudrc.sim.scene import compile_model, compile_true, find_part, find_sensors
@@ -80,6 +81,8 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     judges = not (is_direct or plugin.is_shipped)
     with plugin.calling("actuators" if judges else "build"):
         simulator = Simulator(model, actuators, wind, robot.probe, sensors, judges=judges)
+    if (factors := power_factors(model, nominal, robot.thrust_n_s2)) is not None:
+        simulator.meter = EnergyMeter(simulator.data, factors)
     return _connect(world, plugin, simulator, onboard, limits)
 
 

@@ -19,6 +19,7 @@ onboard: multirotor       # or diff_drive, or ./onboard.py with a function build
 hull_m: 0.34              # ball about the base that holds the robot: at least size_m of the check
 # sensors: {height: {unit: m, sensor: range}}            # own values, from sensors of the model
 guard: {acceleration_max_mps2: 4, braking_mps2: 3}     # 'cloudrc robot check' measures the braking
+# thrust_n_s2: 5.57e-6    # thrust of a rotor per squared speed, for the number rotor_energy
 # response:               # for predictors; 'cloudrc identify RUN' fits it to a flight
 #   time_constant: [0.2, 0.2, 0.1]
 #   dead_time: [0.05, 0.05, 0.02]

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from cloudrc.messages import ZERO, Odometry, Quaternion, Vector
 from cloudrc.outside.values import RESULT
 from cloudrc.records import Contact, SensorLabel
+from cloudrc.sim.energy import EnergyMeter
 from cloudrc.sim.engine import mujoco
 from cloudrc.sim.onboard import Actuators, Commands, Inputs
 from cloudrc.sim.plant import Wind
@@ -56,6 +57,7 @@ class Simulator:
         impulse: Integral over time of the force on the probe since that call [N s].
         touches: Contacts that began since the last call of `take_contacts`.
         actuators: Physics of the robot's actuators.
+        meter: Energy of the robot's rotors; None if it is not known.
         tape: Inputs of every step since the last reset, for `replay`; None unless a caller sets
             a list.
     """
@@ -84,6 +86,7 @@ class Simulator:
         self.tape: list[Inputs] | None = None
         self.data = data = mujoco.MjData(model)
         self.actuators = actuators
+        self.meter: EnergyMeter | None = None
         self._inputs: int = model.nu
         self._nothing: Inputs = (0.0,) * (model.nu + 6)
         self._judges = judges

@@ -34,6 +34,7 @@ from cloudrc.records import (
     CommandApplied,
     ContactForce,
     Counted,
+    EnergyUsed,
     GroundTruth,
     SensorRead,
     SessionOpened,
@@ -204,6 +205,10 @@ class WorldEndpoint(TunnelEnd):
         truth = simulator.truth(now_ns)
         shown = simulator.read_sensors() if self._shows else ()
         records.append(_new(GroundTruth, (now_ns, truth, guard.reference)))
+        if (meter := simulator.meter) is not None:
+            meter.sample()
+            if guard.changes or now_ns >= self._count_ns:
+                records.append(EnergyUsed(now_ns, meter.read(self._sample_period_ns * 1e-9)))
         if (force := simulator.take_contact_force()) is not None:
             records.append(_new(ContactForce, (now_ns, *force, simulator.force_sensor)))
         for number, name, unit in self._recorded:

@@ -18,6 +18,7 @@ from cloudrc.records import (
     CommandApplied,
     Control,
     Counted,
+    EnergyUsed,
     Fault,
     GroundTruth,
     GuardChange,
@@ -233,6 +234,8 @@ NUMBERS = {
         **dict.fromkeys(("contact_time", "touch_speed", "steady_contact_force", "contact_impulse")),
         **dict.fromkeys(("peak_contact_force", "min_clearance", "min_clearance_flight")),
         **dict.fromkeys(("steady_error_x", "recorder_dropped", "controller_gaps")),
+        "rotor_energy": None,
+        "control_cost": approx(2.225),  # 10 s, (0.25, 0.4, 0) m from the setpoint
         **dict.fromkeys(REAL_TIME | OF_RELAYS | TRAFFIC),
     },
     contact: {
@@ -250,6 +253,8 @@ NUMBERS = {
         "min_clearance_flight": approx(ON_AXIS - 0.1, abs=0.05),
         "obstacle_contacts": 0.0,
     },
+    # 2 W from 1 s before the flight to 5 s after it.
+    lambda: plus(EnergyUsed(at(-1.0), 5.0), EnergyUsed(at(15.0), 37.0)): {"rotor_energy": 20.0},
     lambda: plus(*REACHED, waypoints=2): {"waypoints_reached": 2.0, "duration": 10.0},
     echoes_at_once: {
         "rtt_mean": approx(0.1095, abs=1e-4),
@@ -328,7 +333,7 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight():
     others = {"recorder_dropped", "final_error", "controller_gaps", "yaw_error", "age_violation"}
     assert set(SHIPPED) - set(numbers) == REAL_TIME | OF_RELAYS | resting | others
     for name, number in numbers.items():
-        assert set(number.unit) <= set("smNB12^/ "), name
+        assert set(number.unit) <= set("smNJB12^/ "), name
         assert number.meaning[0].isupper(), name
         assert number.meaning.endswith("."), name
         assert isfinite(number.value), name

@@ -72,6 +72,7 @@ def world_records(count, start_ns=0):
             rec.GroundTruth(now, odometry, velocity),
             rec.ContactForce(now, 0.2, 0.3, 0.001),
             rec.SensorRead(now, "battery", "V", 11.9),
+            rec.EnergyUsed(now, 0.8 * n),
         ]
         if n >= 3:
             records += [
