@@ -161,6 +161,11 @@ def compare_with_truth(
     return rms, at_ns, errors
 
 
+def _has_plans(flight: Flight) -> bool:
+    """Whether a command that world applied in the flight had a plan of future velocities."""
+    return bool((flight.during("/command_applied")["planned_ns"] >= 0).any())
+
+
 def prediction_errors(flight: Flight) -> tuple[float | None, Array, Array]:
     """Compare each predicted position with the true position when the command was applied.
 
@@ -168,7 +173,7 @@ def prediction_errors(flight: Flight) -> tuple[float | None, Array, Array]:
     With plans, compare the position that the plan in use had predicted, at each odometry.
     Source: docs/reference/control.md, "Predictors".
     """
-    if flight.has_plans:
+    if _has_plans(flight):
         plans = flight.during("/plan")
         return compare_with_truth(flight, plans["basis_stamp_ns"], plans["position"])
     return compare_with_truth(flight, flight.applied["stamp_ns"], flight.applied["position"])
@@ -192,7 +197,7 @@ def _delay_error(flight: Flight) -> float | None:
     the time at which the plan begins by definition, whenever the command arrives.
     """
     applied = flight.applied
-    if flight.has_plans:
+    if _has_plans(flight):
         return None
     errors = delay_error(applied["horizon"], applied["basis_stamp_ns"], applied["stamp_ns"])
     return rms(errors[np.isfinite(applied["rtt"])])

@@ -8,7 +8,7 @@ Both end with the event that ends the mission or, without such an event, with th
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial, reduce
 from math import isfinite
 from types import SimpleNamespace
@@ -43,11 +43,7 @@ class Flight:
     scene: Scene  # its tubes and all other obstacles
     hull: Spheres | None = None  # of the robot; None: not known
     command_rate_hz: int = 100  # cloud.command_rate_hz
-
-    @property
-    def waypoints(self) -> int:
-        """Number of the mission's waypoints or random setpoints."""
-        return self.mission.count
+    _during: dict[str, Columns] = field(default_factory=dict, init=False)  # of the topics asked for
 
     @cached_property
     def start_ns(self) -> int | None:
@@ -110,12 +106,8 @@ class Flight:
     def during(self, topic: str) -> Columns:
         """Select the rows of a topic from the first to the last instant of the flight."""
         if topic not in self._during:  # fifty metrics ask for ten topics
-            self._during[topic] = self._within(self.recording[topic].columns)
+            self._during[topic] = _flown(self, self.recording[topic].columns)
         return self._during[topic]
-
-    @cached_property
-    def _during(self) -> dict[str, Columns]:
-        return {}
 
     def true_position(self, stamp_ns: Array) -> Array:
         """Interpolate the base's true position at `stamp_ns` [ns], world's clock, shape (n,).
@@ -144,52 +136,28 @@ class Flight:
         return float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
 
     @cached_property
-    def yaw_noise(self) -> float:
-        """Root mean square of the error of the measured yaws [rad]; 0 if unknown."""
-        measured, truth = self.during("/odometry"), self.recording["/ground_truth"]
-        rows = np.searchsorted(truth["stamp_ns"], measured["stamp_ns"])
-        known = rows < len(truth["stamp_ns"])
-        true = yaw_of(truth["orientation_wxyz"][rows[known]])
-        errors = turn_between(yaw_of(measured["orientation_wxyz"][known]), true)
-        return float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
-
-    @cached_property
     def truth(self) -> Columns:
         """True states of the robot during the flight."""
         return self.during("/ground_truth")
 
-    def truth_until(self, end_ns: int) -> Columns:
-        """Select the true states from the start of the flight to `end_ns` [ns], even after it."""
-        return between(self.recording["/ground_truth"].columns, self.start_ns or 0, end_ns)
-
     @cached_property
     def control(self) -> Columns:
         """One row per control period of the flight, with the columns of all its topics."""
-        return self._within(self._control)
+        return _flown(self, self._control)
 
     @cached_property
     def _control(self) -> Columns:
-        return self._joined(Control)
+        return _joined(self.recording, Control)
 
     def rows(self, source: type[Record]) -> Any:
         """Return the flight's records of a class as one record, whose fields are arrays.
 
         A vector is a tuple of x, y and z.
         """
-        columns = self._within(self._joined(source)).items()
+        columns = _flown(self, _joined(self.recording, source)).items()
         return SimpleNamespace(
             **{name: tuple(values.T) if values.ndim > 1 else values for name, values in columns}
         )
-
-    def _joined(self, source: type[Record]) -> Columns:
-        """Return the columns of all topics in whose rows the records of a class are."""
-        tables = [self.recording[topic.name].columns for topic in BY_SOURCE[source]]
-        # In the last period of a torn recording some topics may be missing.
-        stamps = reduce(np.intersect1d, [table["stamp_ns"] for table in tables])
-        columns: Columns = {}
-        for table in tables:
-            columns |= select(table, np.searchsorted(table["stamp_ns"], stamps))
-        return columns
 
     @cached_property
     def clearance(self) -> Array:
@@ -203,11 +171,6 @@ class Flight:
     def obstacles(self) -> tuple[Obstacle, ...]:
         """All bodies that the robot must not touch, and from which clearances are known."""
         return tuple(filter(has_surface, obstacles(self.scene, touch=self.mission.touched)))
-
-    @cached_property
-    def inside(self) -> Array:
-        """Whether the robot's base is inside a tube, per row of `truth`."""
-        return inside_tube(self.scene, self.truth["position"])
 
     def count(self, number: float) -> float | None:
         """Return `number` [any unit] as the value of a metric; None if the robot never flew."""
@@ -227,12 +190,6 @@ class Flight:
         """
         return growth(self.recording, name, self.span_ns)
 
-    def last_value(self, name: str) -> float | None:
-        """Return what was last recorded under /count as `name`; None if it was never recorded."""
-        count = self.recording["/count"]
-        values = count["total"][count["name"] == name]
-        return float(values[-1]) if len(values) else None
-
     @cached_property
     def applied(self) -> Columns:
         """Commands that world applied in the flight, each with cloud's record `Control`.
@@ -246,13 +203,21 @@ class Flight:
         planned, stamp = columns["planned_ns"], columns["stamp_ns"]
         return columns | {"stamp_ns": np.where(planned >= 0, planned, stamp)}
 
-    @property
-    def has_plans(self) -> bool:
-        """Whether a command that world applied in the flight had a plan of future velocities."""
-        return bool((self.during("/command_applied")["planned_ns"] >= 0).any())
 
-    def _within(self, columns: Columns) -> Columns:
-        return between(columns, *(self.span_ns or (0, -1)))
+def _joined(recording: Recording, source: type[Record]) -> Columns:
+    """Return the columns of all topics in whose rows the records of a class are."""
+    tables = [recording[topic.name].columns for topic in BY_SOURCE[source]]
+    # In the last period of a torn recording some topics may be missing.
+    stamps = reduce(np.intersect1d, [table["stamp_ns"] for table in tables])
+    columns: Columns = {}
+    for table in tables:
+        columns |= select(table, np.searchsorted(table["stamp_ns"], stamps))
+    return columns
+
+
+def _flown(flight: Flight, columns: Columns) -> Columns:
+    """Select the rows in the time of a flight."""
+    return between(columns, *(flight.span_ns or (0, -1)))
 
 
 def yaw_of(orientations_wxyz: Array) -> Array:
@@ -379,9 +344,10 @@ STATISTICS: dict[str, Callable[[Array], float | None]] = {
 
 
 def _least_clearance(flight: Flight, *, inside: bool) -> float | None:
-    truth, rows = flight.truth, flight.inside if inside else slice(None)
+    truth = flight.truth
     if flight.hull is None:
         return None
+    rows = inside_tube(flight.scene, truth["position"]) if inside else slice(None)
     poses = truth["position"][rows], truth["orientation_wxyz"][rows]
     found = least_clearance(flight.obstacles, *poses, flight.hull)
     return finite(found)

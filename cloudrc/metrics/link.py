@@ -91,8 +91,9 @@ def _add_direction(way: str, words: str) -> None:
     """Add the metrics of the direction `way`; `words` name the direction in descriptions."""
 
     def seconds(name: str, flight: Flight) -> float | None:
-        total = flight.last_value(f"{way}_release_error_{name}_ns")
-        return None if total is None else total * 1e-9
+        count = flight.recording["/count"]
+        totals = count["total"][count["name"] == f"{way}_release_error_{name}_ns"]
+        return float(totals[-1]) * 1e-9 if len(totals) else None
 
     add_metrics(
         "Link and loop",

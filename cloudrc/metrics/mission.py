@@ -16,8 +16,10 @@ from cloudrc.metrics.flight import (
     Flight,
     Measure,
     add_metrics,
+    between,
     finite,
     mean,
+    rms,
     rows_of,
     select,
     turn_between,
@@ -91,7 +93,7 @@ def _waypoints_reached(flight: Flight) -> float | None:
     else:
         known = (i for i in stamps if i < len(points))
         count = sum(_stay(flight, points[i], stamps[i])[0] for i in known)
-    wanted = 1 if flight.mission.setpoints else flight.waypoints
+    wanted = 1 if flight.mission.setpoints else flight.mission.count
     return None if flight.holes and count < wanted else flight.count(count)
 
 
@@ -143,7 +145,7 @@ def _stay(flight: Flight, waypoint: Waypoint, until_ns: int) -> tuple[bool, str]
     Return whether the robot stayed near the waypoint for its dwell time. If not, also say where it
     was when it was first away in the dwell time; "" if it never was.
     """
-    truth = flight.truth_until(until_ns)
+    truth = between(flight.recording["/ground_truth"].columns, flight.start_ns or 0, until_ns)
     stamps_ns, turned = truth["stamp_ns"], ""
     distance = np.linalg.norm(truth["position"] - waypoint.position_m, axis=1)
     there = differences(waypoint.tolerance_m + NOISE * flight.position_noise, distance) <= 0.0
@@ -151,7 +153,7 @@ def _stay(flight: Flight, waypoint: Waypoint, until_ns: int) -> tuple[bool, str]
         yaws = yaw_of(truth["orientation_wxyz"])
         turn = np.abs(turn_between(yaws, radians(waypoint.yaw_deg)))
         allowed = radians(waypoint.yaw_tolerance_deg or YAW_TOLERANCE_DEG)
-        there &= differences(allowed + NOISE * flight.yaw_noise, turn) <= 0.0
+        there &= differences(allowed + NOISE * _yaw_noise(flight), turn) <= 0.0
         turned = " or not turned as asked"
     # If the mission has a `carrot` (a moving setpoint), a stay of any length is enough, because the
     # setpoint waits at the waypoint for the dwell time.
@@ -169,6 +171,16 @@ def _stay(flight: Flight, waypoint: Waypoint, until_ns: int) -> tuple[bool, str]
         return False, ""
     seconds = flight.seconds(stamps_ns[away[0]])
     return False, f"{distance[away[0]]:.4g} m from it{turned} at {seconds:.2f} s"
+
+
+def _yaw_noise(flight: Flight) -> float:
+    """Return the root mean square of the error of the measured yaws [rad]; 0 if unknown."""
+    measured, truth = flight.during("/odometry"), flight.recording["/ground_truth"]
+    rows = np.searchsorted(truth["stamp_ns"], measured["stamp_ns"])
+    known = rows < len(truth["stamp_ns"])
+    true = yaw_of(truth["orientation_wxyz"][rows[known]])
+    errors = turn_between(yaw_of(measured["orientation_wxyz"][known]), true)
+    return rms(errors) or 0.0
 
 
 def unconfirmed(flight: Flight) -> str:

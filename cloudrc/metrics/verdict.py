@@ -221,7 +221,7 @@ def flight_evidence(
         speed = float(np.linalg.norm(row["touch_velocity"]))
         touch = speed, _moment(flight, int(row["stamp_ns"]))
     return Evidence(
-        waypoints=0 if flight.mission.setpoints else flight.waypoints,
+        waypoints=0 if flight.mission.setpoints else flight.mission.count,
         reached=0 if reached is None else round(reached.value),
         wanted=flight.mission.touch,
         ending=_ending(flight, interrupted),
