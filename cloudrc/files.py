@@ -5,6 +5,7 @@ Reading never blocks. Writing replaces the file in one step.
 
 from __future__ import annotations
 
+import fcntl
 import grp
 import json
 import os
@@ -160,6 +161,20 @@ def at_place(place: Path | str) -> Iterator[None]:
         raise
 
 
+def try_lock(file: IO[Any], *, shared: bool = False) -> bool | None:
+    """Lock a file until it is closed, for this process alone or `shared` with others of its kind.
+
+    Return False if another process has it. None: the file system has no locks.
+    """
+    try:
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
 @contextmanager
 def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
     """Write a file under a temporary name, then rename it to `path`; readers see no partial file.
@@ -174,12 +189,13 @@ def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
         with open(os.open(new, alone, mode), "wb") as file:
             yield file
         new.replace(path)
-    except BaseException as error:
-        with suppress(OSError):
-            new.unlink()
-        if isinstance(error, OSError) and error.filename in (None, str(new)):
+    except OSError as error:
+        if error.filename in (None, str(new)):
             error.filename = str(path)  # the user knows no temporary name
         raise
+    finally:
+        if new.exists():  # writing failed
+            new.unlink()
 
 
 def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -17,6 +16,7 @@ from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import Page
 from cloudrc.console.steering import LinkControl, Steering
 from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.files import try_lock
 from cloudrc.geometry.obstacles import has_surface, obstacles
 from cloudrc.teleop.client import Api
 
@@ -51,13 +51,9 @@ def serve(
     with ExitStack() as opened:
         sys.setswitchinterval(SWITCH_PERIOD)
         config = opened.enter_context(flight.config.open())
-        try:
-            fcntl.flock(config, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if try_lock(config) is False:
             text = "this run has a console already; open its page, or end it first"
-            raise BadInputError(text) from None
-        except OSError:  # a network file system may refuse the lock: then nothing is checked
-            pass
+            raise BadInputError(text)
         experiment = read_experiment(str(flight.config))
         known = obstacles(scene_of(experiment.world), touch=experiment.mission.touched)
         feed = FlightFeed(tuple(filter(has_surface, known)), known_hull(experiment.world.robot))

@@ -67,10 +67,9 @@ def _handle_keys(screen: curses.window, steering: Steering, api: Api) -> None:
 def _sent(screen: curses.window) -> Iterator[str | int]:
     """Yield what the terminal has sent, after at most 50 ms."""
     screen.timeout(50)
-    with suppress(curses.error):  # nothing more was sent
-        while True:
-            yield screen.get_wch()
-            screen.timeout(0)
+    while (key := screen.getch()) != -1:
+        yield chr(key) if key < 256 else key  # larger ones are those of curses, such as KEY_UP
+        screen.timeout(0)
 
 
 def obey(key: str | int, steering: Steering) -> str:

@@ -36,7 +36,7 @@ from cloudrc.errors import (
     InvalidRunError,
     TimedOutError,
 )
-from cloudrc.files import make_own_folder, who_may_write
+from cloudrc.files import make_own_folder, try_lock, who_may_write
 from cloudrc.link.follow import PROFILE
 from cloudrc.link.state import STATE_FILE
 from cloudrc.records import CONTROLLER_LOST, Fault, Record
@@ -149,13 +149,11 @@ def flight_files() -> dict[Path, FlightFile]:
     for path in folder.glob("*.json") if folder else ():
         with contextlib.suppress(FileNotFoundError), path.open() as file:  # it has just ended
             flight = json.load(file)
-            try:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except BlockingIOError:  # locked: the flight is under way
+            if try_lock(file, shared=True):  # the process of this flight was killed
+                path.unlink()
+            else:
                 about = FlightFile(flight["api"], flight["kind"], flight["pid"])
                 found[Path(flight["run"])] = about
-            else:  # not locked: the process of this flight was killed
-                path.unlink()
     return found
 
 

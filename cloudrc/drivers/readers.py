@@ -14,7 +14,6 @@ import os
 import select
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from pathlib import Path
 
 from cloudrc.drivers.process import from_line, to_line
@@ -99,8 +98,7 @@ class RecordReader:
         self._path.unlink(missing_ok=True)
 
     def _connect(self) -> None:
-        with suppress(OSError):  # cloud does not run
-            self._socket.connect(self._cloud)
+        self._socket.connect_ex(self._cloud)  # an error means that cloud does not run
 
     def _read(self, data: bytes) -> list[Record]:
         number, *lines = data.decode().split("\n")

@@ -233,7 +233,7 @@ class Recorder:
         except OSError as error:
             self._unwritten += 1
             self._end(error)
-        except Exception as error:  # one record that cannot be encoded must not stop the others
+        except ValueError as error:  # such as a text of a plug-in that is no Unicode
             self._unwritten += 1
             self._lose(record)
             kind = type(record).__name__

@@ -9,7 +9,6 @@ every wrong byte outside the index. A complete file has the number of its messag
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 from collections import Counter
@@ -24,7 +23,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer, Metadata
 from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 
-from cloudrc.files import atomic_file, open_file
+from cloudrc.files import atomic_file, open_file, try_lock
 from cloudrc.record import WALL_OFFSET, wall_time
 from cloudrc.record.content import Content
 from cloudrc.record.holes import HOLES, Hole, to_metadata
@@ -77,8 +76,7 @@ class McapWriter:
             target.open("wb", buffering=0) if isinstance(target, Path) else target
         )
         if self._owned:
-            with suppress(OSError):  # a file system without locks
-                fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            try_lock(self._stream)
         # Any, because mcap's writer is not annotated throughout.
         self._mcap: Any = Writer(
             self._stream,
@@ -234,11 +232,7 @@ def is_open(path: Path) -> bool:
     if not path.is_file():
         return False
     with open_file(path) as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
+        return try_lock(file, shared=True) is False
 
 
 def write(content: Content, target: Path, attachments: Mapping[str, bytes]) -> None:

@@ -7,17 +7,16 @@ on NFS, a process loses its lock when it closes any other handle of the file.
 
 from __future__ import annotations
 
-import fcntl
 import logging
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from cloudrc.errors import BadInputError
+from cloudrc.files import try_lock
 
 LOCK = ".lock"
 """File that each command locks; the names of further locks begin so."""
-ALONE, TOGETHER = fcntl.LOCK_EX | fcntl.LOCK_NB, fcntl.LOCK_SH | fcntl.LOCK_NB
 
 
 @contextmanager
@@ -26,20 +25,15 @@ def lock_folder(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[
 
     Raise a BadInputError if another command flies the same flights into the folder.
     """
-    names = {LOCK: TOGETHER if shard else ALONE}
-    if shard:
-        names["{}-{}-of-{}".format(LOCK, *shard)] = ALONE
+    names = [LOCK, *(["{}-{}-of-{}".format(LOCK, *shard)] if shard else [])]
     with ExitStack() as stack:
-        for name, how in names.items():
-            try:
-                fcntl.flock(stack.enter_context((folder / name).open("a+")), how)
-            except BlockingIOError:
+        for name in names:
+            file = stack.enter_context((folder / name).open("a+"))
+            is_held = try_lock(file, shared=bool(shard) and name == LOCK)
+            if is_held is False:
                 text = "another command flies into it now; wait for its end"
-                raise BadInputError(f"--out {folder}: {text}") from None
-            except OSError as error:
-                logging.getLogger("cloudrc").warning(
-                    "%s: its file system has no locks (%s); do not write into it twice at a time",
-                    folder,
-                    error.strerror,
-                )
+                raise BadInputError(f"--out {folder}: {text}")
+            if is_held is None:
+                text = "%s: its file system has no locks; do not write into it twice at a time"
+                logging.getLogger("cloudrc").warning(text, folder)
         yield

@@ -114,11 +114,10 @@ def _map_in_workers(
     except BrokenProcessPool as error:
         text = "a worker has died: it was killed, as where memory ran out, or a plug-in ended it"
         raise WorkerDiedError(f"{text}; use fewer processes") from error
-    except BaseException:  # Ctrl-C, or the caller has closed the generator
-        for worker in multiprocessing.active_children():
-            worker.kill()
-        raise
     finally:
+        # After Ctrl-C, or if the caller has closed the generator, nobody waits for what runs.
+        for worker in multiprocessing.active_children() if waiting else ():
+            worker.kill()
         pool.shutdown(cancel_futures=True)
 
 

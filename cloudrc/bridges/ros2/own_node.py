@@ -8,7 +8,7 @@ from typing import Any
 import rclpy
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from cloudrc.errors import MissingPrerequisiteError, to_one_line
+from cloudrc.bridges.ros2 import saying
 
 RELIABLE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 """QoS of what cloudrc publishes for a controller, which all subscriptions match."""
@@ -32,11 +32,8 @@ class OwnNode:
     def __init__(self, name: str, namespace: str = "") -> None:
         """Join ROS as the node `name` in `namespace`, such as "drone1"."""
         self.context = rclpy.Context()
-        try:
+        with saying("ROS 2 does not start here: WHY"):
             rclpy.init(args=[], context=self.context)
-        except Exception as error:
-            text = to_one_line(str(error).partition(", at ")[0])
-            raise MissingPrerequisiteError(f"ROS 2 does not start here: {text}") from None
         self.node = rclpy.create_node(
             name,
             context=self.context,

@@ -15,8 +15,9 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.type_support import check_for_type_support
 
+from cloudrc.bridges.ros2 import saying
 from cloudrc.bridges.ros2.own_node import LINGERS, OwnNode, clash, in_words, known, name_of
-from cloudrc.errors import BadInputError, MissingPrerequisiteError, to_one_line
+from cloudrc.errors import BadInputError
 from cloudrc.link.carry.engine import BATCH, Engine, LinkWay, Packet
 from cloudrc.link.library import KIND
 
@@ -56,10 +57,8 @@ class TopicRelay(OwnNode):
         self._waiting = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, self.context.handle)
 
     def _full(self, flag: str, name: str) -> str:
-        try:
+        with saying(f"{flag} {name}: no name of a topic", BadInputError):
             return str(self.node.resolve_topic_name(name))
-        except Exception:  # rclpy has an error for each kind of wrong name
-            raise BadInputError(f"{flag} {name}: no name of a topic") from None
 
     def wait_for_publisher(self, tell: Callable[[str], None]) -> None:
         """Wait until a node publishes the source; `tell` gets a word if that takes time.
@@ -101,15 +100,13 @@ class TopicRelay(OwnNode):
 
     def _load(self) -> Any:
         package, _, name = self.kind.partition("/msg/")
-        try:
+        with saying(
+            f"{self.source} has the type {self.kind}, which this ROS cannot load: WHY; "
+            f"source the workspace that has {package}"
+        ):
             kind = getattr(importlib.import_module(f"{package}.msg"), name)
             check_for_type_support(kind)
-        except Exception as error:
-            raise MissingPrerequisiteError(
-                f"{self.source} has the type {self.kind}, which this ROS cannot load: "
-                f"{to_one_line(str(error))}; source the workspace that has {package}"
-            ) from None
-        return kind
+            return kind
 
     def problems(self) -> list[str]:
         """Say which nodes do not take part, and which one publishes beside the relay."""
