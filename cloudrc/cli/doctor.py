@@ -29,8 +29,9 @@ because the cluster may be on other machines."""
 MAKE_CLUSTER = "kind create cluster --config kind-config.yaml"
 WORKS = "MuJoCo loads and steps"
 MUJOCO_PROGRAM = (
-    "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
-    f"mujoco.mj_step(m, mujoco.MjData(m)); print('{WORKS}', flush=True)"
+    "from cloudrc.sim.engine import at_rest, mujoco; "
+    "m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
+    f"mujoco.mj_step(m, at_rest(m)); print('{WORKS}', flush=True)"
 )
 STEPS_PROGRAM = (
     "from cloudrc.config.schema import World; from cloudrc.robots.build import describe_steps; "

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.sim.engine import mujoco
+from cloudrc.sim.engine import TRANSMISSION, at_rest, mujoco
 from cloudrc.sim.plant import Array, Inertia
 
 _DYN = mujoco.mjtDyn
@@ -61,8 +61,7 @@ def read_airframe(model: Any, *, steers_yaw: bool = True) -> Airframe:
         _check_actuator(model, number, name)
     low, high = np.array([_limits(model, number) for number in range(model.nu)]).T
 
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+    data = at_rest(model)
     mass, centre, inertia = _inertia(model, data)
     weight = data.qfrc_bias - data.qfrc_passive
     if weight[2] <= 0.0:
@@ -89,9 +88,8 @@ def thrust_to_weight(model: Any) -> float | None:
     The model is a compiled `MjModel`. Return None for a robot that no actuator at a site lifts,
     because its forces are not in the model.
     """
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    at_site = model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE
+    data = at_rest(model)
+    at_site = model.actuator_trntype == TRANSMISSION.mjTRN_SITE
     lift = np.where(at_site, _pushes(model, data)[0][:, 2], 0.0)
     weight = -model.body_subtreemass[model.jnt_bodyid[0]] * model.opt.gravity[2]
     if not lift.any() or weight <= 0.0:
@@ -154,8 +152,7 @@ def read_thrusters(model: Any) -> tuple[Array, Array]:
 
     Both are in the frame of the base.
     """
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+    data = at_rest(model)
     sites, base = model.actuator_trnid[:, 0], model.jnt_bodyid[0]
     places = (data.site_xpos[sites] - data.xpos[base]) @ _axes(model, data)
     return places, _pushes(model, data)[0]
@@ -171,7 +168,7 @@ def _check_actuator(model: Any, number: int, name: str) -> None:
     """Raise an error if an actuator does not push at a site by gain times control."""
     site, reference = model.actuator_trnid[number]
     pushes = (
-        model.actuator_trntype[number] == mujoco.mjtTrn.mjTRN_SITE
+        model.actuator_trntype[number] == TRANSMISSION.mjTRN_SITE
         and reference < 0
         and model.body_rootid[model.site_bodyid[site]] == model.jnt_bodyid[0]
         and model.actuator_gaintype[number] == mujoco.mjtGain.mjGAIN_FIXED

@@ -13,16 +13,15 @@ from cloudrc.geometry.fence import SPACE, Fence
 from cloudrc.geometry.scene import FLOOR, WORLD, Scene
 from cloudrc.geometry.solids import Array, Shape, Solid
 from cloudrc.outside.values import InvalidValueError
-from cloudrc.sim.engine import compile_alone, compile_error, mujoco
+from cloudrc.sim.engine import GEOM, at_rest, compile_alone, compile_error, mujoco
 
-_GEOM = mujoco.mjtGeom
 _SHAPES: dict[Any, Shape] = {
-    _GEOM.mjGEOM_BOX: "box",
-    _GEOM.mjGEOM_SPHERE: "sphere",
-    _GEOM.mjGEOM_CAPSULE: "capsule",
-    _GEOM.mjGEOM_CYLINDER: "cylinder",
-    _GEOM.mjGEOM_PLANE: "plane",
-    _GEOM.mjGEOM_MESH: "hull",
+    GEOM.mjGEOM_BOX: "box",
+    GEOM.mjGEOM_SPHERE: "sphere",
+    GEOM.mjGEOM_CAPSULE: "capsule",
+    GEOM.mjGEOM_CYLINDER: "cylinder",
+    GEOM.mjGEOM_PLANE: "plane",
+    GEOM.mjGEOM_MESH: "hull",
 }
 """Type of a geom -> shape of its solid; all other types become an outline."""
 ROBOT_BITS = 1
@@ -87,8 +86,7 @@ def complete(scene: Scene) -> Scene:
         model = spec.compile()
     except (ValueError, KeyError) as error:
         raise compile_error(path, error) from None
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
+    data = at_rest(model)
     names = [model.geom(geom).name.rpartition("/")[0] for geom in range(model.ngeom)]
     touchable = ((model.geom_contype | model.geom_conaffinity) & ROBOT_BITS) > 0
     solids = tuple(
@@ -110,7 +108,7 @@ def complete(scene: Scene) -> Scene:
 def _fence_around(model: Any, data: Any, spawn: Array, touchable: Any) -> Fence:
     """Return the fence around the point `spawn` [m] and the `touchable` geoms that have an end."""
     corners = [spawn]
-    for geom in np.flatnonzero(touchable & (model.geom_type != _GEOM.mjGEOM_PLANE)):
+    for geom in np.flatnonzero(touchable & (model.geom_type != GEOM.mjGEOM_PLANE)):
         axes, box = data.geom_xmat[geom].reshape(3, 3), model.geom_aabb[geom]
         centre, half = data.geom_xpos[geom] + axes @ box[:3], np.abs(axes) @ box[3:]
         corners += [centre - half, centre + half]
@@ -122,7 +120,7 @@ def _fence_around(model: Any, data: Any, spawn: Array, touchable: Any) -> Fence:
 
 
 def _solid(model: Any, data: Any, geom: int, name: str) -> Solid:
-    shape = _SHAPES.get(_GEOM(model.geom_type[geom]), "outline")
+    shape = _SHAPES.get(GEOM(model.geom_type[geom]), "outline")
     centre, axes = data.geom_xpos[geom].copy(), data.geom_xmat[geom].reshape(3, 3).copy()
     size, faces = model.geom_size[geom].copy(), None
     if shape == "hull":
@@ -159,9 +157,7 @@ def reach_of(robot: Path) -> float:
     model = compile_alone(robot)
     if not model.njnt:  # no robot, as `sim.scene` says
         return 0.0
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    body = model.jnt_bodyid[0]
+    data, body = at_rest(model), model.jnt_bodyid[0]
     geoms = np.flatnonzero(model.body_rootid[model.geom_bodyid] == model.body_rootid[body])
     base = data.xpos[body]
     return max((_reach(model, data, geom, base) for geom in geoms.tolist()), default=0.0)
@@ -169,18 +165,18 @@ def reach_of(robot: Path) -> float:
 
 def _reach(model: Any, data: Any, geom: int, base: Array) -> float:
     """Return the largest distance of a geom's points from the point `base` [m]."""
-    kind, size = _GEOM(model.geom_type[geom]), model.geom_size[geom]
+    kind, size = GEOM(model.geom_type[geom]), model.geom_size[geom]
     centre, axes = data.geom_xpos[geom] - base, data.geom_xmat[geom].reshape(3, 3)
     points, round_off = np.zeros((1, 3)), model.geom_rbound[geom]
-    if kind == _GEOM.mjGEOM_CYLINDER:
+    if kind == GEOM.mjGEOM_CYLINDER:
         along = axes[:, 2] @ centre
         across = np.linalg.norm(centre - along * axes[:, 2])
         return float(np.hypot(abs(along) + size[1], across + size[0]))
-    if kind == _GEOM.mjGEOM_CAPSULE:
+    if kind == GEOM.mjGEOM_CAPSULE:
         points, round_off = np.outer((-size[1], size[1]), (0.0, 0.0, 1.0)), size[0]
-    elif kind == _GEOM.mjGEOM_BOX:
+    elif kind == GEOM.mjGEOM_BOX:
         points, round_off = np.stack(np.meshgrid(*[(-1, 1)] * 3), -1).reshape(-1, 3) * size, 0.0
-    elif kind == _GEOM.mjGEOM_MESH:
+    elif kind == GEOM.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]
         first, number = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
         points, round_off = model.mesh_vert[first : first + number], 0.0

@@ -41,6 +41,17 @@ mujoco = import_mujoco()
 mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
 
 
+GEOM, JOINT, TRANSMISSION = mujoco.mjtGeom, mujoco.mjtJoint, mujoco.mjtTrn
+"""Numbers of the types of geoms, of joints, and of what an actuator acts on."""
+
+
+def at_rest(model: Any) -> Any:
+    """Return the `MjData` of a compiled `MjModel` whose joints are at rest."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return data
+
+
 def compile_error(what: object, error: Exception) -> Exception:
     """Return the error to raise if MuJoCo cannot compile `what` because of `error`.
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.sim.engine import mujoco
+from cloudrc.sim.engine import GEOM, mujoco
 from cloudrc.sim.scene import is_of_robot
 
 MARGIN = 1e-3
@@ -66,9 +66,9 @@ def boxes_around(model: Any, data: Any) -> tuple[Any, float]:
         margin = MARGIN + max(margin, option.o_margin)
         if own[geom]:
             radius = max(radius, dist(place, data.qpos[:3]) + bound + margin)
-        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+        elif model.geom_type[geom] == GEOM.mjGEOM_BOX:
             rows.append([*place, *axes, *size, margin])
-        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
+        elif model.geom_type[geom] == GEOM.mjGEOM_PLANE:
             normal = axes.reshape(3, 3)[:, 2]
             rows.append([*(place - HUGE * normal), *axes, HUGE, HUGE, HUGE, margin])
         else:

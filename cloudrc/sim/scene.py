@@ -16,7 +16,7 @@ import numpy as np
 from cloudrc.geometry.scene import FLOOR, WORLD
 from cloudrc.outside.values import InvalidValueError
 from cloudrc.sim.bodies import ROBOT_BITS, read_scene
-from cloudrc.sim.engine import compile_alone, compile_error, mujoco
+from cloudrc.sim.engine import JOINT, at_rest, compile_alone, compile_error, mujoco
 from cloudrc.sim.plant import Array, Inertia, point_inertia, true_inertia
 from cloudrc.text import unknown_name_text
 
@@ -110,13 +110,10 @@ def _compile(robot_path: Path, scene_path: Path, inertia: Inertia | None = None)
 
 def _put_on_floor(model: Any) -> None:
     """Raise the start of a robot that reaches further down than the spawn is above the floor."""
-    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+    if model.njnt == 0 or model.jnt_type[0] != JOINT.mjJNT_FREE:
         return
-    robot, data = is_of_robot(model), mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_collision(model, data)
-    depth = 0.0
-    for contact in data.contact:
+    robot, depth = is_of_robot(model), 0.0
+    for contact in at_rest(model).contact:
         first, second = contact.geom.tolist()
         other = second if robot[first] else first
         if robot[first] != robot[second] and model.geom(other).name.startswith(f"{FLOOR}/"):
@@ -181,14 +178,12 @@ def find_sensors(model: Any, asked: Mapping[str, SensorConfig]) -> tuple[OwnSens
 
 def _base(spec: Any) -> Any:
     """Return the body with the free joint."""
-    free = mujoco.mjtJoint.mjJNT_FREE
-    return next(joint.parent for joint in spec.joints if joint.type == free)
+    return next(joint.parent for joint in spec.joints if joint.type == JOINT.mjJNT_FREE)
 
 
 def _inertia(model: Any) -> Inertia:
     """Return the inertia of the base and of what is fixed to it."""
-    data, base = mujoco.MjData(model), model.jnt_bodyid[0]
-    mujoco.mj_forward(model, data)
+    data, base = at_rest(model), model.jnt_bodyid[0]
     frame, bodies = data.xmat[base].reshape(3, 3), np.flatnonzero(model.body_weldid == base)
     masses, places = model.body_mass[bodies], (data.xipos[bodies] - data.xpos[base]) @ frame
     centre, inertia = masses @ places / masses.sum(), np.zeros((3, 3))
@@ -219,8 +214,7 @@ def _set_inertia(base: Any, mass: float, centre: Array, inertia: Array) -> None:
 
 
 def _check_parts(model: Any, robot_path: Path, scene_path: Path) -> None:
-    base = mujoco.mjtJoint.mjJNT_FREE
-    joints = model.jnt_type.tolist()
+    base, joints = JOINT.mjJNT_FREE, model.jnt_type.tolist()
     where = f"{robot_path} in {scene_path}"
     if joints[:1] != [base] or joints.count(base) != 1:
         raise InvalidValueError(

@@ -11,10 +11,9 @@ import numpy as np
 from cloudrc.geometry import shapes
 from cloudrc.geometry.scene import FLOOR
 from cloudrc.geometry.shapes import Rgba, Shapes, Surface
-from cloudrc.sim.engine import mujoco
+from cloudrc.sim.engine import GEOM, at_rest
 from cloudrc.sim.scene import bodies_of_geoms
 
-_GEOM = mujoco.mjtGeom
 SHOWN = 3
 """Number of the first group of geoms that MuJoCo's viewers do not show: usually, geoms of groups
 below show a robot, and those of this group are its coarser shape for contacts."""
@@ -30,9 +29,7 @@ def shapes_of(model: Any, *, planar: bool) -> Shapes:
     Joints are at rest. Planes of the body `floor` are left out, because viewers draw the floor as a
     grid. `planar` tells whether the robot stays on the ground.
     """
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    base = model.jnt_bodyid[0]
+    data, base = at_rest(model), model.jnt_bodyid[0]
     places, turns = data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3)
     position, axes = data.xpos[base], data.xmat[base].reshape(3, 3)
     bodies = bodies_of_geoms(model)
@@ -40,7 +37,7 @@ def shapes_of(model: Any, *, planar: bool) -> Shapes:
     for geom in _shown(model, bodies):
         body = bodies[geom]
         surface = _surface(model, geom)
-        is_ground = body == FLOOR and model.geom_type[geom] == _GEOM.mjGEOM_PLANE
+        is_ground = body == FLOOR and model.geom_type[geom] == GEOM.mjGEOM_PLANE
         if is_ground or surface is None:
             continue
         surface = replace(surface, body=body, rgba=_rgba(model, geom))
@@ -77,21 +74,21 @@ def _rgba(model: Any, geom: int) -> Rgba:
 
 def _surface(model: Any, geom: int) -> Surface | None:
     """Return the surface of a geom in its own frame; None for a type without one."""
-    kind, number = _GEOM(model.geom_type[geom]), model.geom_dataid[geom]
+    kind, number = GEOM(model.geom_type[geom]), model.geom_dataid[geom]
     if kind in _SURFACES:
         return _SURFACES[kind](model.geom_size[geom].tolist())
-    if kind == _GEOM.mjGEOM_HFIELD:
+    if kind == GEOM.mjGEOM_HFIELD:
         return _terrain(model, number)
     return _mesh(model, number) if number >= 0 else None  # also of a signed distance field
 
 
 _SURFACES: dict[Any, Callable[[list[float]], Surface]] = {
-    _GEOM.mjGEOM_BOX: shapes.box,
-    _GEOM.mjGEOM_CYLINDER: lambda size: shapes.cylinder(*size[:2]),
-    _GEOM.mjGEOM_CAPSULE: lambda size: shapes.globe(size[:1] * 3, size[1]),
-    _GEOM.mjGEOM_SPHERE: lambda size: shapes.globe(size[:1] * 3),
-    _GEOM.mjGEOM_ELLIPSOID: shapes.globe,
-    _GEOM.mjGEOM_PLANE: lambda size: shapes.sheet(*(each or WIDE for each in size[:2])),
+    GEOM.mjGEOM_BOX: shapes.box,
+    GEOM.mjGEOM_CYLINDER: lambda size: shapes.cylinder(*size[:2]),
+    GEOM.mjGEOM_CAPSULE: lambda size: shapes.globe(size[:1] * 3, size[1]),
+    GEOM.mjGEOM_SPHERE: lambda size: shapes.globe(size[:1] * 3),
+    GEOM.mjGEOM_ELLIPSOID: shapes.globe,
+    GEOM.mjGEOM_PLANE: lambda size: shapes.sheet(*(each or WIDE for each in size[:2])),
 }
 
 

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cloudrc.sim.engine import mujoco
+from cloudrc.sim.engine import GEOM, JOINT, TRANSMISSION, at_rest
 from cloudrc.sim.scene import ROBOT_PREFIX
 
 LEVEL = 0.05
 """Largest sine of the angle between a wheel's axis and the base's y axis."""
 ROUND = tuple(
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{shape}")) for shape in ("CYLINDER", "SPHERE", "ELLIPSOID")
+    int(getattr(GEOM, f"mjGEOM_{shape}")) for shape in ("CYLINDER", "SPHERE", "ELLIPSOID")
 )
 """Shapes whose first size is the radius of a wheel."""
 
@@ -34,12 +34,11 @@ def read_wheels(model: Any, radius: float | None) -> list[Wheel]:
     Raises:
         ValueError: If the model has no such wheels.
     """
-    data, base = mujoco.MjData(model), model.jnt_bodyid[0]
-    mujoco.mj_forward(model, data)
+    data, base = at_rest(model), model.jnt_bodyid[0]
     frame = data.xmat[base].reshape(3, 3)
     wheels = []
     for number in range(model.nu):
-        turns = model.actuator_trntype[number] == mujoco.mjtTrn.mjTRN_JOINT
+        turns = model.actuator_trntype[number] == TRANSMISSION.mjTRN_JOINT
         joint = int(model.actuator_trnid[number, 0]) if turns else 0  # joint 0 is no hinge
         size = radius or _radius(model, joint)
         if wrong := _what_is_wrong(model, number, joint, data.xaxis[joint] @ frame, size):
@@ -59,7 +58,7 @@ def read_wheels(model: Any, radius: float | None) -> list[Wheel]:
 def _what_is_wrong(model: Any, number: int, joint: int, axis: Any, radius: float) -> str:
     """Return why an actuator is no servo of a wheel with this joint, axis [1] and radius [m]."""
     gain, bias = model.actuator_gainprm[number, 0], model.actuator_biasprm[number]
-    if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
+    if model.jnt_type[joint] != JOINT.mjJNT_HINGE:
         return "it must turn the hinge of a wheel"
     if not gain > 0.0 or bias[2] != -gain or bias[:2].any() or not model.actuator_gear[number, 0]:
         return "it must be a velocity servo, in MJCF: <velocity kv=...>"
