@@ -15,6 +15,7 @@ from typing import Any, TypeAlias, get_args
 from cloudrc.exposition import table
 from cloudrc.exposition.parts import Histogram, Readings, samples
 from cloudrc.exposition.table import LiveMetric, MetricKind, of_role
+from cloudrc.link.verify.judge import verdict_of
 from cloudrc.messages import NEVER_NS, Cause, GuardState
 from cloudrc.metrics.definitions import (
     QUANTITIES,
@@ -86,26 +87,24 @@ class End:
         """Whether a session began or a new datagram of the peer arrived in the last 2 s."""
         return self._opened_ns != NEVER_NS and self._woke_ns - self._arrival_ns < SILENCE_NS
 
-    @property
-    def link_verdict(self) -> str:
-        """Verdict on the incoming link: "ok", "off" (not as in its profile), "open" (undecided)."""
-        verdicts = {record.verdict for record in self._checked} - {"told"}
-        return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"
-
     def link_text(self) -> str:
         """Return the content of /link.json: the verdict on the link, and a row per quantity."""
         rows = [record._asdict() for record in self._checked]
         for row in rows:  # fields that are equal in all rows
             del row["stamp_ns"], row["uplink"]
         known = [{key: value for key, value in row.items() if value == value} for row in rows]
-        document = {"direction": self._incoming, "verdict": self.link_verdict, "rows": known}
+        document = {
+            "direction": self._incoming,
+            "verdict": verdict_of(self._checked),
+            "rows": known,
+        }
         return json.dumps(document, indent=2) + "\n"
 
     def _on_linkchecked(self, record: LinkChecked) -> None:
         """Store the verdict on one quantity, and drop verdicts of earlier checks."""
         newest = [one for one in self._checked if one.stamp_ns == record.stamp_ns]
         self._checked = (*newest, record)  # a new tuple: another thread may read the old one
-        believed = {"ok": 1.0, "off": 0.0}.get(self.link_verdict, nan)
+        believed = {"ok": 1.0, "off": 0.0}.get(verdict_of(self._checked), nan)
         self._values["cloudrc_link_believed"] = {self._incoming: believed}
 
     def _observe(self, name: str, seconds: float) -> None:

@@ -23,7 +23,6 @@ from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
 from cloudrc.drivers.readers import RecordSender
 from cloudrc.drivers.realtime import Address, Peer, bind
 from cloudrc.drivers.teleop import RemoteTeleop, UnixDatagrams, UnixPeer
-from cloudrc.errors import BadInputError
 from cloudrc.files import warn_if_readable
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import SIZE_MAX, link_profile
@@ -130,8 +129,7 @@ def run_remote(config: Path, folder: Path, stop: StopSignal, *, watched: bool) -
 
     feed = Feed.on_stdout(watched=watched)
     controller = assembly.build_controller(load_experiment(str(config)))
-    if not isinstance(controller, OutsideController):
-        raise BadInputError(f"{config}: cloud.controller is neither remote nor ros2")
+    assert isinstance(controller, OutsideController), "the supervisor starts it for no other"
     other, own = sockets_of(folder)
     with closing(UnixDatagrams(own, other, DATAGRAM_MAX)) as peer:
         if isinstance(controller, RosController):

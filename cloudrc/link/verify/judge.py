@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import isnan, nan, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -323,7 +323,10 @@ def look_twice(first: Sequence[Judgement], second: Sequence[Judgement]) -> list[
     return [again.get(row.name, row) if row.verdict == "off" else row for row in first]
 
 
-def verdict_of(rows: Iterable[Judgement]) -> str:
-    """Return "off" if any row is "off", "ok" if all judged rows are "ok", otherwise "open"."""
+def verdict_of(rows: Iterable[Any]) -> str:
+    """Return "off" if a row is "off", "ok" if all judged ones are "ok", else "open".
+
+    Rows are those of a measurement, or records `LinkChecked` of one.
+    """
     verdicts = {row.verdict for row in rows} - {"told"}
     return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"
