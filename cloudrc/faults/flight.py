@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint
@@ -31,7 +32,7 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
-from cloudrc.records import CommandApplied, Counted, GroundTruth, GuardChange, MissionEvent, Record
+from cloudrc.records import Counted, GuardChange, MissionEvent, Record
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import MissionRecord, Order
 from cloudrc.tunnel.end import Identity
@@ -39,6 +40,7 @@ from cloudrc.tunnel.keys import KeyRing, KeySet
 from cloudrc.world.endpoint import WorldEndpoint
 from cloudrc.world.robot import Robot
 
+_Kind = TypeVar("_Kind")
 SHARED, OTHER = b"one clock for all".ljust(16)[:16], b"another clock..."
 
 
@@ -129,11 +131,6 @@ class FaultRun:
         plan = assembly.build_plan(self.experiment)
         return Order(plan, touch=self.experiment.mission.touch)
 
-    def order_if_possible(self, now_ns: int) -> None:
-        """Order the experiment's mission; teleop may not take the order. `now_ns` is not used."""
-        order = self.make_order()
-        self.teleop.ask(lambda service, now_ns: service.create(order, now_ns))
-
     def fly(self, until: float, is_over: Callable[[], bool] = lambda: False) -> FaultRun:
         """Fly on until the virtual time `until` [s], or until `is_over()` is True; return self."""
         self.run.fly(is_over, round(until * 1e9), self._sink)
@@ -143,12 +140,6 @@ class FaultRun:
         """Fly until the mission's end or the virtual time `limit` [s], then fly 1 s more."""
         self.fly(limit, lambda: self.teleop.service is not None and self.mission.ended)
         return self.fly(self.now + 1.0)
-
-    def restart_pod(self, now_ns: int, down: float) -> None:
-        """Kill cloud and teleop at `now_ns` [ns]; start new processes after `down` [s]."""
-        self.teleop.kill(now_ns)
-        self.cloud.restart(now_ns, down)
-        self.cloud.at(now_ns * 1e-9 + down, self.teleop.start)
 
     def replace_key(self, end: str, keys: KeySet) -> None:
         """Replace the keys of `end` (world or cloud), in its key file and its running process."""
@@ -163,22 +154,17 @@ class FaultRun:
         """Return the hash of all records so far; the flight must have been made with `keep`."""
         return Recording.from_records(self.of_world, self.of_cloud).sha256
 
-    def trajectory(self) -> list[GroundTruth]:
-        """Return the records of the ground truth, one every 10 ms."""
-        return [record for record in self.of_world if isinstance(record, GroundTruth)]
-
-    def applied(self) -> list[CommandApplied]:
-        """Return the records of the commands that world has applied."""
-        return [record for record in self.of_world if isinstance(record, CommandApplied)]
+    def of(self, kind: type[_Kind]) -> list[_Kind]:
+        """Return world's records of a class."""
+        return [record for record in self.of_world if isinstance(record, kind)]
 
     def count(self, name: str) -> int:
         """Return the last value of world's counter `name` [1]; 0 if it was never recorded."""
-        counted = [r.total for r in self.of_world if isinstance(r, Counted) and r.name == name]
-        return counted[-1] if counted else 0
+        return next((one.total for one in reversed(self.of(Counted)) if one.name == name), 0)
 
-    def events(self, *names: str) -> list[MissionEvent]:
-        """Return the mission events with one of these names."""
-        return [event for event in self.teleop.events if event.event in names]
+    def events(self, name: str) -> list[MissionEvent]:
+        """Return the mission events with this name."""
+        return [event for event in self.teleop.events if event.event == name]
 
     def guard_now(self) -> tuple[GuardState, str]:
         """Return the guard's present state and its cause; GROUND while world is not running.

@@ -93,6 +93,12 @@ def inject(flight: FaultRun) -> None:
             process.tamper = _tamper(mine, rng)
 
 
+def order(flight: FaultRun, now_ns: int = 0) -> None:
+    """Order the experiment's mission; teleop may not take the order. `now_ns` is not used."""
+    mission = flight.make_order()
+    flight.teleop.ask(lambda service, now_ns: service.create(mission, now_ns))
+
+
 def _actions(
     flight: FaultRun, process: RestartableEndpoint, event: FaultEvent
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
@@ -110,20 +116,25 @@ def _actions(
     def read(end: str, keys: KeySet | None = None) -> Action:
         return lambda now_ns: flight.replace_key(end, keys or flight.secrets["world"])
 
+    def restart_pod(now_ns: int, down: float) -> None:
+        teleop.kill(now_ns)
+        flight.cloud.restart(now_ns, down)
+        flight.cloud.at(now_ns * 1e-9 + down, teleop.start)
+
     restart, freeze = partial(process.restart, down=lasts), partial(process.freeze, duration=lasts)
     pause = ask(MissionService.pause)
     return {
         **dict.fromkeys(("cloud_killed", "world_killed"), ((at, restart),)),
         **dict.fromkeys(("cloud_paused", "world_paused"), ((at, freeze),)),
-        "pod_killed": ((at, partial(flight.restart_pod, down=lasts)),),
-        "pod_shut_down": ((at, pause), (gone, partial(flight.restart_pod, down=end - gone))),
+        "pod_killed": ((at, partial(restart_pod, down=lasts)),),
+        "pod_shut_down": ((at, pause), (gone, partial(restart_pod, down=end - gone))),
         "teleop_killed": ((at, teleop.kill), (end, teleop.start)),
         "teleop_shut_down": ((at, pause), (gone, teleop.kill), (end, teleop.start)),
         "teleop_paused": ((at, partial(teleop.freeze, duration=lasts)),),
         "second_cloud": ((end, lambda now_ns: flight.end_rival()),),
         "key_rotated": ((at, read("world", NEXT_KEY)), (end, read("cloud", NEXT_KEY))),
         "key_wrong": ((at, read("cloud", WRONG_KEY)), (end, read("cloud"))),
-        "second_order": ((at, flight.order_if_possible),),
+        "second_order": ((at, partial(order, flight)),),
         "stopped": ((at, teleop.switch_off),),
         "held": ((at, ask(MissionService.hold)), (end, ask(MissionService.resume))),
     }

@@ -16,7 +16,14 @@ from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.schedule import Schedule, generator
 from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
-from cloudrc.records import Fault, GuardChange, Record, SessionOpened
+from cloudrc.records import (
+    CommandApplied,
+    Fault,
+    GroundTruth,
+    GuardChange,
+    Record,
+    SessionOpened,
+)
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 from cloudrc.text import Paint, escape, plain
@@ -219,7 +226,7 @@ def held(flight: FaultRun) -> list[GuardChange]:
 
 def basis_age_at_hold(flight: FaultRun) -> float:
     """Return the largest age that the commands' newest odometry had when a HOLD began [s]."""
-    applied, ages = flight.applied(), []
+    applied, ages = flight.of(CommandApplied), []
     for change in held(flight):
         before = [each.basis_stamp_ns for each in applied if each.stamp_ns <= change.stamp_ns]
         ages += [(change.stamp_ns - max(before)) * 1e-9] if before else []
@@ -262,14 +269,14 @@ def calm_after(flight: FaultRun, start: float, end: float) -> float:
 
     Return 0 if the robot did not move.
     """
-    path = [(r.stamp_ns * 1e-9, hypot(*r.odometry.velocity)) for r in flight.trajectory()]
+    path = [(r.stamp_ns * 1e-9, hypot(*r.odometry.velocity)) for r in flight.of(GroundTruth)]
     fast = [time for time, speed in path if start <= time < end and speed >= STANDS]
     return fast[-1] + SAMPLE - start if fast else 0.0
 
 
 def drift(flight: FaultRun, start: float, end: float) -> float:
     """Return the robot's largest distance [m] from its position at `start` [s], until `end` [s]."""
-    path = [r.odometry for r in flight.trajectory() if start <= r.stamp_ns * 1e-9 <= end]
+    path = [r.odometry for r in flight.of(GroundTruth) if start <= r.stamp_ns * 1e-9 <= end]
     return max((dist(path[0].position, each.position) for each in path), default=nan)
 
 
@@ -285,5 +292,5 @@ def number(flight: FaultRun, name: str) -> float:
 
 def epochs(flight: FaultRun) -> list[int]:
     """Return the epochs of the sessions that world began, in order."""
-    opened = [r for r in flight.of_world if isinstance(r, SessionOpened)]
+    opened = flight.of(SessionOpened)
     return [record.epoch for record in opened if record.end == "world"]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from cloudrc.errors import describe_error
 from cloudrc.faults.flight import FaultRun
+from cloudrc.faults.inject import order
 from cloudrc.faults.measures import events_of_missions, held
 from cloudrc.faults.schedule import Schedule
 from cloudrc.faults.watch import LATCHED, Breach
@@ -157,7 +158,7 @@ class TrialOperator:
         if seen["guard"] in [each.name for each in LATCHED]:
             flight.teleop.ask(MissionService.acknowledge)
         elif is_over:
-            flight.order_if_possible(now_ns)
+            order(flight)
 
 
 def _check_waypoints(flight: FaultRun) -> None:

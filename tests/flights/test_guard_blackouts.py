@@ -10,6 +10,7 @@ from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.schedule import FaultEvent, Schedule
 from cloudrc.geometry.clearance import inside_tube
 from cloudrc.geometry.scene import load_scene
+from cloudrc.records import GroundTruth
 from tests.conftest import nightly
 
 COUNT = 200
@@ -29,7 +30,7 @@ def undisturbed(*settings):
 def mid_pipe(*settings):
     """200 instants [s], evenly over the time in which the undisturbed robot is in a pipe."""
     flight = undisturbed(*settings)
-    path = flight.trajectory()
+    path = flight.of(GroundTruth)
     places = np.array([record.odometry.position for record in path])
     pipes = inside_tube(load_scene("pipes"), places)
     ended = flight.events("done")[0].stamp_ns * 1e-9 - 0.1

@@ -30,7 +30,7 @@ from cloudrc.faults.schedule import FaultEvent, Way, generator
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.geometry.scene import Tube
 from cloudrc.messages import Command, GuardState, Vector
-from cloudrc.records import Control, Fault
+from cloudrc.records import CommandApplied, Control, Fault, GroundTruth
 from cloudrc.tunnel.handshake import BUSY_TEXT
 
 IMPOSSIBLE: dict[str, dict[str, Any]] = {
@@ -55,7 +55,7 @@ def _cloud_killed(outcome: Outcome) -> None:
     at, down = outcome.instant(), 0.8
     flight = outcome.fly(events=(FaultEvent("cloud_killed", at, down),))
     outcome.held_in_time(flight)
-    commands = [r.stamp_ns * 1e-9 - at for r in flight.applied()]
+    commands = [r.stamp_ns * 1e-9 - at for r in flight.of(CommandApplied)]
     again = min((t for t in commands if t > down), default=nan)
     outcome.most("the new process commands after", again, 2.0, "s")
     outcome.most("TRACK again after its start", resumed_after(flight, at + down), 1.0, "s")
@@ -72,7 +72,7 @@ def _cloud_paused(outcome: Outcome) -> None:
     paused = FaultEvent("cloud_paused", outcome.instant(), 5.0)
     flight = outcome.fly(events=(paused,))
     outcome.held_in_time(flight)
-    old = [r for r in flight.applied() if r.stamp_ns - r.basis_stamp_ns > AGE_MAX * 1e9]
+    old = [r for r in flight.of(CommandApplied) if r.stamp_ns - r.basis_stamp_ns > AGE_MAX * 1e9]
     outcome.same("commands applied that were too old", len(old), 0)
 
 
@@ -90,7 +90,7 @@ def _world_restarted(outcome: Outcome) -> None:
     outcome.safe(flight)
     after = [c for c in flight.changes if c.stamp_ns * 1e-9 > at]
     outcome.same("changes of the guard after the restart", len(after), 0)
-    path = [r for r in flight.trajectory() if r.stamp_ns * 1e-9 > at]
+    path = [r for r in flight.of(GroundTruth) if r.stamp_ns * 1e-9 > at]
     moved = max((hypot(*r.odometry.velocity) for r in path), default=nan)
     outcome.most("speed on the ground", moved, 0.01, "m/s")
     raised = drift(flight, at, flight.now)

@@ -10,6 +10,7 @@ from cloudrc.faults.inject import flipped
 from cloudrc.faults.measures import Outcome, epochs, scenario, told
 from cloudrc.faults.models import Tamper
 from cloudrc.faults.schedule import FaultEvent, Schedule, generator
+from cloudrc.records import GroundTruth
 from cloudrc.tunnel import codec
 
 FLOOD = 100  # datagrams of garbage per honest one: 10,000 in a second
@@ -32,7 +33,7 @@ def _check_no_effect(outcome: Outcome, flight: FaultRun, *reasons: str) -> None:
     """
     clean = outcome.prepare().fly_mission()
     outcome.fly_safely(flight)
-    outcome.true("the same path, bit by bit", clean.trajectory() == flight.trajectory())
+    outcome.true("the same path, bit by bit", clean.of(GroundTruth) == flight.of(GroundTruth))
     outcome.rejected(flight, *reasons)
     outcome.least("hostile datagrams", sum(map(flight.count, reasons)), 1000)
     outcome.true("hostile datagrams opened no session", epochs(clean) == epochs(flight))

@@ -18,7 +18,7 @@ from cloudrc.faults.measures import (
 )
 from cloudrc.faults.schedule import WAYS, FaultEvent
 from cloudrc.messages import Cause, GuardState
-from cloudrc.records import Arrival, Control
+from cloudrc.records import Arrival, Control, GroundTruth
 
 HOUR = 3600.0  # [s]
 STEADY = "link.both.jitter_ms=0"
@@ -76,7 +76,7 @@ def _silence(outcome: Outcome) -> None:
 def _long_silence(outcome: Outcome) -> None:
     """Interrupt the link for 75 s in two flights: above the free floor, and among obstacles."""
     flight = _landed(outcome, outcome.instant(1.6, 2.6), "over the floor")
-    first, last = (flight.trajectory()[n].odometry.position for n in (0, -1))
+    first, last = (flight.of(GroundTruth)[n].odometry.position for n in (0, -1))
     outcome.most("over the floor: base above where it took off", abs(last[2] - first[2]), 0.02, "m")
     _landed(outcome, outcome.instant(8.0), "amid obstacles")
 
@@ -95,7 +95,7 @@ def _landed(outcome: Outcome, at: float, where: str) -> FaultRun:
     outcome.most(
         f"{where}: deviation of LAND from 60 s after HOLD", abs(landed - began - 60.0), 0.01, "s"
     )
-    fallen = [-r.odometry.velocity[2] for r in flight.trajectory() if r.stamp_ns >= landed * 1e9]
+    fallen = [-r.odometry.velocity[2] for r in flight.of(GroundTruth) if r.stamp_ns >= landed * 1e9]
     fastest = max(fallen, default=nan)
     outcome.most(f"{where}: deviation of the descent from 0.5 m/s", abs(fastest - 0.5), 0.05, "m/s")
     fastest = max(flight.robot.simulator.actuators.speeds)
@@ -163,7 +163,7 @@ def _disorder(outcome: Outcome) -> None:
 def _copies(outcome: Outcome) -> None:
     clean = outcome.prepare(STEADY).fly_mission()
     flight = outcome.fly(STEADY, duplicate=1.0)
-    same = clean.trajectory() == flight.trajectory()
+    same = clean.of(GroundTruth) == flight.of(GroundTruth)
     outcome.true("the same path, bit by bit", same)
     outcome.least("copies dropped", flight.count("repeated"), 1000)
 
@@ -179,7 +179,7 @@ def _clocks(outcome: Outcome) -> None:
     for hours in (47, 49):
         apart = outcome.prepare(cloud_offset=hours * HOUR).fly_mission()
         text = f"cloud's clock {hours} h ahead: the same path, bit by bit"
-        outcome.true(text, clean.trajectory() == apart.trajectory())
+        outcome.true(text, clean.of(GroundTruth) == apart.of(GroundTruth))
     for ppm in (-500, 500):
         drifting = outcome.fly(cloud_offset=HOUR, cloud_drift=ppm)
         outcome.no_hold(drifting, f"drift of {ppm} ppm: HOLDs")
