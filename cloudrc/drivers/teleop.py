@@ -107,11 +107,7 @@ class UnixPeer(UnixDatagrams):
 
         None in the list stands for an empty datagram, a sign of life of the other process.
         """
-        messages: list[Message | None] = []
-        for data in self.receive_data():
-            with suppress(ValueError):
-                messages.append(decode(data) if data else None)
-        return messages
+        return [decode(data) if data else None for data in self.receive_data()]
 
     def send(self, message: Message | None) -> bool:
         """Send a message (None: an empty datagram, a sign of life); return whether it was accepted.

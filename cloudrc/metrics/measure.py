@@ -14,9 +14,9 @@ from cloudrc.metrics import control, link, mission, response
 from cloudrc.metrics.flight import SHIPPED, Flight, Metric, add_quantities
 from cloudrc.outside import code
 from cloudrc.outside.patience import telling_if_slow
+from cloudrc.outside.refusal import check_names
 from cloudrc.outside.values import RESULT
 from cloudrc.record.holes import goes_on
-from cloudrc.text import unknown_name_text
 
 # The imported modules add the metrics of cloudrc to SHIPPED.
 add_quantities()
@@ -72,8 +72,8 @@ def find(choice: str, *, look: bool = False) -> Metric:
         return SHIPPED[choice]
     known = [*SHIPPED, *plugins.names("metrics")]
     name, is_path = name_of(choice), plugins.is_path(choice)
-    if not is_path and name not in known:
-        raise BadInputError(unknown_name_text("metric", choice, sorted(known)))
+    if not is_path:
+        check_names("metric", [choice], sorted(known))
     if is_path and name in known:
         raise BadInputError(f"metric {choice!r}: {name} is a metric already; rename the file")
     found = plugins.find("metrics", choice, look=look)

@@ -13,7 +13,7 @@ from cloudrc.geometry.fence import SPACE, Fence
 from cloudrc.geometry.scene import FLOOR, WORLD, Scene
 from cloudrc.geometry.solids import Array, Shape, Solid
 from cloudrc.outside.values import InvalidValueError
-from cloudrc.sim.engine import GEOM, at_rest, compile_alone, compile_error, mujoco
+from cloudrc.sim.engine import GEOM, at_rest, compile_alone, compiling, mujoco
 
 _SHAPES: dict[Any, Shape] = {
     GEOM.mjGEOM_BOX: "box",
@@ -79,13 +79,11 @@ def complete(scene: Scene) -> Scene:
     """
     path = scene.path
     assert path is not None
-    try:
+    with compiling(path):
         spec = read_scene(path)
         spec.compiler.fusestatic = False
         spawn = spec.frame("spawn").pos.copy()
         model = spec.compile()
-    except (ValueError, KeyError) as error:
-        raise compile_error(path, error) from None
     data = at_rest(model)
     names = [model.geom(geom).name.rpartition("/")[0] for geom in range(model.ngeom)]
     touchable = ((model.geom_contype | model.geom_conaffinity) & ROBOT_BITS) > 0

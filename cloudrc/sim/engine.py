@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -52,21 +54,23 @@ def at_rest(model: Any) -> Any:
     return data
 
 
-def compile_error(what: object, error: Exception) -> Exception:
-    """Return the error to raise if MuJoCo cannot compile `what` because of `error`.
+@contextmanager
+def compiling(what: object) -> Iterator[None]:
+    """Turn an error of MuJoCo in the block, which compiles `what`, into an InvalidValueError.
 
     MuJoCo reports a lack of memory as an error of the file. It says nothing about the file.
     """
-    reason = " ".join(str(error).split())
-    if tells_no_memory(reason):
-        text = f"memory ran out: {what} could not be compiled"
-        return OutOfMemoryError(f"{text}; use fewer processes, or free some memory")
-    return InvalidValueError(f"{what} does not compile: {reason}")
+    try:
+        yield
+    except (ValueError, KeyError) as error:
+        reason = " ".join(str(error).split())
+        if tells_no_memory(reason):
+            text = f"memory ran out: {what} could not be compiled"
+            raise OutOfMemoryError(f"{text}; use fewer processes, or free some memory") from None
+        raise InvalidValueError(f"{what} does not compile: {reason}") from None
 
 
 def compile_alone(file: Path) -> Any:
     """Compile an MJCF file by itself; raise an InvalidValueError if it does not compile."""
-    try:
+    with compiling(file):
         return mujoco.MjSpec.from_file(str(file)).compile()
-    except (ValueError, KeyError) as error:
-        raise compile_error(file, error) from None

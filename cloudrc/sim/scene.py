@@ -16,7 +16,7 @@ import numpy as np
 from cloudrc.geometry.scene import FLOOR, WORLD
 from cloudrc.outside.values import InvalidValueError
 from cloudrc.sim.bodies import ROBOT_BITS, read_scene
-from cloudrc.sim.engine import JOINT, at_rest, compile_alone, compile_error, mujoco
+from cloudrc.sim.engine import JOINT, at_rest, compile_alone, compiling, mujoco
 from cloudrc.sim.plant import Array, Inertia, point_inertia, true_inertia
 from cloudrc.text import unknown_name_text
 
@@ -87,7 +87,7 @@ def compile_true(robot: Path, scene: Path, nominal: Any, plant: Plant) -> Any:
 
 def _compile(robot_path: Path, scene_path: Path, inertia: Inertia | None = None) -> Any:
     """Compile the robot in the scene; `inertia` replaces that of the robot's base, if given."""
-    try:
+    with compiling(f"{robot_path} in {scene_path}"):
         spec = read_scene(scene_path)
         # An empty prefix would make MuJoCo write MUJOCO_LOG.TXT into the working directory.
         robot = mujoco.MjSpec.from_file(str(robot_path))
@@ -102,8 +102,6 @@ def _compile(robot_path: Path, scene_path: Path, inertia: Inertia | None = None)
             # Sizes in the robot's file, which the scene's replace.
             warnings.filterwarnings("ignore", "Attach conflict")
             model = spec.compile()
-    except (ValueError, KeyError) as error:
-        raise compile_error(f"{robot_path} in {scene_path}", error) from None
     _put_on_floor(model)
     return model
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.messages import Cause, GuardState, OperatorRequest, Setpoint
-from cloudrc.records import Fault, MissionEvent
+from cloudrc.records import MissionEvent
 from cloudrc.teleop.wire import RobotStatus, decode, encode, read_line, write_line
 from tests.console.conftest import control
 
@@ -42,18 +42,3 @@ def test_a_status_comes_back_from_its_line(known):
     assert (tree["touch_speed"], tree["position"]) == (None, [0.0, 0.0, 1.0])
     assert tree["sensors"] == [11.9, None]
     assert read_line(write_line(None)) is None
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"",
-        b'["RobotStatus", [1, [0, 0, 1], 7, 1]]',
-        b'["OperatorRequest", [1, 9, 0]]',
-        b"[" * 5000,
-        encode(Fault(0, "x", "y")),
-    ],
-)
-def test_what_is_no_message_is_refused(data):
-    with pytest.raises(ValueError, match="not a message"):
-        decode(data)
