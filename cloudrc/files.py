@@ -11,7 +11,7 @@ import json
 import os
 import pwd
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from io import BufferedReader, FileIO
 from pathlib import Path
@@ -202,3 +202,8 @@ def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
     """Replace a file in one step, with the permissions `mode` minus umask; may raise an OSError."""
     with atomic_file(path, mode) as file:
         file.write(data)
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write plain values as JSON, as `write_atomically` does."""
+    write_atomically(path, f"{json.dumps(document, indent=2)}\n".encode())

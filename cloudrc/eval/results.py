@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from itertools import count
@@ -13,7 +12,7 @@ from cloudrc import source
 from cloudrc.errors import CloudrcError
 from cloudrc.eval.episode import play
 from cloudrc.eval.setup import Episode, EvalSetup
-from cloudrc.files import read, write_atomically
+from cloudrc.files import read_json, write_json
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.outside.values import InvalidValueError
 from cloudrc.rounding import format_limit
@@ -92,11 +91,10 @@ def check_folder(folder: Path, setup: EvalSetup) -> None:
 
 def _read(folder: Path) -> dict[str, Any]:
     """Return the content of the file of an evaluation."""
-    try:
-        found: dict[str, Any] = json.loads(read(folder / FILE))
-        return found if found["identity"]["env"] else {}
-    except (LookupError, TypeError, ValueError):
-        raise InvalidValueError(f"its {FILE} is of no evaluation") from None
+    found = read_json(folder / FILE)
+    if "env" not in found.get("identity", ()):
+        raise InvalidValueError(f"its {FILE} is of no evaluation")
+    return found
 
 
 def _place(policy: str) -> str:
@@ -156,7 +154,7 @@ def write(folder: Path, setup: EvalSetup, found: Mapping[str, Any]) -> dict[str,
         "identity": setup.identity(),
         **found,
     }
-    write_atomically(folder / FILE, f"{json.dumps(document, indent=2)}\n".encode())
+    write_json(folder / FILE, document)
     return document
 
 

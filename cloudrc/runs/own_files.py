@@ -11,8 +11,7 @@ from pathlib import Path
 from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment, absolute_paths, local_files
 from cloudrc.config.robot import files_of
-from cloudrc.errors import BadInputError
-from cloudrc.files import read
+from cloudrc.files import read_json
 from cloudrc.geometry.model_files import model_files
 from cloudrc.outside import code
 from cloudrc.outside.reuse import reuse
@@ -83,11 +82,10 @@ def describe_changes(name: str, experiment: ResolvedExperiment) -> str:
     `experiment` does not take from there do not count.
     """
     config = Path(name)
-    try:
-        flown = json.loads(read(config.with_name(ENVIRONMENT_FILE)))[FILES]
-        before = absolute_paths(read_experiment(config, flown=True).model_dump(mode="json"))
-    except (OSError, ValueError, LookupError, BadInputError):
+    flown = read_json(config.with_name(ENVIRONMENT_FILE)).get(FILES)
+    if not flown:
         return ""
+    before = absolute_paths(read_experiment(config, flown=True).model_dump(mode="json"))
     now = absolute_paths(experiment.model_dump(mode="json"))
     changes = [
         f"{key} (then {flown[key]}, now {each})"

@@ -18,14 +18,14 @@ from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc import source
 from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, to_one_line
-from cloudrc.files import write_atomically
+from cloudrc.files import read_json, write_atomically, write_json
 from cloudrc.outside.document import read_document, write_yaml
 from cloudrc.runs.fly import fly
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.lock import LOCK, lock_folder
 from cloudrc.text import csv_table, table
 from cloudrc.trials.plan import PlannedFlight, SweepPlan, read_plan
-from cloudrc.trials.rows import Row, Rows, read_rows
+from cloudrc.trials.rows import SIZE_MAX, Row, Rows, read_rows
 from cloudrc.trials.summary import count_verdicts, normalise
 from cloudrc.trials.workers import map_in_order, take_each
 from cloudrc.version import __version__
@@ -127,17 +127,15 @@ def _write_summary(folder: Path, plan: SweepPlan, rows: Rows) -> None:
         **({"baselines": plan.baselines} if plan.baselines else {}),
         "files": plan.files,
     }
-    write_atomically(folder / SUMMARY, f"{json.dumps(summary, indent=2)}\n".encode())
+    write_json(folder / SUMMARY, summary)
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
     """Read the description of a sweep; raise a BadInputError if `folder` is not that of a sweep."""
-    try:
-        found: dict[str, Any] = json.loads((folder / SUMMARY).read_bytes())
-        return {**{key: found[key] for key in ("axes", "flights", "units", "files")}, **found}
-    except (OSError, ValueError, LookupError, TypeError):
-        text = "is not a folder of 'cloudrc sweep run'; name one"
-        raise BadInputError(f"{folder}: {text}") from None
+    found = read_json(folder / SUMMARY, SIZE_MAX)
+    if not found.keys() >= {"axes", "flights", "units", "files"}:
+        raise BadInputError(f"{folder}: is not a folder of 'cloudrc sweep run'; name one")
+    return found
 
 
 def as_csv(columns: Mapping[str, Sequence[Any]], unit_of: Mapping[str, str]) -> str:

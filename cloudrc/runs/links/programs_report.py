@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.files import at_place
+from cloudrc.files import at_place, write_json
 from cloudrc.link.carry.log import LOGGED_MAX
 from cloudrc.link.verify.causes import LATE, Findings, ShaperFacts, in_unit
 from cloudrc.link.verify.packets import judge_packets, recording
@@ -73,9 +72,7 @@ def _starved(link: LiveLink, name: str, late: float) -> str:
 
 def write_report(folder: Path, report: Report, link: LiveLink) -> None:
     """Write link.json, and a recording of the packets of each direction."""
-    path = folder / "link.json"
-    with at_place(path):
-        path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    write_json(folder / "link.json", report)
     for name, way in link.ways.items():
         path = folder / f"{name}.csv"
         with at_place(path), path.open("w", encoding="utf-8") as file:
