@@ -21,6 +21,7 @@ from cloudrc.link.profile import DirectionProfile, Timeline, settled
 from cloudrc.link.profile_file import read_keys
 from cloudrc.link.streams import Stream
 from cloudrc.link.traces import link_profile
+from cloudrc.link.verify import verdict_of
 from cloudrc.link.verify.causes import describe
 from cloudrc.link.verify.judge import (
     FEWEST,
@@ -31,7 +32,6 @@ from cloudrc.link.verify.judge import (
     Judgement,
     Measurement,
     told,
-    verdict_of,
 )
 from cloudrc.metrics.definitions import WINDOW, Echoes
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias, get_args
 from cloudrc.exposition import table
 from cloudrc.exposition.parts import Histogram, Readings, samples
 from cloudrc.exposition.table import LiveMetric, MetricKind, of_role
-from cloudrc.link.verify.judge import verdict_of
+from cloudrc.link.verify import verdict_of
 from cloudrc.messages import NEVER_NS, Cause, GuardState
 from cloudrc.metrics.definitions import (
     QUANTITIES,

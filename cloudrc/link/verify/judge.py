@@ -11,11 +11,11 @@ requested property is only reported, not judged.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import isnan, nan, sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -321,12 +321,3 @@ def look_twice(first: Sequence[Judgement], second: Sequence[Judgement]) -> list[
     """Combine two measurements of a link: a quantity is "off" only if "off" in both."""
     again = {row.name: row for row in second}
     return [again.get(row.name, row) if row.verdict == "off" else row for row in first]
-
-
-def verdict_of(rows: Iterable[Any]) -> str:
-    """Return "off" if a row is "off", "ok" if all judged ones are "ok", else "open".
-
-    Rows are those of a measurement, or records `LinkChecked` of one.
-    """
-    verdicts = {row.verdict for row in rows} - {"told"}
-    return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"

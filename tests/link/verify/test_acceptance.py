@@ -5,8 +5,9 @@ import pytest
 
 from cloudrc.config.shipped import names
 from cloudrc.link.profile import mean_loss
+from cloudrc.link.verify import verdict_of
 from cloudrc.link.verify.causes import Findings, ShaperFacts, find_causes
-from cloudrc.link.verify.judge import look_twice, netem_makes, verdict_of
+from cloudrc.link.verify.judge import look_twice, netem_makes
 from tests.link.profiles import changed, in_bursts, profile_of
 from tests.link.verify.conftest import asked, random_profile, rows_of, verify
 

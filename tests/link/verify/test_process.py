@@ -7,8 +7,8 @@ import subprocess
 import pytest
 
 from cloudrc.errors import CloudrcError
+from cloudrc.link.verify import verdict_of
 from cloudrc.link.verify.causes import find_causes
-from cloudrc.link.verify.judge import verdict_of
 from cloudrc.runs.links import under_test, verify
 from cloudrc.runs.links.under_test import run_link
 from cloudrc.runs.links.verify import find_experiment, make_plans, probe_link
