@@ -245,6 +245,26 @@ def _steady_force(flight: Flight, touch: dict[str, Array]) -> float | None:
     return mean(force["force"][force["stamp_ns"] >= begin_ns])
 
 
+def _cross_track(flight: Flight) -> float | None:
+    """Compute the RMS distance from the true path to the lines between the waypoints [m].
+
+    The first line begins where the flight does. Each position counts up to the first touch, with
+    its distance from the nearest line. None for a mission without waypoints.
+    """
+    path, touch = flight.truth["position"], first_touch(flight)
+    if touch is not None:
+        path = path[flight.truth["stamp_ns"] <= touch["stamp_ns"]]
+    if not len(path) or not flight.mission.waypoints:
+        return None
+    corners = np.array([path[0], *(each.position_m for each in flight.mission.waypoints)])
+    begins, ways = corners[:-1], np.diff(corners, axis=0)
+    since = path[:, None] - begins  # shape (positions, lines, 3)
+    squares = np.maximum((ways**2).sum(axis=1), np.finfo(float).tiny)
+    shares = np.clip((since * ways).sum(axis=2) / squares, 0.0, 1.0)
+    distances = np.linalg.norm(since - shares[:, :, None] * ways, axis=2)
+    return rms(distances.min(axis=1))
+
+
 def obstacle_contacts(flight: Flight) -> dict[str, Array]:
     """Select the rows of /contact in which the robot touches an obstacle."""
     contact, touch = flight.during("/contact"), flight.mission.touched
@@ -330,6 +350,8 @@ add_metrics(
        "5 s of a hover.", partial(_steady_error, axis=axis)) for axis, name in enumerate("xyz")),
     ("rotor_energy", "J", "Mechanical energy of the rotors in the flight, from their thrusts and "
      "speeds.", _rotor_energy),
+    ("cross_track_rms", "m", "RMS distance from the true path of the base to the straight lines "
+     "from its start through the waypoints, until the first touch.", _cross_track),
     waypoints_reached="waypoints reached",
     final_error="from the last setpoint, at the end",
     contact_time="first touch at",

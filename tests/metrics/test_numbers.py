@@ -424,3 +424,16 @@ def test_the_first_telemetry_of_a_session_may_be_that_of_its_first_mission():
     numbers = measure_all(log.flight())[0]
     assert numbers["start_delay"].value == approx(0.4)
     assert numbers["duration"].value == approx(10.4)
+
+
+def test_the_cross_track_error_is_the_distance_from_the_nearest_line_until_the_touch():
+    x, y, z = straight(0)
+    corners = [Waypoint(position_m=(x + way, y + 0.4, z)) for way in (0.0, 20.0)]
+    mission = MissionConfig(waypoints=tuple(corners))
+    flight = flown().flight(mission=mission)
+    measure = SHIPPED["cross_track_rms"].measure
+    assert measure(flight) == approx(0.4, abs=0.01), "but in the first 0.4 s"
+    log = flown()
+    log.world.append(touch(0.2))
+    touched = log.flight(mission=mission, touch="board")
+    assert measure(touched) == approx(0.2 / 3**0.5, abs=0.01), "from 0 to 0.2 m"
