@@ -22,9 +22,9 @@ from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
 from cloudrc.cloud.planar import Planar
 from cloudrc.config import schema
-from cloudrc.config.overrides import build_plugin, build_predictor
+from cloudrc.config.overrides import build_for, build_plugin
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.config.robot import facts, is_planar
+from cloudrc.config.robot import RobotFacts, facts, is_planar
 from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.errors import ControllerLostError
@@ -240,9 +240,7 @@ def build_cloud(
         controller = Planar(controller, cloud.controller.name)
     loop = make_loop(
         lambda: build_plugin("estimators", cloud.estimator),
-        build_predictor(
-            cloud.predictor, facts(experiment.world, experiment.guard.acceleration_max_mps2)
-        ),
+        build_for("predictors", cloud.predictor, _facts_of(experiment)),
         controller,
         horizon_max=cloud.horizon_max_s,
         freeze_after=cloud.freeze_after_s,
@@ -271,8 +269,14 @@ def build_compute_time(
 
 def build_controller(experiment: ResolvedExperiment) -> Controller:
     """Build the controller of an experiment."""
-    controller: Controller = build_plugin("controllers", experiment.cloud.controller)
+    choice = experiment.cloud.controller
+    controller: Controller = build_for("controllers", choice, _facts_of(experiment))
     return controller
+
+
+def _facts_of(experiment: ResolvedExperiment) -> RobotFacts:
+    guard = experiment.guard
+    return facts(experiment.world, guard.acceleration_max_mps2, guard.speed_max_mps)
 
 
 def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDirection]:

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable
 from copy import deepcopy
+from itertools import takewhile
 from math import nan
 from typing import Any
 
@@ -26,7 +27,7 @@ from cloudrc.cloud.controllers import STAND_STILL, Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.plan_log import PlanLog
 from cloudrc.cloud.predictors import Predictor
-from cloudrc.cloud.results import check_estimate, check_output, is_ours, to_vector
+from cloudrc.cloud.results import check_estimate, check_output, is_ours, to_vector, to_vectors
 from cloudrc.errors import ControllerLostError, describe_error
 from cloudrc.messages import (
     FRESH_ECHO_PERIODS,
@@ -103,6 +104,7 @@ class ControlLoop:
         """
         self._build_estimator, self._predictor = build_estimator, predictor
         self._controller = controller
+        self._plans_itself: Any = getattr(controller, "plan", None)
         self._trusts_predictor, self._trusts_controller = is_ours(predictor), is_ours(controller)
         methods = (getattr(predictor, name) for name in ("observe", "commanded", "applied"))
         self._observe, self._commanded, self._applied = (
@@ -276,14 +278,14 @@ class ControlLoop:
             self._note("estimator", error)
         horizon = self._horizon
         estimate = self._predict(basis, horizon)
-        plan, positions = list[Vector](), list[Vector]()
-        if self._echoed_ns < self._newest_echo_ns:
-            self._echoed_ns = self._newest_echo_ns
-        elif self._echoed_ns == NEVER_NS:
+        output, plan, positions = STAND_STILL, list[Vector](), list[Vector]()
+        self._echoed_ns = max(self._echoed_ns, self._newest_echo_ns)
+        if self._echoed_ns == NEVER_NS:
             self._echoed_ns = now_ns
         if now_ns - self._echoed_ns > horizon * 1e9 + self._freeze_after_ns:  # no new echo
             self.counts["frozen"] += 1
-            output = STAND_STILL
+        elif self._plans_itself and (planned := self._ask_plan(moving, now_ns, dt)):
+            output, plan, positions = planned
         else:
             output = self._steer(estimate, setpoint, dt)
             if self._planned:
@@ -331,6 +333,32 @@ class ControlLoop:
         except FAILURES as error:
             self._note("controller", error)
             return STAND_STILL
+
+    def _ask_plan(
+        self, setpoint: Setpoint, now_ns: int, dt: float
+    ) -> tuple[ControlOutput, list[Vector], list[Vector]] | None:
+        """Let a controller plan by itself; return its command, and the results of `_plan`.
+
+        Return None if the predictor has no model. `now_ns` is the time of the command [ns], cloud's
+        clock, `dt` the time since the last one [s].
+        """
+        later, plug_in = path_of(setpoint), "predictor"
+        try:
+            model = self._predictor.model()
+            if model is None:
+                return None
+            plug_in = "controller"
+            velocities, positions, yaw_rate = self._plans_itself(
+                model, lambda ahead: later(now_ns + round(ahead * 1e9)), dt
+            )
+            command, *rest = to_vectors(velocities[: self._planned + 1], "planned velocities")
+            fits = takewhile(lambda velocity: max(map(abs, velocity)) <= PLANNED_MAX, rest)
+            output = ControlOutput(command, RESULT.of(yaw_rate, "yaw rate"))
+            positions = to_vectors(positions[: self._planned], "planned positions")
+            return output, list(map(as_planned, fits)), positions
+        except FAILURES as error:
+            self._note(plug_in, error, INSTEAD["controller"])
+            return STAND_STILL, [], []
 
     def _plan(
         self, setpoint: Setpoint, velocity: Vector, now_ns: int

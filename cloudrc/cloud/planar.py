@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from cloudrc.cloud.controllers import Controller, ControlOutput
+from typing import Any
+
+import numpy as np
+
+from cloudrc.cloud.controllers import Controller, ControlOutput, Goals, Planned
 from cloudrc.cloud.controllers.remote import OutsideController
+from cloudrc.cloud.predictors import Model
 from cloudrc.cloud.results import check_output
 from cloudrc.errors import ControllerLostError
 from cloudrc.messages import Odometry, Setpoint
@@ -20,10 +25,18 @@ class Planar(Controller):
     def __init__(self, controller: Controller, name: str) -> None:
         """Wrap `controller`; errors call it `name`."""
         self._controller, self._name = controller, name
+        self._ask_plan: Any = getattr(controller, "plan", None)
+        if self._ask_plan:
+            self.plan = self._plan_level
 
     def reset(self) -> None:
         """Reset the controller."""
         self._controller.reset()
+
+    def _plan_level(self, model: Model, goals: Goals, dt: float) -> Planned:
+        """Let the controller plan; leave out vertical velocities. `dt` is as for `update` [s]."""
+        velocities, positions, yaw_rate = self._ask_plan(model, goals, dt)
+        return Planned(np.multiply(velocities, (1.0, 1.0, 0.0)), positions, yaw_rate)
 
     def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
         """Compute one command, as the controller does after `dt` [s].

@@ -67,6 +67,14 @@ def to_vector(numbers: Any, name: str) -> Vector:
     return x, y, z
 
 
+def to_vectors(rows: Any, name: str) -> list[Vector]:
+    """Return rows of three numbers as tuples of floats; `name` names them in the error's text."""
+    found = RESULT.array(rows, name)
+    if found.shape != (len(rows), 3):
+        raise InvalidValueError(f"its {name} have the shape {found.shape}, not (n, 3)")
+    return [(x, y, z) for x, y, z in found.astype(float).tolist()]
+
+
 def _parts(result: Any) -> Sequence[Any]:
     """Return the five parts of a result, in order."""
     if not isinstance(result, tuple | list) or len(result) != 5:

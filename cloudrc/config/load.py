@@ -94,7 +94,7 @@ def load_experiment(
         with problems.collect(found, ("world", "scene")):
             bounds = _bounds(draft)
         with problems.collect(found, ("world", "tuning")):
-            facts = facts_of(draft.world, guard.acceleration_max_mps2)
+            facts = facts_of(draft.world, guard.acceleration_max_mps2, guard.speed_max_mps)
         problems.raise_problems(document, found, name)
     if build and facts:
         found += overrides.complete_plugins(document, draft.cloud, facts)

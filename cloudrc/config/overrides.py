@@ -42,7 +42,10 @@ KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "co
 """Key under `cloud` -> kind of plug-in."""
 BRAKING = "braking_mps2"
 """Argument of an onboard controller's `build`: the braking in `guard` of robot.yaml [m/s^2]."""
-GIVEN = {("onboard", "model"), ("onboard", BRAKING), ("predictors", "robot")}
+GIVEN = {
+    *(("onboard", "model"), ("onboard", BRAKING)),
+    *(("predictors", "robot"), ("controllers", "robot")),
+}
 """Kind of plug-in and argument of its `build` that cloudrc gives, not the user."""
 _DEFAULTS = {
     **Experiment().model_dump(mode="json"),
@@ -208,8 +211,8 @@ def complete_plugins(document: Document, cloud: Cloud, robot: RobotFacts) -> lis
 
 
 def _takes_robot(kind: str, name: str) -> bool:
-    """Return whether a plug-in's `build` has the argument `robot`, which only predictors get."""
-    return kind == "predictors" and "robot" in plugins.signature(kind, name).parameters
+    """Return whether a plug-in's `build` has the argument `robot`, and gets it."""
+    return (kind, "robot") in GIVEN and "robot" in plugins.signature(kind, name).parameters
 
 
 def _complete(
@@ -270,10 +273,10 @@ def build_plugin(kind: str, choice: PlugIn, /, **given: Any) -> Any:
     return plugins.load(kind, choice.name, **given, **dict(checked))
 
 
-def build_predictor(choice: PlugIn, robot: RobotFacts) -> Any:
-    """Build a predictor as `build_plugin` does; if its `build` takes `robot`, it gets it."""
-    more = {"robot": robot} if _takes_robot("predictors", choice.name) else {}
-    return build_plugin("predictors", choice, **more)
+def build_for(kind: str, choice: PlugIn, robot: RobotFacts) -> Any:
+    """Build a plug-in as `build_plugin` does; if its `build` takes `robot`, it gets it."""
+    more = {"robot": robot} if _takes_robot(kind, choice.name) else {}
+    return build_plugin(kind, choice, **more)
 
 
 def default_parameters(kind: str, name: str) -> dict[str, Any]:

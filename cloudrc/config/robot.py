@@ -16,6 +16,7 @@ from cloudrc.config import shipped
 from cloudrc.config.heading import Heading
 from cloudrc.config.problems import validate
 from cloudrc.config.schema import (
+    SPEED_MPS,
     Acceleration,
     Constants,
     DeadTimes,
@@ -224,18 +225,21 @@ def is_planar(name: str) -> bool:
 
 @dataclass(frozen=True)
 class RobotFacts:
-    """What cloud knows of a robot: a predictor gets it as the argument `robot` of its `build`."""
+    """What cloud knows of a robot: predictors and controllers get it as `robot` of `build`."""
 
     name: str  # as in world.robot
     response: Response | None  # first-order model of the velocity loop, with its tuning
     motion: PlugIn | None  # file of a better model, with the parameters of the onboard controller
     acceleration_max: float  # limit of the guard [m/s^2]
+    speed_max: float  # likewise [m/s]
 
 
-def facts(world: World, acceleration_max: float | None) -> RobotFacts:
+def facts(
+    world: World, acceleration_max: float | None, speed_max: float | None = None
+) -> RobotFacts:
     """Return what cloud knows of a robot.
 
-    `acceleration_max` is the guard's limit [m/s^2], None for that of the robot.
+    `acceleration_max` [m/s^2] and `speed_max` [m/s] are the guard's limits, None for the robot's.
 
     Raises:
         BadInputError: If the robot has no such tuning.
@@ -247,7 +251,8 @@ def facts(world: World, acceleration_max: float | None) -> RobotFacts:
     tuned = robot.tunings.get(world.tuning or "")
     response = tuned.response if tuned and tuned.response else robot.response
     limit = acceleration_max or robot.guard.acceleration_max_mps2
-    return RobotFacts(world.robot, response, motion, limit)
+    speed = speed_max or robot.guard.speed_max_mps or SPEED_MPS[1]
+    return RobotFacts(world.robot, response, motion, limit, speed)
 
 
 def files_of(name: str) -> list[Path]:

@@ -2,9 +2,10 @@
 
 from math import nan
 
+import numpy as np
 import pytest
 
-from cloudrc.cloud.controllers import Controller, ControlOutput
+from cloudrc.cloud.controllers import Controller, ControlOutput, Planned
 from cloudrc.cloud.controllers.pid import build as pid
 from cloudrc.cloud.predictors import Model
 from cloudrc.cloud.predictors.last_sample import LastSample
@@ -131,3 +132,37 @@ def test_without_its_plan_a_command_leaves_and_a_fault_says_why(predictor, contr
     assert a_loop.counts == {f"{kind}_failed": 1}
     for part in (text, "cloud sends this command without a plan", f"fix cloud.{kind}"):
         assert part in a_loop.faults[0].text
+
+
+class Planning(Controller):
+    """Plans rows of velocities, and climbs by `update`."""
+
+    def __init__(self, velocities):
+        self.velocities = velocities
+
+    def plan(self, model, goals, dt):
+        self.goal = goals(0.5)
+        return Planned(self.velocities, np.arange(9.0).reshape(3, 3), 0.25)
+
+    update = Integrating.update
+    asked = 0
+
+
+def test_cloud_sends_a_controllers_own_plan_and_remembers_its_positions():
+    controller = Planning([(1.0, 0.0, 0.0), (2, 0, 0), (3.0, 0.0, 0.0), (2000.0, 0.0, 0.0)])
+    a_loop = loop(None, Modelled(), controller, heard_ms=1090, echo_ms=1000, plan=0.05)
+    sent, _ = command(a_loop, 1094)
+    assert (sent.velocity, sent.yaw_rate) == ((1.0, 0.0, 0.0), 0.25)
+    assert sent.plan == ((2.0, 0.0, 0.0), (3.0, 0.0, 0.0)), "the guard refuses the last one"
+    [(_, positions)] = a_loop.plans._plans.values()
+    assert positions[1:] == [(0.0, 1.0, 2.0), (3.0, 4.0, 5.0), (6.0, 7.0, 8.0)]
+    assert controller.goal.position == (2.0, 2.0, 3.0)
+    sent, _ = command(loop(None, LastSample(), controller, heard_ms=1090, echo_ms=1000), 1094)
+    assert controller.asked == 1, "without a model cloud calls update"
+
+
+@pytest.mark.parametrize("wrong", [[(nan, 0.0, 0.0)], [(1.0, 2.0)], [], None])
+def test_a_wrong_plan_is_a_failure(wrong):
+    a_loop = loop(None, Modelled(), Planning(wrong), heard_ms=1090, echo_ms=1000, plan=0.05)
+    assert command(a_loop, 1094)[0].velocity == ZERO
+    assert a_loop.counts == {"controller_failed": 1}

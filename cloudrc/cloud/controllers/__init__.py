@@ -6,9 +6,15 @@ returns a `Controller`; all parameters are annotated.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from cloudrc.cloud.predictors import Model
 
 
 class ControlOutput(NamedTuple):
@@ -29,11 +35,36 @@ class ControlOutput(NamedTuple):
     derivative: Vector = ZERO
 
 
+class Planned(NamedTuple):
+    """What a controller that plans by itself commands from now on, in steps of 10 ms.
+
+    Attributes:
+        velocities: Commanded velocities [m/s], world frame, shape (n, 3). The first one is the
+            command; as many of the others as the experiment asks for are its plan.
+        positions: Predicted position at the end of each step [m], world frame, shape (n, 3).
+        yaw_rate: Commanded yaw rate [rad/s].
+    """
+
+    velocities: ArrayLike
+    positions: ArrayLike
+    yaw_rate: float = 0.0
+
+
+Goals: TypeAlias = Callable[[float], Setpoint]
+"""Function that returns the setpoint after a time from now [s], >= 0."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
 
 
 class Controller:
-    """Computes the velocity commands that lead the robot to a setpoint."""
+    """Computes the velocity commands that lead the robot to a setpoint.
+
+    Attributes:
+        plan: Optional method that plans all velocities at once: `plan(model, goals, dt)`. Cloud
+            calls it in place of `update` if the predictor has a model of the robot. The model has
+            the predicted state of the robot; `dt` is the time since the last call [s].
+    """
+
+    plan: Callable[[Model, Goals, float], Planned] | None = None
 
     def reset(self) -> None:
         """Reset the controller at the start of a session or mission."""
