@@ -257,10 +257,11 @@ kind-load: ## load the images into the kind cluster CLUSTER (cloudrc)
 
 lock: $(VENV)/bin/python ## update the locked requirements of images and tests
 	$(bin)/python -m pip install --quiet uv
-	$(COMPILE) pyproject.toml --extra world --extra record --extra console --output-file images/world/requirements.txt \
+	$(COMPILE) pyproject.toml --extra world --extra record --extra console --extra mpc \
+		--output-file images/world/requirements.txt \
 		$(DRAWING:%=--no-emit-package %)
-	$(COMPILE) pyproject.toml --extra record --extra api --output-file images/cloud/requirements.txt
-	$(COMPILE) pyproject.toml --extra world --extra record --extra api --extra policy \
+	$(COMPILE) pyproject.toml --extra record --extra api --extra mpc --output-file images/cloud/requirements.txt
+	$(COMPILE) pyproject.toml --extra world --extra record --extra api --extra policy --extra mpc \
 		--output-file images/cloud-ros/requirements.txt $(DRAWING:%=--no-emit-package %)
 	printf 'hatchling\ntccbox\n' | $(COMPILE) - --output-file images/build-requirements.txt
 	$(COMPILE) pyproject.toml --extra dev --no-emit-package cloudrc \

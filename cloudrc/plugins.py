@@ -25,7 +25,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from cloudrc.errors import CloudrcError
+from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.outside.code import calling, load_file
 from cloudrc.outside.patience import telling_if_slow
 from cloudrc.outside.refusal import check_names, naming
@@ -134,7 +134,8 @@ def load(kind: str, name: str, /, **parameters: Any) -> Any:
     """Find a plug-in and build it."""
     build = builder(kind, name, look=False)
     slow = "" if _own_module(kind, name) else f"{name} is still being built"
-    with calling(f"{one(kind)} {name!r} cannot be built", slow=slow):
+    what = f"{one(kind)} {name!r} cannot be built"
+    with calling(what, keep=MissingPrerequisiteError, slow=slow):
         plugin = build(**parameters)
         for method in METHODS[kind]:
             found = getattr(plugin, method, None)

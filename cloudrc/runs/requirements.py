@@ -17,6 +17,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "policy": ("msgpack", "websockets"),
     "gym": ("gymnasium",),
     "foxglove": ("foxglove",),
+    "mpc": ("daqp",),
 }
 """Name of an extra in pyproject.toml -> the modules that it installs."""
 PACKAGES = {"foxglove": "foxglove-sdk"}

@@ -11,11 +11,11 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DOCKERFILES = sorted((ROOT / "images").glob("*/Dockerfile"))
-ROLES = {"world": ("world", "record"), "cloud": ("record", "api")}
+ROLES = {"world": ("world", "record", "mpc"), "cloud": ("record", "api", "mpc")}
 LOCKS = {
     ROOT / "images" / "world" / "requirements.txt": ROLES["world"],
     ROOT / "images" / "cloud" / "requirements.txt": ROLES["cloud"],
-    ROOT / "images" / "cloud-ros" / "requirements.txt": ("world", "record", "api", "policy"),
+    ROOT / "images" / "cloud-ros" / "requirements.txt": ("world", "record", "api", "policy", "mpc"),
     ROOT / "tests" / "requirements.txt": ("dev",),
 }
 BUILD = ROOT / "images" / "build-requirements.txt"
