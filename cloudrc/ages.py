@@ -84,7 +84,7 @@ def _commands(experiment: ResolvedExperiment, grid_ns: Array) -> tuple[Array, Ar
     begun_ns, sent_ns = list[int](), list[int]()
     while begin_ns < DURATION_NS:
         begun_ns.append(begin_ns)
-        sent_ns.append(begin_ns + compute.end())
+        sent_ns.append(begin_ns + compute.end(begin_ns))
         begin_ns = max(sent_ns[-1], (begin_ns // period_ns + 1) * period_ns)
     return np.array(begun_ns), np.array(sent_ns)
 

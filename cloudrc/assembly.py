@@ -264,7 +264,8 @@ def build_compute_time(
     if not (cloud.compute_ms or cpu_clock):
         return None
     times = cloud.compute_ms * MS_TO_NS, cloud.compute_deviation_ms * MS_TO_NS
-    return ComputeTime(*times, _generator(experiment.seed, "compute time"), cpu_clock)
+    rng = _generator(experiment.seed, "compute time")
+    return ComputeTime(*times, rng, cpu_clock, cloud.cpu_share)
 
 
 def build_controller(experiment: ResolvedExperiment) -> Controller:

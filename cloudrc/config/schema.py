@@ -424,6 +424,10 @@ class Cloud(Section):
     compute_measured: bool = False
     """Whether virtual time delays each command also by the processor time that this machine needed
     to compute it. Such a flight is not repeatable"""
+    cpu_share: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """CPU limit of the emulated cloud, in processors: of each 100 ms it computes for this share,
+    and then stands still, as a container with a limit does. It applies to the times of compute_ms
+    and compute_measured. For a slow processor, raise compute_ms instead. 1: no limit"""
     clock_offset_s: Annotated[float, Field(ge=0, le=1_000_000)] = 0.0
     """By how much cloud's clock is ahead of world's at the start [s]; virtual time only"""
     clock_drift_ppm: Annotated[int, Field(ge=-1000, le=1000)] = 0
@@ -433,6 +437,8 @@ class Cloud(Section):
     def _check_compute(self) -> Cloud:
         if self.compute_deviation_ms > 0 and self.compute_ms == 0:
             raise ValueError("compute_deviation_ms needs compute_ms, the mean, above 0")
+        if self.cpu_share < 1 and not (self.compute_ms or self.compute_measured):
+            raise ValueError("cpu_share needs compute_ms above 0 or compute_measured")
         return self
 
 

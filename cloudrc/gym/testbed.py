@@ -49,6 +49,7 @@ OWN = {
     "cloud.clock_offset_s": 0,
     "cloud.compute_deviation_ms": 0,
     "cloud.compute_measured": False,
+    "cloud.cpu_share": 1,
     "cloud.predictor": "last_sample",
     "cloud.estimator": "running_mean",
     "cloud.controller": "pid",
