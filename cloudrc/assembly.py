@@ -19,6 +19,7 @@ from cloudrc.cloud.controllers.remote import ControllerChannel, OutsideControlle
 from cloudrc.cloud.controllers.ros2 import RosController
 from cloudrc.cloud.endpoint import CloudEndpoint, ComputeTime
 from cloudrc.cloud.loop import ControlLoop
+from cloudrc.cloud.news import SendOnDelta
 from cloudrc.cloud.operator import Operator
 from cloudrc.cloud.planar import Planar
 from cloudrc.config import schema
@@ -238,14 +239,17 @@ def build_cloud(
     remote = controller if isinstance(controller, OutsideController) else None
     if is_planar(experiment.world.robot):
         controller = Planar(controller, cloud.controller.name)
+    beat, delta = cloud.beat, cloud.send_delta_mps
+    news = None if delta is None else SendOnDelta(delta, beat)
     loop = make_loop(
         lambda: build_plugin("estimators", cloud.estimator),
         build_for("predictors", cloud.predictor, _facts_of(experiment)),
         controller,
         horizon_max=cloud.horizon_max_s,
-        freeze_after=cloud.freeze_after_s,
+        freeze_after=cloud.freeze_after_s + (beat if news else 0.0),
         period_ns=round(SECOND_NS / cloud.command_rate_hz),
         plan=cloud.plan_s,
+        news=news,
     )
     if remote is not None and channel is not None:
         remote.connect(channel, loop.period_ns * 1e-9, loop.counts, lambda: loop.newest)

@@ -26,6 +26,8 @@ from cloudrc.messages import (
 Way: TypeAlias = Annotated[bool, "", "true for the uplink, false for the downlink"]
 Epoch: TypeAlias = Annotated[int, "", "epoch of its session"]
 Number: TypeAlias = Annotated[int, "", "counter in the datagram's header"]
+UNSENT = -1
+"""Counter of a command that cloud did not send."""
 Basis: TypeAlias = Annotated[int, "ns", "stamp of the odometry used, world's clock"]
 End: TypeAlias = Annotated[str, "", "process that recorded the row: world, cloud or link"]
 
@@ -231,7 +233,7 @@ class Control(NamedTuple):
 
     stamp_ns: int
     epoch: Epoch
-    counter: Number
+    counter: Annotated[int, "", "counter in the datagram's header; -1: cloud sent none"]
     basis_stamp_ns: Basis
     horizon: Annotated[float, "s", "time by which the odometry was predicted ahead"]
     rtt: Annotated[float, "s", "last round trip without the time in world, or NaN"]

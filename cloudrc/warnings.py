@@ -45,6 +45,13 @@ def _advise(experiment: ResolvedExperiment) -> Iterator[str]:
     yield from _time(experiment, plan)
     yield from _fast_track(experiment, plan) if plan.track else _slow(experiment, plan)
     yield from slow
+    cloud = experiment.cloud
+    if cloud.send_delta_mps is not None and exceeds(cloud.beat, cloud.plan_s / 4):
+        yield (
+            f"a plan of {cloud.plan_s:g} s lasts for less than 4 beats of {cloud.beat:g} s, so the "
+            "robot holds after a few lost commands; a value that fits: --set "
+            f"cloud.beat_s={cloud.plan_s / 4:g}"
+        )
     if not experiment.world.is_nominal and find_spec("mujoco") is not None:
         from cloudrc.robots.build import advise as advise_on_robot
 

@@ -25,6 +25,15 @@ def both(delay, jitter, **others):
             ["link.profile=paper-p3", "cloud.freeze_after_s=0.05"],
             ("cloud freezes at times; ", "cloud.freeze_after_s="),
         ),
+        (
+            [
+                "cloud.predictor=kalman",
+                "cloud.plan_s=0.4",
+                "cloud.send_delta_mps=0.05",
+                "cloud.beat_s=0.2",
+            ],
+            ("less than 4 beats", "cloud.beat_s=0.1"),
+        ),
         (["world.wind.velocity_mps=[0, -3]"], ("0.19 m from", "onboard.integral_limit_xy=")),
         (
             ["world.odometry_rate_hz=20", "cloud.compute_ms=60", "guard.command_age_max_ms=200"],

@@ -176,7 +176,7 @@ class CloudEndpoint(TunnelEnd):
         self._period_ns = loop.period_ns
         self._late_ns, self._late_window_ns = 0, start_ns  # missed time, begin of its window [ns]
         self._compute = compute
-        self._unsent: tuple[int, Datagram] | None = None  # departure [ns] and command
+        self._unsent: tuple[int, Datagram | None] | None = None  # departure [ns] and command
         self._asked = 0  # highest number of an operator request in this session
         self._start: tuple[int, int] | None = None  # number and time [ns] of the newest START
         self._tick_ns = start_ns
@@ -205,7 +205,8 @@ class CloudEndpoint(TunnelEnd):
         if now_ns < self.next_deadline_ns():
             return
         if self._unsent is not None:
-            self._queue(self._unsent[1])
+            if (datagram := self._unsent[1]) is not None:
+                self._queue(datagram)
             self._unsent = None
             if now_ns < self._tick_ns:
                 return
@@ -249,7 +250,7 @@ class CloudEndpoint(TunnelEnd):
             self._relay(alarm)
         if self._loop.ready and self._setpoint is not None:
             self._send_command(self._setpoint, now_ns)
-        elif now_ns >= self._alive_ns:
+        if now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_PERIOD_NS
             self._send(Kind.ALIVE, b"")
 
@@ -329,7 +330,7 @@ class CloudEndpoint(TunnelEnd):
         self._alarm.restart_numbers()
         self._world = accept.world_nonce.hex()
         self._clock_is_shared = accept.clock == self._identity.clock_id
-        self._heard_ns = now_ns
+        self._heard_ns = self._alive_ns = now_ns
         self._commanded_ns = NEVER_NS
         self._records.append(SessionOpened(now_ns, "cloud", epoch, "world accepted"))
 
@@ -422,11 +423,14 @@ class CloudEndpoint(TunnelEnd):
         if compute is not None:
             compute.begin()
         command, control = self._loop.command(setpoint, now_ns, elapsed_ns * 1e-9, epoch, counter)
-        if compute is None:
-            self._queue(self._make_datagram(COMMAND, command))
-        else:
-            sent_ns = now_ns + compute.end(now_ns)
-            self._unsent = sent_ns, self._make_datagram(COMMAND, command)
+        sent_ns = now_ns if compute is None else now_ns + compute.end(now_ns)
+        datagram = None if command is None else self._make_datagram(COMMAND, command)
+        if datagram is not None:
+            self._alive_ns = sent_ns + ALIVE_PERIOD_NS
+        if compute is not None:
+            self._unsent = sent_ns, datagram
+        elif datagram is not None:
+            self._queue(datagram)
         self._records.append(control)
         self._control = control
 

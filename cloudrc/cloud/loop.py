@@ -25,6 +25,7 @@ from typing import Any
 
 from cloudrc.cloud.controllers import STAND_STILL, Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
+from cloudrc.cloud.news import SendOnDelta
 from cloudrc.cloud.plan_log import PlanLog
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.cloud.results import check_estimate, check_output, is_ours, to_vector, to_vectors
@@ -34,6 +35,7 @@ from cloudrc.messages import (
     NEVER_NS,
     PLAN_STEP_NS,
     Command,
+    GuardState,
     Odometry,
     Setpoint,
     Telemetry,
@@ -42,7 +44,7 @@ from cloudrc.messages import (
 )
 from cloudrc.outside.code import FAILURES, calling, check_failure, locate, stack_of
 from cloudrc.outside.values import RESULT, InvalidValueError
-from cloudrc.records import Control, Fault
+from cloudrc.records import UNSENT, Control, Fault
 from cloudrc.teleop.carrot import path_of, setpoint_at
 from cloudrc.tunnel.codec import as_planned
 
@@ -93,12 +95,14 @@ class ControlLoop:
         freeze_after: float,
         period_ns: int = PERIOD_NS,
         plan: float = 0.0,
+        news: SendOnDelta | None = None,
     ) -> None:
         """Connect three plug-ins; every session gets a new estimator.
 
         `horizon_max` is the longest horizon [s]. The loop freezes if the newest echo is older than
         the horizon plus `freeze_after` [s]. `period_ns` is the time between two commands [ns]. Each
-        command contains a plan, the velocities of the next `plan` [s]; 0 means no plan.
+        command contains a plan, the velocities of the next `plan` [s]; 0 means no plan. Commands
+        that are no `news` are withheld; None: all are sent.
 
         Here the failure of a plug-in ends the command, because the robot does not fly yet.
         """
@@ -112,7 +116,7 @@ class ControlLoop:
         )
         self._horizon_max, self._freeze_after_ns = horizon_max, freeze_after * 1e9
         self.period_ns = period_ns
-        self._planned = plan_length(plan)
+        self._planned, self._news = plan_length(plan), news
         self.faults: list[Fault] = []
         self.lost: ControllerLostError | None = None
         self.counts: Counter[str] = Counter()
@@ -150,6 +154,7 @@ class ControlLoop:
         self.ready = False
         self._basis_arrival_ns = 0
         self._horizon, self._echoed_ns = 0.0, NEVER_NS
+        self._guard, self._output = GuardState.GROUND, STAND_STILL
         self.plans = PlanLog()
 
     def start_mission(self) -> None:
@@ -180,7 +185,7 @@ class ControlLoop:
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
         """Process telemetry that arrived at `now_ns` [ns], cloud's clock."""
         self._basis, self._basis_arrival_ns = telemetry.odometry, now_ns
-        self._now_ns, self.ready = now_ns, True
+        self._now_ns, self.ready, self._guard = now_ns, True, telemetry.guard
         try:
             self._observe_delay(telemetry, now_ns)
         except FAILURES as error:
@@ -258,8 +263,8 @@ class ControlLoop:
 
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
-    ) -> tuple[Command, Control]:
-        """Compute the command that is due at `now_ns` [ns], and the record of this period.
+    ) -> tuple[Command | None, Control]:
+        """Compute the command that is due at `now_ns` [ns], None if it is withheld, and its record.
 
         Args:
             setpoint: The newest setpoint.
@@ -278,7 +283,8 @@ class ControlLoop:
             self._note("estimator", error)
         horizon = self._horizon
         estimate = self._predict(basis, horizon)
-        output, plan, positions = STAND_STILL, list[Vector](), list[Vector]()
+        plan, positions = list[Vector](), list[Vector]()
+        output: ControlOutput | None = STAND_STILL
         self._echoed_ns = max(self._echoed_ns, self._newest_echo_ns)
         if self._echoed_ns == NEVER_NS:
             self._echoed_ns = now_ns
@@ -288,24 +294,25 @@ class ControlLoop:
             output, plan, positions = planned
         else:
             output = self._steer(estimate, setpoint, dt)
-            if self._planned:
+            if self._planned and output is not None:
                 plan, positions = self._plan(moving, output.velocity, now_ns)
-        velocity, yaw_rate, proportional, integral, derivative = output
+        is_sent, output = output is not None, output or self._output
+        self._output = output
         held_ns = now_ns - self._basis_arrival_ns
         planned_ns = basis.stamp_ns + round(horizon * 1e9) if plan else NEVER_NS
-        fields = (now_ns, basis.stamp_ns, held_ns, velocity, yaw_rate, tuple(plan), planned_ns)
+        fields = (now_ns, basis.stamp_ns, held_ns, *output[:2], tuple(plan), planned_ns)
         command = _new(Command, fields)
         if plan:
             self.plans.add(command, [estimate.position, *positions])
-        if self._commanded is not None:
+        is_sent = is_sent and (self._news is None or self._news.has(command, self._guard))
+        if not is_sent:
+            self.counts["commands_withheld"] += 1
+        elif self._commanded is not None:
             self._call("predictor", self._commanded, command)
-        _, position, orientation, predicted_velocity, _ = estimate
-        control = _new(Control, (
-            now_ns, epoch, counter, basis.stamp_ns, horizon, self._rtt, self._loop_delay,
-            basis.position, position, orientation, predicted_velocity, setpoint.position,
-            setpoint.waypoint, velocity, yaw_rate, proportional, integral, derivative,
-        ))  # fmt: skip
-        return command, control
+        datagram = epoch, counter if is_sent else UNSENT
+        delays = horizon, self._rtt, self._loop_delay
+        control = _record(now_ns, datagram, delays, basis, estimate, setpoint, output)
+        return command if is_sent else None, control
 
     def take_faults(self) -> list[Fault]:
         """Return the faults that happened since the last call."""
@@ -320,11 +327,13 @@ class ControlLoop:
             self._note("predictor", error)
             return basis
 
-    def _steer(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
+    def _steer(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput | None:
         if self.lost is not None:
             return STAND_STILL
         try:
             output = self._controller.update(estimate, setpoint, dt)
+            if output is None:
+                self._echoed_ns = self._now_ns  # without a command, there is no echo to wait for
             return output if self._trusts_controller else check_output(output)
         except ControllerLostError as error:  # the flight ends when its driver sees the fault
             self.lost = error
@@ -390,7 +399,8 @@ class ControlLoop:
                 goal = later(now_ns + k * PLAN_STEP_NS)
                 plug_in = "controller"
                 output = controller.update(state, goal, PLAN_STEP)
-                velocity = output.velocity
+                if output is not None:
+                    velocity = output.velocity
                 if not self._trusts_controller:
                     velocity = to_vector(velocity, "planned velocity")
                 x, y, z = velocity
@@ -428,3 +438,24 @@ class ControlLoop:
             what = f"the {kind} failed ({describe_error(error)}{where})"
             text = f"{what}; {instead or INSTEAD[kind]}; fix cloud.{kind} or choose another"
             self.faults.append(Fault(self._now_ns, code, text, stack_of(error)))
+
+
+def _record(
+    now_ns: int,
+    datagram: tuple[int, int],
+    delays: tuple[float, float, float],
+    basis: Odometry,
+    estimate: Odometry,
+    setpoint: Setpoint,
+    output: ControlOutput,
+) -> Control:
+    """Make the record of a period that begins at `now_ns` [ns].
+
+    `datagram` is its session and counter, `delays` are horizon, round trip and loop delay [s].
+    """
+    _, position, orientation, velocity, _ = estimate
+    control: Control = _new(Control, (
+        now_ns, *datagram, basis.stamp_ns, *delays, basis.position, position, orientation, velocity,
+        setpoint.position, setpoint.waypoint, *output,
+    ))  # fmt: skip
+    return control

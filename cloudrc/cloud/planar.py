@@ -38,7 +38,7 @@ class Planar(Controller):
         velocities, positions, yaw_rate = self._ask_plan(model, goals, dt)
         return Planned(np.multiply(velocities, (1.0, 1.0, 0.0)), positions, yaw_rate)
 
-    def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
+    def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput | None:
         """Compute one command, as the controller does after `dt` [s].
 
         The controller sees the robot at the height of the setpoint, without vertical velocities. So
@@ -55,6 +55,8 @@ class Planar(Controller):
         if setpoint.velocity[2]:
             setpoint = setpoint._replace(velocity=(rx, ry, 0.0))
         output = check_output(self._controller.update(level, setpoint, dt))
+        if output is None:
+            return None
         x, y, z = output.velocity
         if abs(z) <= ROUNDING:
             return output._replace(velocity=(x, y, 0.0))

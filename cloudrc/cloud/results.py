@@ -51,8 +51,10 @@ def check_estimate(estimate: Any) -> Odometry:
     )
 
 
-def check_output(output: Any) -> ControlOutput:
-    """Judge the output of a controller."""
+def check_output(output: Any) -> ControlOutput | None:
+    """Judge the output of a controller; None says that it sends nothing."""
+    if output is None:
+        return None
     velocity, yaw_rate, *terms = _parts(output)
     return ControlOutput(
         to_vector(velocity, "velocity"),

@@ -406,6 +406,13 @@ class Cloud(Section):
     """Length of the plan in each command [s], with velocities in steps of 10 ms. The robot
     follows the plan while newer commands are late or lost. A plan needs a predictor with a model;
     use it with the estimator earliest. 0: no plan"""
+    send_delta_mps: Positive | None = None
+    """Send-on-delta: cloud sends a command only if its plan differs from that of the last one sent,
+    by more than this velocity on an axis [m/s] or more than this number in the yaw rate [rad/s];
+    and after beat_s. Needs plan_s above 0. While the guard is in HOLD, every command is sent. null:
+    always"""
+    beat_s: CloudTime | None = None
+    """With send_delta_mps, the longest time between two commands [s]. null: a quarter of plan_s"""
     horizon_max_s: CloudTime | None = None
     """Longest horizon of the prediction [s]. null: the link profile's value, else 1"""
     freeze_after_s: CloudTime | None = None
@@ -439,7 +446,14 @@ class Cloud(Section):
             raise ValueError("compute_deviation_ms needs compute_ms, the mean, above 0")
         if self.cpu_share < 1 and not (self.compute_ms or self.compute_measured):
             raise ValueError("cpu_share needs compute_ms above 0 or compute_measured")
+        if self.send_delta_mps is not None and not self.plan_s:
+            raise ValueError("send_delta_mps needs plan_s above 0: the robot follows the plan")
         return self
+
+    @property
+    def beat(self) -> float:
+        """Longest time between two commands with `send_delta_mps` [s]."""
+        return self.plan_s / 4 if self.beat_s is None else self.beat_s
 
 
 class Criteria(Section):

@@ -150,6 +150,8 @@ cloudrc_horizon_clamped_total = horizon_clamped: Delay estimates clamped to the 
     cloud.horizon_max_s.
 cloudrc_commands_frozen_total = frozen: Commands of zero velocity, because the robot confirmed no
     newer command.
+cloudrc_commands_withheld_total = commands_withheld: Commands that cloud did not send, because their
+    plan was no news (cloud.send_delta_mps) or the controller returned None.
 cloudrc_plugin_failures_total[plugin] = *_failed: Plug-in calls that raised, or returned a wrong
     value.
 cloudrc_controller_gaps_total = controller_gaps: Times that the program of cloud.controller remote

@@ -57,11 +57,11 @@ class DishonestLoop(ControlLoop):
 
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
-    ) -> tuple[Command, Control]:
+    ) -> tuple[Command | None, Control]:
         """Compute an honest command, and change it; `dt` is the time since the last command [s]."""
         command, control = super().command(setpoint, now_ns, dt, epoch, counter)
         for lie in self._lies:
-            command = lie(command, control)
+            command = command and lie(command, control)
         return command, control
 
 

@@ -50,6 +50,7 @@ OWN = {
     "cloud.compute_deviation_ms": 0,
     "cloud.compute_measured": False,
     "cloud.cpu_share": 1,
+    "cloud.send_delta_mps": None,
     "cloud.predictor": "last_sample",
     "cloud.estimator": "running_mean",
     "cloud.controller": "pid",
@@ -63,10 +64,10 @@ class _Policy(Controller):
     """Controller that commands what the policy has decided."""
 
     def __init__(self) -> None:
-        self.output = ControlOutput((0.0, 0.0, 0.0), 0.0)
+        self.output: ControlOutput | None = ControlOutput((0.0, 0.0, 0.0), 0.0)
         self.setpoint: Setpoint | None = None  # that of the last command
 
-    def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
+    def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput | None:
         self.setpoint = setpoint
         return self.output
 
@@ -189,12 +190,11 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         return self._observe(self.flight)[0], {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Command a velocity and a yaw rate for one period of the cloud."""
+        """Command a velocity and a yaw rate for one period of the cloud; None: send nothing."""
         flight = self.flight
         if flight is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        x, y, *climb, yaw_rate = self._numbers_of(action)
-        flight.policy.output = ControlOutput((x, y, climb[0] if climb else 0.0), yaw_rate)
+        flight.policy.output = None if action is None else self._output_of(action)
         flight.step()
         observation, distance = self._observe(flight)
         ended = flight.teleop.over
@@ -202,9 +202,10 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         info = self._judge(flight) if ended or late else {}
         return observation, -distance, ended, late, info
 
-    def _numbers_of(self, action: Any) -> tuple[float, ...]:
+    def _output_of(self, action: Any) -> ControlOutput:
         with naming("action", ", ".join(self._parts)):
-            return RESULT.row(action, len(self._parts))
+            x, y, *climb, yaw_rate = RESULT.row(action, len(self._parts))
+        return ControlOutput((x, y, climb[0] if climb else 0.0), yaw_rate)
 
     def _observe(self, flight: _Flight) -> tuple[Any, float]:
         """Return the observation, and the distance from the setpoint [m]."""

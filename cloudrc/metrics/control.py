@@ -262,6 +262,9 @@ add_metrics(
      "with an age of information above criteria.age_deadline_s.", _most_missed),
     ("commands_applied", "1", "Number of commands that reached the low-level controller.",
      lambda flight: flight.count(len(flight.during("/command_applied")["epoch"]))),
+    ("commands_withheld", "1", "Number of commands that cloud did not send, because their plan was "
+     "no news (cloud.send_delta_mps) or the controller returned None.",
+     lambda flight: flight.growth("commands_withheld")),
     rtt_mean="round trip, mean",
 )  # fmt: skip
 add_metrics(

@@ -12,6 +12,7 @@ import numpy as np
 from cloudrc.metrics.counters import growth
 from cloudrc.metrics.flight import Array, Flight, add_metrics, select
 from cloudrc.record.columns import Recording, datagrams, join
+from cloudrc.records import UNSENT
 
 WAYS = {"uplink": "from world to cloud", "downlink": "from cloud to world"}
 """Direction -> words for the direction in the description of a metric."""
@@ -59,7 +60,8 @@ def loss(flight: Flight, way: str) -> float | None:
     world = flight.recording["/telemetry"]["stamp_ns"]
     if not len(world):
         return None
-    sent = select(sent, sent["stamp_ns"] < world[-1] - transit_ns(flight.recording, way))
+    before_ns = world[-1] - transit_ns(flight.recording, way)
+    sent = select(sent, (sent["stamp_ns"] < before_ns) & (sent["counter"] != UNSENT))
     expected = accepted = 0
     for epoch in np.unique(sent["epoch"]):
         counters = sent["counter"][sent["epoch"] == epoch]

@@ -122,6 +122,7 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("world.tuning=none", "world.tuning: no tuning of pelican named 'none'; available: fast"),
         ("cloud.compute_deviation_ms=1", "needs compute_ms"),
         ("cloud.cpu_share=0.2", "needs compute_ms"),
+        ("cloud.send_delta_mps=0.05", "needs plan_s"),
     ],
 )
 def test_an_invalid_setting_is_refused(text, reason):

@@ -55,6 +55,18 @@ def test_network_and_cloud_of_an_experiment_are_left_out(tmp_path):
     assert env.unwrapped.flight.cloud.telemetry.odometry.stamp_ns == before + 10_000_000
 
 
+def test_an_action_of_none_sends_nothing_but_a_sign_of_life_in_100_ms():
+    env = gymnasium.make("cloudrc/Steps-v0").unwrapped
+    env.reset(seed=1)
+    for _ in range(100):
+        env.step(np.array([0.5, 0.0, 0.0, 0.0]))
+    before = env.flight.cloud.counts["sent"]
+    for _ in range(120):
+        env.step(None)
+    assert 12 <= env.flight.cloud.counts["sent"] - before < 20
+    assert env.flight.cloud.counts["commands_withheld"] == 120
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")  # an observation has no bounds
 def test_gymnasium_accepts_a_robot():
     check_env(gymnasium.make("cloudrc/Steps-v0").unwrapped, skip_render_check=True)
@@ -97,6 +109,6 @@ def test_what_a_robot_cannot_fly_is_refused():
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(4))
     env.reset(seed=1)
-    for action in (np.zeros(3), np.array([np.nan, 0, 0, 0]), None, np.ones(4) > 0):
+    for action in (np.zeros(3), np.array([np.nan, 0, 0, 0]), np.ones(4) > 0):
         with pytest.raises(BadInputError, match=r"^action.*; give vx, vy, vz, yaw rate$"):
             env.step(action)

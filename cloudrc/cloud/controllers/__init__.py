@@ -69,8 +69,8 @@ class Controller:
     def reset(self) -> None:
         """Reset the controller at the start of a session or mission."""
 
-    def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
-        """Compute one command.
+    def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput | None:
+        """Compute one command; None: send nothing, so that the robot follows the last one.
 
         Args:
             estimate: Predicted pose and twist of the robot, in the units and frames of `Odometry`.
