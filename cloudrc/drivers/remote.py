@@ -19,7 +19,7 @@ from typing import Any
 
 from cloudrc.drivers.teleop import UnixDatagrams
 from cloudrc.errors import CloudrcError, ControllerLostError
-from cloudrc.policy.actions import PolicyAnswerError, read_actions
+from cloudrc.policy.actions import ACTIONS, PolicyAnswerError, read_actions
 from cloudrc.policy.address import KEY_VARIABLE
 from cloudrc.policy.client import PolicyClient, SilentServerError
 from cloudrc.policy.codec import pack, unpack
@@ -100,6 +100,9 @@ def _lost(error: CloudrcError) -> ControllerLostError:
 
 
 def _rows(answer: dict[Any, Any]) -> list[list[float]]:
+    """Return the rows of an answer; none if its actions are nil: cloud is to send nothing."""
+    if ACTIONS in answer and answer[ACTIONS] is None:
+        return []
     rows: list[list[float]] = read_actions(answer, WIDTH)[:ROWS_MAX].astype(float).tolist()
     return rows
 
@@ -121,6 +124,7 @@ class RemoteLink:
     def _forget(self) -> None:
         self._newest: tuple[int, list[list[float]]] | None = None  # time of the observation [ns]
         self._asked_ns = self._flown_ns = 0  # last observation; last flown answer [ns]
+        self._is_flown = True  # whether cloud has used the newest answer
 
     def begin(self) -> None:
         """Begin an episode: answers to earlier observations no longer count."""
@@ -144,7 +148,7 @@ class RemoteLink:
         if self._newest is not None:
             sent_ns, rows = self._newest
             if now_ns - sent_ns <= len(rows) * self._period_ns + HOLD_NS:
-                self._flown_ns = now_ns
+                self._flown_ns, self._is_flown = now_ns, True
                 return (now_ns - sent_ns) * 1e-9, rows
         self._check_silence((now_ns - self._flown_ns) * 1e-9)
         return None
@@ -158,7 +162,9 @@ class RemoteLink:
         self._trouble = message.get("trouble", "")
         known_ns = self._newest[0] if self._newest is not None else 0
         if "rows" in message and message["sent_ns"] > known_ns:
-            self._newest = message["sent_ns"], message["rows"]
+            rows = message["rows"]
+            if rows or self._is_flown:  # an answer without rows replaces none that is to be flown
+                self._newest, self._is_flown = (message["sent_ns"], rows), False
 
     def _check_silence(self, silence: float) -> None:
         """Raise a ControllerLostError if no answer was flown for `silence` [s], which is long."""

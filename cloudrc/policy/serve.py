@@ -118,7 +118,10 @@ class PolicyServer:
             inferring = time.perf_counter()
             answer = await self._call(policy.infer, observation)
             infer_ms = 1e3 * (time.perf_counter() - inferring)
-            actions = read_actions(answer, may_switch=True)  # the client knows its robot
+            if answer is None:  # nothing new to send
+                answer, actions = {}, None
+            else:
+                actions = read_actions(answer, may_switch=True)  # the client knows its robot
             timing = {"infer_ms": infer_ms}
             if total is not None:
                 timing["prev_total_ms"] = 1e3 * total

@@ -15,6 +15,7 @@ from cloudrc.errors import BadInputError, ControllerLostError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
 from cloudrc.policy.codec import unpack
 from cloudrc.record.columns import Recording, RecordStore
+from cloudrc.records import UNSENT
 from cloudrc.runs.experiment import check_mode
 from cloudrc.runs.fly import fly
 from tests.policy.conftest import actions, serving, stock_like
@@ -67,6 +68,16 @@ def test_a_remote_controller_drives_a_robot_on_the_ground(policy):
     with serving(policy(PID)) as url:
         served = true_path(experiment(url, name="pillars", short=ON_GROUND))
     assert np.array_equal(served, true_path(load_experiment("pillars", ON_GROUND)))
+
+
+def test_a_served_policy_that_returns_none_sends_nothing(policy):
+    every_third = "    calls.append(0)\n    if len(calls) % 3:\n        return None\n    return {"
+    often = "calls = []\n" + PID.replace("    return {", every_third)
+    store = RecordStore()
+    with serving(policy(often)) as url:
+        assembly.fly(experiment(url), store.add)
+    sent = Recording(records=store)["/delay_estimate"]["counter"]
+    assert np.mean(sent == UNSENT) == pytest.approx(2 / 3, abs=0.01)
 
 
 def lost(answer, tmp_path, metadata=b"\x80", settings=()):
@@ -162,7 +173,7 @@ class RealTime:
     def answer(self, *xs, late=0, **more):
         """Answer the observation `late` before the newest with a row for each velocity in x."""
         asked = self.peer.sent[-1 - late]
-        rows = {"rows": [[x, 0.0, 0.0, 0.0] for x in xs]} if xs else {}
+        rows = {"rows": [[x, 0.0, 0.0, 0.0] for x in xs if x is not None]} if xs else {}
         head = {"episode": asked["episode"], "sent_ns": asked["sent_ns"]}
         self.peer.arrived.append({**head, **rows, **more})
 
@@ -172,7 +183,7 @@ class RealTime:
         for _ in range(count):
             estimate = Odometry(self.now_ns, ZERO, UPRIGHT, ZERO, ZERO)
             output = self.controller.update(estimate, Setpoint(ZERO), 0.01)
-            found.append(output.velocity[0])
+            found.append(output and output.velocity[0])
             self.now_ns += 10_000_000
         return found
 
@@ -194,6 +205,22 @@ def test_in_real_time_the_newest_answer_wins(flight):
     assert flight.step() == [1.0]
     flight.answer(7.0, late=3)
     assert flight.step() == [1.0]
+
+
+def test_a_program_that_answers_nil_sends_nothing_and_is_not_silent(flight):
+    flight.step()
+    flight.answer(None)
+    assert flight.step() == [None]
+    assert flight.step() == [None]
+    flight.answer(7.0, late=1)  # both arrive in one period
+    flight.answer(None)
+    assert flight.step() == [7.0]
+    flight.answer(3.0)
+    flight.step()
+    for _ in range(600):
+        flight.answer(None)
+        assert flight.step() == [None]
+    assert not flight.counts["controller_gaps"]
 
 
 def test_a_silent_program_freezes_the_reference_and_may_come_back(flight):

@@ -19,7 +19,7 @@ from cloudrc.messages import Odometry, Setpoint
 
 Answer: TypeAlias = tuple[float, Sequence[Sequence[float]]]
 """Age of the answered observation [s], and the rows vx, vy, vz [m/s], world frame, yaw rate [rad/s]
-for its period and the following ones."""
+for its period and the following ones; without rows cloud sends nothing."""
 Surroundings: TypeAlias = Callable[[], tuple[int, Odometry | None, float, float]]
 """Function that returns cloud's time [ns], the newest odometry as it has arrived, the newest loop
 delay [s], NaN before the first, and the horizon [s]."""
@@ -79,7 +79,7 @@ class OutsideController(Controller):
         if self._channel is not None:
             self._channel.begin()
 
-    def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
+    def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput | None:
         """Return the command of the newest answer for this period; `dt` is the period [s].
 
         Raises:
@@ -94,6 +94,8 @@ class OutsideController(Controller):
             return STAND_STILL
         self._flies = True
         age, rows = answer
+        if not rows:
+            return None
         x, y, z, yaw_rate = rows[min(int(age / self._period + ROUNDING), len(rows) - 1)]
         return ControlOutput((x, y, z), yaw_rate)
 
