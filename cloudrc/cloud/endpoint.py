@@ -181,7 +181,9 @@ class CloudEndpoint(TunnelEnd):
         self._start: tuple[int, int] | None = None  # number and time [ns] of the newest START
         self._tick_ns = start_ns
         self._hello_ns = start_ns - KEY_PERIOD_NS  # time of the last periodic hello
-        self._alive_ns = start_ns
+        self._alive_ns = self._quiet_ns = (
+            start_ns  # next ALIVE: without commands, with withheld ones
+        )
         self._heard_ns = start_ns
         self._commanded_ns = NEVER_NS
         self._count_ns = start_ns + COUNT_PERIOD_NS
@@ -250,7 +252,7 @@ class CloudEndpoint(TunnelEnd):
             self._relay(alarm)
         if self._loop.ready and self._setpoint is not None:
             self._send_command(self._setpoint, now_ns)
-        if now_ns >= self._alive_ns:
+        elif now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_PERIOD_NS
             self._send(Kind.ALIVE, b"")
 
@@ -330,7 +332,7 @@ class CloudEndpoint(TunnelEnd):
         self._alarm.restart_numbers()
         self._world = accept.world_nonce.hex()
         self._clock_is_shared = accept.clock == self._identity.clock_id
-        self._heard_ns = self._alive_ns = now_ns
+        self._heard_ns = now_ns
         self._commanded_ns = NEVER_NS
         self._records.append(SessionOpened(now_ns, "cloud", epoch, "world accepted"))
 
@@ -426,7 +428,10 @@ class CloudEndpoint(TunnelEnd):
         sent_ns = now_ns if compute is None else now_ns + compute.end(now_ns)
         datagram = None if command is None else self._make_datagram(COMMAND, command)
         if datagram is not None:
-            self._alive_ns = sent_ns + ALIVE_PERIOD_NS
+            self._quiet_ns = sent_ns + ALIVE_PERIOD_NS
+        elif now_ns >= self._quiet_ns:
+            self._quiet_ns = now_ns + ALIVE_PERIOD_NS
+            self._send(Kind.ALIVE, b"")
         if compute is not None:
             self._unsent = sent_ns, datagram
         elif datagram is not None:
