@@ -245,19 +245,21 @@ class ControlLoop:
     def _estimate_horizon(self, age: float) -> float:
         """Return the estimator's horizon, limited to its allowed range [s].
 
-        `age` is cloud's time minus the stamp of the newest odometry on world's clock [s].
-
-        Raises:
-            InvalidValueError: If the estimator's horizon is not a finite number.
+        `age` is cloud's time minus the stamp of the newest odometry on world's clock [s]. If the
+        estimator fails, return the last horizon.
         """
-        horizon = self._estimator.horizon(age)
-        if type(horizon) is not float:
+        try:
+            horizon = self._estimator.horizon(age)
+            if type(horizon) is not float:
+                horizon = RESULT.of(horizon, "horizon")
+            if horizon == 0.0 and self._newest_echo_ns == NEVER_NS:
+                horizon = self._expected
+            if 0.0 <= horizon <= self._horizon_max:
+                return horizon
             horizon = RESULT.of(horizon, "horizon")
-        if horizon == 0.0 and self._newest_echo_ns == NEVER_NS:
-            horizon = self._expected
-        if 0.0 <= horizon <= self._horizon_max:
-            return horizon
-        horizon = RESULT.of(horizon, "horizon")
+        except FAILURES as error:
+            self._note("estimator", error)
+            return self._horizon
         self.counts["horizon_clamped"] += 1
         return float(min(max(horizon, 0.0), self._horizon_max))
 
@@ -277,16 +279,13 @@ class ControlLoop:
         if moving.motion is not None:
             setpoint = setpoint_at(moving, now_ns)
         assert basis is not None, "check `ready` first"
-        try:
-            self._horizon = self._estimate_horizon((now_ns - basis.stamp_ns) * 1e-9)
-        except FAILURES as error:
-            self._note("estimator", error)
-        horizon = self._horizon
+        self._horizon = horizon = self._estimate_horizon((now_ns - basis.stamp_ns) * 1e-9)
         estimate = self._predict(basis, horizon)
         plan, positions = list[Vector](), list[Vector]()
         output: ControlOutput | None = STAND_STILL
-        self._echoed_ns = max(self._echoed_ns, self._newest_echo_ns)
-        if self._echoed_ns == NEVER_NS:
+        if self._echoed_ns < self._newest_echo_ns:
+            self._echoed_ns = self._newest_echo_ns
+        elif self._echoed_ns == NEVER_NS:
             self._echoed_ns = now_ns
         if now_ns - self._echoed_ns > horizon * 1e9 + self._freeze_after_ns:  # no new echo
             self.counts["frozen"] += 1
@@ -296,23 +295,26 @@ class ControlLoop:
             output = self._steer(estimate, setpoint, dt)
             if self._planned and output is not None:
                 plan, positions = self._plan(moving, output.velocity, now_ns)
-        is_sent, output = output is not None, output or self._output
-        self._output = output
+        says_nothing, output = output is None, output or self._output
+        velocity, yaw_rate, proportional, integral, derivative = output
         held_ns = now_ns - self._basis_arrival_ns
         planned_ns = basis.stamp_ns + round(horizon * 1e9) if plan else NEVER_NS
-        fields = (now_ns, basis.stamp_ns, held_ns, *output[:2], tuple(plan), planned_ns)
+        fields = (now_ns, basis.stamp_ns, held_ns, velocity, yaw_rate, tuple(plan), planned_ns)
         command = _new(Command, fields)
         if plan:
             self.plans.add(command, [estimate.position, *positions])
-        is_sent = is_sent and (self._news is None or self._news.has(command, self._guard))
-        if not is_sent:
+        if says_nothing or (self._news is not None and not self._news.has(command, self._guard)):
             self.counts["commands_withheld"] += 1
+            counter = UNSENT
         elif self._commanded is not None:
             self._call("predictor", self._commanded, command)
-        datagram = epoch, counter if is_sent else UNSENT
-        delays = horizon, self._rtt, self._loop_delay
-        control = _record(now_ns, datagram, delays, basis, estimate, setpoint, output)
-        return command if is_sent else None, control
+        _, position, orientation, predicted_velocity, _ = estimate
+        control = _new(Control, (
+            now_ns, epoch, counter, basis.stamp_ns, horizon, self._rtt, self._loop_delay,
+            basis.position, position, orientation, predicted_velocity, setpoint.position,
+            setpoint.waypoint, velocity, yaw_rate, proportional, integral, derivative,
+        ))  # fmt: skip
+        return None if counter == UNSENT else command, control
 
     def take_faults(self) -> list[Fault]:
         """Return the faults that happened since the last call."""
@@ -334,7 +336,9 @@ class ControlLoop:
             output = self._controller.update(estimate, setpoint, dt)
             if output is None:
                 self._echoed_ns = self._now_ns  # without a command, there is no echo to wait for
-            return output if self._trusts_controller else check_output(output)
+                return None
+            self._output = output if self._trusts_controller else check_output(output)
+            return self._output
         except ControllerLostError as error:  # the flight ends when its driver sees the fault
             self.lost = error
             self.faults.append(Fault(self._now_ns, error.code, str(error)))
@@ -438,24 +442,3 @@ class ControlLoop:
             what = f"the {kind} failed ({describe_error(error)}{where})"
             text = f"{what}; {instead or INSTEAD[kind]}; fix cloud.{kind} or choose another"
             self.faults.append(Fault(self._now_ns, code, text, stack_of(error)))
-
-
-def _record(
-    now_ns: int,
-    datagram: tuple[int, int],
-    delays: tuple[float, float, float],
-    basis: Odometry,
-    estimate: Odometry,
-    setpoint: Setpoint,
-    output: ControlOutput,
-) -> Control:
-    """Make the record of a period that begins at `now_ns` [ns].
-
-    `datagram` is its session and counter, `delays` are horizon, round trip and loop delay [s].
-    """
-    _, position, orientation, velocity, _ = estimate
-    control: Control = _new(Control, (
-        now_ns, *datagram, basis.stamp_ns, *delays, basis.position, position, orientation, velocity,
-        setpoint.position, setpoint.waypoint, *output,
-    ))  # fmt: skip
-    return control

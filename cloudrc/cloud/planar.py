@@ -54,9 +54,10 @@ class Planar(Controller):
         rx, ry, _ = setpoint.velocity
         if setpoint.velocity[2]:
             setpoint = setpoint._replace(velocity=(rx, ry, 0.0))
-        output = check_output(self._controller.update(level, setpoint, dt))
+        output = self._controller.update(level, setpoint, dt)
         if output is None:
             return None
+        output = check_output(output)
         x, y, z = output.velocity
         if abs(z) <= ROUNDING:
             return output._replace(velocity=(x, y, 0.0))

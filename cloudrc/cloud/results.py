@@ -51,10 +51,8 @@ def check_estimate(estimate: Any) -> Odometry:
     )
 
 
-def check_output(output: Any) -> ControlOutput | None:
-    """Judge the output of a controller; None says that it sends nothing."""
-    if output is None:
-        return None
+def check_output(output: Any) -> ControlOutput:
+    """Judge the output of a controller."""
     velocity, yaw_rate, *terms = _parts(output)
     return ControlOutput(
         to_vector(velocity, "velocity"),
