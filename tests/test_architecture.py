@@ -6,12 +6,12 @@ import subprocess
 import sys
 import tomllib
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "cloudrc"
 FILES = sorted(PACKAGE.rglob("*.py"))
-TREES = {path: ast.parse(path.read_text()) for path in FILES}
 
 ROS = (
     *("rclpy", "diagnostic_msgs", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs"),
@@ -53,6 +53,12 @@ ASKED_AS = {
 }
 
 
+@cache
+def trees():
+    """Return the tree of each file of the package."""
+    return {path: ast.parse(path.read_text()) for path in FILES}
+
+
 def place_of(path):
     return path.relative_to(PACKAGE).as_posix()
 
@@ -70,7 +76,7 @@ def imports(tree):
 def test_a_reserved_package_is_imported_only_in_its_places():
     found = [
         f"{place_of(path)} imports {name}"
-        for path, tree in TREES.items()
+        for path, tree in trees().items()
         for name in imports(tree)
         for reserved, places in RESERVED.items()
         if f"{name}.".startswith(f"{reserved}.") and not place_of(path).startswith(places)
@@ -85,9 +91,9 @@ def test_live_metrics_load_neither_recordings_nor_heavy_libraries():
     assert found.stdout == "set()\n", found.stderr
 
 
-def foreign(trees):
+def foreign(parsed):
     """Return the imported external packages by their names in pyproject.toml."""
-    found = {name.partition(".")[0] for tree in trees for name in imports(tree)}
+    found = {name.partition(".")[0] for tree in parsed for name in imports(tree)}
     found -= sys.stdlib_module_names | {"cloudrc", *ROS}
     return {ASKED_AS.get(name, name) for name in found}
 
@@ -98,13 +104,13 @@ def test_imported_and_declared_packages_are_the_same():
     extras = [lines for name, lines in project["optional-dependencies"].items() if name != "dev"]
     lines = sum(extras, project["dependencies"])
     declared = {re.split(r"[<>=\[; ]", line)[0].replace("-", "_") for line in lines} - {"cloudrc"}
-    assert foreign(TREES.values()) == declared
+    assert foreign(trees().values()) == declared
     assert foreign([ast.parse("def f():\n    from polaris.client import get")]) == {"polaris"}
 
 
 def test_no_file_and_no_function_is_too_long():
     long = {place_of(path) for path in FILES if path.read_text().count("\n") > 500}
-    for path, tree in TREES.items():
+    for path, tree in trees().items():
         for node in ast.walk(tree):
             function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
             if function and node.end_lineno - node.lineno >= 50:
@@ -115,7 +121,7 @@ def test_no_file_and_no_function_is_too_long():
 def test_no_two_public_classes_share_a_name():
     found = Counter(
         node.name
-        for tree in TREES.values()
+        for tree in trees().values()
         for node in tree.body
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
     )

@@ -84,14 +84,19 @@ PROGRESS = re.compile(r"(([a-z]+s| +[\d.]+ s) .*\n)*")
 """What a quick command says on a busy machine."""
 
 
-@pytest.mark.parametrize("command", [c for c in QUICK if c not in FLIGHTS[1:]])
-def test_a_command_works(command, folder):
-    done = execute(command, folder)
+def test_the_first_flight_works(folder):
+    done = execute(FLIGHTS[0], folder)
     assert done.returncode == 0, done.stdout + done.stderr
     assert PROGRESS.fullmatch(done.stderr)
-    if command in FLIGHTS:
-        assert (folder / done.stdout.splitlines()[-1]).name == "report.html"
-        assert (folder / done.stdout.splitlines()[-1]).is_file()
+    assert (folder / done.stdout.splitlines()[-1]).name == "report.html"
+    assert (folder / done.stdout.splitlines()[-1]).is_file()
+
+
+@pytest.mark.parametrize("command", [c for c in QUICK if c not in FLIGHTS])
+def test_a_command_works(command, folder, monkeypatch, call):
+    monkeypatch.chdir(folder)
+    _, *words = shlex.split(command)
+    assert PROGRESS.fullmatch(call("", *words).err)
 
 
 @pytest.mark.process

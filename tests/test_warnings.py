@@ -113,8 +113,7 @@ def test_each_shipped_profile_is_flown_without_a_warning(profile):
     "conditions",
     [
         (90, 50, {}),
-        (110, 20, {}),
-        *nightly((70, 60, {}), (100, 40, {}), (100, 40, {"distribution": "pareto"})),
+        *nightly((110, 20, {}), (70, 60, {}), (100, 40, {}), (100, 40, {"distribution": "pareto"})),
         *nightly((70, 40, {"distribution": "normal"}), (120, 5, {}), (200, 150, {})),
     ],
 )

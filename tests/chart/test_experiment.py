@@ -60,8 +60,7 @@ def test_a_profile_replaces_the_experiments_link(profile):
     own = {"profile": {"downlink": {"delay_ms": 5}}}
     made = profile({"experiment": {"link": link}, "link": own})
     assert (made.uplink.delay_ms, made.downlink.delay_ms) == (0, 5)
-    for name in names("profile"):
-        assert profile({"link": {"profile": name}}) == load_profile(name)
+    assert profile({"link": {"profile": "lossy"}}) == load_profile("lossy")
 
 
 @pytest.mark.parametrize(("key", "way"), [("trace", {"trace": "drive.csv"}), ("table", TABLE)])

@@ -26,7 +26,8 @@ def fly_with(replace_flights):
     return use
 
 
-def test_short_flights_are_compared_for_real(call):
+def test_short_flights_are_compared_for_real(call, monkeypatch):
+    monkeypatch.setattr("cloudrc.trials.workers.usable_cores", lambda: 1)
     out = call(f"compare {A} {B},cloud.estimator=split --seeds 1 -o json", *SHORT).out
     document = json.loads(out)
     sides = A, f"{B},cloud.estimator=split"

@@ -44,13 +44,11 @@ def test_all_problems_are_listed_with_their_lines(mine):
 
 
 def test_fifty_problems_at_most_are_listed(mine):
-    points = ", ".join(["{position_m: [0, 0, 1], dwell_s: -1}"] * 2000)
+    points = ", ".join(["{position_m: [0, 0, 1], dwell_s: -1}"] * 60)
     text = refused_text(mine, f"mission: {{waypoints: [{points}]}}\n")
-    assert "mine.yaml has 2000 problems:" in text
-    assert text.endswith("and 1950 more")
+    assert "mine.yaml has 60 problems:" in text
+    assert text.endswith("and 10 more")
     assert len(text.splitlines()) == 52
-    mine.write_text("waypoints:\n" + "- {position_m: [0.5, 0.0, 0.7], dwell_s: 0}\n" * 10_001)
-    assert "at most 10000 entries" in refused("paper", f"mission={mine}")
 
 
 @pytest.mark.parametrize(

@@ -105,7 +105,7 @@ def file(request, tmp_path):
     return path
 
 
-@pytest.mark.parametrize("step", [10, *nightly(1)])
+@pytest.mark.parametrize("step", [20, *nightly(1)])
 def test_every_pair_of_valid_settings_loads_or_names_one_of_them(file, step):
     """Of pairs that are not of two chosen settings, try one of `step`."""
     single = valid_settings(file)

@@ -42,7 +42,7 @@ gymnasium.register("ID", entry_point=My)
     ("env", "place"),
     [
         ("beside_env:Beside-v0", "laws"),
-        ("elsewhere/else_env.py:space/Else-v0", "elsewhere"),
+        pytest.param("elsewhere/else_env.py:space/Else-v0", "elsewhere", marks=pytest.mark.full),
     ],
 )
 def test_an_environment_may_be_a_file_here_or_beside_the_policy(

@@ -14,7 +14,7 @@ from cloudrc import exercise
 from cloudrc.exercise import checks, scoring
 from cloudrc.exercise.files import FILES
 from cloudrc.exercise.points import POINTS
-from tests.conftest import wait_until
+from tests.conftest import nightly, wait_until
 
 SOLUTION = Path(__file__).with_name("solution")
 ALL = {part: [*tests] for part, tests in POINTS.items()}
@@ -27,11 +27,15 @@ def score(part, folder):
     return [{"test": test, "max_points": most, **row} for (test, most), row in rows]
 
 
-@pytest.mark.parametrize(("folder", "points"), [(STUBS, 0), (SOLUTION, 100)])
 @pytest.mark.parametrize("part", checks.CHECKS)
-def test_a_stub_scores_nothing_and_the_solution_all(part, folder, points):
-    for row in score(part, folder):
-        assert row["points"] == row["max_points"] * points / 100, row
+def test_the_solution_scores_all(part):
+    for row in score(part, SOLUTION):
+        assert row["points"] == row["max_points"], row
+
+
+@pytest.mark.parametrize("part", sorted(checks.CHECKS.keys() - {"together"}) + nightly("together"))
+def test_a_stub_scores_nothing(part):
+    assert [row for row in score(part, STUBS) if row["points"]] == []
 
 
 # Part, text of the solution, what a student writes instead, lost tests, text of the first one.

@@ -33,8 +33,9 @@ def test_a_schedule_that_found_a_bug_breaks_nothing_now(path):
     assert fly(load(path)).breaches == ()
 
 
-@pytest.mark.parametrize("seed", [1, *nightly(*range(2, 9))])
+@pytest.mark.parametrize("seed", nightly(*range(2, 9)))
 def test_random_faults_break_no_invariant(seed):
+    """Seed 1 is flown daily by the command, in tests/cli."""
     assert fly(compose(seed)).breaches == ()
 
 

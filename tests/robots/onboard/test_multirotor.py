@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from cloudrc.robots.onboard import multirotor
+from tests.conftest import nightly
 from tests.robots.onboard.conftest import (
     DT,
     Flight,
@@ -47,7 +48,10 @@ PLANTS = {
 }
 
 
-@pytest.fixture(params=PLANTS, name="flight")
+NIGHTLY = ["other order", "other spin directions", "centre of mass unknown", "unlimited"]
+
+
+@pytest.fixture(params=sorted(PLANTS.keys() - NIGHTLY) + nightly(*NIGHTLY), name="flight")
 def _flight(request):
     return Flight(*PLANTS[request.param])
 

@@ -188,8 +188,8 @@ def test_in_air_that_acts_on_geoms_c_uses_the_whole_model(setting):
     [
         ("paper", ()),
         ("steps", ("world.onboard.integral_limit_xy=0.3", "guard.speed_max_mps=0.5")),
-        ("fast", ("link.profile=lossy", "criteria.time_limit_s=12")),
-        ("paper-verbatim", ()),
+        ("fast", ("link.profile=lossy", "criteria.time_limit_s=5")),
+        pytest.param("paper-verbatim", (), marks=pytest.mark.full),
         ("hover", ("link.uplink.blackouts=[{start_s: 8, duration_s: 3}]",)),
     ],
 )
