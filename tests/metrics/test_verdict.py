@@ -1,13 +1,26 @@
 """Each rule of the verdict: what breaks it, its time and place, and the order of outcomes."""
 
+from dataclasses import replace
+
 import pytest
 
 from cloudrc.config.schema import MissionConfig, Waypoint
 from cloudrc.errors import DISK_FULL
 from cloudrc.messages import GuardState
 from cloudrc.metrics.measure import SHIPPED, Number, measure_all
-from cloudrc.metrics.verdict import SLIP_MAX, exit_code, flight_evidence, judge, operator_verdict
+from cloudrc.metrics.verdict import (
+    SLIP_MAX,
+    Ending,
+    Evidence,
+    FlightFailure,
+    Observations,
+    exit_code,
+    flight_evidence,
+    judge,
+    operator_verdict,
+)
 from cloudrc.records import (
+    CONTROLLER_LOST,
     REAL_TIME_FACTOR_MIN,
     Control,
     Counted,
@@ -198,6 +211,8 @@ MISSED = MissionConfig(waypoints=(Waypoint(position_m=(0.0, 5.0, 1.0)),))
         # What telemetry had not shown when the mission ended
         (world(touch(9.99, "pipe_1")), None, ["obstacle_touched"], []),
         (world(touch(9.99), log=flown), None, [], ["not_touched"]),
+        # What the last command was based on
+        (world(touch(9.95, "pipe_1")), None, ["obstacle_touched"], ["obstacle_touched"]),
     ],
 )
 def test_the_operator_knows_what_had_arrived(log, mission, report, operator):
@@ -239,8 +254,10 @@ def test_real_time_is_kept_or_the_run_is_invalid(slip, factor, found):
     assert (verdict.outcome, codes(verdict)) == ("invalid" if found else "success", found)
     # Virtual time does not depend on the machine.
     assert judged(flight).outcome == "success"
-    unproven = judged(flight, real_time=True)  # no rows of lateness
+    del numbers["world_slip"]  # no rows of lateness
+    unproven = judge(flight_evidence(flight, numbers, real_time=True, interrupted=False))
     assert (unproven.outcome, codes(unproven)) == ("invalid", ["not_real_time"])
+    assert "does not prove" in unproven.failures[0].text
 
 
 @pytest.mark.parametrize(("failures", "found"), [(2, []), (3, ["plugin_failed"])])
@@ -282,3 +299,46 @@ def test_a_recording_cut_off_by_a_full_disk_is_no_failed_mission(words):
     assert codes(verdict)[0] == "disk_full"
     report = {"verdict": verdict.outcome, "failures": [{"code": code} for code in codes(verdict)]}
     assert exit_code(report) == 3
+
+
+@pytest.mark.parametrize("code", [*CONTROLLER_LOST, "late"])
+def test_a_mission_ends_with_the_program_that_controls_it(code):
+    log = without_end(good())
+    log.cloud.append(Fault(at(9), code, "why"))
+    found = codes(judged(log.flight(ONE_PIPE)))
+    assert (code in found, "mission_not_ended" in found) == (code != "late", code == "late")
+
+
+DONE = Ending("done", "")
+REACHED = Evidence(1, 1, None, DONE)
+
+
+@pytest.mark.parametrize(
+    ("more", "outcome", "said"),
+    [
+        ({"lost": "a second"}, "invalid", "success as far as the recording goes: a second"),
+        ({"lost": "a second", "reached": 0}, "invalid", "it is not known whether"),
+        ({"lost": "a second", "violations": (FlightFailure("x", "it hit"),)}, "failure", "it hit"),
+        ({"ending": Ending("timed_out", "late"), "reached": 0}, "failure", "late"),
+    ],
+)
+def test_what_is_known_fails_a_mission_also_if_the_recording_lost_something(more, outcome, said):
+    verdict = judge(replace(REACHED, **more))
+    assert verdict.outcome == outcome
+    assert said in verdict.failures[0].text
+    known = {"verdict": outcome, "failures": [{"code": code} for code in codes(verdict)]}
+    assert exit_code(known) == {"invalid": 6, "failure": 1}[outcome]
+
+
+def test_telemetry_tells_contacts_and_slip_as_they_rise():
+    first = Observations(1, "at 3 s", 0.1, slip_ns=1_000_000_000)
+    more = replace(first, obstacle_contacts=2)
+    told = [text for seen, before in ((first, Observations()), (more, first), (more, more))
+            for _, text in seen.news(before, 5.0, "board")]  # fmt: skip
+    assert told[0] == "the robot touched an obstacle at 3 s"
+    assert told[1] == "board touched at 5.00 s with 0.10 m/s"
+    assert told[2] == "the robot touched an obstacle again, at 5.00 s"
+    found = first.evidence(DONE, 10.0, waypoints=1, reached=1, wanted=None)
+    assert found.violations[0].text == "the robot touched an obstacle at 3 s"
+    assert found.slow.startswith("real-time factor 0.9 is below")
+    assert first.evidence(DONE, 0.0, waypoints=0, reached=0, wanted=None).slow == ""
