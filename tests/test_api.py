@@ -45,12 +45,6 @@ def test_the_configuration_repeats_the_flight(result, tmp_path):
     assert cloudrc.fly(str(path)).records_sha256 == result.records_sha256
 
 
-def test_values_of_numpy_and_mappings_are_settings():
-    pid = {"name": "pid", "gain_p": np.array([0.5, 0.5, 0.5])}
-    settings = {**SHORT, "seed": np.int64(4), "cloud.controller": pid}
-    assert "gain_p: [0.5, 0.5, 0.5]" in cloudrc.fly("steps", settings).config
-
-
 def test_a_failed_mission_is_a_result():
     with pytest.warns(UserWarning, match="loses 100 %"):
         result = cloudrc.fly("steps", {**SHORT, "link.downlink.loss": 1.0}, seed=1)
@@ -101,13 +95,6 @@ def test_an_error_of_a_sweep_in_python_names_its_key(tmp_path, monkeypatch):
     with pytest.raises(BadInputError, match=r"^sweep: grid: link\.profle: unknown key"):
         cloudrc.sweep({"experiment": "steps", "grid": {"link.profle": ["lte"]}}, out="out")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_wrong_number_of_seeds_or_processes_is_named():
-    with pytest.raises(BadInputError, match=r"^seeds: .* is not a whole number >= 1$"):
-        cloudrc.margin("link.both.delay_ms", seeds=0)
-    with pytest.raises(BadInputError, match=r"^jobs: .* is not a whole number >= 1$"):
-        cloudrc.sweep(GRID, jobs=0)
 
 
 def test_none_in_an_axis_of_numbers_is_nan_and_texts_stay_texts():
@@ -185,14 +172,6 @@ def test_the_examples_with_many_flights_run(tmp_path):
     assert (done.returncode, len(done.stdout.splitlines())) == (0, 5), done.stderr
 
 
-def test_the_velocity_loop_of_a_recording_is_identified(tmp_path, monkeypatch):
-    monkeypatch.setattr("cloudrc.report.write._draw", lambda *given, **wanted: None)
-    cloudrc.fly("steps", {"link.profile": "paper-p1"}, seed=1, out=tmp_path / "run")
-    model = cloudrc.identify(tmp_path / "run")
-    assert all(0.05 < each < 0.3 for each in model["time_constant"])
-    assert model == cloudrc.identify(tmp_path / "run" / "mission.mcap")
-
-
 @pytest.mark.process
 def test_a_link_is_verified(capfd):
     settings = {"link.both.delay_ms": 100, "link.both.jitter_ms": 0}
@@ -201,13 +180,6 @@ def test_a_link_is_verified(capfd):
     (mean,) = (r for r in found["directions"]["uplink"]["rows"] if r["name"] == "mean")
     assert mean["asked"] == pytest.approx(0.1)
     assert capfd.readouterr() == ("", "")
-
-
-def test_a_wrong_verification_is_refused():
-    with pytest.raises(BadInputError, match="is not a number >= 1 and <= 3600"):
-        cloudrc.verify(seconds=0.5)
-    with pytest.raises(BadInputError, match="no mode named"):
-        cloudrc.verify(mode="virtual")
 
 
 @pytest.mark.full

@@ -108,28 +108,12 @@ def test_the_number_of_pairs_needed_has_power_80_percent():
     assert 0.77 <= power <= 0.88
 
 
-@pytest.mark.parametrize("values", [[1.0], [0.0] * 8, [1.0, 2.0, 3.0, 4.0, 5.0]])
-def test_few_pairs_or_no_effect_decide_nothing(values):
-    found = paired(values)
-    assert not found.decided
-    assert found.pairs_needed is None or found.pairs_needed > len(values)
-
-
 def test_differences_that_are_equal_up_to_rounding_share_their_ranks_and_cancel():
     rounded = [0.1 + 0.2, -0.3, 0.3, 0.7, -0.7, 0.1 + 0.6]
     exact = [0.3, -0.3, 0.3, 0.7, -0.7, 0.7]
     assert signed_rank_test(rounded) == signed_rank_test(exact)
     found = paired([0.1 + 0.2, -0.3] * 4)
     assert (found.difference, found.decided, found.pairs_needed) == (0.0, False, None)
-
-
-def test_the_sign_test_holds_its_level_for_skewed_differences():
-    """The signed-rank test does not: it assumes symmetric differences."""
-    rng = np.random.default_rng(1)
-    samples = rng.exponential(1.0, (400, 50)) - np.log(2.0)  # the median is 0
-    found = [paired(sample.tolist()) for sample in samples]
-    assert np.mean([each.p_sign < 0.05 for each in found]) < 0.06
-    assert np.mean([each.p_wilcoxon < 0.05 for each in found]) > 0.1
 
 
 def test_holms_p_has_the_values_of_a_calculation_by_hand():

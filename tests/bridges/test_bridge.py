@@ -8,7 +8,6 @@ from rosbags.typesys import Stores, get_typestore
 
 from cloudrc.bridges.ros2.health import FlightHealth
 from cloudrc.bridges.ros2.requests import RosRequests
-from cloudrc.cli.main import main
 from cloudrc.console.steering import Steering
 from cloudrc.geometry.shapes import Shapes, Surface
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
@@ -23,7 +22,7 @@ from cloudrc.record.live import (
     encode_text,
     encode_transforms,
 )
-from cloudrc.records import Arrival, Counted, Lateness, TelemetrySent
+from cloudrc.records import Arrival, TelemetrySent
 from cloudrc.report.markers import encode_markers, path_shape, scene_shapes
 from tests.console.conftest import FakeApi
 
@@ -180,23 +179,6 @@ def test_loss_is_counted_as_everywhere_and_delays_are_those_of_the_last_seconds(
     assert health(*arrivals, now_ns=times[-1] + 600_000_000)[1].level == ERROR
 
 
-def test_a_cloud_that_misses_periods_or_a_bridge_that_is_slow_warns():
-    late = Lateness(900_000_000, "cloud", 0.002, 0.001, 0)
-    assert health(late)[2] == HealthStatus(
-        OK,
-        "cloud",
-        "lateness 2.0 ms",
-        {
-            "lateness, mean": "2.0 ms",
-            "lateness, max": "2.0 ms",
-            "missed periods": "0",
-            "records dropped": "0",
-        },
-    )
-    assert health(late, dropped=1)[2].level == WARN
-    assert health(Counted(0, "cloud", "missed_periods", 9))[2].level == WARN
-
-
 def test_ros_reads_health_guard_and_frames():
     statuses = [HealthStatus(WARN, "link", "slow", {"loss": "1 %"})]
     data = encode_diagnostics(2_000_000_003, statuses, "drone1")
@@ -228,21 +210,3 @@ def test_markers_move_with_the_robots_frames_and_the_scene_stays():
         ("flown", "world"),
     ]
     assert len(markers[-1].points) == 2
-
-
-def test_a_namespace_that_ros_refuses_is_bad_input(capsys):
-    assert main(["ros", "bridge", "--namespace", "a-b"]) == 2
-    assert "invalid ros_namespace value" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["--records", "here"],
-        ["runs/latest", "--config", "a.yaml", "--records", "here", "--api", "http://[::1]:8080"],
-    ],
-)
-def test_the_flags_of_the_pod_belong_together(words, capsys):
-    assert main(["ros", "bridge", *words]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "--config, --records and --api are for the chart's container" in line

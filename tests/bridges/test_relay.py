@@ -11,7 +11,6 @@ from importlib.util import find_spec
 import pytest
 
 import cloudrc.link
-from cloudrc.cli.main import main
 
 pytestmark = [
     pytest.mark.ros2,
@@ -19,7 +18,7 @@ pytestmark = [
     pytest.mark.skipif(find_spec("rclpy") is None, reason="needs a sourced ROS 2: make ros2-test"),
 ]
 if find_spec("rclpy"):
-    from geometry_msgs.msg import Point, Vector3
+    from geometry_msgs.msg import Point
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import QoSProfile, ReliabilityPolicy
 
@@ -139,22 +138,3 @@ def test_a_subscription_that_wants_reliable_needs_a_flag_and_is_told_so(flags):
         _, words = link.end()
     assert len(one.ages) == (500 if flags else 0)
     assert ("see --reliable" in words) is not bool(flags)
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "text"),
-    [
-        (["--to", "odom"], 2, "--from and --to are both /odom"),
-        ([], 2, "/other publishes /odom as geometry_msgs/msg/Vector3"),
-        (["--from", "/other"], 2, "but node /robot subscribes to /remote/odom as geometry_msgs"),
-    ],
-)
-def test_topics_that_cannot_be_relayed_end_the_command_with_one_line(capsys, words, code, text):
-    with robot():
-        other = OwnNode("other")
-        publishers = [other.node.create_publisher(Vector3, name, 1) for name in ("/odom", "/other")]
-        assert len(publishers) == 2
-        assert main([*WORDS, *words]) == code
-        other.close()
-    (error,) = capsys.readouterr().err.splitlines()
-    assert text in error

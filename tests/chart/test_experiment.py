@@ -91,22 +91,3 @@ def test_a_change_restarts_only_what_it_must():
     after = named({"link": {"profile": "lossy"}})
     differ = {key for key in before if before[key] != after[key]}
     assert differ == {("ConfigMap", "demo-cloudrc-link")}
-
-
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        ({"link": {"profile": "wify"}}, "link.profile: no profile 'wify' ships.*choose one of 5g"),
-        (
-            {"experiment": {"link": {"profile": "./mine.yaml"}}},
-            "experiment.link.profile: no profile './mine.yaml'.*profile under link.profile",
-        ),
-        (
-            {"link": {"profile": "wifi"}, "experiment": {"link": {"uplink": {"trace": "/t.csv"}}}},
-            "experiment.link: uplink.trace names '/t.csv', but link.traces has no",
-        ),
-    ],
-)
-def test_names_that_pods_could_not_find_are_refused(values, said):
-    with pytest.raises(Exception, match=said):
-        render(values)

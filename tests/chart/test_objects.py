@@ -29,31 +29,6 @@ def test_names_follow_release_and_override(release, values, name):
     assert max(len(thing["metadata"]["name"]) for thing in objects) <= 63
 
 
-@pytest.mark.parametrize("release", ["1rel"])
-def test_an_invalid_name_is_refused(release):
-    with pytest.raises(Exception, match=f"the name '{release}-cloudrc' .* set fullnameOverride"):
-        render(release=release)
-
-
-def test_a_chart_may_contain_this_one_several_times_under_aliases():
-    on = {"enabled": True}
-    values = {**on, "mission": on, "dashboards": on}
-    for release, *aliases in (("b-lab", "cloudrc", "robot_A", "b"), ("d" * 53, "robotA", "robotB")):
-        robots = [render(values, release=release, alias=alias) for alias in aliases]
-        named = [{(x["kind"], x["metadata"]["name"]) for x in objects} for objects in robots]
-        assert len(set.union(*named)) == sum(map(len, named))
-        pods = [
-            labels
-            for objects in robots
-            for x in objects
-            if (labels := x.get("spec", {}).get("template", {}).get("metadata", {}).get("labels"))
-        ]
-        assert len({labels["app.kubernetes.io/instance"] for labels in pods}) == len(robots)
-        for service in (x for o in robots for x in o if x["kind"] == "Service"):
-            selector = service["spec"]["selector"].items()
-            assert sum(selector <= labels.items() for labels in pods) == 1
-
-
 def test_the_command_line_accepts_every_containers_arguments():
     load = {"backgroundLoad": {"enabled": True, "workers": 3}}
     on = {"enabled": True}
@@ -99,11 +74,8 @@ TOPICS = "topics of ROS 2, which know no token"
     [
         ({}, SLOW, False),
         ({"link": {"profile": "satellite"}}, SLOW, True),
-        ({"experiment": {"link": {"profile": "satellite"}}}, SLOW, False),
         ({}, CLOSED, True),
-        ({"metrics": {"allowFrom": [{"ipBlock": {"cidr": "10.0.0.0/8"}}]}}, CLOSED, False),
         ({}, KEEP, True),
-        ({"teleop": {"journal": {"keep": True}}}, KEEP, False),
         ({"networkPolicy": {"enabled": False}}, TOPICS, False),
         ({"networkPolicy": {"enabled": False}, "ros": {"enabled": True}}, TOPICS, True),
     ],

@@ -30,20 +30,6 @@ def test_a_configmap_that_the_pods_could_not_use_is_refused(objects, said):
     render(OWN)  # helm template cannot ask
 
 
-def test_changed_files_restart_the_pods():
-    def annotations(*objects):
-        made = render(OWN, lookup=a_namespace(objects=objects))
-        pods = of_kind(made, "Deployment")
-        return [pods[end]["spec"]["template"]["metadata"]["annotations"] for end in pods]
-
-    before = annotations(*PRESENT)
-    assert annotations(*PRESENT) == before
-    for one, other in zip(
-        before, annotations(files("mine", "robot.yaml"), PRESENT[1]), strict=True
-    ):
-        assert {key for key in one if one[key] != other[key]} == {"checksum/experiment"}
-
-
 def test_helm_test_and_notes_fly_the_mission_of_the_experiment():
     def flown(mission):
         made = render({"experiment": {"mission": mission} if mission else {}})

@@ -71,30 +71,6 @@ def test_numbers_of_flights_that_failed_are_marked(fly_with, call):
     assert (number["a_failed"], number["b_failed"]) == (2, 0)
 
 
-@pytest.mark.parametrize(
-    ("form", "start"),
-    [("csv", "number,unit,a_median,"), ("latex", r"\begin{tabular}{lrrrrrrrrrr}")],
-)
-def test_the_table_is_also_one_of_csv_or_latex_alone(form, start, fly_with, call):
-    fly_with(lambda is_a, n: ("success", 0.01 * n + 0.001 * is_a))
-    out = call(f"{COMPARE} --seeds 6 -o {form}").out
-    assert out.startswith(start)
-    assert "prediction" in out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (f"seed=1 {B}", "seed: each flight has its own seed; give the seeds with --seeds"),
-        ("last_sample nonsense",
-         "last_sample: is not KEY=VALUE; for a value of a sweep, add --in DIR"),
-        ("last_sample kalman --cost --in .", "--cost: these flights are finished"),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_compared_is_refused(arguments, text, refused):
-    assert text in refused(f"compare {arguments}")
-
-
 def test_ctrl_c_compares_the_finished_pairs(fly_with, call):
     def measure(is_a, seed):
         if seed > 2:

@@ -1,22 +1,15 @@
 """Text from files and from the API is escaped: it cannot control the terminal or fake a line."""
 
 import json
-from pathlib import Path
 
 import pytest
 import yaml
 
-from cloudrc.cli import report
 from cloudrc.cli.main import main
-from cloudrc.cli.progress import FlightView
 from cloudrc.errors import BadInputError
-from cloudrc.record.writer import MISSING, McapWriter
-from cloudrc.records import Fault
 from cloudrc.teleop.client import Api
 from cloudrc.teleop.store import Order
-from cloudrc.text import table
-from tests.cli.conftest import EVIL, SHOWN, assert_harmless
-from tests.record.conftest import world_records
+from tests.cli.conftest import EVIL, assert_harmless
 from tests.teleop.conftest import PLAN, running
 
 
@@ -37,26 +30,6 @@ def test_a_name_in_an_error(words, printed):
     assert main([*words.split(), EVIL]) != 0
     (line,) = printed().splitlines()
     assert line.startswith("cloudrc: error: ")
-
-
-def test_the_note_of_a_recording(folder, call):
-    with McapWriter(folder / "a.mcap", clock="world") as writer:
-        writer.write(world_records(5))
-        writer.note({MISSING: EVIL})
-    note = SHOWN.replace(r"\r", " ").replace(r"\n", " ")
-    assert f"missing: {note}\n" in call("recover a.mcap").out
-
-
-def test_what_is_printed_of_a_flight(printed):
-    failures = [{"code": "x", "text": EVIL}] * 2
-    found = {"verdict": "failure", "failures": failures, "numbers": {}}
-    print(report.summary(found, Path(EVIL)))
-    printed(count=4)
-    with FlightView(1) as view:
-        view.see([Fault(0, "bad", EVIL)])
-    printed()
-    print(table([["name", "value"], [EVIL, "1"]]))
-    assert printed().count("\n") == 2
 
 
 @pytest.fixture

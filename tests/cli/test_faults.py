@@ -44,18 +44,6 @@ def test_a_failed_check_ends_in_exit_code_1(monkeypatch, call):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("run /dev/null", "/dev/null: cannot be read: not a file; name a YAML file"),
-        ("run cloud-kiled", "; did you mean cloud-killed?"),
-        ("search --store /dev/null/found", "/dev/null/found: Not a directory"),
-    ],
-)
-def test_bad_input_is_told_in_one_line(words, said, refused):
-    assert said in refused(f"faults {words}")
-
-
-@pytest.mark.parametrize(
     ("line", "error", "code", "said"),
     [
         ("search --jobs 2", KILLED, 6, "to continue, add --first 2"),

@@ -72,16 +72,6 @@ def test_no_command_steers_another_flight_after_yours_has_ended(tmp_path, elsewh
         assert said(0, "mission estop") == using
 
 
-def test_a_link_without_a_flight_is_changed_after_yours_has_ended(tmp_path, elsewhere, said):
-    latest = elsewhere / "runs" / "latest"
-    latest.mkdir(parents=True)
-    (latest / "uplink.log").touch()
-    with local.announced(tmp_path / "a", "unix:/none.sock", local.LINK):
-        assert f"using the run in {tmp_path / 'a'}" in said(2, SET)  # it has no state to change
-        with flying(tmp_path / "b"):
-            assert "2 runs are flying here; name one" in said(2, SET)
-
-
 def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
     with flying(elsewhere / "runs" / "latest") as served:
         api, far = Api(served.url), {"name": "far", "waypoints": [{"position_m": [0.5, -2.0, 1.0]}]}
@@ -111,14 +101,6 @@ def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
             error = call(f"mission {words}", code=code).err
             assert error.startswith("cloudrc: error: runs/latest: "), error
             assert why in error
-
-
-def test_the_console_names_a_run_as_it_was_given(tmp_path, elsewhere, said):
-    with flying(tmp_path / "a"), flying(tmp_path / "b"):
-        assert "error: runs/nope: no run flies there" in said(2, "console runs/nope")
-        assert "2 runs are flying here" in said(2, "console")
-        looks = "cloudrc: no folder 'nope' here: looking for a release\n"
-        assert said(3, "console nope") == looks + said(3, "console --release nope")
 
 
 def test_no_request_goes_to_a_server_that_a_folder_names(elsewhere, said):

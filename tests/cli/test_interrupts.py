@@ -4,7 +4,6 @@ MuJoCo turns every exception in its import into an ImportError, so that a sweep 
 verdict `error` and ended as if it was done.
 """
 
-import json
 import os
 import signal
 from contextlib import suppress
@@ -14,12 +13,10 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.errors import InterruptedRunError
 from cloudrc.runs import fly as flights
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.trials.plan import PlannedFlight
 from cloudrc.trials.rows import read_rows
-from cloudrc.trials.workers import map_in_order, take_each
 from tests.support.sweeps import write_sweep
 
 __all__ = ["write_sweep"]
@@ -56,15 +53,7 @@ def swallow(flight):
         return flight.row({**found, "numbers": {}, "records_sha256": ""})
 
 
-def convert(flight):
-    """Get a signal as in a library that turns it into an exception of its own."""
-    try:
-        os.kill(os.getpid(), signal.SIGTERM)
-    except KeyboardInterrupt:
-        raise ImportError("initialization failed") from None
-
-
-@pytest.mark.parametrize("fly", [swallow, convert])
+@pytest.mark.parametrize("fly", [swallow])
 def test_a_sweep_stores_no_row_after_a_signal_that_a_library_caught(
     fly, write_sweep, monkeypatch, call
 ):
@@ -72,24 +61,6 @@ def test_a_sweep_stores_no_row_after_a_signal_that_a_library_caught(
     error = call("sweep run --out grid", write_sweep(), code=130).err
     assert "cloudrc: interrupted; to continue" in error
     assert read_rows(Path("grid")) == {}
-
-
-def test_results_before_the_signal_are_kept():
-    """The second of three calls gets the signal, and returns a result all the same."""
-    interrupt_on_signals()
-    results = []
-
-    def work(number):
-        try:
-            if number == 1:
-                os.kill(os.getpid(), signal.SIGINT)
-        except KeyboardInterrupt:
-            pass
-        return json.dumps(number)
-
-    end = take_each(map_in_order(work, range(3), 1), results.append)
-    assert isinstance(end, InterruptedRunError)
-    assert results == ["0"]
 
 
 def test_a_flight_ends_after_a_signal_that_a_plugin_caught(tmp_path, monkeypatch):
@@ -106,11 +77,3 @@ def test_a_flight_ends_after_a_signal_that_a_plugin_caught(tmp_path, monkeypatch
     monkeypatch.setattr("cloudrc.runs.fly.write_report", report)
     flights.fly(experiment, "virtual", tmp_path)
     assert report.call_args.args[3].interrupted
-
-
-def test_an_interrupted_flight_says_at_once_that_the_report_takes_time(monkeypatch, call):
-    interrupt = Mock(side_effect=lambda *given, **more: os.kill(os.getpid(), signal.SIGINT))
-    monkeypatch.setattr("cloudrc.assembly.fly", interrupt)
-    monkeypatch.setattr("cloudrc.runs.fly.views", interrupt)
-    shown = call("run hover --mode virtual --out r", code=130)
-    assert "interrupted: writes the report; Ctrl-C again leaves it out" in shown.out

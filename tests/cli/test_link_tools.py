@@ -38,35 +38,9 @@ def test_a_trace_replaces_no_file(folder, call, refused):
     assert (folder / "log.csv").read_text() == log
 
 
-def test_a_picture_replaces_a_picture_of_its_kind_alone(folder, call, refused):
-    for _ in range(2):
-        call("link show ideal -o fig.png --packets 10 --seconds 1")
-    (folder / "fig.png").write_text("mine")
-    said = refused("link show ideal -o fig.png")
-    assert "fig.png: already there; name another file with -o" in said
-    assert (folder / "fig.png").read_text() == "mine"
-
-
-@pytest.mark.parametrize(
-    ("name", "data", "says"),
-    [
-        ("a.json", b'{"round_trips": []}', "choose --direction"),
-        ("a.mcap", b"\x89MCAP0\r\n", "a.mcap"),
-        (".", None, "no such file or folder"),
-    ],
-)
-def test_an_unusable_source_is_refused_in_one_line(name, data, says, folder, refused):
-    if data is not None:
-        (folder / name).write_bytes(data)
-    assert says in refused(f"link record {name} -o t.csv")
-    assert not (folder / "t.csv").exists()
-
-
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("show ideal -o ideal.gif", "no kind of picture"),
-        ("show ideal --seconds 8e4 --rate 1e4", "are more than 10000000 packets"),
         ("verify nonsense", "no profile or experiment named 'nonsense'"),
         ("verify lossy --shaper netem", "lasts); use the relay"),
     ],

@@ -8,11 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from cloudrc.config.load import load_experiment
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.records import LinkChecked
 from cloudrc.runs.links import verify
-from cloudrc.runs.links.verify import as_text, find_experiment, verify_release
+from cloudrc.runs.links.verify import as_text, verify_release
 
 PAGE = {"shaper": "relay", "reason": "", "interface": "eth0", "netems": {}}
 MEASURED = {"ok": 0.0451, "open": 0.0451, "off": 0.0902}
@@ -111,10 +110,3 @@ def test_what_is_not_judged_is_noted(release):
     assert "uplink: time_line NOT JUDGED; docs/link.md says why" in as_text(said)
     release.hears(cloud="ok")
     assert as_text(release.ask()).endswith("except what is NOT JUDGED (above)")
-
-
-def test_a_file_with_any_key_of_an_experiment_is_verified_as_one(tmp_path):
-    (tmp_path / "mine.yaml").write_text("seed: 7\n")
-    assert find_experiment("./mine.yaml", []).uplink == load_experiment("./mine.yaml").uplink
-    (tmp_path / "mine.yaml").write_text("description: mine\nuplink: {delay_ms: 12}\n")
-    assert find_experiment("./mine.yaml", []).uplink.delay_ms == 12.0

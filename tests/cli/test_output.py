@@ -4,7 +4,7 @@ import io
 import json
 import subprocess
 import sys
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr
 
 import pytest
 import yaml
@@ -96,14 +96,6 @@ def test_a_flight_shows_what_happens_before_it_and_after_it(kind, monkeypatch):
         wait_until(lambda: "writes [it] (0 s)" in stderr.getvalue(), 5.0)
 
 
-def test_a_moving_line_leaves_stdout_alone():
-    document, stderr = io.StringIO(), Terminal()
-    with redirect_stdout(document), redirect_stderr(stderr), Progress("reads"):
-        print("{}")
-    assert document.getvalue() == "{}\n"
-    assert "reads" in stderr.getvalue()
-
-
 PRINTS = """\
 import os, subprocess
 os.write(1, b"descriptor\\n")
@@ -119,11 +111,3 @@ def test_nothing_that_a_plugin_prints_gets_into_a_document(folder):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert json.loads(done.stdout)["schemaVersion"] == 1
     assert {"descriptor", "child"} <= set(done.stderr.splitlines())
-
-
-def test_a_full_disk_is_told(folder):
-    with open("/dev/full", "w") as full:
-        command = [sys.executable, "-m", "cloudrc", "list", "-o", "json"]
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
-    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
-    assert "disk_full: the output (stdout): free some space" in done.stderr

@@ -10,18 +10,14 @@ import pytest
 
 from cloudrc import assembly
 from cloudrc.cli.processes import read_address, read_size
-from cloudrc.config.load import load_experiment
 from cloudrc.drivers import realtime
-from cloudrc.drivers.link_monitor import LinkMonitor
 from cloudrc.drivers.realtime import free_ports, show_address
 from cloudrc.errors import ControllerLostError
 from cloudrc.processes import ends
 from cloudrc.record.columns import Recording
 from tests.record.conftest import MS, counted, world_records
 
-FREE = "127.0.0.1:9"
 ENDS = ("world", "cloud")
-END = f"--listen {FREE} --route route --record end.mcap"
 
 
 @pytest.fixture
@@ -29,22 +25,6 @@ def key(tmp_path):
     (tmp_path / "key").write_bytes(b"k" * 32)
     (tmp_path / "key").chmod(0o600)
     return f"--key {tmp_path / 'key'}"
-
-
-@pytest.fixture
-def taken():
-    """Yield an address at which a UDP socket already receives."""
-    address = "127.0.0.1", free_ports(1)[0]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
-        udp.bind(address)
-        yield f"127.0.0.1:{address[1]}"
-
-
-# The process would close the socket at its end, but here the test process goes on.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_an_address_in_use_is_reported_with_its_flag(taken, key, refused):
-    line = refused(f"world --config hover {END} {key} --listen {taken}")
-    assert f"--listen {taken}: Address already in use" in line
 
 
 def test_an_address_of_ipv6_is_in_brackets(monkeypatch):
@@ -148,33 +128,3 @@ def test_a_restart_keeps_the_recording_of_a_crash(tmp_path):
     started(path)._close()
     assert before.read_bytes() == left, "only the previous one is kept"
     assert len(list(tmp_path.iterdir())) == 2
-
-
-@pytest.mark.parametrize(
-    ("name", "setting", "uplink", "size"),
-    [
-        ("fast", "cloud.plan_s=0", False, 88),
-        ("fast", "cloud.plan_s=0.4", False, 576),
-        ("hover", "world.robot=nano", True, 196),
-    ],
-)
-def test_the_link_is_expected_to_carry_plans_and_sensors(name, setting, uplink, size, monkeypatch):
-    monitor = Mock()
-    monkeypatch.setattr("cloudrc.processes.ends.LinkMonitor", monitor)
-    ends.link_monitor(load_experiment(name, [setting]), uplink=uplink, trusted=False)
-    assert monitor.call_args.args[1].size == size
-
-
-def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
-    path = tmp_path / "trace.csv"
-    monkeypatch.setattr(LinkMonitor, "begin", lambda self, asked: None)
-    monitor = ends.link_monitor(load_experiment("paper"), uplink=False, trusted=False)
-
-    def load(**uplink):
-        asked = monitor._load({"uplink": uplink})
-        return asked and asked[0]
-
-    path.write_text("time_s,delay_ms\n0,45\n1,50\n")
-    assert load(trace=str(path)).rows
-    assert load(table=str(path), distribution="table").quantiles
-    assert load(trace="/dev/zero") is None, "an endless device would fill the memory"

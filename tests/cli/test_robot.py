@@ -135,22 +135,3 @@ def build(model):
 def test_a_model_that_cannot_fly_is_refused_in_one_line(mine, refused, old, new, shown):
     replace(mine / "robot.xml", old, new)
     assert shown in refused("robot check", mine)
-
-
-def test_a_picture_replaces_no_other_file(mine, capsys):
-    other = mine / "notes.png"
-    other.write_text("mine")
-    assert main(["robot", "check", "x2", "--picture", str(other)]) == 2
-    assert main(["robot", "check", "x2", "--picture", "x2.gif"]) == 2
-    assert other.read_text() == "mine"
-
-
-def test_a_tuning_that_no_experiment_has_chosen_yet_is_checked(mine, capsys):
-    tunings = "{slow: {tilt: 3}, wild: {tilt_max_deg: 80}, ok: {tilt_max_deg: 30}}"
-    with (mine / "robot.yaml").open("a") as file:
-        file.write(f"tunings: {tunings}\n")
-    changes = changes_of(mine, capsys)
-    assert [each.partition("tunings.")[2].partition(":")[0] for each in changes] == [
-        "slow.tilt",
-        "wild.tilt_max_deg",
-    ]

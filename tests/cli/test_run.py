@@ -4,13 +4,11 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 
 from cloudrc.cli.main import main
-from cloudrc.cli.report import summary
 from cloudrc.report.figures import FIGURES
 from cloudrc.runs import requirements
 from tests.cli.conftest import FLY, SHORT
@@ -71,13 +69,6 @@ def test_figures_are_files_if_they_are_asked_for(line, folder, monkeypatch, call
 
 
 @pytest.mark.usefixtures("no_page")
-def test_a_run_that_c_cannot_fly_says_so(folder):
-    main([*FLY, "--set=world.wind.gust_mps=1", "--out", "a"])
-    steps = json.loads((folder / "a/environment.json").read_text())["physics_steps"]
-    assert steps.startswith("Python (wind, a robot that differs from its model")
-
-
-@pytest.mark.usefixtures("no_page")
 def test_a_run_and_its_report_can_be_repeated(folder, call):
     only_the_report = call(*FLY, "--seed", "3", "--out", "a", "-o", "json")
     assert only_the_report.out == (folder / "a/report.json").read_text()
@@ -93,15 +84,6 @@ def test_a_run_and_its_report_can_be_repeated(folder, call):
     # A recording has velocities in the body frame, so their last bit may change.
     for name, number in numbers.items():
         assert number["value"] == pytest.approx(first["numbers"][name]["value"], rel=1e-12), name
-
-
-@pytest.mark.usefixtures("no_page")
-def test_a_flight_and_a_report_that_take_long_are_told_in_a_log(monkeypatch, call):
-    monkeypatch.setattr("cloudrc.cli.progress.PERIOD", 0.01)
-    said = call(*FLY, "--out", "here")
-    assert "mission started" in said.out
-    assert " s  TRACK " in said.err
-    assert "writes the report (" in said.err
 
 
 @pytest.mark.usefixtures("no_page")
@@ -151,19 +133,6 @@ def test_a_failing_plug_in_fails_the_run_and_debug_shows_where(how, folder, call
     assert "KeyError: 'oops', bad.py:5 in predict" in shown.out
     assert 'raise KeyError("oops")' not in shown.err
     assert 'raise KeyError("oops")' in call(*line, "--debug", code=1).err
-
-
-@pytest.mark.usefixtures("no_page")
-def test_debug_shows_the_lines_of_a_metric_that_fails(folder, call):
-    (folder / "bad.py").write_text("UNIT = 'm'\ndef measure(flight):\n    return {}['gain']\n")
-    line = "run steps --mode virtual --set report.metrics=[./bad.py] --debug"
-    assert "return {}['gain']" in call(line, *SHORT).err
-
-
-def test_a_summary_says_what_the_mission_had_to_do():
-    found = {"numbers": {"final_error": {"value": 0.04, "unit": "m"}}}
-    text = summary({"verdict": "success", "failures": [], **found}, Path("runs/a"))
-    assert "0.04 m from the last one" in text.splitlines()[1]
 
 
 def test_a_run_in_real_time_needs_the_extra_of_the_api(monkeypatch, refused):

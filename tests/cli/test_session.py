@@ -5,12 +5,10 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from contextlib import closing, contextmanager, suppress
 from math import inf
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 from websockets.sync.client import connect
@@ -23,7 +21,6 @@ from cloudrc.config.setpoints import write_setpoints
 from cloudrc.drivers import local
 from cloudrc.drivers.machine import usable_cores
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.errors import BadInputError
 from cloudrc.messages import Start
 from cloudrc.record.columns import Recording
 from cloudrc.records import TelemetrySent
@@ -104,30 +101,6 @@ def test_a_killed_session_whose_recording_lacks_the_last_mission_has_no_report(f
     assert "the recording ends before mission m2, the last one, so there is no report" in shown
     assert read_experiment(folder / "config.yaml").name == "hover"
     assert not (folder / "mission.mcap").exists()
-
-
-@pytest.mark.process
-def test_a_console_is_shown_and_a_missing_one_is_explained(folder, monkeypatch):
-    def console(code):
-        monkeypatch.setattr("cloudrc.drivers.machine.interpreter", lambda *words: [*PYTHON, code])
-        said = []
-        with session._beside(said.append, "cloudrc", "console"):
-            wait_until(lambda: said)
-        return said
-
-    sleeps = "import time; print('console: http://127.0.0.1:1', flush=True); time.sleep(60)"
-    assert console(sleeps) == ["console: http://127.0.0.1:1"]
-    absent = "cloudrc: error: a console needs viser; run: pip install it"
-    assert console(f"raise SystemExit({absent!r})") == [absent]
-
-
-def test_a_session_needs_no_body_that_a_shipped_mission_touches(folder, monkeypatch, call):
-    monkeypatch.setattr("cloudrc.cli.run._fly_here", Mock(side_effect=BadInputError("enough")))
-    assert "enough" in call("up --set world.scene=empty", code=2).err
-    call("up --set world.scene=empty --set mission.touch.body=board", code=2)
-
-
-PYTHON = [sys.executable, "-c"]
 
 
 @pytest.fixture

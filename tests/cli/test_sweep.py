@@ -15,7 +15,6 @@ import pytest
 
 from cloudrc.assembly import assemble
 from cloudrc.cluster import batch
-from cloudrc.runs.lock import lock_folder
 from cloudrc.source import code_hash
 from cloudrc.trials.plan import PlannedFlight, pack, read_plan
 from cloudrc.trials.rows import read_rows
@@ -75,16 +74,6 @@ def test_a_sweep_goes_on_where_it_ended(write_sweep, monkeypatch, call):
     assert begun == [1, 2, 2, 3]
 
 
-def test_a_folder_that_was_only_locked_is_still_free(write_sweep, call, refused):
-    """Ctrl-C came before the file of the sweep was written."""
-    Path("a").mkdir()
-    Path("a/.lock").touch()
-    file = write_sweep(ONE)
-    with lock_folder(Path("a")):
-        assert "another command flies into it now" in refused("sweep run --out a", file)
-    call("sweep run --out a", file)
-
-
 def test_a_sweep_that_is_too_large_is_refused_before_it_is_checked(write_sweep, refused, call):
     axes = {f"guard.{key}": list(range(1, 1001)) for key in ("hold_max_s", "speed_max_mps")}
     error = refused("sweep run --out grid", write_sweep(axes, seeds=5))
@@ -106,15 +95,6 @@ def test_a_row_flies_again_to_the_same_hash(write_sweep, call):
     assert "no file of its key has changed" in call("sweep fly grid", row["key"], code=6).err
 
 
-def test_a_row_of_other_code_is_not_flown_again(write_sweep, call, monkeypatch):
-    call("sweep run --out grid", write_sweep(ONE))
-    (row,) = rows("grid")
-    monkeypatch.setattr("cloudrc.source.code_hash", lambda: "0123456789abcdef")
-    error = call("sweep fly grid", row["key"], code=2).err
-    assert f"of code {row['code']}, this is code 0123456789abcdef" in error
-    call("sweep status grid")
-
-
 def test_a_row_of_a_changed_file_is_not_flown_again(write_sweep, call):
     Path("mine.py").write_text("from cloudrc.cloud.predictors.last_sample import build\n")
     call("sweep run --out grid", write_sweep({"cloud.predictor": [str(Path("mine.py").resolve())]}))
@@ -122,17 +102,6 @@ def test_a_row_of_a_changed_file_is_not_flown_again(write_sweep, call):
     Path("mine.py").write_text("from cloudrc.cloud.predictors.last_sample import build  # new\n")
     error = call("sweep fly grid", row["key"], code=2).err
     assert f"{row['key']}: changed since its flights: {Path('mine.py').resolve()}; fly" in error
-
-
-def test_code_that_changes_during_a_sweep_ends_it(write_sweep, call, monkeypatch):
-    """A worker that starts later runs the changed sources."""
-    play = PlannedFlight.play
-    monkeypatch.setattr(PlannedFlight, "play", lambda flight: (
-        play(flight) | ({"code": "0123456789abcdef"} if flight.seed == 2 else {})
-    ))  # fmt: skip
-    error = call("sweep run --out grid", write_sweep(ONE, seeds=3), code=2).err
-    assert "the code of cloudrc has changed meanwhile" in error
-    assert [row["seed"] for row in rows("grid")] == [1]
 
 
 def test_failed_flights_are_recorded_if_asked_for(write_sweep, call):

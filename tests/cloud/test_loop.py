@@ -3,7 +3,6 @@
 from functools import partial
 from math import inf, nan
 
-import numpy as np
 import pytest
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
@@ -11,8 +10,7 @@ from cloudrc.cloud.estimators import Estimator
 from cloudrc.cloud.estimators.running_mean import RunningMean
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.cloud.predictors.last_sample import LastSample
-from cloudrc.drivers.process import from_line, to_line
-from cloudrc.errors import ControllerLostError, OutOfMemoryError
+from cloudrc.errors import ControllerLostError
 from cloudrc.messages import ZERO
 from tests.cloud.conftest import HERE, MS, Integrating, command, loop, telemetry
 
@@ -159,37 +157,6 @@ def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
     assert len(fault.text.encode()) < 2200
     assert len(fault.traceback.encode()) < 6200
     assert fault.text.endswith(f"fix cloud.{kind} or choose another")
-
-
-def test_arrays_become_plain_numbers():
-    class Arrays(returns(np.float32(0.5))):
-        def update(self, *arguments):
-            return ANY._replace(velocity=np.array([1, 2, 3]), integral=[4, 5, 6])
-
-        def predict(self, odometry, horizon):
-            return odometry._replace(position=np.array(odometry.position, np.float32))
-
-    sent, control = command(loop(Arrays, Arrays(), Arrays(), heard_ms=1090), 1094)
-    assert sent.velocity == (1.0, 2.0, 3.0)
-    assert (control.horizon, control.position, control.integral) == (0.5, HERE, (4.0, 5.0, 6.0))
-    assert str(from_line(to_line(control))) == str(control)
-
-
-@pytest.mark.parametrize(
-    ("error", "raised"), [(KeyboardInterrupt, KeyboardInterrupt), (MemoryError, OutOfMemoryError)]
-)
-@pytest.mark.parametrize("kind", ["estimator", "predictor", "controller"])
-def test_ctrl_c_and_a_lack_of_memory_end_the_flight(kind, error, raised):
-    bad = raises(error)
-    a_loop = loop(**{kind: bad if kind == "estimator" else bad()})
-
-    def fly():
-        a_loop.observe(telemetry(100, 1000), 1090 * MS)
-        command(a_loop, 1094)
-
-    with pytest.raises(raised):
-        fly()
-    assert a_loop.counts == {}
 
 
 def test_a_lost_program_is_asked_no_more_and_told_once():

@@ -10,7 +10,6 @@ from cloudrc.cloud.predictors import command_history, kalman, model_based
 from cloudrc.cloud.predictors._history import Replay
 from cloudrc.config.robot import facts
 from cloudrc.config.schema import World
-from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Command, Odometry
 
 MS = 1_000_000
@@ -201,26 +200,6 @@ def test_values_of_a_file_replace_the_parameters(tmp_path):
     assert after_a_step(0.2, model=path) == own
 
 
-@pytest.mark.parametrize(
-    ("build", "parameters", "text"),
-    [
-        (kalman.build, {"parameters": {"model": "m.yaml"}}, "parameters: choose the model beside"),
-        (kalman.build, {"parameters": {"gain": 1}}, "gain: unknown key"),
-    ],
-)
-def test_a_bad_parameter_is_named(build, parameters, text, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises((ValueError, BadInputError), match=text):
-        build(robot=PELICAN, **parameters)
-
-
-def test_a_file_with_a_wrong_value_is_refused(tmp_path):
-    path = tmp_path / "model.yaml"
-    path.write_text("time_constant: [1, 2, -3]\n")
-    with pytest.raises(BadInputError, match=r"model.yaml:1: time_constant.2: -3: must be"):
-        command_history.build(robot=PELICAN, model=path)
-
-
 # model_based and kalman
 
 
@@ -269,12 +248,3 @@ def test_kalman_halves_the_noise_of_the_odometry(model):
     raw, filtered = (fly(each, noise=0.005, speed=0.0)[100:] for each in (noisy, quiet))
     assert rms(filtered[:, 0]) < 0.5 * rms(raw[:, 0])
     assert rms(filtered[:, 1]) < 0.5 * rms(raw[:, 1])
-
-
-def test_a_filter_that_trusts_the_odometry_is_the_replay():
-    sure = kalman.build(
-        robot=PELICAN, position_noise=1e-6, velocity_noise=1e-6, acceleration_error=1e3
-    )
-    assert fly(sure, seconds=2.0) == pytest.approx(
-        fly(model_based.build(robot=PELICAN), seconds=2.0), abs=1e-5
-    )

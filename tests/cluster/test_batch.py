@@ -88,14 +88,6 @@ def test_the_lines_of_lost_and_complete_pods_are_read(started, api, release):
     assert api.jobs() == []
 
 
-def test_a_failed_job_is_kept_and_named(started, api, release):
-    api.end("sweep-1", "Failed", reason="FailedIndexes", message="Job has failed indexes")
-    api.get("jobs", "sweep-1")["status"]["failedIndexes"] = "2,5"
-    with pytest.raises(ClusterError, match=r"failed indexes \(index 2,5\); see: kubectl"):
-        lines(release)
-    assert api.jobs()
-
-
 def test_the_first_pod_that_refuses_the_flights_ends_the_job(started, api, release):
     """For example, the image has other code: no shard of the Job can succeed."""
     said = "the flights come from code 1, this image has code 2"

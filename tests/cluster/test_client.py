@@ -5,7 +5,7 @@ import pytest
 from cloudrc.cluster import client
 from cloudrc.cluster.client import ClusterError, Release, connect
 from cloudrc.cluster.jobs import follow, run_job
-from cloudrc.cluster.pods import find_pod, list_pods
+from cloudrc.cluster.pods import find_pod
 from cloudrc.errors import MissingPrerequisiteError, TimedOutError
 from tests.cluster.conftest import MISSION, pod, terminated
 
@@ -19,12 +19,6 @@ def test_flags_override_the_kubeconfig(api):
     assert release.helm_flags == ["--kube-context=elsewhere", "--namespace=mine"]
     with pytest.raises(MissingPrerequisiteError, match=r"no context 'x'.*elsewhere, here"):
         connect("x")
-
-
-def test_a_refusal_names_cause_and_next_command(api, release):
-    api.refuse["GET", "pods"] = 403, 'User "me" cannot list'
-    with pytest.raises(ClusterError, match="can-i list pods"):
-        list_pods(release, "cloud")
 
 
 def test_the_newest_pod_of_the_release_is_found(api, release):
@@ -50,16 +44,6 @@ def test_only_a_short_outage_is_waited_for(running, release):
     with pytest.raises(ClusterError, match="leader changed"):
         follow(release, "first", print)
     assert len(left) == 4, "a refusal is not repeated"
-
-
-def test_the_chart_is_found_in_the_repository_and_in_a_wheel(tmp_path):
-    package = tmp_path / "cloudrc"
-    with pytest.raises(MissingPrerequisiteError, match="install cloudrc again"):
-        client.chart_folder(package)
-    for folder in (tmp_path / "charts" / "cloudrc", package / "_chart"):
-        folder.mkdir(parents=True)
-        (folder / "Chart.yaml").touch()
-        assert client.chart_folder(package) == folder
 
 
 @pytest.mark.parametrize(

@@ -188,20 +188,3 @@ def test_a_run_does_not_end_a_flight_in_progress(ready, teleop, tmp_path, call):
     assert "Job 'first' is under way" in call(f"{LINE} --out out", code=5).err
     assert not (tmp_path / "helm").exists()
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        (["hover", "--set", "cloud.predictor=./mine.py"], "the pods do not have this file"),
-        (["steps"], "mission.steps"),
-    ],
-)
-def test_files_that_pods_lack_are_refused_before_the_install(
-    tmp_path, call, monkeypatch, settings, words
-):
-    monkeypatch.chdir(tmp_path)
-    plugin = "from cloudrc.cloud.predictors.last_sample import build as build\n"
-    (tmp_path / "mine.py").write_text(plugin)
-    assert words in call("run --mode cluster", *settings, code=2).err
-    assert not (tmp_path / "runs").exists()

@@ -1,14 +1,9 @@
 """What happens to pods in flight is told: events, killed containers."""
 
-import functools
-from types import SimpleNamespace
-
 import pytest
 
 from cloudrc.cluster.incidents import ReleaseWatch
 from cloudrc.cluster.jobs import JobGoneError, follow, run_job
-from cloudrc.cluster.pods import describe_end
-from tests.chart.conftest import CHART, values_of
 from tests.cluster.conftest import MISSION, pod, terminated
 
 
@@ -39,20 +34,6 @@ def test_a_container_that_ends_in_flight_is_told_once_with_its_cause(running, wa
     again = ended(137, at="2026-01-01T00:09:00Z")
     running.put("pods", {**pod("cloud-1", "cloud", restarts=2, last=again), **kept(running)})
     assert len(list(watch.look())) == 1, "it was killed a second time"
-
-
-@pytest.mark.parametrize(
-    ("container", "key"),
-    [
-        ("load", "cloud.backgroundLoad.resources"),
-        ("link", "link.resources"),
-    ],
-)
-def test_the_value_of_a_container_without_memory_is_one_of_the_chart(container, key):
-    state = SimpleNamespace(reason="OOMKilled")
-    assert describe_end(container, state).endswith(f"raise {key}.limits.memory")
-    values = values_of(CHART / "values.yaml")
-    assert functools.reduce(dict.__getitem__, key.split("."), values)["limits"]["memory"]
 
 
 def kept(api, name="cloud-1"):
@@ -108,13 +89,3 @@ def test_a_job_that_is_gone_is_not_an_error_of_the_api(running, release, action,
     with pytest.raises(JobGoneError) as told:
         follow(release, "first", print)
     assert (str(told.value), told.value.key) == (words, job["metadata"]["uid"])
-
-
-def test_a_job_that_a_queue_has_suspended_waits(running, release):
-    run_job(release, MISSION, name="first")
-    suspend(running)
-    running.at_look(4, lambda: delete(running))
-    lines = []
-    with pytest.raises(JobGoneError, match="deleted"):
-        follow(release, "first", lines.append)
-    assert lines == ["waiting: the Job is suspended"]

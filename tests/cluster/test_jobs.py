@@ -4,10 +4,8 @@ import json
 
 import pytest
 
-from cloudrc.cluster import jobs
 from cloudrc.cluster.client import ClusterError
-from cloudrc.cluster.jobs import delete_job, follow, run_job
-from cloudrc.errors import TimedOutError
+from cloudrc.cluster.jobs import follow, run_job
 from tests.cluster.conftest import MISSION, TOKEN
 
 
@@ -45,19 +43,3 @@ def test_follow_ends_when_the_pod_cannot_run(running, release):
     running.start_pod("first", phase="Pending", **waits)
     with pytest.raises(ClusterError, match=r"cannot start: the image.*make kind-load"):
         follow(release, "first", print)
-
-
-def test_a_job_is_deleted_and_its_end_is_awaited(running, release, monkeypatch):
-    run_job(release, MISSION, name="two")
-    delete_job(release, "two")
-    assert running.jobs() == []
-    with pytest.raises(ClusterError, match='"two" not found'):
-        delete_job(release, "two")
-    run_job(release, MISSION, name="stuck")
-    monkeypatch.setattr(jobs, "DELETE_LIMIT", 0.05)
-    answer = running.answer
-    running.answer = lambda method, *rest: (
-        (200, {}) if method == "DELETE" else answer(method, *rest)
-    )
-    with pytest.raises(TimedOutError, match=r"'stuck' has not ended .* see: kubectl"):
-        delete_job(release, "stuck")

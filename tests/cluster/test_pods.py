@@ -115,12 +115,6 @@ esac
 """
 
 
-def test_a_release_without_a_console_says_how_to_get_one(api, release):
-    api.put("pods", pod("cloud-1", "cloud"))
-    with pytest.raises(ClusterError, match=r"no console; add it: helm upgrade .*console.enabled"):
-        next(pods.follow_page(release, 0, print))
-
-
 def test_the_page_is_forwarded_and_its_log_is_read(api, release, pretend):
     made = pod("cloud-1", "cloud")
     made["spec"]["containers"].append({"name": "console"})

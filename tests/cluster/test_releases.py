@@ -67,11 +67,3 @@ def test_the_releases_of_all_namespaces_are_listed(api, call, monkeypatch):
     assert [line.split()[0] for line in call("list releases -n lab").out.splitlines()] == [
         "NAME", "b",
     ]  # fmt: skip
-
-
-def test_a_release_that_does_not_answer_is_listed(api, call, monkeypatch):
-    release_in(api, "a", "demo", ready=False)
-    monkeypatch.setattr("cloudrc.cluster.fleet.release_api", Mock(side_effect=ClusterError("gone")))
-    captured = call("list releases")
-    assert captured.out.splitlines()[1].split()[-1] == "?"
-    assert "release 'a' in namespace 'demo': gone" in captured.err

@@ -56,10 +56,6 @@ def test_fifty_problems_at_most_are_listed(mine):
     [
         ("seed: 1\nseed: 2", "mine.yaml:2: the key 'seed' is given twice"),
         ("seed: 1\nname: !!python/name:os.system x", "mine.yaml:2: could not determine a constr"),
-        # libyaml's own limit and message
-        ("a: &a [*a]", "mine.yaml: nested too deep"),
-        ("name: ../../x", "name: '../../x': must be text without slashes"),
-        ("mission: ./nowhere.yaml", "mission: ./nowhere.yaml: cannot be read: No such file"),
         ("guard: {speed_max_mps: 7}", "must be at most 6 m/s: above it the robot does not stop"),
         ("mission: {waypoints: []}",
          "mine.yaml:1: mission.waypoints: none given; give waypoints, or steps, or setpoints"),
@@ -95,7 +91,6 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("seed", "--set seed: must be key=value"),
         ("mission.waypoints.9.dwell_s=1", "entries 0 to 6; use one of these, or 7 to append"),
         (
             "mission.waypoints.2.yaw_deg=90",
@@ -106,20 +101,13 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
             "cloud.predictor: 'constant_velocity' has no model of the robot, which cloud.plan_s",
         ),
         (
-            "cloud.plan_s=0.4 cloud.predictor=last_sample",
-            "--set: cloud.predictor: 'last_sample' has no model of the robot",
-        ),
-        (
             "world.scene=empty",
             "mission.touch.body: board: no body of the scene empty named 'board'",
         ),
         ("world.robot=./no.xml", "no such folder with robot.yaml or .xml file"),
         # A limit of the guard cannot be switched off.
         ("guard.command_age_max_ms=true", "--set: guard.command_age_max_ms: "),
-        ("world.plant.actuator_factor=[1,9]", "actuator_factor.1: 9: must be <= 5"),
         ("world.tuning=none", "world.tuning: no tuning of pelican named 'none'; available: fast"),
-        ("cloud.compute_deviation_ms=1", "needs compute_ms"),
-        ("cloud.cpu_share=0.2", "needs compute_ms"),
         ("cloud.send_delta_mps=0.05", "needs plan_s"),
     ],
 )
@@ -131,7 +119,6 @@ def test_an_invalid_setting_is_refused(text, reason):
     ("text", "reason"),
     [
         ("uplink: {distribution: table}", "uplink: distribution: table needs the key table"),
-        ("uplink: {changes: [{at_s: 5}, {at_s: 5}]}", "uplink: at_s of changes must rise"),
         ("uplink: {trace: falling.csv}", "falling.csv, line 3"),
     ],
 )

@@ -93,19 +93,3 @@ def test_teleop_takes_two_numbers_and_refuses_heights():
     assert read.goto(b'{"position_m": [1, 1.2]}').position == (1.0, 1.2, 0.1)
     with pytest.raises(RefusedError, match=r"position_m: .* has a height"):
         read.goto(b'{"position_m": [1, 1.2, 1]}')
-
-
-@pytest.mark.parametrize(
-    ("z", "planar", "fits"), [(0, True, True), (0.5, True, False), (0.5, False, True)]
-)
-def test_a_drive_up_or_down_is_refused(z, planar, fits):
-    read = RequestReader(SCENE, SIZE, PLAN, planar=planar)
-    body = json.dumps({"velocity_mps": [1, 0, z]}).encode()
-    if fits:
-        assert read.drive(body) == (1.0, 0.0, z)
-    else:
-        with pytest.raises(
-            RefusedError,
-            match=r"velocity_mps.2: 0.5: leads up or down, but this robot stays on the ground",
-        ):
-            read.drive(body)

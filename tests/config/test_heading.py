@@ -9,11 +9,9 @@ import pytest
 from cloudrc.assembly import build_plan, mission_plan
 from cloudrc.config.hull import hull_of
 from cloudrc.config.load import load_experiment
-from cloudrc.config.resolved import dump
 from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
-from cloudrc.runs.experiment import check_mode
 from cloudrc.teleop.models import RefusedError, RequestReader
 from tests.fences import FENCE
 
@@ -51,13 +49,6 @@ def test_a_yaw_of_a_robot_that_obeys_reaches_the_plan(robot):
     assert build_plan(flown(robot)).legs[0].yaw is None
 
 
-def test_a_yaw_of_0_is_what_the_pelican_holds_anyway(tmp_path):
-    experiment = flown("pelican", yaw_deg=0.0)
-    assert experiment == flown("pelican")
-    (tmp_path / "again.yaml").write_text(dump(experiment))
-    assert load_experiment(tmp_path / "again.yaml").mission == experiment.mission
-
-
 @pytest.mark.parametrize(
     ("text", "heading"),
     [
@@ -70,14 +61,6 @@ def test_a_yaw_of_0_is_what_the_pelican_holds_anyway(tmp_path):
 def test_robot_yaml_says_what_decides_about_the_heading(tmp_path, text, heading):
     (tmp_path / "robot.yaml").write_text(text)
     assert find_robot(str(tmp_path)).heading == heading
-
-
-def test_a_flight_with_a_controller_that_leaves_the_yaw_alone_is_refused():
-    waypoint = "{position_m: [0, 0, 1], yaw_deg: 90}"
-    more = ["world.robot=x2", "world.scene=empty", "world.onboard.yaw_bandwidth_radps=0"]
-    experiment = load_experiment("steps", [*more, f"mission={{waypoints: [{waypoint}]}}"])
-    with pytest.raises(BadInputError, match="does not obey a yaw; leave yaw_deg out"):
-        check_mode(experiment, "virtual")
 
 
 def test_teleop_takes_and_refuses_yaws_as_a_mission_does():

@@ -42,36 +42,6 @@ def test_limits_and_hull_are_read_and_have_defaults(read):
     assert (robot.guard.braking_mps2, robot.guard.speed_max_mps, robot.hull_m) == (2.0, 1.5, 0.35)
 
 
-@pytest.mark.parametrize(
-    ("keys", "message"),
-    [
-        ("guard: {braking_mps2: 50}", "guard.braking_mps2: 50: must be <= 10"),
-        ("sensors: {range: {sensor: a}}", "sensors.range.unit: is missing"),
-    ],
-)
-def test_a_wrong_value_is_one_line_with_file_line_and_key(read, tmp_path, keys, message):
-    with pytest.raises(BadInputError) as error:
-        read(keys)
-    assert f"{tmp_path}/robot.yaml:2: {message}" in str(error.value)
-    assert "\n" not in str(error.value)
-
-
 def test_a_planar_robot_does_not_land(read):
     with pytest.raises(BadInputError, match=r"guard\.stop is land, but planar"):
         read("planar: true", "guard: {stop: land}")
-
-
-@pytest.mark.parametrize(
-    ("onboard", "key", "message"),
-    [
-        ("multirotor", "planar: true", "multirotor needs planar: false"),
-        ("diff_drive", "", "diff_drive needs planar: true"),
-    ],
-)
-def test_a_shipped_controller_that_does_not_fit_planar_is_refused_in_one_line(
-    read, onboard, key, message
-):
-    with pytest.raises(BadInputError) as error:
-        read(key, onboard=onboard)
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)

@@ -7,7 +7,7 @@ import pytest
 
 from cloudrc.cli import console
 from cloudrc.config.load import load_experiment
-from cloudrc.console.access import ORIGIN, Access, page_token
+from cloudrc.console.access import Access, page_token
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import Page
 from cloudrc.console.steering import Steering
@@ -159,15 +159,6 @@ def test_the_token_moves_from_the_address_to_a_cookie_of_this_console(served):
     assert f"set-cookie: {page._access.cookie}={TOKEN}; HttpOnly; SameSite=lax" in head
     assert "path=" not in head.lower(), "behind a proxy, the browser takes the path of the page"
     assert Access(lambda: TOKEN[::-1]).cookie != page._access.cookie
-
-
-@pytest.mark.parametrize(
-    "origin",
-    ["hub.example.org", "https://hub.example.org/"],
-)
-def test_allow_origin_asks_for_an_origin(refused, origin):
-    assert "is no origin; give scheme and host" in refused("console --allow-origin", origin)
-    assert ORIGIN.fullmatch("https://hub.example.org:8443")
 
 
 def test_the_token_of_a_release_s_page_follows_from_that_of_its_api(tmp_path):

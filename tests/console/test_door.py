@@ -194,11 +194,3 @@ def test_viser_listens_on_the_socket_alone(tmp_path):
         pass
     with pytest.raises(RuntimeError, match="viser's page"):
         scene_page("<html></html>", {})
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_port_in_use_is_an_error(api):
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        port = other.getsockname()[1]
-        with pytest.raises(OSError, match=f"--port {port}"):
-            Page(load_experiment("hover"), FlightFeed(), Steering(api), port)

@@ -12,9 +12,7 @@ from cloudrc.console.feed import (
     ESTIMATE,
     SPEED,
     STALE,
-    TIME,
     UPLINK,
-    WINDOW,
     FlightFeed,
 )
 from cloudrc.geometry.scene import load_scene
@@ -64,18 +62,6 @@ def test_error_and_estimate_are_unknown_without_control(feed):
     for sample in [*feed.samples][1:]:
         assert isnan(sample[CHARTED_FROM])
         assert isnan(sample[ESTIMATE])
-
-
-def test_copies_of_a_status_are_no_samples(feed):
-    for given in (None, status(0.1), status(0.1)):
-        feed.take(given, 1.0)
-    assert len(feed.samples) == 1
-
-
-def test_samples_older_than_the_window_are_dropped(feed):
-    for second in range(40):
-        feed.take(status(second), float(second))
-    assert feed.columns()[TIME].min() >= -WINDOW
 
 
 def test_the_trail_is_coloured_by_the_clearance_from_the_pipes():

@@ -67,10 +67,3 @@ def test_every_robot_has_its_own_shape_and_colours(server, robot):
     assert len(meshes) == len({surface.rgba for surface in shapes.robot}) > 1
     corners = np.concatenate([mesh.vertices for mesh in meshes])
     assert 2 * np.linalg.norm(corners, axis=1).max() == pytest.approx(shapes.size, rel=1e-5)
-
-
-def test_balls_of_setpoint_and_waypoints_do_not_hide_a_small_robot(server):
-    scene, nodes = shown(server, "hover", "world.robot=nano")
-    scene.set_waypoints(np.eye(3), 0)
-    size = read_shapes(load_experiment("hover", ("world.robot=nano",)).world).size
-    assert max(nodes["/setpoint"].radius, nodes["/waypoints/1"].radius) < size / 4

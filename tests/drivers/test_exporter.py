@@ -91,14 +91,12 @@ def test_a_pod_has_less_than_200_series(pod, flight):
 
 
 LIMITED = "nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n"
-OLD = "nr_periods 4\nnr_throttled 2\nthrottled_time 500000000\n"
 
 
 @pytest.mark.parametrize(
     ("file", "text", "counts"),
     [
         ("cpu.stat", LIMITED, [120, 17, 1.25]),
-        ("cpu,cpuacct/cpu.stat", OLD, [4, 2, 0.5]),
         ("cpu.stat", "usage_usec 4402130\n", []),  # without a limit
     ],
 )

@@ -55,15 +55,6 @@ def test_without_a_common_clock_one_way_delays_are_not_judged():
     assert len(faults) == 1
 
 
-def test_simulated_compute_time_is_no_delay_of_the_link():
-    heard = arrivals(PAPER, overhead=0.008)
-    assert checked(hearing(PAPER, PAPER), heard)[1] != []
-    moments, faults = checked(hearing(PAPER, PAPER, computes=True), heard)
-    assert faults == []
-    assert "loss" in moments[-1]
-    assert not {"mean", "deviation"} & moments[-1].keys()
-
-
 def test_late_wakes_of_the_ends_are_no_fault_of_the_link():
     slow = arrivals(changed(PAPER, delay_ms=PAPER.delay_ms + 4.5))
     assert checked(hearing(PAPER, PAPER), slow)[1], "of punctual ends it is"
@@ -85,17 +76,6 @@ def test_cloud_judges_round_trips_without_a_common_clock(slower, verdict):
     moments, _ = checked(hearing(up, down, uplink=True), heard)
     trip = moments[-1]["round_trip"]
     assert (trip.asked, trip.verdict) == (pytest.approx(0.120, abs=1e-4), verdict)
-
-
-def test_the_monitor_follows_the_link_and_ignores_nonsense():
-    monitor = hearing(PAPER, PAPER)
-    monitor.request({"uplink": {"delay_ms": 9}})
-    assert monitor.after([], 0) == []
-    assert monitor._asked[0].delay_ms == 9
-    for unknown in (None, {"nonsense": 1}, {"uplink": {"trace": "/no/such.csv"}}):
-        monitor.request(unknown)
-        assert checked(monitor, arrivals(FAULTS["mean"], 20.0)) == ([], []), "nothing is known"
-        monitor.follow((PAPER, PAPER))
 
 
 def test_the_thread_judges_like_the_loop():

@@ -45,17 +45,6 @@ def test_a_flight_is_in_the_home_without_a_runtime_folder_of_ones_own(
         assert (tmp_path / "home/.local/state/cloudrc/flights").is_dir()
 
 
-def test_without_a_folder_of_ones_own_a_flight_is_flown_and_not_found(
-    tmp_path, monkeypatch, caplog
-):
-    """In a pod, all containers of the user may write into /tmp, and nobody has a home."""
-    monkeypatch.setattr(local, "make_own_folder", lambda folder: "others may write there")
-    with local.announced(tmp_path, ""):
-        assert local.under_way() == {}
-    assert "other commands do not find this flight" in caplog.text
-    assert socket_folder() == "/tmp"
-
-
 def test_sockets_lie_in_a_folder_with_a_short_path(monkeypatch):
     for folder, chosen in (("/short", "/short"), ("/" + "x" * 90, "/tmp")):
         monkeypatch.setattr(local, "flights_folder", lambda folder=folder: Path(folder, "flights"))

@@ -19,8 +19,6 @@ from tests.drivers.conftest import COMMAND, start, wait_until_flying
 
 pytestmark = pytest.mark.process
 
-ENDS = ("world", "cloud")
-
 
 def report(folder):
     return json.loads((folder / "report.json").read_text())

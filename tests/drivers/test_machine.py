@@ -12,7 +12,6 @@ from cloudrc.drivers import machine
     [
         ("0::/\n", {"": "200000 100000"}, 2),  # in a container
         ("1:cpu:/x\n0::/a/b\n", {"a": "150000 100000", "a/b": "max 100000"}, 2),
-        ("1:cpu:/x\n", {"": "200000 100000"}, 4),  # version 1
     ],
 )
 def test_the_smallest_limit_counts(group, limits, cores, tmp_path, monkeypatch):

@@ -145,16 +145,6 @@ def test_a_change_is_recorded_once_and_again_at_a_mission_start(path):
     assert check.request.mock_calls == [call(STATE.profile), call(SET.profile)]
 
 
-def test_nonsense_is_recorded_as_nothing(path):
-    """Neither is the state before it, which no longer holds."""
-    tell(path, STATE)
-    notes = LinkNotes(path, uplink=False, check=Mock())
-    assert len(notes.after([], 200 * MS)) == 1
-    for file in (path, path.with_suffix(".released")):
-        file.write_text('{"shaper": "relay"}')
-    assert notes.after(BEGINS, 2200 * MS) == []
-
-
 @pytest.fixture
 def end(path, pipe):
     """World's process with a key that has just changed; `put` is what it has recorded."""

@@ -5,8 +5,6 @@ import io
 import signal
 import subprocess
 import sys
-import threading
-import time
 from contextlib import suppress
 from pathlib import Path
 from unittest.mock import Mock
@@ -114,44 +112,6 @@ def test_a_recording_at_its_size_limit_ends_complete(tmp_path):
     assert recorder.dropped > 0
     assert 20_000 <= path.stat().st_size < 100_000
     assert Recording.read(path).note == said
-
-
-class Slow(Shelf):
-    """A sink whose third sync hangs until it is released."""
-
-    def __init__(self):
-        super().__init__()
-        self.release, self.begun = threading.Event(), threading.Semaphore(0)
-        self.began, self.flushed = [], threading.Semaphore(0)
-
-    def flush(self):
-        self.flushed.release()
-
-    def sync(self):
-        self.began.append(time.monotonic())
-        self.begun.release()
-        if len(self.began) == 3:
-            self.release.wait(10.0)
-
-
-def test_a_hanging_sync_delays_nobody_and_is_told(tmp_path):
-    """The loop goes on, and the operating system gets the data."""
-    shelf = Slow()
-    recorder = Recorder(tmp_path / "w.mcap", lambda path: shelf)
-    assert recorder.sync_age() is None
-    recorder.start()
-    for _ in range(3):
-        assert shelf.begun.acquire(timeout=5.0)
-    ages = [recorder.sync_age(), recorder.sync_age()]
-    assert shelf.began[2] - shelf.began[1] <= ages[0] < ages[1], "it rises while the disk hangs"
-    recorder.put(counted(500))
-    while shelf.flushed.acquire(blocking=False):
-        pass
-    for _ in range(2):
-        assert shelf.flushed.acquire(timeout=5.0)
-    assert recorder.stop(timeout=10.0)
-    assert (len(shelf.records), recorder.dropped) == (500, 0)
-    shelf.release.set()
 
 
 def test_a_pod_records_flights_whole_and_events_between_them():

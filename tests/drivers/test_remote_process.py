@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -80,15 +79,6 @@ def test_a_program_and_its_children_end_with_the_block_even_if_they_ignore_sigte
         os.kill(child, 0)
     stat = Path(f"/proc/{child}/stat")
     wait_until(lambda: not stat.exists() or stat.read_text().split()[2] == "Z", 5)
-
-
-@pytest.mark.process
-def test_a_program_has_ended_once_its_children_have(tmp_path):
-    with companion("true", tmp_path) as gone:
-        wait_until(gone, 5)
-    with companion("sh -c 'sleep 600 & exit 3'", tmp_path) as gone:
-        time.sleep(0.3)
-        assert not gone()
 
 
 def test_a_program_that_ends_before_it_listens_is_named_with_its_last_line(tmp_path):

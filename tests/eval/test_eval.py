@@ -166,32 +166,6 @@ def test_an_environment_that_does_not_follow_its_seed_is_told_and_may_get_it(law
         assert document["repeatable"] is not warned
 
 
-def test_a_failing_environment_is_one_line(law):
-    setup = EvalSetup("Task-v0", law(STILL), (("fails", True),))
-    with pytest.raises(BadInputError, match=r"episode failed: test_eval\.py:.*: the simulator"):
-        play(Episode(None, "newest", 1), setup)
-
-
-@pytest.mark.parametrize(
-    ("told", "words"),
-    [
-        ((0.0, True, False, {"success": 0.5}), "see --success-at"),
-        ((True, np.True_, np.array([False]), {"success": np.array([1.0])}), None),
-    ],
-)
-def test_a_wrong_value_of_an_environment_is_no_success(law, monkeypatch, told, words):
-    world = gymnasium.make("MountainCarContinuous-v0").unwrapped
-    monkeypatch.setattr(type(world), "step", lambda env, action: (env.state, *told))
-    setup = EvalSetup(
-        "MountainCarContinuous-v0", law("def infer(o): return {'actions': [[0.0]]}"), dt=0.1
-    )
-    if words is None:
-        assert play(Episode(None, "newest", 1), setup)["verdict"] == "success"
-        return
-    with pytest.raises(BadInputError, match=words):
-        play(Episode(None, "newest", 1), setup)
-
-
 def test_spaces_without_numbers_are_refused_and_whole_numbers_are_integers():
     with pytest.raises(InvalidValueError, match="Dict"):
         width_of(gymnasium.spaces.Dict({}))
@@ -225,22 +199,6 @@ def test_a_round_trip_keeps_the_ratio_of_the_profile():
     assert (even.uplink.delay_ms, even.downlink.delay_ms) == (40.0, 40.0)
     with pytest.raises(BadInputError, match="change over time"):
         check_round_trips("handover", (80.0,))
-
-
-@pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        ("0.05,0.02", (0.05, 0.02)),
-        ("measured", ("measured", "")),
-        ("a.csv", ("file", "a.csv")),
-    ],
-)
-def test_a_time_for_an_answer_is_read(text, found, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("a.csv").write_text("1")
-    assert read_compute(text)[0] == found
-    with pytest.raises(BadInputError, match=r"--compute.* 0\.05, MEAN,DEVIATION .* file"):
-        read_compute("absent.csv")
 
 
 def test_arguments_of_an_environment_are_yaml():
@@ -322,35 +280,6 @@ def test_a_server_that_fails_keeps_the_rows_and_is_one_line(tmp_path, capsys, la
     assert text in error[-1]
     assert "rows are kept" in error[-2]
     assert len((tmp_path / "e" / "rows.jsonl").read_text().splitlines()) > 2
-
-
-@pytest.mark.parametrize(
-    ("answer", "text"),
-    [
-        ("[[float('nan')]]", "not a finite number"),
-        ("[[1]] * count", "after 1"),
-    ],
-)
-def test_wrong_actions_of_a_file_are_one_line(law, answer, text):
-    source = "count = 0\ndef infer(o):\n    global count\n    count += 1\n"
-    path = law(f"{source}    return {{'actions': {answer}}}\n")
-    with pytest.raises(CloudrcError, match=text) as raised:
-        play(Episode(None, "newest", 1), EvalSetup("CartPole-v1", path))
-    assert raised.value.exit_code == 5
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (["--env", "NoSuch-v0"], "--env NoSuch-v0"),
-        (["--env-arg", "nothing=1"], "nothing"),
-        (["--rtt", "0,x"], "--rtt"),
-    ],
-)
-def test_wrong_flags_are_one_line_and_leave_no_folder(law, tmp_path, capsys, words, text):
-    assert run("--policy", law(), "--out", tmp_path / "e", *words) == 2
-    assert text in capsys.readouterr().err.splitlines()[-1]
-    assert not (tmp_path / "e").exists()
 
 
 def test_the_policy_of_the_documentation_stands_where_the_table_says(law, tmp_path):

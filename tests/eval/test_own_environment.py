@@ -3,16 +3,13 @@
 import json
 import sys
 from pathlib import Path
-from textwrap import dedent
 
-import gymnasium
 import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
-from cloudrc.eval.episode import check_environment, play
-from cloudrc.eval.setup import Episode, EvalSetup
-from tests.tensors import KINDS, Tensor
+from cloudrc.eval.episode import check_environment
+from cloudrc.eval.setup import EvalSetup
 
 STILL = "def infer(observation):\n    return {'actions': [[0.0]]}\n"
 
@@ -73,28 +70,3 @@ def test_an_unknown_environment_is_one_line_with_the_way_to_name_ones_own(law):
     with pytest.raises(BadInputError, match=words) as caught:
         check_environment(EvalSetup("Point-v0", law(STILL)), [])
     assert "\n" not in str(caught.value)
-
-
-def test_a_step_that_only_a_film_tells_is_said_to_be_one(law):
-    setup = EvalSetup("MountainCar-v0", law(STILL))
-    step = check_environment(setup, []).step
-    assert str(step) == "0.03333 s (render_fps of MountainCarEnv, a film's rate)"
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_tensors_of_a_policy_and_an_environment_are_taken(law, monkeypatch, kind):
-    def told(env, action):
-        assert action.tolist() == [0.5]
-        reward, flag = Tensor([1.0], **kind), Tensor(True, **kind)
-        return Tensor(env.state, **kind), reward, flag, Tensor([False]), {"success": flag}
-
-    world = gymnasium.make("MountainCarContinuous-v0").unwrapped
-    monkeypatch.setattr(type(world), "step", told)
-    source = f"""
-        from tests.tensors import Tensor
-        def infer(observation):
-            return {{"actions": [Tensor([0.5], **{kind}), Tensor([0.25], **{kind})]}}
-    """
-    setup = EvalSetup("MountainCarContinuous-v0", law(dedent(source)))
-    row = play(Episode(None, "newest", 1), setup)
-    assert (row["verdict"], row["numbers"]["return"]) == ("success", 1.0)

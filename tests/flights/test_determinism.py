@@ -63,18 +63,6 @@ def test_objects_and_encrypted_bytes_make_the_same_records(settings):
     assert Recording(records=records).sha256 == digest(experiment)
 
 
-def test_who_watches_cloud_sees_the_telemetry_that_it_uses_and_changes_nothing():
-    experiment, records, seen = short(), RecordStore(), []
-    _, cloud, teleop, run = assemble(experiment)
-    cloud.watch = lambda epoch, counter, telemetry: seen.append((epoch, counter))
-    run.fly(lambda: teleop.over, 150_000_000_000, records.add)
-    recording = Recording(records=records)
-    arrivals = recording["/uplink_delay"]
-    used = arrivals["used"].astype(bool)
-    assert seen == [*zip(arrivals["epoch"][used], arrivals["counter"][used], strict=True)]
-    assert recording.sha256 == digest(experiment)
-
-
 def watch_damage(link, session):
     """Count how `session` answers the datagrams that `link` damages: the refusal, or "opened".
 

@@ -59,17 +59,6 @@ def test_what_nothing_can_touch_is_no_obstacle(flown_into):
     assert [note for note in found.notes if note.startswith("The robot flies through ghost: ")]
 
 
-def test_two_bodies_are_told_apart(flown_into):
-    found = flown_into(
-        f'<body name="left" pos="1.2 .25 0">{GEOM.replace(".5", ".2")}</body>'
-        f'<body name="right" pos="1.2 -.25 0">{GEOM.replace(".5", ".2")}</body>'
-        f'<body name="far" pos="3 0 0">{GEOM}</body>'
-    )
-    touched = [each.text for each in found.verdict.failures if each.code == "obstacle_touched"]
-    names = [text.partition(" (")[0] for text in touched]
-    assert sorted(names) == ["the robot touched left", "the robot touched right"]
-
-
 def test_the_report_has_the_clearance_from_any_obstacle(flown_into):
     assert "min_clearance_flight" not in flown_into("").numbers
     found = flown_into(f'<body name="post" pos="3 0 0">{GEOM}</body>')

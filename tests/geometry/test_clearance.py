@@ -56,11 +56,6 @@ def test_clearance_on_the_axis_is_that_of_the_plant():
         assert clearance(TUBES, pipe.centre, facing, FEW) == pytest.approx([0.320], abs=1e-3)
 
 
-def test_clearance_is_infinite_in_an_empty_scene():
-    assert clearance((), [(0, 0, 1), (1, 0, 1)], [LEVEL] * 2, FEW).tolist() == [math.inf] * 2
-    assert clearance(TUBES, np.empty((0, 3)), np.empty((0, 4)), FEW).shape == (0,)
-
-
 def test_points_are_those_of_the_plant_and_turn_with_the_robot():
     points = FEW
     assert points.positions.shape == (225, 3)

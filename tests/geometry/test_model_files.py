@@ -26,7 +26,6 @@ CORNERS = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3
         ("", "m.obj", "m.obj"),
         ("", "m.obj", "sub/m.obj"),
         ('meshdir="shapes"', "shapes/m.obj", "m.obj"),
-        ('strippath="true"', "m.obj", "/somewhere/else/m.obj"),
     ],
 )
 def test_a_mesh_is_found_where_mujoco_reads_it(tmp_path, compiler, name, mesh):
@@ -52,16 +51,3 @@ def test_nested_includes_and_attached_models_are_found(tmp_path):
     includes = '<include file="parts/one.xml"/><include file="dirs.xml"/>'
     scene = place(tmp_path, "scene.xml", mjcf(inner + includes))
     assert model_files(scene) == sorted([scene, *files])
-
-
-@pytest.mark.parametrize(
-    "inner",
-    [
-        '<include file="scene.xml"/>',
-        '<asset><mesh file="/dev/null"/></asset>',
-        "<broken",
-    ],
-)
-def test_a_file_that_names_no_other_stands_alone(tmp_path, inner):
-    scene = place(tmp_path, "scene.xml", mjcf(inner))
-    assert model_files(scene) == [scene]

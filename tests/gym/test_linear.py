@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from cloudrc.errors import BadInputError
 from examples import canon
 from tests.conftest import nightly
 
@@ -53,19 +52,3 @@ def test_noise_has_its_covariance_and_a_large_state_ends_the_episode():
 @pytest.mark.filterwarnings("ignore:.*Box:UserWarning")  # it advises finite, symmetric bounds
 def test_gymnasium_accepts_it():
     check_env(gymnasium.make("cloudrc/Linear-v0", A=np.eye(2)).unwrapped)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "text"),
-    [
-        ({"A": [[1, 2]]}, "A has the shape"),
-        ({"A": "x"}, "its A is 'x', not"),
-        ({"A": np.eye(2), "B": [[1]]}, "B has the shape"),
-        ({"A": np.eye(2), "W": [[1, 2], [2, 1]]}, "W is no covariance"),
-        ({"x0": [1, 2]}, "x0 has the shape"),
-        ({"dt": 0}, "its dt is 0, not"),
-    ],
-)
-def test_wrong_matrices_are_named(wrong, text):
-    with pytest.raises(BadInputError, match=text):
-        gymnasium.make("cloudrc/Linear-v0", **wrong)

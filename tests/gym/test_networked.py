@@ -14,7 +14,6 @@ from gymnasium.vector import SyncVectorEnv
 
 from cloudrc.errors import BadInputError
 from cloudrc.gym import Networked, NetworkedVector
-from cloudrc.gym.values import neutral
 from tests.gym.envs import Counter, Mixed, both_ways
 from tests.tensors import KINDS, Tensor
 
@@ -235,18 +234,6 @@ def test_a_copy_within_an_episode_continues_bit_by_bit(make_copy, options):
     assert fly(other, after) == fly(env, after)
 
 
-def test_a_step_or_a_summary_before_the_first_reset_is_refused():
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        Networked(Counter()).step(np.zeros(1, np.float32))
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"reset\(\) before summary"):
-        Networked(Counter()).summary()
-
-
-def test_an_unknown_argument_names_the_class_and_the_nearest():
-    with pytest.raises(BadInputError, match=r"Networked named .chunk_size.*mean chunk"):
-        Networked(Counter(), chunk_size=8)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_tensor_is_an_action_and_may_be_an_observation(kind):
     class Torch(Counter):
@@ -268,22 +255,6 @@ def test_a_tensor_is_an_action_and_may_be_an_observation(kind):
     assert [each.executed[0].tolist() for each in envs.env.envs] == [[0.5], [0.25]]
 
 
-def test_the_neutral_action_is_in_its_space():
-    space = spaces.Dict(
-        a=spaces.Box(np.array([1.0, -2.0]), np.array([3.0, 2.0]), dtype=np.float64),
-        b=spaces.Tuple((spaces.Discrete(3, start=-1), spaces.MultiDiscrete([2, 2]))),
-        c=spaces.MultiBinary(3),
-    )
-    assert space.contains(neutral(space))
-    assert neutral(space)["a"].tolist() == [1.0, 0.0]
-    with pytest.raises(BadInputError, match="Text has no neutral action; give start="):
-        Networked(Counter(spaces.Text(5)))
-    env = Networked(Counter(spaces.Text(5)), start="abc")
-    env.reset()
-    env.step("xyz")
-    assert env.unwrapped.executed == ["xyz"]
-
-
 @pytest.mark.parametrize("space", [spaces.Discrete(5), spaces.Box(-9.0, 9.0, (2,))])
 def test_the_policy_may_observe_the_age_and_its_own_last_actions(space):
     env = Networked(
@@ -302,10 +273,3 @@ def test_the_policy_may_observe_the_age_and_its_own_last_actions(space):
         seen, *_ = env.step(answer)
     assert seen["actions"].tolist() == [answers[n].tolist() for n in (0, 2, 3)]
     assert env.reset()[0]["actions"].tolist() == np.zeros((3, *space.shape)).tolist()
-
-
-def test_without_memory_an_observation_is_that_of_the_environment():
-    env = Networked(Counter())
-    assert env.observation_space == Counter().observation_space
-    env = Networked(Counter(), observe_age=True)
-    assert set(env.reset()[0]) == {"observation", "age"}

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from cloudrc.errors import BadInputError
 from cloudrc.gym import Networked, NetworkedVector
 from tests.gym.envs import Counter, Mixed, both_ways
 
@@ -82,21 +81,3 @@ def test_gymnasium_makes_a_vector_by_name():
     observations, infos = env.reset(seed=1)
     assert observations.shape == (4, 3)
     assert infos["cloudrc"]["observation_age"].tolist() == [0.0] * 4
-
-
-def test_what_does_not_fit_a_vector_is_refused_in_one_line():
-    ready = NetworkedVector(SyncVectorEnv([Counter] * 2), chunk=3)
-    ready.reset()
-    with pytest.raises(BadInputError, match="for each of 2 robots a chunk of 3 actions"):
-        ready.step(np.zeros((2, 1)))
-    with pytest.raises(BadInputError, match="the action: it is None"):
-        ready.step(None)
-
-
-def test_environments_in_other_processes_need_a_time_step():
-    with pytest.raises(BadInputError, match=r"do not tell their time step; give dt="):
-        NetworkedVector(gymnasium.make_vec("CartPole-v1", 1, "async"))
-    env = NetworkedVector(gymnasium.make_vec("CartPole-v1", 1, "async"), "lte", dt=0.02)
-    env.reset(seed=1)
-    assert env.step(np.zeros(1, int))[0].shape == (1, 4)
-    env.close()

@@ -128,22 +128,6 @@ def test_a_change_can_contain_a_trace(pod):
     assert pod.poll() is None
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        '{"profile.yaml": "", "../route": "1.2.3.4:5"}',
-        '{"profile.yaml": "uplink: {delay_ms: -1}"}',
-    ],
-)
-def test_an_invalid_document_is_refused_in_one_line(pod, text):
-    assert pod.first() == 40.0
-    with pytest.raises((BadInputError, ValueError)) as error:
-        pod.take(text)
-    assert "\n" not in str(error.value)
-    assert pod.poll() is None
-    assert os.listdir(pod.run) == []
-
-
 def test_the_peer_is_the_newest_address_even_without_an_answer():
     """While an old and a new pod overlap, their name has two addresses."""
     log, answers = [], [[], ["b"], ["a", "b"], [], ["b", "a"], ["a", "b", "c"], ["a"]]

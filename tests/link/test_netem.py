@@ -265,12 +265,3 @@ def test_a_step_is_taken_when_it_is_due():
     ]
     late_ns = [shaper.counts()[f"step_lateness_p{share}_ns"] for share in (50, 99)]
     assert late_ns == pytest.approx([0, 0], abs=1000)
-
-
-def test_changes_faster_than_the_step_are_skipped():
-    times = tuple(0.001 * n for n in range(1000))
-    trace = Trace(times, tuple(0.03 + 1e-5 * n for n in range(1000)))
-    kernel, _ = shaped(profile_of(rows=trace), 1.2)
-    assert np.diff([at for at, _, _ in kernel.history]).min() >= 4.999
-    assert len(kernel.history) >= 199
-    assert kernel.history[-1][1] == "39990.000us"

@@ -3,7 +3,6 @@
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.link import traces
 from cloudrc.link.profile import Trace
 from cloudrc.link.traces import parse_trace, read_table, read_trace, write_trace
 
@@ -59,14 +58,3 @@ def test_a_table_is_the_arrived_delays_with_mean_0_deviation_1(tmp_path):
     path.write_text(f"{HEAD},loss\n0,45,0\n1,45,0\n2,50,1\n")
     with pytest.raises(BadInputError, match="at least two different delays"):
         read_table(path)
-
-
-def test_an_unchanged_file_is_read_once_and_a_changed_one_anew(tmp_path, monkeypatch):
-    path, reads = tmp_path / "trace.csv", []
-    path.write_text(f"{HEAD}\n0,45\n")
-    real = traces.read
-    monkeypatch.setattr(traces, "read", lambda *given: reads.append(given) or real(*given))
-    assert read_trace(path) is read_trace(path)
-    assert len(reads) == 1
-    path.write_text(f"{HEAD}\n0,45\n1,50\n")
-    assert read_trace(path).times == (0.0, 1.0)

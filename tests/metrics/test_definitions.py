@@ -23,7 +23,6 @@ from cloudrc.metrics.definitions import (
     QUANTITIES,
     WINDOW,
     DatagramTally,
-    Echoes,
     PredictionJudge,
     RecordQuantity,
 )
@@ -107,12 +106,6 @@ def test_a_prediction_is_compared_at_its_own_instant(lead, every_ms, judged):
     assert judge.judged == judged
     assert judge.square == pytest.approx(judged * lead**2, abs=1e-12)
     assert judge.error == pytest.approx((lead, 0, 0) if judged else (math.nan,) * 3, nan_ok=True)
-
-
-def test_a_round_trip_is_new_once():
-    echoes, none = Echoes(), math.nan
-    periods = [(none, none), (0.1, 0.2), (0.1, 0.2), (0.1, 0.3), (none, none), (0.1, 0.3)]
-    assert [echoes.take(*each) for each in periods] == [False, True, False, True, False, True]
 
 
 def test_one_row_is_a_number_a_live_metric_and_a_panel():

@@ -270,31 +270,12 @@ def test_a_program_that_has_ended_before_its_first_answer_is_not_waited_for(flig
     assert raised.value.code == "controller_silent"
 
 
-def test_a_program_that_has_ended_later_may_be_followed_by_another_one_within_5_s(flight):
-    flight.step()
-    flight.answer(1.0)
-    flight.step()
-    flight.peer.arrived.append({"ended": True})
-    flight.step(500)
-    flight.answer(2.0)
-    assert flight.step() == [2.0]
-
-
 def test_a_wrong_answer_in_real_time_ends_the_flight_at_once(flight):
     flight.step()
     flight.answer(invalid="ws://h:1: 'actions' has values that are not finite")
     with pytest.raises(ControllerLostError, match="not finite") as raised:
         flight.step()
     assert raised.value.code == "controller_invalid"
-
-
-def test_answers_of_an_earlier_mission_do_not_count(flight):
-    flight.step()
-    flight.controller.reset()
-    flight.answer(1.0)
-    assert flight.step() == [0.0]
-    flight.answer(2.0)
-    assert flight.step() == [2.0]
 
 
 def test_a_pause_of_the_loop_is_no_silence_of_the_program(flight):

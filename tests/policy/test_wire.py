@@ -13,9 +13,8 @@ import pytest
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import connect
 
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import CloudrcError
 from cloudrc.policy.client import PolicyClient, PolicyServerError, SilentServerError
-from cloudrc.policy.load import LoadedPolicy
 from tests.policy.conftest import actions, serving, stock_like
 
 STATE = {"state": np.arange(3.0)}
@@ -126,21 +125,6 @@ def test_a_wrong_frame_of_a_client_is_answered_with_an_error(policy, frame):
 
 
 @pytest.mark.parametrize(
-    ("source", "text"),
-    [
-        ("x = 1", "no function infer"),
-        (
-            "def build():\n    raise ValueError('no weights')",
-            "cannot be built: expert.py:2: no weights",
-        ),
-    ],
-)
-def test_a_file_without_a_policy_is_refused(policy, source, text):
-    with pytest.raises(BadInputError, match=text):
-        LoadedPolicy(str(policy(source)))
-
-
-@pytest.mark.parametrize(
     ("answer", "text"),
     [
         ("Traceback\n  File\nValueError: bad prompt\n", "error: ValueError: bad prompt$"),
@@ -170,18 +154,6 @@ def test_a_late_answer_is_not_taken_for_the_next_one():
         late.set()
         with pytest.raises(SilentServerError, match="closed"):
             client.infer(STATE)
-
-
-def test_two_answers_to_one_observation_are_refused():
-    """The second would be taken for the answer to the next observation."""
-
-    def twice(connection, frame):
-        connection.send(actions(1.0))
-        return actions(2.0)
-
-    with stock_like(twice) as url, PolicyClient(url) as client:
-        with pytest.raises(PolicyServerError, match="belongs to no observation"):
-            [client.infer(STATE) for _ in range(100)]  # the second answer may arrive later
 
 
 def test_nobody_listening_and_other_servers_are_one_line():

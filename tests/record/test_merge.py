@@ -203,16 +203,3 @@ def test_the_last_mission_is_kept_even_if_its_start_is_lost(tmp_path, events, ke
     mission.messages = [(topic, to_ns + late_ns, data) for topic, to_ns, data in mission.messages]
     assert cut_to_last_mission(mission) is ("done" in list(events.values())[-1:])
     assert (mission["/mission"]["stamp_ns"] / SECOND).tolist() == kept
-
-
-@pytest.mark.parametrize("ended", [5, 9.9])
-def test_the_counters_before_the_last_mission_are_kept(tmp_path, ended):
-    """The counters of the link have 2 s between their records."""
-    events = {1: "started", ended: "done", 10: "started", 20: "done"}
-    records = [rec.MissionEvent(round(at * SECOND), word, 0, "") for at, word in events.items()]
-    records += [rec.Counted(at * SECOND, "link", "", at) for at in range(6, 30, 2)]
-    records.sort(key=lambda record: record.stamp_ns)
-    mission = Recording.read(write(tmp_path / "m.mcap", records))
-    cut_to_last_mission(mission)
-    assert mission["/count"]["total"][:2].tolist() == [8, 10]
-    assert mission["/mission"]["event"].tolist() == ["started", "done"]

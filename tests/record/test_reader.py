@@ -11,12 +11,11 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole
-from cloudrc.record.ros import definition
 from cloudrc.record.writer import McapWriter
 from tests.record.conftest import assert_equal, rewrite, world_records
 
@@ -143,55 +142,6 @@ def test_changes_by_another_program_are_noted(whole, path, options, said):
     assert (copied(path).note, copied(path).holes) == (recording.note, (SOMEWHERE,))
 
 
-def test_a_torn_file_that_another_program_ended_is_noted(path):
-    with path.open("wb") as stream:
-        writer = McapWriter(stream, clock="world")
-        writer.write(RECORDS)
-        writer._mcap.finish()
-    assert "another program added an end" in Recording.read(path).lacking
-
-
-def write_foreign(path, topic, ros_type, text):
-    """Write a message as another program, but with the metadata key `clock` of cloudrc."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros2")
-        writer.add_metadata("cloudrc", {"clock": "world"})
-        schema = writer.register_schema(ros_type, "ros2msg", text.encode())
-        channel = writer.register_channel(topic, "cdr", schema)
-        writer.add_message(channel, 1, b"\0\1\0\0\7", 1)
-        writer.finish()
-
-
-OURS = "cloudrc_msgs/msg/Arrival"
-ARRIVAL = definition(OURS)
-
-
-@pytest.mark.parametrize(
-    ("topic", "name", "text", "said"),
-    [
-        ("/uplink_delay", OURS, ARRIVAL.replace("bool used", "int8 used"), "layout"),
-        ("/uplink_delay", "cloudrc_msgs/msg/Pid", definition("cloudrc_msgs/msg/Pid"), "layout"),
-        ("/camera", OURS, ARRIVAL, ""),
-    ],
-)
-def test_foreign_topics_are_not_read_as_topics_of_cloudrc(path, topic, name, text, said):
-    write_foreign(path, topic, name, text)
-    recording = Recording.read(path)
-    assert said in recording.lacking
-    assert bool(said) == bool(recording.note)
-    assert bool(recording.remarks) == (not said)
-    assert len(recording["/uplink_delay"]) == 0
-
-
-def test_an_unreadable_message_gives_one_line(path):
-    write_foreign(path, "/uplink_delay", OURS, ARRIVAL)
-    with pytest.raises(
-        BadInputError, match=r"x\.mcap: a message on /uplink_delay is not readable;"
-    ):
-        Recording.read(path)["/uplink_delay"]
-
-
 SOME = [start for _, start, _ in spans(WHOLE)][::6]
 EVERYWHERE = pytest.mark.parametrize(
     "places",
@@ -261,22 +211,6 @@ def test_damage_is_told_with_its_place_and_the_tool_that_reads_on(path):
     assert at < int(found[1]) <= CHUNKS[1][0]
     with pytest.raises(BadInputError, match=r"mcap recover; .*: cloudrc recover .*x\.mcap$"):
         Recording.read(path, whole=True)
-
-
-def test_damage_that_only_the_checksum_of_all_data_shows_may_be_anywhere(path):
-    """The opcode of a chunk: the reader takes it for a kind of record that is not known yet."""
-    path.write_bytes(flipped(CHUNKS[1][0]))
-    recording = Recording.read(path)
-    assert recording.note.startswith("damaged: a checksum is wrong: ")
-    assert recording.holes == (SOMEWHERE,)
-
-
-@pytest.mark.parametrize("rest", [b"rubbish" * 99, WHOLE])
-def test_bytes_behind_the_end_are_left_out_and_told(path, rest):
-    path.write_bytes(WHOLE + rest)
-    recording = Recording.read(path)
-    assert (recording.messages, recording.note) == (MESSAGES, "")
-    assert recording.remarks == (f"had {len(rest)} bytes behind its end, which were left out",)
 
 
 def test_the_command_says_what_is_copied_and_missing(path, call, refused):

@@ -87,12 +87,3 @@ def test_the_figure_of_a_robot_on_the_ground_shows_obstacles_but_no_heights():
     centres = {tuple(np.round((each.max(0) + each.min(0)) / 2, 2) + 0.0) for each in seen}
     assert {(1.5, 0.0), (3.5, 2.5), (1.5, -2.2)} <= centres
     assert len(seen) == len(shapes.scene)
-
-
-def test_a_tube_is_seen_from_above_and_from_the_side():
-    with own_settings(Look()):
-        figure = FIGURES["flight"][0](subject_of(flown()))
-    for axes in figure.axes[:2]:
-        shadow, *_ = axes.collections
-        corners = np.concatenate([path.vertices for path in shadow.get_paths()])
-        assert np.ptp(corners, axis=0) == pytest.approx((5.0, 1.324), abs=1e-3)

@@ -1,7 +1,6 @@
 """The folder of a run gives the same report again, or an error, and then stays unchanged."""
 
 import json
-import os
 import re
 import shutil
 from dataclasses import replace
@@ -41,16 +40,6 @@ def run(flown_once, tmp_path):
 
 def report(folder):
     return json.loads((folder / "report.json").read_text())
-
-
-def test_a_new_report_keeps_the_machine_that_flew(run):
-    environment = run / "environment.json"
-    environment.write_text(flown := '{"cores": 3, "physics_steps": "C (compiled by cc)"}')
-    write_report(run, *read_run(run), page=False)
-    assert environment.read_text() == flown
-    environment.write_text("{")
-    write_report(run, *read_run(run), page=False)
-    assert json.loads(environment.read_text())["cores"] == os.cpu_count()
 
 
 def filtered(**options):

@@ -4,7 +4,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.record.topics import VIEWS
-from cloudrc.records import Lateness, TelemetrySent
+from cloudrc.records import TelemetrySent
 from cloudrc.report.live_views import REPEAT_NS, LiveViews
 
 STORE = get_typestore(Stores.ROS2_KILTED)
@@ -35,8 +35,3 @@ def test_the_guard_comes_at_a_change_and_with_the_scene_once_a_second():
     changed = topics(views, sent(20, GuardState.TRACK))
     assert ("/guard" in changed, "/scene" in changed) == (True, False)
     assert {"/guard", "/scene"} <= set(topics(views, sent(REPEAT_NS, GuardState.TRACK)))
-
-
-def test_another_record_of_cloud_is_its_topic():
-    (message,) = LiveViews([]).of(Lateness(7, "cloud", 0.1, 0.2, 0))
-    assert message[:2] == ("/lateness", 7)

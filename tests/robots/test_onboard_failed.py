@@ -3,13 +3,9 @@
 import pytest
 
 import cloudrc
-from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState
-from cloudrc.records import Fault, MissionEvent
-from cloudrc.runs.fly import fly as fly_into_folder
-from cloudrc.runs.folder import run_folder
 
 HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
 FAILS = """
@@ -119,17 +115,6 @@ def test_a_controller_that_fails_in_flight_ends_it_with_onboard_failed(fly, what
     assert [each.code for each in flight.failures] == ["onboard_failed"]
 
 
-def test_what_a_flight_tells_stands_in_the_order_of_time(own, tmp_path):
-    own(FAILS.replace("{what}", "raise KeyError"))
-    told = []
-    experiment = load_experiment("hover", [f"world.robot={tmp_path}", "world.scene=empty"])
-    folder = run_folder(experiment, "virtual", tmp_path / "run")
-    fly_into_folder(experiment, "virtual", folder, told.extend)
-    stamps = [each.stamp_ns for each in told if isinstance(each, Fault | MissionEvent)]
-    assert len(stamps) >= 3
-    assert stamps == sorted(stamps)
-
-
 def test_the_actuators_of_a_robot_that_failed_push_nothing(fly):
     flight = fly(FAILS.replace("{what}", "raise ValueError"))
     truth = flight["/ground_truth"]
@@ -178,27 +163,3 @@ def test_an_accelerator_that_holds_the_contract_flies_as_without_it(fly):
 def test_a_controller_without_its_parts_is_refused_before_the_flight(fly):
     with pytest.raises(BadInputError, match=r"/own\.py: .*'Fails' object has no attribute 'brake'"):
         fly(FAILS.replace("{what}", "pass").replace("def brake", "def halt"))
-
-
-def test_an_accelerator_that_makes_no_robot_is_refused_before_the_flight(fly):
-    with pytest.raises(BadInputError, match=r"own\.py: accelerator\(\) failed: "):
-        fly(FASTER.replace("{what}", "pass").replace("(Faster", "(lambda *given: 3"))
-
-
-def test_build_and_actuators_are_of_one_import_of_the_file(fly):
-    shared = """
-from cloudrc.robots.onboard.multirotor import build as general
-from cloudrc.sim.onboard import Direct
-
-BUILT = []
-
-
-def build(model):
-    BUILT.append(model.nu)
-    return general(model)
-
-
-def actuators(model, dt):
-    return Direct(BUILT[0])
-"""
-    assert fly(shared).verdict == "success"

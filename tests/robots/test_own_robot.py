@@ -3,7 +3,6 @@
 import pytest
 
 import cloudrc
-from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
 from tests.robots.conftest import CONTROLLER
@@ -43,7 +42,6 @@ def test_the_controller_may_lie_in_the_folder_and_takes_parameters(own_robot):
     ("text", "message"),
     [
         ("onbord: x", "robot.yaml:1: onbord: unknown key; did you mean onboard?"),
-        (f"{{model: other.xml, onboard: {CONTROLLER}}}", "other.xml"),
         (f"onboard: {CONTROLLER}", "a mass of 1.06 +- 0.1 kg, not 4 and 1.325 kg"),
     ],
 )
@@ -53,9 +51,3 @@ def test_what_is_wrong_with_a_robot_is_one_problem_by_name(own_robot, text, mess
     with pytest.raises(BadInputError) as error:
         cloudrc.fly("hover", HOVER | {"world.robot": str(mine)})
     assert message in str(error.value)
-
-
-def test_a_folder_named_like_a_shipped_robot_is_a_robot_of_its_own(own_robot, tmp_path):
-    own_robot("onboard: multirotor", find_robot("x2").model.read_text()).rename(tmp_path / "nano")
-    name = load_experiment("hover", [f"world.robot={tmp_path}/nano"]).world.robot
-    assert find_robot(name).model.read_text() != find_robot("nano").model.read_text()

@@ -1,8 +1,5 @@
 """No flight is flown by two commands into one folder at the same time."""
 
-import errno
-import fcntl
-
 import pytest
 
 from cloudrc.errors import BadInputError
@@ -30,12 +27,3 @@ def test_two_commands_never_fly_the_same_flights(first, second, refused, tmp_pat
                 pass
     with lock_folder(tmp_path, second):  # the first command has ended
         pass
-
-
-def test_a_file_system_without_locks_is_told(tmp_path, monkeypatch, caplog):
-    def refuse(file, how):
-        raise OSError(errno.ENOLCK, "refused")
-
-    monkeypatch.setattr(fcntl, "flock", refuse)
-    with lock_folder(tmp_path, (1, 2)), lock_folder(tmp_path, (1, 2)):
-        assert "its file system has no locks; do not write" in caplog.text

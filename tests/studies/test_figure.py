@@ -4,7 +4,6 @@ import json
 
 import pytest
 
-from cloudrc.errors import BadInputError
 from cloudrc.studies.compare import of_sweep
 from cloudrc.studies.figure import draw_sweep
 from cloudrc.studies.sweep import read_flights
@@ -60,13 +59,6 @@ def row(point, seed, *failures):
     return {"point": point, "seed": seed, **flown(verdict, *failures, iae_mean=seed)}
 
 
-def test_numbers_of_a_plugin_that_failed_are_not_drawn(drawn):
-    draw_sweep([row({"a": 1}, 3), row({"a": 1}, 7, "plugin_failed"), row({"a": 2}, 4)], UNITS)
-    iae, success = drawn[0]
-    assert [point.middle for point in iae.lines["a"]] == [3, 4]
-    assert [point.middle for point in success.lines["a"]] == [50, 100]
-
-
 def test_a_figure_is_three_files_whose_text_is_text(tmp_path, call):
     folder = sweep(tmp_path / "s")
     out = call("sweep figure", folder, "--out", tmp_path / "one.png").out
@@ -74,16 +66,6 @@ def test_a_figure_is_three_files_whose_text_is_text(tmp_path, call):
     assert (tmp_path / "one.pdf").read_bytes().startswith(b"%PDF")
     assert (tmp_path / "one.png").read_bytes().startswith(b"\x89PNG")
     assert ">delay (ms)</text>" in (tmp_path / "one.svg").read_text()
-
-
-def test_a_figure_of_unknown_names_is_refused(tmp_path, refused):
-    said = refused("sweep figure", sweep(tmp_path / "s"), "--x", "delay")
-    assert "no axis named 'delay'" in said
-
-
-def test_a_sweep_without_rows_has_no_figure(tmp_path):
-    with pytest.raises(BadInputError, match="has no rows"):
-        read_flights(sweep(tmp_path / "s", rows=0))
 
 
 def test_missing_flights_are_reported(tmp_path, call, drawn):
@@ -100,9 +82,3 @@ def test_values_of_an_axis_are_paired_over_the_others(tmp_path):
     assert len(found) == 12
     assert found[0].label == {"delay_ms": 20, "gain": "[1, 2]", "seed": 1}
     assert {a["numbers"]["iae_mean"] - b["numbers"]["iae_mean"] for _, a, b in found} == {0.5}
-
-
-@pytest.mark.parametrize("sides", [("none", "none"), ("none", "5")])
-def test_values_that_make_no_pairs_are_refused(sides, tmp_path):
-    with pytest.raises(BadInputError, match=r"must be two values of one axis.*delay_ms: 20, 5"):
-        of_sweep(sweep(tmp_path / "s"), *sides)

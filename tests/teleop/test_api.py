@@ -278,16 +278,6 @@ def test_a_network_address_needs_tokens(where, host, refused):
     assert "needs --tokens DIR" in line
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_an_unusable_address_is_named_and_a_file_in_the_way_kept(api, tmp_path):
-    thesis = tmp_path / "thesis"
-    thesis.write_text("mine")
-    for address in (thesis, ("127.0.0.1", int(api.url.rpartition(":")[2]))):
-        with pytest.raises(OSError, match="--api "):
-            ApiServer(api.gate, api.bridge, address)
-    assert thesis.read_text() == "mine"
-
-
 def test_a_socket_file_is_for_its_owner_and_needs_no_token(tmp_path):
     with running(unix=True) as api:
         assert stat.S_IMODE(api.address.stat().st_mode) == 0o600

@@ -2,19 +2,15 @@
 
 import re
 from math import inf, nan
-from unittest.mock import Mock
 
 import pytest
 
 from cloudrc.config.schema import Touch
-from cloudrc.drivers.teleop import STALL_NS, TeleopLoop
-from cloudrc.exposition.table import MISSION_OUTCOMES
 from cloudrc.messages import Cause, GuardState, Setpoint, Start
-from cloudrc.teleop.api import Bridge
 from cloudrc.teleop.refusals import ConflictError
 from cloudrc.teleop.store import Order
 from cloudrc.teleop.view import NO_CLOUD, NOT_HEARD
-from cloudrc.teleop.wire import ENDED, STATES, Leg, Plan
+from cloudrc.teleop.wire import Leg, Plan
 from tests.teleop.conftest import FROM_SPAWN, PLACES, A, ServiceFlight, play, service_flying
 
 BOARD = Touch(body="board")
@@ -178,25 +174,6 @@ def test_what_follows_from_a_script(name, script, expected):
 
 
 @pytest.mark.parametrize(
-    ("script", "said"),
-    [
-        (
-            "deaf 15.4 link 0.05",
-            "no telemetry since 0.04 s (teleop does not hear cloud); last seen "
-            "at (1.00, 0.00, 1.00) m, with the guard in TRACK",
-        ),
-        ("deaf 15.4 link 0.05", "telemetry again at 15.45 s, after 15.4 s: guard in TRACK"),
-        ("HOLD 3 TRACK 0.05", "guard in TRACK at 3.05 s, after 3.0 s in HOLD"),
-    ],
-)
-def test_an_event_says_what_happened_once(script, said):
-    flight, _ = service_flying()
-    play(flight, script)
-    events = flight.teleop.book.events_after(0)
-    assert [said in event["text"] for event in events].count(True) == 1
-
-
-@pytest.mark.parametrize(
     ("script", "codes", "words"),
     [
         ("deaf 60", ["timed_out", "no_telemetry"], "no telemetry for 60.0 s in all"),
@@ -214,11 +191,6 @@ def test_the_verdict_of_a_failed_mission_tells_its_interruptions(script, codes, 
     told = [failure for failure in failures if failure["code"] != "waypoint_not_reached"]
     assert [failure["code"] for failure in told] == codes
     assert words in "; ".join(failure["text"] for failure in told)
-
-
-def test_every_end_of_a_mission_is_counted_under_its_own_name():
-    ends = {event for event, state in STATES.items() if state in ENDED}
-    assert ends <= set(MISSION_OUTCOMES)
 
 
 def test_a_key_is_that_of_one_order_for_ever():
@@ -258,21 +230,6 @@ def test_what_the_robot_touched_decides(seen, codes, exit_code, restarted):
     verdict = flight.view(mission_id)["verdict"]
     assert verdict["exit_code"] == exit_code
     assert [failure["code"] for failure in verdict["failures"]] == codes
-
-
-def test_after_a_stall_the_stop_belongs_to_the_stopped_mission():
-    """Teleop's loop saw the robot stopped first, and that was why the mission had failed."""
-    (flight, mission_id), bridge = service_flying(), Bridge()
-    bridge.open(flight.teleop)
-    stopped = bridge.submit(type(flight.teleop).switch_off, "stop")
-    flight.guard = ESTOP
-    cloud = Mock(receive=lambda: [flight.seen])
-    queued = {"calls": bridge.make_calls, "stops": bridge.make_stops}
-    loop = TeleopLoop(flight.teleop, cloud, print, **queued)
-    for late_ns in (STALL_NS + 1, 0):
-        loop.wake(flight.now_ns + 10**9, late_ns)
-    assert stopped.result()["id"] == mission_id
-    assert flight.names(mission_id)[-1] == "emergency_stopped"
 
 
 # What is shown

@@ -13,7 +13,6 @@ from mypkg import consts
 def build():
     return LastSample()
 """
-METRIC = 'from mypkg import consts\nUNIT = "1"\ndef measure(flight):\n    return consts.GAIN\n'
 
 
 @pytest.fixture
@@ -65,15 +64,6 @@ def test_what_a_plug_in_of_an_editable_package_imports_counts(install, write_swe
     before = key(write_sweep)
     install(("predictors", entry), {"mypkg/consts.py": "GAIN = 2"})
     assert key(write_sweep) != before
-
-
-def test_every_installed_metric_counts(install, write_sweep):
-    before = key(write_sweep, "last_sample")
-    metric = ("metrics", "mypkg.metric")
-    install(metric, {**PACKAGE, "mypkg/metric.py": METRIC, "mypkg/consts.py": "GAIN = 1"})
-    with_metric = key(write_sweep, "last_sample")
-    install(metric, {"mypkg/consts.py": "GAIN = 2"})
-    assert len({before, with_metric, key(write_sweep, "last_sample")}) == 3
 
 
 def test_a_pod_with_another_version_of_a_plugin_refuses_the_flights(

@@ -4,12 +4,10 @@ A file of flights gives the same flights in a pod that has none of the user's fi
 """
 
 import re
-from collections import Counter
 from pathlib import Path
 
 import pytest
 
-from cloudrc.config import load, overrides, scene
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import SCENES
 from cloudrc.trials.plan import pack, read_plan, unpack
@@ -118,8 +116,6 @@ def test_relative_paths_start_at_the_file(write_sweep, tmp_path, monkeypatch):
         ({"grid": {"link.both.delayms": [1]}}, "link.uplink.delayms: unknown key; did you mean"),
         ({"grid": {"world.plant.payload_kg": [0, 9]}}, "world.plant: the thrust-to-weight ratio"),
         ({"set": {"seed": 1}}, "seed: each flight has its own seed"),
-        ({"grid": {"duration": {"one": {}}}}, "grid.duration: is the name of another column"),
-        ({"seeds": [1, 1]}, "seeds: [1, 1]: must be"),
     ],
 )
 def test_a_problem_is_refused_at_its_place(write_sweep, keys, reason):
@@ -152,25 +148,3 @@ def test_the_flights_are_the_same_in_a_pod(flights, tmp_path, some):
     (tmp_path / "flights").write_bytes(pack(flights[some]))
     (tmp_path / "mine.yaml").unlink()
     assert unpack(tmp_path / "flights") == flights[some]
-
-
-def test_what_points_share_is_read_and_checked_once(write_sweep, tmp_path, monkeypatch):
-    """A sweep of 2,000 points took 25 s: each point parsed files, and flew its mission in mind."""
-    counts = Counter()
-
-    def count(place, name):
-        real = getattr(place, name)
-        monkeypatch.setattr(place, name, lambda *given, **words: (
-            counts.update([name]) or real(*given, **words)
-        ))  # fmt: skip
-
-    for place, name in (
-        (load, "check_mission"),
-        (scene, "load_scene"),
-        (overrides, "_model_of"),
-    ):
-        count(place, name)
-    axes = {"link.both.delay_ms": [*range(20)], "guard.hold_max_s": [1, 2]}
-    sweep = read_plan(write_sweep(axes))
-    assert len(sweep.points) == 40
-    assert counts == {"check_mission": 1, "load_scene": 1, "_model_of": 3}

@@ -28,11 +28,6 @@ def test_the_drag_of_robot_yaml_reaches_the_rotors(own_robot):
     ("text", "settings", "message"),
     [
         ("onboard: Multirotor", {}, "robot.yaml: onboard: no onboard named 'Multirotor'"),
-        (
-            "onboard: multirotor\ntunings: {fast: {drag: 0.1}}",
-            {"world.tuning": "fast"},
-            "robot.yaml: tunings.fast.drag: unknown key",
-        ),
     ],
 )
 def test_a_wrong_onboard_controller_is_refused_where_it_is_chosen(

@@ -71,10 +71,3 @@ def test_datagrams_under_way_at_the_end_do_not_count():
     log = ended(flown(), DONE)
     assert loss(log) == loss(log, "downlink") == 0
     assert not np.isnan(trace(log).delays).any()
-
-
-def test_a_repeated_datagram_that_arrives_much_later_hides_no_loss():
-    log = losing(lambda counter, sent: 7.0 <= sent < 8.0)
-    first = next(each for each in log.cloud if isinstance(each, Arrival) and each.uplink)
-    log.cloud.append(first._replace(stamp_ns=DONE, used=False))
-    assert loss(ended(log, DONE + TRANSIT)) == pytest.approx(0.1, rel=0.05)

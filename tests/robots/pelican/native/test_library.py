@@ -61,12 +61,6 @@ def test_a_compiler_is_used_once(name, monkeypatch, cache):
     assert module.library().text == f"C (compiled by {name})"
 
 
-def test_a_broken_compiler_means_python(monkeypatch, cache):
-    use(monkeypatch, BROKEN)
-    assert module.library().text == "Python (cc: no crt1.o)"
-    assert not list(cache.iterdir())
-
-
 @pytest.mark.skipif(not COMPILERS, reason="no compiler here")
 @pytest.mark.parametrize("where", ["folder", "file"])
 def test_a_file_that_others_may_write_is_not_used(where, monkeypatch, cache):

@@ -1,7 +1,6 @@
 """Flights in C and in Python have the same bits, whatever the cloud sends."""
 
 import logging
-from ctypes import c_int
 from functools import cache, partial
 from math import inf
 
@@ -19,7 +18,6 @@ from cloudrc.robots.pelican.native.library import SWITCH, Library, library
 from cloudrc.robots.pelican.native.robot import NativeRobot, usable
 from cloudrc.robots.pelican.onboard import accelerator
 from cloudrc.runs.flight import fly_in_memory
-from cloudrc.sim import memory
 from cloudrc.sim.engine import mujoco
 from cloudrc.tunnel.end import Identity
 from cloudrc.world.guard.state import Guard
@@ -207,15 +205,6 @@ def test_what_c_cannot_simulate_is_flown_in_python(setting):
     experiment = load_experiment("hover", [f"world.{setting}"])
     identity = Identity(CLOCK, bytes(16), ring())
     assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
-
-
-def test_the_number_of_contacts_is_found_in_the_memory_of_mujoco():
-    simulator = simulate("pelican", "empty")
-    data, contacts = simulator.data, simulator.data.ncon
-    number = c_int.from_address(data._address + memory.contacts_offset())
-    assert number.value == data.ncon == contacts > 0
-    data.ncon = 0
-    assert number.value == 0
 
 
 def test_observers_and_a_tape_see_every_step():
