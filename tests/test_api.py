@@ -90,13 +90,6 @@ def test_a_sweep_is_a_table_of_arrays_that_goes_on(result, tmp_path, capfd):
         table["prediction_error"]
 
 
-def test_an_error_of_a_sweep_in_python_names_its_key(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(BadInputError, match=r"^sweep: grid: link\.profle: unknown key"):
-        cloudrc.sweep({"experiment": "steps", "grid": {"link.profle": ["lte"]}}, out="out")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_none_in_an_axis_of_numbers_is_nan_and_texts_stay_texts():
     grid = {"criteria.settle_m": [None, 0.5], "cloud.predictor": ["last_sample"]}
     table = cloudrc.sweep({"experiment": "steps", "set": SHORT, "grid": grid})

@@ -46,13 +46,6 @@ def test_a_place_of_another_user_is_named(file, at):
     assert who_may_write(file) == f"another user owns {place}"
 
 
-def test_a_sticky_folder_is_trusted_above_but_not_itself(file):
-    file.parents[1].chmod(0o1777)
-    assert who_may_write(file) == ""
-    assert "everybody" in who_may_write(file.parents[1])
-    file.parents[1].chmod(0o700)
-
-
 @as_root
 def test_a_symbolic_link_counts_with_its_owner_its_place_and_its_target(file, tmp_path):
     link = tmp_path / "link"

@@ -6,10 +6,9 @@ from math import pi
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from cloudrc.bridges.ros2 import require_ros
 from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.errors import BadInputError
 from cloudrc.record.live import (
     decode_stamped_twist,
     encode_clock,
@@ -30,16 +29,6 @@ def test_without_ros_a_flight_is_refused_before_a_folder_is_made(tmp_path, monke
     (error,) = capsys.readouterr().err.splitlines()
     assert "source /opt/ros" in error
     assert not (tmp_path / "run").exists()
-
-
-def test_a_ros_for_another_python_is_named(tmp_path, monkeypatch):
-    (tmp_path / "rclpy").mkdir()
-    (tmp_path / "rclpy" / "__init__.py").write_text("raise ImportError('no _rclpy_pybind11')")
-    monkeypatch.syspath_prepend(tmp_path)
-    for name in ("rclpy", "cloudrc.bridges.ros2.node"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    with pytest.raises(MissingPrerequisiteError, match=r"no _rclpy_pybind11.*source /opt"):
-        require_ros("a node", "node", "nav_msgs")
 
 
 def test_a_node_neither_plans_nor_flies_in_a_cluster():

@@ -2,9 +2,7 @@
 
 import pytest
 
-from cloudrc.cli.parser import build_parser
-from cloudrc.runs.links.verify import RELEASE_TIMEOUT
-from tests.chart.conftest import a_namespace, containers, nothing, of_kind, pod_specs, render
+from tests.chart.conftest import a_namespace, containers, nothing, pod_specs, render
 
 
 def modes(lookup, values=None):
@@ -30,17 +28,3 @@ def test_an_upgrade_keeps_the_mode_unless_the_label_is_new():
     assert render(lookup=a_namespace(objects=installed)) == installed
     installed = render(lookup=a_namespace())
     assert modes(a_namespace("restricted", installed)) == {"--mode=relay"}
-
-
-def test_helm_test_verifies_the_link_of_this_release():
-    objects = render()
-    (test,) = (t for name, t in of_kind(objects, "Pod").items() if name.endswith("test-link"))
-    annotations, spec = test["metadata"]["annotations"], test["spec"]
-    assert int(annotations["helm.sh/hook-weight"]) > 0, "commands flow once a mission has flown"
-    assert "hook-failed" not in annotations["helm.sh/hook-delete-policy"]
-    # Helm waits 300 s for one hook.
-    assert RELEASE_TIMEOUT + 10.0 <= spec["activeDeadlineSeconds"] < 300.0
-    (container,) = spec["containers"]
-    hosts = build_parser(["link"]).parse_args(container["args"]).ends.split(",")
-    services = of_kind(objects, "Service")
-    assert hosts == [services[end]["metadata"]["name"] for end in ("world", "cloud")]

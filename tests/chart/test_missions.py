@@ -5,7 +5,6 @@ import copy
 import pytest
 import yaml
 
-import cloudrc
 from cloudrc.config.load import load_experiment
 from tests.chart.conftest import CHART, of_kind, render
 
@@ -65,13 +64,3 @@ def test_the_chart_makes_the_job_of_the_example():
         pod["volumes"][0]["configMap"] = {}
         pod.pop("serviceAccountName", None)
     assert ours == theirs
-
-
-def test_the_example_of_the_paper_fits_the_release_of_the_readme(tmp_path):
-    config, job = EXAMPLES["mission-paper"]
-    pod = job["spec"]["template"]
-    (container,) = pod["spec"]["containers"]
-    assert "--api=http://cloudrc-api:8080" in container["args"]
-    assert container["image"] == f"cloudrc/cloud:{cloudrc.__version__}"
-    (tmp_path / "mission.yaml").write_text(config["data"]["mission.yaml"])
-    assert load(tmp_path / "mission.yaml").waypoints == load("pipes").waypoints

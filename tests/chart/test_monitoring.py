@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cloudrc.exposition import table
 from cloudrc.exposition.table import METRICS, MetricKind
 from tests.chart.conftest import CHART, OPERATOR, of_kind, render
 from tools.dashboards import expressions
@@ -140,18 +139,6 @@ def queries(**where):
         for panel in one["panels"]
         for query in expressions(one, panel).values()
     ]
-
-
-def test_panels_name_the_states():
-    states = {}
-    for one in dashboards()[1].values():
-        for panel in one["panels"]:
-            for mapping in panel["fieldConfig"]["defaults"].get("mappings", ()):
-                options = mapping["options"]
-                states[panel["title"]] = tuple(options[str(n)]["text"] for n in range(len(options)))
-    assert states.pop("State of the guard") == table.GUARD_STATES
-    assert states.pop("State of the mission") == table.MISSION_STATES
-    assert states == {"The link is as asked": ("no", "yes")}
 
 
 def test_panels_query_metrics_of_the_release_alone():

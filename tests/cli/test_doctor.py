@@ -45,17 +45,6 @@ def test_every_problem_says_how_to_fix_it(monkeypatch):
         requirements.require("mode virtual", ["world", "record"])
 
 
-@pytest.mark.parametrize(
-    ("program", "told"),
-    [
-        ("print('one', flush=True); import os; os._exit(7)", ("one", "exit code 7")),
-        ("raise OSError('no library')", ("OSError: no library",) * 2),
-    ],
-)
-def test_a_check_without_a_result_has_the_reason_why_its_process_ended(program, told):
-    assert work.said(work.start(program)) == told
-
-
 def test_the_extras_are_those_of_pyproject():
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     declared = project["optional-dependencies"]

@@ -6,14 +6,10 @@ verdict `error` and ended as if it was done.
 
 import os
 import signal
-from contextlib import suppress
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 
-from cloudrc.config.load import load_experiment
-from cloudrc.runs import fly as flights
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.trials.plan import PlannedFlight
 from cloudrc.trials.rows import read_rows
@@ -61,19 +57,3 @@ def test_a_sweep_stores_no_row_after_a_signal_that_a_library_caught(
     error = call("sweep run --out grid", write_sweep(), code=130).err
     assert "cloudrc: interrupted; to continue" in error
     assert read_rows(Path("grid")) == {}
-
-
-def test_a_flight_ends_after_a_signal_that_a_plugin_caught(tmp_path, monkeypatch):
-    def fly(experiment, see, gone):
-        with suppress(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGTERM)
-        see([], [])
-        pytest.fail("the flight goes on")
-
-    interrupt_on_signals()
-    monkeypatch.setattr("cloudrc.assembly.fly", fly)
-    experiment = load_experiment("hover")
-    report = Mock()
-    monkeypatch.setattr("cloudrc.runs.fly.write_report", report)
-    flights.fly(experiment, "virtual", tmp_path)
-    assert report.call_args.args[3].interrupted

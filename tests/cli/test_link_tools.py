@@ -60,15 +60,3 @@ def test_a_profile_is_drawn_and_its_statistics_printed(folder, call):
     first = (folder / "a.svg").read_bytes()
     call(line)
     assert (folder / "a.svg").read_bytes() == first, "the same link gives the same picture"
-
-
-def test_a_trace_is_shown_row_by_row_whatever_its_span(folder, call):
-    """Its time is Unix time; a row in a year would be 3 billion packets at 100 Hz."""
-    rows = [f"{1_700_000_000 + n / 100},{40 + n % 7},{int(n % 10 == 0)}" for n in range(500)]
-    (folder / "t.csv").write_text("\n".join(["time_s,delay_ms,loss", *rows, "1731536000,90,0"]))
-    (folder / "mine.yaml").write_text("uplink: {trace: t.csv, loop: true}\n")
-    trace, profile = call("link show t.csv").out, call("link show ./mine.yaml").out
-    for said in (trace, profile):
-        assert any(line.split()[:2] == ["lost", "9.98"] for line in said.splitlines())
-    assert trace.startswith("t: a trace of 501 rows in 3.154e+07 s\n")
-    assert "downlink" not in trace

@@ -13,11 +13,9 @@ from pathlib import Path
 import pytest
 from websockets.sync.client import connect
 
-from cloudrc import assembly
 from cloudrc.cli import session
 from cloudrc.config.load import load_experiment, read_experiment
 from cloudrc.config.resolved import dump
-from cloudrc.config.setpoints import write_setpoints
 from cloudrc.drivers import local
 from cloudrc.drivers.machine import usable_cores
 from cloudrc.drivers.realtime import free_ports
@@ -29,7 +27,6 @@ from cloudrc.teleop.store import Order, open_store
 from cloudrc.teleop.wire import Leg, Plan
 from tests.conftest import wait_until
 from tests.drivers.conftest import COMMAND, processes_of
-from tests.fences import FENCE
 from tests.record.conftest import cloud_records, world_records, write
 
 USING = "cloudrc: using the run in s\n"
@@ -59,17 +56,6 @@ def test_down_ends_sessions_only_and_asks_which(folder, down):
 def drive_order():
     leg = Leg((0.0, 99.0, 0.35), tolerance=inf, dwell=0.0)  # beyond the fence
     return Order(Plan((leg,), Start.HERE, 3600.0, by_hand=True), "drive")
-
-
-def test_a_drive_becomes_a_mission_with_setpoints(folder):
-    flown = assembly.with_order(load_experiment("hover"), drive_order(), "")
-    (folder / "config.yaml").write_text(dump(flown))
-    rest = write_setpoints([(0.0, (0.0, 99.0, 0.35)), (1.0, (0.0, 0.0, 1.0))], FENCE)
-    (folder / "drive.csv").write_text(rest)
-    again = read_experiment(folder / "config.yaml")
-    assert again.mission.setpoints == str(folder / "drive.csv")
-    assert (again.mission.start, again.mission.touch) == ("here", None)
-    assert assembly.build_plan(again).track[0][1][1] < 10.0
 
 
 def test_down_tells_a_missing_report_from_no_mission(folder, down):

@@ -10,7 +10,6 @@ from cloudrc.cloud.estimators import Estimator
 from cloudrc.cloud.estimators.running_mean import RunningMean
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.cloud.predictors.last_sample import LastSample
-from cloudrc.errors import ControllerLostError
 from cloudrc.messages import ZERO
 from tests.cloud.conftest import HERE, MS, Integrating, command, loop, telemetry
 
@@ -157,24 +156,3 @@ def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
     assert len(fault.text.encode()) < 2200
     assert len(fault.traceback.encode()) < 6200
     assert fault.text.endswith(f"fix cloud.{kind} or choose another")
-
-
-def test_a_lost_program_is_asked_no_more_and_told_once():
-    a_loop = loop(controller=raises(ControllerLostError("controller_silent", "gone"))(), heard_ms=9)
-    assert [command(a_loop, now_ms)[0].velocity for now_ms in (10, 20)] == [ZERO, ZERO]
-    assert [fault.code for fault in a_loop.take_faults()] == ["controller_silent"]
-
-
-def test_a_failing_reset_is_reported():
-    estimators, sample, steady = [Estimator()], LastSample(), Integrating()
-    a_loop = loop(estimators.pop, sample, steady)  # there is no second estimator
-    sample.reset = steady.reset = lambda: 1 / 0
-    a_loop.start_mission()
-    a_loop.reset(1080 * MS)
-    a_loop.observe(telemetry(100, echo_ms=1000), 1090 * MS)
-    sent, control = command(a_loop, 1094)
-    assert (sent.velocity, control.horizon) == (ONE, 0.0)
-    faults = {fault.code: (fault.stamp_ns, fault.text) for fault in a_loop.take_faults()}
-    assert set(faults) == {"estimator_failed", "predictor_failed", "controller_failed"}
-    assert faults["predictor_failed"][0] == 1080 * MS
-    assert "cloud goes on using it" in faults["controller_failed"][1]

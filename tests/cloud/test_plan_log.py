@@ -41,8 +41,3 @@ def test_the_plan_is_that_of_the_echoed_command(log):
     assert log.look_up(told(115, 60), 0).position == pytest.approx((0.0, 0.05, 0.0))
     assert log.look_up(told(115, 50), 0) is None, "older commands are not followed again"
     assert log.look_up(told(115, 55), 0) is None, "a command without a plan"
-
-
-@pytest.mark.parametrize("guard", [state for state in GuardState if state is not GuardState.TRACK])
-def test_only_in_track_the_robot_follows_a_plan(log, guard):
-    assert log.look_up(told(115, 60, guard), 0) is None

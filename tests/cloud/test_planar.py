@@ -4,9 +4,7 @@ import pytest
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.controllers.pid import build
-from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.cloud.planar import Planar
-from cloudrc.errors import ControllerLostError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
 from cloudrc.outside.values import InvalidValueError
 
@@ -22,13 +20,6 @@ class Climbing(Controller):
 
     def update(self, estimate, setpoint, dt):
         return ControlOutput((0.5, 0.0, self.z), 0.0)
-
-
-class Outside(OutsideController):
-    """Stands for a program outside that commands a vertical velocity."""
-
-    def update(self, estimate, setpoint, dt):
-        return ControlOutput((0.5, 0.0, 0.3), 0.0)
 
 
 def steer(controller):
@@ -47,10 +38,3 @@ def test_a_vertical_velocity_is_refused_with_file_and_value():
     with pytest.raises(InvalidValueError, match=r"^/mine/climb.py: its velocity in z is -0.3 m/s,"):
         steer(Climbing(-0.3))
     assert steer(Climbing(1e-12)).velocity == (0.5, 0.0, 0.0), "a rounding error"
-
-
-def test_a_program_outside_ends_the_flight():
-    planar = Planar(Outside("ws://here:1", 60.0), "remote")
-    with pytest.raises(ControllerLostError, match="its velocity in z") as raised:
-        planar.update(SEEN, GOAL, 0.01)
-    assert raised.value.code == "controller_invalid"

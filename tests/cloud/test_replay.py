@@ -129,21 +129,6 @@ def planned(stamp_ms, planned_ms, *speeds):
     return Command(stamp_ms * MS, 0, 0, first, 0.0, tuple(rest), planned_ms * MS)
 
 
-def along_x(segments):
-    return [(velocity[0], pytest.approx(duration)) for velocity, duration in segments]
-
-
-def test_the_past_has_the_steps_of_the_applied_plans():
-    history = Replay()
-    history.commanded(planned(0, 100, 1.0, 2.0, 3.0))
-    history.commanded(planned(10, 110, 5.0, 6.0, 7.0))
-    history.applied(0, 112 * MS)
-    history.applied(10 * MS, 124 * MS)
-    assert along_x(history.past(114 * MS, 134 * MS)) == [
-        *((2.0, 0.006), (3.0, 0.004), (6.0, 0.006), (7.0, 0.004)),
-    ]
-
-
 def test_command_history_knows_the_plan_between_two_commands():
     """At 20 Hz the robot flies four steps of the plan before the next command."""
     planning, plain = command_history.build(robot=PELICAN), command_history.build(robot=PELICAN)

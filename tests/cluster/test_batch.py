@@ -8,7 +8,6 @@ import pytest
 from cloudrc import __version__
 from cloudrc.cluster import batch
 from cloudrc.cluster.batch import PodSettings
-from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import UID_LABEL
 from cloudrc.errors import BadInputError
 from tests.cluster.conftest import pod, terminated
@@ -96,14 +95,3 @@ def test_the_first_pod_that_refuses_the_flights_ends_the_job(started, api, relea
     with pytest.raises(BadInputError, match=f"^the pods refuse the flights: {said}$"):
         lines(release)
     assert api.jobs() == []
-
-
-def test_pods_may_wait_for_a_node_but_not_for_an_image(started, api, release):
-    waits = {"type": "PodScheduled", "status": "False", "message": "0/1 nodes: Insufficient cpu"}
-    add_pod(api, "a", "Pending", conditions=[waits])
-    api.at_look(2, lambda: api.end("sweep-1", "Complete"))
-    assert lines(release)[1] == ["waiting: no node takes it: 0/1 nodes: Insufficient cpu"]
-    batch.start(release, "sweep-1", b"flights", PODS)
-    add_pod(api, "b", "Pending", state={"waiting": {"reason": "ImagePullBackOff"}})
-    with pytest.raises(ClusterError, match="cannot start"):
-        lines(release)

@@ -8,8 +8,8 @@ from unittest.mock import Mock
 
 import pytest
 
-from cloudrc.cluster import flight, pods
-from cloudrc.cluster.client import ClusterError, connect
+from cloudrc.cluster import flight
+from cloudrc.cluster.client import connect
 from cloudrc.cluster.jobs import run_job
 from cloudrc.config.load import load_experiment
 from cloudrc.config.shipped import FOLDERS
@@ -145,24 +145,6 @@ def test_the_recording_from_before_a_restart_is_copied(ready, tmp_path, call, le
     found = (tmp_path / "runs" / "latest").glob("*.before.mcap")
     wanted = {"world.before.mcap": left} if left else {}
     assert {path.name: path.read_text() for path in found} == wanted
-
-
-def test_a_broken_connection_loses_logs_but_no_report(ready, call, monkeypatch):
-    def fails(*arguments):
-        raise ClusterError("no way to the pod")
-
-    def fails_once(*arguments):
-        monkeypatch.setattr(pods, "fetch_recording", fetch_recording)
-        fails()
-
-    fetch_recording = pods.fetch_recording
-    monkeypatch.setattr(pods, "fetch_logs", fails)
-    monkeypatch.setattr(pods, "fetch_recording", fails_once)
-    ends(ready)
-    captured = call(f"{LINE} --out out", code=6)
-    assert json.loads(captured.out)["shaper"] == "relay"
-    assert "without the world pod's logs: no way to the pod" in captured.err
-    assert "no way to the pod; trying again" in captured.err
 
 
 def test_an_interrupted_flight_cancels_and_reports_its_mission(

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from unittest.mock import Mock
 
 import pytest
 
@@ -73,13 +72,6 @@ def test_run_waits_until_the_release_is_ready(lands, call):
     assert deadline >= 86_400 + 60, "a mission without a time limit gets a day"
     plan = lands.get("configmaps", job["metadata"]["name"])["data"]["mission.yaml"]
     assert json.loads(plan) == read_mission("pipes")
-
-
-def test_an_interrupted_run_says_that_the_job_continues(running, call, monkeypatch):
-    monkeypatch.setattr(flight, "follow", Mock(side_effect=KeyboardInterrupt))
-    said = call("mission run one.yaml", code=130).err
-    (job,) = running.jobs()
-    assert f"kubectl --namespace=demo delete job {job['metadata']['name']}\n" in said
 
 
 def forget_jobs(api):

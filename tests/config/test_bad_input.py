@@ -130,19 +130,3 @@ def test_an_invalid_profile_is_refused_with_the_reason(mine, text, reason):
     text = refused("paper", f"link.profile={mine}")
     assert reason in text
     assert f"{mine}:1: " in text
-
-
-@pytest.mark.parametrize(
-    ("rows", "said"),
-    [
-        ("0,0,0,1\n0,0,0,1\n", "line 3: time_s 0 does not rise"),
-        ("0,0,0,1\n1,0,0,9\n", "line 3: z_m is 9; the guard moves the robot from 0.35 to 2.3"),
-        (None, "the header is time_s,delay_ms; it must be time_s,x_m,y_m,z_m"),
-    ],
-)
-def test_an_invalid_file_of_setpoints_is_one_line(tmp_path, rows, said):
-    header = "time_s,delay_ms" if rows is None else "time_s,x_m,y_m,z_m"
-    (tmp_path / "drive.csv").write_text(f"{header}\n{rows or ''}")
-    text = refused("hover", f"mission.setpoints={tmp_path / 'drive.csv'}")
-    assert said in text
-    assert "\n" not in text

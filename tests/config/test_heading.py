@@ -1,21 +1,14 @@
 """A waypoint may have a yaw only if the robot obeys one; robot.yaml says whether it does."""
 
 import json
-from functools import partial
 from math import radians
 
 import pytest
 
-from cloudrc.assembly import build_plan, mission_plan
-from cloudrc.config.hull import hull_of
+from cloudrc.assembly import build_plan
 from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.scene import load_scene
-from cloudrc.teleop.models import RefusedError, RequestReader
-from tests.fences import FENCE
-
-SCENE = load_scene("empty")
 
 
 def flown(robot, point=(0, 0, 1), **keys):
@@ -61,21 +54,3 @@ def test_a_yaw_of_a_robot_that_obeys_reaches_the_plan(robot):
 def test_robot_yaml_says_what_decides_about_the_heading(tmp_path, text, heading):
     (tmp_path / "robot.yaml").write_text(text)
     assert find_robot(str(tmp_path)).heading == heading
-
-
-def test_teleop_takes_and_refuses_yaws_as_a_mission_does():
-    known = SCENE, hull_of("x2"), partial(mission_plan, fence=FENCE)
-    read, fixed = RequestReader(*known), RequestReader(*known, heading="fixed")
-    velocity = RequestReader(*known, heading="velocity")
-    order = json.dumps({"waypoints": [{"position_m": [0, 0, 1], "yaw_deg": 90}]}).encode()
-    goto = b'{"position_m": [0, 0, 1], "yaw_deg": 90}'
-    assert read.order(order).plan.legs[0].yaw == radians(90)
-    assert read.goto(goto).yaw == radians(90)
-    assert read.goto(b'{"position_m": [0, 0, 1]}').yaw is None
-    with pytest.raises(RefusedError, match=r"^yaw_deg: .*must be <= 360"):
-        read.goto(goto.replace(b"90", b"361"))
-    with pytest.raises(RefusedError, match=r"^yaw_deg: 90: the onboard controller"):
-        fixed.goto(goto)
-    with pytest.raises(RefusedError, match=r"waypoints.0.yaw_deg: 90: the heading"):
-        velocity.order(order)
-    assert fixed.goto(goto.replace(b"90", b"0")).yaw is None

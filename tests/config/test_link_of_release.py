@@ -34,16 +34,3 @@ def test_without_a_name_the_link_is_that_of_the_experiment_whatever_its_robot(li
     default = load_experiment("paper")
     assert link("profile: null") == link("profile: null", dump(default))
     assert link("profile: null").uplink == default.uplink
-
-
-def test_an_empty_profile_is_an_ideal_link(link):
-    assert link("{}", "{link: {profile: wifi}}") == load_profile("ideal").model_copy(
-        update={"description": ""}
-    )
-
-
-def test_a_trace_is_beside_the_file_that_names_it(link, tmp_path):
-    (tmp_path / "t.csv").write_text("time_s,delay_ms\n0,30\n1,40\n")
-    named = "{link: {uplink: {trace: t.csv}}}"
-    assert link("profile: null", named).uplink.trace == str(tmp_path / "t.csv")
-    assert link("{uplink: {trace: t.csv}}").uplink.trace == str(tmp_path / "t.csv")

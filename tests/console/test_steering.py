@@ -1,12 +1,10 @@
 """What the operator asks for on the page reaches teleop and the link."""
 
-import threading
 import time
 
 import pytest
 
 from cloudrc.console.steering import LinkControl, Steering
-from cloudrc.errors import BadInputError
 from cloudrc.messages import ZERO
 from tests.conftest import wait_until
 
@@ -56,27 +54,6 @@ def test_a_flying_mission_is_held_before_a_goto(api, steering):
     assert api.posted == [goto]
 
 
-def test_a_start_ends_a_drive_that_waits_for_keys(api, steering):
-    steering.state = {"mission": {"by_hand": True, "state": "held"}}
-    steering.start_mission({"waypoints": []})
-    start = ("/v1/missions", {"waypoints": [], "queue": True})
-    assert api.posted == [("/v1/resume", None), start]
-    api.posted.clear()
-    steering.state = {"mission": None}
-    steering.start_mission({"waypoints": []})
-    assert api.posted == [("/v1/missions", {"waypoints": []})]
-    assert "set back to its spawn" in steering.answer.text
-
-
-def test_the_route_is_asked_once_for_each_mission(api, steering):
-    api.answers["/v1/state"] = {"mission": {"id": "m1"}}
-    api.answers["/v1/missions/m1"] = {"route_m": [[1] * 3]}
-    steering.watch()
-    del api.answers["/v1/missions/m1"]
-    steering.watch()
-    assert steering.route == [[1, 1, 1]]
-
-
 def test_a_stop_is_repeated_until_the_api_answers(api, steering):
     api.refused["/v1/estop"] = "teleop does not answer"
     steering.start()
@@ -87,27 +64,3 @@ def test_a_stop_is_repeated_until_the_api_answers(api, steering):
     count = len(api.posted)
     time.sleep(0.5)
     assert len(api.posted) == count
-
-
-def test_a_slow_link_gets_the_newest_value_of_each_slider(steering):
-    applied, go = [], threading.Event()
-
-    def change(settings):
-        applied.append(sorted(settings))
-        if settings == ["uplink.loss=2"]:
-            raise BadInputError("loss: must be at most 1")
-        go.wait()
-
-    steering.link = LinkControl(change=change, note=" requested")
-    steering.start()
-    steering.set_link("uplink.delay_ms", 10)
-    wait_until(lambda: applied)
-    for value in (20, 30, 40):
-        steering.set_link("uplink.delay_ms", value)
-    steering.set_link("downlink.loss", 0.25)
-    go.set()
-    wait_until(lambda: len(applied) == 2)
-    wait_until(lambda: steering.answer.text.endswith("uplink.delay_ms=40 requested"))
-    assert applied == [["uplink.delay_ms=10"], ["downlink.loss=0.25", "uplink.delay_ms=40"]]
-    steering.set_link("uplink.loss", 2)
-    wait_until(lambda: steering.answer.text == "link: loss: must be at most 1")

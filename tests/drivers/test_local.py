@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.drivers import local
-from cloudrc.drivers.local import LocalRun, socket_folder
+from cloudrc.drivers.local import LocalRun
 from cloudrc.drivers.machine import AwakeClock
 
 
@@ -43,12 +43,6 @@ def test_a_flight_is_in_the_home_without_a_runtime_folder_of_ones_own(
     with local.announced(tmp_path, ""):
         assert list(local.under_way()) == [tmp_path]
         assert (tmp_path / "home/.local/state/cloudrc/flights").is_dir()
-
-
-def test_sockets_lie_in_a_folder_with_a_short_path(monkeypatch):
-    for folder, chosen in (("/short", "/short"), ("/" + "x" * 90, "/tmp")):
-        monkeypatch.setattr(local, "flights_folder", lambda folder=folder: Path(folder, "flights"))
-        assert socket_folder() == chosen
 
 
 def test_a_file_of_a_killed_run_is_removed(flights):

@@ -49,14 +49,3 @@ def test_a_slow_reader_knows_how_many_records_it_has_lost(sender, reader):
     sender.put([arrival(-1)])
     assert reader.take(0) == [arrival(-1)]
     assert got + reader.dropped == 10_000
-
-
-def test_a_reader_goes_on_with_a_new_process_of_cloud(tmp_path, sender, reader):
-    sender.put([arrival(k) for k in range(9)])
-    assert len(reader.take(0)) == 9
-    sender.close()
-    again = RecordSender(tmp_path)
-    assert reader.take(0) == []
-    again.put([arrival(1)])
-    assert (reader.take(0), reader.dropped) == ([arrival(1)], 0)
-    again.close()

@@ -96,21 +96,3 @@ def test_an_episode_of_a_changed_file_is_another(folder):
         (folder / name).write_text(text)
     assert unseen == []
     assert key_of_all() == before
-
-
-@pytest.mark.parametrize("name", ["mine.yaml", "point.yaml", "turns.py"])
-def test_an_episode_of_a_robot_depends_on_the_files_of_its_experiment(tmp_path, name):
-    files = {
-        "mine.yaml": "mission: ./point.yaml\nreport: {metrics: [./turns.py]}\n",
-        "point.yaml": "waypoints: [{position_m: [0.5, 0.0, 0.7]}]\n",
-        "turns.py": "UNIT = '1'\ndef measure(flight):\n    return 1.0\n",
-    }
-    for each, text in files.items():
-        (tmp_path / each).write_text(text)
-    args = (("experiment", str(tmp_path / "mine.yaml")),)
-    setup = EvalSetup("cloudrc.gym:cloudrc/Steps-v0", "ws://127.0.0.1:1", args)
-    before = key_of(setup)
-    assert key_of(setup) == before
-    changed = {"mine.yaml": "guard: {speed_max_mps: 0.3}\n", "point.yaml": "description: hold\n"}
-    (tmp_path / name).write_text(files[name] + changed.get(name, "# more\n"))
-    assert key_of(setup) != before

@@ -116,18 +116,3 @@ def test_another_policy_is_compared_in_each_condition_also_without_a_network():
     ]
     last = found[-1]["success"]
     assert (last["count"], last["only_a"], last["only_b"]) == (15, 0, 10)
-
-
-def crash(executor, rtt_ms, total, steps):
-    count = 20
-    values = {"return": [total - n for n in range(count)], "steps": [steps] * count}
-    return rows(executor, rtt_ms, [None] * count, **values)
-
-
-def test_a_better_return_of_shorter_episodes_is_told_with_its_condition():
-    """The robot crashes early at 300 ms, so that it has fewer negative rewards."""
-    world = crash(BASELINE, None, -20, 200)
-    world += crash("newest", 0.0, -22, 200) + crash("newest", 50.0, -53, 200)
-    world += crash("newest", 300.0, -48, 31) + crash("broker", 0.0, -21, 200)
-    (told,) = (each for each in judge(world)["notes"] if "return improves" in each)
-    assert told.endswith(": newest at 300 ms")

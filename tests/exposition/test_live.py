@@ -7,14 +7,13 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition import table
-from cloudrc.exposition.live import ONE_SHAPER, LiveMetrics
+from cloudrc.exposition.live import LiveMetrics
 from cloudrc.messages import UPRIGHT, ZERO, Cause, GuardState, Odometry, Telemetry
 from cloudrc.records import (
     Arrival,
     CommandApplied,
     Contact,
     ContactForce,
-    Counted,
     GuardChange,
     Lateness,
     LinkChecked,
@@ -79,25 +78,6 @@ def test_control_periods_give_delays_errors_and_terms():
     assert value(live, "cloudrc_tracking_error_meters", "y") == -0.5
     assert value(live, "cloudrc_pid_output", "derivative", "z") == -0.7
     assert "cloudrc_estimate_error_meters" not in live.read(), "no prediction compared yet"
-
-
-@pytest.mark.parametrize(
-    ("role", "count", "name", "labels"),
-    [
-        ("world", "late", "cloudrc_datagrams_total", ("downlink", "late")),
-        ("world", "limited_fence", "cloudrc_guard_limited_total", ("fence",)),
-        ("teleop", "api_order_conflict", "cloudrc_missions_refused_total", ("conflict",)),
-        ("link", "released_early", "cloudrc_link_released_early_total", ()),
-    ],
-)
-def test_a_count_is_in_its_metric(role, count, name, labels):
-    live = LiveMetrics(role)
-    live.see([Counted(0, role, count, 7), Counted(0, role, "unheard_of", 9)])
-    assert value(live, name, *labels) == 7
-    if name in ONE_SHAPER:
-        assert name not in LiveMetrics(role).read()
-    else:
-        assert value(LiveMetrics(role), name, *labels) == 0
 
 
 def test_guard_and_contacts_are_counted():

@@ -2,7 +2,6 @@
 
 import pytest
 
-from cloudrc.errors import BadInputError
 from cloudrc.faults.adversary import POLICIES, choose
 from cloudrc.faults.schedule import CALM, KINDS, compose, dump, load
 
@@ -25,17 +24,3 @@ def test_random_schedules_have_all_faults_and_calm_at_the_end():
     # A hostile cloud flies alone or amid faults.
     hostile = {(chosen.policy, not chosen.events) for chosen in map(choose, range(200))}
     assert hostile == {(policy, alone) for policy in POLICIES for alone in (True, False)}
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        *("[1, 2]", "seed: one", "seed: 1\nwind: 3", "seed: 1\nevents: [{kind: storm, at: 1}]"),
-        "seed: 1\nevents: [{kind: loss, at: 1, duration: 3, value: 1.5}]",
-    ],
-)
-def test_a_file_that_is_no_schedule_is_bad_input(tmp_path, text):
-    path = tmp_path / "schedule.yaml"
-    path.write_text(text)
-    with pytest.raises((BadInputError, ValueError)):
-        load(path)

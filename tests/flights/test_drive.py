@@ -1,7 +1,5 @@
 """Driving by hand over a link: latency, an operator who is lost, stops, and the flight again."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 
@@ -138,19 +136,3 @@ def test_a_stop_gets_through_thirty_percent_loss(count, figure):
         assert flight.changes[-1].state is GROUND
         assert not flight.watch.breaches
     figure("stop under 30 % loss", max(took), "<=", drive.rtt + 0.1, "s", count=count)
-
-
-def test_a_robot_on_the_ground_is_driven_on_the_ground():
-    flight = FaultRun(Schedule(1, robot="rover"), "world.scene=empty", start=False)
-    for n in range(25):
-        flight.cloud.at(0.5 + 0.1 * n, partial(_ask, flight, EAST if n < 20 else ZERO))
-    flight.fly(5.0)
-    at = flight.robot.simulator.readings.position
-    assert at[0] == pytest.approx(1.0, abs=0.15)
-    driven = [r.setpoint for r in flight.of_cloud if isinstance(r, Control) and r.waypoint < 0]
-    assert {round(z, 3) for _, _, z in driven} == {0.1}
-    assert not flight.watch.breaches
-
-
-def _ask(flight, velocity, now_ns):
-    flight.teleop.ask(lambda service, now_ns: service.drive(velocity, now_ns))

@@ -66,23 +66,6 @@ def test_the_report_has_the_clearance_from_any_obstacle(flown_into):
     assert not [note for note in found.notes if "No clearance is known" in note]
 
 
-HILL = """<body name="hill" pos="1.5 0 0"><geom type="hfield" hfield="h"/></body></worldbody>
-<asset><hfield name="h" nrow="4" ncol="4" size=".5 .5 .9 .1"
- elevation="0 0 0 1 0 0 0 0 0 0 0 0 0 0 0 0"/></asset><worldbody>"""
-
-
-@pytest.mark.parametrize("post", ["", f'<body name="post" pos="4 0 0">{GEOM}</body>'])
-def test_above_a_height_field_no_clearance_from_it_is_known(flown_into, post):
-    """The robot flies through the box around the hill, above its flat part."""
-    found = flown_into(f"{HILL}{post}")
-    assert found.numbers["obstacle_contacts"].value == 0
-    (note,) = clearance_notes(found)
-    assert note.startswith("No clearance is known from hill: ")
-    assert ("min_clearance_flight" in found.numbers) == bool(post)
-    if post:
-        assert found.numbers["min_clearance_flight"].value > 1.0
-
-
 def clearance_notes(found):
     again = assess(found.flight.recording, found.experiment, found.run)
     return [note for note in again.notes if note.startswith("No clearance is known from")]

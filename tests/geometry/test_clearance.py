@@ -13,7 +13,6 @@ from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.geometry.clearance import (
     clearance,
     clearance_per_obstacle,
-    inside_tube,
     least_clearance,
     place_points,
 )
@@ -64,13 +63,6 @@ def test_points_are_those_of_the_plant_and_turn_with_the_robot():
     assert placed == pytest.approx(points.positions[:, [2, 0, 1]])
     tip = place_points(points, np.array([[8.135, -6.422, 0.7]]), np.array([LEVEL]))[0, 8]
     assert tip == pytest.approx((8.535, -6.422, 0.87))  # at the contact pose
-
-
-def test_inside_a_pipe_is_in_its_bore_and_between_its_ends():
-    inside = [(-1, 2.5, 0.8), (-1, 0, 1.461), (5.66, -6.42, 0.8)]
-    outside = [(-1, 2.501, 0.8), (-1, 0, 1.463), (0.5, 0, 0.7)]
-    assert inside_tube(PIPES, np.array([*inside, *outside])).tolist() == [True] * 3 + [False] * 3
-    assert not inside_tube(load_scene("empty"), np.array(inside)).any()
 
 
 @settings(max_examples=30, deadline=None)

@@ -41,21 +41,6 @@ def refusals(*positions, start="spawn", scene="pipes", **more):
     return "\n".join(map(str, problems))
 
 
-@pytest.mark.parametrize(
-    ("start", "end", "pipe"),
-    [
-        ((-1.0, 0.0, 0.8), (0.5, 0.0, 0.8), 0),  # out of the bore, sideways
-        ((-1.0, 3.6, 0.7), (-1.0, 0.0, 0.7), -1),  # into the bore, by its mouth
-        ((-2.5, 2.7, 0.8), (0.5, 2.7, 0.8), 0),  # with a rotor in it
-        ((-2.5, 0.0, 1.7), (0.5, 0.0, 1.7), -1),  # over it
-        ((-2.5, 0.0, 1.6), (0.5, 0.0, 1.6), 0),  # its box would scrape along the top
-        ((-0.78, 0.0, 0.8), (-1.0, 0.0, 0.8), -1),  # at a wall, away from it
-    ],
-)
-def test_a_straight_way_through_a_wall_is_found(start, end, pipe):
-    assert crossed(start, end) == pipe
-
-
 @settings(max_examples=50, deadline=None)
 @given(*[st.tuples(st.floats(-2.8, 9), st.floats(-8.3, 5.3), st.floats(0.4, 2.2))] * 2)
 def test_a_way_touches_a_wall_if_one_of_its_points_does(start, end):

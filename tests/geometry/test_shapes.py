@@ -5,9 +5,7 @@ import pytest
 
 from cloudrc.geometry import shapes
 from cloudrc.geometry.clearance import rotations
-from cloudrc.geometry.scene import Tube
 from cloudrc.geometry.shapes import Shapes, Surface
-from cloudrc.geometry.tubes import rims, wall
 
 BODIES = {
     "box": (shapes.box((1.0, 2.0, 3.0)), 48.0),
@@ -50,15 +48,3 @@ def test_a_file_has_the_same_shapes_and_is_the_same_each_time():
     np.testing.assert_array_equal(read.scene[0].triangles, some().scene[0].triangles)
     empty = Shapes.from_bytes(Shapes().to_bytes())
     assert (empty.robot, empty.scene, empty.size) == ((), (), 0.0)
-
-
-@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
-def test_wall_and_rims_lie_on_the_faces_of_their_tube(axis):
-    tube = Tube("tube", (1.0, 2.0, 3.0), axis, 5.0, 0.6, 0.7)
-    colour = (1.0, 1.0, 1.0, 1.0)
-    for surface in (wall(tube, colour), *rims(tube, colour)):
-        relative = surface.corners - tube.centre
-        along = relative @ np.array(axis)
-        assert np.abs(along) == pytest.approx(2.5)
-        radii = np.linalg.norm(relative - along[:, None] * axis, axis=1)
-        assert set(np.round(radii, 6)) <= {0.6, 0.7}

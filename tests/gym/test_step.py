@@ -3,7 +3,6 @@
 import gymnasium
 import pytest
 from gymnasium.vector import SyncVectorEnv
-from gymnasium.wrappers import MaxAndSkipObservation, TransformAction
 
 from cloudrc.errors import BadInputError
 from cloudrc.gym import Networked, NetworkedVector
@@ -51,19 +50,6 @@ def test_a_time_that_may_be_a_part_of_a_step_is_refused_and_dt_decides(told, wor
             wrap(env)
         assert "give dt=, the time of a step in seconds" in str(caught.value)
     assert Networked(telling(**told), dt=0.05).dt == 0.05
-
-
-def test_a_wrapper_that_skips_frames_is_refused_and_dt_decides():
-    def make():
-        return MaxAndSkipObservation(gymnasium.make("Pendulum-v1"), 4)
-
-    with pytest.raises(BadInputError, match="is several steps of PendulumEnv; give dt="):
-        Networked(make())
-    with pytest.raises(BadInputError, match="is several steps of PendulumEnv; give dt="):
-        NetworkedVector(SyncVectorEnv([make]))
-    assert Networked(make(), dt=0.2).dt == 0.2
-    env = gymnasium.make("Pendulum-v1")
-    assert Networked(TransformAction(Networked(env), lambda action: action, None)).dt == 0.05
 
 
 @pytest.mark.parametrize(

@@ -73,11 +73,3 @@ def test_chunks_and_spaces_of_every_kind():
     for _ in range(20):
         observation, *_ = env.step(env.action_space.sample())
     assert env.observation_space.contains(observation)
-
-
-def test_gymnasium_makes_a_vector_by_name():
-    env = gymnasium.make_vec("cloudrc/Networked-v0", 4, env="Pendulum-v1", link="lte", seed=2)
-    assert isinstance(env, NetworkedVector)
-    observations, infos = env.reset(seed=1)
-    assert observations.shape == (4, 3)
-    assert infos["cloudrc"]["observation_age"].tolist() == [0.0] * 4

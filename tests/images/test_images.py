@@ -5,12 +5,10 @@ import tomllib
 from pathlib import Path
 
 import pytest
-import yaml
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-DOCKERFILES = sorted((ROOT / "images").glob("*/Dockerfile"))
 ROLES = {"world": ("world", "record", "mpc"), "cloud": ("record", "api", "mpc")}
 LOCKS = {
     ROOT / "images" / "world" / "requirements.txt": ROLES["world"],
@@ -52,11 +50,3 @@ def test_every_package_has_a_hash_and_no_address(lock):
     assert all("--hash=sha256:" in block for block in blocks)
     assert blocks
     assert "://" not in text
-
-
-def test_dependabot_looks_at_every_lock_and_dockerfile():
-    entries = yaml.safe_load((ROOT / ".github" / "dependabot.yml").read_text())["updates"]
-    for kind, paths in {"pip": [*LOCKS, BUILD], "docker": DOCKERFILES}.items():
-        (seen,) = (each["directories"] for each in entries if each["package-ecosystem"] == kind)
-        folders = {f"/{path.parent.relative_to(ROOT)}" for path in paths}
-        assert folders == {*seen} - {"/"}, kind

@@ -200,18 +200,6 @@ def test_qdiscs_of_a_killed_process_are_taken_over():
     assert len(kernel.filters) == 1
 
 
-def test_a_smaller_limit_waits_until_queued_packets_have_left():
-    kernel, shaper = shaped(profile_of(1.0, rate=1e6, queue_packets=10))
-    small = profile_of(0.02, rate=1e6, queue_packets=10)
-    for held, seconds, room in ((100, 1.5, limit(small) + 100), (3, 2.0, limit(small))):
-        kernel.held = held
-        shaper.follow_profile(small)
-        for _ in range(2):
-            shaper.step(seconds / 2)
-        assert f"limit {room} " in kernel.said[-1]
-    assert shaper.counts()["restored"] == 0, "its own changes are nobody else's"
-
-
 @pytest.mark.parametrize("delay", [300.0, 0.1])
 def test_a_refused_profile_leaves_the_old_one_in_force(delay):
     """`check` refuses a delay of 300 s, and tc a delay of 0.1 s."""
@@ -221,47 +209,3 @@ def test_a_refused_profile_leaves_the_old_one_in_force(delay):
         shaper.follow_profile(profile_of(delay))
     shaper.step(0.1)
     assert kernel.netem == before
-
-
-def test_a_kernel_that_lacks_a_module_is_left_as_it_was():
-    kernel = Kernel("netem")
-    with pytest.raises(MissingPrerequisiteError, match="this kernel lacks sch_netem, sch_prio or "):
-        netem(kernel, PLAIN).follow_peer(PEER)
-    assert kernel.root["kind"] == "noqueue"
-
-
-@pytest.mark.parametrize(
-    ("harm", "said"),
-    [
-        (Kernel.clear, "was removed by another program"),
-        (lambda kernel: kernel.netem.append("ecn"), 'was changed to {"words": ["limit", "1000'),
-    ],
-)
-def test_a_foreign_change_of_the_qdisc_is_an_error(harm, said):
-    log = []
-    profile = profile_of(0.04, changes=(change(5.0, loss=0.1),))
-    kernel, shaper = shaped(profile, 1.5, log.append)
-    assert (log, shaper.counts()["restored"]) == ([], 0)
-    harm(kernel)
-    kernel.said.clear()
-    for _ in range(30):
-        shaper.step(0.1)
-    (line,) = log
-    assert line.startswith(f"error: the qdisc of eth0 {said}")
-    assert (kernel.said, shaper.counts()["restored"]) == ([], 1)
-    with pytest.raises(MissingPrerequisiteError, match="restart this pod"):
-        shaper.follow_profile(profile_of(0.07))
-
-
-def test_a_step_is_taken_when_it_is_due():
-    profile = profile_of(
-        delay=0.02, changes=(change(1.003, delay=0.1),), blackouts=(blackout(1.511, 0.05),)
-    )
-    kernel, shaper = shaped(profile, 2.0)
-    assert kernel.history == [
-        (pytest.approx(1003.0), "100000.000us", "0%"),
-        (pytest.approx(1511.0), "100000.000us", "100%"),
-        (pytest.approx(1561.0), "100000.000us", "0%"),
-    ]
-    late_ns = [shaper.counts()[f"step_lateness_p{share}_ns"] for share in (50, 99)]
-    assert late_ns == pytest.approx([0, 0], abs=1000)

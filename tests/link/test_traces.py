@@ -4,7 +4,7 @@ import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import Trace
-from cloudrc.link.traces import parse_trace, read_table, read_trace, write_trace
+from cloudrc.link.traces import parse_trace, read_trace, write_trace
 
 HEAD = "time_s,delay_ms"
 
@@ -49,12 +49,3 @@ def test_a_written_trace_reads_back_the_same(scale):
     assert again.times == pytest.approx(trace.times)
     assert again.delays == pytest.approx(trace.delays)
     assert again.losses == trace.losses
-
-
-def test_a_table_is_the_arrived_delays_with_mean_0_deviation_1(tmp_path):
-    path = tmp_path / "trace.csv"
-    path.write_text(f"{HEAD},loss\n0,60,0\n1,40,0.5\n2,900,1\n3,40,0\n4,60,0\n")
-    assert read_table(path) == pytest.approx((-1.0, -1.0, 1.0, 1.0))
-    path.write_text(f"{HEAD},loss\n0,45,0\n1,45,0\n2,50,1\n")
-    with pytest.raises(BadInputError, match="at least two different delays"):
-        read_table(path)

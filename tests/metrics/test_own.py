@@ -1,15 +1,11 @@
 """A user's own metrics: found by path or installed, measured by a run, checked before it."""
 
 import json
-import sys
-from importlib.metadata import EntryPoint
 
 import pytest
 
-from cloudrc import plugins
 from cloudrc.cli.main import main
-from cloudrc.metrics.measure import SHIPPED, measure_all
-from cloudrc.runs.catalogue import describe_all
+from cloudrc.metrics.measure import measure_all
 from tests.metrics.conftest import straight_flight
 
 OVERSHOOT = '''"""Largest distance by which the robot flies past the setpoint along x.
@@ -97,22 +93,6 @@ def test_an_invalid_metric_is_refused_in_one_line(folder, refused, names, text, 
     ):
         assert reason in refused("", *line)
     assert not (folder / "runs").exists()
-
-
-def test_an_installed_metric_is_in_every_report(folder, monkeypatch):
-    names = ("past", "duration")  # a shipped metric cannot be replaced
-    entries = tuple(EntryPoint(name, "overshoot", "cloudrc.metrics") for name in names)
-    monkeypatch.syspath_prepend(str(folder / "mine"))
-    monkeypatch.setattr(
-        plugins, "entry_points", lambda group: entries if group == "cloudrc.metrics" else ()
-    )
-    numbers, notes, _ = measure_all(straight_flight(), ["past"])
-    assert (numbers["past"].unit, notes) == ("m", [])
-    assert numbers["duration"].meaning == SHIPPED["duration"].meaning
-    listed = describe_all("metrics")
-    assert list(listed) == sorted({*SHIPPED, "past"})
-    assert listed["past"].startswith("Largest distance by which")
-    sys.modules.pop("overshoot", None)
 
 
 def test_a_metric_that_changes_its_arrays_changes_no_other_number(folder):

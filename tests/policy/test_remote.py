@@ -61,15 +61,6 @@ def test_the_served_pid_flies_the_path_of_the_built_in_one_bit_by_bit(policy):
     assert len(served) > 100
 
 
-ON_GROUND = ["mission.waypoints=[{position_m: [0.5, 0], dwell_s: 0.5}]", "criteria.time_limit_s=20"]
-
-
-def test_a_remote_controller_drives_a_robot_on_the_ground(policy):
-    with serving(policy(PID)) as url:
-        served = true_path(experiment(url, name="pillars", short=ON_GROUND))
-    assert np.array_equal(served, true_path(load_experiment("pillars", ON_GROUND)))
-
-
 def test_a_served_policy_that_returns_none_sends_nothing(policy):
     every_third = "    calls.append(0)\n    if len(calls) % 3:\n        return None\n    return {"
     often = "calls = []\n" + PID.replace("    return {", every_third)

@@ -5,7 +5,7 @@ from mcap.reader import make_reader
 
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
-from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, union
+from cloudrc.record.holes import END_NS, SOMEWHERE, Hole
 from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted, MissionEvent
@@ -101,13 +101,3 @@ def test_the_last_mission_of_a_killed_session_and_of_its_copy_are_whole_alike(
 def test_every_reader_refuses_a_damaged_file_and_names_the_remedy(damaged, read):
     with pytest.raises(BadInputError, match=r"damaged at byte .*cloudrc recover .*x\.mcap$"):
         read(damaged)
-
-
-def test_holes_that_overlap_are_one_hole():
-    """A commanded phase must not begin behind one hole and inside of another."""
-    assert union([Hole(5, 9), Hole(0, 3), Hole(1, 4), Hole(0, 2), Hole(4, 4)]) == (
-        Hole(0, 4),
-        Hole(4, 4),
-        Hole(5, 9),
-    )
-    assert union([Hole(5, 9), SOMEWHERE]) == (SOMEWHERE,)

@@ -8,11 +8,10 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.config.profile import DirectionConfig
-from cloudrc.records import Control
 from cloudrc.report.figures import FIGURES, PRINT_KINDS, draw_all, own_settings
 from cloudrc.report.figures.style import RC, Look, Subject
 from cloudrc.robots.shapes import read_shapes
-from tests.metrics.conftest import ONE_PIPE, OPEN_AIR, SECOND, START, flown
+from tests.metrics.conftest import ONE_PIPE, OPEN_AIR, START, flown
 
 CALM = DirectionConfig(delay_ms=50.0)
 
@@ -39,20 +38,6 @@ def test_figures_ignore_the_users_matplotlib_settings(monkeypatch):
     with matplotlib.rc_context(theirs):
         assert draw_all(subject_of(flown())) == [picture]
         assert matplotlib.rcParams["text.usetex"], "put back"
-
-
-@pytest.mark.parametrize(("width", "panels"), [(3.5, 3), (7.16, 4)])
-def test_a_wide_figure_enlarges_the_largest_step(width, panels):
-    log = flown()
-    for n, record in enumerate(log.cloud):
-        if isinstance(record, Control):
-            to = (5.0 * (record.stamp_ns > START + 2 * SECOND), 0.0, 0.7)
-            log.cloud[n] = record._replace(setpoint=to)
-    with own_settings(Look(width)):
-        figure = FIGURES["odom"][0](replace(subject_of(log), look=Look(width)))
-    assert len(figure.axes) == panels
-    shown = [axes.get_xlim() for axes in figure.axes]
-    assert any(begin < 2.0 < end < 4.0 for begin, end in shown) == (panels == 4)
 
 
 def test_text_stays_text_and_a_flight_in_real_time_has_a_date(monkeypatch):

@@ -51,16 +51,6 @@ def test_the_band_follows_the_profile():
     assert band(subject_of(uplink=timed), 4.0) == pytest.approx((50, 90))
 
 
-def test_a_trace_replaces_the_delay(tmp_path):
-    trace = tmp_path / "trace.csv"
-    trace.write_text("time_s,delay_ms,loss\n1,30,0\n5,90,0\n", encoding="utf-8-sig")  # of Excel
-    subject = subject_of(uplink=DirectionConfig(delay_ms=5.0, jitter_ms=10.0, trace=str(trace)))
-    # The first row also holds before it.
-    assert low(subject, -0.9, 6.0) == pytest.approx([20, 80])
-    trace.unlink()
-    assert np.isnan(low(subject, 0.0)).all()
-
-
 def test_a_time_line_starts_at_its_change_and_ends_at_the_next():
     subject = subject_of(changed(1.0, TIMED, "profile timed"), changed(4.0, CALM, "profile calm"))
     assert band(subject, 1.5, uplink=False)[0] == pytest.approx(50), "the other way stays"

@@ -9,14 +9,11 @@ import cloudrc
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import find_robot
-from cloudrc.config.schema import Plant, World
-from cloudrc.config.shipped import file_of
+from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
 from cloudrc.robots.build import build_robot, check_robot
-from cloudrc.sim.scene import compile_model, compile_true
 
 MODEL = find_robot("rover").model
-EMPTY = file_of("empty")
 TEXT = MODEL.read_text()
 SERVO = '<velocity kv="3" ctrlrange="-20 20" forcerange="-3 3"/>'
 
@@ -127,17 +124,6 @@ def test_a_model_without_such_wheels_is_refused_in_one_line(own_robot, changes, 
     assert message in str(error.value)
     assert "\n" not in str(error.value)
     assert str(folder / "robot.xml") in str(error.value)
-
-
-def test_factors_scale_base_and_wheels_and_the_payload_is_on_the_base():
-    nominal = compile_model(MODEL, EMPTY)
-    plant = Plant(mass_factor=1.1, inertia_factor=1.2, payload_kg=0.5)
-    heavy = compile_true(MODEL, EMPTY, nominal, plant)
-    base = nominal.jnt_bodyid[0]
-    assert nominal.body_mass[base] == pytest.approx(6.2)
-    assert heavy.body_mass[base] == pytest.approx(1.1 * 6.2 + 0.5)
-    assert heavy.body_subtreemass[base] == pytest.approx(1.1 * 7.0 + 0.5)
-    assert heavy.body_inertia[base + 1 :] == pytest.approx(1.2 * nominal.body_inertia[base + 1 :])
 
 
 def fly_pillars(rtt_ms, judged_by, predictor="command_history"):

@@ -1,8 +1,6 @@
 """Parameters on board, a robot unlike its model, and wind, for every robot."""
 
 import json
-import subprocess
-import sys
 
 import pytest
 
@@ -90,14 +88,3 @@ def test_a_shipped_drone_leans_against_the_wind_as_its_drag_asks(robot, drag):
     assert truth["position"][:, 0].max() > 0.05  # before the integral has found the wind
     w, x, y, z = truth["orientation_wxyz"][-100:].mean(axis=0)
     assert 2 * (x * z + w * y) == pytest.approx(-drag * wind / (mass * 9.81), rel=0.03)
-
-
-def test_a_machine_without_mujoco_leaves_the_check_and_the_advice_to_world():
-    program = (
-        "import sys; sys.modules['mujoco'] = None\n"
-        "from cloudrc.runs.experiment import advice_on, check_world, load\n"
-        "found = load('steps', ['world.robot=nano', 'world.plant.mass_factor=3'])\n"
-        "check_world(found.world); print(advice_on(found))"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert (done.stdout, done.stderr) == ("[]\n", "")

@@ -68,22 +68,3 @@ def test_numbers_of_a_plugin_that_failed_do_not_count(code):
     ok, failed = flown(iae_mean=1.0), flown("failure", code, iae_mean=1.0)
     found = compare(pairs((ok, ok), (ok, failed)), UNITS)
     assert (found["pairs"], found["left_out"]) == (1, 1)
-    with pytest.raises(BadInputError, match="plug-in failed: a reason"):
-        compare(pairs((ok, failed)), UNITS)
-
-
-def test_a_number_that_a_side_lacks_is_counted_and_the_others_are_compared():
-    """In the flights of B, which have plans, this number is never known."""
-    a, b = flown(rtt_mean=1.0, iae_mean=1.0), flown(iae_mean=2.0)
-    found = compare(pairs((a, b), (a, b)), UNITS, ["rtt_mean", "iae_mean"])
-    assert list(found["numbers"]) == ["iae_mean"]
-    assert found["lacking"] == {"rtt_mean": {"a": 0, "b": 2, "left_out": 2}}
-    text = as_text({"a": "x=1", "b": "x=2", "of": "steps", **found})
-    assert "B has no rtt_mean: 2 pairs left out" in text
-    found = compare(pairs((a, b), (b, a), (a, a)), UNITS, ["rtt_mean"])
-    assert found["numbers"]["rtt_mean"]["count"] == 1
-    assert found["lacking"] == {"rtt_mean": {"a": 1, "b": 1, "left_out": 2}}
-    found = compare(pairs((b, b)), UNITS, ["rtt_mean", "min_clearance"])
-    assert (found["numbers"], list(found["lacking"])) == ({}, ["rtt_mean", "min_clearance"])
-    text = as_text({"a": "x=1", "b": "x=2", "of": "steps", **found})
-    assert "A and B have no rtt_mean: 1 pair left out" in text

@@ -119,17 +119,6 @@ def test_other_code_flies_nothing_into_the_folder(write_sweep, folder, monkeypat
         fly(path, folder, shard=(2, 2))
 
 
-def test_rows_of_two_codes_are_told_with_both_hashes(write_sweep, folder, caplog):
-    fly(write_sweep(), folder)
-    assert len(sweep.read_flights(folder).rows) == 4
-    assert caplog.messages == []
-    path = folder / "rows.jsonl"  # copied from elsewhere
-    path.write_text(path.read_text().replace(source.code_hash(), "other", 1))
-    sweep.read_flights(folder)
-    (said,) = caplog.messages
-    assert f"{folder}: its flights are of different code: {source.code_hash()} and other" in said
-
-
 def test_rows_of_another_grid_and_other_folders_are_refused(write_sweep, folder):
     with pytest.raises(BadInputError, match="is not a folder of"):
         sweep.read_sweep(folder)

@@ -60,30 +60,6 @@ def follow(flight, seconds):
         flight.step(reference(flight).position)
 
 
-def test_it_rests_and_leaves_by_time_alone():
-    """A robot that is behind, but within the tolerance, does not delay the mission."""
-    left = []
-    for behind in (0.0, 0.3):
-        flight = led()
-        while flight.leg == 0:
-            x, y, z = reference(flight).position
-            flight.step((x - behind, y, z))
-        motion = flight.setpoints[-1].motion
-        assert motion.start == A
-        left.append(motion.begin_ns)
-        assert flight.now_ns - motion.begin_ns < PERIOD_NS
-    assert left[0] == left[1]
-
-
-def test_it_waits_for_a_robot_that_is_too_far_behind():
-    flight = led()
-    flight.step((3.0, 0.0, 1.0), seconds=5.0)
-    assert (flight.leg, reference(flight).position) == (0, A)
-    flight.step((3.6 - 1e-12, 0.0, 1.0))  # at the edge of the tolerance, up to rounding
-    assert flight.leg == 1
-    assert flight.setpoints[-1].motion.begin_ns == flight.now_ns
-
-
 def test_it_waits_at_a_robot_that_holds_and_starts_from_there():
     flight = led()
     follow(flight, 1.0)

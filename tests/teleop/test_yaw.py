@@ -4,10 +4,8 @@ from math import cos, pi, radians, sin
 
 import pytest
 
-from cloudrc.messages import NEVER_NS, Setpoint, Start
-from cloudrc.teleop.carrot import setpoint_at, steer
-from cloudrc.teleop.wire import Leg, Plan, decode, encode
-from tests.fences import FENCE
+from cloudrc.messages import Start
+from cloudrc.teleop.wire import Leg, Plan
 from tests.teleop.conftest import A, B, flying
 
 
@@ -43,12 +41,3 @@ def test_the_setpoint_turns_only_at_a_waypoint_with_a_yaw_and_keeps_the_last_one
     flight.operate("go_to", Leg(B))
     turned = [(s.yaw, s.turns) for s in flight.setpoints[before:]]
     assert turned == [(0.5, False), (-1.0, True), (-1.0, False)]
-
-
-def test_a_carrot_keeps_the_yaw_and_a_drive_by_hand_asks_for_none():
-    flight = flying(Plan((Leg(A, 0.5, speed=1.0),), Start.HERE))
-    moving = flight.setpoints[-1]
-    assert decode(encode(moving)) == moving
-    midway = setpoint_at(moving, moving.motion.begin_ns + 500_000_000)
-    assert (midway.yaw, midway.turns) == (0.5, True)
-    assert not steer(Setpoint(A, 0.5, turns=True), (0.5, 0.0, 0.0), NEVER_NS + 1, FENCE).turns

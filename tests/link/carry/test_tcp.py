@@ -161,19 +161,6 @@ def test_a_reset_reaches_the_other_end(relayed):
         assert told.wait(5.0)
 
 
-def test_200_connections_at_once(relayed):
-    with server(echo) as port:
-        relay = relayed(port, *SHORT)
-        clients = [relay.connect() for _ in range(200)]
-        for number, client in enumerate(clients):
-            client.sendall(b"%04d" % number)
-        answers = [client.recv(4, socket.MSG_WAITALL) for client in clients]
-        assert answers == [b"%04d" % number for number in range(200)]
-        for client in clients:
-            client.close()
-        assert relay.end()["connections"] == 200
-
-
 def test_a_stopped_reader_stops_the_sender_and_memory_stays_small(relayed):
     stop = threading.Event()
     with server(lambda one: stop.wait(60)) as port:

@@ -94,12 +94,6 @@ def test_a_lost_segment_waits_for_a_time_out_if_nothing_shows_the_loss():
     assert far.send(b"y", 1_000 * MS) == pytest.approx(80 + 200 + 40)
 
 
-def test_the_time_out_doubles_while_nothing_arrives():
-    """Sent at 0, .28 and .84 s; the link is back at .6 s."""
-    far = Far(changed(PLAIN, blackouts=(blackout(0.0, 0.6),)))
-    assert far.send(b"x") == pytest.approx(280 + 560 + 40)
-
-
 def test_a_link_that_keeps_the_order_holds_up_all_connections():
     medium = Medium(profile_of(0.040, 0.020, keep_order=True), 1, True, 0)
     times = [medium.cross(number % 3, number, 1, 100, 0) for number in range(100)]

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from cloudrc.config.shipped import names
-from cloudrc.link.profile import mean_loss
 from cloudrc.link.verify import verdict_of
 from cloudrc.link.verify.causes import Findings, ShaperFacts, find_causes
-from cloudrc.link.verify.judge import look_twice, netem_makes
-from tests.link.profiles import changed, in_bursts, profile_of
+from cloudrc.link.verify.judge import look_twice
+from tests.link.profiles import changed, profile_of
 from tests.link.verify.conftest import asked, random_profile, rows_of, verify
 
 PAPER = asked("paper-p2", "uplink")
@@ -81,19 +80,6 @@ def test_netem_is_believed_unless_it_delays_twice_as_long():
     profile = profile_of(0.08, 0.02, correlation=0.9)
     assert doubts(rows_of(profile, profile, netem=True)) == []
     assert ("mean", "off") in doubts(rows_of(profile, changed(profile, delay=0.16), netem=True))
-
-
-@pytest.mark.parametrize("loss", [0.2, in_bursts(0.1, 0.4, 0.8, 0.05)])
-def test_netem_loses_either_a_packet_or_its_copy(loss):
-    """A packet selected for loss and duplication arrives once; a copy can be lost, too.
-
-    Source: Linux, net/sched/sch_netem.c: netem_enqueue; get_crandom for the correlation.
-    """
-    lost = mean_loss(loss)
-    made = netem_makes(profile_of(0.08, 0.02, correlation=0.9, loss=loss, duplicate=0.3))
-    assert (lost, made.correlation) == (pytest.approx(0.2), 0.0)
-    assert mean_loss(made.loss) == pytest.approx(0.7 * lost)
-    assert made.duplicate * (1 - 0.7 * lost) == pytest.approx(0.3 * (1 - lost) ** 2)
 
 
 @pytest.mark.parametrize(

@@ -1,15 +1,10 @@
 """Evidence is read from the state, metrics and qdiscs of a link container."""
 
-import pytest
-
 from cloudrc.link.verify.causes import (
-    Findings,
     ShaperFacts,
-    find_causes,
     read_evidence,
     read_metrics,
 )
-from cloudrc.link.verify.judge import Judgement
 
 NETEM = {"kind": "netem", "handle": "7401:", "packets": 85, "drops": 15}
 METRICS = """
@@ -35,19 +30,3 @@ def test_metrics_report_lateness_counts_and_stops():
     assert read_evidence(page, {}, 5) == nothing, "without tools nothing is claimed"
     netem = {"shaper": "netem", "interface": "eth0", "netems": {"eth0": [NETEM]}}
     assert read_evidence(netem, {}, 100).passed == 100, "counted by the kernel"
-
-
-@pytest.mark.parametrize(
-    ("shaper", "netems", "code"),
-    [
-        ("netem", {"eth1": [NETEM]}, "wrong_interface"),
-        ("netem", {}, "no_qdisc"),
-        ("netem", {"eth0": [NETEM, NETEM]}, "shaped_twice"),
-        ("relay", {"lo": [NETEM]}, "shaped_twice"),
-        ("relay", {"eth1": [NETEM]}, "doubled_delay"),
-    ],
-)
-def test_qdiscs_on_the_way_of_the_flow_are_the_cause(shaper, netems, code):
-    known = read_evidence({"shaper": shaper, "interface": "eth0", "netems": netems}, {})
-    row = Judgement("mean", 0.045, 0.09, 0.043, 0.047, "off")
-    assert [one.code for one in find_causes({"uplink": Findings([row], known)})] == [code]
