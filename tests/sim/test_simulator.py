@@ -1,20 +1,13 @@
 """Rotors and drag follow their formulas, contacts are found, replay is equal bit by bit."""
 
-from math import exp
-
-import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.robots.pelican.low_level import LowLevel
-from cloudrc.robots.pelican.rotors import STOPPED, Rotors
+from cloudrc.robots.pelican.rotors import STOPPED
 from cloudrc.sim.readings import Readings
 from cloudrc.sim.simulator import replay
-from tests.world.conftest import normalised, simulate
-
-AT_REST = Readings.of((*ZERO, *UPRIGHT), (*ZERO, *ZERO))
+from tests.world.conftest import simulate
 
 
 def fly(simulator, low_level, reference, duration):
@@ -22,39 +15,6 @@ def fly(simulator, low_level, reference, duration):
     for _ in range(round(duration / simulator.dt)):
         simulator.step(low_level.update(simulator.readings, reference))
     return simulator.take_contacts()
-
-
-def test_rotors_are_faster_up_than_down():
-    # One time constant: 1 - 1/e of the way up in 12.5 ms; down only 1 - exp(-1/2).
-    rotors = Rotors(0.0125)
-    rotors.speeds = (0.0, 500.0, 1000.0, 800.0)
-    rotors.step((100.0, 500.0, 0.0, 0.0), AT_REST)
-    assert rotors.speeds == pytest.approx((63.212, 500.0, 606.531, 800.0 * exp(-0.5)), abs=1e-3)
-
-
-unit = st.floats(-1.0, 1.0)
-
-
-@settings(max_examples=50, deadline=None)
-@given(
-    speeds=st.tuples(*[st.floats(0.0, 1838.0)] * 4),
-    quaternion=st.tuples(*[unit] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
-    velocity=st.tuples(*[st.floats(-5.0, 5.0)] * 3),
-    rate=st.tuples(*[st.floats(-5.0, 5.0)] * 3),
-)
-def test_thrust_and_drag_are_those_of_the_rotors(speeds, quaternion, velocity, rate):
-    orientation, rotation = normalised(quaternion)
-    force, torque = np.zeros(3), np.zeros(3)
-    hubs = [(0.21, 0, 0.05), (0, 0.21, 0.05), (-0.21, 0, 0.05), (0, -0.21, 0.05)]
-    for speed, hub in zip(speeds, hubs, strict=True):
-        across = (rotation.T @ velocity + np.cross(rate, hub)) * (1, 1, 0)
-        force += -speed * 8.06428e-5 * across
-        torque += np.cross(hub, -speed * 8.06428e-5 * across)
-    rotors = Rotors(0.002)
-    rotors.speeds = speeds
-    found = rotors.step(speeds, Readings.of((*ZERO, *orientation), (*velocity, *rate)))
-    assert found[:4] == pytest.approx([9.9865e-6 * speed**2 for speed in speeds])
-    assert found[4:] == pytest.approx([*(rotation @ force), *torque], abs=1e-9)
 
 
 def test_it_stands_at_its_spawn_and_falls_from_the_air(scene_at):
