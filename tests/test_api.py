@@ -25,8 +25,7 @@ def result():
     return cloudrc.fly("steps", SHORT, seed=3)
 
 
-def test_a_flight_equals_that_of_the_command(result, tmp_path, call, monkeypatch):
-    monkeypatch.setattr("cloudrc.report.write._draw", lambda *given, **wanted: None)
+def test_a_flight_equals_that_of_the_command(result, tmp_path, call, no_page):
     sets = [f"--set={key}={value}" for key, value in SHORT.items()]
     out = call("run steps --mode=virtual --seed=3 -o=json", *sets, "--out", tmp_path / "run").out
     report = json.loads(out)
@@ -63,8 +62,7 @@ def test_every_function_can_be_called_after_every_module_is_imported():
     assert callable(cloudrc.sweep)
 
 
-def test_a_flight_with_a_folder_equals_one_without(result, tmp_path, monkeypatch):
-    monkeypatch.setattr("cloudrc.report.write._draw", lambda *given, **wanted: None)
+def test_a_flight_with_a_folder_equals_one_without(result, tmp_path, no_page):
     kept = cloudrc.fly("steps", SHORT, seed=3, out=tmp_path / "run")
     assert (kept.numbers, kept.records_sha256) == (result.numbers, result.records_sha256)
     assert (tmp_path / "run/report.json").is_file()

@@ -110,10 +110,9 @@ def test_a_slow_command_works(command, folder):
 
 
 @pytest.fixture
-def numbers_only(folder, monkeypatch):
+def numbers_only(folder, monkeypatch, no_page):
     """Fly in this process and without figures, which is fast."""
     monkeypatch.chdir(folder)
-    monkeypatch.setattr("cloudrc.report.write._draw", lambda *given, **wanted: None)
 
 
 @pytest.mark.parametrize(("command", "printed"), REFUSED)

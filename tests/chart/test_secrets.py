@@ -11,7 +11,6 @@ OURS = {
     "teleop": {"tokens": {"existingSecret": "lab-tokens"}},
     "mission": {"enabled": True},
 }
-RUN, TELEOP = ({"medium": "Memory", "sizeLimit": size} for size in ("4Mi", "1Mi"))
 
 
 def test_key_and_tokens_are_made_once_and_kept():

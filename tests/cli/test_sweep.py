@@ -16,7 +16,7 @@ import pytest
 from cloudrc.assembly import assemble
 from cloudrc.cluster import batch
 from cloudrc.source import code_hash
-from cloudrc.trials.plan import PlannedFlight, pack, read_plan
+from cloudrc.trials.plan import PlannedFlight, read_plan
 from cloudrc.trials.rows import read_rows
 from tests.cli.conftest import SHORT
 from tests.conftest import wait_until
@@ -153,22 +153,6 @@ def test_an_error_of_the_machine_ends_a_sweep_and_is_no_row(broken_machine, writ
     assert broken_machine in line
     assert "; to continue, add --out grid" in line
     assert [row["seed"] for row in rows("grid")] == [1]
-
-
-def test_an_error_of_the_machine_ends_a_pod_with_one_sentence(
-    broken_machine, write_sweep, call, tmp_path, monkeypatch
-):
-    """No exit code 2: with all others, Kubernetes flies the shard again."""
-    log = tmp_path / "termination-log"
-    log.touch()
-    monkeypatch.setattr("cloudrc.cli.output.TERMINATION_LOG", log)
-    plan = read_plan(write_sweep(ONE, seeds=[1, 2, 3]))
-    (tmp_path / "flights").write_bytes(pack(plan.flights.values()))
-    out, error = call("sweep rows", tmp_path / "flights", code=3)
-    assert [json.loads(line)["seed"] for line in out.splitlines()] == [1]
-    (line,) = error.splitlines()
-    assert broken_machine in line
-    assert line == f"cloudrc: error: {log.read_text()}".rstrip()
 
 
 @pytest.mark.process

@@ -13,7 +13,6 @@ import pytest
 from cloudrc.cli.eval_values import (
     check_round_trips,
     read_compute,
-    read_env_args,
     read_mapped,
 )
 from cloudrc.cli.main import main
@@ -199,14 +198,6 @@ def test_a_round_trip_keeps_the_ratio_of_the_profile():
     assert (even.uplink.delay_ms, even.downlink.delay_ms) == (40.0, 40.0)
     with pytest.raises(BadInputError, match="change over time"):
         check_round_trips("handover", (80.0,))
-
-
-def test_arguments_of_an_environment_are_yaml():
-    assert read_env_args(["b=[1, 2]", "a=None"]) == (("a", None), ("b", [1, 2]))
-    assert read_env_args(["seed={seed}", "c={at: [a, b]}"])[1] == ("seed", "{seed}")
-    for wrong in ("a", "=1", "a b=1"):
-        with pytest.raises(BadInputError, match="--env-arg"):
-            read_env_args([wrong])
 
 
 def run(*words):

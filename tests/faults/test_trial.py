@@ -52,9 +52,6 @@ def test_a_hostile_cloud_causes_no_breach(robot, policy):
     assert fly(replace(choose(seed), duration=7.0, robot=robot)).breaches == ()
 
 
-BLACKOUT, STOPPED = FaultEvent("blackout", 44.0, 8.0), FaultEvent("stopped", 5.0)
-
-
 HELD = Schedule(
     3,
     events=(

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from cloudrc.config.profile import BlackoutConfig, ChangeConfig, DirectionConfig
+from cloudrc.config.profile import ChangeConfig, DirectionConfig
 from cloudrc.messages import GuardState
 from cloudrc.records import GuardChange, LinkChanged
 from cloudrc.report.figures.marks import HELD, bounds, legend, mark_events
@@ -14,11 +14,6 @@ from cloudrc.report.figures.style import Subject, new_figure
 from tests.metrics.conftest import ONE_PIPE, at, flown
 
 CALM = DirectionConfig(delay_ms=50.0)
-TIMED = DirectionConfig(
-    delay_ms=20.0,
-    changes=(ChangeConfig(at_s=2.0, delay_ms=90.0), ChangeConfig(at_s=99.0, delay_ms=9.0)),
-    blackouts=(BlackoutConfig(start_s=1.0, duration_s=9.0),),
-)
 
 
 def changed(time, direction, cause, age=0.0, *, uplink=True):
@@ -39,25 +34,12 @@ def band(subject, time, *, uplink=True):
     return bounds(subject, np.array([time]), uplink=uplink)[:, 0].tolist()
 
 
-def low(subject, *times):
-    return [band(subject, time)[0] for time in times]
-
-
 def test_the_band_follows_the_profile():
     steps = (ChangeConfig(at_s=5.0, delay_ms=70.0), ChangeConfig(at_s=9.0, jitter_ms=5.0))
     timed = DirectionConfig(delay_ms=5.0, jitter_ms=20.0, changes=steps)
     # The link started one second before the mission. A delay is never negative.
     assert band(subject_of(uplink=timed), 3.99) == pytest.approx((0, 25))
     assert band(subject_of(uplink=timed), 4.0) == pytest.approx((50, 90))
-
-
-def test_a_time_line_starts_at_its_change_and_ends_at_the_next():
-    subject = subject_of(changed(1.0, TIMED, "profile timed"), changed(4.0, CALM, "profile calm"))
-    assert band(subject, 1.5, uplink=False)[0] == pytest.approx(50), "the other way stays"
-    assert low(subject, 0.5, 1.5, 4.5) == pytest.approx([50, 20, 50])
-    assert np.isnan(low(subject, 2.5)).all(), "in its blackout"
-    said = "set in flight (profile timed, at 1.0 s; profile calm, at 4.0 s)."
-    assert said in legend(subject)
 
 
 def test_holds_are_marked():

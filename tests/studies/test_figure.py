@@ -54,11 +54,6 @@ def test_names_along_x_keep_the_order_of_the_grid(tmp_path, drawn):
     assert [*drawn[0][0].lines] == ["[1, 2]", "[3, 4]"]
 
 
-def row(point, seed, *failures):
-    verdict = "failure" if failures else "success"
-    return {"point": point, "seed": seed, **flown(verdict, *failures, iae_mean=seed)}
-
-
 def test_a_figure_is_three_files_whose_text_is_text(tmp_path, call):
     folder = sweep(tmp_path / "s")
     out = call("sweep figure", folder, "--out", tmp_path / "one.png").out

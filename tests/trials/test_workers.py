@@ -3,7 +3,6 @@
 import multiprocessing
 import os
 import signal
-import sys
 import time
 from functools import partial
 
@@ -34,10 +33,6 @@ def _kill_at_five(folder, number):
         wait_until((folder / str(KILLED - 1)).exists)
         os.kill(os.getpid(), signal.SIGKILL)
     return number
-
-
-def _exit(number):
-    sys.exit(0)
 
 
 @pytest.mark.parametrize(("pieces", "jobs", "workers"), [(6, 100_000, 2), (1, 9, 0), (6, 1, 0)])
