@@ -23,11 +23,11 @@ from tests.chart.conftest import (
     VALUES,
     a_namespace,
     containers,
-    each_file,
     pod_specs,
     render,
     values_of,
 )
+from tests.conftest import nightly
 
 kubernetes_validate = pytest.importorskip("kubernetes_validate", reason="comes with the extra dev")
 
@@ -193,7 +193,7 @@ def helm(*arguments):
     return subprocess.run(["helm", *arguments], capture_output=True, text=True)
 
 
-@each_file
+@pytest.mark.parametrize("path", [*VALUES[:2], *nightly(*VALUES[2:])], ids=lambda path: path.stem)
 def test_helm_renders_the_same_objects(path):
     flags = ("--kube-version", OLDEST, "--values", str(path))
     done = helm("template", "demo", str(CHART), "--namespace", "lab", *flags)

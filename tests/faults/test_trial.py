@@ -24,7 +24,7 @@ from tests.faults.conftest import experiment
 
 MS = 1_000_000
 REGRESSIONS = sorted((Path(__file__).parent / "regressions").glob("*.yaml"))
-SHORT = [path for path in REGRESSIONS if load(path).duration < 45.0]
+SHORT = [path for path in REGRESSIONS if load(path).duration < 30.0]
 LONG = [path for path in REGRESSIONS if path not in SHORT]
 
 

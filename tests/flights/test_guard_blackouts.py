@@ -69,15 +69,13 @@ def interrupt(figure, kill, at, *settings, calm=1.0):
 @pytest.mark.parametrize("kill", [False, True], ids=["silent", "killed"])
 @pytest.mark.parametrize("k", [173, *nightly(*sorted({*range(COUNT)} - {173}))])
 def test_without_its_cloud_the_robot_holds_in_a_pipe(k, kill, figure):
-    if kill:
-        interrupt(figure, kill, mid_pipe(*SLOW)[k], *SLOW)
-    else:  # without the cap stopping takes a little longer
-        interrupt(figure, kill, mid_pipe()[k], calm=1.4)
+    interrupt(figure, kill, mid_pipe()[k], calm=1.4)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("k", range(COUNT))
 def test_without_its_cloud_the_slow_robot_holds_in_a_pipe(k, figure):
+    """With a cap on its speed it stops sooner."""
     interrupt(figure, False, mid_pipe(*SLOW)[k], *SLOW)
 
 

@@ -17,7 +17,7 @@ SHORT = {"mission": {"steps": {"count": 2}}}
     ("name", "options", "experiment", "settings"),
     [
         ("cloudrc/Steps-v0", {"settings": SHORT}, "steps", SHORT),
-        ("cloudrc/Pipes-v0", {}, "paper", {}),
+        pytest.param("cloudrc/Pipes-v0", {}, "paper", {}, marks=pytest.mark.full),
         ("cloudrc/Steps-v0", {"experiment": "pillars"}, "pillars", {}),
     ],
 )

@@ -10,6 +10,7 @@ from cloudrc.config.robot import facts, known_robot
 from cloudrc.config.schema import PlugIn, World
 from cloudrc.errors import BadInputError
 from cloudrc.robots.build import onboard_values
+from tests.conftest import nightly
 
 GROUND = {"steps": {"count": 3, "centre_m": [0, 0, 0.1], "range_m": [1.5, 1.5, 0]}}
 MODELS = ("command_history", "kalman", "model_based")
@@ -20,7 +21,7 @@ def build(robot, predictor, **keys):
     return build_for("predictors", PlugIn.model_validate(predictor), facts(world, 7.0))
 
 
-@pytest.mark.parametrize("robot", ["nano", "rover"])
+@pytest.mark.parametrize("robot", ["nano", *nightly("rover")])
 def test_a_predictor_with_the_robots_model_predicts_far_better_than_none(robot):
     keys = {"world.robot": robot, "link.profile": "paper-p3", "mission.steps.count": 3}
     if robot == "rover":

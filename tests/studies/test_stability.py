@@ -91,7 +91,7 @@ def flown(*settings, rtt=0.0, gains=PUBLISHED, of="steps"):
     ("predictor", "gains"),
     [
         ("last_sample", FAST),
-        ("constant_velocity", FAST),
+        pytest.param("constant_velocity", FAST, marks=pytest.mark.full),
         pytest.param("last_sample", PUBLISHED, marks=pytest.mark.full),
         pytest.param("constant_velocity", PUBLISHED, marks=pytest.mark.full),
     ],
@@ -106,14 +106,15 @@ def test_the_limit_of_stability_is_that_of_the_linear_model(predictor, gains):
 
 
 @pytest.mark.parametrize(
-    ("predictor", "stable"),
+    ("predictor", "rtt", "stable"),
     [
-        ("command_history", True),
-        pytest.param("last_sample", False, marks=pytest.mark.full),
+        ("command_history", 1.5, True),
+        pytest.param("command_history", 3.0, True, marks=pytest.mark.full),
+        pytest.param("last_sample", 3.0, False, marks=pytest.mark.full),
     ],
 )
-def test_a_predictor_that_replays_the_commands_is_stable_at_3_s(predictor, stable):
-    found = fly_step(flown(f"cloud.predictor={predictor}", rtt=3.0))
+def test_a_predictor_that_replays_the_commands_is_stable_at_3_s(predictor, rtt, stable):
+    found = fly_step(flown(f"cloud.predictor={predictor}", rtt=rtt))
     assert found["stable"] == stable, found
 
 
