@@ -106,9 +106,9 @@ def _cross(
     rate_hz = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
     numbers = (begun_ns // round(1e9 / rate_hz)).tolist()
     profile = link_profile(way.model_copy(update={"blackouts": (), "corrupt": 0.0}))
-    link = LinkDirection(profile, experiment.seed, uplink)
+    link = LinkDirection(profile, experiment.seed, uplink, stream=experiment.stream)
     if (only := link.only) is not None:  # nearly all links: a call per block of packets
-        key = stream_key(experiment.seed, uplink, 1, kind)
+        key = stream_key(experiment.seed, uplink, 1, kind, experiment.stream)
         blocks = range(numbers[-1] // BLOCK + 1 if numbers else 0)
         tables = [impairments(key, block, profile, only.jitter, only.loss) for block in blocks]
         fates = [tables[number // BLOCK][number % BLOCK] for number in numbers]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, closing, nullcontext
+from dataclasses import replace
 from itertools import pairwise
 from math import degrees, dist, inf, pi, radians
 from pathlib import Path
@@ -31,6 +32,7 @@ from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.errors import ControllerLostError
 from cloudrc.geometry.fence import Fence
 from cloudrc.link.model import LinkDirection
+from cloudrc.link.queue import PacketQueue
 from cloudrc.link.traces import link_profile
 from cloudrc.messages import Start
 from cloudrc.outside.code import apart
@@ -78,31 +80,38 @@ def assemble(
     experiment: ResolvedExperiment,
     make_loop: Callable[..., ControlLoop] = ControlLoop,
     channel: ControllerChannel | None = None,
+    *,
+    queue: Callable[[LinkDirection], PacketQueue] | None = None,
+    compute: ComputeTime | None = None,
 ) -> tuple[WorldEndpoint, CloudEndpoint, Teleop, VirtualRun]:
     """Build world, cloud and teleop, and connect them for a flight in virtual time.
 
-    The mission starts with the flight; `Teleop.over` tells when it is over. `make_loop` and
-    `channel` are those of `build_cloud`.
+    The mission starts with the flight; `Teleop.over` tells when it is over. `make_loop`, `channel`
+    and `compute` are those of `build_cloud`. `queue` makes the queue of the packets in flight.
     """
     from cloudrc.drivers.virtual import CPU_CLOCK, Clock, VirtualRun
 
     own = Clock(round(experiment.cloud.clock_offset_s * 1e9), experiment.cloud.clock_drift_ppm)
-    links = build_links(experiment)
+    links, start_ns = build_links(experiment), phase_ns(experiment)
     passes = not any(link.corrupts for link in links)  # only bytes can be damaged
     clock_id = VIRTUAL_CLOCK if own == Clock() else CLOUD_CLOCK
     of_world = Identity(VIRTUAL_CLOCK, b"world".ljust(16), VIRTUAL_RING, passes)
     of_cloud = Identity(clock_id, b"cloud".ljust(16), VIRTUAL_RING, passes)
-    world, teleop = build_world(experiment, of_world), start_mission(experiment, own.at(0))
+    world = build_world(experiment, of_world, lambda: start_ns)
+    teleop = start_mission(experiment, own.at(start_ns))
     cloud = build_cloud(
         experiment,
         of_cloud,
         teleop,
-        lambda: own.at(0),
+        lambda: own.at(start_ns),
         cpu_clock=CPU_CLOCK,
         make_loop=make_loop,
         channel=channel,
+        compute=compute,
     )
-    return world, cloud, teleop, VirtualRun(world, cloud, *links, cloud_clock=own)
+    in_flight = queue(links[1]) if queue else None
+    run = VirtualRun(world, cloud, *links, cloud_clock=own, in_flight=in_flight)
+    return world, cloud, teleop, run
 
 
 def start_mission(experiment: ResolvedExperiment, now_ns: int = 0) -> Teleop:
@@ -205,8 +214,11 @@ def build_world(
     from cloudrc.world.sensors import Sensors
 
     world, seed = experiment.world, experiment.seed
-    wind = Wind(world.wind, _generator(seed, "wind")) if world.wind.blows else None
-    noise, turn_noise = _generator(seed, "odometry noise"), _generator(seed, "attitude noise")
+    noise, turn_noise, air = (
+        generator(seed, name, experiment.stream)
+        for name in ("odometry noise", "attitude noise", "wind")
+    )
+    wind = Wind(world.wind, air) if world.wind.blows else None
     return WorldEndpoint(
         build_robot(world, experiment.guard, wind),
         Sensors(world.sensors, noise, turn_noise),
@@ -226,13 +238,15 @@ def build_cloud(
     cpu_clock: Callable[[], int] | None = None,
     make_loop: Callable[..., ControlLoop] = ControlLoop,
     channel: ControllerChannel | None = None,
+    compute: ComputeTime | None = None,
 ) -> CloudEndpoint:
     """Build cloud: plug-ins, and cloud's end of the tunnel.
 
     `teleop` provides the setpoints. `clock` returns cloud's monotonic time [ns]. In virtual time,
     `cpu_clock` returns the processor time of this thread [ns], which delays commands if
     `cloud.compute_measured` is set. `make_loop` is called in place of `ControlLoop`, for example to
-    make a loop that lies. `channel` leads to a program outside that controls the robot.
+    make a loop that lies. `channel` leads to a program outside that controls the robot. `compute`
+    takes the place of the time that the experiment says.
     """
     cloud = experiment.cloud
     controller = build_controller(experiment)
@@ -253,7 +267,8 @@ def build_cloud(
     )
     if remote is not None and channel is not None:
         remote.connect(channel, loop.period_ns * 1e-9, loop.counts, lambda: loop.newest)
-    compute = build_compute_time(experiment, cpu_clock if cloud.compute_measured else None)
+    if compute is None:
+        compute = build_compute_time(experiment, cpu_clock if cloud.compute_measured else None)
     newest_wins = experiment.tunnel.order == "newest"
     return CloudEndpoint(
         loop, teleop, identity, newest_wins=newest_wins, compute=compute, start_ns=clock()
@@ -268,8 +283,8 @@ def build_compute_time(
     if not (cloud.compute_ms or cpu_clock):
         return None
     times = cloud.compute_ms * MS_TO_NS, cloud.compute_deviation_ms * MS_TO_NS
-    rng = _generator(experiment.seed, "compute time")
-    return ComputeTime(*times, rng, cpu_clock, cloud.cpu_share)
+    draws = generator(experiment.seed, "compute time", experiment.stream)
+    return ComputeTime(*times, draws, cpu_clock, cloud.cpu_share)
 
 
 def build_controller(experiment: ResolvedExperiment) -> Controller:
@@ -286,9 +301,23 @@ def _facts_of(experiment: ResolvedExperiment) -> RobotFacts:
 
 def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDirection]:
     """Build the uplink and the downlink of the emulated network."""
-    profiles, seed = (experiment.uplink, experiment.downlink), experiment.seed
-    up, down = map(link_profile, profiles)
-    return LinkDirection(up, seed, uplink=True), LinkDirection(down, seed, uplink=False)
+    up, down = map(link_profile, (experiment.uplink, experiment.downlink))
+    if experiment.cell.rate_kbit is not None:  # packets get their order behind the cell
+        up, down = replace(up, keep_order=False), replace(down, keep_order=False)
+    seed, stream = experiment.seed, experiment.stream
+    return (
+        LinkDirection(up, seed, uplink=True, stream=stream),
+        LinkDirection(down, seed, uplink=False, stream=stream),
+    )
+
+
+def phase_ns(experiment: ResolvedExperiment) -> int:
+    """Return the time at which a robot and its cloud begin [ns]: 0, but for robots of a fleet."""
+    if not experiment.stream or experiment.fleet.phase == "equal":
+        return 0
+    slower = min(experiment.world.odometry_rate_hz, experiment.cloud.command_rate_hz)
+    draws = generator(experiment.seed, "phase", experiment.stream)
+    return int(draws.integers(SECOND_NS // slower))
 
 
 def build_plan(experiment: ResolvedExperiment) -> Plan:
@@ -297,6 +326,7 @@ def build_plan(experiment: ResolvedExperiment) -> Plan:
         experiment.mission,
         experiment.criteria.time_limit_s,
         experiment.seed,
+        stream=experiment.stream,
         fence=steered_in(experiment.world),
         speed_max=experiment.guard.speed_max_mps,
         turn_rate_max=experiment.guard.yaw_rate_max_radps,
@@ -308,6 +338,7 @@ def mission_plan(
     time_limit: float | None,
     seed: int = 0,
     *,
+    stream: str = "",
     fence: Fence,
     speed_max: float = inf,
     turn_rate_max: float = inf,
@@ -315,15 +346,15 @@ def mission_plan(
     """Convert a valid mission to a plan for teleop.
 
     `time_limit` is the time limit of the mission [s]; None: as long as the mission may need. `seed`
-    is the seed of random setpoints, `fence` that of the scene, `speed_max` the guard's speed limit
-    [m/s], `turn_rate_max` its limit of the yaw rate [rad/s].
+    and `stream` are those of random setpoints, `fence` that of the scene, `speed_max` the guard's
+    speed limit [m/s], `turn_rate_max` its limit of the yaw rate [rad/s].
     """
     track = read_setpoints(Path(mission.setpoints), fence) if mission.setpoints else ()
     if track:
         legs: tuple[Leg, ...] = (Leg(track[0][1], tolerance=inf, time_limit=inf),)
         needed = LEG_FACTOR * track[-1][0]
     elif mission.steps is not None:
-        legs = _step_legs(mission.steps, seed)
+        legs = _step_legs(mission.steps, seed, stream)
         needed = LEG_FACTOR * mission.steps.count * mission.steps.period_s
     else:
         limits = speed_max, turn_rate_max
@@ -407,9 +438,9 @@ def _leg(
     )
 
 
-def _step_legs(steps: schema.Steps, seed: int) -> tuple[Leg, ...]:
+def _step_legs(steps: schema.Steps, seed: int, stream: str) -> tuple[Leg, ...]:
     """Make random setpoints. Each lasts one period, even if the robot does not arrive."""
-    rng = _generator(seed, "steps")
+    rng = generator(seed, "steps", stream)
     offsets = rng.uniform(-1.0, 1.0, (steps.count, 3)) * steps.range_m + steps.centre_m
     limit = 10 * steps.period_s
     return tuple(
@@ -418,6 +449,7 @@ def _step_legs(steps: schema.Steps, seed: int) -> tuple[Leg, ...]:
     )
 
 
-def _generator(seed: int, stream: str) -> np.random.Generator:
-    """Make a random number generator; generators with different names `stream` are independent."""
+def generator(seed: int, *names: str) -> np.random.Generator:
+    """Make a random number generator; generators with different `names` are independent."""
+    stream = " ".join(filter(None, names))
     return np.random.Generator(np.random.PCG64([seed, int.from_bytes(stream.encode(), "little")]))

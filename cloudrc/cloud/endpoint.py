@@ -202,6 +202,11 @@ class CloudEndpoint(TunnelEnd):
         """Return when cloud has to send a computed command or to compute the next command [ns]."""
         return self._tick_ns if self._unsent is None else self._unsent[0]
 
+    def finish(self, now_ns: int) -> None:
+        """Let the computation of the present command end at `now_ns` [ns]."""
+        if self._unsent is not None:
+            self._unsent = now_ns, self._unsent[1]
+
     def handle_deadline(self, now_ns: int) -> None:
         """Send the datagrams that are due at `now_ns` [ns]; skip missed periods."""
         if now_ns < self.next_deadline_ns():

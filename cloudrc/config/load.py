@@ -7,6 +7,7 @@ error lists all problems of an experiment, each with its file and line.
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from math import inf
@@ -37,6 +38,7 @@ from cloudrc.config.resolved import (
     PLAN_MAX_S,
     Bounds,
     ResolvedExperiment,
+    dump,
     speed_cap,
 )
 from cloudrc.config.robot import DEFAULT_LIMITS, known_robot
@@ -50,8 +52,8 @@ from cloudrc.config.schema import (
 )
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.obstacles import fence_of
-from cloudrc.link.traces import read_trace
-from cloudrc.outside.document import Document, KeyPath, read_document
+from cloudrc.link.traces import read_lines, read_trace
+from cloudrc.outside.document import Document, KeyPath, parse_value, read_document
 from cloudrc.outside.reuse import reuse, reuse_results
 
 _NO_BOUNDS = Bounds(DEFAULT_LIMITS.model_copy(update={"acceleration_max_mps2": inf}), inf)
@@ -84,7 +86,8 @@ def load_experiment(
     BadInputError that lists the experiment's problems.
     """
     name = str(name)
-    document, found = _combine(name, settings, build=build, flown=flown)
+    changes = settings if isinstance(settings, dict) else overrides.parse_settings(settings)
+    document, found = _combine(name, changes, build=build, flown=flown)
     lost = _resolve_paths(document)
     draft = problems.validate(document, Experiment, name, found if flown else found + lost)
     guard, facts = draft.guard, None
@@ -101,18 +104,26 @@ def load_experiment(
     else:
         overrides.name_plugins(document, draft.cloud)
     experiment = problems.validate(document, ResolvedExperiment, name, found, context=bounds)
+    if not flown:
+        fleet = experiment.fleet
+        for number in range(min(len(fleet.vary), fleet.robots)):
+            only = {
+                ("fleet", "only"): overrides.Setting(number, document.source(("fleet", "vary")))
+            }
+            load_experiment(name, changes | only, build=build)
     return experiment if flown else _judge(document, experiment, name)
 
 
 def _combine(
-    name: str, settings: Iterable[str] | Settings, *, build: bool, flown: bool
+    name: str, changes: Settings, *, build: bool, flown: bool
 ) -> tuple[Document, list[ConfigProblem]]:
     """Read an experiment, apply settings, and replace the names of mission and profile.
 
     Also return the problems of these two.
     """
     document, found = shipped.read("experiment", name, Path()), list[ConfigProblem]()
-    changes = settings if isinstance(settings, dict) else overrides.parse_settings(settings)
+    with problems.collect(found, ("fleet", "vary")):
+        changes = _settings_of_robot(document, changes)
     inner = {path: value for path, value in changes.items() if _is_inside_name(path)}
     _default(document, ("name",), Path(name).stem)
     if changes and _has_all_values(document) and not flown:
@@ -138,6 +149,53 @@ def _combine(
     return document, found
 
 
+def _settings_of_robot(document: Document, changes: Settings) -> Settings:
+    """Apply the settings of the fleet; return the others and those of its robot `fleet.only`."""
+    of_fleet = {path: value for path, value in changes.items() if path[0] == "fleet"}
+    overrides.apply_overrides(document, of_fleet)
+    others = {path: value for path, value in changes.items() if path not in of_fleet}
+    place, source = ("fleet", "vary"), document.source(("fleet", "vary"))
+    if isinstance(vary := document.get(*place), str):
+        vary = _read_robots(source.absolute(vary))
+        document.set_value(place, vary, source)
+    if not (isinstance(vary, list) and vary and all(isinstance(each, dict) for each in vary)):
+        return others
+    for robot in vary:
+        for key, value in robot.items():
+            if key.startswith(("fleet", "cell", "cloud.cores", "cloud.sharing")):
+                raise BadInputError(f"{key} is the same for all robots")
+            if isinstance(value, str) and value.startswith("."):
+                robot[key] = str(source.absolute(value))
+    if type(only := document.get("fleet", "only")) is not int:
+        return others
+    document.tree["fleet"]["vary"] = []
+    given = ((key, value, source) for key, value in vary[only % len(vary)].items())
+    own = others | overrides.collect_settings(given)
+    return dict(sorted(own.items(), key=lambda each: len(each[0])))
+
+
+def _read_robots(path: Path) -> list[dict[str, Any]]:
+    """Read a CSV file with a key in each column and the settings of a robot in each row."""
+    rows = csv.DictReader(read_lines(path, f"fleet {path}", "give a CSV file: KEY,KEY"))
+    return [
+        {key: parse_value(value, f"{path.name}: {key}") for key, value in row.items()}
+        for row in rows
+    ]
+
+
+def robots_of(experiment: ResolvedExperiment) -> list[ResolvedExperiment]:
+    """Return the experiment of each robot of a fleet, with which it also flies alone."""
+    fleet = experiment.fleet
+    numbers = range(fleet.robots) if fleet.only is None else [fleet.only]
+    if not fleet.vary:
+        alone = (fleet.model_copy(update={"only": number}) for number in numbers)
+        return [experiment.model_copy(update={"fleet": each}) for each in alone]
+    with TemporaryDirectory() as folder:
+        config = Path(folder) / "config.yaml"
+        config.write_text(dump(experiment), encoding="utf-8")
+        return [load_experiment(config, [f"fleet.only={number}"]) for number in numbers]
+
+
 def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> ResolvedExperiment:
     """Check that the mission fits the scene and the robot, and complete it with what they give."""
     mission, robot = experiment.mission, known_robot(experiment.world.robot)
@@ -149,8 +207,11 @@ def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> Res
 
 
 def _without_effect(document: Document, experiment: ResolvedExperiment) -> Iterator[ConfigProblem]:
-    """List the settings of the link that a trace replaces: their flights would all be equal."""
+    """List the settings of the link that another key replaces: their flights would be equal."""
     for way in DIRECTIONS:
+        if experiment.cell.rate_kbit is not None and getattr(experiment, way).rate_kbit is not None:
+            path = "link", way, "rate_kbit"
+            yield ConfigProblem(path, "", "the cell is the bottleneck; set this to null")
         trace = getattr(experiment, way).trace
         if trace is None:
             continue

@@ -128,6 +128,17 @@ class ResolvedExperiment(Experiment):
     cloud: ResolvedCloud
 
     @property
+    def is_fleet(self) -> bool:
+        """Whether the experiment flies several robots, or a robot in a cell."""
+        fleet = self.fleet
+        return self.cell.rate_kbit is not None or (fleet.robots > 1 and fleet.only is None)
+
+    @property
+    def stream(self) -> str:
+        """Name of the robot's random numbers; "" for robot 0."""
+        return f"robot {self.fleet.only}" if self.fleet.only else ""
+
+    @property
     def uplink(self) -> DirectionConfig:
         """Conditions of the link from world to cloud."""
         return self.link.uplink

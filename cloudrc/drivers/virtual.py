@@ -60,11 +60,13 @@ class VirtualRun:
         downlink: LinkDirection,
         *,
         cloud_clock: Clock = Clock(),
+        in_flight: PacketQueue | None = None,
     ) -> None:
+        """Connect the ends; `in_flight` is a queue that lets packets pass a cell first."""
         self._world, self._cloud = world, cloud
         self._uplink, self._downlink = uplink, downlink
         self.cloud_clock = cloud_clock
-        self._in_flight = PacketQueue()
+        self.in_flight = PacketQueue() if in_flight is None else in_flight
         self.now_ns = 0
 
     def fly(self, until: Callable[[], bool], limit_ns: int, sink: Sink) -> None:
@@ -76,13 +78,23 @@ class VirtualRun:
         gc.disable()  # a flight makes no reference cycles, so that collections would waste time
         try:
             while self.now_ns < limit_ns:
-                self._advance(min(self.now_ns + PERIOD_NS, limit_ns))
-                sink(self._world.take_records(), self._cloud.take_records())
+                self.advance(min(self.now_ns + PERIOD_NS, limit_ns))
+                sink(*self.take_records())
                 if until():
                     return
         finally:
             if gc_was_on:
                 gc.enable()
+
+    def take_records(self) -> tuple[list[Record], list[Record]]:
+        """Return the new records of world and of cloud."""
+        return self._world.take_records(), self._cloud.take_records()
+
+    @property
+    def next_ns(self) -> int:
+        """Time of the next event [ns]."""
+        cloud_ns = self.cloud_clock.when(self._cloud.next_deadline_ns())
+        return min(self.in_flight.next_ns, self._world.next_deadline_ns(), cloud_ns)
 
     def on_world_clock(self, from_cloud: list[Record]) -> list[Record]:
         """Convert the stamps of cloud's records [ns] to virtual time, which is world's clock."""
@@ -91,9 +103,9 @@ class VirtualRun:
         when = self.cloud_clock.when
         return [record._replace(stamp_ns=when(record.stamp_ns)) for record in from_cloud]
 
-    def _advance(self, end_ns: int) -> None:
+    def advance(self, end_ns: int) -> None:
         """Handle all events up to and including `end_ns` [ns]."""
-        world, cloud, in_flight = self._world, self._cloud, self._in_flight
+        world, cloud, in_flight = self._world, self._cloud, self.in_flight
         clock = None if self.cloud_clock == Clock() else self.cloud_clock  # None takes less time
         world_ns, cloud_ns = world.next_deadline_ns(), cloud.next_deadline_ns()
         cloud_ns = clock.when(cloud_ns) if clock else cloud_ns
@@ -132,4 +144,4 @@ class VirtualRun:
                 header, size = data[:3], data.size
             else:
                 header, size = peek(data), len(data)
-            self._in_flight.send(link, header, size, data, self.now_ns)
+            self.in_flight.send(link, header, size, data, self.now_ns)

@@ -19,7 +19,6 @@ from gymnasium import spaces
 from cloudrc.assembly import assemble, build_links, flight_limit
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.loop import ControlLoop
-from cloudrc.config.load import load_experiment
 from cloudrc.config.problems import problem_at
 from cloudrc.config.robot import is_planar
 from cloudrc.config.schema import Link
@@ -31,6 +30,7 @@ from cloudrc.outside.values import RESULT
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
+from cloudrc.runs.experiment import load
 from cloudrc.runs.requirements import SIM, require
 
 if TYPE_CHECKING:
@@ -157,11 +157,10 @@ class RobotEnv(gymnasium.Env[Any, Any]):
                 raise problem_at(key, "is the affair of Networked and the policy; leave it out")
         texts = {**(settings or {}), **OWN, **({"world.robot": robot} if robot else {})}
         self.render_mode = render_mode
-        loaded = load_experiment(
+        loaded = load(
             experiment, [f"{key}={json.dumps(value, default=str)}" for key, value in texts.items()]
         )
         self.experiment = loaded.model_copy(update={"link": Link(profile="ideal")})
-        measure.check(self.experiment.report.metrics)
         guard = self.experiment.guard
         axes = PLANE if is_planar(self.experiment.world.robot) else SPACE
         self._parts = (*axes, "yaw rate")

@@ -119,6 +119,16 @@ class LinkDirection:
         """The conditions, if packets do not act on each other and the conditions never change."""
         return self._only if self._plain else None
 
+    @property
+    def shortest_ns(self) -> int:
+        """A time that no packet's delay is below [ns]: the delay less the largest jitter."""
+        profile = self._profile
+        least = -profile.quantiles[0] if profile.quantiles else 0.0
+        spread = {"uniform": 1.0, "normal": 9.0, "pareto": 0.7, "table": least}
+        below = spread[profile.distribution] * 1e9
+        delays = (piece.delay_ns - below * piece.jitter for piece in self._timeline.pieces)
+        return 0 if profile.reorder else max(0, int(min(delays)) - 1)
+
     def corrupted(self, epoch: int, kind: int, counter: int, data: bytes) -> bytes:
         """Return the content of a datagram as it arrives: unchanged, or with one bit flipped.
 

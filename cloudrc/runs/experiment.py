@@ -21,10 +21,17 @@ WARNINGS_MAX = 3
 """Largest number of warnings about more than two experiments."""
 
 
-def load(name: str, overrides: Iterable[str], seed: int | None = None) -> ResolvedExperiment:
-    """Load an experiment by name or path with `overrides` (KEY=VALUE); check `report.metrics`."""
+def load(
+    name: str, overrides: Iterable[str], seed: int | None = None, *, fleets: bool = False
+) -> ResolvedExperiment:
+    """Load an experiment by name or path with `overrides` (KEY=VALUE); check `report.metrics`.
+
+    Without `fleets`, it must be the flight of one robot.
+    """
     seeds = [] if seed is None else [f"seed={seed}"]
     experiment = load_experiment(name, [*overrides, *seeds])
+    if not fleets:
+        check_alone(experiment)
     measure.check(experiment.report.metrics)
     return experiment
 
@@ -38,11 +45,20 @@ def check_no_seed(texts: Iterable[str]) -> None:
         raise problem_at("seed", "each flight has its own seed; give their number with --seeds")
 
 
+def check_alone(experiment: ResolvedExperiment) -> None:
+    """Check that an experiment is the flight of one robot, which needs no cell."""
+    if experiment.is_fleet:
+        text = "a fleet, or a robot in a cell, flies with `cloudrc run --mode virtual` only"
+        raise problem_at("fleet", f"{text}; fleet.only=0 is its robot 0 alone")
+
+
 def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
     """Check that an experiment can fly in a mode, before a folder is made.
 
     `mode` is "virtual", "local" or "cluster".
     """
+    if mode != "virtual":
+        check_alone(experiment)
     if mode != "virtual" and (experiment.cloud.clock_offset_s or experiment.cloud.clock_drift_ppm):
         text = "acts, as clock_drift_ppm, in virtual time only; use --mode virtual, or leave it out"
         raise problem_at("cloud.clock_offset_s", text)

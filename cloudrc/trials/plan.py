@@ -31,7 +31,7 @@ from cloudrc.metrics import measure
 from cloudrc.outside.document import Document, Source, parse_yaml, read_document, write_yaml
 from cloudrc.outside.reuse import reuse, reuse_results
 from cloudrc.runs import flight
-from cloudrc.runs.experiment import check_world
+from cloudrc.runs.experiment import check_alone, check_world
 from cloudrc.trials.fingerprint import experiment_facts, fingerprint
 from cloudrc.trials.rows import Row
 from cloudrc.trials.summary import RATIO
@@ -152,6 +152,7 @@ class Draft(NamedTuple):
                 "with the key 'seeds' of a sweep"
             )
         resolved = load_experiment(self.experiment, settings)
+        check_alone(resolved)
         try:
             check_world(resolved.world, turns=resolved.mission.turns)
         except ProblemsError as error:

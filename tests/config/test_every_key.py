@@ -43,6 +43,13 @@ def test_out_of_range_is_refused(key):
 
 def test_every_key_is_described_and_dumped():
     text = dump(load_experiment("paper"))
-    optional = ("mission.steps", "mission.carrot", ".loss.", ".changes.0", ".blackouts.0")
+    optional = (
+        "mission.steps",
+        "mission.carrot",
+        ".loss.",
+        ".changes.0",
+        ".blackouts.0",
+        ".traffic.0",
+    )
     for key in FORMS:
         assert any(part in key for part in optional) or f"{key.rpartition('.')[2]}:" in text, key

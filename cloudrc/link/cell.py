@@ -1,0 +1,275 @@
+"""A radio cell: one medium that serves the packets of many robots one after another.
+
+Which packet leaves next is decided when the packet before it has left. So the cell is no function
+of one packet, as a bottleneck of a link is, but goes on with time, step by step: it gets all
+packets sent before an instant, and tells which leave until this instant.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from math import inf
+from typing import Any, Literal, NamedTuple, Protocol
+
+from cloudrc.link.model import HEADER_BYTES
+from cloudrc.link.queue import NOTHING_NS
+
+QUANTUM = 1500
+"""What a robot may send in its turn with the queue drr [bytes].
+Source: M. Shreedhar, G. Varghese, "Efficient fair queueing using deficit round robin", 1995."""
+FRAME_NS, VIDEO_BYTES = 33_333_333, 1228
+"""Time between two frames of a video [ns], and size of its packets with headers [bytes]."""
+BULK_BYTES, ROUND_TRIP_NS, WINDOW_MAX = 1500, 40_000_000, 2000.0
+"""Size of a packet of a bulk flow with headers [bytes]; time from its departure to its confirmation
+[ns]; largest number of its packets under way."""
+
+
+class Packet(NamedTuple):
+    """A packet that is sent through a cell; packets of one instant keep the order of the fields."""
+
+    sent_ns: int
+    way: int  # 0: uplink, 1: downlink, 2: of others
+    flow: int  # number of the robot; below 0: of others
+    number: int  # of the packet in its flow
+    kind: int
+    size: int  # with headers [bytes]
+    delay_ns: int = 0  # behind the cell [ns]
+    data: Any = None
+
+
+@dataclass(slots=True)
+class Usage:
+    """What a cell has done within a time."""
+
+    packets: int = 0  # that began to leave
+    size: int = 0  # of these [bytes]
+    busy_ns: int = 0
+    waited_ns: int = 0  # sum over all packets
+    longest_ns: int = 0  # longest wait [ns]
+    most: int = 0  # largest number of waiting packets
+    dropped: dict[int, int] = field(default_factory=dict)  # flow -> packets
+
+
+class Traffic(Protocol):
+    """Others in the cell."""
+
+    next_ns: int
+
+    def fire(self, cell: Cell) -> None:
+        """Send what is due at `next_ns`."""
+
+    def leave(self, now_ns: int) -> None:
+        """Note that a packet of this traffic has left at `now_ns` [ns]."""
+
+
+class Cell:
+    """One direction of a cell, or both if they share the medium.
+
+    Attributes:
+        inbox: Packets that are sent, in any order, for the next `advance`.
+        done_ns: When the packet in service leaves [ns]; `NOTHING_NS` if there is none.
+        usage: Sums since the start, or since somebody has replaced them.
+    """
+
+    def __init__(
+        self,
+        rate: float,
+        queue: Literal["fifo", "drr", "priority", "newest"] = "fifo",
+        packets_max: int = 1000,
+        airtime_ns: int = 0,
+    ) -> None:
+        """Create an idle cell of `rate` [bit/s]; `airtime_ns` is what each packet costs more [ns].
+
+        `packets_max` is the size of a queue, with the packet in service.
+        """
+        self._rate, self._queue, self._packets_max = rate, queue, packets_max
+        self._airtime_ns = airtime_ns
+        self._lanes: dict[int, dict[Any, Packet]] = {}  # lane -> place -> packet, oldest first
+        self._turn, self._deficits = deque[int](), dict[int, int]()  # of drr
+        self._serving: Packet | None = None
+        self._waiting = 0
+        self.traffic: dict[int, Traffic] = {}  # flow -> source
+        self.inbox: list[Packet] = []
+        self.done_ns = NOTHING_NS
+        self.usage = Usage()
+
+    def service_ns(self, size: int) -> int:
+        """Return how long the cell serves a packet of `size` [bytes], with headers."""
+        return round(size * 8e9 / self._rate) + self._airtime_ns
+
+    @property
+    def next_ns(self) -> int:
+        """Time of the next departure or of the next packet of others [ns]."""
+        return min([self.done_ns, *(source.next_ns for source in self.traffic.values())])
+
+    def soonest_ns(self, now_ns: int) -> int:
+        """Return a time before which no packet leaves [ns], also if robots send at `now_ns`."""
+        if self._serving is not None:
+            return self.done_ns
+        return now_ns + self.service_ns(HEADER_BYTES)
+
+    def advance(self, until_ns: int) -> list[Packet]:
+        """Take the packets sent before `until_ns` [ns]; return those that leave up to this time.
+
+        Their `sent_ns` is then the time of leaving. At equal times packets leave first; then come
+        new ones: by direction, robot and number, and at last those of others.
+        """
+        inbox, self.inbox, gone = sorted(self.inbox), [], list[Packet]()
+        inbox.reverse()
+        while True:
+            sent_ns = inbox[-1].sent_ns if inbox else NOTHING_NS
+            other_ns, others = min(
+                ((source.next_ns, -flow) for flow, source in self.traffic.items()),
+                default=(NOTHING_NS, 0),
+            )
+            if self.done_ns <= min(sent_ns, other_ns):
+                if self.done_ns > until_ns:
+                    return gone
+                gone += self._leave(self.done_ns)
+            elif sent_ns <= other_ns:
+                self.put(inbox.pop())
+            elif other_ns < until_ns:
+                self.traffic[-others].fire(self)
+            else:
+                return gone
+
+    def put(self, packet: Packet) -> bool:
+        """Let a packet wait; return False if it is dropped, because the queue is full."""
+        flow, lane = packet.flow, self._lane(packet)
+        waiting = self._lanes.setdefault(lane, {})
+        place: tuple[int, ...] = (flow, packet.number)
+        if self._queue == "newest" and flow >= 0:
+            place = flow, packet.kind, packet.way
+            if place in waiting:
+                self._drop(flow)
+                self._waiting -= 1
+        elif len(waiting) + self._is_serving(lane) >= self._packets_max:
+            self._drop(flow)
+            return False
+        waiting[place] = packet
+        self._waiting += 1
+        self.usage.most = max(self.usage.most, self._waiting)
+        if self._queue == "drr" and lane not in self._deficits:
+            self._turn.append(lane)
+            self._deficits[lane] = QUANTUM
+        if self._serving is None:
+            self._serve(packet.sent_ns)
+        return True
+
+    def _lane(self, packet: Packet) -> int:
+        """Return the number of the queue in which a packet waits; lower ones leave first."""
+        if self._queue == "drr":
+            return packet.flow
+        return int(self._queue == "priority" and packet.flow < 0)
+
+    def _is_serving(self, lane: int) -> bool:
+        return self._serving is not None and self._lane(self._serving) == lane
+
+    def _drop(self, flow: int) -> None:
+        dropped = self.usage.dropped
+        dropped[flow] = dropped.get(flow, 0) + 1
+
+    def _leave(self, now_ns: int) -> Iterable[Packet]:
+        """Serve the next packet; return the one that has left, if it is a robot's."""
+        packet = self._serving
+        assert packet is not None, "the cell serves a packet"
+        self._serving, self.done_ns = None, NOTHING_NS
+        self._serve(now_ns)
+        if packet.flow >= 0:
+            return (packet._replace(sent_ns=now_ns),)
+        self.traffic[packet.flow].leave(now_ns)
+        return ()
+
+    def _serve(self, now_ns: int) -> None:
+        """Begin to serve the next packet, if one waits."""
+        lane = self._next_lane()
+        if lane is None:
+            return
+        waiting, usage = self._lanes[lane], self.usage
+        packet = self._serving = waiting.pop(next(iter(waiting)))
+        self._waiting -= 1
+        service_ns, wait_ns = self.service_ns(packet.size), now_ns - packet.sent_ns
+        self.done_ns = now_ns + service_ns
+        usage.packets += 1
+        usage.size += packet.size
+        usage.busy_ns += service_ns
+        usage.waited_ns += wait_ns
+        usage.longest_ns = max(usage.longest_ns, wait_ns)
+
+    def _next_lane(self) -> int | None:
+        """Return the queue from which the next packet leaves; None if nothing waits."""
+        if self._queue != "drr":
+            return next((lane for lane in sorted(self._lanes) if self._lanes[lane]), None)
+        while self._turn:
+            lane = self._turn[0]
+            waiting = self._lanes[lane]
+            if not waiting:
+                self._turn.popleft()
+                del self._deficits[lane]
+                continue
+            size = next(iter(waiting.values())).size
+            if size <= self._deficits[lane]:
+                self._deficits[lane] -= size
+                return lane
+            self._deficits[lane] += QUANTUM
+            self._turn.rotate(-1)
+        return None
+
+
+class Video:
+    """Frames of equal size at a constant rate, cut into packets; it does not react to losses."""
+
+    def __init__(self, flow: int, rate: float, start_ns: int) -> None:
+        """Set the mean `rate` [bit/s] and the time of the first frame [ns]."""
+        self._flow, self._sent, self.next_ns = flow, 0, start_ns
+        self._packets = max(1, round(rate * FRAME_NS / 8e9 / VIDEO_BYTES))
+
+    def fire(self, cell: Cell) -> None:
+        """Send a frame."""
+        for _ in range(self._packets):
+            self._sent += 1
+            cell.put(Packet(self.next_ns, 2, self._flow, self._sent, 0, VIDEO_BYTES))
+        self.next_ns += FRAME_NS
+
+    def leave(self, now_ns: int) -> None:
+        """Nothing depends on it."""
+
+
+class Bulk:
+    """A flow that fills the queue: its window grows until a drop, and then becomes half as large.
+
+    It is no TCP: the window grows by one packet per confirmed packet up to the first drop and then
+    by one per round trip. Nothing is sent again, and confirmations neither queue nor get lost.
+    """
+
+    def __init__(self, flow: int, start_ns: int) -> None:
+        """Set the time of the first packet [ns]."""
+        self._flow, self._sent, self.next_ns = flow, 0, start_ns
+        self._window, self._flying, self._threshold, self._halved_ns = 10.0, 0, inf, -1
+        self._confirmed: list[int] = []
+
+    def fire(self, cell: Cell) -> None:
+        """Take the confirmations that are due, and send as many packets as the window allows."""
+        now_ns = self.next_ns
+        while self._confirmed and self._confirmed[0] <= now_ns:
+            heappop(self._confirmed)
+            self._flying -= 1
+            growth = 1.0 if self._window < self._threshold else 1.0 / self._window
+            self._window = min(WINDOW_MAX, self._window + growth)
+        self.next_ns = self._confirmed[0] if self._confirmed else now_ns + ROUND_TRIP_NS
+        while self._flying < int(self._window):
+            self._sent += 1
+            if not cell.put(Packet(now_ns, 2, self._flow, self._sent, 0, BULK_BYTES)):
+                if now_ns > self._halved_ns:
+                    self._window = self._threshold = max(2.0, self._window / 2)
+                    self._halved_ns = now_ns + ROUND_TRIP_NS
+                return
+            self._flying += 1
+
+    def leave(self, now_ns: int) -> None:
+        """Expect the confirmation of a packet that has left at `now_ns` [ns]."""
+        heappush(self._confirmed, now_ns + ROUND_TRIP_NS)
+        self.next_ns = min(self.next_ns, self._confirmed[0])

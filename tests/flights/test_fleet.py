@@ -1,0 +1,103 @@
+"""Robots of a fleet act on each other through the cell and the shared cloud alone."""
+
+import pytest
+
+from cloudrc.config.load import load_experiment, robots_of
+from cloudrc.record.columns import Recording, RecordStore
+from cloudrc.runs.fleet import assemble_fleet
+from cloudrc.runs.flight import fly_in_memory
+from tests.config.conftest import refused
+
+SHORT = ("mission.steps.count=1", "mission.steps.period_s=0.5", "criteria.time_limit_s=1")
+VARIED = "fleet.vary=[{world.robot: x2, seed: 4}, {link.both.delay_ms: 60, link.both.loss: 0.02}]"
+CLOCK = "cloud.clock_offset_s=5"
+LATE = ("cloud.compute_ms=8", "cloud.compute_deviation_ms=4", "cloud.cores=1")
+
+
+def alone(*settings):
+    return fly_in_memory(load_experiment("steps", (*SHORT, *settings))).records_sha256
+
+
+def in_fleet(*settings):
+    """Fly a fleet; return the hash of each robot's records."""
+    experiment = load_experiment("steps", (*SHORT, *settings))
+    robots = robots_of(experiment)
+    stores = [RecordStore() for _ in robots]
+    assemble_fleet(experiment, robots, [store.add for store in stores]).run.fly()
+    return [Recording(records=store).sha256 for store in stores]
+
+
+@pytest.mark.parametrize("own", [(), (VARIED,), ("fleet.phase=equal", CLOCK)])
+def test_without_contention_each_robot_flies_as_alone(own):
+    flown = in_fleet("fleet.robots=3", *own)
+    assert flown == [alone("fleet.robots=3", *own, f"fleet.only={k}") for k in range(3)]
+    assert len({*flown}) == 3
+
+
+def test_robot_0_flies_as_without_a_fleet():
+    assert in_fleet("fleet.robots=2")[0] == alone() == alone("fleet.robots=1")
+
+
+def test_a_cell_without_limits_is_no_cell():
+    fleet = "fleet.robots=3", VARIED
+    assert in_fleet(*fleet, "cell.rate_kbit=1e12") == in_fleet(*fleet)
+
+
+@pytest.mark.parametrize(
+    ("queue", "rate", "packets"), [("fifo", 200, 1000), ("fifo", 150, 20), ("drr", 150, 20)]
+)
+def test_one_robot_in_a_cell_is_a_robot_behind_a_bottleneck(queue, rate, packets):
+    odd = "link.both.keep_order=true", "link.both.duplicate=0.05", "link.both.corrupt=0.01"
+    cell = f"cell.rate_kbit={rate}", f"cell.queue_packets={packets}", f"cell.queue={queue}"
+    link = f"link.both.rate_kbit={rate}", f"link.both.queue_packets={packets}"
+    assert in_fleet(*odd, *cell) == [alone(*odd, *link)]
+
+
+@pytest.mark.parametrize("sharing", ["fifo", "ps"])
+def test_one_cloud_on_shared_cores_computes_as_alone(sharing):
+    flown = in_fleet(CLOCK, *LATE, "cell.rate_kbit=1e12", f"cloud.sharing={sharing}")
+    assert flown == [alone(CLOCK, *LATE[:2])]
+
+
+@pytest.mark.parametrize(
+    ("queue", "sharing"), [("fifo", "ps"), ("drr", "fifo"), ("priority", "ps"), ("newest", "fifo")]
+)
+def test_a_fleet_with_contention_flies_twice_alike(queue, sharing):
+    traffic = "cell.traffic=[{kind: bulk}, {kind: video, rate_kbit: 300, direction: downlink}]"
+    cell = f"cell.queue={queue}", "cell.rate_kbit=3000", "cell.shared=true", "cell.airtime_us=100"
+    fleet = "fleet.robots=4", *cell, traffic, *LATE, f"cloud.sharing={sharing}", "fleet.phase=equal"
+    flown = in_fleet(*fleet)
+    assert flown == in_fleet(*fleet)
+    assert len({*flown}) == 4
+
+
+def test_how_far_robots_fly_on_alone_changes_nothing(monkeypatch):
+    fleet = "fleet.robots=3", "cell.rate_kbit=500", "cell.queue=newest", *LATE
+    flown = in_fleet(*fleet)
+    monkeypatch.setattr("cloudrc.link.model.LinkDirection.shortest_ns", 0)
+    assert flown == in_fleet(*fleet)
+
+
+def test_settings_of_single_robots_come_from_a_file_too(tmp_path):
+    table = tmp_path / "robots.csv"
+    table.write_text("world.robot,link.both.delay_ms\nx2,20\npelican,60\n")
+    named = load_experiment("steps", [f"fleet.vary={table}", "fleet.robots=3"])
+    robots = robots_of(named)
+    assert [robot.world.robot for robot in robots] == ["x2", "pelican", "x2"]
+    assert [robot.uplink.delay_ms for robot in robots] == [20.0, 60.0, 20.0]
+    assert [robot.fleet.only for robot in robots] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        (["fleet.only=3", "fleet.robots=3"], "the robots are 0 to 2"),
+        (["fleet.vary=[{cell.rate_kbit: 5}]"], "cell.rate_kbit is the same for all robots"),
+        (["fleet.vary=[{link.both.delay: 5}]"], "did you mean delay_ms"),
+        (["fleet.vary=none.csv"], "none.csv"),
+        (["cell.rate_kbit=5", "link.both.rate_kbit=5"], "the cell is the bottleneck"),
+        (["cloud.cores=2"], "cores needs compute_ms above 0"),
+    ],
+)
+def test_a_fleet_that_cannot_fly_is_refused(settings, why):
+    assert why in refused("steps", *settings)

@@ -1,0 +1,88 @@
+"""A cell serves the packets of many robots one after another."""
+
+import numpy as np
+import pytest
+
+from cloudrc.link.cell import Bulk, Cell, Packet, Usage, Video
+from cloudrc.link.waiting import md1, nddd1
+
+MS = 1_000_000
+RATE = 1e6
+"""Rate at which a packet of 125 bytes takes 1 ms [bit/s]."""
+
+
+def served(cell, *packets, until=1000 * MS):
+    """Send packets, each a time [ms], a robot and perhaps a kind; return who left, and when."""
+    for number, (at, flow, *kind) in enumerate(packets):
+        cell.inbox.append(Packet(round(at * MS), 0, flow, number, *(kind or [0]), 125))
+    return [(packet.sent_ns / MS, packet.flow) for packet in cell.advance(until)]
+
+
+def test_fifo_serves_in_the_order_of_sending_and_drops_what_finds_the_queue_full():
+    cell = Cell(RATE, "fifo", packets_max=2)
+    assert served(cell, (0, 1), (0, 0), (0.5, 2), (1, 3)) == [(1, 0), (2, 1), (3, 3)]
+    assert cell.usage.dropped == {2: 1}
+    assert (cell.usage.waited_ns, cell.usage.longest_ns) == (2 * MS, MS)
+
+
+def test_a_packet_is_served_with_its_airtime():
+    assert served(Cell(RATE, airtime_ns=MS // 2), (0, 0), (0, 1)) == [(1.5, 0), (3, 1)]
+
+
+def test_drr_gives_each_robot_its_share_and_its_own_limit():
+    cell = Cell(RATE, "drr", packets_max=40)
+    greedy = [(0, 0)] * 60
+    assert (2, 1) not in served(cell, *greedy, (0, 1), until=2 * MS)
+    assert cell.usage.dropped == {0: 20}
+    assert served(cell, until=14 * MS)[-2:] == [(13, 1), (14, 0)]  # after 1,500 bytes of robot 0
+
+
+def test_priority_lets_robots_pass_the_traffic_of_others():
+    cell = Cell(RATE, "priority")
+    cell.traffic[-1] = Video(-1, 1e6, 0)
+    left = served(cell, (0.1, 0), until=40 * MS)
+    assert left == [(pytest.approx(1228 * 8e-3 + 1), 0)]
+
+
+def test_newest_replaces_the_waiting_packet_of_the_same_robot_and_kind_alone():
+    cell = Cell(RATE, "newest")
+    left = served(cell, (0, 0), (0.1, 1, 7), (0.2, 2, 7), (0.3, 1, 8), (0.4, 1, 7))
+    assert left == [(1, 0), (2, 1), (3, 2), (4, 1)]
+    assert cell.usage.dropped == {1: 1}
+    assert cell.usage.waited_ns == round((0.6 + 1.8 + 2.7) * MS)  # the newer one has the old place
+
+
+def test_a_bulk_flow_fills_the_queue_and_halves_its_window_at_a_drop():
+    cell = Cell(10e6, "fifo", packets_max=50)
+    cell.traffic[-1] = Bulk(-1, 0)
+    cell.advance(10_000 * MS)
+    assert cell.usage.busy_ns > 0.95 * 10_000 * MS
+    assert 0 < cell.usage.dropped[-1] < 0.05 * cell.usage.packets
+
+
+def test_equal_times_give_an_equal_order_whatever_the_order_of_the_inbox():
+    packets = [(0, flow) for flow in range(5)]
+    assert served(Cell(RATE), *packets) == served(Cell(RATE), *reversed(packets))
+
+
+@pytest.mark.parametrize("senders", [3, 5])
+def test_periodic_senders_wait_as_long_as_theory_says(senders):
+    period, service = 10.0, 1.856  # of a packet of 232 bytes [ms]
+    rng, means = np.random.default_rng(1), []
+    for _ in range(800):
+        cell, phases = Cell(RATE, packets_max=10**6), rng.integers(0, 10 * MS, senders)
+        for n in range(3):
+            cell.usage = Usage()  # the last period counts
+            at_ns = (phases + n * 10 * MS).tolist()
+            cell.inbox = [Packet(at, 0, flow, n, 0, 232) for flow, at in enumerate(at_ns)]
+            cell.advance((n + 1) * 10 * MS - 1)
+        means.append(cell.usage.waited_ns / senders / MS)
+    assert np.mean(means) == pytest.approx(nddd1(senders, period, service), rel=0.03)
+    assert np.mean(means) < md1(senders * service / period, service) / 2
+
+
+def test_theory_knows_the_published_numbers():
+    assert nddd1(5, 10.0, 1.856) == pytest.approx(1.241, rel=2e-3)
+    assert nddd1(1, 10.0, 1.856) == 0.0
+    assert nddd1(6, 10.0, 1.856) == float("inf")
+    assert md1(0.928, 1.856) == pytest.approx(11.96, rel=1e-3)
