@@ -12,7 +12,15 @@ from shlex import quote, split
 from shutil import which
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.output import output_argument, print_line, print_or_drop, print_result, tell, warn
+from cloudrc.cli.output import (
+    output_argument,
+    paint,
+    print_line,
+    print_or_drop,
+    print_result,
+    tell,
+    warn,
+)
 from cloudrc.cli.parser import Options, Parser, flags, read_count, read_seed
 from cloudrc.cli.report import print_traceback, report_arguments, summary
 from cloudrc.cli.where import (
@@ -121,6 +129,11 @@ def fly_once(options: Options, mode: str, ready: Ready | None = None) -> int:
     from cloudrc.runs.own_files import describe_changes
 
     experiment = _experiment(options, is_session=ready is not None)
+    if experiment.is_fleet:
+        if ready or options.beside or options.figures or options.mode not in (None, "virtual"):
+            text = "a fleet flies in virtual time, without --with and --figures"
+            raise BadInputError(f"{text}; fleet.only=0 is its robot 0 alone")
+        mode = "virtual"
     check_mode(experiment, mode)
     warn(experiment)
     if changes := describe_changes(options.experiment, experiment):
@@ -130,16 +143,24 @@ def fly_once(options: Options, mode: str, ready: Ready | None = None) -> int:
     folder = run_folder(experiment, "session" if ready else mode, options.out)
     if options.output == "table":
         facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
-        flown = "session" if ready else experiment.mission.contents
+        flown = "session" if ready else f"{_fleet(experiment)}{experiment.mission.contents}"
         print_or_drop(escape(f"{experiment.name}: {facts}, {flown}"))
     with _place_of_recording(folder):
-        if release:
+        if experiment.is_fleet:
+            report = _fly_fleet(experiment, folder, options)
+        elif release:
             report = _fly_in_cluster(experiment, folder, release, options)
         else:
             report = _fly_here(experiment, folder, mode, ready, options)
     print_traceback(options, report)
     last = "report.html" if options.report == "page" else "report.json"
-    print_result(options.output, report, summary(report, folder, last))
+    if experiment.is_fleet:
+        from cloudrc.report.fleet import summarize_fleet
+
+        text = f"\n{summarize_fleet(report, paint)}\n\n{escape(str(folder / last))}"
+    else:
+        text = summary(report, folder, last)
+    print_result(options.output, report, text)
     return 0 if ready else exit_code(report)
 
 
@@ -152,11 +173,36 @@ def _experiment(options: Options, *, is_session: bool) -> ResolvedExperiment:
     from cloudrc.runs.experiment import load
 
     try:
-        return load(options.experiment, options.set, options.seed)
+        return load(options.experiment, options.set, options.seed, fleets=True)
     except BadInputError:
         if not is_session:
             raise
     return load(options.experiment, ["mission.touch=null", *options.set], options.seed)
+
+
+def _fleet(experiment: ResolvedExperiment) -> str:
+    """Describe the robots and the cell of a fleet; "" for the flight of one robot."""
+    if not experiment.is_fleet:
+        return ""
+    cell, count = (
+        experiment.cell,
+        1 if experiment.fleet.only is not None else experiment.fleet.robots,
+    )
+    place = f" in a cell of {cell.rate_kbit:g} kbit/s ({cell.queue})" if cell.rate_kbit else ""
+    return f"{count} robot{'s' * (count > 1)}{place}, "
+
+
+def _fly_fleet(experiment: ResolvedExperiment, folder: Path, options: Options) -> dict[str, Any]:
+    """Fly a fleet in virtual time; return its report."""
+    from cloudrc.cli.progress import Progress
+    from cloudrc.runs.fleet import fly_fleet
+
+    with Progress("flies the fleet") as view:
+
+        def landed() -> None:
+            view.tell("judges each robot")
+
+        return fly_fleet(experiment, folder, page=options.report == "page", landed=landed)
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from dataclasses import replace
 from math import inf
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, Self, TypeAlias
 
 from cloudrc import assembly, source
 from cloudrc.config.overrides import OUTSIDE, REMOTE
@@ -100,6 +100,60 @@ def _beside(
     return companion(command, folder, url)
 
 
+class VirtualRecorder:
+    """Records a flight in virtual time, and writes its report; mission.mcap gets a copy of it.
+
+    The recording is kept if the run or its report fails; a copy cut short has the experiment.
+    """
+
+    def __init__(self, experiment: ResolvedExperiment, folder: Path, see: See) -> None:
+        """Begin the recording in `folder`, which has the experiment; `see` is that of `fly`."""
+        from cloudrc.robots.shapes import flown_files
+
+        self._experiment, self._folder, self._see = experiment, folder, see
+        self._store, self._code = RecordStore(), source.code_hash()
+        self._at_start = attachments(folder) | flown_files(experiment.world)
+        self._writer = McapWriter(folder / "mission.mcap", clock="world", code=self._code)
+
+    def __enter__(self) -> Self:
+        """Attach the experiment."""
+        self._writer.__enter__()
+        for name, data in self._at_start.items():
+            self._writer.attach(name, data)
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        """Close the file."""
+        self._writer.__exit__(*error)
+
+    def sink(self, from_world: list[Record], from_cloud: list[Record]) -> None:
+        """Take new records of world and cloud."""
+        records = [*heapq.merge(from_world, from_cloud, key=attrgetter("stamp_ns"))]
+        self._writer.write(records)
+        self._store.add(from_world, from_cloud)
+        self._see(records)
+
+    def finish(
+        self, report: Report, *, interrupted: bool, lost: ControllerLostError | None = None
+    ) -> dict[str, Any]:
+        """Return the report of the flight; `lost` is the reason why it ended early."""
+        experiment, writer = self._experiment, self._writer
+        try:
+            notes = assembly.virtual_notes(experiment)
+            run = _describe("virtual", interrupted, experiment, notes, lost)
+            writer.note(run.metadata)
+            store, self._store = self._store, RecordStore()  # many robots need much memory
+            recording = Recording(
+                records=store, metadata={CODE: self._code}, attachments=self._at_start
+            )
+            writer.write_views(views(recording, experiment))
+            _raise_if_refused(recording, lost)
+            return report(recording, experiment, run)
+        finally:
+            for name, data in attachments(self._folder).items() - self._at_start.items():
+                writer.attach(name, data)
+
+
 def _fly_virtual(
     experiment: ResolvedExperiment,
     folder: Path,
@@ -108,44 +162,20 @@ def _fly_virtual(
     landed: Callable[[], None],
     report: Report,
 ) -> dict[str, Any]:
-    """Fly in virtual time, and return the report; mission.mcap gets a copy of it.
+    """Fly in virtual time, and return the report.
 
     `gone` is that of `assembly.fly`, `landed` that of `fly`.
     """
-    from cloudrc.robots.shapes import flown_files
-
-    store, code = RecordStore(), source.code_hash()
     interrupted, lost = False, None
-    # The recording is kept if the run or its report fails; a copy cut short has the experiment.
-    with McapWriter(folder / "mission.mcap", clock="world", code=code) as writer:
-        at_start = attachments(folder) | flown_files(experiment.world)
-        for name, data in at_start.items():
-            writer.attach(name, data)
-
-        def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
-            records = [*heapq.merge(from_world, from_cloud, key=attrgetter("stamp_ns"))]
-            writer.write(records)
-            store.add(from_world, from_cloud)
-            see(records)
-
+    with VirtualRecorder(experiment, folder, see) as recorder:
         try:
-            assembly.fly(experiment, sink, gone=gone)
+            assembly.fly(experiment, recorder.sink, gone=gone)
         except KeyboardInterrupt:
             interrupted = True
         except ControllerLostError as error:
             lost = error
         landed()
-        try:
-            notes = assembly.virtual_notes(experiment)
-            run = _describe("virtual", interrupted, experiment, notes, lost)
-            writer.note(run.metadata)
-            recording = Recording(records=store, metadata={CODE: code}, attachments=at_start)
-            writer.write_views(views(recording, experiment))
-            _raise_if_refused(recording, lost)
-            document = report(recording, experiment, run)
-        finally:
-            for name, data in attachments(folder).items() - at_start.items():
-                writer.attach(name, data)
+        document = recorder.finish(report, interrupted=interrupted, lost=lost)
     if lost:
         raise lost
     return document

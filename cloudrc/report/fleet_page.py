@@ -1,0 +1,138 @@
+"""Make the page report.html of a fleet, with its figure."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from cloudrc.config.resolved import dump
+from cloudrc.files import write_atomically
+from cloudrc.report.figures import own_settings, save
+from cloudrc.report.figures.style import (
+    BLACK,
+    BLUE,
+    DOWNLINK,
+    GREY,
+    UPLINK,
+    VERMILION,
+    Look,
+    legend_above,
+    new_figure,
+    panel,
+)
+from cloudrc.report.fleet import FleetFlown, cell_rows, remarks, robot_rows
+from cloudrc.report.page import HEADLINES
+from cloudrc.version import __version__
+
+CAPTION = (
+    "Age of information at the actuator of each robot: dot: mean; line: up to the 99th "
+    "percentile; red: the robot failed. Above the dashed line the guard holds a robot. "
+)
+WAITS = "Right: the longest wait of a packet in the cell, in each tenth of a second."
+COLOURS = {"uplink": UPLINK, "downlink": DOWNLINK, "both": BLACK}
+BODY = Template("""<body>
+<header>
+<p class="kicker">$kicker</p>
+<h1>$headline</h1>
+$notes
+</header>
+<main>
+<figure><img src="data:image/svg+xml;base64,$figure" alt="$caption">
+<figcaption><b>Fig. 1.</b> $caption</figcaption></figure>
+$tables
+<h2>Repeat this run</h2>
+<p>Run this in the folder of the report; the records will be identical. The first command flies the
+fleet, the second one its first robot alone, and the third one writes the page of this robot:</p>
+<pre>cloudrc run config.yaml --mode virtual
+cloudrc run config.yaml --mode virtual --set fleet.only=$first --set cell.rate_kbit=null
+cloudrc report robot-$first</pre>
+<details><summary>Complete experiment (<code>config.yaml</code>)</summary>
+<pre>$config</pre></details>
+</main>
+<footer>Made by cloudrc $version.</footer>
+</body>
+</html>
+""")
+
+
+def write_fleet_page(folder: Path, flown: FleetFlown, document: Mapping[str, Any]) -> None:
+    """Write the page of a fleet into `folder`; `document` is the content of its report.json."""
+    experiment, count = flown.experiment, len(flown.robots)
+    headline, accent = HEADLINES[document["verdict"]]
+    name = f"{experiment.name}: {count} robots"
+    page = files("cloudrc.report").joinpath("page.html").read_text("utf-8")
+    facts = {"version": escape(__version__), "accent": accent, "title": escape(name)}
+    notes = [*(failure["text"] for failure in document["failures"]), *remarks(document)]
+    tables = {"Robots": robot_rows(document), "Cell": cell_rows(document)}
+    body = BODY.substitute(
+        facts,
+        kicker=escape(f"cloudrc fleet report · {name} · seed {experiment.seed}"),
+        headline=f"{document['succeeded']} of {count} robots succeeded."
+        if document["verdict"] in ("success", "failure")
+        else headline,
+        notes="".join(f"<p>{escape(note[0].upper() + note[1:])}.</p>" for note in notes),
+        figure=b64encode(_draw(flown, document)).decode(),
+        caption=escape(CAPTION + WAITS * bool(flown.log.cells)),
+        tables="".join(_table(title, rows) for title, rows in tables.items() if rows),
+        first=flown.robots[0].number,
+        config=escape(dump(experiment)),
+    )
+    text = Template(page.partition("<body>")[0]).substitute(facts) + body
+    write_atomically(folder / "report.html", text.encode("utf-8"))
+
+
+def _table(title: str, rows: Sequence[Sequence[str]]) -> str:
+    """Return a table with its title as HTML; the first row has the heads."""
+    lines = ["".join(f'<td class="value">{escape(each)}</td>' for each in row) for row in rows]
+    head, *others = (f"<tr>{line}</tr>\n" for line in lines)
+    head = head.replace('<td class="value"', '<th scope="col" style="text-align: right"')
+    head = head.replace("</td", "</th")
+    return (
+        f"<section><h2>{title}</h2>\n<table><thead>{head}</thead>"
+        f"<tbody>{''.join(others)}</tbody></table></section>"
+    )
+
+
+def _draw(flown: FleetFlown, document: Mapping[str, Any]) -> bytes:
+    """Draw the ages of all robots and, if there is a cell, its waits over time, as SVG."""
+    look = Look()
+    with own_settings(look):
+        if flown.log.cells:
+            figure, (ages, waits) = look.two_panels()
+            _draw_waits(waits, flown)
+        else:
+            figure = new_figure(2.6, look.width)
+            ages = figure.subplots()
+        limit_ms = flown.experiment.guard.command_age_max_ms
+        ages.axhline(limit_ms, color=GREY, linestyle="--", linewidth=0.8)
+        for robot in document["robots"]:
+            mean, most = robot["age_at_actuator_mean"], robot["age_at_actuator_p99"]
+            if mean is not None and most is not None:
+                colour = BLUE if robot["verdict"] == "success" else VERMILION
+                at = [robot["robot"]] * 2
+                ages.plot(at, [mean * 1e3, most * 1e3], "-", color=colour)
+                ages.plot(at[:1], [mean * 1e3], "o", ms=3, color=colour)
+        ages.set(xlabel="robot", ylabel="age [ms]", ylim=(0, None))
+        ages.xaxis.set_major_locator(MaxNLocator(integer=True))
+        panel(ages, "a")
+        return save(figure, "svg")
+
+
+def _draw_waits(axes: Axes, flown: FleetFlown) -> None:
+    for way in flown.log.cells:
+        rows = flown.log.of(way)
+        times = [row.now_ns * 1e-9 for row in rows]
+        longest = np.array([row.usage.longest_ns * 1e-6 for row in rows])
+        axes.plot(times, longest, color=COLOURS[way], label=way, linewidth=0.8)
+    axes.set(xlabel="time [s]", ylabel="longest wait [ms]", ylim=(0, None))
+    panel(axes, "b")
+    legend_above(axes)

@@ -1,0 +1,57 @@
+"""`cloudrc run` with a fleet: a folder for each robot, and one report of all."""
+
+import csv
+import json
+
+import pytest
+
+from cloudrc.record.columns import Recording
+from tests.cli.conftest import FLY, SHORT
+
+REPORTS = "all/report.json", "one/report.json"
+FLEET = "--set fleet.robots=3 --set cell.rate_kbit=1000 --set cell.queue=newest".split()
+
+
+def test_a_fleet_is_told_as_tables_and_leaves_a_folder_for_each_robot(folder, call):
+    lines = call("run", "steps", *SHORT, *FLEET, "--out", "fleet").out.splitlines()
+    cell = "3 robots in a cell of 1000 kbit/s (newest)"
+    assert lines[0] == f"steps: mode virtual, seed 1, link paper-p3, {cell}, 1 step"
+    assert "SUCCESS: all 3 robots succeeded" in lines
+    heads = [line.split()[0] for line in lines if line]
+    assert heads[2:10] == ["robot", "median", "worst", "0", "1", "2", "cell", "uplink"]
+    assert lines[-1] == "fleet/report.html"
+    assert (folder / lines[-1]).read_text().count("<tr>") == 9
+    report = json.loads((folder / "fleet/report.json").read_text())
+    assert report["succeeded"] == 3
+    rows = [*csv.DictReader((folder / "fleet/cell.csv").read_text().splitlines())]
+    packets = sum(int(row["packets"]) for row in rows if row["direction"] == "uplink")
+    assert packets == report["cell"]["uplink"]["packets"]
+    for number, robot in enumerate(report["robots"]):
+        own = folder / f"fleet/robot-{number}"
+        assert Recording.read(own / "mission.mcap").sha256 == robot["records_sha256"]
+        assert json.loads((own / "report.json").read_text())["verdict"] == robot["verdict"]
+    call("report", "fleet/robot-2")
+    assert (folder / "fleet/robot-2/report.html").exists()
+
+
+def test_a_robot_flies_alone_as_in_a_fleet_without_a_cell(folder, call):
+    call(*FLY, *FLEET[:2], "--set", "cloud.cores=2", "--set", "cloud.compute_ms=1", "--out", "all")
+    call(*FLY, *FLEET[:2], "--set", "fleet.only=1", "--set", "cloud.compute_ms=1", "--out", "one")
+    fleet, alone = (
+        json.loads((folder / f"{name}/report.json").read_text()) for name in ("all", "one")
+    )
+    assert fleet["robots"][1]["records_sha256"] == alone["records_sha256"]
+    assert fleet["cloud"]["rate_expected"] == 100
+    assert not (folder / "all/cell.csv").exists()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "run --mode local --set fleet.robots=2",
+        "run --seeds 2 --set cell.rate_kbit=100",
+        "run --figures --set fleet.robots=2",
+    ],
+)
+def test_a_fleet_flies_in_virtual_time_by_run_alone(line, refused):
+    assert "fleet" in refused(line)
