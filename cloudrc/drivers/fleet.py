@@ -19,7 +19,7 @@ from heapq import heapreplace
 from typing import Any, Literal, Protocol
 
 from cloudrc.drivers.virtual import PERIOD_NS, Sink, VirtualRun
-from cloudrc.link.cell import Cell, Packet
+from cloudrc.link.cell import Cell, CellPacket
 from cloudrc.link.model import HEADER_BYTES, LinkDirection
 from cloudrc.link.queue import NOTHING_NS, PacketQueue
 
@@ -48,9 +48,9 @@ class CellQueue(PacketQueue):
         for arrival_ns in arrivals:
             self._numbers += 1
             what = self._robot, self._numbers, kind, whole, arrival_ns - now_ns, (link, data)
-            self._cells[way].inbox.append(Packet(now_ns, way, *what))
+            self._cells[way].inbox.append(CellPacket(now_ns, way, *what))
 
-    def take(self, packet: Packet) -> None:
+    def take(self, packet: CellPacket) -> None:
         """Take a packet that has left the cell at its `sent_ns`."""
         arrival_ns, way = packet.sent_ns + packet.delay_ns, packet.way
         if self._orders[way]:
@@ -212,7 +212,7 @@ class FleetRun:
         ends_ns += [cell.done_ns for cell in self._cells]
         return until_ns if min(ends_ns) <= now_ns else max(until_ns, now_ns + 1)
 
-    def _take(self, packet: Packet) -> None:
+    def _take(self, packet: CellPacket) -> None:
         queue = self._members[packet.flow].run.in_flight
         assert isinstance(queue, CellQueue), "a fleet in a cell has such queues"
         queue.take(packet)

@@ -27,7 +27,7 @@ BULK_BYTES, ROUND_TRIP_NS, WINDOW_MAX = 1500, 40_000_000, 2000.0
 [ns]; largest number of its packets under way."""
 
 
-class Packet(NamedTuple):
+class CellPacket(NamedTuple):
     """A packet that is sent through a cell; packets of one instant keep the order of the fields."""
 
     sent_ns: int
@@ -87,12 +87,12 @@ class Cell:
         """
         self._rate, self._queue, self._packets_max = rate, queue, packets_max
         self._airtime_ns = airtime_ns
-        self._lanes: dict[int, dict[Any, Packet]] = {}  # lane -> place -> packet, oldest first
+        self._lanes: dict[int, dict[Any, CellPacket]] = {}  # lane -> place -> packet, oldest first
         self._turn, self._deficits = deque[int](), dict[int, int]()  # of drr
-        self._serving: Packet | None = None
+        self._serving: CellPacket | None = None
         self._waiting = 0
         self.traffic: dict[int, Traffic] = {}  # flow -> source
-        self.inbox: list[Packet] = []
+        self.inbox: list[CellPacket] = []
         self.done_ns = NOTHING_NS
         self.usage = Usage()
 
@@ -111,13 +111,13 @@ class Cell:
             return self.done_ns
         return now_ns + self.service_ns(HEADER_BYTES)
 
-    def advance(self, until_ns: int) -> list[Packet]:
+    def advance(self, until_ns: int) -> list[CellPacket]:
         """Take the packets sent before `until_ns` [ns]; return those that leave up to this time.
 
         Their `sent_ns` is then the time of leaving. At equal times packets leave first; then come
         new ones: by direction, robot and number, and at last those of others.
         """
-        inbox, self.inbox, gone = sorted(self.inbox), [], list[Packet]()
+        inbox, self.inbox, gone = sorted(self.inbox), [], list[CellPacket]()
         inbox.reverse()
         while True:
             sent_ns = inbox[-1].sent_ns if inbox else NOTHING_NS
@@ -136,7 +136,7 @@ class Cell:
             else:
                 return gone
 
-    def put(self, packet: Packet) -> bool:
+    def put(self, packet: CellPacket) -> bool:
         """Let a packet wait; return False if it is dropped, because the queue is full."""
         flow, lane = packet.flow, self._lane(packet)
         waiting = self._lanes.setdefault(lane, {})
@@ -159,7 +159,7 @@ class Cell:
             self._serve(packet.sent_ns)
         return True
 
-    def _lane(self, packet: Packet) -> int:
+    def _lane(self, packet: CellPacket) -> int:
         """Return the number of the queue in which a packet waits; lower ones leave first."""
         if self._queue == "drr":
             return packet.flow
@@ -172,7 +172,7 @@ class Cell:
         dropped = self.usage.dropped
         dropped[flow] = dropped.get(flow, 0) + 1
 
-    def _leave(self, now_ns: int) -> Iterable[Packet]:
+    def _leave(self, now_ns: int) -> Iterable[CellPacket]:
         """Serve the next packet; return the one that has left, if it is a robot's."""
         packet = self._serving
         assert packet is not None, "the cell serves a packet"
@@ -231,7 +231,7 @@ class Video:
         """Send a frame."""
         for _ in range(self._packets):
             self._sent += 1
-            cell.put(Packet(self.next_ns, 2, self._flow, self._sent, 0, VIDEO_BYTES))
+            cell.put(CellPacket(self.next_ns, 2, self._flow, self._sent, 0, VIDEO_BYTES))
         self.next_ns += FRAME_NS
 
     def leave(self, now_ns: int) -> None:
@@ -262,7 +262,7 @@ class Bulk:
         self.next_ns = self._confirmed[0] if self._confirmed else now_ns + ROUND_TRIP_NS
         while self._flying < int(self._window):
             self._sent += 1
-            if not cell.put(Packet(now_ns, 2, self._flow, self._sent, 0, BULK_BYTES)):
+            if not cell.put(CellPacket(now_ns, 2, self._flow, self._sent, 0, BULK_BYTES)):
                 if now_ns > self._halved_ns:
                     self._window = self._threshold = max(2.0, self._window / 2)
                     self._halved_ns = now_ns + ROUND_TRIP_NS

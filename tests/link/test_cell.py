@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cloudrc.link.cell import Bulk, Cell, Packet, Usage, Video
+from cloudrc.link.cell import Bulk, Cell, CellPacket, Usage, Video
 from cloudrc.link.waiting import md1, nddd1
 
 MS = 1_000_000
@@ -14,7 +14,7 @@ RATE = 1e6
 def served(cell, *packets, until=1000 * MS):
     """Send packets, each a time [ms], a robot and perhaps a kind; return who left, and when."""
     for number, (at, flow, *kind) in enumerate(packets):
-        cell.inbox.append(Packet(round(at * MS), 0, flow, number, *(kind or [0]), 125))
+        cell.inbox.append(CellPacket(round(at * MS), 0, flow, number, *(kind or [0]), 125))
     return [(packet.sent_ns / MS, packet.flow) for packet in cell.advance(until)]
 
 
@@ -74,7 +74,7 @@ def test_periodic_senders_wait_as_long_as_theory_says(senders):
         for n in range(3):
             cell.usage = Usage()  # the last period counts
             at_ns = (phases + n * 10 * MS).tolist()
-            cell.inbox = [Packet(at, 0, flow, n, 0, 232) for flow, at in enumerate(at_ns)]
+            cell.inbox = [CellPacket(at, 0, flow, n, 0, 232) for flow, at in enumerate(at_ns)]
             cell.advance((n + 1) * 10 * MS - 1)
         means.append(cell.usage.waited_ns / senders / MS)
     assert np.mean(means) == pytest.approx(nddd1(senders, period, service), rel=0.03)
