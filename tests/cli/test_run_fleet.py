@@ -12,6 +12,7 @@ REPORTS = "all/report.json", "one/report.json"
 FLEET = "--set fleet.robots=3 --set cell.rate_kbit=1000 --set cell.queue=newest".split()
 
 
+@pytest.mark.usefixtures("no_page")
 def test_a_fleet_is_told_as_tables_and_leaves_a_folder_for_each_robot(folder, call):
     lines = call("run", "steps", *SHORT, *FLEET, "--out", "fleet").out.splitlines()
     cell = "3 robots in a cell of 1000 kbit/s (newest)"
@@ -35,8 +36,30 @@ def test_a_fleet_is_told_as_tables_and_leaves_a_folder_for_each_robot(folder, ca
 
 
 def test_a_robot_flies_alone_as_in_a_fleet_without_a_cell(folder, call):
-    call(*FLY, *FLEET[:2], "--set", "cloud.cores=2", "--set", "cloud.compute_ms=1", "--out", "all")
-    call(*FLY, *FLEET[:2], "--set", "fleet.only=1", "--set", "cloud.compute_ms=1", "--out", "one")
+    call(
+        *FLY,
+        "--report",
+        "none",
+        *FLEET[:2],
+        "--set",
+        "cloud.cores=2",
+        "--set",
+        "cloud.compute_ms=1",
+        "--out",
+        "all",
+    )
+    call(
+        *FLY,
+        "--report",
+        "none",
+        *FLEET[:2],
+        "--set",
+        "fleet.only=1",
+        "--set",
+        "cloud.compute_ms=1",
+        "--out",
+        "one",
+    )
     fleet, alone = (
         json.loads((folder / f"{name}/report.json").read_text()) for name in ("all", "one")
     )

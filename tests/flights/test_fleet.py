@@ -14,6 +14,11 @@ CLOCK = "cloud.clock_offset_s=5"
 LATE = ("cloud.compute_ms=8", "cloud.compute_deviation_ms=4", "cloud.cores=1")
 
 
+def full(*values):
+    """Mark several values of a parametrized test as those of `make nightly`."""
+    return [pytest.param(*each, marks=pytest.mark.full) for each in values]
+
+
 def alone(*settings):
     return fly_in_memory(load_experiment("steps", (*SHORT, *settings))).records_sha256
 
@@ -44,7 +49,8 @@ def test_a_cell_without_limits_is_no_cell():
 
 
 @pytest.mark.parametrize(
-    ("queue", "rate", "packets"), [("fifo", 200, 1000), ("fifo", 150, 20), ("drr", 150, 20)]
+    ("queue", "rate", "packets"),
+    [("fifo", 200, 1000), *full(("fifo", 150, 20)), ("drr", 150, 20)],
 )
 def test_one_robot_in_a_cell_is_a_robot_behind_a_bottleneck(queue, rate, packets):
     odd = "link.both.keep_order=true", "link.both.duplicate=0.05", "link.both.corrupt=0.01"
@@ -60,7 +66,8 @@ def test_one_cloud_on_shared_cores_computes_as_alone(sharing):
 
 
 @pytest.mark.parametrize(
-    ("queue", "sharing"), [("fifo", "ps"), ("drr", "fifo"), ("priority", "ps"), ("newest", "fifo")]
+    ("queue", "sharing"),
+    [("newest", "ps"), *full(("fifo", "ps"), ("drr", "fifo"), ("priority", "fifo"))],
 )
 def test_a_fleet_with_contention_flies_twice_alike(queue, sharing):
     traffic = "cell.traffic=[{kind: bulk}, {kind: video, rate_kbit: 300, direction: downlink}]"
