@@ -130,10 +130,7 @@ def fly_once(options: Options, mode: str, ready: Ready | None = None) -> int:
 
     experiment = _experiment(options, is_session=ready is not None)
     if experiment.is_fleet:
-        if ready or options.beside or options.figures or options.mode not in (None, "virtual"):
-            text = "a fleet flies in virtual time, without --with and --figures"
-            raise BadInputError(f"{text}; fleet.only=0 is its robot 0 alone")
-        mode = "virtual"
+        return _fly_fleet(experiment, options)
     check_mode(experiment, mode)
     warn(experiment)
     if changes := describe_changes(options.experiment, experiment):
@@ -143,24 +140,16 @@ def fly_once(options: Options, mode: str, ready: Ready | None = None) -> int:
     folder = run_folder(experiment, "session" if ready else mode, options.out)
     if options.output == "table":
         facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
-        flown = "session" if ready else f"{_fleet(experiment)}{experiment.mission.contents}"
+        flown = "session" if ready else experiment.mission.contents
         print_or_drop(escape(f"{experiment.name}: {facts}, {flown}"))
     with _place_of_recording(folder):
-        if experiment.is_fleet:
-            report = _fly_fleet(experiment, folder, options)
-        elif release:
+        if release:
             report = _fly_in_cluster(experiment, folder, release, options)
         else:
             report = _fly_here(experiment, folder, mode, ready, options)
     print_traceback(options, report)
     last = "report.html" if options.report == "page" else "report.json"
-    if experiment.is_fleet:
-        from cloudrc.report.fleet import summarize_fleet
-
-        text = f"\n{summarize_fleet(report, paint)}\n\n{escape(str(folder / last))}"
-    else:
-        text = summary(report, folder, last)
-    print_result(options.output, report, text)
+    print_result(options.output, report, summary(report, folder, last))
     return 0 if ready else exit_code(report)
 
 
@@ -180,29 +169,37 @@ def _experiment(options: Options, *, is_session: bool) -> ResolvedExperiment:
     return load(options.experiment, ["mission.touch=null", *options.set], options.seed)
 
 
-def _fleet(experiment: ResolvedExperiment) -> str:
-    """Describe the robots and the cell of a fleet; "" for the flight of one robot."""
-    if not experiment.is_fleet:
-        return ""
-    cell, count = (
-        experiment.cell,
-        1 if experiment.fleet.only is not None else experiment.fleet.robots,
-    )
-    place = f" in a cell of {cell.rate_kbit:g} kbit/s ({cell.queue})" if cell.rate_kbit else ""
-    return f"{count} robot{'s' * (count > 1)}{place}, "
-
-
-def _fly_fleet(experiment: ResolvedExperiment, folder: Path, options: Options) -> dict[str, Any]:
-    """Fly a fleet in virtual time; return its report."""
+def _fly_fleet(experiment: ResolvedExperiment, options: Options) -> int:
+    """Fly a fleet in virtual time, print the summary, and return the exit code."""
     from cloudrc.cli.progress import Progress
+    from cloudrc.config.overrides import OUTSIDE
+    from cloudrc.metrics.verdict import exit_code
+    from cloudrc.report.fleet import summarize_fleet
+    from cloudrc.runs.experiment import check_mode, robots_of
     from cloudrc.runs.fleet import fly_fleet
 
+    beside = options.beside or experiment.cloud.controller.name in OUTSIDE
+    if beside or options.figures or options.mode not in (None, "virtual"):
+        text = "a fleet flies in virtual time, without --figures and a controller outside"
+        raise BadInputError(f"{text}; fleet.only=0 is its robot 0 alone")
+    robots = robots_of(experiment, options.experiment, options.set, options.seed)
+    for robot in robots:
+        check_mode(robot, "virtual")
+    warn(*robots)
+    folder, page = run_folder(experiment, "virtual", options.out), options.report == "page"
+    if options.output == "table":
+        cell, count = experiment.cell, f"{len(robots)} robot{'s' * (len(robots) > 1)}"
+        place = f" in a cell of {cell.rate_kbit:g} kbit/s ({cell.queue})" if cell.rate_kbit else ""
+        facts = f"mode virtual, seed {experiment.seed}, link {experiment.link.profile}"
+        contents = experiment.mission.contents
+        print_or_drop(escape(f"{experiment.name}: {facts}, {count}{place}, {contents}"))
     with Progress("flies the fleet") as view:
-
-        def landed() -> None:
-            view.tell("judges each robot")
-
-        return fly_fleet(experiment, folder, page=options.report == "page", landed=landed)
+        judging = partial(view.tell, "judges each robot")
+        report = fly_fleet(experiment, robots, folder, page=page, landed=judging)
+    last = folder / ("report.html" if page else "report.json")
+    text = f"\n{summarize_fleet(report, paint)}\n\n{escape(str(last))}"
+    print_result(options.output, report, text)
+    return exit_code(report)
 
 
 @contextlib.contextmanager

@@ -38,7 +38,6 @@ from cloudrc.config.resolved import (
     PLAN_MAX_S,
     Bounds,
     ResolvedExperiment,
-    dump,
     speed_cap,
 )
 from cloudrc.config.robot import DEFAULT_LIMITS, known_robot
@@ -86,8 +85,7 @@ def load_experiment(
     BadInputError that lists the experiment's problems.
     """
     name = str(name)
-    changes = settings if isinstance(settings, dict) else overrides.parse_settings(settings)
-    document, found = _combine(name, changes, build=build, flown=flown)
+    document, found = _combine(name, settings, build=build, flown=flown)
     lost = _resolve_paths(document)
     draft = problems.validate(document, Experiment, name, found if flown else found + lost)
     guard, facts = draft.guard, None
@@ -104,24 +102,18 @@ def load_experiment(
     else:
         overrides.name_plugins(document, draft.cloud)
     experiment = problems.validate(document, ResolvedExperiment, name, found, context=bounds)
-    if not flown:
-        fleet = experiment.fleet
-        for number in range(min(len(fleet.vary), fleet.robots)):
-            only = {
-                ("fleet", "only"): overrides.Setting(number, document.source(("fleet", "vary")))
-            }
-            load_experiment(name, changes | only, build=build)
     return experiment if flown else _judge(document, experiment, name)
 
 
 def _combine(
-    name: str, changes: Settings, *, build: bool, flown: bool
+    name: str, settings: Iterable[str] | Settings, *, build: bool, flown: bool
 ) -> tuple[Document, list[ConfigProblem]]:
     """Read an experiment, apply settings, and replace the names of mission and profile.
 
     Also return the problems of these two.
     """
     document, found = shipped.read("experiment", name, Path()), list[ConfigProblem]()
+    changes = settings if isinstance(settings, dict) else overrides.parse_settings(settings)
     with problems.collect(found, ("fleet", "vary")):
         changes = _settings_of_robot(document, changes)
     inner = {path: value for path, value in changes.items() if _is_inside_name(path)}
@@ -181,19 +173,6 @@ def _read_robots(path: Path) -> list[dict[str, Any]]:
         {key: parse_value(value, f"{path.name}: {key}") for key, value in row.items()}
         for row in rows
     ]
-
-
-def robots_of(experiment: ResolvedExperiment) -> list[ResolvedExperiment]:
-    """Return the experiment of each robot of a fleet, with which it also flies alone."""
-    fleet = experiment.fleet
-    numbers = range(fleet.robots) if fleet.only is None else [fleet.only]
-    if not fleet.vary:
-        alone = (fleet.model_copy(update={"only": number}) for number in numbers)
-        return [experiment.model_copy(update={"fleet": each}) for each in alone]
-    with TemporaryDirectory() as folder:
-        config = Path(folder) / "config.yaml"
-        config.write_text(dump(experiment), encoding="utf-8")
-        return [load_experiment(config, [f"fleet.only={number}"]) for number in numbers]
 
 
 def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> ResolvedExperiment:

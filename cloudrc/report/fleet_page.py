@@ -10,7 +10,6 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
@@ -29,7 +28,7 @@ from cloudrc.report.figures.style import (
     new_figure,
     panel,
 )
-from cloudrc.report.fleet import FleetFlown, cell_rows, remarks, robot_rows
+from cloudrc.report.fleet import FleetFlown, remarks, tables
 from cloudrc.report.page import HEADLINES
 from cloudrc.version import __version__
 
@@ -67,46 +66,39 @@ cloudrc report robot-$first</pre>
 def write_fleet_page(folder: Path, flown: FleetFlown, document: Mapping[str, Any]) -> None:
     """Write the page of a fleet into `folder`; `document` is the content of its report.json."""
     experiment, count = flown.experiment, len(flown.robots)
-    headline, accent = HEADLINES[document["verdict"]]
+    _, accent = HEADLINES[document["verdict"]]
     name = f"{experiment.name}: {count} robots"
     page = files("cloudrc.report").joinpath("page.html").read_text("utf-8")
     facts = {"version": escape(__version__), "accent": accent, "title": escape(name)}
     notes = [*(failure["text"] for failure in document["failures"]), *remarks(document)]
-    tables = {"Robots": robot_rows(document), "Cell": cell_rows(document)}
     body = BODY.substitute(
         facts,
         kicker=escape(f"cloudrc fleet report · {name} · seed {experiment.seed}"),
-        headline=f"{document['succeeded']} of {count} robots succeeded."
-        if document["verdict"] in ("success", "failure")
-        else headline,
+        headline=f"{document['succeeded']} of {count} robots succeeded.",
         notes="".join(f"<p>{escape(note[0].upper() + note[1:])}.</p>" for note in notes),
         figure=b64encode(_draw(flown, document)).decode(),
-        caption=escape(CAPTION + WAITS * bool(flown.log.cells)),
-        tables="".join(_table(title, rows) for title, rows in tables.items() if rows),
-        first=flown.robots[0].number,
+        caption=escape(CAPTION + WAITS * bool(flown.log.ways)),
+        tables="\n".join(map(_table, tables(document))),
+        first=flown.robots[0]["robot"],
         config=escape(dump(experiment)),
     )
     text = Template(page.partition("<body>")[0]).substitute(facts) + body
     write_atomically(folder / "report.html", text.encode("utf-8"))
 
 
-def _table(title: str, rows: Sequence[Sequence[str]]) -> str:
-    """Return a table with its title as HTML; the first row has the heads."""
-    lines = ["".join(f'<td class="value">{escape(each)}</td>' for each in row) for row in rows]
-    head, *others = (f"<tr>{line}</tr>\n" for line in lines)
-    head = head.replace('<td class="value"', '<th scope="col" style="text-align: right"')
-    head = head.replace("</td", "</th")
-    return (
-        f"<section><h2>{title}</h2>\n<table><thead>{head}</thead>"
-        f"<tbody>{''.join(others)}</tbody></table></section>"
-    )
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    """Return a table as HTML; the first row has the heads."""
+    lines = ["".join(f'<td class="value">{escape(each)}</td>' for each in row) for row in rows[1:]]
+    heads = "".join(f'<th style="text-align: right">{escape(each)}</th>' for each in rows[0])
+    body = "\n".join(f"<tr>{line}</tr>" for line in lines)
+    return f"<table><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def _draw(flown: FleetFlown, document: Mapping[str, Any]) -> bytes:
     """Draw the ages of all robots and, if there is a cell, its waits over time, as SVG."""
     look = Look()
     with own_settings(look):
-        if flown.log.cells:
+        if flown.log.ways:
             figure, (ages, waits) = look.two_panels()
             _draw_waits(waits, flown)
         else:
@@ -115,12 +107,10 @@ def _draw(flown: FleetFlown, document: Mapping[str, Any]) -> bytes:
         limit_ms = flown.experiment.guard.command_age_max_ms
         ages.axhline(limit_ms, color=GREY, linestyle="--", linewidth=0.8)
         for robot in document["robots"]:
-            mean, most = robot["age_at_actuator_mean"], robot["age_at_actuator_p99"]
-            if mean is not None and most is not None:
+            if "age_ms" in robot:
+                at, ages_ms = [robot["robot"]] * 2, [robot["age_ms"], robot["age_p99_ms"]]
                 colour = BLUE if robot["verdict"] == "success" else VERMILION
-                at = [robot["robot"]] * 2
-                ages.plot(at, [mean * 1e3, most * 1e3], "-", color=colour)
-                ages.plot(at[:1], [mean * 1e3], "o", ms=3, color=colour)
+                ages.plot(at, ages_ms, "o-", ms=3, markevery=[0], color=colour)
         ages.set(xlabel="robot", ylabel="age [ms]", ylim=(0, None))
         ages.xaxis.set_major_locator(MaxNLocator(integer=True))
         panel(ages, "a")
@@ -128,11 +118,11 @@ def _draw(flown: FleetFlown, document: Mapping[str, Any]) -> bytes:
 
 
 def _draw_waits(axes: Axes, flown: FleetFlown) -> None:
-    for way in flown.log.cells:
-        rows = flown.log.of(way)
-        times = [row.now_ns * 1e-9 for row in rows]
-        longest = np.array([row.usage.longest_ns * 1e-6 for row in rows])
-        axes.plot(times, longest, color=COLOURS[way], label=way, linewidth=0.8)
+    for way in flown.log.ways:
+        rows = [row for row in flown.log.rows if row["direction"] == way]
+        waits = [row["longest_ns"] * 1e-6 for row in rows]
+        times = [row["time_s"] for row in rows]
+        axes.plot(times, waits, color=COLOURS[way], label=way, linewidth=0.8)
     axes.set(xlabel="time [s]", ylabel="longest wait [ms]", ylim=(0, None))
     panel(axes, "b")
     legend_above(axes)

@@ -45,6 +45,16 @@ def check_no_seed(texts: Iterable[str]) -> None:
         raise problem_at("seed", "each flight has its own seed; give their number with --seeds")
 
 
+def robots_of(
+    experiment: ResolvedExperiment, name: str, overrides: Iterable[str], seed: int | None = None
+) -> list[ResolvedExperiment]:
+    """Load the experiment of each robot of a fleet; the other arguments are those of `load`."""
+    if experiment.fleet.only is not None:
+        return [experiment]
+    numbers = range(experiment.fleet.robots)
+    return [load(name, [*overrides, f"fleet.only={n}"], seed, fleets=True) for n in numbers]
+
+
 def check_alone(experiment: ResolvedExperiment) -> None:
     """Check that an experiment is the flight of one robot, which needs no cell."""
     if experiment.is_fleet:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import heapq
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from math import inf
 from operator import attrgetter
@@ -65,7 +65,7 @@ def fly(
     `beside` is a command: a program that runs during the flight, such as a remote controller.
     `landed` is called once the flight is over, before the report is written.
     """
-    try:
+    with naming_files(folder):
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
         files = hash_files(experiment)  # now: the user may edit them during the flight
 
@@ -81,6 +81,13 @@ def fly(
             if mode == "virtual":
                 return _fly_virtual(experiment, folder, look, gone, landed, report)
             return _fly_local(experiment, folder, look, gone, landed, report, session)
+
+
+@contextlib.contextmanager
+def naming_files(folder: Path) -> Iterator[None]:
+    """Let an OSError of the `with` block name its file, or else `folder`."""
+    try:
+        yield
     except OSError as error:
         error.filename = str(error.filename or folder)
         raise machine_error(error) or error from error
@@ -110,7 +117,7 @@ class VirtualRecorder:
         """Begin the recording in `folder`, which has the experiment; `see` is that of `fly`."""
         from cloudrc.robots.shapes import flown_files
 
-        self._experiment, self._folder, self._see = experiment, folder, see
+        self._experiment, self.folder, self._see = experiment, folder, see
         self._store, self._code = RecordStore(), source.code_hash()
         self._at_start = attachments(folder) | flown_files(experiment.world)
         self._writer = McapWriter(folder / "mission.mcap", clock="world", code=self._code)
@@ -150,7 +157,7 @@ class VirtualRecorder:
             _raise_if_refused(recording, lost)
             return report(recording, experiment, run)
         finally:
-            for name, data in attachments(self._folder).items() - self._at_start.items():
+            for name, data in attachments(self.folder).items() - self._at_start.items():
                 writer.attach(name, data)
 
 

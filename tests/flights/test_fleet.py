@@ -2,8 +2,9 @@
 
 import pytest
 
-from cloudrc.config.load import load_experiment, robots_of
+from cloudrc.config.load import load_experiment
 from cloudrc.record.columns import Recording, RecordStore
+from cloudrc.runs.experiment import robots_of
 from cloudrc.runs.fleet import assemble_fleet
 from cloudrc.runs.flight import fly_in_memory
 from tests.config.conftest import refused
@@ -26,7 +27,7 @@ def alone(*settings):
 def in_fleet(*settings):
     """Fly a fleet; return the hash of each robot's records."""
     experiment = load_experiment("steps", (*SHORT, *settings))
-    robots = robots_of(experiment)
+    robots = robots_of(experiment, "steps", (*SHORT, *settings))
     stores = [RecordStore() for _ in robots]
     assemble_fleet(experiment, robots, [store.add for store in stores]).run.fly()
     return [Recording(records=store).sha256 for store in stores]
@@ -88,8 +89,8 @@ def test_how_far_robots_fly_on_alone_changes_nothing(monkeypatch):
 def test_settings_of_single_robots_come_from_a_file_too(tmp_path):
     table = tmp_path / "robots.csv"
     table.write_text("world.robot,link.both.delay_ms\nx2,20\npelican,60\n")
-    named = load_experiment("steps", [f"fleet.vary={table}", "fleet.robots=3"])
-    robots = robots_of(named)
+    settings = f"fleet.vary={table}", "fleet.robots=3"
+    robots = robots_of(load_experiment("steps", settings), "steps", settings)
     assert [robot.world.robot for robot in robots] == ["x2", "pelican", "x2"]
     assert [robot.uplink.delay_ms for robot in robots] == [20.0, 60.0, 20.0]
     assert [robot.fleet.only for robot in robots] == [0, 1, 2]
@@ -100,7 +101,7 @@ def test_settings_of_single_robots_come_from_a_file_too(tmp_path):
     [
         (["fleet.only=3", "fleet.robots=3"], "the robots are 0 to 2"),
         (["fleet.vary=[{cell.rate_kbit: 5}]"], "cell.rate_kbit is the same for all robots"),
-        (["fleet.vary=[{link.both.delay: 5}]"], "did you mean delay_ms"),
+        (["fleet.vary=[{link.both.delay: 5}]", "fleet.only=0"], "did you mean delay_ms"),
         (["fleet.vary=none.csv"], "none.csv"),
         (["cell.rate_kbit=5", "link.both.rate_kbit=5"], "the cell is the bottleneck"),
         (["cloud.cores=2"], "cores needs compute_ms above 0"),
