@@ -15,24 +15,20 @@ class SharedCompute(ComputeTime):
 
     Attributes:
         shortest_ns: Duration of the next computation on a core of its own [ns].
-        begun: Begin and duration of a computation that nobody has taken yet [ns]; None without one.
-        now_ns: Returns the virtual time [ns].
-        finish: Lets the computation end at a virtual time [ns].
+        ask: Is called with the duration of a computation that begins, on a core of its own [ns].
     """
 
-    now_ns: Callable[[], int]
-    finish: Callable[[int], None]
+    ask: Callable[[int], None]
 
     def __init__(self, own: ComputeTime) -> None:
         """Draw the durations from `own`, in the same order as without sharing."""
         self._own, self.shortest_ns = own, own.end()
-        self.begun: tuple[int, int] | None = None
 
     def begin(self) -> None:
         """Nothing is measured."""
 
     def end(self) -> int:
-        """Note that a computation has begun; return `FOREVER_NS`."""
-        self.begun = self.now_ns(), self.shortest_ns
+        """Ask for a core; return `FOREVER_NS`."""
+        self.ask(self.shortest_ns)
         self.shortest_ns = self._own.end()
         return FOREVER_NS

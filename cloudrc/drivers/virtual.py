@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from cloudrc.endpoint import Endpoint
@@ -46,6 +47,18 @@ class Clock:
         return now_ns
 
 
+@contextmanager
+def without_collections() -> Iterator[None]:
+    """Collect no garbage: a flight makes no reference cycles, so that it would waste time."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
 class VirtualRun:
     """Runs world, cloud and both directions of the link, in virtual time that starts at 0.
 
@@ -74,17 +87,12 @@ class VirtualRun:
 
         Every 100 ms of virtual time, call `sink` with the new records, and then `until`.
         """
-        gc_was_on = gc.isenabled()
-        gc.disable()  # a flight makes no reference cycles, so that collections would waste time
-        try:
+        with without_collections():
             while self.now_ns < limit_ns:
                 self.advance(min(self.now_ns + PERIOD_NS, limit_ns))
                 sink(*self.take_records())
                 if until():
                     return
-        finally:
-            if gc_was_on:
-                gc.enable()
 
     def take_records(self) -> tuple[list[Record], list[Record]]:
         """Return the new records of world and of cloud."""

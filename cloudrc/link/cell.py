@@ -8,7 +8,7 @@ packets sent before an instant, and tells which leave until this instant.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from math import inf
@@ -36,8 +36,7 @@ class CellPacket(NamedTuple):
     number: int  # of the packet in its flow
     kind: int
     size: int  # with headers [bytes]
-    delay_ns: int = 0  # behind the cell [ns]
-    data: Any = None
+    leave: Callable[[int], None] = print  # is called with the time at which a robot's packet leaves
 
 
 @dataclass(slots=True)
@@ -70,6 +69,7 @@ class Cell:
 
     Attributes:
         inbox: Packets that are sent, in any order, for the next `advance`.
+        delay_ns: Shortest delay of a robot's packet behind the cell [ns].
         done_ns: When the packet in service leaves [ns]; `NOTHING_NS` if there is none.
         usage: Sums since the start, or since somebody has replaced them.
     """
@@ -93,7 +93,7 @@ class Cell:
         self._waiting = 0
         self.traffic: dict[int, Traffic] = {}  # flow -> source
         self.inbox: list[CellPacket] = []
-        self.done_ns = NOTHING_NS
+        self.delay_ns, self.done_ns = 0, NOTHING_NS
         self.usage = Usage()
 
     def service_ns(self, size: int) -> int:
@@ -106,19 +106,19 @@ class Cell:
         return min([self.done_ns, *(source.next_ns for source in self.traffic.values())])
 
     def soonest_ns(self, now_ns: int) -> int:
-        """Return a time before which no packet leaves [ns], also if robots send at `now_ns`."""
+        """Return a time before which no packet arrives that leaves at `now_ns` or later [ns]."""
         if self._serving is not None:
-            return self.done_ns
-        return now_ns + self.service_ns(HEADER_BYTES)
+            return self.done_ns + self.delay_ns
+        return now_ns + max(1, self.service_ns(HEADER_BYTES) + self.delay_ns)
 
-    def advance(self, until_ns: int) -> list[CellPacket]:
-        """Take the packets sent before `until_ns` [ns]; return those that leave up to this time.
+    def advance(self, until_ns: int) -> Iterable[tuple[int, int, Callable[[int], None]]]:
+        """Take the packets sent before `until_ns` [ns].
 
-        Their `sent_ns` is then the time of leaving. At equal times packets leave first; then come
-        new ones: by direction, robot and number, and at last those of others.
+        Yield time [ns], robot and `leave` of the packets that leave up to this time. At equal times
+        packets leave first; then come new ones: by direction, robot and number, and at last those
+        of others.
         """
-        inbox, self.inbox, gone = sorted(self.inbox), [], list[CellPacket]()
-        inbox.reverse()
+        inbox, self.inbox = sorted(self.inbox, reverse=True), []
         while True:
             sent_ns = inbox[-1].sent_ns if inbox else NOTHING_NS
             other_ns, others = min(
@@ -127,14 +127,16 @@ class Cell:
             )
             if self.done_ns <= min(sent_ns, other_ns):
                 if self.done_ns > until_ns:
-                    return gone
-                gone += self._leave(self.done_ns)
+                    return
+                now_ns, packet = self.done_ns, self._leave()
+                if packet.flow >= 0:
+                    yield now_ns, packet.flow, packet.leave
             elif sent_ns <= other_ns:
                 self.put(inbox.pop())
             elif other_ns < until_ns:
                 self.traffic[-others].fire(self)
             else:
-                return gone
+                return
 
     def put(self, packet: CellPacket) -> bool:
         """Let a packet wait; return False if it is dropped, because the queue is full."""
@@ -172,16 +174,15 @@ class Cell:
         dropped = self.usage.dropped
         dropped[flow] = dropped.get(flow, 0) + 1
 
-    def _leave(self, now_ns: int) -> Iterable[CellPacket]:
-        """Serve the next packet; return the one that has left, if it is a robot's."""
-        packet = self._serving
+    def _leave(self) -> CellPacket:
+        """Return the packet in service, which leaves, and serve the next one."""
+        packet, now_ns = self._serving, self.done_ns
         assert packet is not None, "the cell serves a packet"
         self._serving, self.done_ns = None, NOTHING_NS
         self._serve(now_ns)
-        if packet.flow >= 0:
-            return (packet._replace(sent_ns=now_ns),)
-        self.traffic[packet.flow].leave(now_ns)
-        return ()
+        if packet.flow < 0:
+            self.traffic[packet.flow].leave(now_ns)
+        return packet
 
     def _serve(self, now_ns: int) -> None:
         """Begin to serve the next packet, if one waits."""

@@ -161,9 +161,10 @@ def _cell(flown: FleetFlown, way: str) -> dict[str, Any]:
     packets, dropped, busy_ns, waited_ns = (sum(row[name] for row in rows) for name in names)
     duration, senders = flown.now_ns * 1e-9, len(flown.robots)
     service, rate = busy_ns * 1e-9 / packets, (packets + dropped) / duration  # [s], offered [1/s]
-    expected = {"md1_ms": md1(rate * service, service)}
+    expected = dict[str, float]()
     if way != "both" and not flown.experiment.cell.traffic:
         expected["nddd1_ms"] = nddd1(senders, senders / rate, service)
+        expected["md1_ms"] = md1(rate * service, service)
     return {
         "direction": way,
         "load": rate * service,
@@ -212,8 +213,10 @@ def tables(document: Mapping[str, Any], most: int = 1000) -> Iterator[list[tuple
     robots = document["robots"]
     if len(robots) > most:
         robots = [robot for robot in robots if robot["verdict"] != "success"][:most]
-    middle = {"robot": "median", **document["median"]}
-    yield cells([middle, {"robot": "worst", **document["worst"]}, *robots], ROBOTS)
+    blank = {"verdict": "", "why": ""}
+    middle = {"robot": "median", **document["median"], **blank}
+    worst = {"robot": "worst", **document["worst"], **blank}
+    yield cells([middle, worst, *robots], ROBOTS)
     if document["cell"]:
         yield cells(document["cell"], CELL)
 

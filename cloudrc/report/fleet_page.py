@@ -91,7 +91,8 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
     lines = ["".join(f'<td class="value">{escape(each)}</td>' for each in row) for row in rows[1:]]
     heads = "".join(f'<th style="text-align: right">{escape(each)}</th>' for each in rows[0])
     body = "\n".join(f"<tr>{line}</tr>" for line in lines)
-    return f"<table><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table>"
+    inner = f"<thead><tr>{heads}</tr></thead><tbody>{body}</tbody>"
+    return f'<table style="margin-top: 2rem">{inner}</table>'
 
 
 def _draw(flown: FleetFlown, document: Mapping[str, Any]) -> bytes:

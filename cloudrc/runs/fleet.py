@@ -11,12 +11,12 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from cloudrc import assembly
 from cloudrc.cloud.sharing import SharedCompute
 from cloudrc.config.resolved import ResolvedExperiment, dump
-from cloudrc.drivers.fleet import CellQueue, FleetRun, Member, SharedCores
+from cloudrc.drivers.fleet import CellQueue, Computation, FleetRun, Member, SharedCores
 from cloudrc.drivers.virtual import Sink
 from cloudrc.link.cell import FRAME_NS, Bulk, Cell, Video
 from cloudrc.record.columns import Recording
@@ -28,14 +28,6 @@ from cloudrc.runs.fly import VirtualRecorder, naming_files
 from cloudrc.runs.interrupts import raise_if_interrupted
 from cloudrc.runs.own_files import hash_files
 from cloudrc.text import csv_table
-
-
-class Fleet(NamedTuple):
-    """A fleet that is ready to fly in virtual time."""
-
-    run: FleetRun
-    cells: Sequence[Cell]  # of uplink and downlink, or one for both; empty without a cell
-    cores: SharedCores | None
 
 
 def fly_fleet(
@@ -60,11 +52,11 @@ def fly_fleet(
         fleet = assemble_fleet(experiment, robots, [each.sink for each in recorders])
         log, interrupted = CellLog(fleet.cells), False
         try:
-            fleet.run.fly(log.take)
+            fleet.fly(log.take)
         except KeyboardInterrupt:
             interrupted = True
         landed()
-        flown = FleetFlown(experiment, log, fleet.cores, fleet.run.now_ns, [], [])
+        flown = FleetFlown(experiment, log, fleet.cores, fleet.now_ns, [], [])
         for recorder, hashes in zip(recorders, files, strict=True):
             report = partial(_report, flown, recorder.folder, hashes)
             recorder.finish(report, interrupted=interrupted)
@@ -102,36 +94,45 @@ def _report(
 
 def assemble_fleet(
     experiment: ResolvedExperiment, robots: Sequence[ResolvedExperiment], sinks: Sequence[Sink]
-) -> Fleet:
+) -> FleetRun:
     """Build the robots of a fleet and connect them; each of `sinks` gets the records of a robot."""
     cells, cloud = _build_cells(experiment), experiment.cloud
     cores = SharedCores(cloud.cores, cloud.sharing) if cloud.cores else None
-    members, shortest_ns = list[Member](), list[int]()
+    members = list[Member]()
     for number, (robot, sink) in enumerate(zip(robots, sinks, strict=True)):
         orders = robot.uplink.keep_order, robot.downlink.keep_order
         queue = partial(CellQueue, number, (*cells, *cells)[:2], orders) if cells else None
-        own = assembly.build_compute_time(robot) if cores else None
-        members.append(_build(robot, sink, queue, None if own is None else SharedCompute(own)))
-        shortest_ns += (link.shortest_ns for link in assembly.build_links(robot))
-    return Fleet(FleetRun(members, cells, cores, min(shortest_ns)), cells, cores)
+        members.append(_build(number, robot, sink, queue, cores))
+    links = [link for robot in robots for link in assembly.build_links(robot)]
+    for cell in cells:
+        cell.delay_ns = min(link.shortest_ns for link in links)
+    return FleetRun(members, cells, cores)
 
 
 def _build(
+    number: int,
     robot: ResolvedExperiment,
     sink: Sink,
     queue: Callable[..., CellQueue] | None,
-    compute: SharedCompute | None,
+    cores: SharedCores | None,
 ) -> Member:
+    compute, own = None, assembly.build_compute_time(robot)
+    if cores is not None and own is not None:
+        compute = SharedCompute(own)
+        cores.clouds.append(compute)
+        compute.ask = lambda duration_ns: cores.inbox.append(
+            Computation(run.now_ns, number, duration_ns, finish)
+        )
     _, cloud, teleop, run = assembly.assemble(robot, queue=queue, compute=compute)
-    if compute is not None:
-        compute.now_ns = lambda: run.now_ns
-        compute.finish = lambda now_ns: cloud.finish(run.cloud_clock.at(now_ns))
+
+    def finish(now_ns: int) -> None:
+        cloud.finish(run.cloud_clock.at(now_ns))
 
     def see(from_world: list[Record], from_cloud: list[Record]) -> None:
         sink(from_world, run.on_world_clock(from_cloud))
 
     limit_ns = round(assembly.flight_limit(robot) * 1e9)
-    return Member(run, compute, lambda: teleop.over, limit_ns, see)
+    return Member(run, lambda: teleop.over, limit_ns, see)
 
 
 def _build_cells(experiment: ResolvedExperiment) -> list[Cell]:
