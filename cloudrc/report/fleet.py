@@ -132,7 +132,7 @@ def fleet_document(flown: FleetFlown) -> dict[str, Any]:
         for robot in robots
         if robot["verdict"] != "success"
     ]
-    text = f"{len(failed)} of {len(robots)} robots failed: {list_some(failed, 5)}"
+    text = f"{len(failed)} of {len(robots)} robots did not succeed: {list_some(failed, 5)}"
     numbers = [*NUMBERS, "dropped"]
     values = {name: [robot[name] for robot in robots if name in robot] for name in numbers}
     return {
@@ -148,7 +148,7 @@ def fleet_document(flown: FleetFlown) -> dict[str, Any]:
         "robots": robots,
         "median": {name: median(known) for name, known in values.items() if known},
         "worst": {name: max(known) for name, known in values.items() if known},
-        "cell": [_cell(flown, way) for way in flown.log.ways],
+        "cell": [_cell(flown, way) for way in flown.log.ways if flown.log.rows],
         "cloud": _cloud(flown),
         "separation_min_m": separation_min(flown.paths, scene_of(experiment.world).spawn),
     }
