@@ -168,11 +168,14 @@ def make_schema(text: str) -> Schema:
     made["properties"]["enabled"] = {"enum": [True], "description": about}
     models = [(model, "validation") for model in (Experiment, MissionConfig, Profile)]
     defined = _adapt(models_json_schema(models)[1]["$defs"])
-    for name in ("PlugIn", "Parameters"):
-        defined[name]["additionalProperties"] = {
+    fleet, cell = (defined[name]["properties"] for name in ("FleetConfig", "CellConfig"))
+    for owner in (defined["PlugIn"], defined["Parameters"], fleet["vary"]["items"]):
+        owner["additionalProperties"] = {
             "description": "A parameter of the plug-in, in the unit that its `build` documents",
             "type": ["number", "string", "boolean", "array", "null"],
         }
+    fleet["robots"] |= {"maximum": 1}  # a release is one robot
+    cell["rate_kbit"] = {"description": cell["rate_kbit"]["description"], "type": "null"}
     amount = _either(*QUANTITY["anyOf"], NULL)
     about = "CPU [cores; 250m is a quarter of a core] and memory [bytes; 64Mi is 64 * 2^20]"
     amounts = _closed(about, {"cpu": amount, "memory": amount})
