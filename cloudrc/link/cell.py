@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from math import inf
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 from cloudrc.link.model import HEADER_BYTES
 from cloudrc.link.queue import NOTHING_NS
@@ -36,7 +36,7 @@ class CellPacket(NamedTuple):
     number: int  # of the packet in its flow
     kind: int
     size: int  # with headers [bytes]
-    leave: Callable[[int], None] = print  # is called with the time at which a robot's packet leaves
+    leave: Callable[[int], None] = lambda now_ns: None  # gets the time at which it leaves [ns]
 
 
 @dataclass(slots=True)
@@ -50,18 +50,6 @@ class Usage:
     longest_ns: int = 0  # longest wait [ns]
     most: int = 0  # largest number of waiting packets
     dropped: dict[int, int] = field(default_factory=dict)  # flow -> packets
-
-
-class Traffic(Protocol):
-    """Others in the cell."""
-
-    next_ns: int
-
-    def fire(self, cell: Cell) -> None:
-        """Send what is due at `next_ns`."""
-
-    def leave(self, now_ns: int) -> None:
-        """Note that a packet of this traffic has left at `now_ns` [ns]."""
 
 
 class Cell:
@@ -91,7 +79,7 @@ class Cell:
         self._turn, self._deficits = deque[int](), dict[int, int]()  # of drr
         self._serving: CellPacket | None = None
         self._waiting = 0
-        self.traffic: dict[int, Traffic] = {}  # flow -> source
+        self.traffic: dict[int, Video | Bulk] = {}  # flow -> source
         self.inbox: list[CellPacket] = []
         self.delay_ns, self.done_ns = 0, NOTHING_NS
         self.usage = Usage()

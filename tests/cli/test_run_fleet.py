@@ -79,3 +79,13 @@ def test_a_robot_flies_alone_as_in_a_fleet_without_a_cell(folder, call):
 )
 def test_a_fleet_flies_in_virtual_time_by_run_alone(line, refused):
     assert "fleet" in refused(line)
+
+
+def test_an_interrupted_fleet_has_a_report(folder, call, monkeypatch):
+    def interrupt(run, look):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("cloudrc.drivers.fleet.FleetRun.fly", interrupt)
+    line = [*FLY, *FLEET, "--report", "none", "--out", "fleet"]
+    assert "INTERRUPTED: 3 of 3 robots did not succeed" in call(*line, code=130).out
+    assert json.loads((folder / "fleet/report.json").read_text())["cell"] == []
