@@ -27,8 +27,8 @@ class SharedCompute(ComputeTime):
     def begin(self) -> None:
         """Nothing is measured."""
 
-    def end(self) -> int:
-        """Ask for a core; return `FOREVER_NS`."""
+    def end(self, began_ns: int = 0) -> int:
+        """Ask for a core; return `FOREVER_NS`. `began_ns` is not used."""
         self.ask(self.shortest_ns)
         self.shortest_ns = self._own.end()
         return FOREVER_NS
