@@ -110,7 +110,8 @@ class FleetFlown:
         """Take what is needed from the recording and the report of a robot."""
         number, known = robot.fleet.only or 0, document["numbers"]
         row = {"robot": number, "verdict": document["verdict"]}
-        row["why"] = ", ".join(failure["code"] for failure in document["failures"])
+        if codes := [failure["code"] for failure in document["failures"]]:
+            row["why"] = ", ".join(codes)
         for name, (own, factor) in NUMBERS.items():
             if own in known:
                 row[name] = known[own]["value"] * factor
@@ -128,7 +129,7 @@ def fleet_document(flown: FleetFlown) -> dict[str, Any]:
     """Return the content of the fleet's report.json."""
     experiment, robots = flown.experiment, flown.robots
     failed = [
-        f"robot {robot['robot']} ({robot['why'] or robot['verdict']})"
+        f"robot {robot['robot']} ({robot.get('why', robot['verdict'])})"
         for robot in robots
         if robot["verdict"] != "success"
     ]
@@ -213,9 +214,8 @@ def tables(document: Mapping[str, Any], most: int = 1000) -> Iterator[list[tuple
     robots = document["robots"]
     if len(robots) > most:
         robots = [robot for robot in robots if robot["verdict"] != "success"][:most]
-    blank = {"verdict": "", "why": ""}
-    middle = {"robot": "median", **document["median"], **blank}
-    worst = {"robot": "worst", **document["worst"], **blank}
+    middle = {"robot": "median", **document["median"], "verdict": ""}
+    worst = {"robot": "worst", **document["worst"], "verdict": ""}
     yield cells([middle, worst, *robots], ROBOTS)
     if document["cell"]:
         yield cells(document["cell"], CELL)

@@ -18,7 +18,7 @@ def test_robots_count_as_near_once_one_of_them_is_away_from_the_spawn():
 
 def test_of_many_robots_the_table_has_the_median_the_worst_and_those_that_failed():
     robots = [{"robot": k, "verdict": "failure", "why": f"code_{k}", **NUMBERS} for k in range(12)]
-    robots[3] |= {"verdict": "success", "why": ""}
+    robots[3] = {"robot": 3, "verdict": "success", **NUMBERS}
     document = {"robots": robots, "median": NUMBERS, "worst": NUMBERS, "cell": []}
     (rows,) = tables(document, 10)
     assert [row[0] for row in rows] == ["robot", "median", "worst", *"012456789", "10"]
