@@ -130,7 +130,8 @@ def test_another_flight_works(command, is_whole, call):
     captured = call("", *shlex.split(command)[1:], *short, code=0 if is_whole else 1)
     too_short = "" if is_whole else r"cloudrc: warning: .*\n"
     assert PROGRESS.fullmatch(re.sub(too_short, "", captured.err))
-    assert "faults noted" not in captured.out
+    # A loop that the CPU limit stalls misses periods.
+    assert ("faults noted" in captured.out) == ("cpu_share" in command)
     folder = Path(captured.out.splitlines()[-1]).parent
     assert {"report.json", "mission.mcap"} <= {path.name for path in folder.iterdir()}
 

@@ -283,9 +283,8 @@ class ControlLoop:
         estimate = self._predict(basis, horizon)
         plan, positions = list[Vector](), list[Vector]()
         output: ControlOutput | None = STAND_STILL
-        if self._echoed_ns < self._newest_echo_ns:
-            self._echoed_ns = self._newest_echo_ns
-        elif self._echoed_ns == NEVER_NS:
+        self._echoed_ns = max(self._echoed_ns, self._newest_echo_ns)
+        if self._echoed_ns == NEVER_NS:
             self._echoed_ns = now_ns
         if now_ns - self._echoed_ns > horizon * 1e9 + self._freeze_after_ns:  # no new echo
             self.counts["frozen"] += 1
@@ -296,10 +295,9 @@ class ControlLoop:
             if self._planned and output is not None:
                 plan, positions = self._plan(moving, output.velocity, now_ns)
         says_nothing, output = output is None, output or self._output
-        velocity, yaw_rate, proportional, integral, derivative = output
         held_ns = now_ns - self._basis_arrival_ns
         planned_ns = basis.stamp_ns + round(horizon * 1e9) if plan else NEVER_NS
-        fields = (now_ns, basis.stamp_ns, held_ns, velocity, yaw_rate, tuple(plan), planned_ns)
+        fields = (now_ns, basis.stamp_ns, held_ns, *output[:2], tuple(plan), planned_ns)
         command = _new(Command, fields)
         if plan:
             self.plans.add(command, [estimate.position, *positions])
@@ -308,11 +306,9 @@ class ControlLoop:
             counter = UNSENT
         elif self._commanded is not None:
             self._call("predictor", self._commanded, command)
-        _, position, orientation, predicted_velocity, _ = estimate
         control = _new(Control, (
             now_ns, epoch, counter, basis.stamp_ns, horizon, self._rtt, self._loop_delay,
-            basis.position, position, orientation, predicted_velocity, setpoint.position,
-            setpoint.waypoint, velocity, yaw_rate, proportional, integral, derivative,
+            basis.position, *estimate[1:4], setpoint.position, setpoint.waypoint, *output,
         ))  # fmt: skip
         return None if counter == UNSENT else command, control
 

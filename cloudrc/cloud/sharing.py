@@ -22,13 +22,13 @@ class SharedCompute(ComputeTime):
 
     def __init__(self, own: ComputeTime) -> None:
         """Draw the durations from `own`, in the same order as without sharing."""
-        self._own, self.shortest_ns = own, own.end()
+        self._own, self.shortest_ns = own, own.end(0)
 
     def begin(self) -> None:
         """Nothing is measured."""
 
-    def end(self, began_ns: int = 0) -> int:
+    def end(self, began_ns: int) -> int:
         """Ask for a core; return `FOREVER_NS`. `began_ns` is not used."""
         self.ask(self.shortest_ns)
-        self.shortest_ns = self._own.end()
+        self.shortest_ns = self._own.end(0)
         return FOREVER_NS

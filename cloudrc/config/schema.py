@@ -449,8 +449,8 @@ class Cloud(Section):
 
     @model_validator(mode="after")
     def _check_compute(self) -> Cloud:
-        if self.cores and (self.compute_ms == 0 or self.compute_measured):
-            raise ValueError("cores needs compute_ms above 0, and not compute_measured")
+        if self.cores and (self.compute_ms == 0 or self.compute_measured or self.cpu_share < 1):
+            raise ValueError("cores needs compute_ms above 0, not compute_measured or cpu_share")
         if self.compute_deviation_ms > 0 and self.compute_ms == 0:
             raise ValueError("compute_deviation_ms needs compute_ms, the mean, above 0")
         if self.cpu_share < 1 and not (self.compute_ms or self.compute_measured):

@@ -54,15 +54,19 @@ def test_a_flag_reads_what_the_table_says(name):
     assert disagreements(TEXTS.items(), read.quantity, read, argparse.ArgumentTypeError) == []
 
 
+NEED_ANOTHER = {"compute_deviation_ms", "cpu_share", "send_delta_mps", "cores", "only"}
+
+
 def keys(model):
     """Yield path and quantity of each key of a model whose value is a number or null."""
     for name, forms in forms_of(model).items():
         path = tuple(name.split("."))
-        # Below a loss there are keys that must be given, and the deviation needs a mean.
+        # Below a loss there are keys that must be given, and some keys need another key.
         is_alone = {"0", "loss", "touch"}.isdisjoint(path[:-1])
         one = [form for form in forms if form.get("type") != "null"]
         is_number = len(one) == 1 and one[0].get("type") in ("number", "integer")
-        if is_alone and is_number and "enum" not in one[0] and path[-1] != "compute_deviation_ms":
+        is_alone = is_alone and path[-1] not in NEED_ANOTHER
+        if is_alone and is_number and "enum" not in one[0]:
             yield path, Quantity(**limits_of(one[0]), whole=one[0]["type"] == "integer")
 
 
