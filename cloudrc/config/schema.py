@@ -22,6 +22,7 @@ from pydantic import (
     model_validator,
 )
 
+from cloudrc.config.disturbances import Plant, SensorsConfig, WindConfig
 from cloudrc.config.fleet import CellConfig, FleetConfig
 from cloudrc.config.profile import CloudTime, CommandAge, DirectionConfig
 from cloudrc.config.section import Section
@@ -75,23 +76,6 @@ DURATION_MAX = 1_000_000
 """Largest value of a time limit, or of a dwell time in a mission [s]: eleven days."""
 Dwell = Annotated[float, Field(ge=0, le=DURATION_MAX)]
 TimeLimit = Annotated[float, Field(gt=0, le=DURATION_MAX)]
-Factor = Annotated[float, Field(ge=0.2, le=5)]
-
-
-def _factor_tag(value: Any) -> str:
-    return "<each>" if isinstance(value, list | tuple) else "<all>"
-
-
-ActuatorFactor = Annotated[
-    Annotated[Factor, Tag("<all>")]
-    | Annotated[tuple[Factor, ...], Field(min_length=1), Tag("<each>")],
-    Discriminator(_factor_tag),
-]
-Offset = Annotated[float, Field(ge=-1, le=1)]
-WindSpeed = Annotated[float, Field(ge=-20, le=20)]
-Bias = Annotated[float, Field(ge=-90, le=90)]
-
-
 MAX_WAYPOINTS = 10_000
 """Largest number of waypoints in a mission."""
 
@@ -241,55 +225,6 @@ class Parameters(Section):
     """Parameters of a plug-in, whose signature says which there are."""
 
     model_config = ConfigDict(extra="allow")
-
-
-class SensorsConfig(Section):
-    """Errors that world adds to the true state to make the odometry for cloud."""
-
-    position_noise_m: NotNegative = 0.0
-    """Standard deviation of the position noise per axis [m]"""
-    velocity_noise_mps: NotNegative = 0.0
-    """Standard deviation of the velocity noise per axis [m/s]"""
-    attitude_bias_deg: tuple[Bias, Bias, Bias] = (0.0, 0.0, 0.0)
-    """Constant error of the orientation: a rotation about the body's x, y, z [deg]"""
-    attitude_noise_deg: Annotated[float, Field(ge=0, le=90)] = 0.0
-    """Standard deviation of the orientation noise per body axis [deg]"""
-    rate_bias_radps: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
-    """Constant error of the angular velocity about the body's x, y, z [rad/s]"""
-    rate_noise_radps: NotNegative = 0.0
-    """Standard deviation of the angular velocity noise per body axis [rad/s]"""
-
-
-class Plant(Section):
-    """How the true robot differs from its model."""
-
-    mass_factor: Factor = 1.0
-    """True mass of the robot, as a multiple of the model's mass"""
-    inertia_factor: Factor = 1.0
-    """True inertia of the robot about each axis, as a multiple of the model's inertia"""
-    payload_kg: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Mass of a payload, a point that is fixed to the robot [kg]"""
-    payload_offset_m: tuple[Offset, Offset, Offset] = (0.0, 0.0, -0.1)
-    """Position of the payload in the body frame, from the origin of the base [m]"""
-    actuator_factor: ActuatorFactor = 1.0
-    """True force of the actuators as a multiple of the model's: a number for all, or a list with a
-    number for each, in the order of the model"""
-
-
-class WindConfig(Section):
-    """Horizontal wind: a mean velocity and gusts."""
-
-    velocity_mps: tuple[WindSpeed, WindSpeed] = (0.0, 0.0)
-    """Mean velocity of the air in x and y, world frame [m/s]"""
-    gust_mps: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Standard deviation of the gusts in x and in y [m/s]"""
-    gust_time_s: Annotated[float, Field(ge=0.01, le=100)] = 1.0
-    """Time constant of the gusts: their correlation falls to 37 % after this time [s]"""
-
-    @property
-    def blows(self) -> bool:
-        """Whether there is any wind."""
-        return any(self.velocity_mps) or self.gust_mps > 0.0
 
 
 class World(Section):

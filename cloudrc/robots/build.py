@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc import plugins
+from cloudrc.config.disturbances import Plant
 from cloudrc.config.overrides import BRAKING, build_plugin, default_parameters
 from cloudrc.config.problems import ProblemsError, problem_at
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotFiles, known_robot, parameters
 from cloudrc.config.scene import scene_of, steered_in
-from cloudrc.config.schema import Plant, PlugIn, World
+from cloudrc.config.schema import PlugIn, World
 from cloudrc.config.shipped import ROBOT_FILE, file_of
 from cloudrc.errors import BadInputError
 from cloudrc.messages import ZERO, Vector

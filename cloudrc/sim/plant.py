@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cloudrc.sim.readings import Readings
 
 if TYPE_CHECKING:
-    from cloudrc.config import schema
+    from cloudrc.config import disturbances
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ def point_inertia(mass: float, place: Array) -> Array:
     return mass * (place @ place * np.eye(3) - np.outer(place, place))
 
 
-def true_inertia(plant: schema.Plant, model: Inertia) -> Inertia:
+def true_inertia(plant: disturbances.Plant, model: Inertia) -> Inertia:
     """Return the inertia of the true robot: `model`, scaled by factors of `plant`, plus payload.
 
     By the parallel-axis theorem, the payload adds the inertia of a point mass m1 m2/(m1 + m2) at
@@ -51,7 +51,7 @@ class Wind:
     Deviation: both axes have this spectrum, with a given time constant.
     """
 
-    def __init__(self, wind: schema.WindConfig, rng: np.random.Generator) -> None:
+    def __init__(self, wind: disturbances.WindConfig, rng: np.random.Generator) -> None:
         self._mean, self._gust, self._time = wind.velocity_mps, wind.gust_mps, wind.gust_time_s
         self._rng, self._gusts = rng, self._gust * rng.standard_normal(2)
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cloudrc.config import schema
+from cloudrc.config import disturbances
 from cloudrc.messages import ZERO, Odometry, Vector
 from cloudrc.sim.simulator import turned
 
@@ -44,7 +44,10 @@ class Sensors:
     """
 
     def __init__(
-        self, errors: schema.SensorsConfig, rng: np.random.Generator, turn_rng: np.random.Generator
+        self,
+        errors: disturbances.SensorsConfig,
+        rng: np.random.Generator,
+        turn_rng: np.random.Generator,
     ) -> None:
         """Set the errors of the measured position, velocity, attitude and body rate.
 
@@ -57,7 +60,7 @@ class Sensors:
         self._attitude = Errors(radians(errors.attitude_noise_deg), (roll, pitch, yaw))
         self._rate = Errors(errors.rate_noise_radps, errors.rate_bias_radps)
         self._rng, self._turn_rng = rng, turn_rng
-        self.exact = errors == schema.SensorsConfig()
+        self.exact = errors == disturbances.SensorsConfig()
 
     def measure(self, truth: Odometry) -> Odometry:
         """Return the odometry that cloud gets: the true odometry plus the configured errors."""

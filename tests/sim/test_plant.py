@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from cloudrc.config import schema
+from cloudrc.config.disturbances import Plant
 from cloudrc.config.robot import find_robot
-from cloudrc.config.schema import Plant
 from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.sim.engine import mujoco
 from cloudrc.sim.plant import Wind, point_inertia

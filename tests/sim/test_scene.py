@@ -8,8 +8,9 @@ from contextlib import nullcontext
 
 import pytest
 
+from cloudrc.config.disturbances import Plant
 from cloudrc.config.robot import find_robot
-from cloudrc.config.schema import Plant, World
+from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of, names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.outside.values import InvalidValueError
@@ -153,7 +154,8 @@ def test_a_robot_meets_what_the_path_check_says_or_is_refused(
 
 
 FLIES = """
-from cloudrc.config.schema import Plant, World
+from cloudrc.config.disturbances import Plant
+from cloudrc.config.schema import World
 from cloudrc.robots.build import check_robot
 
 check_robot(World())

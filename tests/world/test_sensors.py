@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cloudrc.config import schema
+from cloudrc.config import disturbances
 from cloudrc.messages import Odometry
 from cloudrc.world.sensors import Sensors
 
@@ -12,7 +12,7 @@ TRUTH = Odometry(5, (1.0, 2.0, 3.0), (0.6, 0.0, 0.8, 0.0), (4.0, 5.0, 6.0), (7.0
 
 def sensors(**errors):
     return Sensors(
-        schema.SensorsConfig(**errors), np.random.default_rng(1), np.random.default_rng(2)
+        disturbances.SensorsConfig(**errors), np.random.default_rng(1), np.random.default_rng(2)
     )
 
 
