@@ -45,7 +45,7 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link results docs dist images kind-load lock clean
+.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link results docs dist images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -98,6 +98,12 @@ build/ros-%/done: tests/bridges/ros-%.txt | $(VENV)/dev
 	echo "import site; site.addsitedir('$$($(bin)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')')" \
 		> "$$(build/ros-$*/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/dev.pth"
 	@touch $@
+
+MOONSHOT = moonshot moonshot-disturbed
+moonshot: $(VENV)/dev build/ros-jazzy/done ## 523 flights up to a round trip of a second: all succeed in the same time? 40 minutes
+	for name in $(MOONSHOT); do $(bin)/cloudrc sweep run docs/sweeps/$$name.yaml --out build/moonshot/$$name; done
+	$(bin)/python -m tools.moonshot build/moonshot
+	build/ros-jazzy/bin/python -m pytest -m ros2 -k moonshot tests/bridges
 
 # Without root or sch_netem, pytest ends with 3; make turns every failure into 2.
 test-netem: $(VENV)/dev ## run the tests of netem in the kernel; needs root and sch_netem

@@ -74,6 +74,19 @@ def test_the_papers_controller_as_a_node_flies_the_path_of_the_built_in_one_bit_
     assert len(path) > 1000
 
 
+@pytest.mark.full
+@pytest.mark.parametrize("delay_ms", [0, 200, 500])
+def test_moonshot_the_node_flies_the_built_in_path_over_a_long_and_lossy_link(delay_ms, tmp_path):
+    settings = [
+        "link.profile=ideal", f"link.both.delay_ms={delay_ms}", "link.both.loss=0.1",
+        "guard.command_age_max_ms=1500", "cloud.freeze_after_s=1.2", "cloud.horizon_max_s=2",
+        "cloud.predictor=model_based",
+    ]  # fmt: skip
+    path = true_path(flown([*settings, "cloud.controller=ros2"], example(), tmp_path))
+    assert np.array_equal(path, true_path(built_in(settings)))
+    assert first_touch(path) > 0
+
+
 def first_touch(path):
     """Return the time at which the path is at the board [s]."""
     return path[np.argmax(path[:, 1] > 8.1), 0] * 1e-9
