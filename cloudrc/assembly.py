@@ -282,7 +282,8 @@ def build_compute_time(
     cloud = experiment.cloud
     if not (cloud.compute_ms or cpu_clock):
         return None
-    times = cloud.compute_ms * MS_TO_NS, cloud.compute_deviation_ms * MS_TO_NS
+    scale = MS_TO_NS / cloud.speed
+    times = cloud.compute_ms * scale, cloud.compute_deviation_ms * scale
     draws = generator(experiment.seed, "compute time", experiment.stream)
     return ComputeTime(*times, draws, cpu_clock, cloud.cpu_share)
 

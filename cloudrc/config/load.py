@@ -47,6 +47,7 @@ from cloudrc.config.schema import (
     Cloud,
     Experiment,
     MissionConfig,
+    PlaceFile,
     World,
 )
 from cloudrc.errors import BadInputError
@@ -65,8 +66,12 @@ _NAMES: dict[KeyPath, Any] = {
 """Key path of a name -> value in place of null."""
 _SECTIONS = ("world", "guard", "link", "cloud", "report")
 """Sections that may be null, and get values."""
-_PROFILE_KEYS = {("link",), ("link", "profile")}
+_PROFILE_KEYS = {("link",), ("link", "profile"), ("cloud", "place")}
 """If a setting gives one of these keys, it replaces the whole link profile."""
+_OF_ALL = "fleet", "cell", "cloud.cores", "cloud.sharing", "cloud.place"
+"""Beginnings of keys that are the same for all robots of a fleet."""
+_COMPUTER = "speed", "cores", "sharing"
+"""Keys of cloud that a place gives."""
 
 
 @reuse_results()
@@ -128,6 +133,8 @@ def _combine(
         _default(document, path, name)
     with problems.collect(found, ("mission",)):
         _inline_mission(document)
+    with problems.collect(found, ("cloud", "place")):
+        _take_place(document)
     with problems.collect(found, ("link", "profile")):
         _inline_profile(document)
     _take_contact(document)
@@ -154,7 +161,7 @@ def _settings_of_robot(document: Document, changes: Settings) -> Settings:
         return others
     for robot in vary:
         for key, value in robot.items():
-            if key.startswith(("fleet", "cell", "cloud.cores", "cloud.sharing")):
+            if key.startswith(_OF_ALL):
                 raise BadInputError(f"{key} is the same for all robots")
             if isinstance(value, str) and value.startswith("."):
                 robot[key] = str(source.absolute(value))
@@ -300,6 +307,26 @@ def _take_contact(document: Document) -> None:
             mission["touch"] = None
 
 
+def _take_place(document: Document) -> None:
+    """Fill in link and computer of the place where cloud runs; keys that are given win."""
+    name = document.get("cloud", "place")
+    if not isinstance(name, str):
+        return
+    source = document.source(("cloud", "place"))
+    file = shipped.read("place", name, source.folder)
+    place = problems.validate(file, PlaceFile, name)
+    if shipped.is_path(name):
+        document.set_value(("cloud", "place"), str(source.absolute(name)), source)
+    for key in _COMPUTER:
+        if key not in document.tree["cloud"]:
+            document.set_value(("cloud", key), getattr(place, key), source)
+    if _has_all_values(document) or document.source(("link", "profile")).is_setting:
+        return
+    document.set_value(("link", "profile"), place.profile, file.source(("profile",)))
+    for way in DIRECTIONS:
+        _inline_direction(document, way, file)
+
+
 def _inline_profile(document: Document) -> None:
     """Fill in the values of the link that the experiment omits, from the link profile."""
     _default(document, ("link", "profile"), Experiment().link.profile)
@@ -386,19 +413,28 @@ def _remove_derived(document: Document, name: str, *, new_profile: bool) -> None
     """
     draft = problems.validate(document, Experiment, name)
     guard = draft.guard
-    derived: dict[KeyPath, float] = {("guard", "plan_max_s"): _plan_max(document)}
+    derived: dict[KeyPath, Any] = {("guard", "plan_max_s"): _plan_max(document)}
     with suppress(BadInputError):  # another robot or scene may follow
         bounds = _bounds(draft)
         derived["guard", "acceleration_max_mps2"] = bounds.robot.acceleration_max_mps2
         age_max = guard.command_age_max_ms or COMMAND_AGE_MAX_MS
         derived["guard", "speed_max_mps"] = speed_cap(age_max, guard.plan_max_s or 0.0, bounds)
     if new_profile:
-        derived |= _implied(_present_profile(document))
+        derived |= _implied(_present_profile(document)) | _computer(document)
         for way in DIRECTIONS:
             del document.tree["link"][way]
     for (section, key), value in derived.items():
         if document.get(section, key) == value:
-            del document.tree[section][key]
+            document.tree[section].pop(key, None)
+
+
+def _computer(document: Document) -> dict[KeyPath, Any]:
+    """Return the values of the place of a resolved experiment, or the defaults without one."""
+    present = PlaceFile()
+    if name := document.get("cloud", "place"):
+        with suppress(BadInputError):
+            present = problems.validate(shipped.read("place", name, Path()), PlaceFile, name)
+    return {("cloud", key): getattr(present, key) for key in _COMPUTER}
 
 
 def _resolve_paths(document: Document) -> list[ConfigProblem]:

@@ -328,6 +328,11 @@ COMMAND_RATE_MIN_HZ, COMMAND_RATE_MAX_HZ = 20, 500
 """Smallest and largest value of cloud.command_rate_hz [Hz]; the guard runs at 500 Hz."""
 
 
+Sharing = Literal["fifo", "ps"]
+ComputeSpeed = Annotated[float, Field(ge=0.01, le=100)]
+"""Speed of a processor, as a multiple of that of the reference."""
+
+
 class Cloud(Section):
     """The remote controller."""
 
@@ -375,16 +380,24 @@ class Cloud(Section):
     """By how much cloud's clock is ahead of world's at the start [s]; virtual time only"""
     clock_drift_ppm: Annotated[int, Field(ge=-1000, le=1000)] = 0
     """By how much cloud's clock is faster than world's [ppm]; virtual time only"""
+    place: str | None = None
+    """Where cloud runs: name of a shipped place, or a path. It gives the link, speed, cores and
+    sharing. A key of these that the experiment or a setting gives wins over the place, but the
+    place replaces the experiment's link.profile. null: link and keys as given"""
+    speed: ComputeSpeed = 1.0
+    """Speed of cloud's processor: with 0.2, each computation needs 5 times compute_ms, which holds
+    for the reference, speed 1"""
     cores: Count | None = None
     """Number of cores that the clouds of a fleet share, each for compute_ms; virtual time only.
     null: each robot's cloud has a core of its own"""
-    sharing: Literal["fifo", "ps"] = "fifo"
+    sharing: Sharing = "fifo"
     """How the clouds share cores. fifo: one computation after the other; ps: processor sharing, all
     at the same time, each more slowly"""
 
     @model_validator(mode="after")
     def _check_compute(self) -> Cloud:
-        if self.cores and (self.compute_ms == 0 or self.compute_measured or self.cpu_share < 1):
+        timed = self.compute_ms > 0 or self.place is not None
+        if self.cores and (not timed or self.compute_measured or self.cpu_share < 1):
             raise ValueError("cores needs compute_ms above 0, not compute_measured or cpu_share")
         if self.compute_deviation_ms > 0 and self.compute_ms == 0:
             raise ValueError("compute_deviation_ms needs compute_ms, the mean, above 0")
@@ -398,6 +411,25 @@ class Cloud(Section):
     def beat(self) -> float:
         """Longest time between two commands with `send_delta_mps` [s]."""
         return self.plan_s / 4 if self.beat_s is None else self.beat_s
+
+
+class PlaceFile(Section):
+    """A place where cloud may run, such as the files under places."""
+
+    description: str = ""
+    """One line about the place, for lists"""
+    profile: str = "ideal"
+    """Link profile of the network to the place: a name, or a path"""
+    uplink: DirectionConfig = DirectionConfig()
+    """Conditions from the robot to the place; a key here overrides the profile"""
+    downlink: DirectionConfig = DirectionConfig()
+    """Conditions from the place to the robot; a key here overrides the profile"""
+    speed: ComputeSpeed = 1.0
+    """Speed of a core, as a multiple of that of the reference, for which cloud.compute_ms holds"""
+    cores: Count | None = None
+    """Number of cores that the clouds of all robots share. null: each has a core of its own"""
+    sharing: Sharing = "fifo"
+    """How they share the cores, see cloud.sharing"""
 
 
 class Criteria(Section):

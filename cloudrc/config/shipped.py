@@ -14,6 +14,7 @@ _PACKAGE = Path(__file__).parents[1]
 FOLDERS = {
     "experiment": _PACKAGE / "experiments",
     "mission": _PACKAGE / "missions",
+    "place": _PACKAGE / "places",
     "profile": _PACKAGE / "link" / "profiles",
     "scene": _PACKAGE / "world" / "scenes",
     "robot": _PACKAGE / "robots",
@@ -45,7 +46,7 @@ def describe(kind: str, name: str) -> str:
 
 
 def read(kind: str, name: str, folder: Path) -> Document:
-    """Read an experiment, mission or profile by name, or by path relative to `folder`.
+    """Read an experiment, mission, place or profile by name, or by path relative to `folder`.
 
     Raise a BadInputError if this is not possible.
     """

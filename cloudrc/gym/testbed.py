@@ -50,6 +50,8 @@ OWN = {
     "cloud.compute_deviation_ms": 0,
     "cloud.compute_measured": False,
     "cloud.cpu_share": 1,
+    "cloud.place": None,
+    "cloud.speed": 1,
     "cloud.send_delta_mps": None,
     "cloud.predictor": "last_sample",
     "cloud.estimator": "running_mean",

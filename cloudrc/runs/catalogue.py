@@ -9,7 +9,7 @@ from pathlib import Path
 from cloudrc.text import Paint, plain, table
 
 PLUGINS = ("estimators", "predictors", "controllers", "onboard", "metrics")
-YAML = ("experiments", "missions", "profiles", "robots")
+YAML = ("experiments", "missions", "places", "profiles", "robots")
 XML = ("scenes",)
 KINDS = (*YAML, *PLUGINS, *XML)
 """Kinds of what an experiment may name."""
@@ -88,6 +88,7 @@ def settings() -> Iterator[str]:
         **{f"world.{kind}": shipped.names(kind) for kind in ("robot", "scene")},
         "link.profile": shipped.names("profile"),
         "mission": shipped.names("mission"),
+        "cloud.place": shipped.names("place"),
     }
     keys = plain_keys(Experiment)
     keys |= {key.replace("uplink", "both") for key in keys if key.startswith("link.uplink.")}

@@ -19,11 +19,11 @@ from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.drivers.fleet import CellQueue, Computation, FleetRun, Member, SharedCores
 from cloudrc.drivers.virtual import Sink
 from cloudrc.link.cell import FRAME_NS, Bulk, Cell, Video
-from cloudrc.record.columns import Recording
+from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.records import Record
-from cloudrc.report.document import Run, write_json
+from cloudrc.report.document import Assessment, Run, write_json
 from cloudrc.report.fleet import CellLog, FleetFlown, fleet_document
-from cloudrc.report.write import write_report
+from cloudrc.report.write import assess, write_report
 from cloudrc.runs.fly import VirtualRecorder, naming_files
 from cloudrc.runs.interrupts import raise_if_interrupted
 from cloudrc.runs.own_files import hash_files
@@ -71,6 +71,19 @@ def fly_fleet(
     return document
 
 
+def fly_in_memory(
+    experiment: ResolvedExperiment, robots: Sequence[ResolvedExperiment]
+) -> list[Assessment]:
+    """Fly a fleet in virtual time, and measure and judge each robot, without any file."""
+    stores = [RecordStore() for _ in robots]
+    assemble_fleet(experiment, robots, [store.add for store in stores]).fly()
+    run = Run("virtual", "virtual", notes=assembly.virtual_notes(experiment))
+    return [
+        assess(Recording(records=store), robot, run, robot.report.metrics)
+        for store, robot in zip(stores, robots, strict=True)
+    ]
+
+
 def _record(robot: ResolvedExperiment, folder: Path) -> VirtualRecorder:
     folder.mkdir()
     (folder / "config.yaml").write_text(dump(robot), encoding="utf-8")
@@ -97,7 +110,7 @@ def assemble_fleet(
 ) -> FleetRun:
     """Build the robots of a fleet and connect them; each of `sinks` gets the records of a robot."""
     cells, cloud = _build_cells(experiment), experiment.cloud
-    cores = SharedCores(cloud.cores, cloud.sharing) if cloud.cores else None
+    cores = SharedCores(cloud.cores, cloud.sharing) if cloud.cores and cloud.compute_ms else None
     members = list[Member]()
     for number, (robot, sink) in enumerate(zip(robots, sinks, strict=True)):
         orders = robot.uplink.keep_order, robot.downlink.keep_order

@@ -1,0 +1,80 @@
+"""`cloudrc place EXPERIMENT`: where should the controller run?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from cloudrc.cli.output import TABLE, output_argument, print_result, tell, warn
+from cloudrc.cli.parser import COUNT_MAX, Options, Parser, flags, number, read_count, settings_from
+from cloudrc.runs.folder import new_folder
+from cloudrc.runs.lock import lock_folder
+from cloudrc.text import escape
+
+EPILOG = """\
+examples:
+  cloudrc place fast
+  cloudrc place steps --compute 0,5,20,60 --robots 1,4,10 --seeds 3
+  cloudrc place fast --places onboard,./factory.yaml --set cloud.controller=mpc
+
+A computing time holds for a core of speed 1; each place has a speed, see
+'cloudrc list places'. The best place is where most robots succeed; of equal
+ones the one with the shortest time in HOLD, then the smallest cross-track
+error, then the shortest settling time. A place loses if it is worse by more
+than 5 % with every seed. With --out DIR of an earlier call, only what is missing flies."""
+
+
+def arguments(parser: Parser) -> None:
+    """Declare the command's arguments."""
+    add = flags(parser)
+    about = "a shipped name or a YAML file (default: fast)"
+    add("experiment", "EXPERIMENT", about, "fast", nargs="?")
+    about = "computing times of a command in ms (default: 0,5,20,60)"
+    add("--compute", "MS,...", about, "0,5,20,60", _list_of(number(0, 1000, "ms")))
+    add("--robots", "N,...", "numbers of robots (default: 1)", "1", _list_of(read_count))
+    about = "shipped places or YAML files (default: onboard,edge,cloud)"
+    add("--places", "PLACE,...", about, "onboard,edge,cloud", _list_of(str))
+    add("--set", "KEY=VALUE", "change one key of the experiment; repeatable")
+    add("--seeds", "N", "fly seeds 1 to N (default: 3)", 3, read_count)
+    add("--calm", "", "fly without wind and without a payload")
+    add("--jobs", "N", "parallel processes (default: one per core)", COUNT_MAX, read_count)
+    add("--out", "DIR", "folder (default: a new one in runs/); if it has rows, fly the others")
+    output_argument(parser)
+
+
+def _list_of(read: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
+    return lambda text: tuple(dict.fromkeys(read(each.strip()) for each in text.split(",")))
+
+
+def execute(options: Options) -> int:
+    """Fly what is missing, and print the table; return 0 if all was flown."""
+    from cloudrc.cli.progress import Progress, SweepView
+    from cloudrc.studies.place import Asked, PlaceTrial, as_text, describe
+    from cloudrc.trials.play import run
+    from cloudrc.trials.rows import Rows
+
+    asked = settings_from(options, Asked)
+    with Progress("checks the flights"):
+        trials: Sequence[PlaceTrial] = asked.plan()
+    warn(*(trial.fleet for trial in trials))
+    name, folder = trials[0].fleet.name, options.out
+    if folder is None or not any(folder.glob("rows*.jsonl")):
+        folder = new_folder(folder, f"place-{name}", "latest-place")
+    with lock_folder(folder):
+        rows = Rows(folder)
+        missing = [trial for trial in trials if trial.key not in rows.kept]
+        disturbed = ", ".join(f"{key}={value}" for key, value in asked.disturbances.items())
+        air = f"with {disturbed} (--calm: without)" if disturbed else "calm"
+        head = f"{name} {air}; seeds 1 to {asked.seeds}"
+        head = f"{head}; {len(missing)} flights"
+        with SweepView(head, len(missing), on_stdout=options.output == TABLE) as view:
+            stopped = run(missing, rows, options.jobs, view.see, in_order=False)
+    if stopped:
+        tell(f"{stopped}; to continue, add --out {folder}")
+    document = {
+        **{"experiment": name, "overrides": options.set, "disturbances": asked.disturbances},
+        **{"seeds": asked.seeds, "interrupted": bool(stopped)},
+        **describe(trials, rows.kept),
+    }
+    print_result(options.output, document, f"\n{as_text(document)}\n\n{escape(str(folder))}")
+    return stopped.exit_code if stopped else 0

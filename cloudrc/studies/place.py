@@ -1,0 +1,258 @@
+"""Say where the controller should run, by flights with disturbances at several places.
+
+In calm air a place hardly matters: a controller that knows the robot needs no news. So the flights
+have wind and a robot that is heavier than its model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby, product
+from operator import itemgetter
+from pathlib import Path
+from statistics import mean, median
+from typing import Any, NamedTuple
+
+from cloudrc import assembly, source
+from cloudrc.config.overrides import parse_settings
+from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.outside import code
+from cloudrc.outside.reuse import reuse_results
+from cloudrc.runs.experiment import check_mode, check_no_seed, load, robots_of
+from cloudrc.runs.fleet import fly_in_memory
+from cloudrc.runs.flight import ERROR, explain
+from cloudrc.text import FAILED_MARK, FAILED_NOTE, cells, escape, table
+from cloudrc.trials.fingerprint import experiment_facts, fingerprint
+from cloudrc.trials.rows import Row
+
+DISTURBANCES = {
+    "world.wind.velocity_mps": "[1, 0]",
+    "world.wind.gust_mps": "1",
+    "world.plant.mass_factor": "1.1",
+    "criteria.settle_m": "0.3",
+}
+"""Setting -> value in flights that are not calm: a light breeze, and a payload. A controller without an
+integral part then rests beside its setpoint, hence the last one."""
+AXES = "compute_ms", "robots", "place"
+NUMBERS = {
+    "age_ms": ("age_at_actuator_mean", 1e3),
+    "age_p99_ms": ("age_at_actuator_p99", 1e3),
+    "hold_s": ("hold_time", 1.0),
+    "cross_track_mm": ("cross_track_rms", 1e3),
+    "settling_s": ("settling_time_mean", 1.0),
+}
+"""Number of a row -> number of a flight, factor from the SI unit."""
+JUDGED = {
+    "hold_s": ("time in HOLD", "{:.1f} s", 0.1),
+    "cross_track_mm": ("cross-track error", "{:.0f} mm", 1.0),
+    "settling_s": ("settling time", "{:.2f} s", 0.01),
+}
+"""Number that decides between places where equally many robots succeed, the first one first -> its
+name, its form, and a difference that counts as none [unit of the number]. Less is better."""
+SAME = 0.05
+"""Relative difference that counts as none."""
+TABLE = {
+    "compute [ms]": "{compute_ms:g}",
+    "robots": "{robots}",
+    "place": "{name}",
+    "success": "{succeeded}/{flown}{mark}",
+    "age [ms]": "{age_ms:.0f}",
+    "age p99 [ms]": "{age_p99_ms:.0f}",
+    "HOLD [s]": "{hold_s:.2f}",
+    "cross-track [mm]": "{cross_track_mm:.0f}",
+    "settling [s]": "{settling_s:.2f}",
+    "kbit/s": "{rate_kbit:.0f}",
+    "why": "{why}",
+}
+"""Head -> cell of the table."""
+
+
+class PlaceTrial(NamedTuple):
+    """Flights of all robots at a place, with one seed."""
+
+    fingerprint: str
+    point: dict[str, Any]  # axis -> value
+    seed: int
+    fleet: ResolvedExperiment
+    robots: tuple[ResolvedExperiment, ...]
+
+    @property
+    def key(self) -> str:
+        """Name of the trial's row."""
+        return fingerprint(self.fingerprint, self.seed)
+
+    def play(self) -> Row:
+        """Fly; return the row, whose numbers are medians over the robots."""
+        of = {"key": self.key, "point": self.point, "seed": self.seed, "code": source.code_hash()}
+        fleet, *robots = (
+            each.model_copy(update={"seed": self.seed}) for each in (self.fleet, *self.robots)
+        )
+        try:
+            with reuse_results():
+                found = fly_in_memory(fleet, robots)
+        except code.FAILURES as error:
+            row = {"verdict": ERROR, "failures": [ERROR], "text": explain(error)}
+            return of | row | {"numbers": {}, "records_sha256": ""}
+        failures = [failure for each in found for failure in each.verdict.failures]
+        succeeded = sum(each.verdict.outcome == "success" for each in found)
+        values = [{name: each.value for name, each in robot.numbers.items()} for robot in found]
+        names = {name for robot in values for name in robot}
+        middle = {name: median(robot[name] for robot in values if name in robot) for name in names}
+        return {
+            **of,
+            "verdict": "success" if succeeded == len(found) else "failure",
+            "failures": sorted({failure.code for failure in failures}),
+            "text": failures[0].text if failures else "",
+            "numbers": {"succeeded": succeeded, **middle},
+            "records_sha256": fingerprint([each.records_sha256 for each in found]),
+            "physics_steps": assembly.step_code(fleet),
+        }
+
+
+@dataclass(frozen=True)
+class Asked:
+    """The question of `cloudrc place`."""
+
+    experiment: str  # name or path
+    set: Sequence[str]  # KEY=VALUE
+    compute: Sequence[float]  # computing times of a command on the reference [ms]
+    robots: Sequence[int]
+    places: Sequence[str]  # names or paths
+    seeds: int
+    calm: bool
+
+    @property
+    def disturbances(self) -> dict[str, str]:
+        """Setting -> value that the person has not set."""
+        given = [".".join(path) for path in parse_settings(self.set)]
+        return {
+            key: value
+            for key, value in DISTURBANCES.items()
+            if not self.calm and not any(f"{key}.".startswith(f"{own}.") for own in given)
+        }
+
+    def plan(self) -> list[PlaceTrial]:
+        """Check all flights; return them in the order of the table."""
+        check_no_seed(self.set)
+        disturbed = [f"{key}={value}" for key, value in self.disturbances.items()]
+        trials = list[PlaceTrial]()
+        with reuse_results():
+            for values in product(self.compute, self.robots, self.places):
+                point = dict(zip(AXES, values, strict=True))
+                keys = (f"cloud.{AXES[0]}", f"fleet.{AXES[1]}", f"cloud.{AXES[2]}")
+                own = [f"{key}={value}" for key, value in zip(keys, values, strict=True)]
+                settings = [*self.set, *disturbed, *own]
+                fleet = load(self.experiment, settings, fleets=True)
+                robots = tuple(robots_of(fleet, self.experiment, settings))
+                for robot in robots:
+                    check_mode(robot, "virtual")
+                known = fingerprint(experiment_facts(fleet), *map(experiment_facts, robots))
+                of_point = (
+                    PlaceTrial(known, point, seed, fleet, robots)
+                    for seed in range(1, self.seeds + 1)
+                )
+                trials.extend(of_point)
+        return trials
+
+
+def describe(trials: Iterable[PlaceTrial], rows: Mapping[str, Row]) -> dict[str, Any]:
+    """Return a row for each point that has flown, and which place wins, as values for JSON."""
+    found = [
+        _describe_point(trial, [rows[each.key] for each in (trial, *others) if each.key in rows])
+        for _, (trial, *others) in groupby(trials, lambda trial: trial.fingerprint)
+    ]
+    shown = [each for each in found if each["flown"]]
+    groups = groupby(shown, lambda row: (row["compute_ms"], row["robots"]))
+    best = [
+        {"compute_ms": compute, "robots": robots, **judge([*group])}
+        for (compute, robots), group in groups
+    ]
+    return {"points": shown, "best": best}
+
+
+def _describe_point(trial: PlaceTrial, rows: Sequence[Row]) -> dict[str, Any]:
+    numbers = [row["numbers"] for row in rows]
+    row = {
+        **trial.point,
+        "name": Path(trial.point["place"]).stem,
+        "succeeded": sum(each.get("succeeded", 0) for each in numbers),
+        "flown": len(trial.robots) * len(rows),
+    }
+    row["by_seed"] = {
+        name: [each[own] * factor if own in each else None for each in numbers]
+        for name, (own, factor) in NUMBERS.items()
+    }
+    for name, values in row["by_seed"].items():
+        if known := [value for value in values if value is not None]:
+            row[name] = median(known)
+    if trial.fleet.link_values:  # else nothing leaves the robot
+        sent = [
+            (each["bytes_sent_uplink"] + each["bytes_sent_downlink"]) / each["duration"] / 125
+            for each in numbers
+            if "duration" in each
+        ]
+        row["rate_kbit"] = mean(sent) if sent else None
+    else:
+        row["rate_kbit"] = 0.0
+    if codes := sorted({code for each in rows for code in each["failures"]}):
+        row["why"] = ", ".join(codes)
+    return row
+
+
+def judge(places: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the names of the best of places, several if they do not differ, and by what they win.
+
+    First decides how many robots succeed, then the numbers in `JUDGED`: a place loses if it is
+    worse with every seed. All have the same wind with a seed.
+    """
+    share = max(each["succeeded"] / each["flown"] for each in places)
+    if share == 0:
+        return {"places": [], "by": "no robot succeeds anywhere"}
+    best = [each for each in places if each["succeeded"] / each["flown"] == share]
+    by, lost = list[str](), [each for each in places if each not in best]
+    if lost:
+        shares = (f"{each['succeeded']}/{each['flown']} ({each['name']})" for each in lost)
+        by.append(f"{best[0]['succeeded']}/{best[0]['flown']} succeed, not {', '.join(shares)}")
+    for name, (words, form, same) in JUDGED.items():
+        if not all(name in each for each in best):
+            continue
+        first = min(best, key=itemgetter(name))
+        limits = [
+            None if value is None else value + max(same, SAME * value)
+            for value in first["by_seed"][name]
+        ]
+        worse = [each for each in best if _all_above(each["by_seed"][name], limits)]
+        if worse:
+            best = [each for each in best if each not in worse]
+            others = (f"{form.format(each[name])} ({each['name']})" for each in worse)
+            by.append(f"{words} {form.format(first[name])}, not {', '.join(others)}")
+    return {"places": [each["name"] for each in best], "by": "; ".join(by)}
+
+
+def _all_above(values: Iterable[float | None], limits: Iterable[float | None]) -> bool:
+    """Return whether all values [any unit] are above their limits, where both are known."""
+    pairs = zip(values, limits, strict=False)  # an interrupted study has fewer seeds
+    known = [value > limit for value, limit in pairs if value is not None and limit is not None]
+    return bool(known) and all(known)
+
+
+def as_text(document: Mapping[str, Any]) -> str:
+    """Format what `describe` returns: the table, and a line for each computing time and number."""
+    rows = [
+        {**each, "mark": FAILED_MARK * (each["succeeded"] < each["flown"])}
+        for each in document["points"]
+    ]
+    text = [table(cells(rows, TABLE), right=(0, 1, *range(3, 10)))]
+    if any(each["mark"] for each in rows):
+        text.append(FAILED_NOTE)
+    count = len({each["place"] for each in rows})
+    lines = list[str]()
+    for each in document["best"]:
+        names, by = each["places"], each["by"]
+        where = "anywhere" if len(names) == count > 1 else " or ".join(names) or "nowhere"
+        robots = f"{each['robots']} robot{'s' * (each['robots'] > 1)}"
+        lines.append(
+            escape(f"{each['compute_ms']:g} ms, {robots}: {where}{f': {by}' if by else ''}")
+        )
+    return "\n\n".join([*text, "\n".join(lines)])
