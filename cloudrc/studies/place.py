@@ -32,8 +32,10 @@ DISTURBANCES = {
     "world.plant.mass_factor": "1.1",
     "criteria.settle_m": "0.3",
 }
-"""Setting -> value in flights that are not calm: a light breeze, and a payload. A controller without an
-integral part then rests beside its setpoint, hence the last one."""
+"""Setting -> value in flights that are not calm: a light breeze, and a payload.
+
+A controller without an integral part then rests beside its setpoint, hence the last one.
+"""
 AXES = "compute_ms", "robots", "place"
 NUMBERS = {
     "age_ms": ("age_at_actuator_mean", 1e3),
@@ -43,6 +45,8 @@ NUMBERS = {
     "settling_s": ("settling_time_mean", 1.0),
 }
 """Number of a row -> number of a flight, factor from the SI unit."""
+SENT = "bytes_sent_uplink", "bytes_sent_downlink"
+"""Numbers of a flight: payload of all datagrams [byte]."""
 JUDGED = {
     "hold_s": ("time in HOLD", "{:.1f} s", 0.1),
     "cross_track_mm": ("cross-track error", "{:.0f} mm", 1.0),
@@ -186,15 +190,13 @@ def _describe_point(trial: PlaceTrial, rows: Sequence[Row]) -> dict[str, Any]:
     for name, values in row["by_seed"].items():
         if known := [value for value in values if value is not None]:
             row[name] = median(known)
-    if trial.fleet.link_values:  # else nothing leaves the robot
-        sent = [
-            (each["bytes_sent_uplink"] + each["bytes_sent_downlink"]) / each["duration"] / 125
-            for each in numbers
-            if "duration" in each
-        ]
-        row["rate_kbit"] = mean(sent) if sent else None
-    else:
-        row["rate_kbit"] = 0.0
+    sent = [
+        sum(each[name] for name in SENT) / each["duration"] * 8e-3
+        for each in numbers
+        if each.keys() >= {*SENT, "duration"}
+    ]
+    onboard = not trial.fleet.link_values  # nothing leaves the robot
+    row["rate_kbit"] = 0.0 if onboard else mean(sent) if sent else None
     if codes := sorted({code for each in rows for code in each["failures"]}):
         row["why"] = ", ".join(codes)
     return row
