@@ -139,7 +139,7 @@ def fly_once(options: Options, mode: str, ready: Ready | None = None) -> int:
     release = _checked_release(experiment, options) if mode == "cluster" else None
     folder = run_folder(experiment, "session" if ready else mode, options.out)
     if options.output == "table":
-        facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
+        facts = f"mode {mode}, seed {experiment.seed}, {experiment.network}"
         flown = "session" if ready else experiment.mission.contents
         print_or_drop(escape(f"{experiment.name}: {facts}, {flown}"))
     with _place_of_recording(folder):
@@ -190,7 +190,7 @@ def _fly_fleet(experiment: ResolvedExperiment, options: Options) -> int:
     if options.output == "table":
         cell, count = experiment.cell, f"{len(robots)} robot{'s' * (len(robots) > 1)}"
         place = f" in a cell of {cell.rate_kbit:g} kbit/s ({cell.queue})" if cell.rate_kbit else ""
-        facts = f"mode virtual, seed {experiment.seed}, link {experiment.link.profile}"
+        facts = f"mode virtual, seed {experiment.seed}, {experiment.network}"
         contents = experiment.mission.contents
         print_or_drop(escape(f"{experiment.name}: {facts}, {count}{place}, {contents}"))
     with Progress("flies the fleet") as view:

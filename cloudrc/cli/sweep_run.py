@@ -187,7 +187,7 @@ def fly_seeds(options: Options) -> int:
     warn(experiment)
     folder = new_folder(options.out, f"{plan.name}-virtual-{count}seeds", "latest-sweep")
     rows = sweep.begin(folder, plan)
-    head = f"{plan.name}: mode virtual, seeds 1 to {count}, link {experiment.link.profile}"
+    head = f"{plan.name}: mode virtual, seeds 1 to {count}, {experiment.network}"
     is_table = options.output == "table"
     make = SeedsView if is_table else SweepView
     with make(head, count, on_stdout=is_table) as view:

@@ -262,8 +262,11 @@ def load_link(file: Path, experiment: Path) -> Profile:
 
 def _link_of(document: Document, name: str) -> Profile:
     """Return the link of an experiment, whose other parts are not looked at."""
-    document.tree = {"link": document.get("link") or {}}
+    place = document.get("cloud", "place")
+    document.tree = {"link": document.get("link") or {}, "cloud": {"place": place}}
     found: list[ConfigProblem] = []
+    with problems.collect(found, ("cloud", "place")):
+        _take_place(document)
     with problems.collect(found, ("link", "profile")):
         _inline_profile(document)
     found += _resolve_paths(document)

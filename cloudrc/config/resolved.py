@@ -149,6 +149,14 @@ class ResolvedExperiment(Experiment):
         return self.link.downlink
 
     @property
+    def network(self) -> str:
+        """The link in words, for headlines: the place of cloud, or the link profile."""
+        place, profile = self.cloud.place, self.link.profile
+        if place is not None and profile == "ideal":
+            return f"place {Path(place).stem}"
+        return f"link {profile}"
+
+    @property
     def link_values(self) -> dict[str, Any]:
         """Content of a profile of this link, without defaults."""
         return self.link.model_dump(mode="json", include={*DIRECTIONS}, exclude_defaults=True)

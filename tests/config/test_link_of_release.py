@@ -34,3 +34,10 @@ def test_without_a_name_the_link_is_that_of_the_experiment_whatever_its_robot(li
     default = load_experiment("paper")
     assert link("profile: null") == link("profile: null", dump(default))
     assert link("profile: null").uplink == default.uplink
+
+
+def test_without_a_name_the_link_is_that_of_the_experiments_place(link):
+    found = link("profile: null", "{cloud: {place: edge}, link: {uplink: {delay_ms: 80}}}")
+    assert (found.uplink.delay_ms, found.downlink.delay_ms) == (80, 5)
+    with pytest.raises(BadInputError, match=r"no place named 'egde'.*did you mean edge"):
+        link("profile: null", "{cloud: {place: egde}}")
