@@ -31,7 +31,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "recover": "write a clean copy of a damaged recording",
         "compare": "say whether a setting differs from another, and how sure that is",
         "margin": "find the delay, or other value, up to which the loop is stable",
-        "place": "say where the controller should run: on board, at the edge, in the cloud",
+        "place": "find out where the controller should run: robot, edge or cloud",
         "eval": "measure whether a policy survives a network",
         "policy": "serve a policy that controls robots elsewhere",
         "bench": "measure how fast the simulation runs here",

@@ -21,7 +21,8 @@ A computing time holds for a core of speed 1; each place has a speed, see
 'cloudrc list places'. The best place is where most robots succeed; of equal
 ones the one with the shortest time in HOLD, then the smallest cross-track
 error, then the shortest settling time. A place loses if it is worse by more
-than 5 % with every seed. With --out DIR of an earlier call, only what is missing flies."""
+than 5 % with every seed. With --out DIR of an earlier call, only what is
+missing flies."""
 
 
 def arguments(parser: Parser) -> None:
@@ -49,13 +50,13 @@ def _list_of(read: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
 def execute(options: Options) -> int:
     """Fly what is missing, and print the table; return 0 if all was flown."""
     from cloudrc.cli.progress import Progress, SweepView
-    from cloudrc.studies.place import Asked, PlaceTrial, as_text, describe
+    from cloudrc.studies.place import PlaceStudy, PlaceTrial, as_text, describe
     from cloudrc.trials.play import run
     from cloudrc.trials.rows import Rows
 
-    asked = settings_from(options, Asked)
+    study = settings_from(options, PlaceStudy)
     with Progress("checks the flights"):
-        trials: Sequence[PlaceTrial] = asked.plan()
+        trials: Sequence[PlaceTrial] = study.plan()
     warn(*(trial.fleet for trial in trials))
     name, folder = trials[0].fleet.name, options.out
     if folder is None or not any(folder.glob("rows*.jsonl")):
@@ -63,17 +64,17 @@ def execute(options: Options) -> int:
     with lock_folder(folder):
         rows = Rows(folder)
         missing = [trial for trial in trials if trial.key not in rows.kept]
-        disturbed = ", ".join(f"{key}={value}" for key, value in asked.disturbances.items())
-        air = f"with {disturbed} (--calm: without)" if disturbed else "calm"
-        head = f"{name} {air}; seeds 1 to {asked.seeds}"
-        head = f"{head}; {len(missing)} flights"
+        settings = [*options.set, *(f"{key}={each}" for key, each in study.disturbances.items())]
+        air = "calm" if study.calm else "in wind, with a payload (--calm: without)"
+        head = f"{name} {air}, seeds 1 to {study.seeds}, {len(missing)} flights"
+        head = ": ".join(filter(None, (head, ", ".join(settings))))
         with SweepView(head, len(missing), on_stdout=options.output == TABLE) as view:
             stopped = run(missing, rows, options.jobs, view.see, in_order=False)
     if stopped:
         tell(f"{stopped}; to continue, add --out {folder}")
     document = {
-        **{"experiment": name, "overrides": options.set, "disturbances": asked.disturbances},
-        **{"seeds": asked.seeds, "interrupted": bool(stopped)},
+        **{"experiment": name, "overrides": options.set, "disturbances": study.disturbances},
+        **{"seeds": study.seeds, "interrupted": bool(stopped)},
         **describe(trials, rows.kept),
     }
     print_result(options.output, document, f"\n{as_text(document)}\n\n{escape(str(folder))}")

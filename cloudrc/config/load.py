@@ -22,6 +22,7 @@ from cloudrc.config.heading import without_held_yaws
 from cloudrc.config.hull import hull_of
 from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.overrides import Settings
+from cloudrc.config.place import PlaceFile
 from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.profile import (
     DIRECTIONS,
@@ -47,7 +48,6 @@ from cloudrc.config.schema import (
     Cloud,
     Experiment,
     MissionConfig,
-    PlaceFile,
     World,
 )
 from cloudrc.errors import BadInputError

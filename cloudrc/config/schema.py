@@ -413,25 +413,6 @@ class Cloud(Section):
         return self.plan_s / 4 if self.beat_s is None else self.beat_s
 
 
-class PlaceFile(Section):
-    """A place where cloud may run, such as the files under places."""
-
-    description: str = ""
-    """One line about the place, for lists"""
-    profile: str = "ideal"
-    """Link profile of the network to the place: a name, or a path"""
-    uplink: DirectionConfig = DirectionConfig()
-    """Conditions from the robot to the place; a key here overrides the profile"""
-    downlink: DirectionConfig = DirectionConfig()
-    """Conditions from the place to the robot; a key here overrides the profile"""
-    speed: ComputeSpeed = 1.0
-    """Speed of a core, as a multiple of that of the reference, for which cloud.compute_ms holds"""
-    cores: Count | None = None
-    """Number of cores that the clouds of all robots share. null: each has a core of its own"""
-    sharing: Sharing = "fifo"
-    """How they share the cores, see cloud.sharing"""
-
-
 class Criteria(Section):
     """Conditions for the success of a flight."""
 

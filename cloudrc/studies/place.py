@@ -115,7 +115,7 @@ class PlaceTrial(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Asked:
+class PlaceStudy:
     """The question of `cloudrc place`."""
 
     experiment: str  # name or path

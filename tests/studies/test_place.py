@@ -7,7 +7,7 @@ import pytest
 from cloudrc import assembly
 from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
-from cloudrc.studies.place import DISTURBANCES, Asked, judge
+from cloudrc.studies.place import DISTURBANCES, PlaceStudy, judge
 from tests.cli.conftest import SHORT
 
 
@@ -49,8 +49,8 @@ def test_no_place_is_best_where_no_robot_succeeds():
 
 
 def test_a_setting_replaces_a_disturbance():
-    asked = Asked("steps", ["world.wind={gust_mps: 2}"], [0], [1], ["edge"], 1, calm=False)
-    assert asked.disturbances.keys() == {k for k in DISTURBANCES if "wind" not in k}
+    study = PlaceStudy("steps", ["world.wind={gust_mps: 2}"], [0], [1], ["edge"], 1, calm=False)
+    assert study.disturbances.keys() == {k for k in DISTURBANCES if "wind" not in k}
 
 
 def test_a_small_study_names_the_best_place_and_flies_only_what_is_missing(capsys):
@@ -60,12 +60,13 @@ def test_a_small_study_names_the_best_place_and_flies_only_what_is_missing(capsy
         return capsys.readouterr()
 
     shown = call("--robots", "1,2").out.splitlines()
-    assert shown[0].endswith("seeds 1 to 1; 4 flights")
-    assert shown[0].startswith("steps with world.wind.velocity_mps=[1, 0], ")
+    head = "steps in wind, with a payload (--calm: without), seeds 1 to 1, 4 flights: "
+    assert shown[0].startswith(head)
+    assert "world.wind.velocity_mps=[1, 0], " in shown[0]
     one = "60 ms, 1 robot: edge: 1/1 succeed, not 0/1 (onboard)"
     assert [line for line in shown if line.startswith("60 ms, 1")] == [one]
     again = call("--robots", "2", "-o", "json")
-    assert "; 0 flights" in again.err
+    assert ", 0 flights" in again.err
     document = json.loads(again.out)
     assert document["best"][0]["places"] == ["edge"]
     onboard, edge = document["points"]
