@@ -26,14 +26,18 @@ plug-in failed, `traceback`. A row of a sweep also has `key`, `point`, `seed` an
 the sources."""
 
 
-def fly_point(experiment: ResolvedExperiment) -> Row:
+def fly_point(
+    experiment: ResolvedExperiment, fly: Callable[[ResolvedExperiment], Row] | None = None
+) -> Row:
     """Fly an experiment in virtual time and measure it; an exception becomes the verdict ERROR.
+
+    `fly` does so in place of `measure`.
 
     Raises:
         MissingPrerequisiteError: If the machine failed, not the flight. It must be flown again.
     """
     try:
-        return measure(experiment)
+        return (fly or measure)(experiment)
     except code.FAILURES as error:  # one point that cannot fly must not stop the others
         none: Row = {"numbers": {}, "records_sha256": "", "physics_steps": ""}
         return {"verdict": ERROR, "failures": [ERROR], "text": explain(error), **none}

@@ -8,21 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby, product
+from itertools import chain, groupby, product
 from operator import itemgetter
 from pathlib import Path
 from statistics import mean, median
 from typing import Any, NamedTuple
 
-from cloudrc import assembly, source
-from cloudrc.config.overrides import parse_settings
+from cloudrc import source
+from cloudrc.config.overrides import OUTSIDE, parse_settings
+from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.outside import code
 from cloudrc.outside.reuse import reuse_results
-from cloudrc.runs.experiment import check_mode, check_no_seed, load, robots_of
+from cloudrc.runs.experiment import check_no_seed, check_world, load, robots_of
 from cloudrc.runs.fleet import fly_in_memory
-from cloudrc.runs.flight import ERROR, explain
-from cloudrc.text import FAILED_MARK, FAILED_NOTE, cells, escape, table
+from cloudrc.runs.flight import fly_point
+from cloudrc.text import cells, escape, table
 from cloudrc.trials.fingerprint import experiment_facts, fingerprint
 from cloudrc.trials.rows import Row
 
@@ -36,7 +36,12 @@ DISTURBANCES = {
 
 A controller without an integral part then rests beside its setpoint, hence the last one.
 """
-AXES = "compute_ms", "robots", "place"
+AXES = {
+    "compute_ms": "cloud.compute_ms",
+    "robots": "fleet.robots",
+    "place": "cloud.place",
+}
+"""Axis -> its key."""
 NUMBERS = {
     "age_ms": ("age_at_actuator_mean", 1e3),
     "age_p99_ms": ("age_at_actuator_p99", 1e3),
@@ -60,7 +65,7 @@ TABLE = {
     "compute [ms]": "{compute_ms:g}",
     "robots": "{robots}",
     "place": "{name}",
-    "success": "{succeeded}/{flown}{mark}",
+    "success": "{succeeded}/{flown}",
     "age [ms]": "{age_ms:.0f}",
     "age p99 [ms]": "{age_p99_ms:.0f}",
     "HOLD [s]": "{hold_s:.2f}",
@@ -89,28 +94,25 @@ class PlaceTrial(NamedTuple):
     def play(self) -> Row:
         """Fly; return the row, whose numbers are medians over the robots."""
         of = {"key": self.key, "point": self.point, "seed": self.seed, "code": source.code_hash()}
+        return of | fly_point(self.fleet, self._measure)
+
+    def _measure(self, fleet: ResolvedExperiment) -> Row:
         fleet, *robots = (
-            each.model_copy(update={"seed": self.seed}) for each in (self.fleet, *self.robots)
+            each.model_copy(update={"seed": self.seed}) for each in (fleet, *self.robots)
         )
-        try:
-            with reuse_results():
-                found = fly_in_memory(fleet, robots)
-        except code.FAILURES as error:
-            row = {"verdict": ERROR, "failures": [ERROR], "text": explain(error)}
-            return of | row | {"numbers": {}, "records_sha256": ""}
+        with reuse_results():
+            found = fly_in_memory(fleet, robots)
         failures = [failure for each in found for failure in each.verdict.failures]
         succeeded = sum(each.verdict.outcome == "success" for each in found)
-        values = [{name: each.value for name, each in robot.numbers.items()} for robot in found]
-        names = {name for robot in values for name in robot}
-        middle = {name: median(robot[name] for robot in values if name in robot) for name in names}
+        values: dict[str, list[float]] = {}
+        for name, number in chain.from_iterable(each.numbers.items() for each in found):
+            values.setdefault(name, []).append(number.value)
         return {
-            **of,
             "verdict": "success" if succeeded == len(found) else "failure",
             "failures": sorted({failure.code for failure in failures}),
             "text": failures[0].text if failures else "",
-            "numbers": {"succeeded": succeeded, **middle},
+            "numbers": {"succeeded": succeeded, **{n: median(of) for n, of in values.items()}},
             "records_sha256": fingerprint([each.records_sha256 for each in found]),
-            "physics_steps": assembly.step_code(fleet),
         }
 
 
@@ -144,30 +146,29 @@ class PlaceStudy:
         with reuse_results():
             for values in product(self.compute, self.robots, self.places):
                 point = dict(zip(AXES, values, strict=True))
-                keys = (f"cloud.{AXES[0]}", f"fleet.{AXES[1]}", f"cloud.{AXES[2]}")
-                own = [f"{key}={value}" for key, value in zip(keys, values, strict=True)]
+                own = (f"{key}={value}" for key, value in zip(AXES.values(), values, strict=True))
                 settings = [*self.set, *disturbed, *own]
                 fleet = load(self.experiment, settings, fleets=True)
                 robots = tuple(robots_of(fleet, self.experiment, settings))
+                if fleet.cloud.controller.name in OUTSIDE:
+                    raise problem_at("cloud.controller", "flies with `cloudrc run` only")
                 for robot in robots:
-                    check_mode(robot, "virtual")
+                    check_world(robot.world, turns=robot.mission.turns)
                 known = fingerprint(experiment_facts(fleet), *map(experiment_facts, robots))
-                of_point = (
-                    PlaceTrial(known, point, seed, fleet, robots)
-                    for seed in range(1, self.seeds + 1)
-                )
-                trials.extend(of_point)
+                trial = PlaceTrial(known, point, 1, fleet, robots)
+                trials += [trial._replace(seed=1 + n) for n in range(self.seeds)]
         return trials
 
 
 def describe(trials: Iterable[PlaceTrial], rows: Mapping[str, Row]) -> dict[str, Any]:
     """Return a row for each point that has flown, and which place wins, as values for JSON."""
-    found = [
-        _describe_point(trial, [rows[each.key] for each in (trial, *others) if each.key in rows])
-        for _, (trial, *others) in groupby(trials, lambda trial: trial.fingerprint)
+    points = ([*of_point] for _, of_point in groupby(trials, lambda trial: trial.fingerprint))
+    shown = [
+        _describe_point(each[0], [rows[trial.key] for trial in each])
+        for each in points
+        if all(trial.key in rows for trial in each)
     ]
-    shown = [each for each in found if each["flown"]]
-    groups = groupby(shown, lambda row: (row["compute_ms"], row["robots"]))
+    groups = groupby(shown, itemgetter("compute_ms", "robots"))
     best = [
         {"compute_ms": compute, "robots": robots, **judge([*group])}
         for (compute, robots), group in groups
@@ -220,11 +221,12 @@ def judge(places: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         if not all(name in each for each in best):
             continue
         first = min(best, key=itemgetter(name))
-        limits = [
-            None if value is None else value + max(same, SAME * value)
-            for value in first["by_seed"][name]
+        pairs = (zip(first["by_seed"][name], each["by_seed"][name], strict=True) for each in best)
+        worse = [
+            each
+            for each, of_seeds in zip(best, pairs, strict=True)
+            if all(None not in (a, b) and b > a + max(same, SAME * a) for a, b in of_seeds)
         ]
-        worse = [each for each in best if _all_above(each["by_seed"][name], limits)]
         if worse:
             best = [each for each in best if each not in worse]
             others = (f"{form.format(each[name])} ({each['name']})" for each in worse)
@@ -232,22 +234,9 @@ def judge(places: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {"places": [each["name"] for each in best], "by": "; ".join(by)}
 
 
-def _all_above(values: Iterable[float | None], limits: Iterable[float | None]) -> bool:
-    """Return whether all values [any unit] are above their limits, where both are known."""
-    pairs = zip(values, limits, strict=False)  # an interrupted study has fewer seeds
-    known = [value > limit for value, limit in pairs if value is not None and limit is not None]
-    return bool(known) and all(known)
-
-
 def as_text(document: Mapping[str, Any]) -> str:
     """Format what `describe` returns: the table, and a line for each computing time and number."""
-    rows = [
-        {**each, "mark": FAILED_MARK * (each["succeeded"] < each["flown"])}
-        for each in document["points"]
-    ]
-    text = [table(cells(rows, TABLE), right=(0, 1, *range(3, 10)))]
-    if any(each["mark"] for each in rows):
-        text.append(FAILED_NOTE)
+    rows = document["points"]
     count = len({each["place"] for each in rows})
     lines = list[str]()
     for each in document["best"]:
@@ -257,4 +246,5 @@ def as_text(document: Mapping[str, Any]) -> str:
         lines.append(
             escape(f"{each['compute_ms']:g} ms, {robots}: {where}{f': {by}' if by else ''}")
         )
-    return "\n\n".join([*text, "\n".join(lines)])
+    shown = table(cells(rows, TABLE), right=(0, 1, *range(3, 10)))
+    return "\n\n".join([shown, "\n".join(lines)])
