@@ -156,33 +156,35 @@ class FleetRun:
         self, members: Sequence[Member], cells: Sequence[Cell], cores: SharedCores | None
     ) -> None:
         """Set the robots and what they share."""
-        self._members, self.cells, self.cores = members, cells, cores
+        self.members, self.cells, self.cores = members, cells, cores
         self._media: tuple[Cell | SharedCores, ...] = (*cells, *([cores] if cores else []))
         self._next_ns = [member.run.next_ns for member in members]
         self.now_ns = 0
 
-    def fly(self, look: Callable[[int], None] = lambda now_ns: None) -> None:
+    def fly(self, look: Callable[[int], object] = lambda now_ns: None) -> None:
         """Fly until the missions of all robots are over, or until the limit of each.
 
         Every 100 ms of virtual time, call the sinks of the robots whose flight is not over. If the
-        robots share something, the others go on, and `look` is called with the time [ns].
+        robots share something, the others go on, and `look` is called with the time [ns]; if its
+        answer is true, the flight of all is over.
         """
         if not self._media:
-            for each in self._members:  # nobody acts on the others
+            for each in self.members:  # nobody acts on the others
                 each.run.fly(each.over, each.limit_ns, each.sink)
             return
-        flying = [*self._members]
+        flying = [*self.members]
         with without_collections():
             while flying:
                 self._advance(self.now_ns + PERIOD_NS)
-                for each in self._members:
+                for each in self.members:
                     records = each.run.take_records()
                     if each in flying:
                         each.sink(*records)
                 flying = [
                     each for each in flying if self.now_ns < each.limit_ns and not each.over()
                 ]
-                look(self.now_ns)
+                if look(self.now_ns):
+                    return
 
     def _advance(self, end_ns: int) -> None:
         """Handle all events up to and including `end_ns` [ns]."""
@@ -194,10 +196,10 @@ class FleetRun:
             until_ns = min([end_ns + 1, *(medium.soonest_ns(now_ns) for medium in self._media)])
             for number, next_ns in enumerate(self._next_ns):
                 if next_ns < until_ns:
-                    run = self._members[number].run
+                    run = self.members[number].run
                     run.advance(until_ns - 1)
                     self._next_ns[number] = run.next_ns
             for medium in self._media:
                 for at_ns, number, happen in medium.advance(until_ns):
                     happen(at_ns)
-                    self._next_ns[number] = self._members[number].run.next_ns
+                    self._next_ns[number] = self.members[number].run.next_ns

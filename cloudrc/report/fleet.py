@@ -149,13 +149,13 @@ def fleet_document(flown: FleetFlown) -> dict[str, Any]:
         "robots": robots,
         "median": {name: median(known) for name, known in values.items() if known},
         "worst": {name: max(known) for name, known in values.items() if known},
-        "cell": [_cell(flown, way) for way in flown.log.ways if flown.log.rows],
-        "cloud": _cloud(flown),
+        "cell": [cell_numbers(flown, way) for way in flown.log.ways if flown.log.rows],
+        "cloud": cloud_numbers(flown),
         "separation_min_m": separation_min(flown.paths, scene_of(experiment.world).spawn),
     }
 
 
-def _cell(flown: FleetFlown, way: str) -> dict[str, Any]:
+def cell_numbers(flown: FleetFlown, way: str) -> dict[str, Any]:
     """Return the numbers of a cell; a wait without end is None."""
     rows = [row for row in flown.log.rows if row["direction"] == way]
     names = "packets", "dropped", "busy_ns", "waited_ns"
@@ -179,7 +179,7 @@ def _cell(flown: FleetFlown, way: str) -> dict[str, Any]:
     }
 
 
-def _cloud(flown: FleetFlown) -> dict[str, Any] | None:
+def cloud_numbers(flown: FleetFlown) -> dict[str, Any] | None:
     """Return the numbers of the shared cores in SI units; None without shared cores."""
     cores, duration, robots = flown.cores, flown.now_ns * 1e-9, len(flown.robots)
     if cores is None or not cores.count:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, TypeAlias
 
 from cloudrc import assembly, plugins
@@ -26,18 +27,19 @@ plug-in failed, `traceback`. A row of a sweep also has `key`, `point`, `seed` an
 the sources."""
 
 
-def fly_point(
-    experiment: ResolvedExperiment, fly: Callable[[ResolvedExperiment], Row] | None = None
-) -> Row:
+def fly_point(experiment: ResolvedExperiment) -> Row:
     """Fly an experiment in virtual time and measure it; an exception becomes the verdict ERROR.
-
-    `fly` does so in place of `measure`.
 
     Raises:
         MissingPrerequisiteError: If the machine failed, not the flight. It must be flown again.
     """
+    return or_error(partial(measure, experiment))
+
+
+def or_error(fly: Callable[[], Row]) -> Row:
+    """Return the row of a flight that `fly` makes; an exception becomes the verdict ERROR."""
     try:
-        return (fly or measure)(experiment)
+        return fly()
     except code.FAILURES as error:  # one point that cannot fly must not stop the others
         none: Row = {"numbers": {}, "records_sha256": "", "physics_steps": ""}
         return {"verdict": ERROR, "failures": [ERROR], "text": explain(error), **none}

@@ -21,7 +21,7 @@ from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.runs.experiment import check_no_seed, check_world, load, robots_of
 from cloudrc.runs.fleet import fly_in_memory
-from cloudrc.runs.flight import fly_point
+from cloudrc.runs.flight import or_error
 from cloudrc.text import cells, escape, table
 from cloudrc.trials.fingerprint import experiment_facts, fingerprint
 from cloudrc.trials.rows import Row
@@ -94,11 +94,11 @@ class PlaceTrial(NamedTuple):
     def play(self) -> Row:
         """Fly; return the row, whose numbers are medians over the robots."""
         of = {"key": self.key, "point": self.point, "seed": self.seed, "code": source.code_hash()}
-        return of | fly_point(self.fleet, self._measure)
+        return of | or_error(self._measure)
 
-    def _measure(self, fleet: ResolvedExperiment) -> Row:
+    def _measure(self) -> Row:
         fleet, *robots = (
-            each.model_copy(update={"seed": self.seed}) for each in (fleet, *self.robots)
+            each.model_copy(update={"seed": self.seed}) for each in (self.fleet, *self.robots)
         )
         with reuse_results():
             found = fly_in_memory(fleet, robots)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import cycle
 from math import isfinite, nan
 from typing import Any, NamedTuple
 
@@ -41,6 +42,7 @@ class Panel:
     unit: str
     lines: Mapping[str, Sequence[Point]]
     baseline: float = nan  # value without a network, a dashed line, any unit
+    marks: Mapping[str, float] = field(default_factory=dict)  # name -> x of a vertical line
 
 
 def draw(
@@ -88,6 +90,8 @@ def _draw_panel(axes: Axes, content: Panel, *, named: bool) -> None:
     if isfinite(content.baseline):
         look = {"color": style.GREY, "lw": 0.9, "zorder": 1}
         axes.axhline(content.baseline, ls=(0, (5, 3)), label="no network", **look)
+    for (name, x), dots in zip(content.marks.items(), cycle(DASHES[3:] + DASHES[2:3])):
+        axes.axvline(x, color=style.GREY, lw=0.9, ls=dots, zorder=1, label=name)
     axes.ticklabel_format(axis="y", useOffset=False)
     if content.unit == "%":
         axes.set_ylim(-5.0, 105.0)

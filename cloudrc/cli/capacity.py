@@ -1,0 +1,88 @@
+"""`cloudrc capacity EXPERIMENT`: how many robots do one cell and one cloud carry?"""
+
+from __future__ import annotations
+
+from cloudrc.cli.output import TABLES, output_argument, print_result, tell, warn
+from cloudrc.cli.parser import Options, Parser, flags, number, read_count, whole_number
+from cloudrc.errors import CloudrcError
+from cloudrc.text import cells, csv_table, escape, latex_table
+
+EPILOG = """\
+examples:
+  cloudrc capacity steps --cell 1000 --queue fifo,newest --seeds 10
+  cloudrc capacity steps --cell 1000 --queue fifo:50,fifo:10 --controllers pid,mpc
+  cloudrc capacity steps --set cloud.cores=1 --set cloud.compute_ms=2
+
+The capacity is the largest fleet in which all robots succeed that succeed
+alone. Seed 1 finds it by bisection; then it flies, and one robot less and one
+more, with all seeds. A fleet is stopped at its first failure. The mission gets
+a time limit of 1.4 times its duration alone, unless criteria.time_limit_s is
+set. docs/fleet.md explains the result."""
+
+
+def arguments(parser: Parser) -> None:
+    """Declare the command's arguments."""
+    add = flags(parser)
+    about = "experiment to fly: a shipped name or a YAML file (default: steps)"
+    add("experiment", "EXPERIMENT", about, "steps", nargs="?")
+    about = "rate of the cell in each direction (default: that of the experiment)"
+    add("--cell", "KBIT", about, read=number(1e-3, 1e9, "kbit/s"))
+    about = (
+        "compare these queues of the cell: fifo, drr, priority or newest, with :PACKETS if wanted"
+    )
+    add("--queue", "NAME,...", about, [], read=_split)
+    add("--controllers", "NAME,...", "compare these controllers", [], read=_split)
+    add("--seeds", "N", "fly seeds 1 to N (default: 5)", 5, read_count)
+    add("--max", "N", "largest fleet to try (default: 64)", 64, whole_number(1, 1000))
+    add("--set", "KEY=VALUE", "change one key of the experiment; repeatable")
+    about = "folder of the results; with those of an earlier call, fly what is missing"
+    add("--out", "DIR", f"{about} (default: runs/capacity-...)")
+    output_argument(parser, forms=TABLES)
+
+
+def _split(text: str) -> list[str]:
+    return text.split(",")
+
+
+def execute(options: Options) -> None:
+    """Find the capacity of each queue and controller; write and print it, and draw the figure."""
+    from cloudrc.cli.progress import Progress
+    from cloudrc.files import write_atomically, write_json
+    from cloudrc.report.figures.style import Look
+    from cloudrc.runs.folder import new_folder
+    from cloudrc.runs.lock import lock_folder
+    from cloudrc.runs.requirements import MODES, require
+    from cloudrc.studies.capacity import Asked, Capacity, describe
+    from cloudrc.studies.capacity_text import (
+        CAPTION,
+        COLUMNS,
+        as_text,
+        draw_capacity,
+        in_words,
+        rows_of,
+    )
+    from cloudrc.trials.rows import Rows
+
+    require("a capacity", MODES["virtual"])
+    names = "experiment", "set", "cell", "queue", "controllers", "seeds", "max"
+    asked = Asked(*(getattr(options, name) for name in names))
+    found = Capacity(asked)
+    warn(*(each.fleet for each in found.conditions))
+    folder = options.out
+    if folder is None or not [*folder.glob("rows*.jsonl")]:
+        folder = new_folder(folder, f"capacity-{found.conditions[0].fleet.name}", "latest-capacity")
+    with lock_folder(folder), Progress("flies") as view:
+        view.say(f"{options.experiment}: how many robots? seeds 1 to {options.seeds}")
+        try:
+            found.fly(Rows(folder), lambda row: view.say(in_words(row)))
+        except CloudrcError:
+            tell(f"the finished fleets are kept; the same call with --out {folder} goes on")
+            raise
+        document = describe(found, asked)
+        write_json(folder / "capacity.json", {"schemaVersion": 1, **document})
+        for kind, content in draw_capacity(document, Look(width=3.5)).items():
+            write_atomically(folder / f"capacity.{kind}", content)
+    rows = rows_of(document)
+    tables = {"csv": csv_table(rows), "latex": latex_table(cells(rows, COLUMNS))}
+    text = f"\n{as_text(document)}\n\n{CAPTION}\n\n{escape(str(folder / 'capacity.pdf'))}"
+    print_result(options.output, document, text, **tables)

@@ -1,0 +1,348 @@
+"""Find how many robots a cell and a cloud carry: the largest fleet in which all robots succeed.
+
+Success need not fall steadily with the size of the fleet. So the search finds the cliff with one
+seed, and then the sizes around it fly with all seeds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from itertools import product
+from statistics import median_low
+from typing import Any, NamedTuple
+
+from cloudrc.config.problems import problem_at
+from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.errors import NothingFlownError
+from cloudrc.link.model import HEADER_BYTES
+from cloudrc.link.waiting import nddd1
+from cloudrc.outside.values import InvalidValueError, Quantity
+from cloudrc.runs.experiment import check_no_seed, check_world, load, robots_of
+from cloudrc.runs.flight import ERROR
+from cloudrc.statistics import exact_interval, median_interval
+from cloudrc.trials.fingerprint import experiment_facts, fingerprint
+from cloudrc.trials.fleet import FleetTrial, alone
+from cloudrc.trials.plan import PlannedFlight
+from cloudrc.trials.play import run
+from cloudrc.trials.rows import Row, Rows
+
+SLACK = 1.4
+"""Time limit of a mission, as a multiple of its duration alone [1]: a robot in HOLD would fly on
+until the limit of the experiment, three times that."""
+GROWTH = 2
+"""Growth of the fleet from one size to the next, until one fails [1]."""
+RESUME_HZ = 20.0
+"""Rate of commands below which a HOLD does not end [1/s].
+Source: docs/reference/plant.md, "Leaving HOLD": 10 commands within 500 ms."""
+CLOSE = 0.9
+"""Share of a limit from which on a number counts as near it [1]."""
+
+
+class Asked(NamedTuple):
+    """The question of `cloudrc capacity`."""
+
+    experiment: str  # name of a shipped experiment, or path of a YAML file
+    settings: Sequence[str]  # KEY=VALUE
+    cell: float | None  # rate of the cell [kbit/s]; None: that of the experiment
+    queues: Sequence[str]  # NAME or NAME:PACKETS; []: that of the experiment
+    controllers: Sequence[str]  # []: that of the experiment
+    seeds: int  # the fleets have the seeds 1 to `seeds`
+    max: int  # largest fleet to try
+
+
+def search(start: int, top: int) -> Generator[int, bool, int]:
+    """Yield sizes of fleets to try, up to `top`, and get whether each succeeds.
+
+    Return the largest size that succeeds next to one that fails; 0 if none does.
+    """
+    yes, no, size = 0, top + 1, min(start, top)
+    while no - yes > 1:
+        if (yield size):
+            yes = size
+        else:
+            no = size
+        size = min(top, max(yes + 1, yes * GROWTH)) if no > top else (yes + no) // 2
+    return yes
+
+
+class Condition:
+    """One queue and one controller.
+
+    Attributes:
+        point: Axis -> value, without the number of robots.
+        bases: Flights alone, with seed 1, of robots that differ in more than random numbers.
+        arithmetic: Number of robots that fill each shared medium; `set_base` finds it.
+        theory: The same by queueing theory: the largest number that gets commands in time.
+        traffic: What a robot sends in the cell, per direction.
+        time_limit: Time limit of the mission [s].
+    """
+
+    def __init__(self, asked: Asked, queue: str, controller: str) -> None:
+        """Load the experiment."""
+        name, _, packets = queue.partition(":")
+        given = {
+            "cell.rate_kbit": asked.cell,
+            "cell.queue": name,
+            "cell.queue_packets": packets,
+            "cloud.controller": controller,
+        }
+        settings = [*asked.settings, *(f"{key}={value}" for key, value in given.items() if value)]
+        check_no_seed(settings)
+        own = self._load(asked.experiment, settings, 1)
+        kinds = len(own.fleet.vary) or 1
+        self.fleet = self._load(asked.experiment, settings, kinds)
+        self._kinds = robots_of(self.fleet, asked.experiment, [*settings, f"fleet.robots={kinds}"])
+        for robot in self._kinds:
+            check_world(robot.world, turns=robot.mission.turns)
+        cell, cloud = self.fleet.cell, self.fleet.cloud
+        if cell.rate_kbit is None and not (cloud.cores and cloud.compute_ms):
+            text = "the robots share nothing; give a rate [kbit/s], or --set cloud.cores=1 with"
+            raise problem_at("--cell", f"{text} --set cloud.compute_ms=2")
+        limits = f"{cell.queue} {cell.queue_packets}" if cell.queue != "newest" else "newest"
+        self.point = {"queue": limits, "controller": cloud.controller.name}
+        self.bases = [
+            PlannedFlight(fingerprint(experiment_facts(each)), {"robot": number}, 1, each)
+            for number, each in enumerate(map(alone, self._kinds))
+        ]
+        self.arithmetic, self.theory = dict[str, float](), dict[str, int]()
+        self.traffic = dict[str, dict[str, float]]()
+        self.time_limit: float | None = self.fleet.criteria.time_limit_s
+
+    @staticmethod
+    def _load(name: str, settings: Sequence[str], robots: int) -> ResolvedExperiment:
+        more = f"fleet.robots={robots}", "fleet.only=null"
+        return load(name, [*settings, *more], fleets=True)
+
+    def set_base(self, rows: Sequence[Row], top: int) -> None:
+        """Take the flights alone: time limit, arithmetic and theory, up to `top` robots."""
+        if failed := [row for row in rows if row["verdict"] != "success"]:
+            text = failed[0]["text"]
+            raise NothingFlownError(f"the experiment fails without neighbours, seed 1: {text}")
+        numbers = [row["numbers"] for row in rows]
+        if self.time_limit is None:
+            self.time_limit = math.ceil(SLACK * max(each["duration"] for each in numbers))
+        cell, cloud, first = self.fleet.cell, self.fleet.cloud, numbers[0]
+        spare = self.age_max - first["age_at_actuator_p99"]
+        if cell.rate_kbit is not None and "packets_sent_uplink" in first:  # a long mission has it
+            for way in ("uplink", "downlink"):
+                packets = first[f"packets_sent_{way}"]
+                size = first[f"bytes_sent_{way}"] / packets + HEADER_BYTES
+                rate = packets / first["duration"]
+                service = size * 8e-3 / cell.rate_kbit + cell.airtime_us * 1e-6
+                self.traffic[way] = {"rate_hz": rate, "bytes": size, "service_s": service}
+            loads = [each["rate_hz"] * each["service_s"] for each in self.traffic.values()]
+            self.arithmetic["cell"] = 1.0 / (sum(loads) if cell.shared else max(loads))
+            if not (cell.shared or cell.traffic):
+                busiest = max(self.traffic.values(), key=lambda way: way["bytes"])
+                fits = (
+                    nddd1(n, 1 / busiest["rate_hz"], busiest["service_s"]) < spare
+                    for n in range(1, top + 1)
+                )
+                self.theory["N.D/D/1"] = next((n for n, fit in enumerate(fits) if not fit), top)
+        if cloud.cores and cloud.compute_ms:
+            whole = cloud.cores / (cloud.compute_ms * 1e-3)  # commands a second for all
+            self.arithmetic["cloud"] = whole / cloud.command_rate_hz
+            self.theory["closed queue"] = int(whole / RESUME_HZ)
+
+    @property
+    def age_max(self) -> float:
+        """The guard's limit on the age of a command [s]."""
+        return self.fleet.guard.command_age_max_ms * 1e-3
+
+    def trial(self, robots: int, seed: int) -> FleetTrial:
+        """Return the flight of a fleet; not before `set_base`."""
+        judged = self.fleet.criteria.model_copy(update={"time_limit_s": self.time_limit})
+        own = self.fleet.fleet.model_copy(update={"robots": robots})
+        fleet = self.fleet.model_copy(update={"criteria": judged, "fleet": own})
+        kinds = [each.model_copy(update={"criteria": judged}) for each in self._kinds]
+        facts = [experiment_facts(each) for each in (fleet, *kinds)]
+        return FleetTrial(fingerprint(facts), self.point | {"robots": robots}, seed, fleet, kinds)
+
+
+def conditions(asked: Asked) -> list[Condition]:
+    """Load the experiment under all conditions."""
+    for queue in asked.queues:
+        if packets := queue.partition(":")[2]:
+            try:
+                Quantity(ge=1, le=100_000, whole=True).read(packets)
+            except InvalidValueError as error:
+                raise problem_at("--queue", f"{queue}: {error}") from None
+    pairs = product(asked.queues or [""], asked.controllers or [""])
+    return [Condition(asked, *pair) for pair in pairs]
+
+
+class Capacity:
+    """Finds the capacity of each condition.
+
+    Attributes:
+        found: Of each condition, the largest fleet that succeeds with seed 1.
+        rows: The rows of all fleets that have flown.
+    """
+
+    def __init__(self, asked: Asked) -> None:
+        """Load the experiment under all conditions."""
+        self._asked = asked
+        self.conditions = conditions(asked)
+        self.found = list[int]()
+        self.rows = dict[str, Row]()
+
+    def fly(self, rows: Rows, see: Callable[[Row], None] = lambda row: None) -> None:
+        """Fly what has no row in `rows`; raise the reason if that ends early.
+
+        Call `see` with the row of each fleet that has flown.
+        """
+        self._rows, self._see = rows, see
+        bases = {each.key: each for one in self.conditions for each in one.bases}
+        self._play(bases.values(), lambda row: None)
+        for each in self.conditions:
+            each.set_base([self._rows.kept[base.key] for base in each.bases], self._asked.max)
+        self._search()
+        wanted = [
+            each.trial(size, seed)
+            for each, found in zip(self.conditions, self.found, strict=True)
+            for size in range(max(1, found - 1), min(self._asked.max, found + 1) + 1)
+            for seed in range(1, self._asked.seeds + 1)
+        ]
+        self._fly(sorted(wanted, key=lambda each: -each.fleet.fleet.robots))
+
+    def _search(self) -> None:
+        """Search all conditions at once, so that the flights of one round share the cores."""
+        starts = [int(min(each.arithmetic.values(), default=1)) or 1 for each in self.conditions]
+        searches = [search(start, self._asked.max) for start in starts]
+        asked, found = {n: next(each) for n, each in enumerate(searches)}, dict[int, int]()
+        while asked:
+            trials = {n: self.conditions[n].trial(size, 1) for n, size in asked.items()}
+            self._fly(trials.values())
+            for n, trial in trials.items():
+                try:
+                    asked[n] = searches[n].send(succeeded(self.rows[trial.key]))
+                except StopIteration as end:
+                    found[n] = end.value
+                    del asked[n]
+        self.found = [found[n] for n in range(len(searches))]
+
+    def _fly(self, trials: Iterable[FleetTrial]) -> None:
+        trials = [*trials]
+        self._play(trials, self._see)
+        self.rows |= {each.key: self._rows.kept[each.key] for each in trials}
+
+    def _play(self, trials: Iterable[Any], see: Callable[[Row], None]) -> None:
+        trials = [*trials]
+        if stopped := run(trials, self._rows, len(trials), see, in_order=False):
+            raise stopped
+
+
+def succeeded(row: Row) -> bool:
+    """Return whether all robots of a fleet succeeded; a fleet that cannot fly is an error."""
+    if row["verdict"] == ERROR:
+        raise NothingFlownError(row["text"])
+    return bool(row["verdict"] == "success")
+
+
+def capacity_of(fleets: Mapping[int, Mapping[int, bool]], top: int) -> dict[str, Any]:
+    """Return the capacity over seeds: its median, and the interval of this median.
+
+    `fleets` are seed -> number of robots -> whether the fleet succeeded. The capacity of a seed is
+    the largest flown size up to which all succeed. If the smallest one fails, it is lower; if the
+    largest one succeeds, it may be higher, up to `top`.
+    """
+    sizes = sorted({size for each in fleets.values() for size in each})
+    values = list[int]()
+    for each in fleets.values():
+        last = sizes[0] - 1
+        for size in sizes:
+            if not each[size]:
+                break
+            last = size
+        values.append(last)
+    interval = median_interval(values)
+    low, high = interval or (min(values), max(values))
+    return {
+        "capacity": median_low(values),
+        "interval": [int(low), int(high)],
+        "interval_is": "95 % interval" if interval else "range",
+        "at_most": sizes[0] - 1 if sizes[0] > 1 else None,  # this value stands for lower ones, too
+        "at_least": sizes[-1] if sizes[-1] < top else None,  # and this one for higher ones
+        "of_seeds": values,
+    }
+
+
+def describe(found: Capacity, asked: Asked) -> dict[str, Any]:
+    """Return the result as values for JSON."""
+    return {
+        **asked._asdict(),
+        "conditions": [
+            _describe(each, largest, [*found.rows.values()], asked)
+            for each, largest in zip(found.conditions, found.found, strict=True)
+        ],
+    }
+
+
+def _describe(
+    condition: Condition, largest: int, rows: Sequence[Row], asked: Asked
+) -> dict[str, Any]:
+    own = [row for row in rows if condition.point.items() <= row["point"].items()]
+    sizes = sorted({row["point"]["robots"] for row in own})
+    groups = {size: [row for row in own if row["point"]["robots"] == size] for size in sizes}
+    around = {size: each for size, each in groups.items() if abs(size - largest) <= 1}
+    fleets = {
+        seed: {
+            n: succeeded(row) for n, each in around.items() for row in each if row["seed"] == seed
+        }
+        for seed in range(1, asked.seeds + 1)
+    }
+    capacity = capacity_of(fleets, asked.max)
+    above = [size for size in sizes if size > capacity["capacity"]]
+    failed = [row for size in above for row in groups[size] if not succeeded(row)]
+    return {
+        **condition.point,
+        **capacity,
+        "arithmetic": condition.arithmetic,
+        "theory": condition.theory,
+        "traffic": condition.traffic,
+        "time_limit_s": condition.time_limit,
+        "age_max_ms": condition.age_max * 1e3,
+        "binding": binding(failed, condition) if failed else None,
+        "fleets": [_summary(size, groups[size]) for size in sizes],
+    }
+
+
+def _summary(size: int, rows: Sequence[Row]) -> dict[str, Any]:
+    """Return the medians of all fleets of a size, and how many succeeded."""
+    done, names = sum(map(succeeded, rows)), dict.fromkeys(n for r in rows for n in r["numbers"])
+    values = {name: [r["numbers"][name] for r in rows if name in r["numbers"]] for name in names}
+    return {
+        "robots": size,
+        "fleets": len(rows),
+        "success": done,
+        "interval": exact_interval(done, len(rows)),
+        "numbers": {name: median_low(each) for name, each in values.items()},
+        "lowest": {name: min(each) for name, each in values.items()},
+        "highest": {name: max(each) for name, each in values.items()},
+    }
+
+
+def binding(failed: Sequence[Row], condition: Condition) -> dict[str, Any]:
+    """Say what broke the smallest fleets that failed: of `failed`, those of the first size."""
+    size = failed[0]["point"]["robots"]
+    rows = [row for row in failed if row["point"]["robots"] == size]
+    worst = {
+        name: median_low([row["numbers"].get(name, 0.0) for row in rows])
+        for name in ("age_p99_ms_worst", "hold_s_worst", "rate_hz_worst", "loss_uplink_worst")
+    }
+    rate = condition.fleet.cloud.command_rate_hz
+    cloud = median_low([row["numbers"].get("cloud_hz", rate) for row in rows])
+    limits = {
+        "command_age": worst["age_p99_ms_worst"] >= CLOSE * condition.age_max * 1e3,
+        "hold": worst["hold_s_worst"] > 0.0 and worst["rate_hz_worst"] < RESUME_HZ,
+        "cloud_rate": cloud < CLOSE * rate,
+    }
+    codes = sorted({code for row in rows for code in row["failures"]})
+    return {
+        "robots": size,
+        "failures": codes,
+        "limits": [name for name, holds in limits.items() if holds],
+        **worst,
+        "cloud_hz": cloud,
+    }

@@ -1,0 +1,170 @@
+"""Show how many robots a cell and a cloud carry: a table and a figure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from math import nan
+from typing import Any
+
+from cloudrc.report.figures.bands import Panel, Point, draw
+from cloudrc.report.figures.style import Look
+from cloudrc.text import cells, table
+from cloudrc.trials.rows import Row
+
+COLUMNS = {
+    "queue": "{queue}",
+    "controller": "{controller}",
+    "robots": "{robots}",
+    "fleets ok": "{success}/{fleets}",
+    "95 % interval": "{low:.0%} .. {high:.0%}",
+    "age p99 [ms]": "{age_p99_ms_median:.0f}",
+    "worst": "{age_p99_ms_worst:.0f}",
+    "commands [Hz]": "{rate_hz_median:.0f}",
+    "worst ": "{rate_hz_worst:.0f}",
+    "HOLD [s]": "{hold_s_worst:.1f}",
+    "lost up": "{loss_uplink_worst:.0%}",
+    "cloud [Hz]": "{cloud_hz:.0f}",
+    "load": "{load:.2f}",
+    "wait [ms]": "{wait_mean_ms:.1f}",
+    "N.D/D/1": "{nddd1_ms:.1f}",
+    "fail alone": "{fail_alone}",
+}
+"""Head -> cell of the table; numbers are medians over the fleets."""
+CAPTION = (
+    "Success: share of fleets in which all robots succeed that succeed alone, and Clopper and "
+    "Pearson's 95 % interval. Age and commands: the worst robot of a fleet, median over the "
+    "fleets; the band goes from the median robot to the worst one of all fleets. Commands are "
+    "those that reach the onboard controller; a fleet that fails is measured up to then."
+)
+
+
+def name_of(condition: Mapping[str, Any], document: Mapping[str, Any]) -> str:
+    """Return the name of a condition: what differs from others."""
+    axes = [
+        axis
+        for axis in ("queue", "controller")
+        if len({each[axis] for each in document["conditions"]}) > 1
+    ]
+    return ", ".join(condition[axis] for axis in axes or ["queue"])
+
+
+def rows_of(document: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return a flat row for each condition and size of a fleet."""
+    return [
+        {
+            **{name: each[name] for name in ("queue", "controller")},
+            **{name: fleet[name] for name in ("robots", "fleets", "success")},
+            **dict(zip(("low", "high"), fleet["interval"], strict=True)),
+            **fleet["numbers"],
+        }
+        for each in document["conditions"]
+        for fleet in each["fleets"]
+    ]
+
+
+def in_words(row: Row) -> str:
+    """Say how a fleet has flown."""
+    where = ", ".join(f"{value}" for value in row["point"].values())
+    return (
+        f"{where} robots, seed {row['seed']}: {row['verdict']}{row['text'] and ', '}{row['text']}"
+    )
+
+
+def as_text(document: Mapping[str, Any]) -> str:
+    """Format the result: what a robot needs, the table, capacities, and what limits them."""
+    rows = cells(rows_of(document), COLUMNS)
+    lines = [*dict.fromkeys(_needs(document)), "", table(rows, right=range(2, len(rows[0]))), ""]
+    for each in document["conditions"]:
+        lines += [_capacity(each, name_of(each, document)), *_binding(each)]
+    return "\n".join(lines)
+
+
+def _needs(document: Mapping[str, Any]) -> Iterator[str]:
+    for each in document["conditions"]:
+        for medium, robots in each["arithmetic"].items():
+            text = f"{medium}: {robots:.1f} robots by arithmetic"
+            if medium == "cell":
+                ways = ", ".join(
+                    f"{way} {own['rate_hz'] * own['bytes'] * 8e-3:.0f} kbit/s "
+                    f"({own['rate_hz']:.0f} Hz, {own['bytes']:.0f} bytes with headers)"
+                    for way, own in each["traffic"].items()
+                )
+                text += f"; a robot needs {ways}"
+            yield text
+        for theory, robots in each["theory"].items():
+            yield f"theory ({theory}): {robots} robots"
+        yield f"time limit of a mission: {each['time_limit_s']:g} s"
+
+
+def _bound(value: int, each: Mapping[str, Any]) -> str:
+    """Return a number of robots; one at the end of the flown sizes stands for those beyond it."""
+    mark = {each["at_most"]: "<=", each["at_least"]: ">="}.get(value, "")
+    return f"{mark}{value}"
+
+
+def _capacity(each: Mapping[str, Any], name: str) -> str:
+    low, high = (_bound(value, each) for value in each["interval"])
+    what = f"{each['interval_is']} over {len(each['of_seeds'])} seeds"
+    return f"capacity, {name}: {_bound(each['capacity'], each)} robots [{low}, {high}] ({what})"
+
+
+def _binding(each: Mapping[str, Any]) -> Iterator[str]:
+    found = each["binding"]
+    if found is None:
+        yield "  no fleet failed; raise --max"
+        return
+    texts = {
+        "command_age": f"command age {found['age_p99_ms_worst']:.0f} of {each['age_max_ms']:.0f} "
+        "ms (guard.command_age_max_ms)",
+        "hold": f"HOLD for {found['hold_s_worst']:.0f} s: it ends after 10 fresh commands within "
+        f"500 ms, and {found['rate_hz_worst']:.0f} a second arrive",
+        "cloud_rate": f"the cloud computes {found['cloud_hz']:.0f} commands a second for a robot",
+    }
+    limits = [texts[name] for name in found["limits"]]
+    why = f"{', '.join(found['failures'])}, {found['loss_uplink_worst']:.0%} lost in the uplink"
+    yield f"  breaks at {found['robots']} robots: {'; '.join(limits or [why])}"
+
+
+def draw_capacity(document: Mapping[str, Any], look: Look) -> dict[str, bytes]:
+    """Draw success, age and rate over the number of robots; return the figure by suffix."""
+    conditions = {name_of(each, document): each for each in document["conditions"]}
+    first = document["conditions"][0]
+    marks = {f"arithmetic, {name}": value for name, value in first["arithmetic"].items()}
+    marks |= first["theory"]
+
+    def lines(name: str) -> dict[str, Sequence[Point]]:
+        return {
+            key: [_point(fleet, name) for fleet in each["fleets"]]
+            for key, each in conditions.items()
+        }
+
+    success = {
+        key: [
+            Point(each["robots"], *_share(each), each["success"] < each["fleets"])
+            for each in own["fleets"]
+        ]
+        for key, own in conditions.items()
+    }
+    limit = first["age_max_ms"]
+    panels = [
+        Panel("fleets that succeed", "%", success, marks=marks),
+        Panel(
+            "age of the command, p99; dashed: the guard's limit", "ms", lines("age_p99_ms"), limit
+        ),
+        Panel("commands", "Hz", lines("rate_hz")),
+    ]
+    return draw(panels, "robots", [], "queue", look=look)
+
+
+def _share(fleet: Mapping[str, Any]) -> tuple[float, float, float]:
+    low, high = fleet["interval"] if fleet["fleets"] > 1 else (nan, nan)
+    return 100 * fleet["success"] / fleet["fleets"], 100 * low, 100 * high
+
+
+def _point(fleet: Mapping[str, Any], name: str) -> Point:
+    middle = fleet["numbers"].get(f"{name}_worst", nan)
+    ends = (
+        fleet["numbers"].get(f"{name}_median", nan),
+        *(fleet[end].get(f"{name}_worst", nan) for end in ("lowest", "highest")),
+    )
+    return Point(fleet["robots"], middle, min(ends), max(ends), fleet["success"] < fleet["fleets"])
