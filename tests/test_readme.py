@@ -41,7 +41,7 @@ REFUSED = [
 UNTESTED = {"", ". .venv/bin/activate", ".venv/bin/cloudrc up --console"}
 """Lines that are not run here; the last one runs until Ctrl-C, and tests/console tests it."""
 COMMANDS = [line for line in LINES if line not in UNTESTED]
-ANSWERS = {"compare": "B has a lower", "margin": "settles up to"}
+ANSWERS = {"compare": "B has a lower", "margin": "settles up to", "capacity": "runs/capacity"}
 """Subcommand with many flights -> beginning of the last line that it prints."""
 
 
