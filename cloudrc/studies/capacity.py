@@ -7,7 +7,7 @@ seed, and then the sizes around it fly with all seeds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from statistics import median_low
 from typing import Any, NamedTuple
@@ -17,7 +17,6 @@ from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import NothingFlownError
 from cloudrc.link.model import HEADER_BYTES
 from cloudrc.link.waiting import nddd1
-from cloudrc.outside.values import InvalidValueError, Quantity
 from cloudrc.runs.experiment import check_no_seed, check_world, load, robots_of
 from cloudrc.runs.flight import ERROR
 from cloudrc.statistics import exact_interval, median_interval
@@ -32,6 +31,8 @@ SLACK = 1.4
 until the limit of the experiment, three times that."""
 GROWTH = 2
 """Growth of the fleet from one size to the next, until one fails [1]."""
+FILL = 4
+"""Number of fleets that fly beside those of a search, so that no core waits for it."""
 RESUME_HZ = 20.0
 """Rate of commands below which a HOLD does not end [1/s].
 Source: docs/reference/plant.md, "Leaving HOLD": 10 commands within 500 ms."""
@@ -150,6 +151,16 @@ class Condition:
         """The guard's limit on the age of a command [s]."""
         return self.fleet.guard.command_age_max_ms * 1e-3
 
+    def limits(self, numbers: Mapping[str, float]) -> list[str]:
+        """Name the limits that a fleet with these numbers has come near to."""
+        rate = self.fleet.cloud.command_rate_hz
+        near = {
+            "command_age": numbers["age_p99_ms_worst"] >= CLOSE * self.age_max * 1e3,
+            "hold": numbers["hold_s_worst"] > 0.0 and numbers["rate_hz_worst"] < RESUME_HZ,
+            "cloud_rate": numbers.get("cloud_hz", rate) < CLOSE * rate,
+        }
+        return [name for name, is_near in near.items() if is_near]
+
     def trial(self, robots: int, seed: int) -> FleetTrial:
         """Return the flight of a fleet; not before `set_base`."""
         judged = self.fleet.criteria.model_copy(update={"time_limit_s": self.time_limit})
@@ -160,31 +171,20 @@ class Condition:
         return FleetTrial(fingerprint(facts), self.point | {"robots": robots}, seed, fleet, kinds)
 
 
-def conditions(asked: Asked) -> list[Condition]:
-    """Load the experiment under all conditions."""
-    for queue in asked.queues:
-        if packets := queue.partition(":")[2]:
-            try:
-                Quantity(ge=1, le=100_000, whole=True).read(packets)
-            except InvalidValueError as error:
-                raise problem_at("--queue", f"{queue}: {error}") from None
-    pairs = product(asked.queues or [""], asked.controllers or [""])
-    return [Condition(asked, *pair) for pair in pairs]
-
-
 class Capacity:
     """Finds the capacity of each condition.
 
     Attributes:
-        found: Of each condition, the largest fleet that succeeds with seed 1.
+        found: Number of each condition -> largest fleet that succeeds with seed 1.
         rows: The rows of all fleets that have flown.
     """
 
     def __init__(self, asked: Asked) -> None:
         """Load the experiment under all conditions."""
         self._asked = asked
-        self.conditions = conditions(asked)
-        self.found = list[int]()
+        pairs = product(asked.queues or [""], asked.controllers or [""])
+        self.conditions = [Condition(asked, *pair) for pair in pairs]
+        self.found = dict[int, int]()
         self.rows = dict[str, Row]()
 
     def fly(self, rows: Rows, see: Callable[[Row], None] = lambda row: None) -> None:
@@ -197,30 +197,26 @@ class Capacity:
         self._play(bases.values(), lambda row: None)
         for each in self.conditions:
             each.set_base([self._rows.kept[base.key] for base in each.bases], self._asked.max)
-        self._search()
-        wanted = [
-            each.trial(size, seed)
-            for each, found in zip(self.conditions, self.found, strict=True)
-            for size in range(max(1, found - 1), min(self._asked.max, found + 1) + 1)
-            for seed in range(1, self._asked.seeds + 1)
-        ]
-        self._fly(sorted(wanted, key=lambda each: -each.fleet.fleet.robots))
-
-    def _search(self) -> None:
-        """Search all conditions at once, so that the flights of one round share the cores."""
         starts = [int(min(each.arithmetic.values(), default=1)) or 1 for each in self.conditions]
         searches = [search(start, self._asked.max) for start in starts]
-        asked, found = {n: next(each) for n, each in enumerate(searches)}, dict[int, int]()
+        asked, wanted = {n: next(each) for n, each in enumerate(searches)}, list[FleetTrial]()
         while asked:
             trials = {n: self.conditions[n].trial(size, 1) for n, size in asked.items()}
-            self._fly(trials.values())
+            self._fly([*trials.values(), *wanted[:FILL]])
+            del wanted[:FILL]
             for n, trial in trials.items():
                 try:
                     asked[n] = searches[n].send(succeeded(self.rows[trial.key]))
                 except StopIteration as end:
-                    found[n] = end.value
+                    self.found[n] = end.value
+                    wanted += self._around(self.conditions[n], end.value)
                     del asked[n]
-        self.found = [found[n] for n in range(len(searches))]
+        self._fly(sorted(wanted, key=lambda each: -each.fleet.fleet.robots))
+
+    def _around(self, condition: Condition, largest: int) -> Iterator[FleetTrial]:
+        for size in range(max(1, largest - 1), min(self._asked.max, largest + 1) + 1):
+            for seed in range(1, self._asked.seeds + 1):
+                yield condition.trial(size, seed)
 
     def _fly(self, trials: Iterable[FleetTrial]) -> None:
         trials = [*trials]
@@ -273,8 +269,8 @@ def describe(found: Capacity, asked: Asked) -> dict[str, Any]:
     return {
         **asked._asdict(),
         "conditions": [
-            _describe(each, largest, [*found.rows.values()], asked)
-            for each, largest in zip(found.conditions, found.found, strict=True)
+            _describe(each, found.found[number], [*found.rows.values()], asked)
+            for number, each in enumerate(found.conditions)
         ],
     }
 
@@ -282,19 +278,18 @@ def describe(found: Capacity, asked: Asked) -> dict[str, Any]:
 def _describe(
     condition: Condition, largest: int, rows: Sequence[Row], asked: Asked
 ) -> dict[str, Any]:
-    own = [row for row in rows if condition.point.items() <= row["point"].items()]
-    sizes = sorted({row["point"]["robots"] for row in own})
-    groups = {size: [row for row in own if row["point"]["robots"] == size] for size in sizes}
-    around = {size: each for size, each in groups.items() if abs(size - largest) <= 1}
-    fleets = {
-        seed: {
-            n: succeeded(row) for n, each in around.items() for row in each if row["seed"] == seed
-        }
-        for seed in range(1, asked.seeds + 1)
-    }
-    capacity = capacity_of(fleets, asked.max)
-    above = [size for size in sizes if size > capacity["capacity"]]
-    failed = [row for size in above for row in groups[size] if not succeeded(row)]
+    groups = dict[int, list[Row]]()
+    for row in sorted(rows, key=lambda row: row["point"]["robots"]):
+        if condition.point.items() <= row["point"].items():
+            groups.setdefault(row["point"]["robots"], []).append(row)
+    seeds = {seed: dict[int, bool]() for seed in range(1, asked.seeds + 1)}
+    for size, each in groups.items():
+        if abs(size - largest) <= 1:
+            for row in each:
+                seeds[row["seed"]][size] = succeeded(row)
+    capacity = capacity_of(seeds, asked.max)
+    fleets = [_summary(size, each) for size, each in groups.items()]
+    failed = [each for each in fleets if each["robots"] > capacity["capacity"] and each["failures"]]
     return {
         **condition.point,
         **capacity,
@@ -303,46 +298,23 @@ def _describe(
         "traffic": condition.traffic,
         "time_limit_s": condition.time_limit,
         "age_max_ms": condition.age_max * 1e3,
-        "binding": binding(failed, condition) if failed else None,
-        "fleets": [_summary(size, groups[size]) for size in sizes],
+        "breaks_at": failed[0]["robots"] if failed else None,
+        "limits": condition.limits(failed[0]["numbers"]) if failed else [],
+        "fleets": fleets,
     }
 
 
 def _summary(size: int, rows: Sequence[Row]) -> dict[str, Any]:
     """Return the medians of all fleets of a size, and how many succeeded."""
     done, names = sum(map(succeeded, rows)), dict.fromkeys(n for r in rows for n in r["numbers"])
-    values = {name: [r["numbers"][name] for r in rows if name in r["numbers"]] for name in names}
     return {
         "robots": size,
         "fleets": len(rows),
         "success": done,
         "interval": exact_interval(done, len(rows)),
-        "numbers": {name: median_low(each) for name, each in values.items()},
-        "lowest": {name: min(each) for name, each in values.items()},
-        "highest": {name: max(each) for name, each in values.items()},
-    }
-
-
-def binding(failed: Sequence[Row], condition: Condition) -> dict[str, Any]:
-    """Say what broke the smallest fleets that failed: of `failed`, those of the first size."""
-    size = failed[0]["point"]["robots"]
-    rows = [row for row in failed if row["point"]["robots"] == size]
-    worst = {
-        name: median_low([row["numbers"].get(name, 0.0) for row in rows])
-        for name in ("age_p99_ms_worst", "hold_s_worst", "rate_hz_worst", "loss_uplink_worst")
-    }
-    rate = condition.fleet.cloud.command_rate_hz
-    cloud = median_low([row["numbers"].get("cloud_hz", rate) for row in rows])
-    limits = {
-        "command_age": worst["age_p99_ms_worst"] >= CLOSE * condition.age_max * 1e3,
-        "hold": worst["hold_s_worst"] > 0.0 and worst["rate_hz_worst"] < RESUME_HZ,
-        "cloud_rate": cloud < CLOSE * rate,
-    }
-    codes = sorted({code for row in rows for code in row["failures"]})
-    return {
-        "robots": size,
-        "failures": codes,
-        "limits": [name for name, holds in limits.items() if holds],
-        **worst,
-        "cloud_hz": cloud,
+        "failures": sorted({code for row in rows for code in row["failures"]}),
+        "numbers": {
+            name: median_low([r["numbers"][name] for r in rows if name in r["numbers"]])
+            for name in names
+        },
     }

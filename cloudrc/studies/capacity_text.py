@@ -30,11 +30,19 @@ COLUMNS = {
     "fail alone": "{fail_alone}",
 }
 """Head -> cell of the table; numbers are medians over the fleets."""
+LIMITS = {
+    "command_age": "command age {age_p99_ms_worst:.0f} of {age_max_ms:.0f} ms "
+    "(guard.command_age_max_ms)",
+    "hold": "HOLD for {hold_s_worst:.0f} s: it ends after 10 fresh commands within 500 ms, and "
+    "{rate_hz_worst:.0f} a second arrive",
+    "cloud_rate": "the cloud computes {cloud_hz:.0f} commands a second for a robot",
+}
+"""Limit that a fleet has come near to -> how."""
 CAPTION = (
     "Success: share of fleets in which all robots succeed that succeed alone, and Clopper and "
     "Pearson's 95 % interval. Age and commands: the worst robot of a fleet, median over the "
-    "fleets; the band goes from the median robot to the worst one of all fleets. Commands are "
-    "those that reach the onboard controller; a fleet that fails is measured up to then."
+    "fleets; the band ends at the median robot. Commands are those that reach the onboard "
+    "controller; a fleet that fails is measured up to then."
 )
 
 
@@ -109,20 +117,12 @@ def _capacity(each: Mapping[str, Any], name: str) -> str:
 
 
 def _binding(each: Mapping[str, Any]) -> Iterator[str]:
-    found = each["binding"]
-    if found is None:
-        yield "  no fleet failed; raise --max"
+    if each["breaks_at"] is None:
+        yield "  no larger fleet failed; raise --max"
         return
-    texts = {
-        "command_age": f"command age {found['age_p99_ms_worst']:.0f} of {each['age_max_ms']:.0f} "
-        "ms (guard.command_age_max_ms)",
-        "hold": f"HOLD for {found['hold_s_worst']:.0f} s: it ends after 10 fresh commands within "
-        f"500 ms, and {found['rate_hz_worst']:.0f} a second arrive",
-        "cloud_rate": f"the cloud computes {found['cloud_hz']:.0f} commands a second for a robot",
-    }
-    limits = [texts[name] for name in found["limits"]]
-    why = f"{', '.join(found['failures'])}, {found['loss_uplink_worst']:.0%} lost in the uplink"
-    yield f"  breaks at {found['robots']} robots: {'; '.join(limits or [why])}"
+    found = next(fleet for fleet in each["fleets"] if fleet["robots"] == each["breaks_at"])
+    text = "; ".join(LIMITS[name] for name in each["limits"]).format(**each, **found["numbers"])
+    yield f"  breaks at {found['robots']} robots ({', '.join(found['failures'])}): {text}"
 
 
 def draw_capacity(document: Mapping[str, Any], look: Look) -> dict[str, bytes]:
@@ -162,9 +162,6 @@ def _share(fleet: Mapping[str, Any]) -> tuple[float, float, float]:
 
 
 def _point(fleet: Mapping[str, Any], name: str) -> Point:
-    middle = fleet["numbers"].get(f"{name}_worst", nan)
-    ends = (
-        fleet["numbers"].get(f"{name}_median", nan),
-        *(fleet[end].get(f"{name}_worst", nan) for end in ("lowest", "highest")),
-    )
-    return Point(fleet["robots"], middle, min(ends), max(ends), fleet["success"] < fleet["fleets"])
+    worst, middle = (fleet["numbers"].get(f"{name}_{which}", nan) for which in ("worst", "median"))
+    ends = min(worst, middle), max(worst, middle)
+    return Point(fleet["robots"], worst, *ends, fleet["success"] < fleet["fleets"])

@@ -15,7 +15,7 @@ def test_the_capacity_of_a_small_cell(folder, call):
     (found,) = json.loads(first.out)["conditions"]
     assert (found["capacity"], found["queue"]) == (1, "fifo 20")
     assert [each["success"] for each in found["fleets"]] == [1, 0]
-    assert "command_age" in found["binding"]["limits"]
+    assert "command_age" in found["limits"]
     assert (folder / "out/capacity.png").exists()
     again = call(*LINE, "--queue", "fifo:20")
     assert "seed 1: " in first.err
