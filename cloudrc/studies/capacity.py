@@ -29,6 +29,8 @@ from cloudrc.trials.rows import Row, Rows
 SLACK = 1.4
 """Time limit of a mission, as a multiple of its duration alone [1]: a robot in HOLD would fly on
 until the limit of the experiment, three times that."""
+BASES = 4
+"""Smallest number of robots that fly alone first; one may fail by itself."""
 GROWTH = 2
 """Growth of the fleet from one size to the next, until one fails [1]."""
 FILL = 4
@@ -72,7 +74,7 @@ class Condition:
 
     Attributes:
         point: Axis -> value, without the number of robots.
-        bases: Flights alone, with seed 1, of robots that differ in more than random numbers.
+        bases: Flights alone, with seed 1, of the first robots.
         arithmetic: Number of robots that fill each shared medium; `set_base` finds it.
         theory: The same by queueing theory: the largest number that gets commands in time.
         traffic: What a robot sends in the cell, per direction.
@@ -100,12 +102,15 @@ class Condition:
         if cell.rate_kbit is None and not (cloud.cores and cloud.compute_ms):
             text = "the robots share nothing; give a rate [kbit/s], or --set cloud.cores=1 with"
             raise problem_at("--cell", f"{text} --set cloud.compute_ms=2")
-        limits = f"{cell.queue} {cell.queue_packets}" if cell.queue != "newest" else "newest"
-        self.point = {"queue": limits, "controller": cloud.controller.name}
-        self.bases = [
-            PlannedFlight(fingerprint(experiment_facts(each)), {"robot": number}, 1, each)
-            for number, each in enumerate(map(alone, self._kinds))
-        ]
+        shown = cell.queue if cell.queue == "newest" else f"{cell.queue} {cell.queue_packets}"
+        shown = shown if cell.rate_kbit else "no cell"
+        self.point = {"queue": shown, "controller": cloud.controller.name}
+        self.bases = list[PlannedFlight]()
+        first = FleetTrial("", {}, 1, self.fleet, self._kinds)
+        for number in range(max(BASES, kinds)):
+            robot = alone(first.robot(number))
+            facts = fingerprint(experiment_facts(robot))
+            self.bases.append(PlannedFlight(facts, {"robot": number}, 1, robot))
         self.arithmetic, self.theory = dict[str, float](), dict[str, int]()
         self.traffic = dict[str, dict[str, float]]()
         self.time_limit: float | None = self.fleet.criteria.time_limit_s
@@ -117,10 +122,9 @@ class Condition:
 
     def set_base(self, rows: Sequence[Row], top: int) -> None:
         """Take the flights alone: time limit, arithmetic and theory, up to `top` robots."""
-        if failed := [row for row in rows if row["verdict"] != "success"]:
-            text = failed[0]["text"]
-            raise NothingFlownError(f"the experiment fails without neighbours, seed 1: {text}")
-        numbers = [row["numbers"] for row in rows]
+        numbers = [row["numbers"] for row in rows if row["verdict"] == "success"]
+        if not numbers:
+            raise NothingFlownError(f"the first robots fail alone, too: {rows[0]['text']}")
         if self.time_limit is None:
             self.time_limit = math.ceil(SLACK * max(each["duration"] for each in numbers))
         cell, cloud, first = self.fleet.cell, self.fleet.cloud, numbers[0]

@@ -46,14 +46,8 @@ CAPTION = (
 )
 
 
-def name_of(condition: Mapping[str, Any], document: Mapping[str, Any]) -> str:
-    """Return the name of a condition: what differs from others."""
-    axes = [
-        axis
-        for axis in ("queue", "controller")
-        if len({each[axis] for each in document["conditions"]}) > 1
-    ]
-    return ", ".join(condition[axis] for axis in axes or ["queue"])
+def _name(condition: Mapping[str, Any]) -> str:
+    return f"{condition['queue']}, {condition['controller']}"
 
 
 def rows_of(document: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -83,7 +77,7 @@ def as_text(document: Mapping[str, Any]) -> str:
     rows = cells(rows_of(document), COLUMNS)
     lines = [*dict.fromkeys(_needs(document)), "", table(rows, right=range(2, len(rows[0]))), ""]
     for each in document["conditions"]:
-        lines += [_capacity(each, name_of(each, document)), *_binding(each)]
+        lines += [_capacity(each, _name(each)), *_binding(each)]
     return "\n".join(lines)
 
 
@@ -122,12 +116,13 @@ def _binding(each: Mapping[str, Any]) -> Iterator[str]:
         return
     found = next(fleet for fleet in each["fleets"] if fleet["robots"] == each["breaks_at"])
     text = "; ".join(LIMITS[name] for name in each["limits"]).format(**each, **found["numbers"])
-    yield f"  breaks at {found['robots']} robots ({', '.join(found['failures'])}): {text}"
+    why = f"{', '.join(found['failures'])}{': ' * bool(text)}{text}"
+    yield f"  breaks at {found['robots']} robots: {why}"
 
 
 def draw_capacity(document: Mapping[str, Any], look: Look) -> dict[str, bytes]:
     """Draw success, age and rate over the number of robots; return the figure by suffix."""
-    conditions = {name_of(each, document): each for each in document["conditions"]}
+    conditions = {_name(each): each for each in document["conditions"]}
     first = document["conditions"][0]
     marks = {f"arithmetic, {name}": value for name, value in first["arithmetic"].items()}
     marks |= first["theory"]
@@ -153,7 +148,7 @@ def draw_capacity(document: Mapping[str, Any], look: Look) -> dict[str, bytes]:
         ),
         Panel("commands", "Hz", lines("rate_hz")),
     ]
-    return draw(panels, "robots", [], "queue", look=look)
+    return draw(panels, "robots", [], "queue, controller", look=look)
 
 
 def _share(fleet: Mapping[str, Any]) -> tuple[float, float, float]:

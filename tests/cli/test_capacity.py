@@ -20,7 +20,7 @@ def test_the_capacity_of_a_small_cell(folder, call):
     again = call(*LINE, "--queue", "fifo:20")
     assert "seed 1: " in first.err
     assert "seed 1: " not in again.err
-    assert "capacity, fifo 20: 1 robots [1, 1] (range over 1 seeds)" in again.out
+    assert "capacity, fifo 20, pid: 1 robots [1, 1] (range over 1 seeds)" in again.out
 
 
 def test_robots_that_share_nothing_have_no_capacity(refused):
