@@ -10,7 +10,7 @@ from cloudrc.text import cells, csv_table, escape, latex_table
 EPILOG = """\
 examples:
   cloudrc capacity steps --cell 1000 --queue fifo,newest --seeds 10
-  cloudrc capacity steps --cell 1000 --queue fifo:50,fifo:10 --controllers pid,mpc
+  cloudrc capacity steps --cell 1000 --queue fifo:9 --controllers pid,mpc
   cloudrc capacity steps --set cloud.cores=1 --set cloud.compute_ms=2
 
 The capacity is the largest fleet in which all robots succeed that succeed
@@ -52,7 +52,7 @@ def execute(options: Options) -> None:
     from cloudrc.runs.folder import new_folder
     from cloudrc.runs.lock import lock_folder
     from cloudrc.runs.requirements import MODES, require
-    from cloudrc.studies.capacity import Asked, Capacity, describe
+    from cloudrc.studies.capacity import Sought, Capacity, describe
     from cloudrc.studies.capacity_text import (
         CAPTION,
         COLUMNS,
@@ -65,7 +65,7 @@ def execute(options: Options) -> None:
 
     require("a capacity", MODES["virtual"])
     names = "experiment", "set", "cell", "queue", "controllers", "seeds", "max"
-    asked = Asked(*(getattr(options, name) for name in names))
+    asked = Sought(*(getattr(options, name) for name in names))
     found = Capacity(asked)
     warn(*(each.fleet for each in found.conditions))
     folder = options.out

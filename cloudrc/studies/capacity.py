@@ -42,7 +42,7 @@ CLOSE = 0.9
 """Share of a limit from which on a number counts as near it [1]."""
 
 
-class Asked(NamedTuple):
+class Sought(NamedTuple):
     """The question of `cloudrc capacity`."""
 
     experiment: str  # name of a shipped experiment, or path of a YAML file
@@ -81,7 +81,7 @@ class Condition:
         time_limit: Time limit of the mission [s].
     """
 
-    def __init__(self, asked: Asked, queue: str, controller: str) -> None:
+    def __init__(self, asked: Sought, queue: str, controller: str) -> None:
         """Load the experiment."""
         name, _, packets = queue.partition(":")
         given = {
@@ -183,7 +183,7 @@ class Capacity:
         rows: The rows of all fleets that have flown.
     """
 
-    def __init__(self, asked: Asked) -> None:
+    def __init__(self, asked: Sought) -> None:
         """Load the experiment under all conditions."""
         self._asked = asked
         pairs = product(asked.queues or [""], asked.controllers or [""])
@@ -268,7 +268,7 @@ def capacity_of(fleets: Mapping[int, Mapping[int, bool]], top: int) -> dict[str,
     }
 
 
-def describe(found: Capacity, asked: Asked) -> dict[str, Any]:
+def describe(found: Capacity, asked: Sought) -> dict[str, Any]:
     """Return the result as values for JSON."""
     return {
         **asked._asdict(),
@@ -280,7 +280,7 @@ def describe(found: Capacity, asked: Asked) -> dict[str, Any]:
 
 
 def _describe(
-    condition: Condition, largest: int, rows: Sequence[Row], asked: Asked
+    condition: Condition, largest: int, rows: Sequence[Row], asked: Sought
 ) -> dict[str, Any]:
     groups = dict[int, list[Row]]()
     for row in sorted(rows, key=lambda row: row["point"]["robots"]):

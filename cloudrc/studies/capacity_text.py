@@ -116,8 +116,8 @@ def _binding(each: Mapping[str, Any]) -> Iterator[str]:
         return
     found = next(fleet for fleet in each["fleets"] if fleet["robots"] == each["breaks_at"])
     text = "; ".join(LIMITS[name] for name in each["limits"]).format(**each, **found["numbers"])
-    why = f"{', '.join(found['failures'])}{': ' * bool(text)}{text}"
-    yield f"  breaks at {found['robots']} robots: {why}"
+    codes = ", ".join(found["failures"])
+    yield f"  breaks at {found['robots']} robots ({codes}){text and ': '}{text}"
 
 
 def draw_capacity(document: Mapping[str, Any], look: Look) -> dict[str, bytes]:
@@ -125,7 +125,7 @@ def draw_capacity(document: Mapping[str, Any], look: Look) -> dict[str, bytes]:
     conditions = {_name(each): each for each in document["conditions"]}
     first = document["conditions"][0]
     marks = {f"arithmetic, {name}": value for name, value in first["arithmetic"].items()}
-    marks |= first["theory"]
+    marks |= {f"theory, {name}": value for name, value in first["theory"].items()}
 
     def lines(name: str) -> dict[str, Sequence[Point]]:
         return {

@@ -6,7 +6,7 @@ from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 from cloudrc.runs.fleet import assemble_fleet
-from cloudrc.studies.capacity import Asked, Condition, capacity_of, search
+from cloudrc.studies.capacity import Sought, Condition, capacity_of, search
 
 SHORT = (
     *("mission.steps.count=8", "mission.steps.period_s=0.5"),
@@ -16,7 +16,7 @@ DEAF = "fleet.vary=[{world.odometry_rate_hz: 100}, {link.both.loss: 1}]"
 
 
 def trial(robots, *settings, seed=1):
-    asked = Asked("steps", (*SHORT, *settings), 300, ["fifo:20"], [], 1, 4)
+    asked = Sought("steps", (*SHORT, *settings), 300, ["fifo:20"], [], 1, 4)
     return Condition(asked, "fifo:20", "").trial(robots, seed)
 
 
