@@ -52,7 +52,7 @@ def execute(options: Options) -> None:
     from cloudrc.runs.folder import new_folder
     from cloudrc.runs.lock import lock_folder
     from cloudrc.runs.requirements import MODES, require
-    from cloudrc.studies.capacity import Sought, Capacity, describe
+    from cloudrc.studies.capacity import Capacity, Sought, describe
     from cloudrc.studies.capacity_text import (
         CAPTION,
         COLUMNS,
@@ -69,9 +69,10 @@ def execute(options: Options) -> None:
     found = Capacity(asked)
     warn(*(each.fleet for each in found.conditions))
     folder = options.out
-    if folder is None or not [*folder.glob("rows*.jsonl")]:
+    if folder is None or not (folder / "capacity.json").exists():
         folder = new_folder(folder, f"capacity-{found.conditions[0].fleet.name}", "latest-capacity")
     with lock_folder(folder), Progress("flies") as view:
+        write_json(folder / "capacity.json", {"schemaVersion": 1, **asked._asdict()})
         view.say(f"{options.experiment}: how many robots? seeds 1 to {options.seeds}")
         try:
             found.fly(Rows(folder), lambda row: view.say(in_words(row)))

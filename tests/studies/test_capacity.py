@@ -6,7 +6,7 @@ from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 from cloudrc.runs.fleet import assemble_fleet
-from cloudrc.studies.capacity import Sought, Condition, capacity_of, search
+from cloudrc.studies.capacity import Condition, Sought, capacity_of, search
 
 SHORT = (
     *("mission.steps.count=8", "mission.steps.period_s=0.5"),
