@@ -16,6 +16,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from cloudrc.studies.sweep import read_summary
 from cloudrc.text import table
 from cloudrc.trials.rows import Row, read_rows
 
@@ -33,9 +34,11 @@ def time_of(row: Row) -> float:
 def judge(folder: Path) -> tuple[str, bool]:
     """Return a table of a sweep's flights, and whether all is as it should be."""
     groups: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
-    for row in read_rows(folder).values():
+    flown = read_rows(folder)
+    for row in flown.values():
         groups[tuple(row["point"].values())].append(row)
-    lines, is_good = [("robot", "controller", "RTT [ms]", "success", "time [s]", "longer")], True
+    lines = [("robot", "controller", "RTT [ms]", "success", "time [s]", "longer")]
+    is_good = len(flown) == read_summary(folder)["flights"]
     before = 0.0
     for (robot, controller, delay_ms), rows in sorted(groups.items()):
         good = [row for row in rows if row["verdict"] == "success"]
@@ -46,7 +49,7 @@ def judge(folder: Path) -> tuple[str, bool]:
         counts = f"{len(good)} of {len(rows)}"
         rtt = f"{2 * delay_ms:g}"
         lines.append((robot, controller, rtt, counts, f"{time:.2f}", f"{longer:+.1%}"))
-    return table(lines, right=(2, 4, 5)), is_good
+    return table([*lines, ("flown", f"{len(flown)}", *[""] * 4)], right=(2, 4, 5)), is_good
 
 
 def main(folder: Path) -> int:
