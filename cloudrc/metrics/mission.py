@@ -257,12 +257,12 @@ def _cross_track(flight: Flight) -> float | None:
     if not len(path) or not flight.mission.waypoints:
         return None
     corners = np.array([path[0], *(each.position_m for each in flight.mission.waypoints)])
-    begins, ways = corners[:-1], np.diff(corners, axis=0)
-    since = path[:, None] - begins  # shape (positions, lines, 3)
-    squares = np.maximum((ways**2).sum(axis=1), np.finfo(float).tiny)
-    shares = np.clip((since * ways).sum(axis=2) / squares, 0.0, 1.0)
-    distances = np.linalg.norm(since - shares[:, :, None] * ways, axis=2)
-    return rms(distances.min(axis=1))
+    squares = np.full(len(path), np.inf)  # of the distances [m^2]
+    for begin, way in zip(corners, np.diff(corners, axis=0), strict=False):
+        since = path - begin
+        share = np.clip(since @ way / max(way @ way, np.finfo(float).tiny), 0.0, 1.0)
+        np.minimum(squares, np.square(since - np.outer(share, way)).sum(axis=1), out=squares)
+    return rms(np.sqrt(squares))
 
 
 def obstacle_contacts(flight: Flight) -> dict[str, Array]:
