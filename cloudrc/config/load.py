@@ -13,7 +13,7 @@ from contextlib import suppress
 from math import inf
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
 from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
@@ -70,6 +70,7 @@ _PROFILE_KEYS = {("link",), ("link", "profile"), ("cloud", "place")}
 """If a setting gives one of these keys, it replaces the whole link profile."""
 _OF_ALL = "fleet", "cell", "cloud.cores", "cloud.sharing", "cloud.place"
 """Beginnings of keys that are the same for all robots of a fleet."""
+_Named = TypeVar("_Named", PlaceFile, Profile)
 _COMPUTER = "speed", "cores", "sharing"
 """Keys of cloud that a place gives."""
 
@@ -315,11 +316,8 @@ def _take_place(document: Document) -> None:
     name = document.get("cloud", "place")
     if not isinstance(name, str):
         return
+    file, place = _read_named(document, "place", ("cloud", "place"), PlaceFile)
     source = document.source(("cloud", "place"))
-    file = shipped.read("place", name, source.folder)
-    place = problems.validate(file, PlaceFile, name)
-    if shipped.is_path(name):
-        document.set_value(("cloud", "place"), str(source.absolute(name)), source)
     for key in _COMPUTER:
         if key not in document.tree["cloud"]:
             document.set_value(("cloud", key), getattr(place, key), source)
@@ -330,6 +328,18 @@ def _take_place(document: Document) -> None:
         _inline_direction(document, way, file)
 
 
+def _read_named(
+    document: Document, kind: str, path: KeyPath, model: type[_Named]
+) -> tuple[Document, _Named]:
+    """Read the file that the key `path` names, and check it; make its path in the key absolute."""
+    name, source = document.get(*path), document.source(path)
+    file = shipped.read(kind, name, source.folder)
+    content = problems.validate(file, model, name)
+    if shipped.is_path(name):
+        document.set_value(path, str(source.absolute(name)), source)
+    return file, content
+
+
 def _inline_profile(document: Document) -> None:
     """Fill in the values of the link that the experiment omits, from the link profile."""
     _default(document, ("link", "profile"), Experiment().link.profile)
@@ -338,11 +348,7 @@ def _inline_profile(document: Document) -> None:
         return
     profile = _present_profile(document)
     if not _has_all_values(document):
-        source = document.source(("link", "profile"))
-        file = shipped.read("profile", name, source.folder)
-        profile = problems.validate(file, Profile, name)
-        if shipped.is_path(name):
-            document.set_value(("link", "profile"), str(source.absolute(name)), source)
+        file, profile = _read_named(document, "profile", ("link", "profile"), Profile)
         for way in DIRECTIONS:
             _inline_direction(document, way, file)
     for path, value in _implied(profile).items():
