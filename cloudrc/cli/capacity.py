@@ -2,8 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 from cloudrc.cli.output import TABLES, output_argument, print_result, tell, warn
-from cloudrc.cli.parser import Options, Parser, flags, number, read_count, whole_number
+from cloudrc.cli.parser import (
+    Options,
+    Parser,
+    flags,
+    number,
+    read_count,
+    settings_from,
+    whole_number,
+)
 from cloudrc.errors import CloudrcError
 from cloudrc.text import cells, csv_table, escape, latex_table
 
@@ -64,15 +74,14 @@ def execute(options: Options) -> None:
     from cloudrc.trials.rows import Rows
 
     require("a capacity", MODES["virtual"])
-    names = "experiment", "set", "cell", "queue", "controllers", "seeds", "max"
-    asked = Sought(*(getattr(options, name) for name in names))
+    asked = settings_from(options, Sought)
     found = Capacity(asked)
     warn(*(each.fleet for each in found.conditions))
     folder = options.out
     if folder is None or not (folder / "capacity.json").exists():
         folder = new_folder(folder, f"capacity-{found.conditions[0].fleet.name}", "latest-capacity")
     with lock_folder(folder), Progress("flies") as view:
-        write_json(folder / "capacity.json", {"schemaVersion": 1, **asked._asdict()})
+        write_json(folder / "capacity.json", {"schemaVersion": 1, **asdict(asked)})
         view.say(f"{options.experiment}: how many robots? seeds 1 to {options.seeds}")
         try:
             found.fly(Rows(folder), lambda row: view.say(in_words(row)))

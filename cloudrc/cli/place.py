@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from cloudrc.cli.output import TABLE, output_argument, print_result, tell, warn
@@ -50,13 +50,13 @@ def _list_of(read: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
 def execute(options: Options) -> int:
     """Fly what is missing, and print the table; return 0 if all was flown."""
     from cloudrc.cli.progress import Progress, SweepView
-    from cloudrc.studies.place import PlaceStudy, PlaceTrial, as_text, describe
+    from cloudrc.studies.place import PlaceStudy, as_text, describe
     from cloudrc.trials.play import run
     from cloudrc.trials.rows import Rows
 
     study = settings_from(options, PlaceStudy)
     with Progress("checks the flights"):
-        trials: Sequence[PlaceTrial] = study.plan()
+        trials = study.plan()
     warn(*(trial.fleet for trial in trials))
     name, folder = trials[0].fleet.name, options.out
     if folder is None or not any(folder.glob("rows*.jsonl")):

@@ -33,10 +33,14 @@ NUMBERS = {
     "age_p99_ms": ("age_at_actuator_p99", 1e3),
     "hold_s": ("hold_time", 1.0),
     "tracking_rms_m": ("tracking_rms_measured", 1.0),
+    "cross_track_mm": ("cross_track_rms", 1e3),
+    "settling_s": ("settling_time_mean", 1.0),
     "loss_uplink": ("loss_uplink", 1.0),
     "loss_downlink": ("loss_downlink", 1.0),
 }
 """Number of a robot in the fleet's report -> number in its own report, factor from the SI unit."""
+SENT = "bytes_sent_uplink", "bytes_sent_downlink", "duration"
+"""Numbers in a robot's own report: payload of all datagrams [byte], and their time [s]."""
 ROBOTS = {
     "robot": "{robot}",
     "age [ms]": "{age_ms:.0f}",
@@ -115,6 +119,9 @@ class FleetFlown:
         for name, (own, factor) in NUMBERS.items():
             if own in known:
                 row[name] = known[own]["value"] * factor
+        if known.keys() >= {*SENT}:
+            uplink, downlink, duration = (known[name]["value"] for name in SENT)
+            row["sent_kbit"] = (uplink + downlink) / duration * 8e-3
         if self.log.ways:
             row["dropped"] = sum(self.log.dropped[way, number] for way in self.log.ways)
         self.robots.append(row | {"records_sha256": document["records_sha256"]})
@@ -134,7 +141,7 @@ def fleet_document(flown: FleetFlown) -> dict[str, Any]:
         if robot["verdict"] != "success"
     ]
     text = f"{len(failed)} of {len(robots)} robots did not succeed: {list_some(failed, 5)}"
-    numbers = [*NUMBERS, "dropped"]
+    numbers = [*NUMBERS, "sent_kbit", "dropped"]
     values = {name: [robot[name] for robot in robots if name in robot] for name in numbers}
     return {
         "schemaVersion": SCHEMA_VERSION,

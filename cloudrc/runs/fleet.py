@@ -19,11 +19,11 @@ from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.drivers.fleet import CellQueue, Computation, FleetRun, Member, SharedCores
 from cloudrc.drivers.virtual import Sink
 from cloudrc.link.cell import FRAME_NS, Bulk, Cell, Video
-from cloudrc.record.columns import Recording, RecordStore
+from cloudrc.record.columns import Recording
 from cloudrc.records import Record
-from cloudrc.report.document import Assessment, Run, write_json
+from cloudrc.report.document import Run, write_json
 from cloudrc.report.fleet import CellLog, FleetFlown, fleet_document
-from cloudrc.report.write import assess, write_report
+from cloudrc.report.write import write_report
 from cloudrc.runs.fly import VirtualRecorder, naming_files
 from cloudrc.runs.interrupts import raise_if_interrupted
 from cloudrc.runs.own_files import hash_files
@@ -69,19 +69,6 @@ def fly_fleet(
 
             write_fleet_page(folder, flown, document)
     return document
-
-
-def fly_in_memory(
-    experiment: ResolvedExperiment, robots: Sequence[ResolvedExperiment]
-) -> list[Assessment]:
-    """Fly a fleet in virtual time, and measure and judge each robot, without any file."""
-    stores = [RecordStore() for _ in robots]
-    assemble_fleet(experiment, robots, [store.add for store in stores]).fly()
-    run = Run("virtual", "virtual", notes=assembly.virtual_notes(experiment))
-    return [
-        assess(Recording(records=store), robot, run, robot.report.metrics)
-        for store, robot in zip(stores, robots, strict=True)
-    ]
 
 
 def _record(robot: ResolvedExperiment, folder: Path) -> VirtualRecorder:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from itertools import product
 from statistics import median_low
-from typing import Any, NamedTuple
+from typing import Any
 
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
@@ -42,13 +43,14 @@ CLOSE = 0.9
 """Share of a limit from which on a number counts as near it [1]."""
 
 
-class Sought(NamedTuple):
+@dataclass(frozen=True)
+class Sought:
     """The question of `cloudrc capacity`."""
 
     experiment: str  # name of a shipped experiment, or path of a YAML file
-    settings: Sequence[str]  # KEY=VALUE
+    set: Sequence[str]  # KEY=VALUE
     cell: float | None  # rate of the cell [kbit/s]; None: that of the experiment
-    queues: Sequence[str]  # NAME or NAME:PACKETS; []: that of the experiment
+    queue: Sequence[str]  # NAME or NAME:PACKETS; []: that of the experiment
     controllers: Sequence[str]  # []: that of the experiment
     seeds: int  # the fleets have the seeds 1 to `seeds`
     max: int  # largest fleet to try
@@ -90,7 +92,7 @@ class Condition:
             "cell.queue_packets": packets,
             "cloud.controller": controller,
         }
-        settings = [*asked.settings, *(f"{key}={value}" for key, value in given.items() if value)]
+        settings = [*asked.set, *(f"{key}={value}" for key, value in given.items() if value)]
         check_no_seed(settings)
         own = self._load(asked.experiment, settings, 1)
         kinds = len(own.fleet.vary) or 1
@@ -172,7 +174,8 @@ class Condition:
         fleet = self.fleet.model_copy(update={"criteria": judged, "fleet": own})
         kinds = [each.model_copy(update={"criteria": judged}) for each in self._kinds]
         facts = [experiment_facts(each) for each in (fleet, *kinds)]
-        return FleetTrial(fingerprint(facts), self.point | {"robots": robots}, seed, fleet, kinds)
+        point = self.point | {"robots": robots}
+        return FleetTrial(fingerprint(facts), point, seed, fleet, kinds, until_failure=True)
 
 
 class Capacity:
@@ -186,7 +189,7 @@ class Capacity:
     def __init__(self, asked: Sought) -> None:
         """Load the experiment under all conditions."""
         self._asked = asked
-        pairs = product(asked.queues or [""], asked.controllers or [""])
+        pairs = product(asked.queue or [""], asked.controllers or [""])
         self.conditions = [Condition(asked, *pair) for pair in pairs]
         self.found = dict[int, int]()
         self.rows = dict[str, Row]()
@@ -271,7 +274,7 @@ def capacity_of(fleets: Mapping[int, Mapping[int, bool]], top: int) -> dict[str,
 def describe(found: Capacity, asked: Sought) -> dict[str, Any]:
     """Return the result as values for JSON."""
     return {
-        **asked._asdict(),
+        **asdict(asked),
         "conditions": [
             _describe(each, found.found[number], [*found.rows.values()], asked)
             for number, each in enumerate(found.conditions)

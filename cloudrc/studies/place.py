@@ -8,22 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain, groupby, product
+from itertools import groupby, product
 from operator import itemgetter
 from pathlib import Path
 from statistics import mean, median
-from typing import Any, NamedTuple
+from typing import Any
 
-from cloudrc import source
 from cloudrc.config.overrides import OUTSIDE, parse_settings
 from cloudrc.config.problems import problem_at
-from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.runs.experiment import check_no_seed, check_world, load, robots_of
-from cloudrc.runs.fleet import fly_in_memory
-from cloudrc.runs.flight import or_error
 from cloudrc.text import cells, escape, table
 from cloudrc.trials.fingerprint import experiment_facts, fingerprint
+from cloudrc.trials.fleet import FleetTrial
 from cloudrc.trials.rows import Row
 
 DISTURBANCES = {
@@ -42,16 +39,8 @@ AXES = {
     "place": "cloud.place",
 }
 """Axis -> its key."""
-NUMBERS = {
-    "age_ms": ("age_at_actuator_mean", 1e3),
-    "age_p99_ms": ("age_at_actuator_p99", 1e3),
-    "hold_s": ("hold_time", 1.0),
-    "cross_track_mm": ("cross_track_rms", 1e3),
-    "settling_s": ("settling_time_mean", 1.0),
-}
-"""Number of a row -> number of a flight, factor from the SI unit."""
-SENT = "bytes_sent_uplink", "bytes_sent_downlink"
-"""Numbers of a flight: payload of all datagrams [byte]."""
+SHOWN = "age_ms", "age_p99_ms", "hold_s", "cross_track_mm", "settling_s"
+"""Numbers of a fleet's report that the table shows: the median over the robots."""
 JUDGED = {
     "hold_s": ("time in HOLD", "{:.1f} s", 0.1),
     "cross_track_mm": ("cross-track error", "{:.0f} mm", 1.0),
@@ -77,45 +66,6 @@ TABLE = {
 """Head -> cell of the table."""
 
 
-class PlaceTrial(NamedTuple):
-    """Flights of all robots at a place, with one seed."""
-
-    fingerprint: str
-    point: dict[str, Any]  # axis -> value
-    seed: int
-    fleet: ResolvedExperiment
-    robots: tuple[ResolvedExperiment, ...]
-
-    @property
-    def key(self) -> str:
-        """Name of the trial's row."""
-        return fingerprint(self.fingerprint, self.seed)
-
-    def play(self) -> Row:
-        """Fly; return the row, whose numbers are medians over the robots."""
-        of = {"key": self.key, "point": self.point, "seed": self.seed, "code": source.code_hash()}
-        return of | or_error(self._measure)
-
-    def _measure(self) -> Row:
-        fleet, *robots = (
-            each.model_copy(update={"seed": self.seed}) for each in (self.fleet, *self.robots)
-        )
-        with reuse_results():
-            found = fly_in_memory(fleet, robots)
-        failures = [failure for each in found for failure in each.verdict.failures]
-        succeeded = sum(each.verdict.outcome == "success" for each in found)
-        values: dict[str, list[float]] = {}
-        for name, number in chain.from_iterable(each.numbers.items() for each in found):
-            values.setdefault(name, []).append(number.value)
-        return {
-            "verdict": "success" if succeeded == len(found) else "failure",
-            "failures": sorted({failure.code for failure in failures}),
-            "text": failures[0].text if failures else "",
-            "numbers": {"succeeded": succeeded, **{n: median(of) for n, of in values.items()}},
-            "records_sha256": fingerprint([each.records_sha256 for each in found]),
-        }
-
-
 @dataclass(frozen=True)
 class PlaceStudy:
     """The question of `cloudrc place`."""
@@ -138,11 +88,11 @@ class PlaceStudy:
             if not self.calm and not any(f"{key}.".startswith(f"{own}.") for own in given)
         }
 
-    def plan(self) -> list[PlaceTrial]:
+    def plan(self) -> list[FleetTrial]:
         """Check all flights; return them in the order of the table."""
         check_no_seed(self.set)
         disturbed = [f"{key}={value}" for key, value in self.disturbances.items()]
-        trials = list[PlaceTrial]()
+        trials = list[FleetTrial]()
         with reuse_results():
             for values in product(self.compute, self.robots, self.places):
                 point = dict(zip(AXES, values, strict=True))
@@ -155,12 +105,12 @@ class PlaceStudy:
                 for robot in robots:
                     check_world(robot.world, turns=robot.mission.turns)
                 known = fingerprint(experiment_facts(fleet), *map(experiment_facts, robots))
-                trial = PlaceTrial(known, point, 1, fleet, robots)
+                trial = FleetTrial(known, point, 1, fleet, robots)
                 trials += [trial._replace(seed=1 + n) for n in range(self.seeds)]
         return trials
 
 
-def describe(trials: Iterable[PlaceTrial], rows: Mapping[str, Row]) -> dict[str, Any]:
+def describe(trials: Iterable[FleetTrial], rows: Mapping[str, Row]) -> dict[str, Any]:
     """Return a row for each point that has flown, and which place wins, as values for JSON."""
     points = ([*of_point] for _, of_point in groupby(trials, lambda trial: trial.fingerprint))
     shown = [
@@ -176,26 +126,19 @@ def describe(trials: Iterable[PlaceTrial], rows: Mapping[str, Row]) -> dict[str,
     return {"points": shown, "best": best}
 
 
-def _describe_point(trial: PlaceTrial, rows: Sequence[Row]) -> dict[str, Any]:
+def _describe_point(trial: FleetTrial, rows: Sequence[Row]) -> dict[str, Any]:
     numbers = [row["numbers"] for row in rows]
     row = {
         **trial.point,
         "name": Path(trial.point["place"]).stem,
         "succeeded": sum(each.get("succeeded", 0) for each in numbers),
-        "flown": len(trial.robots) * len(rows),
+        "flown": trial.fleet.fleet.robots * len(rows),
     }
-    row["by_seed"] = {
-        name: [each[own] * factor if own in each else None for each in numbers]
-        for name, (own, factor) in NUMBERS.items()
-    }
+    row["by_seed"] = {name: [each.get(f"{name}_median") for each in numbers] for name in SHOWN}
     for name, values in row["by_seed"].items():
         if known := [value for value in values if value is not None]:
             row[name] = median(known)
-    sent = [
-        sum(each[name] for name in SENT) / each["duration"] * 8e-3
-        for each in numbers
-        if each.keys() >= {*SENT, "duration"}
-    ]
+    sent = [each["sent_kbit_median"] for each in numbers if "sent_kbit_median" in each]
     onboard = not trial.fleet.link_values  # nothing leaves the robot
     row["rate_kbit"] = 0.0 if onboard else mean(sent) if sent else None
     if codes := sorted({code for each in rows for code in each["failures"]}):

@@ -25,6 +25,11 @@ def fingerprint(*facts: Any) -> str:
     return sha256(text.encode()).hexdigest()[:16]
 
 
+def key_of(condition: str, seed: int) -> str:
+    """Return the key of a trial with the fingerprint of its condition: 16 hexadecimal digits."""
+    return sha256(f"{condition} seed {seed}".encode()).hexdigest()[:16]
+
+
 def experiment_facts(experiment: ResolvedExperiment) -> list[Any]:
     """Return all that decides a flight, except its seed and what `fingerprint` adds itself."""
     values = experiment.model_dump(mode="json", exclude={"seed"})

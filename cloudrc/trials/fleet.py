@@ -1,7 +1,8 @@
-"""A fleet as a trial: fly it until a robot fails that succeeds alone, and measure its robots.
+"""A fleet as a trial: fly it, judge its robots, and measure the median and the worst one.
 
-A robot that fails alone, without neighbours, says nothing about what it shares with them. So the
-trial succeeds if all other robots do.
+If `until_failure` is set, the flight ends once a robot has failed that succeeds alone. A robot that
+fails alone, without neighbours, says nothing about what it shares with them; so such a trial
+succeeds if all other robots do.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from cloudrc.report.write import assess
 from cloudrc.runs import flight
 from cloudrc.runs.fleet import assemble_fleet
 from cloudrc.runs.interrupts import raise_if_interrupted
-from cloudrc.trials.fingerprint import experiment_facts, fingerprint
+from cloudrc.trials.fingerprint import experiment_facts, fingerprint, key_of
 from cloudrc.trials.rows import Row
 
 LATE_NS = 1_000_000_000
@@ -42,11 +43,12 @@ class FleetTrial(NamedTuple):
     seed: int
     fleet: ResolvedExperiment  # its seed is not used
     kinds: Sequence[ResolvedExperiment]  # robot k is as number k modulo their count
+    until_failure: bool = False
 
     @property
     def key(self) -> str:
         """16 hexadecimal digits; equal keys mean equal flights."""
-        return sha256(f"{self.fingerprint} seed {self.seed}".encode()).hexdigest()[:16]
+        return key_of(self.fingerprint, self.seed)
 
     def robot(self, number: int) -> ResolvedExperiment:
         """Return the experiment of a robot in the fleet."""
@@ -79,6 +81,7 @@ class _Flight:
 
     def __init__(self, trial: FleetTrial) -> None:
         self._experiment = trial.fleet.model_copy(update={"seed": trial.seed})
+        self._until_failure = trial.until_failure
         numbers = range(trial.fleet.fleet.robots)
         self._robots = [trial.robot(number) for number in numbers]
         self._stores = [RecordStore() for _ in numbers]
@@ -92,16 +95,18 @@ class _Flight:
         self._log = CellLog(self.run.cells)
 
     def _take(self, number: int, from_world: list[Record], from_cloud: list[Record]) -> None:
+        raise_if_interrupted()
         self._stores[number].add(from_world, from_cloud)
         for record in from_cloud:
             if type(record) is Control and record.waypoint >= 0:
                 self._legs[number] = record.waypoint
 
     def look(self, now_ns: int) -> bool:
-        """Return whether a robot has failed that succeeds alone; `now_ns` is the time [ns]."""
-        raise_if_interrupted()
+        """Return whether the flight is over before its end; `now_ns` is the time [ns]."""
         self._log.take(now_ns)
-        return any(self._has_failed(number, now_ns) for number in range(len(self._robots)))
+        return self._until_failure and any(
+            self._has_failed(number, now_ns) for number in range(len(self._robots))
+        )
 
     def _has_failed(self, number: int, now_ns: int) -> bool:
         if number in self._judged or number in self._excused:
@@ -141,8 +146,13 @@ class _Flight:
             duration = found.numbers.get("duration")
             time = duration.value if duration else self.run.now_ns * 1e-9
             applied = found.numbers.get("commands_applied")
-            rates.append(applied.value / time if applied else 0.0)
+            rates.append(applied.value / time if applied and time else 0.0)
         document = fleet_document(flown)
+        if not self._until_failure:
+            failed = [found for found in self._judged.values() if found.verdict.failures]
+            codes = {each.code for found in failed for each in found.verdict.failures}
+            self._failures = sorted(codes)
+            self._text = failed[0].verdict.failures[0].text if failed else ""
         numbers = {
             f"{name}_{which}": value
             for which in ("median", "worst")
@@ -161,7 +171,9 @@ class _Flight:
                 **{"rate_hz_median": median(rates), "rate_hz_worst": min(rates)},
                 **{name: busiest[name] for name in names if busiest.get(name) is not None},
                 **({"cloud_hz": document["cloud"]["rate_hz"]} if document["cloud"] else {}),
-                **{"fail_alone": len(self._excused), "flown_s": self.run.now_ns * 1e-9},
+                "succeeded": document["succeeded"],
+                "fail_alone": len(self._excused),
+                "flown_s": self.run.now_ns * 1e-9,
             },
             "records_sha256": sha256(hashes.encode()).hexdigest(),
         }

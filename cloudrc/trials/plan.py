@@ -10,7 +10,6 @@ import gzip
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from hashlib import sha256
 from itertools import chain, product
 from math import prod
 from pathlib import Path
@@ -32,7 +31,7 @@ from cloudrc.outside.document import Document, Source, parse_yaml, read_document
 from cloudrc.outside.reuse import reuse, reuse_results
 from cloudrc.runs import flight
 from cloudrc.runs.experiment import check_alone, check_world
-from cloudrc.trials.fingerprint import experiment_facts, fingerprint
+from cloudrc.trials.fingerprint import experiment_facts, fingerprint, key_of
 from cloudrc.trials.rows import Row
 from cloudrc.trials.summary import RATIO
 
@@ -74,7 +73,7 @@ class PlannedFlight(NamedTuple):
     @property
     def key(self) -> str:
         """16 hexadecimal digits; equal keys mean equal flights."""
-        return sha256(f"{self.fingerprint} seed {self.seed}".encode()).hexdigest()[:16]
+        return key_of(self.fingerprint, self.seed)
 
     @property
     def experiment(self) -> ResolvedExperiment:
