@@ -181,9 +181,8 @@ class CloudEndpoint(TunnelEnd):
         self._start: tuple[int, int] | None = None  # number and time [ns] of the newest START
         self._tick_ns = start_ns
         self._hello_ns = start_ns - KEY_PERIOD_NS  # time of the last periodic hello
-        self._alive_ns = self._quiet_ns = (
-            start_ns  # next ALIVE: without commands, with withheld ones
-        )
+        self._alive_ns = start_ns  # time of the next ALIVE while there are no commands
+        self._quiet_ns = start_ns  # likewise while commands are withheld
         self._heard_ns = start_ns
         self._commanded_ns = NEVER_NS
         self._count_ns = start_ns + COUNT_PERIOD_NS

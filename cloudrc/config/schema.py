@@ -326,8 +326,6 @@ class PlugIn(Section):
 PlugInChoice = NameOr[PlugIn]
 COMMAND_RATE_MIN_HZ, COMMAND_RATE_MAX_HZ = 20, 500
 """Smallest and largest value of cloud.command_rate_hz [Hz]; the guard runs at 500 Hz."""
-
-
 Sharing = Literal["fifo", "ps"]
 ComputeSpeed = Annotated[float, Field(ge=0.01, le=100)]
 """Speed of a processor, as a multiple of that of the reference."""
@@ -375,7 +373,7 @@ class Cloud(Section):
     cpu_share: Annotated[float, Field(gt=0, le=1)] = 1.0
     """CPU limit of the emulated cloud, in processors: of each 100 ms it computes for this share,
     and then stands still, as a container with a limit does. It applies to the times of compute_ms
-    and compute_measured. For a slow processor, raise compute_ms instead. 1: no limit"""
+    and compute_measured. For a slow processor, lower speed instead. 1: no limit"""
     clock_offset_s: Annotated[float, Field(ge=0, le=1_000_000)] = 0.0
     """By how much cloud's clock is ahead of world's at the start [s]; virtual time only"""
     clock_drift_ppm: Annotated[int, Field(ge=-1000, le=1000)] = 0
