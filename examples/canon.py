@@ -368,7 +368,7 @@ def rows() -> list[Row]:
         ("peak_mean", "peak age behind M/M/1 [s]"),
     ):
         found.append(Row(name, partial(age_in_queue, part), 20, 500_000))
-    for share, delay in ((0.1, 20), (0.5, 30)):
+    for share, delay in ((0.1, 20), (0.5, 30), (0.5, 60)):
         name = f"starvation of `async`, share {share:g}, {delay} steps late"
         found.append(Row(name, partial(starvation, share, delay), 3, 10_000))
     return [
