@@ -5,6 +5,9 @@
 serviceAccountName: {{ include "cloudrc.serviceAccountName" . }}
 automountServiceAccountToken: false
 enableServiceLinks: false
+{{- with (.root.Values.scheduling | default dict).schedulerName }}
+schedulerName: {{ . }}
+{{- end }}
 {{- with .root.Values.podSecurityContext }}
 securityContext:
   {{- toYaml . | nindent 2 }}

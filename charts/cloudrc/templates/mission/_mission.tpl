@@ -16,7 +16,7 @@
 {{- end }}
 
 {{/* The container that posts a mission, follows it and ends with its verdict.
-     Argument: (dict "root" $ "name" NAME "uid" FIELD "queue" BOOL). */}}
+     Argument: (dict "root" $ "name" NAME "uid" FIELD "queue" BOOL "number" ROBOT), of a fleet the robot. */}}
 {{- define "cloudrc.missionContainer" -}}
 - name: {{ .name }}
   image: {{ include "cloudrc.image" (dict "root" .root "role" "cloud") }}
@@ -24,7 +24,11 @@
   args:
     - mission
     - fly
+    {{- if include "cloudrc.isFleet" .root }}
+    - --api=http://{{ include "cloudrc.hostOf" (dict "root" .root "component" (include "cloudrc.cloudPods" .root) "number" (.number | default "0")) }}:8080
+    {{- else }}
     - --api=http://{{ include "cloudrc.fullname" .root }}-api:{{ .root.Values.teleop.service.port }}
+    {{- end }}
     - --token-file=/etc/cloudrc-tokens/operator
     - --mission=/etc/cloudrc-mission/mission.yaml
     - --key=$(MISSION_KEY)
@@ -70,7 +74,14 @@
 {{/* Spec of a Job that flies a mission. Argument: (dict "root" $ "name" CONFIGMAP "queue" BOOL). */}}
 {{- define "cloudrc.missionJobSpec" -}}
 # A failed mission is not flown again automatically.
+{{- if include "cloudrc.isFleet" .root }}
+backoffLimitPerIndex: 0
+completionMode: Indexed
+completions: {{ include "cloudrc.robots" .root }}
+parallelism: {{ include "cloudrc.robots" .root }}
+{{- else }}
 backoffLimit: 0
+{{- end }}
 # A stopped watcher ends nothing: a new pod follows the mission.
 podFailurePolicy:
   rules:
@@ -95,7 +106,7 @@ template:
     {{- . | nindent 4 }}
     {{- end }}
     containers:
-      {{- include "cloudrc.missionContainer" (dict "root" .root "name" "mission" "uid" "metadata.labels['batch.kubernetes.io/controller-uid']" "queue" .queue) | nindent 6 }}
+      {{- include "cloudrc.missionContainer" (dict "root" .root "name" "mission" "uid" "metadata.labels['batch.kubernetes.io/controller-uid']" "queue" .queue "number" "$(JOB_COMPLETION_INDEX)") | nindent 6 }}
     volumes:
       {{- include "cloudrc.missionVolumes" (dict "root" .root "name" .name) | nindent 6 }}
 {{- end }}
