@@ -53,6 +53,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "world": "the robot: physics, sensors, guard, low-level control",
         "cloud": "the remote controller",
         "teleop": "missions and the operator's HTTP API",
+        "cell": "the radio cell that all robots of a fleet share",
     },
 }
 """Group of commands -> command -> help line. `cloudrc/cli/<command>.py` contains the command."""

@@ -149,6 +149,14 @@ def _combine(
     return document, found
 
 
+def robot_settings(robot: int | None) -> list[str]:
+    """Return the settings of a process that works for a robot of a fleet, or for no fleet (None).
+
+    A fleet in a cluster may grow, so the experiment's number of robots is no limit.
+    """
+    return [] if robot is None else [f"fleet.robots={robot + 1}", f"fleet.only={robot}"]
+
+
 def _settings_of_robot(document: Document, changes: Settings) -> Settings:
     """Apply the settings of the fleet; return the others and those of its robot `fleet.only`."""
     of_fleet = {path: value for path, value in changes.items() if path[0] == "fleet"}

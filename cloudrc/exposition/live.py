@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import nan
 from typing import Any, TypeAlias, get_args
 
@@ -309,6 +309,33 @@ class LinkMetrics:
         self._values["cloudrc_link_delay_seconds"] = dict(self._delays)
 
 
+class CellMetrics:
+    """Metrics of the radio cell of a fleet."""
+
+    def __init__(self, values: Values) -> None:
+        self._values = values
+
+    def take(
+        self, rows: Sequence[Mapping[str, Any]], dropped: Mapping[tuple[str, int], int]
+    ) -> None:
+        """Take the rows of a `CellLog`, those of the last second, and its `dropped`."""
+        busy, most, waits = dict[str, float](), dict[str, int](), dict[str, float]()
+        for way in {row["direction"] for row in rows}:
+            own = [row for row in rows if row["direction"] == way]
+            busy_ns, waited_ns, packets = (
+                sum(row[name] for row in own) for name in ("busy_ns", "waited_ns", "packets")
+            )
+            busy[way], most[way] = busy_ns * 1e-8 / len(own), max(row["most"] for row in own)
+            waits[way] = waited_ns * 1e-9 / packets if packets else nan
+        lost = defaultdict[str, dict[str, int]](dict)
+        for (way, robot), count in sorted(dropped.items()):
+            if robot >= 0:
+                lost[str(robot)][way] = count
+        read = {"utilisation": busy, "queue_packets": most, "wait_seconds": waits}
+        for name, value in {**read, "dropped_total": dict(lost)}.items():
+            self._values[f"cloudrc_cell_{name}"] = value
+
+
 NO_WAYPOINT = -1
 """Index of the waypoint while no mission is active."""
 HELD = table.MISSION_STATES.index("held")
@@ -371,6 +398,7 @@ PARTS = {
     table.CLOUD: CloudEnd,
     table.TELEOP: MissionMetrics,
     table.LINK: LinkMetrics,
+    table.CELL: CellMetrics,
 }
 """Role of a process -> what handles its records: method `_on_NAME` those of the class NAME."""
 
@@ -379,7 +407,7 @@ class LiveMetrics:
     """Current metrics of one process. One thread calls `see`, any other thread may call `read`."""
 
     def __init__(self, role: str) -> None:
-        """Set the role of the process: "world", "cloud", "teleop" or "link"."""
+        """Set the role of the process, one of `table.ROLES`."""
         # The exporter reads the metrics that all processes have.
         metrics = [metric for metric in of_role(role) if metric.roles != table.ROLES]
         # It has a key per metric from now on: another thread may read it at any time.
@@ -387,6 +415,7 @@ class LiveMetrics:
         part = PARTS[role](values)
         self.end = part if isinstance(part, End) else None
         self.link = part if isinstance(part, LinkMetrics) else None
+        self.cell = part if isinstance(part, CellMetrics) else None
         self._places = _places(metrics, values)
         self._handlers: dict[type, Callable[[Any], None]] = {Counted: self._on_counted}
         for kind in get_args(Record):

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import combinations
 from math import inf
 from statistics import median
@@ -17,7 +16,7 @@ from cloudrc import source
 from cloudrc.config.resolved import ResolvedExperiment, fingerprint
 from cloudrc.config.scene import scene_of
 from cloudrc.drivers.fleet import SharedCores
-from cloudrc.link.cell import Cell, Usage
+from cloudrc.link.cell import CellLog
 from cloudrc.link.waiting import md1, nddd1
 from cloudrc.record.columns import Recording
 from cloudrc.report.document import SCHEMA_VERSION
@@ -70,31 +69,6 @@ SHOWN = 10
 """Largest fleet of which the terminal shows each robot."""
 ORDER = "interrupted", "invalid", "failure", "success"
 """Verdicts; that of a fleet is the first one that a robot has."""
-
-
-class CellLog:
-    """What the cells of a fleet do, in each tenth of a second.
-
-    Attributes:
-        ways: Directions: "uplink" and "downlink", or "both".
-        rows: The rows of a CSV file.
-        dropped: Direction and robot, below 0 others, -> number of packets that were dropped.
-    """
-
-    def __init__(self, served: Sequence[Cell]) -> None:
-        """Take the cells of uplink and downlink, or the one that both share."""
-        self.ways = {0: (), 1: ("both",), 2: ("uplink", "downlink")}[len(served)]
-        self._cells, self.rows = served, list[dict[str, Any]]()
-        self.dropped = Counter[tuple[str, int]]()
-
-    def take(self, now_ns: int) -> None:
-        """End a period at `now_ns` [ns]."""
-        for way, cell in zip(self.ways, self._cells, strict=True):
-            values, cell.usage = asdict(cell.usage), Usage()
-            dropped = values.pop("dropped")
-            self.dropped.update({(way, flow): count for flow, count in dropped.items()})
-            row = {"time_s": now_ns / 1e9, "direction": way, **values}
-            self.rows.append(row | {"dropped": sum(dropped.values())})
 
 
 @dataclass(frozen=True, slots=True)

@@ -62,6 +62,12 @@ def check_alone(experiment: ResolvedExperiment) -> None:
         raise problem_at("fleet", f"{text}; fleet.only=0 is its robot 0 alone")
 
 
+def check_cell(experiment: ResolvedExperiment) -> None:
+    """Check that an experiment has a cell."""
+    if experiment.cell.rate_kbit is None:
+        raise problem_at("cell.rate_kbit", "the process 'cell' needs a rate, such as 1000")
+
+
 def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
     """Check that an experiment can fly in a mode, before a folder is made.
 

@@ -16,13 +16,13 @@ from typing import Any
 from cloudrc import assembly
 from cloudrc.cloud.sharing import SharedCompute
 from cloudrc.config.resolved import ResolvedExperiment, dump
-from cloudrc.drivers.fleet import CellQueue, Computation, FleetRun, Member, SharedCores
+from cloudrc.drivers.fleet import Computation, FleetRun, Member, SharedCores
 from cloudrc.drivers.virtual import Sink
-from cloudrc.link.cell import FRAME_NS, Bulk, Cell, Video
+from cloudrc.link.cell import CellLog, CellQueue
 from cloudrc.record.columns import Recording
 from cloudrc.records import Record
 from cloudrc.report.document import Run, write_json
-from cloudrc.report.fleet import CellLog, FleetFlown, fleet_document
+from cloudrc.report.fleet import FleetFlown, fleet_document
 from cloudrc.report.write import write_report
 from cloudrc.runs.fly import VirtualRecorder, naming_files
 from cloudrc.runs.interrupts import raise_if_interrupted
@@ -96,7 +96,7 @@ def assemble_fleet(
     experiment: ResolvedExperiment, robots: Sequence[ResolvedExperiment], sinks: Sequence[Sink]
 ) -> FleetRun:
     """Build the robots of a fleet and connect them; each of `sinks` gets the records of a robot."""
-    cells, cloud = _build_cells(experiment), experiment.cloud
+    cells, cloud = assembly.build_cells(experiment), experiment.cloud
     cores = SharedCores(cloud.cores, cloud.sharing) if cloud.cores and cloud.compute_ms else None
     members = list[Member]()
     for number, (robot, sink) in enumerate(zip(robots, sinks, strict=True)):
@@ -133,18 +133,3 @@ def _build(
 
     limit_ns = round(assembly.flight_limit(robot) * 1e9)
     return Member(run, lambda: teleop.over, limit_ns, see)
-
-
-def _build_cells(experiment: ResolvedExperiment) -> list[Cell]:
-    """Build the cell of each direction, or one for both, with the traffic of others."""
-    given = experiment.cell
-    if given.rate_kbit is None:
-        return []
-    limits = given.queue, given.queue_packets, round(given.airtime_us * 1e3)
-    cells = [Cell(given.rate_kbit * 1e3, *limits) for _ in range(1 if given.shared else 2)]
-    for flow, each in enumerate(given.traffic, start=-len(given.traffic)):
-        start_ns = int(assembly.generator(experiment.seed, f"traffic {flow}").integers(FRAME_NS))
-        video = Video(flow, each.rate_kbit * 1e3, start_ns)
-        source = video if each.kind == "video" else Bulk(flow, start_ns)
-        cells[-1 if each.direction == "downlink" else 0].traffic[flow] = source
-    return cells

@@ -17,12 +17,13 @@ from typing import Any, NamedTuple
 from cloudrc import assembly, source
 from cloudrc.config.fleet import CellConfig
 from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.link.cell import CellLog
 from cloudrc.outside.code import apart
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.records import Control, Record
 from cloudrc.report.document import Assessment, Run
-from cloudrc.report.fleet import CellLog, FleetFlown, fleet_document
+from cloudrc.report.fleet import FleetFlown, fleet_document
 from cloudrc.report.write import assess
 from cloudrc.runs import flight
 from cloudrc.runs.fleet import assemble_fleet
