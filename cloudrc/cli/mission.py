@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -104,6 +105,8 @@ def arguments(parser: Parser) -> None:
     add("--key", None, "a mission posted twice under one key flies once", "")
     lease = f"seconds that the mission flies on after the end of this command (default: {LEASE:g})"
     add("--lease", "S", lease, LEASE, number(5, 3600, "seconds"))
+    together = "Unix time at which to post it: the robots of a fleet begin together"
+    add("--at", "T", together, 0.0, number(0, 1e11, "seconds"))
     for verb in (run, fly):
         flags(verb)("--queue", "", "wait for the current mission to end")
     for name in ("list", "status"):
@@ -164,6 +167,10 @@ def _fly(options: Options, api: Api) -> int:
     signal.signal(signal.SIGTERM, _leave)
     follower = MissionFollower(api, API_TIMEOUT, options.lease, print_line)
     order = {**read_mission(options.mission), "key": options.key}
+    if (left := options.at - time.time()) > 0:
+        time.sleep(left)
+    elif options.at:
+        print_line(f"{-left:.1f} s after the time at which the fleet begins")
     return _follow(options, follower, order, stopped)
 
 
@@ -328,11 +335,14 @@ def _forwarded_api(options: Options) -> Iterator[Api]:
 def _run_job(options: Options) -> int:
     """Create the Job of a mission, follow its log, and return the exit code of its verdict."""
     mission, release = read_mission(options.mission, options.name), need_release(options)
+    from cloudrc.cluster.fleet_mission import follow_fleet
     from cloudrc.cluster.flight import begin_job, cancelling_command, follow_job
+    from cloudrc.cluster.pods import fleet_size
 
     job = begin_job(release, mission, print_line, options.timeout, queue=options.queue)
+    follow = follow_fleet if fleet_size(release) else follow_job
     try:
-        return follow_job(release, job, print_line).exit_code
+        return follow(release, job, print_line).exit_code
     except KeyboardInterrupt:
         remedy = cancelling_command(release, job)
         tell(f"Job {job} is still running; cancel its mission: {remedy}")

@@ -13,9 +13,9 @@ from tests.cluster.conftest import deployment, labels
 
 
 def put(api, name, namespace="demo"):
-    body = deployment("cloud")
+    body = deployment("world")
     body["metadata"]["labels"]["app.kubernetes.io/instance"] = name
-    body["metadata"] |= {"name": f"{namespace}-{name}-cloud", "namespace": namespace}
+    body["metadata"] |= {"name": f"{namespace}-{name}-world", "namespace": namespace}
     api.put("deployments", body)
 
 
