@@ -8,7 +8,7 @@ packets sent before an instant, and tells which leave until this instant.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from heapq import heappop, heappush
@@ -311,9 +311,25 @@ class CellLog:
 
     def __init__(self, served: Sequence[Cell]) -> None:
         """Take the cells of uplink and downlink, or the one that both share."""
-        self.ways = {0: (), 1: ("both",), 2: ("uplink", "downlink")}[len(served)]
+        self.ways: tuple[str, ...] = {0: (), 1: ("both",), 2: ("uplink", "downlink")}[len(served)]
         self._cells, self.rows = served, list[dict[str, Any]]()
         self.dropped = Counter[tuple[str, int]]()
+
+    @classmethod
+    def read(cls, rows: Iterable[Mapping[str, str]]) -> CellLog:
+        """Return the log whose rows a CSV file has; raise a ValueError or KeyError for others."""
+        log = cls(())
+        for row in rows:
+            way, by, numbers = row["direction"], row["dropped_by"], dict(row)
+            del numbers["direction"], numbers["dropped_by"]
+            time_s = float(numbers.pop("time_s"))
+            counts = {name: int(value) for name, value in numbers.items()}
+            log.rows.append({"time_s": time_s, "direction": way, **counts, "dropped_by": by})
+            for pair in by.split():
+                flow, _, count = pair.partition(":")
+                log.dropped[way, int(flow)] += int(count)
+        log.ways = tuple(dict.fromkeys(row["direction"] for row in log.rows))
+        return log
 
     def take(self, now_ns: int) -> None:
         """End a period at `now_ns` [ns]."""
