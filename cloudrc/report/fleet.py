@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from math import inf
 from statistics import median
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cloudrc import source
 from cloudrc.config.resolved import ResolvedExperiment, fingerprint
 from cloudrc.config.scene import scene_of
-from cloudrc.drivers.fleet import SharedCores
+from cloudrc.drivers.fleet import FleetRun
 from cloudrc.link.cell import CellLog
 from cloudrc.link.waiting import md1, nddd1
 from cloudrc.record.columns import Recording
@@ -77,10 +77,11 @@ class FleetFlown:
 
     experiment: ResolvedExperiment
     log: CellLog
-    cores: SharedCores | None
-    now_ns: int  # end of the flight [ns]
-    robots: list[dict[str, Any]]  # what the report says of each
-    paths: list[NDArray[np.float64]]  # of each, world frame [m], a row per `GRID_NS`, (n, 3)
+    cloud: Mapping[str, float] | None  # numbers of the shared cores
+    mode: str = "virtual"
+    robots: list[dict[str, Any]] = field(default_factory=list)  # what the report says of each
+    # Of each robot, world frame [m], a row per `GRID_NS`, shape (n, 3).
+    paths: list[NDArray[np.float64]] = field(default_factory=list)
 
     def add(
         self, recording: Recording, robot: ResolvedExperiment, document: Mapping[str, Any]
@@ -114,14 +115,14 @@ def fleet_document(flown: FleetFlown) -> dict[str, Any]:
         "experiment": experiment.name,
         "config_sha256": fingerprint(experiment),
         "code": source.code_hash(),
-        "mode": "virtual",
+        "mode": flown.mode,
         "seed": experiment.seed,
         "cell": [
             cell_numbers(flown.log, way, len(flown.robots), alone=alone)
             for way in flown.log.ways
             if flown.log.rows
         ],
-        "cloud": cloud_numbers(flown),
+        "cloud": flown.cloud,
         "separation_min_m": separation_min(flown.paths, scene_of(experiment.world).spawn),
     }
 
@@ -174,12 +175,15 @@ def cell_numbers(log: CellLog, way: str, senders: int, *, alone: bool) -> dict[s
     }
 
 
-def cloud_numbers(flown: FleetFlown) -> dict[str, Any] | None:
-    """Return the numbers of the shared cores in SI units; None without shared cores."""
-    cores, duration, robots = flown.cores, flown.now_ns * 1e-9, len(flown.robots)
+def cloud_numbers(fleet: FleetRun, rate: float) -> dict[str, float] | None:
+    """Return the numbers of the shared cores in SI units; None without shared cores.
+
+    `rate` is that of commands [1/s].
+    """
+    cores, duration, robots = fleet.cores, fleet.now_ns * 1e-9, len(fleet.members)
     if cores is None or not cores.count:
         return None
-    busy, rate = cores.busy_ns * 1e-9 / cores.cores, flown.experiment.cloud.command_rate_hz
+    busy = cores.busy_ns * 1e-9 / cores.cores
     return {
         "utilisation": busy / duration,
         "rate_hz": cores.count / robots / duration,
