@@ -132,7 +132,7 @@ def execute(options: Options) -> int | None:
     if (found := find_local_run(options, steers=verb not in READS)) is not None:
         api = Api(found.url, place=str(found.folder))  # it needs no token: send none
         return carry_out(options, api)
-    if verb == "run":
+    if verb == "run" and options.robot is None:
         return _run_job(options)
     with _forwarded_api(options) as forwarded:
         return carry_out(options, forwarded)
