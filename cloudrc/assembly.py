@@ -24,6 +24,7 @@ from cloudrc.cloud.news import SendOnDelta
 from cloudrc.cloud.operator import Operator
 from cloudrc.cloud.planar import Planar
 from cloudrc.config import schema
+from cloudrc.config.compute import compute_times
 from cloudrc.config.overrides import build_for, build_plugin
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import RobotFacts, facts, is_planar
@@ -284,9 +285,10 @@ def build_compute_time(
     if not (cloud.compute_ms or cpu_clock):
         return None
     scale = MS_TO_NS / cloud.speed
-    times = cloud.compute_ms * scale, cloud.compute_deviation_ms * scale
+    times = [each * scale for each in compute_times(cloud.compute_ms)]
     draws = generator(experiment.seed, "compute time", experiment.stream)
-    return ComputeTime(*times, draws, cpu_clock, cloud.cpu_share)
+    deviation, drawn = cloud.compute_deviation_ms * scale, times if len(times) > 1 else ()
+    return ComputeTime(times[0], deviation, draws, cpu_clock, cloud.cpu_share, drawn)
 
 
 def build_controller(experiment: ResolvedExperiment) -> Controller:

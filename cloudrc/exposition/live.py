@@ -318,22 +318,21 @@ class CellMetrics:
     def take(
         self, rows: Sequence[Mapping[str, Any]], dropped: Mapping[tuple[str, int], int]
     ) -> None:
-        """Take the rows of a `CellLog`, those of the last second, and its `dropped`."""
-        busy, most, waits = dict[str, float](), dict[str, int](), dict[str, float]()
-        for way in {row["direction"] for row in rows}:
-            own = [row for row in rows if row["direction"] == way]
-            busy_ns, waited_ns, packets = (
-                sum(row[name] for row in own) for name in ("busy_ns", "waited_ns", "packets")
-            )
-            busy[way], most[way] = busy_ns * 1e-8 / len(own), max(row["most"] for row in own)
-            waits[way] = waited_ns * 1e-9 / packets if packets else nan
+        """Take the newest rows of a `CellLog`, each of a tenth of a second, and its `dropped`."""
         lost = defaultdict[str, dict[str, int]](dict)
         for (way, robot), count in sorted(dropped.items()):
             if robot >= 0:
                 lost[str(robot)][way] = count
-        read = {"utilisation": busy, "queue_packets": most, "wait_seconds": waits}
-        for name, value in {**read, "dropped_total": dict(lost)}.items():
-            self._values[f"cloudrc_cell_{name}"] = value
+        ways = {row["direction"]: row for row in rows}
+        self._values |= {  # new dictionaries: another thread may read the old ones
+            "cloudrc_cell_dropped_total": lost,
+            "cloudrc_cell_utilisation": {way: ways[way]["busy_ns"] * 1e-8 for way in ways},
+            "cloudrc_cell_queue_packets": {way: ways[way]["most"] for way in ways},
+            "cloudrc_cell_wait_seconds": {
+                way: row["waited_ns"] * 1e-9 / row["packets"] if row["packets"] else nan
+                for way, row in ways.items()
+            },
+        }
 
 
 NO_WAYPOINT = -1

@@ -193,12 +193,13 @@ cloudrc_dns_errors_total = unresolved: Failed look-ups of the peer's name; the l
     stays in use.
 
 cell
-cloudrc_cell_utilisation[direction]: Part of the last second in which the cell was busy.
-cloudrc_cell_queue_packets[direction]: Largest number of packets that waited in the last second.
+cloudrc_cell_utilisation[direction]: Part of the last tenth of a second in which the cell was busy.
+cloudrc_cell_queue_packets[direction]: Largest number of packets that waited in the last tenth of a
+    second.
 cloudrc_cell_dropped_total[robot, direction]: Packets of a robot that the full queue dropped, or
     that a newer packet replaced.
-cloudrc_cell_wait_seconds[direction]: Mean wait of the packets that left in the last second; absent
-    without packets.
+cloudrc_cell_wait_seconds[direction]: Mean wait of the packets that left in the last tenth of a
+    second; absent without packets.
 """
 """All metrics but those of `QUANTITIES`, in blocks: the processes that expose them, then
 name[labels] = count: meaning."""

@@ -11,7 +11,6 @@ import random
 import socket
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from ipaddress import ip_address
 from itertools import product
 from math import inf
 from pathlib import Path
-from typing import Any, TextIO, TypeAlias
+from typing import TextIO, TypeAlias
 
 from cloudrc import assembly
 from cloudrc.config.load import read_experiment, robot_settings
@@ -43,8 +42,6 @@ from cloudrc.tunnel.codec import peek
 
 PERIOD_NS = 100_000_000
 """Time of a row of the recording [ns]."""
-SECOND = 10
-"""Number of such times over which the metrics are computed."""
 AT_ONCE = 10
 """Largest number of names that are resolved within a pause of `PEER_PAUSE`."""
 log = partial(warn, process="cell")
@@ -180,7 +177,6 @@ def _carry(
 
     At a size of `record_max` [bytes] the record begins anew.
     """
-    recent = deque[dict[str, Any]](maxlen=SECOND * len(cells.ways))
     until_ns, start_ns = time.monotonic_ns(), 0
     while not stop():
         until_ns += PERIOD_NS
@@ -190,7 +186,6 @@ def _carry(
             start_ns = until_ns - PERIOD_NS
         cells.rows.clear()
         cells.take(until_ns - start_ns)
-        recent.extend(cells.rows)
         if any(row["packets"] for row in cells.rows):
             if file.tell() > record_max:
                 file.seek(0)
@@ -199,5 +194,5 @@ def _carry(
             file.write(f"{lines[0]}\n" * (not file.tell()) + f"{lines[1]}\n")
             file.flush()
         if exporter:
-            exporter.cell.take(recent, cells.dropped)
+            exporter.cell.take(cells.rows, cells.dropped)
             exporter.ready(True)

@@ -259,7 +259,7 @@ def link_monitor(experiment: ResolvedExperiment, *, uplink: bool, trusted: bool)
     if uplink:
         size = TELEMETRY_SIZES[len(known_robot(experiment.world.robot).sensors)]
     flow = Flow(experiment.seed, uplink, kind, size, experiment.stream)
-    computes, file_max = experiment.cloud.compute_ms > 0, SIZE_MAX if trusted else TRACE_MAX
+    computes, file_max = bool(experiment.cloud.compute_ms), SIZE_MAX if trusted else TRACE_MAX
     check = LinkMonitor(uplink, flow, period=1.0 / rate, computes=computes, file_max=file_max)
     if experiment.cell.rate_kbit is None:
         check.begin((link_profile(experiment.uplink), link_profile(experiment.downlink)))
