@@ -7,12 +7,15 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.output import output_argument, paint, print_lines, print_result
 from cloudrc.cli.parser import Options, Parser, figure_arguments, flags
 from cloudrc.errors import BadInputError
 from cloudrc.text import escape
+
+if TYPE_CHECKING:
+    from cloudrc.report.figures.style import Look
 
 EPILOG = """\
 examples:
@@ -53,17 +56,22 @@ def execute(options: Options) -> int:
     """Write the report from the recording; return the exit code of the run's verdict."""
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
+    from cloudrc.report.figures.style import Look
+
+    return write_again(options, Look(options.width, options.font_size))
+
+
+def write_again(options: Options, look: Look | None = None) -> int:
+    """Write the report of the run that `options` name; return the exit code of its verdict."""
     from cloudrc.cli.progress import Progress
     from cloudrc.metrics import measure
     from cloudrc.metrics.verdict import exit_code
     from cloudrc.record.topics import TOPICS
-    from cloudrc.report.figures.style import Look
     from cloudrc.report.folder import read_run
     from cloudrc.report.write import write_report
     from cloudrc.runs.session import check_ended, restore_mission
 
     measure.check(options.metric)
-    look = Look(options.width, options.font_size)
     with Progress(f"reads the recording of {options.run}") as view:
         check_ended(options.run)
         restore_mission(options.run)

@@ -210,8 +210,8 @@ def follow_page(release: Release, port: int, tell: Callable[[str], None]) -> Ite
     if CONSOLE not in {container.name for container in pod.spec.containers}:
         raise ClusterError(
             f"{release} has no console; add it: helm upgrade "
-            f"{release.name} charts/cloudrc {' '.join(release.helm_flags)} --reuse-values "
-            "--set console.enabled=true"
+            f"{release.name} charts/cloudrc {' '.join(release.helm_flags)} "
+            "--reset-then-reuse-values --set console.enabled=true"
         )
     name = pod.metadata.name
     words = ["logs", f"pod/{name}", f"--container={CONSOLE}", "--follow", "--since=1s"]
