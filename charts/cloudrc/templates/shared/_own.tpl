@@ -36,6 +36,7 @@
      the format of `cloudrc run`. */}}
 {{- define "cloudrc.experiment" -}}
 {{- $experiment := deepCopy .Values.experiment -}}
+{{- $_ := include "cloudrc.takeRetired" (dict "root" . "values" (dict "experiment" $experiment)) -}}
 {{- if and .Values.cloud.ros.enabled (not (include "cloudrc.controllerName" .)) -}}
 {{- $_ := set $experiment "cloud" (set ($experiment.cloud | default dict) "controller" "ros2") -}}
 {{- end -}}
