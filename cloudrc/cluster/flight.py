@@ -266,7 +266,7 @@ def fly_in_cluster(
         raise
     (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
     mission = fetch_all(release, folder, tell, want_end=not interrupted)
-    return _report(experiment, folder, mission, interrupted, page=page, figures=figures)
+    return report_flight(experiment, folder, mission, interrupted, page=page, figures=figures)
 
 
 def chart_values(
@@ -310,11 +310,14 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> bool:
     return ended.exit_code != InterruptedRunError.exit_code
 
 
-def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Recording:
-    """Fetch recordings and logs into a folder; return the merged recording.
+def fetch_all(
+    release: Release, folder: Path, tell: Tell, *, want_end: bool, number: int | None = None
+) -> Recording:
+    """Fetch recordings and logs into a folder; return the merged recording of one mission.
 
-    If logs cannot be fetched, `tell` receives the error. With `want_end`, fetch the recordings
-    again until they contain the end of the mission.
+    It is the last mission, or the one with this `number` in telemetry. If logs cannot be fetched,
+    `tell` receives the error. With `want_end`, fetch the recordings again until they contain the
+    end of the mission.
     """
     from cloudrc.record.merge import cut_to_last_mission, merge
 
@@ -329,7 +332,7 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
             tell(f"{error}; trying again")
             continue
         mission = merge(folder / "world.mcap", folder / "cloud.mcap")
-        if cut_to_last_mission(mission, being_written=True) or not want_end:
+        if cut_to_last_mission(mission, being_written=True, number=number) or not want_end:
             break
     for component in COMPONENTS:
         _fetch_previous(release, component, folder / f"{component}.before.mcap", tell)
@@ -355,7 +358,7 @@ def _fetch_previous(release: Release, component: str, path: Path, tell: Tell) ->
         tell(f"{component} was restarted; no earlier recording: {error}")
 
 
-def _report(
+def report_flight(
     experiment: ResolvedExperiment,
     folder: Path,
     mission: Recording,
@@ -364,6 +367,11 @@ def _report(
     page: bool,
     figures: bool,
 ) -> dict[str, Any]:
+    """Write report and mission.mcap of a flight of a release into a folder; return the report.
+
+    `interrupted` says whether the flight was cut short; `page` and `figures` are those of
+    `write_report`.
+    """
     from cloudrc.report.document import Run
     from cloudrc.report.views import views
     from cloudrc.report.write import attachments, write_report

@@ -243,8 +243,8 @@ def follow_page(release: Release, port: int, tell: Callable[[str], None]) -> Ite
     if not has_container(pod, CONSOLE):
         raise ClusterError(
             f"{release} has no console; add it: helm upgrade "
-            f"{release.name} charts/cloudrc {' '.join(release.helm_flags)} --reuse-values "
-            "--set console.enabled=true"
+            f"{release.name} charts/cloudrc {' '.join(release.helm_flags)} "
+            "--reset-then-reuse-values --set console.enabled=true"
         )
     name = pod.metadata.name
     words = ["logs", f"pod/{name}", f"--container={CONSOLE}", "--follow", "--since=1s"]

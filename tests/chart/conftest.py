@@ -98,14 +98,16 @@ def render_texts(
     apis=(),
     upgrade=False,
     alias="cloudrc",
+    reused=None,
 ):
     """Render every template: path -> text; raise if the schema refuses the values.
 
-    `alias` is the chart's name as a dependency of a larger chart.
+    `alias` is the chart's name as a dependency of a larger chart. `reused` are all values of an
+    earlier install, in place of this chart's defaults, as with `helm upgrade --reuse-values`.
     """
     import jsonschema
 
-    merged = laid_over(values_of(CHART / "values.yaml"), values or {})
+    merged = laid_over(reused or values_of(CHART / "values.yaml"), values or {})
     jsonschema.Draft7Validator(SCHEMA).validate(merged)
     context = {
         "Values": copy.deepcopy(merged),

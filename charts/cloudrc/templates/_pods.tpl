@@ -12,10 +12,10 @@ schedulerName: {{ . }}
 securityContext:
   {{- toYaml . | nindent 2 }}
 {{- end }}
-{{- with .root.Values.image.pullSecrets }}
+{{- with concat ((.root.Values.global | default dict).imagePullSecrets | default list) .root.Values.image.pullSecrets }}
 imagePullSecrets:
   {{- range . }}
-  - name: {{ . }}
+  - name: {{ kindIs "map" . | ternary (get (kindIs "map" . | ternary . dict) "name") . }}
   {{- end }}
 {{- end }}
 {{- end }}
@@ -139,8 +139,25 @@ affinity:
     medium: Memory
     sizeLimit: 4Mi
 - name: data
+  {{- with include "cloudrc.recordingsClaim" .root }}
+  persistentVolumeClaim:
+    claimName: {{ . }}
+  {{- else }}
   emptyDir:
     sizeLimit: {{ (index .root.Values .component).recordingSizeLimit }}
+  {{- end }}
+{{- end }}
+
+{{/* Name of the claim for recordings and reports; "" without one. */}}
+{{- define "cloudrc.recordingsClaim" -}}
+{{- $made := .Values.recordings.storage | empty | ternary "" (printf "%s-recordings" (include "cloudrc.fullname" .)) -}}
+{{- .Values.recordings.existingClaim | default $made -}}
+{{- end }}
+
+{{/* Mount of this volume; several releases may share a claim. */}}
+{{- define "cloudrc.dataMount" -}}
+{name: data, mountPath: /var/lib/cloudrc
+{{- if include "cloudrc.recordingsClaim" . }}, {{ include "cloudrc.isFleet" . | empty | ternary "subPath: " "subPathExpr: $(ROBOT)/" }}{{ include "cloudrc.fullname" . }}{{ end }}}
 {{- end }}
 
 {{/* Volume mounts of world and cloud. Argument: the root. */}}
@@ -148,5 +165,5 @@ affinity:
 {{ include "cloudrc.experimentMounts" . }}
 - {name: secret, mountPath: /etc/cloudrc-secret, readOnly: true}
 - {name: run, mountPath: /run/cloudrc}
-- {name: data, mountPath: /var/lib/cloudrc}
+- {{ include "cloudrc.dataMount" . }}
 {{- end }}

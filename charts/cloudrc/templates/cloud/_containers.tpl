@@ -34,7 +34,7 @@
     {{- toYaml .Values.cloud.resources | nindent 4 }}
   {{- include "cloudrc.env" (list . .Values.cloud) | nindent 2 }}
   volumeMounts:
-    {{- include "cloudrc.endMounts" . | replace "name: data" (ternary "name: data-cloud" "name: data" $onboard) | nindent 4 }}
+    {{- include "cloudrc.endMounts" . | replace "name: data" (ternary "name: data-cloud" "name: data" (and $onboard (not (include "cloudrc.recordingsClaim" .)))) | nindent 4 }}
     - {name: teleop, mountPath: /run/cloudrc-teleop}
     {{- if .Values.ros.enabled }}
     - {name: records, mountPath: /run/cloudrc-records}
@@ -139,6 +139,9 @@
     - --token-file=/etc/cloudrc-tokens/operator
     - --profile=/etc/cloudrc-link/profile.yaml
     - --port=8090
+    {{- with include "cloudrc.consoleOrigins" . }}
+    {{- . | trimPrefix "\n" | nindent 4 }}
+    {{- end }}
   env:
     - {name: HOME, value: /tmp}
     {{- with .Values.console.extraEnv }}

@@ -37,6 +37,7 @@
      restarts, and has the link of link.profile, because a cell follows no other file. */}}
 {{- define "cloudrc.experiment" -}}
 {{- $experiment := deepCopy .Values.experiment -}}
+{{- $_ := include "cloudrc.takeRetired" (dict "root" . "values" (dict "experiment" $experiment)) -}}
 {{- if and .Values.cloud.ros.enabled (not (include "cloudrc.controllerName" .)) -}}
 {{- $_ := set $experiment "cloud" (set ($experiment.cloud | default dict) "controller" "ros2") -}}
 {{- end -}}
