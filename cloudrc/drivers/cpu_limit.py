@@ -17,7 +17,7 @@ Source: Linux, Documentation/scheduler/sched-bwc.rst."""
 
 @contextmanager
 def cpu_limit(cpus: float) -> Iterator[str]:
-    """Limit this process to a number of processors in the `with` block, as a container is.
+    """Limit this process to `cpus` processors [1] in the `with` block, as a container is.
 
     Yield why that was not possible; "" if it was. It takes the permission to make a control group.
     """

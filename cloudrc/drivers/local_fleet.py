@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
-from cloudrc.drivers.local import LINK_FOLDER, RECEIVERS, ROUTE_FILE, LocalRun, Robot
+from cloudrc.drivers.local import LINK_FOLDER, RECEIVERS, ROUTE_FILE, LocalRun, RobotProcesses
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.files import write_atomically
 from cloudrc.records import Record
@@ -43,7 +43,7 @@ class LocalFleet(LocalRun):
 
     def _fly(self, limit: float, files: ExitStack) -> None:
         first = dict(zip(RECEIVERS, free_ports(4, max(self._robots) + 1), strict=True))
-        robots = list[Robot]()
+        robots = list[RobotProcesses]()
         for number, folder in self._robots.items():
             at = {name: f"127.0.0.1:{port + number}" for name, port in first.items()}
             robots.append(self._open(folder, at, files))
