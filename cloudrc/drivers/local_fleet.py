@@ -53,15 +53,15 @@ class LocalFleet(LocalRun):
             self._start_end(robots[-1], "world", ROUTE_FILE)
             self._start_teleop(robots[-1])
         self._wait_until_ready()
-        for robot in robots:
-            self._start_end(robot, "cloud", START_FILE, teleop=robot.sockets)
-        self._wait_until_ready()
         if self._cell:
             self._start_cell({name: f"127.0.0.1:{port}" for name, port in first.items()})
         else:
             origin_ns = time.monotonic_ns()
             for robot in robots:
                 self._start_links(robot, origin_ns)
+        self._wait_until_ready()
+        for robot in robots:  # last: after 5 s, a cloud complains that world is silent
+            self._start_end(robot, "cloud", START_FILE, teleop=robot.sockets)
         self._wait_until_ready()
         for robot in robots:
             route = robot.folder / LINK_FOLDER / "downlink" / ROUTE_FILE
