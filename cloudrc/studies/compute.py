@@ -50,7 +50,8 @@ def of_controller(
 ) -> MeasuredTimes:
     """Measure a controller in real time, in a flight of at most `seconds` [s].
 
-    `cpus` is the CPU limit, in processors [1]; None: no limit.
+    World flies in this process, too, and needs about 0.01 processors of the limit. `cpus` is this
+    limit, in processors [1]; None: no limit.
     """
     experiment = load("steps", [f"cloud.controller={controller}", *settings])
     clock = PacedClock()
