@@ -85,8 +85,9 @@ def measure(
     wake = folder / "wake_lateness"
     source = Path(__file__).with_name("wake_lateness.c")
     subprocess.run(["cc", "-O2", "-o", wake, source], check=True)
-    config, log, sink = folder / "fleet.yaml", folder / "cell.log", socket.socket(type=2)
+    config, log = folder / "fleet.yaml", folder / "cell.log"
     config.write_text(EXPERIMENT.format(robots=robots, rate=400 * robots))
+    sink = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     with suppress(PermissionError):  # without it, a busy machine may drop what has arrived here
         sink.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, 1 << 26)
     sink.bind(("0.0.0.0", 0))
@@ -108,7 +109,8 @@ def measure(
     stat = Path(f"/proc/{cell.pid}/stat").read_text().rpartition(")")[2].split()
     used = (int(stat[11]) + int(stat[12])) / os.sysconf("SC_CLK_TCK")
     cell.terminate()
-    cell.wait()
+    cell.communicate()
+    sink.close()
     counts = json.loads(log.read_text().splitlines()[-1].removeprefix("cloudrc cell: "))
     return counts, arrived, [float(each) for each in waking.communicate()[0].split()], used
 

@@ -56,6 +56,7 @@ examples:
   cloudrc run pillars --mode virtual --report none        no report.html
   cloudrc run my.yaml --mode virtual --set cloud.predictor=./my_predictor.py
   cloudrc run --set cloud.controller=remote --with "node controller.js"
+  cloudrc run steps --mode local --set fleet.robots=3 --set cell.rate_kbit=1000
   cloudrc run --mode cluster --context kind-cloudrc -n demo --release demo
   cloudrc run runs/latest/config.yaml --mode virtual     the same run again
 

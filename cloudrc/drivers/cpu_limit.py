@@ -17,12 +17,12 @@ Source: Linux, Documentation/scheduler/sched-bwc.rst."""
 
 @contextmanager
 def cpu_limit(cpus: float) -> Iterator[str]:
-    """Limit this process to a number of processors in the `with` block, as a container is.
+    """Limit this process to `cpus` processors [1] in the `with` block, as a container is.
 
     Yield why that was not possible; "" if it was. It takes the permission to make a control group.
     """
-    errors = list[str]()
-    for parent, limits in _groups(round(cpus * QUOTA_PERIOD_US)):
+    why = "this system has no control groups"
+    for home, parent, limits in _groups(round(cpus * QUOTA_PERIOD_US)):
         own = parent / f"cloudrc-{os.getpid()}"
         try:
             own.mkdir()
@@ -30,28 +30,35 @@ def cpu_limit(cpus: float) -> Iterator[str]:
                 (own / name).write_text(value)
             (own / "cgroup.procs").write_text(str(os.getpid()))
         except OSError as error:
-            errors.append(f"{own}: {error.strerror}")
+            why = f"{error.filename}: {error.strerror}"
             _remove(own)
             continue
         try:
             yield ""
         finally:
-            (parent / "cgroup.procs").write_text(str(os.getpid()))
+            (home / "cgroup.procs").write_text(str(os.getpid()))
             _remove(own)
         return
-    yield "; ".join(errors) or "this system has no control groups"
+    yield why
 
 
-def _groups(quota_us: int) -> Iterator[tuple[Path, Mapping[str, str]]]:
-    """Yield control groups of this process, and files with the limit for a new one in them."""
+def _groups(quota_us: int) -> Iterator[tuple[Path, Path, Mapping[str, str]]]:
+    """Yield a control group of this process, the place for a new one, and the limit's files.
+
+    In version 2 a group with processes has no groups with limits in it, so the new one may have to
+    be in a group above.
+    """
     lines = CGROUP.read_text().splitlines() if CGROUP.exists() else []
     for names, path in (line.split(":", 2)[1:] for line in lines):
         if not names:
-            yield CGROUPS / path.strip("/"), {"cpu.max": f"{quota_us} {QUOTA_PERIOD_US}"}
+            home = CGROUPS / path.strip("/")
+            for parent in (home, *home.parents):
+                if parent.is_relative_to(CGROUPS) and (parent / "cgroup.procs").exists():
+                    yield home, parent, {"cpu.max": f"{quota_us} {QUOTA_PERIOD_US}"}
         elif "cpu" in names.split(","):
+            home = CGROUPS / names / path.strip("/")
             files = {"cpu.cfs_period_us": QUOTA_PERIOD_US, "cpu.cfs_quota_us": quota_us}
-            values = {name: str(value) for name, value in files.items()}
-            yield CGROUPS / names / path.strip("/"), values
+            yield home, home, {name: str(value) for name, value in files.items()}
 
 
 def _remove(group: Path) -> None:

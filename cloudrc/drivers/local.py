@@ -202,7 +202,7 @@ class Child:
         return records
 
 
-class Robot(NamedTuple):
+class RobotProcesses(NamedTuple):
     """The files and addresses of the processes of a robot."""
 
     folder: Path  # of the recording
@@ -293,14 +293,16 @@ class LocalRun:
             session(robot.url, self._metrics)
         self._watch(limit, robot.sockets)
 
-    def _open(self, folder: Path, at: Mapping[str, str], files: contextlib.ExitStack) -> Robot:
+    def _open(
+        self, folder: Path, at: Mapping[str, str], files: contextlib.ExitStack
+    ) -> RobotProcesses:
         """Make the files of a robot's processes; `files` removes those that only a flight needs."""
         files.callback((folder / API_FILE).unlink, missing_ok=True)
         files.callback(shutil.rmtree, folder / LINK_FOLDER, ignore_errors=True)
         # The sockets are not in the run's folder, whose path may be too long for a Unix socket.
         # Their folder is private: it also contains this run's key.
         private = tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder())
-        robot = Robot(folder, Path(files.enter_context(private)), at)
+        robot = RobotProcesses(folder, Path(files.enter_context(private)), at)
         kind = SESSION if self._session else RUN
         self.announcement.enter_context(announced(folder, robot.url, kind))
         key = robot.sockets / "key"
@@ -308,7 +310,7 @@ class LocalRun:
         key.write_text(write(KeySet(Key(os.urandom(KEY_SIZE)))), encoding="ascii")
         return robot
 
-    def _start_end(self, robot: Robot, name: str, route: str, **more: object) -> None:
+    def _start_end(self, robot: RobotProcesses, name: str, route: str, **more: object) -> None:
         """Start world or cloud; the file `route` will have the address to which it sends."""
         way = "uplink" if name == "world" else "downlink"
         self._start(
@@ -323,7 +325,7 @@ class LocalRun:
             **more,
         )
 
-    def _start_teleop(self, robot: Robot) -> None:
+    def _start_teleop(self, robot: RobotProcesses) -> None:
         folder = robot.folder
         # Only this user can open the socket of the API: no token is needed.
         self._start(
@@ -337,7 +339,7 @@ class LocalRun:
             link=folder / LINK_FOLDER / "downlink" / STATE_FILE,
         )
 
-    def _start_links(self, robot: Robot, origin_ns: int) -> None:
+    def _start_links(self, robot: RobotProcesses, origin_ns: int) -> None:
         """Start both directions of a robot's link; their time lines begin at `origin_ns` [ns]."""
         for way, end, peer in (("uplink", "world", "cloud"), ("downlink", "cloud", "world")):
             self._start(

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
-from cloudrc.drivers.local import LINK_FOLDER, RECEIVERS, ROUTE_FILE, LocalRun, Robot
+from cloudrc.drivers.local import LINK_FOLDER, RECEIVERS, ROUTE_FILE, LocalRun, RobotProcesses
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.files import write_atomically
 from cloudrc.records import Record
@@ -43,7 +43,7 @@ class LocalFleet(LocalRun):
 
     def _fly(self, limit: float, files: ExitStack) -> None:
         first = dict(zip(RECEIVERS, free_ports(4, max(self._robots) + 1), strict=True))
-        robots = list[Robot]()
+        robots = list[RobotProcesses]()
         for number, folder in self._robots.items():
             at = {name: f"127.0.0.1:{port + number}" for name, port in first.items()}
             robots.append(self._open(folder, at, files))
@@ -53,15 +53,15 @@ class LocalFleet(LocalRun):
             self._start_end(robots[-1], "world", ROUTE_FILE)
             self._start_teleop(robots[-1])
         self._wait_until_ready()
-        for robot in robots:
-            self._start_end(robot, "cloud", START_FILE, teleop=robot.sockets)
-        self._wait_until_ready()
         if self._cell:
             self._start_cell({name: f"127.0.0.1:{port}" for name, port in first.items()})
         else:
             origin_ns = time.monotonic_ns()
             for robot in robots:
                 self._start_links(robot, origin_ns)
+        self._wait_until_ready()
+        for robot in robots:  # last: after 5 s, a cloud complains that world is silent
+            self._start_end(robot, "cloud", START_FILE, teleop=robot.sockets)
         self._wait_until_ready()
         for robot in robots:
             route = robot.folder / LINK_FOLDER / "downlink" / ROUTE_FILE

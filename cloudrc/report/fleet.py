@@ -71,7 +71,7 @@ ORDER = "interrupted", "invalid", "failure", "success"
 """Verdicts; that of a fleet is the first one that a robot has."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class FleetFlown:
     """A fleet that has flown."""
 

@@ -89,12 +89,14 @@ def write_again(
     `write` writes the report of a robot, whose folder it gets; it returns the robot's recording,
     experiment and report.
     """
-    before = read_json(folder / "report.json")
-    experiment = read_experiment(folder / "config.yaml", flown=True)
-    mode = before.get("mode", "virtual")
-    flown = FleetFlown(experiment, read_cell(folder / CELL_FILE), before.get("cloud"), mode)
+    cloud = read_json(folder / "report.json").get("cloud")  # it is recorded nowhere else
+    flown = FleetFlown(
+        read_experiment(folder / "config.yaml", flown=True), read_cell(folder / CELL_FILE), cloud
+    )
     for robot in robots_in(folder):
-        flown.add(*write(robot))
+        recording, experiment, document = write(robot)
+        flown.mode = document["mode"]
+        flown.add(recording, experiment, document)
     return write_fleet(folder, flown, page=True)
 
 

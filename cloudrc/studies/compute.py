@@ -23,8 +23,8 @@ ARRIVAL = "epoch", "counter", "delay"
 """Columns of the topic /downlink_delay."""
 
 
-class Measured(NamedTuple):
-    """Measured durations."""
+class MeasuredTimes(NamedTuple):
+    """MeasuredTimes durations."""
 
     times_ms: list[float]
     where: str  # what was measured, and how
@@ -47,10 +47,11 @@ class _Kept(ComputeTime):
 @apart()
 def of_controller(
     controller: str, settings: list[str], cpus: float | None, seconds: float
-) -> Measured:
+) -> MeasuredTimes:
     """Measure a controller in real time, in a flight of at most `seconds` [s].
 
-    `cpus` is the CPU limit, in processors [1]; None: no limit.
+    World flies in this process, too, and needs about 0.01 processors of the limit. `cpus` is this
+    limit, in processors [1]; None: no limit.
     """
     experiment = load("steps", [f"cloud.controller={controller}", *settings])
     clock = PacedClock()
@@ -61,16 +62,16 @@ def of_controller(
         run.fly(lambda: teleop.over, round(seconds * 1e9), lambda *_: raise_if_interrupted())
     limit = "" if cpus is None or unlimited else f", limited to {cpus:g} CPUs"
     where = f"{controller}, {experiment.cloud.command_rate_hz} Hz{limit}"
-    return Measured(kept.times_ms, where, unlimited)
+    return MeasuredTimes(kept.times_ms, where, unlimited)
 
 
-def of_run(folder: Path) -> Measured:
+def of_run(folder: Path) -> MeasuredTimes:
     """Take the durations from the recording of a run: real time, or `cloud.compute_measured`."""
     recording, experiment, _ = read_run(folder)
     rows = recording["/lateness"]
     if len(rows):
         busy = rows["busy"][rows["end"] == "cloud"]
-        return Measured((busy * 1e3).tolist(), f"periods of cloud's loop in {folder}")
+        return MeasuredTimes((busy * 1e3).tolist(), f"periods of cloud's loop in {folder}")
     link, arrived = assembly.build_links(experiment)[1], recording["/downlink_delay"]
     if not experiment.cloud.compute_measured or link.only is None or experiment.is_fleet:
         text = "needs a flight in real time, or one with cloud.compute_measured and a link without"
@@ -81,4 +82,4 @@ def of_run(folder: Path) -> Measured:
         own_ns = link.send(epoch, Kind.COMMAND, counter, size, 0)
         if len(own_ns) == 1:  # of a duplicate, one does not know which copy it is
             times_ms.append(max(0.0, delay * 1e3 - own_ns[0] * 1e-6))
-    return Measured(times_ms, f"commands in {folder}")
+    return MeasuredTimes(times_ms, f"commands in {folder}")

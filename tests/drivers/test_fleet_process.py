@@ -3,11 +3,13 @@
 import json
 import subprocess
 import sys
+from shutil import which
 
 import pytest
 
 from cloudrc.record.columns import Recording
 from tests.conftest import nightly
+from tools.bench_cell import measure
 
 pytestmark = [pytest.mark.process, pytest.mark.alone]
 FLEET = "mission.steps.count=1 mission.steps.period_s=1 fleet.robots=2".split()
@@ -39,3 +41,12 @@ def test_two_robots_fly_together_and_are_judged_as_a_fleet(tmp_path, cell):
     for way in report["cell"]:
         assert way["packets"] > 400
         assert not way["dropped"]
+
+
+@pytest.mark.skipif(not which("cc"), reason="needs a C compiler")
+def test_the_cell_loses_nothing_and_sends_nothing_too_early(tmp_path):
+    counts, arrived, *_ = measure(3, 1.0, tmp_path)
+    assert set(arrived.values()) == {100}
+    assert len(arrived) == 6
+    assert counts["released_early"] == 0
+    assert counts["forwarded"] == 600
