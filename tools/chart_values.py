@@ -75,6 +75,9 @@ RULES = {
     "digest": _text(r"^$|^sha256:[0-9a-f]{64}$"),
     "pullPolicy": _one_of("Always", "IfNotPresent", "Never"),
     "experiment": _ref("Experiment"),
+    "robots": _either({"type": "integer", "minimum": 1, "maximum": 1000}, NULL),
+    "queueName": NAME,
+    "schedulerName": NAME,
     "configMap": NAME,
     "mode": _one_of("auto", "netem", "relay"),
     "profile": _either(STRING, _ref("Profile"), NULL),
@@ -220,14 +223,12 @@ def make_schema(text: str) -> Schema:
     made["properties"]["enabled"] = {"enum": [True], "description": about}
     models = [(model, "validation") for model in (Experiment, MissionConfig, Profile)]
     defined = _adapt(models_json_schema(models)[1]["$defs"])
-    fleet, cell = (defined[name]["properties"] for name in ("FleetConfig", "CellConfig"))
-    for owner in (defined["PlugIn"], defined["Parameters"], fleet["vary"]["items"]):
+    vary = defined["FleetConfig"]["properties"]["vary"]
+    for owner in (defined["PlugIn"], defined["Parameters"], vary["items"]):
         owner["additionalProperties"] = {
             "description": "A parameter of the plug-in, in the unit that its `build` documents",
             "type": ["number", "string", "boolean", "array", "null"],
         }
-    fleet["robots"] |= {"maximum": 1}  # a release is one robot
-    cell["rate_kbit"] = {"description": cell["rate_kbit"]["description"], "type": "null"}
     amount = _either(*QUANTITY["anyOf"], NULL)
     about = "CPU [cores; 250m is a quarter of a core] and memory [bytes; 64Mi is 64 * 2^20]"
     amounts = _closed(about, {"cpu": amount, "memory": amount})

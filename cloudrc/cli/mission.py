@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -106,6 +107,8 @@ def arguments(parser: Parser) -> None:
     add("--key", None, "a mission posted twice under one key flies once", "")
     lease = f"seconds that the mission flies on after the end of this command (default: {LEASE:g})"
     add("--lease", "S", lease, LEASE, number(5, 3600, "seconds"))
+    together = "Unix time at which to post it: the robots of a fleet begin together"
+    add("--at", "T", together, 0.0, number(0, 1e11, "seconds"))
     _keep_arguments(fly)
     for verb in (run, fly):
         flags(verb)("--queue", "", "wait for the current mission to end")
@@ -155,7 +158,7 @@ def execute(options: Options) -> int | None:
     if (found := find_local_run(options, steers=verb not in READS)) is not None:
         api = Api(found.url, place=str(found.folder))  # it needs no token: send none
         return carry_out(options, api)
-    if verb == "run":
+    if verb == "run" and options.robot is None:
         return _run_job(options)
     with _forwarded_api(options) as forwarded:
         return carry_out(options, forwarded)
@@ -190,6 +193,10 @@ def _fly(options: Options, api: Api) -> int:
     signal.signal(signal.SIGTERM, _leave)
     follower = MissionFollower(api, API_TIMEOUT, options.lease, print_line)
     order = {**read_mission(options.mission), "key": options.key}
+    if (left := options.at - time.time()) > 0:
+        time.sleep(left)
+    elif options.at:
+        print_line(f"{-left:.1f} s after the time at which the fleet begins")
 
     def ended(mission: str) -> None:
         if options.report:
@@ -214,7 +221,7 @@ def _keep_report(options: Options, order: Json, view: Json) -> None:
 
 def _report(options: Options, _: Api | None = None) -> int:
     """Write the report of a mission of a release; return the exit code of its verdict."""
-    from cloudrc.cli.report import write_again
+    from cloudrc.cli import report
     from cloudrc.cli.where import flown_release
     from cloudrc.runs.folder import new_folder
     from cloudrc.runs.kept import fetch_mission
@@ -229,7 +236,8 @@ def _report(options: Options, _: Api | None = None) -> int:
             folder.rmdir()  # nothing was fetched
         raise
     options.run, options.metric, options.figures = folder, [], False
-    return write_again(options)
+    options.width, options.font_size = 7.16, 9.0
+    return report.execute(options)
 
 
 def _follow(
@@ -399,11 +407,14 @@ def _forwarded_api(options: Options) -> Iterator[Api]:
 def _run_job(options: Options) -> int:
     """Create the Job of a mission, follow its log, and return the exit code of its verdict."""
     mission, release = read_mission(options.mission, options.name), need_release(options)
+    from cloudrc.cluster.fleet_mission import follow_fleet
     from cloudrc.cluster.flight import begin_job, cancelling_command, follow_job
+    from cloudrc.cluster.pods import fleet_size
 
     job = begin_job(release, mission, print_line, options.timeout, queue=options.queue)
+    follow = follow_fleet if fleet_size(release) else follow_job
     try:
-        return follow_job(release, job, print_line).exit_code
+        return follow(release, job, print_line).exit_code
     except KeyboardInterrupt:
         remedy = cancelling_command(release, job)
         tell(f"Job {job} is still running; cancel its mission: {remedy}")

@@ -7,13 +7,20 @@ import re
 import socket
 from types import SimpleNamespace
 
-from cloudrc.cli.parser import Options, Parser, flags, settings_from
+from cloudrc.cli.parser import Options, Parser, flags, settings_from, whole_number
 from cloudrc.drivers.process import StopSignal
 from cloudrc.drivers.realtime import Address, split_address
 
 
 def process_arguments(parser: Parser) -> None:
     """Declare the flags that world, cloud, link and teleop have in common."""
+    status_arguments(parser)
+    about = "number in the experiment's fleet (default: no fleet)"
+    flags(parser)("--robot", "K", about, read=whole_number(0, 999))
+
+
+def status_arguments(parser: Parser) -> None:
+    """Declare the flags that all processes have in common."""
     add = flags(parser)
     add("--config", "FILE", "experiment file (YAML)", required=True)
     add("--feed", "", "write status for a supervisor to stdout (default: events only)")
@@ -33,6 +40,8 @@ def _end_arguments(parser: Parser) -> None:
     add("--key", "FILE", "the tunnel's key ('cloudrc key new FILE')", required=True)
     route = "the link's file with the address to send to; the link's state is beside it"
     add("--route", "FILE", route, required=True)
+    peer = "where to send without a link process; to robot 0's PORT, the number is added"
+    add("--peer", "HOST:PORT", peer, read=read_address)
 
 
 def _cloud_arguments(parser: Parser) -> None:

@@ -15,8 +15,10 @@ from cloudrc.errors import BadInputError
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
-    from cloudrc.report.figures.style import Look
+    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.record.columns import Recording
 
+PAGE = "report.html"
 EPILOG = """\
 examples:
   cloudrc report runs/latest
@@ -56,43 +58,50 @@ def execute(options: Options) -> int:
     """Write the report from the recording; return the exit code of the run's verdict."""
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
-    from cloudrc.report.figures.style import Look
-
-    return write_again(options, Look(options.width, options.font_size))
-
-
-def write_again(options: Options, look: Look | None = None) -> int:
-    """Write the report of the run that `options` name; return the exit code of its verdict."""
     from cloudrc.cli.progress import Progress
     from cloudrc.metrics import measure
     from cloudrc.metrics.verdict import exit_code
     from cloudrc.record.topics import TOPICS
-    from cloudrc.report.folder import read_run
+    from cloudrc.report.figures.style import Look
+    from cloudrc.report.fleet import summarize_fleet
+    from cloudrc.report.folder import read_run, robots_in
     from cloudrc.report.write import write_report
+    from cloudrc.runs.fleet import write_again
     from cloudrc.runs.session import check_ended, restore_mission
 
     measure.check(options.metric)
+    look, is_fleet = Look(options.width, options.font_size), bool(robots_in(options.run))
     with Progress(f"reads the recording of {options.run}") as view:
-        check_ended(options.run)
-        restore_mission(options.run)
-        recording, experiment, run = read_run(options.run)
-        # The run may come from somebody else: never execute files that it names.
-        unmeasured = measure.not_measured(experiment.report.metrics, options.metric)
-        run = replace(run, notes=(*run.notes, *unmeasured))
-        count = sum(len(recording[topic]) for topic in TOPICS)
-        view.tell(f"measures {count:,} messages and draws the figures")
-        document = write_report(
-            *(options.run, recording, experiment, run),
-            own=options.metric,
-            figures=options.figures,
-            look=look,
-        )
+
+        def write(folder: Path) -> tuple[Recording, ResolvedExperiment, dict[str, Any]]:
+            check_ended(folder)
+            restore_mission(folder)
+            recording, experiment, run = read_run(folder)
+            # The run may come from somebody else: never execute files that it names.
+            unmeasured = measure.not_measured(experiment.report.metrics, options.metric)
+            run = replace(run, notes=(*run.notes, *unmeasured))
+            count = sum(len(recording[topic]) for topic in TOPICS)
+            view.tell(f"measures {count:,} messages and draws the figures")
+            document = write_report(
+                *(folder, recording, experiment, run),
+                own=options.metric,
+                page=not is_fleet,
+                figures=options.figures,
+                look=look,
+            )
+            return recording, experiment, document
+
+        document = write_again(options.run, write) if is_fleet else write(options.run)[2]
     print_traceback(options, document)
-    print_result(options.output, document, summary(document, options.run))
+    if is_fleet:
+        text = f"\n{summarize_fleet(document, paint)}\n\n{escape(str(options.run / PAGE))}"
+    else:
+        text = summary(document, options.run)
+    print_result(options.output, document, text)
     return exit_code(document)
 
 
-def summary(report: Mapping[str, Any], folder: Path, last: str = "report.html") -> str:
+def summary(report: Mapping[str, Any], folder: Path, last: str = PAGE) -> str:
     """Summarize a report as text, and say where the replay and the file `last` are."""
     from cloudrc.report.summary import summarize
 

@@ -115,7 +115,8 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
 def _why_not_ready(release: Release) -> tuple[str, str]:
     """Say why the pods of a release are not ready, and why they will never be; "" if not so."""
     words, never = list[str](), list[str]()
-    for component in COMPONENTS:
+    cell = [pods.CELL] if release.find("statefulsets", pods.CELL) else []
+    for component in (*COMPONENTS, *cell):
         why, is_fatal = _state(release, component)
         words += [f"{component}: {why}"] * bool(why)
         never += [f"the {component} pod cannot run: {why}"] * is_fatal
@@ -124,19 +125,20 @@ def _why_not_ready(release: Release) -> tuple[str, str]:
 
 def _state(release: Release, component: str) -> tuple[str, bool]:
     """Return why a component is not ready ("" if ready), and whether it can never be ready."""
-    deployment = pods.find_deployment(release, component)
-    for condition in deployment.status.conditions or []:  # for example Pod Security or a quota
+    workload = pods.find_workload(release, component)[1]
+    for condition in workload.status.conditions or []:  # for example Pod Security or a quota
         if condition.type == "ReplicaFailure" and condition.status == "True":
             return str(condition.message), True
     found = pods.list_pods(release, component)
     for pod in found:
         if why := pods.pod_failure(pod):
             return why, True
-    status = deployment.status
-    is_observed = (status.observed_generation or 0) >= deployment.metadata.generation
-    if not (found and is_observed and status.updated_replicas == status.replicas == 1):
+    status, wanted = workload.status, workload.spec.replicas
+    is_observed = (status.observed_generation or 0) >= workload.metadata.generation
+    if not (is_observed and len(found) >= wanted == status.updated_replicas == status.replicas):
         return "its pod is being created", False
-    return _pod_state(release, found[0])
+    states = (_pod_state(release, pod) for pod in found[:wanted])
+    return next((state for state in states if state[0]), ("", False))
 
 
 def _pod_state(release: Release, pod: Any) -> tuple[str, bool]:

@@ -187,14 +187,19 @@ def _moved(hole: Hole, moved: Callable[[list[int]], list[int]]) -> Hole:
 
 
 def cut_to_last_mission(
-    mission: Recording, *, being_written: bool = False, number: int | None = None
+    mission: Recording,
+    *,
+    being_written: bool = False,
+    after_ns: int = AFTER_NS,
+    number: int | None = None,
 ) -> bool:
     """Reduce a recording of several missions to the mission that was started last.
 
     With `number`, which telemetry has as `mission_id`, reduce it to this mission.
 
     `being_written` tells that pods still write the files. If such files contain the end of the
-    mission, they have lost nothing; files of a session that was killed may have.
+    mission, they have lost nothing; files of a session that was killed may have. The recording ends
+    `after_ns` after the end of the mission [ns].
 
     Return whether the recording contains the end of that mission.
     """
@@ -203,7 +208,7 @@ def cut_to_last_mission(
     (began, ended), after = found[index], found[index + 1 : index + 2]
     earlier = max((end for _, end in found[:index] if end is not None), default=-1)
     first = max((began or 0) - BEFORE_NS, earlier + 1)
-    last = ended + AFTER_NS if ended is not None else END_NS
+    last = ended + after_ns if ended is not None else END_NS
     last = min([last, *(start - 1 for start, _ in after if start is not None)])
     until = mission.messages[-1][1] if mission.messages else 0
     mission.keep(first, last, first - COUNTED_NS)

@@ -152,11 +152,11 @@ def of_kind(objects, kind):
 
 
 def pod_specs(objects):
-    """Return all pod specs: by component for Deployments and Jobs, by container for Pods."""
+    """Return all pod specs: by container for Pods, by component for all others."""
     specs = {}
     for thing in objects:
         spec = thing.get("spec", {})
-        if thing["kind"] in ("Deployment", "Job"):
+        if thing["kind"] in ("Deployment", "StatefulSet", "Job"):
             component = thing["metadata"]["labels"]["app.kubernetes.io/component"]
             specs[component] = spec["template"]["spec"]
         elif thing["kind"] == "Pod":

@@ -15,16 +15,21 @@
 {{- end -}}
 {{- end }}
 
+{{/* Whether the Job of a mission leaves a report in the volume of the recordings: "true" or "". */}}
+{{- define "cloudrc.keepsReports" -}}
+{{- if and (include "cloudrc.recordingsClaim" .) (not (include "cloudrc.isFleet" .)) }}true{{ end -}}
+{{- end }}
+
 {{/* The name of a CronJob has at most 52 characters. */}}
 {{- define "cloudrc.cronJobName" -}}
 {{ include "cloudrc.fullname" . | trunc 44 | trimSuffix "-" }}-mission
 {{- end }}
 
 {{/* The container that posts a mission, follows it and ends with its verdict.
-     Argument: (dict "root" $ "name" NAME "uid" FIELD "queue" BOOL). With a claim for recordings, that of
-     a mission, not of a test, leaves a report there. */}}
+     Argument: (dict "root" $ "name" NAME "uid" FIELD "queue" BOOL "number" ROBOT), of a fleet the robot.
+     With a claim for recordings, that of a mission, not of a test, leaves a report there. */}}
 {{- define "cloudrc.missionContainer" -}}
-{{- $reports := and (eq .name "mission") (include "cloudrc.recordingsClaim" .root) -}}
+{{- $reports := and (eq .name "mission") (include "cloudrc.keepsReports" .root) -}}
 {{- $resources := deepCopy .root.Values.mission.resources -}}
 {{- if $reports -}}
 {{- $_ := set $resources "limits" (merge (dict "memory" .root.Values.recordings.memory) ($resources.limits | default dict)) -}}
@@ -35,7 +40,11 @@
   args:
     - mission
     - fly
+    {{- if include "cloudrc.isFleet" .root }}
+    - --api=http://{{ include "cloudrc.hostOf" (dict "root" .root "component" (include "cloudrc.cloudPods" .root) "number" (.number | default "0")) }}:8080
+    {{- else }}
     - --api=http://{{ include "cloudrc.fullname" .root }}-api:{{ .root.Values.teleop.service.port }}
+    {{- end }}
     - --token-file=/etc/cloudrc-tokens/operator
     - --mission=/etc/cloudrc-mission/mission.yaml
     - --key=$(MISSION_KEY)
@@ -85,7 +94,7 @@
     defaultMode: 0440
     items:
       - {key: operator, path: operator}
-{{- if and .reports (include "cloudrc.recordingsClaim" .root) }}
+{{- if and .reports (include "cloudrc.keepsReports" .root) }}
 {{ include "cloudrc.experimentVolumes" .root }}
 - name: link
   configMap:
@@ -102,7 +111,14 @@
 {{/* Spec of a Job that flies a mission. Argument: (dict "root" $ "name" CONFIGMAP "queue" BOOL). */}}
 {{- define "cloudrc.missionJobSpec" -}}
 # A failed mission is not flown again automatically.
+{{- if include "cloudrc.isFleet" .root }}
+backoffLimitPerIndex: 0
+completionMode: Indexed
+completions: {{ include "cloudrc.robots" .root }}
+parallelism: {{ include "cloudrc.robots" .root }}
+{{- else }}
 backoffLimit: 0
+{{- end }}
 # A stopped watcher ends nothing: a new pod follows the mission.
 podFailurePolicy:
   rules:
@@ -127,7 +143,7 @@ template:
     {{- . | nindent 4 }}
     {{- end }}
     containers:
-      {{- include "cloudrc.missionContainer" (dict "root" .root "name" "mission" "uid" "metadata.labels['batch.kubernetes.io/controller-uid']" "queue" .queue) | nindent 6 }}
+      {{- include "cloudrc.missionContainer" (dict "root" .root "name" "mission" "uid" "metadata.labels['batch.kubernetes.io/controller-uid']" "queue" .queue "number" "$(JOB_COMPLETION_INDEX)") | nindent 6 }}
     volumes:
       {{- include "cloudrc.missionVolumes" (dict "root" .root "name" .name "reports" true) | nindent 6 }}
 {{- end }}
