@@ -105,6 +105,8 @@ RULES = {
     "storage": _either(*QUANTITY["anyOf"], _one_of("")),
     "accessMode": _one_of("ReadWriteOnce", "ReadWriteOncePod", "ReadWriteMany"),
     "memory": QUANTITY,
+    "keepMissions": {"type": "integer", "minimum": 1},
+    "keepDays": {"type": "number", "exclusiveMinimum": 0},
     "apiHost": HOST,
     "consoleHost": HOST,
     "tlsSecret": NAME,

@@ -221,7 +221,7 @@ def _keep_report(options: Options, order: Json, view: Json) -> None:
 
 def _report(options: Options, _: Api | None = None) -> int:
     """Write the report of a mission of a release; return the exit code of its verdict."""
-    from cloudrc.cli.report import write_again
+    from cloudrc.cli import report
     from cloudrc.cli.where import flown_release
     from cloudrc.runs.folder import new_folder
     from cloudrc.runs.kept import fetch_mission
@@ -236,7 +236,8 @@ def _report(options: Options, _: Api | None = None) -> int:
             folder.rmdir()  # nothing was fetched
         raise
     options.run, options.metric, options.figures = folder, [], False
-    return write_again(options)
+    options.width, options.font_size = 7.16, 9.0
+    return report.execute(options)
 
 
 def _follow(

@@ -17,7 +17,6 @@ from cloudrc.text import escape
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
     from cloudrc.record.columns import Recording
-    from cloudrc.report.figures.style import Look
 
 PAGE = "report.html"
 EPILOG = """\
@@ -59,25 +58,19 @@ def execute(options: Options) -> int:
     """Write the report from the recording; return the exit code of the run's verdict."""
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
-    from cloudrc.report.figures.style import Look
-
-    return write_again(options, Look(options.width, options.font_size))
-
-
-def write_again(options: Options, look: Look | None = None) -> int:
-    """Write the report of the run that `options` name; return the exit code of its verdict."""
     from cloudrc.cli.progress import Progress
     from cloudrc.metrics import measure
     from cloudrc.metrics.verdict import exit_code
     from cloudrc.record.topics import TOPICS
+    from cloudrc.report.figures.style import Look
     from cloudrc.report.fleet import summarize_fleet
     from cloudrc.report.folder import read_run, robots_in
     from cloudrc.report.write import write_report
-    from cloudrc.runs import fleet
+    from cloudrc.runs.fleet import write_again
     from cloudrc.runs.session import check_ended, restore_mission
 
     measure.check(options.metric)
-    is_fleet = bool(robots_in(options.run))
+    look, is_fleet = Look(options.width, options.font_size), bool(robots_in(options.run))
     with Progress(f"reads the recording of {options.run}") as view:
 
         def write(folder: Path) -> tuple[Recording, ResolvedExperiment, dict[str, Any]]:
@@ -98,7 +91,7 @@ def write_again(options: Options, look: Look | None = None) -> int:
             )
             return recording, experiment, document
 
-        document = fleet.write_again(options.run, write) if is_fleet else write(options.run)[2]
+        document = write_again(options.run, write) if is_fleet else write(options.run)[2]
     print_traceback(options, document)
     if is_fleet:
         text = f"\n{summarize_fleet(document, paint)}\n\n{escape(str(options.run / PAGE))}"

@@ -190,8 +190,8 @@ def cut_to_last_mission(
     mission: Recording,
     *,
     being_written: bool = False,
-    number: int | None = None,
     after_ns: int = AFTER_NS,
+    number: int | None = None,
 ) -> bool:
     """Reduce a recording of several missions to the mission that was started last.
 

@@ -18,7 +18,7 @@ from cloudrc.cluster.client import Release, run
 from cloudrc.cluster.flight import FETCHES, FLUSH, fetch_all, report_flight
 from cloudrc.cluster.link import EXPERIMENT
 from cloudrc.cluster.pods import DATA, find_pod
-from cloudrc.config.load import load_link, read_experiment
+from cloudrc.config.load import load_link, read_experiment, robot_settings
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.config.schema import MissionConfig
@@ -78,8 +78,13 @@ def keep_report(
     return folder
 
 
-def _experiment(experiment: Path, profile: Path, order: Mapping[str, Any]) -> ResolvedExperiment:
-    """Return a release's experiment with its link; with an `order`, with this mission."""
+def _experiment(
+    experiment: Path, profile: Path, order: Mapping[str, Any], robot: int | None = None
+) -> ResolvedExperiment:
+    """Return a release's experiment with its link; with an `order`, with this mission.
+
+    `robot` is the number of a robot in a fleet.
+    """
     tree: dict[str, Any] = parse_yaml(experiment.read_text("utf-8"), experiment.name)[0] or {}
     link = load_link(profile, experiment).model_dump(mode="json", include=set(DIRECTIONS))
     tree["link"] = link
@@ -90,7 +95,7 @@ def _experiment(experiment: Path, profile: Path, order: Mapping[str, Any]) -> Re
     with TemporaryDirectory() as name:
         config = Path(name) / "config.yaml"
         config.write_text(write_yaml(tree), encoding="utf-8")
-        return read_experiment(config, flown=True)
+        return read_experiment(config, robot_settings(robot), flown=True)
 
 
 def _remove_old(reports: Path, keep: int, days: float) -> None:
@@ -144,7 +149,7 @@ def _report_of_pods(
             for found in release.find("configmaps", component):
                 for key, text in (found.data or {}).items():
                     (Path(name) / key).write_text(text, encoding="utf-8")
-        session = _experiment(*files, {})
+        session = _experiment(*files, {}, release.robot)
         about = f"Mission {record.id} ({record.order.name}) of {release.name}"
         experiment = experiment_of(session, record, folder, about)
         recording = fetch_all(release, folder, tell, want_end=True, number=record.number)

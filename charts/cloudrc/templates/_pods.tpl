@@ -154,10 +154,13 @@ affinity:
 {{- .Values.recordings.existingClaim | default $made -}}
 {{- end }}
 
-{{/* Mount of this volume; several releases may share a claim. */}}
+{{/* Mount of this volume; several releases, and the robots of a fleet, may share a claim. */}}
 {{- define "cloudrc.dataMount" -}}
-{name: data, mountPath: /var/lib/cloudrc
-{{- if include "cloudrc.recordingsClaim" . }}, {{ include "cloudrc.isFleet" . | empty | ternary "subPath: " "subPathExpr: $(ROBOT)/" }}{{ include "cloudrc.fullname" . }}{{ end }}}
+{{- $folder := printf "subPath: %s" (include "cloudrc.fullname" .) -}}
+{{- if include "cloudrc.isFleet" . -}}
+{{- $folder = printf "subPathExpr: %s/$(ROBOT)" (include "cloudrc.fullname" .) -}}
+{{- end -}}
+{name: data, mountPath: /var/lib/cloudrc{{ if include "cloudrc.recordingsClaim" . }}, {{ $folder }}{{ end }}}
 {{- end }}
 
 {{/* Volume mounts of world and cloud. Argument: the root. */}}

@@ -15,16 +15,21 @@
 {{- end -}}
 {{- end }}
 
+{{/* Whether the Job of a mission leaves a report in the volume of the recordings: "true" or "". */}}
+{{- define "cloudrc.keepsReports" -}}
+{{- if and (include "cloudrc.recordingsClaim" .) (not (include "cloudrc.isFleet" .)) }}true{{ end -}}
+{{- end }}
+
 {{/* The name of a CronJob has at most 52 characters. */}}
 {{- define "cloudrc.cronJobName" -}}
 {{ include "cloudrc.fullname" . | trunc 44 | trimSuffix "-" }}-mission
 {{- end }}
 
 {{/* The container that posts a mission, follows it and ends with its verdict.
-     Argument: (dict "root" $ "name" NAME "uid" FIELD "queue" BOOL "number" ROBOT), of a fleet the robot. With
-     a claim for recordings, that of a mission, not of a test, leaves a report there. */}}
+     Argument: (dict "root" $ "name" NAME "uid" FIELD "queue" BOOL "number" ROBOT), of a fleet the robot.
+     With a claim for recordings, that of a mission, not of a test, leaves a report there. */}}
 {{- define "cloudrc.missionContainer" -}}
-{{- $reports := and (eq .name "mission") (include "cloudrc.recordingsClaim" .root) -}}
+{{- $reports := and (eq .name "mission") (include "cloudrc.keepsReports" .root) -}}
 {{- $resources := deepCopy .root.Values.mission.resources -}}
 {{- if $reports -}}
 {{- $_ := set $resources "limits" (merge (dict "memory" .root.Values.recordings.memory) ($resources.limits | default dict)) -}}
@@ -89,7 +94,7 @@
     defaultMode: 0440
     items:
       - {key: operator, path: operator}
-{{- if and .reports (include "cloudrc.recordingsClaim" .root) }}
+{{- if and .reports (include "cloudrc.keepsReports" .root) }}
 {{ include "cloudrc.experimentVolumes" .root }}
 - name: link
   configMap:
