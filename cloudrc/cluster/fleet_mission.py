@@ -71,7 +71,8 @@ def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> En
         {"robot": robot, **_verdict(end), **_flown(before.get(robot), after.get(robot))}
         for robot, end in ended.items()
     ]
-    tell(f"\n{summarize_fleet(_document(rows, record, known))}")
+    for line in ["", *summarize_fleet(_document(rows, record, known)).splitlines()]:
+        tell(line)
     return Ended(max(end.exit_code for end in ended.values()), "")
 
 

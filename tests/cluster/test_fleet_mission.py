@@ -54,7 +54,7 @@ def test_a_fleet_ends_with_a_verdict_per_robot_and_a_summary_that_names_the_cell
         "robot 1: FAILURE: timed_out: too late; also not_settled: 1 m",
         "robot 2: SUCCESS",
     ]
-    summary = lines[-1]
+    summary = "\n".join(lines)
     assert "FAILURE: 1 of 3 robots did not succeed: robot 1 (timed_out, not_settled)" in summary
     assert summary.count("200") == 5, "ms, mean age of the commands; also of median and worst"
     assert "cell overloaded: uplink, load 1.6" in summary
