@@ -24,7 +24,7 @@ from cloudrc.cluster.pods import (
     find_pod,
     list_pods,
 )
-from cloudrc.errors import to_one_line
+from cloudrc.errors import CloudrcError, to_one_line
 
 ROBOT = "batch.kubernetes.io/job-completion-index"
 """Annotation of a Job's pod: the robot that it flies."""
@@ -32,8 +32,6 @@ JOB = "batch.kubernetes.io/job-name"
 """Label of a Job's pods."""
 ROUND, FIRST = 60, 10
 """Longest time between two looks at the Job, and until the first pod is missed [s]."""
-VERDICTS = {0: "success", 1: "failure", 6: "invalid"}
-"""Exit code of a mission -> its verdict; other codes mean that it was interrupted."""
 COUNTERS = {
     "age_s": "cloudrc_command_age_seconds_sum",
     "ages": "cloudrc_command_age_seconds_count",
@@ -82,7 +80,8 @@ def _ends(release: Release, name: str, tell: Callable[[str], None]) -> Iterator[
     while True:
         job = release.request("get", "jobs", name=name)
         is_over = failure_of(job) is not None
-        waits = "" if seen or is_over else why_waiting(release, job, [])
+        if not (seen or is_over):
+            why_waiting(release, job, [])  # raises if the cluster denies the pods
         limit = 1 if is_over else ROUND if seen else FIRST
         for pod in release.watch("pods", limit, label_selector=f"{JOB}={name}"):
             waits = why_waiting(release, job, [pod])
@@ -107,9 +106,12 @@ def _ends(release: Release, name: str, tell: Callable[[str], None]) -> Iterator[
 
 def _verdict(end: Ended) -> dict[str, str]:
     """Return the verdict of a robot and, after a failure, the codes of its causes."""
+    from cloudrc.metrics.verdict import EXIT_CODES
+
+    named = {code: verdict for verdict, code in EXIT_CODES.items()}
     codes = re.findall(r"(?:^[A-Z]+|; also) ?:? (\w+)", end.message) if end.exit_code else []
     why = {"why": ", ".join(codes)} if codes else {}
-    return {"verdict": VERDICTS.get(end.exit_code, "interrupted"), **why}
+    return {"verdict": named.get(end.exit_code, "interrupted"), **why}
 
 
 def _flown(before: Numbers | None, after: Numbers | None) -> Numbers:
@@ -131,17 +133,21 @@ def _document(rows: list[dict[str, Any]], record: list[dict[str, str]], known: i
         row["time_s"] -= start
     for row in rows if log.rows else ():
         row["dropped"] = sum(log.dropped[way, row["robot"]] for way in log.ways)
-    cell = [cell_numbers(log, way, len(rows), alone=True) for way in log.ways]
+    cell = [cell_numbers(log, way, len(rows), alone=False) for way in log.ways]
     return {**judge_robots(rows), "cell": cell, "cloud": None, "separation_min_m": None}
 
 
 def _read_cell(release: Release) -> list[dict[str, str]]:
-    """Read what the cell has recorded so far; [] without a cell."""
+    """Read what the cell has recorded so far; [] without a cell, or if it does not answer."""
     if not release.find("statefulsets", CELL):
         return []
-    pod = find_pod(release, CELL).metadata.name
-    words = ["exec", pod, f"--container={CELL}", "--", "cat", f"{DATA}/cell.csv"]
-    return [*csv.DictReader(run("kubectl", [*release.flags, *words]).splitlines())]
+    try:
+        pod = find_pod(release, CELL).metadata.name
+        words = ["exec", pod, f"--container={CELL}", "--", "cat", f"{DATA}/cell.csv"]
+        text = run("kubectl", [*release.flags, *words])
+    except CloudrcError:  # the verdicts count
+        return []
+    return [*csv.DictReader(text.splitlines()[: text.count("\n")])]  # the last line may be cut
 
 
 def _read_robots(release: Release) -> dict[int, Numbers]:
