@@ -126,14 +126,14 @@ def _flown(before: Numbers | None, after: Numbers | None) -> Numbers:
 def _document(rows: list[dict[str, Any]], record: list[dict[str, str]], known: int) -> Any:
     """Return what the summary of a fleet needs; its cell's rows from `known` on are its flight."""
     from cloudrc.link.cell import CellLog
-    from cloudrc.report.fleet import cell_numbers, judge_robots
+    from cloudrc.report.fleet import cell_rows, judge_robots
 
     log, start = CellLog.read(record[known:]), float(record[known - 1]["time_s"]) if known else 0.0
     for row in log.rows:
         row["time_s"] -= start
     for row in rows if log.rows else ():
         row["dropped"] = sum(log.dropped[way, row["robot"]] for way in log.ways)
-    cell = [cell_numbers(log, way, len(rows), alone=False) for way in log.ways]
+    cell = cell_rows(log, len(rows), alone=False)  # others may send, too
     return {**judge_robots(rows), "cell": cell, "cloud": None, "separation_min_m": None}
 
 

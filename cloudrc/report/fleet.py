@@ -117,11 +117,7 @@ def fleet_document(flown: FleetFlown) -> dict[str, Any]:
         "code": source.code_hash(),
         "mode": flown.mode,
         "seed": experiment.seed,
-        "cell": [
-            cell_numbers(flown.log, way, len(flown.robots), alone=alone)
-            for way in flown.log.ways
-            if flown.log.rows
-        ],
+        "cell": cell_rows(flown.log, len(flown.robots), alone=alone),
         "cloud": flown.cloud,
         "separation_min_m": separation_min(flown.paths, scene_of(experiment.world).spawn),
     }
@@ -146,6 +142,12 @@ def judge_robots(robots: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "median": {name: median(known) for name, known in values.items() if known},
         "worst": {name: max(known) for name, known in values.items() if known},
     }
+
+
+def cell_rows(log: CellLog, senders: int, *, alone: bool) -> list[dict[str, Any]]:
+    """Return `cell_numbers` of each direction in which packets have left."""
+    used = {row["direction"] for row in log.rows if row["packets"]}
+    return [cell_numbers(log, way, senders, alone=alone) for way in log.ways if way in used]
 
 
 def cell_numbers(log: CellLog, way: str, senders: int, *, alone: bool) -> dict[str, Any]:
