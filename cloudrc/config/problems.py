@@ -73,6 +73,20 @@ def problem_at(key: str, reason: str) -> ProblemsError:
     return ProblemsError([ConfigProblem(tuple(key.split(".")), "", reason)])
 
 
+@contextmanager
+def at_key(key: str, place: str = "") -> Iterator[None]:
+    """Turn a BadInputError of the `with` block into one about the value of a key.
+
+    `place` precedes its text. An error that names its key already stays as it is.
+    """
+    try:
+        yield
+    except ProblemsError:
+        raise
+    except BadInputError as error:
+        raise problem_at(key, f"{place}{error}") from error
+
+
 def from_pydantic(
     error: ValidationError, model: type[BaseModel], prefix: KeyPath = (), limit: int | None = None
 ) -> list[ConfigProblem]:

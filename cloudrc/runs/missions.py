@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from cloudrc.drivers.machine import AwakeClock
-from cloudrc.errors import BadInputError, TimedOutError
+from cloudrc.errors import TimedOutError
 from cloudrc.teleop.client import Api, UnreachableError, describe_mission, mission_path
 
 BEGINS = ("queued", "starting")
@@ -29,17 +29,10 @@ def read_mission(name: str, shown: str = "") -> Json:
     """Read a mission file, or a mission that cloudrc ships; the API checks the content later.
 
     `shown` is the mission's name in lists and messages, by default the name of the file.
-
-    Raises:
-        BadInputError: If the file does not exist, or if it contains no mission.
     """
     from cloudrc.config import shipped
 
-    mission = dict(shipped.read("mission", name, Path()).tree)
-    if mission.pop("steps", None) is not None:
-        raise BadInputError(
-            f"{name}: steps are for experiments; fly them with 'cloudrc run', or give waypoints"
-        )
+    mission = shipped.read("mission", name, Path()).tree
     return {"name": Path(name).stem, **mission, **({"name": shown} if shown else {})}
 
 
