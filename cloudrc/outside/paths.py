@@ -89,10 +89,10 @@ def lock_folder(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[
         yield
 
 
-def check_there(path: Path, remedy: str, what: str = "no such file or folder") -> None:
+def check_there(path: Path, remedy: str) -> None:
     """Raise a BadInputError if nothing is at `path`."""
     if not path.exists():
-        raise BadInputError(f"{path}: {what}; {remedy}")
+        raise BadInputError(f"{path}: no such file or folder; {remedy}")
 
 
 def read_secret(

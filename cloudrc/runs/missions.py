@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cloudrc.drivers.machine import AwakeClock
 from cloudrc.errors import TimedOutError
 from cloudrc.teleop.client import Api, UnreachableError, describe_mission, mission_path
 
@@ -15,9 +14,6 @@ BEGINS = ("queued", "starting")
 """States of a mission that nobody has followed yet."""
 POLL_PERIOD = 0.5
 """Time between two requests for the state of a mission [s]."""
-TURN_MAX = 30.0
-"""Longest time that a request and the pause after the request take [s]. If more time has passed,
-this process was suspended; the suspension does not count towards a time limit."""
 Tell = Callable[[str], None]
 """Function that receives one line of text."""
 
@@ -80,12 +76,12 @@ class MissionFollower:
 
     def _retry(self, request: Callable[[], _Answer]) -> _Answer:
         """Repeat a request until the API answers; raise a TimedOutError if this takes too long."""
-        clock, reported = AwakeClock(TURN_MAX), False
+        deadline, reported = time.monotonic() + self._patience, False
         while True:
             try:
                 return request()
             except UnreachableError as error:
-                if clock() > self._patience:
+                if time.monotonic() > deadline:
                     raise TimedOutError(f"{error}; gave up after {self._patience:g} s") from None
                 if not reported:
                     self._tell(f"{error}; waiting")
