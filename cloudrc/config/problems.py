@@ -117,8 +117,8 @@ def validate(
 ) -> _Model:
     """Convert a document to `model`; `name` names the document in error messages.
 
-    The model's validators see `context`. If there are problems, raise one BadInputError for all: the
-    new ones and those in `found`.
+    The model's validators see `context`. If there are problems, raise one BadInputError for all:
+    the new ones and those in `found`.
     """
     known = {problem.path for problem in found}
     try:
