@@ -45,7 +45,7 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link results docs dist images kind-load lock clean
+.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench results docs dist images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -145,7 +145,7 @@ mutants: $(VENV)/dev ## mutate guard, tunnel and store, list the mutants that te
 # kind, helm and kubectl.
 NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults.json \
 	search-adversarial.json $(ROBOTS:%=search-%.json) search-random.json \
-	link.json mujoco-oldest.json mujoco-newest.json delayed-cartpole.md) \
+	mujoco-oldest.json mujoco-newest.json delayed-cartpole.md) \
 	mutants night-tun night-ros2 night-netem e2e-full
 
 nightly: $(VENV)/dev ## run every test, search and bench; writes build/evidence (needs what e2e needs)
@@ -169,9 +169,6 @@ $(ROBOTS:%=$(EVIDENCE)/search-%.json): $(EVIDENCE)/search-%.json:
 
 $(EVIDENCE)/search-random.json:
 	$(SEARCH) --minutes 10 -o json > $@
-
-$(EVIDENCE)/link.json:
-	$(bin)/python -m tools.bench_link $(BENCH_LINK) -o json > $@
 
 # The paper's mission on the oldest and on the newest MuJoCo that pyproject.toml allows.
 $(EVIDENCE)/mujoco-oldest.json: MUJOCO = mujoco==$(shell sed -n 's/.*"mujoco>=\([0-9.]*\),.*/\1/p' pyproject.toml)
@@ -229,9 +226,6 @@ api: $(VENV)/dev ## list changes of the public Python API since the last release
 
 bench: $(VENV)/all ## measure the closed loop against raw physics
 	$(bin)/cloudrc bench
-
-bench-link: $(VENV)/all ## compare the relay with its profiles
-	$(bin)/python -m tools.bench_link $(BENCH_LINK)
 
 results: $(VENV)/dev ## fly the README's results and write them into it: two minutes
 	$(bin)/python -m tools.results

@@ -58,9 +58,9 @@ def execute(options: Options) -> int:
     from cloudrc.metrics.verdict import exit_code
     from cloudrc.record.topics import TOPICS
     from cloudrc.report.figures.style import Look
-    from cloudrc.report.folder import read_run
+    from cloudrc.report.folder import check_ended, read_run
     from cloudrc.report.write import write_report
-    from cloudrc.runs.session import check_ended, restore_mission
+    from cloudrc.runs.session import restore_mission
 
     measure.check(options.metric)
     look = Look(options.width, options.font_size)
