@@ -45,7 +45,7 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link results docs dist images kind-load lock clean
+.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link results docs site dist images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -233,11 +233,16 @@ bench: $(VENV)/all ## measure the closed loop against raw physics
 bench-link: $(VENV)/all ## compare the relay with its profiles
 	$(bin)/python -m tools.bench_link $(BENCH_LINK)
 
-results: $(VENV)/dev ## fly the README's results and write them into it: two minutes
+results: $(VENV)/dev ## fly the results of docs/results.md and write them into it: two minutes
 	$(bin)/python -m tools.results
 
 docs: $(VENV)/dev ## write the generated tables of docs/, and the chart's schema, table and copied files
 	$(bin)/python -m tools.docs
+
+site: $(VENV)/site ## build all pages into build/site; a link that leads nowhere is an error
+	$(bin)/python -m tools.site pages build/pages
+	$(bin)/zensical build --strict --clean
+	$(bin)/python -m tools.site check build/site
 
 # The time of all files in them: two builds of one commit are byte-equal.
 EPOCH = $(shell git log -1 --format=%ct)
@@ -299,3 +304,7 @@ $(VENV)/dev: pyproject.toml | $(VENV)/bin/python
 	@echo "installs cloudrc, its packages and its test tools into $(VENV), once: a minute, 900 MB"
 	$(INSTALL) '.[dev]'
 	@touch $(VENV)/all $@
+
+$(VENV)/site: pyproject.toml | $(VENV)/dev
+	$(INSTALL) '.[docs]'
+	@touch $@
