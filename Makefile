@@ -305,6 +305,7 @@ $(VENV)/dev: pyproject.toml | $(VENV)/bin/python
 	$(INSTALL) '.[dev]'
 	@touch $(VENV)/all $@
 
-$(VENV)/site: pyproject.toml | $(VENV)/dev
-	$(INSTALL) '.[docs]'
+# Not an extra: pip would install cloudrc again, while .ci/run flies with it.
+$(VENV)/site: tools/site-requirements.txt | $(VENV)/dev
+	$(bin)/python -m pip install --disable-pip-version-check --quiet --requirement $<
 	@touch $@

@@ -45,8 +45,6 @@ RESERVED: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),
 }
 # Imported package -> its name in pyproject.toml.
-TOOLS = "dev", "docs"
-"""Extras for those who change cloudrc, which it does not import."""
 ASKED_AS = {
     "yaml": "pyyaml",
     **dict.fromkeys(("pydantic_core", "annotated_types"), "pydantic"),
@@ -103,9 +101,7 @@ def foreign(parsed):
 def test_imported_and_declared_packages_are_the_same():
     """A package with a wrong, similar name in pyproject.toml fails this test."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = [
-        lines for name, lines in project["optional-dependencies"].items() if name not in TOOLS
-    ]
+    extras = [lines for name, lines in project["optional-dependencies"].items() if name != "dev"]
     lines = sum(extras, project["dependencies"])
     declared = {re.split(r"[<>=\[; ]", line)[0].replace("-", "_") for line in lines} - {"cloudrc"}
     assert foreign(trees().values()) == declared
