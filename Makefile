@@ -45,7 +45,7 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench results docs dist images kind-load lock clean
+.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench results docs site dist images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -227,11 +227,16 @@ api: $(VENV)/dev ## list changes of the public Python API since the last release
 bench: $(VENV)/all ## measure the closed loop against raw physics
 	$(bin)/cloudrc bench
 
-results: $(VENV)/dev ## fly the README's results and write them into it: two minutes
+results: $(VENV)/dev ## fly the results of docs/results.md and write them into it: two minutes
 	$(bin)/python -m tools.results
 
 docs: $(VENV)/dev ## write the generated tables of docs/, and the chart's schema, table and copied files
 	$(bin)/python -m tools.docs
+
+site: $(VENV)/site ## build all pages into build/site; a link that leads nowhere is an error
+	$(bin)/python -m tools.site pages build/pages
+	$(bin)/zensical build --strict --clean
+	$(bin)/python -m tools.site check build/site
 
 # The time of all files in them: two builds of one commit are byte-equal.
 EPOCH = $(shell git log -1 --format=%ct)
@@ -293,3 +298,8 @@ $(VENV)/dev: pyproject.toml | $(VENV)/bin/python
 	@echo "installs cloudrc, its packages and its test tools into $(VENV), once: a minute, 900 MB"
 	$(INSTALL) '.[dev]'
 	@touch $(VENV)/all $@
+
+# Not an extra: pip would install cloudrc again, while .ci/run flies with it.
+$(VENV)/site: tools/site-requirements.txt | $(VENV)/dev
+	$(bin)/python -m pip install --disable-pip-version-check --quiet --requirement $<
+	@touch $@
