@@ -116,7 +116,7 @@ def _open(stack: ExitStack, options: Options, flight: _Flight) -> tuple[Any, Any
         steering,
         tell,
         planar=robot.planar,
-        turns=robot.heading == "free",
+        heading=robot.heading,
         prefix=prefix,
         observes=options.observe or not flight.has_api,
     )

@@ -40,11 +40,11 @@ def telemetry(stamp_ns=0, guard=GuardState.TRACK):
 class Asking:
     """Requests of nodes for a robot, and what came of them."""
 
-    def __init__(self, *, planar=False, turns=True, **options):
+    def __init__(self, *, planar=False, heading="free", **options):
         self.said = []
         self.api = FakeApi()
         self.steering = Steering(self.api)
-        options |= {"planar": planar, "turns": turns}
+        options |= {"planar": planar, "heading": heading}
         self.requests = RosRequests(self.steering, self.said.append, **options)
 
     def velocity(self, now=0.0):
@@ -62,8 +62,8 @@ def test_a_goal_is_a_goto_with_its_yaw():
 @pytest.mark.parametrize(
     ("options", "height", "goal"),
     [
-        ({"turns": False}, 2.0, {"position_m": [1.0, 0.0, 2.0]}),
-        ({"turns": False, "planar": True}, 0.1, {"position_m": [1.0, 0.0]}),
+        ({"heading": "velocity"}, 2.0, {"position_m": [1.0, 0.0, 2.0]}),
+        ({"heading": "velocity", "planar": True}, 0.1, {"position_m": [1.0, 0.0]}),
     ],
 )
 def test_a_goal_on_the_ground_as_rviz_sends_keeps_the_height(options, height, goal):
@@ -85,12 +85,23 @@ def test_a_velocity_is_turned_from_the_base_to_the_world(frame, flown):
     assert asking.said == []
 
 
-def test_a_robot_on_the_ground_gets_no_vertical_velocity_and_a_turn_is_ignored_with_a_word():
-    asking = Asking(planar=True)
+@pytest.mark.parametrize(
+    ("frame", "heading", "velocity", "turn"),
+    [
+        ("", "velocity", (0.5, 0.0, 0.0), -0.2),
+        ("map", "free", (0.0, -0.5, 0.0), -0.2),
+        ("", "fixed", (0.0, 0.5, 0.0), None),
+    ],
+)
+def test_a_turn_is_asked_for_in_the_frame_of_the_heading(frame, heading, velocity, turn):
+    asking = Asking(planar=True, heading=heading)
+    asking.requests.see(ZERO, LEFT)
     for _ in range(3):
-        asking.requests.drive("", (0.5, 0.0, 0.3), 0.2)
-    assert asking.velocity() == (0.5, 0.0, 0.0)
-    assert ["angular.z is ignored" in text for text in asking.said] == [True]
+        asking.requests.drive(frame, (0.5, 0.0, 0.3), -0.2)
+    assert asking.velocity() == pytest.approx(velocity)
+    assert asking.steering._turn == turn
+    ignored = ["angular.z is ignored" in text for text in asking.said]
+    assert ignored == [True] * (heading == "fixed")
 
 
 @pytest.mark.parametrize("frame", ["odom"])

@@ -105,7 +105,7 @@ def bridge(folder, said):
     api, ended = FakeApi(), threading.Event()
     api.answers["/v1/state"] = {"mission": None}
     steering, sender = Steering(api), RecordSender(folder)
-    robot = {"planar": False, "turns": True, "prefix": "drone1/"}
+    robot = {"planar": False, "heading": "free", "prefix": "drone1/"}
     requests = RosRequests(steering, said.append, **robot)
     scene = encode_markers(0, scene_shapes(Shapes(), (), "drone1/"))
     node = RosBridge("drone1", "drone1/", scene, steering, requests, said.append)

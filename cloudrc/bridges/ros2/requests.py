@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from math import cos, degrees, hypot, inf, isfinite, sin
 
+from cloudrc.config.heading import WHY, Heading
 from cloudrc.console.steering import Steering
 from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import ZERO, Quaternion, Vector
@@ -40,7 +41,7 @@ class RosRequests:
         tell: Callable[[str], None],
         *,
         planar: bool,
-        turns: bool,
+        heading: Heading,
         prefix: str = "",
         observes: bool = False,
     ) -> None:
@@ -50,16 +51,17 @@ class RosRequests:
             steering: Sends requests to teleop.
             tell: Gets words for the user.
             planar: Whether the robot stays on the ground.
-            turns: Whether it obeys a yaw.
+            heading: What decides about its heading.
             prefix: Prefix of the robot's frames.
             observes: Whether to take no request.
         """
         self._steering, self._tell_user = steering, tell
-        self._planar, self._turns = planar, turns
+        self._planar, self._heading = planar, heading
         self._base, self._observes = prefix + BASE, observes
         self.position: Vector = ZERO
         self.yaw = 0.0
-        self._wanted: tuple[Vector, float] | None = None  # velocity, and end of its time [s]
+        # Velocity, end of its time [s], yaw rate [rad/s].
+        self._wanted: tuple[Vector, float, float | None] | None = None
         self._passed = -inf  # time at which the newest velocity was passed on [s]
         self._said: dict[str, float] = {}  # words -> when they were said last [s]
 
@@ -81,7 +83,8 @@ class RosRequests:
         if z == 0.0:  # RViz clicks on the ground
             z = max(self.position[2], HEIGHT)
         place = (x, y) if self._planar else (x, y, z)
-        answer = self._steering.go_to(place, _yaw_deg(wxyz) if self._turns else None)
+        turns = self._heading == "free"
+        answer = self._steering.go_to(place, _yaw_deg(wxyz) if turns else None)
         self._tell(answer.text)
 
     def drive(self, frame: str, linear: Sequence[float], yaw_rate: float) -> None:
@@ -90,20 +93,21 @@ class RosRequests:
         Args:
             frame: Frame of the velocity.
             linear: Velocity [m/s], shape (3,).
-            yaw_rate: Yaw rate [rad/s], which is ignored.
+            yaw_rate: Yaw rate [rad/s].
         """
         frame = frame or self._base
-        if not self._accepts("cmd_vel", frame, (self._base, *GROUND_FRAMES), linear):
+        if not self._accepts("cmd_vel", frame, (self._base, *GROUND_FRAMES), (*linear, yaw_rate)):
             return
-        if yaw_rate:
-            self._tell("cmd_vel: angular.z is ignored; a drive does not turn the robot")
+        if yaw_rate and self._heading == "fixed":
+            self._tell(f"cmd_vel: angular.z is ignored: {WHY['fixed']}")
+            yaw_rate = 0.0
         x, y, z = linear
-        if frame == self._base:
-            x, y = (
-                x * cos(self.yaw) - y * sin(self.yaw),
-                x * sin(self.yaw) + y * cos(self.yaw),
-            )
-        self._wanted = (x, y, 0.0 if self._planar else z), time.monotonic() + DRIVE_LASTS
+        # A turn is flown in the frame of the robot's heading, a plain velocity in the world's.
+        turn = (frame == self._base) * self.yaw - (self.yaw if yaw_rate else 0.0)
+        if turn:
+            x, y = x * cos(turn) - y * sin(turn), x * sin(turn) + y * cos(turn)
+        velocity = x, y, 0.0 if self._planar else z
+        self._wanted = velocity, time.monotonic() + DRIVE_LASTS, yaw_rate or None
 
     def pass_on(self) -> None:
         """Pass the newest velocity on, if it is due; say why teleop has not taken a request."""
@@ -111,7 +115,8 @@ class RosRequests:
         wanted = self._wanted
         if wanted is not None and now - self._passed >= DRIVE_PERIOD:
             self._passed, self._wanted = now, None
-            self._steering.hold_key("cmd_vel", wanted[0], wanted[1] - now)
+            velocity, until, turn = wanted
+            self._steering.hold_key("cmd_vel", velocity, until - now, turn)
         text, is_refusal, said = self._steering.answer
         if is_refusal and max(now - self._passed, now - said) < DRIVE_LASTS:
             self._tell(text)
