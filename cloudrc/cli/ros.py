@@ -21,10 +21,11 @@ examples:
   cloudrc ros bridge --namespace drone1  /drone1/odom and so on
   cloudrc ros bridge --observe           nodes see the robot, but cannot steer
 
-It needs a sourced ROS 2 with rclpy for this Python. It publishes odom, /tf,
-cloudrc/guard, cloudrc/scene, cloudrc/path and /diagnostics, takes goal_pose and
-cmd_vel, and serves cloudrc/hold, resume, cancel, estop and acknowledge. It ends
-with the flight. docs/ros2.md describes the topics."""
+It needs a ROS 2 with rclpy for this Python. It publishes odom, /tf,
+robot_description, cloudrc/mission, guard, scene, path and /diagnostics, takes
+goal_pose and cmd_vel, and serves navigate_to_pose and cloudrc/hold, resume,
+cancel, estop and acknowledge. It ends with the flight. docs/ros2.md describes
+the topics."""
 
 
 def arguments(parser: Parser) -> None:
@@ -36,6 +37,7 @@ def arguments(parser: Parser) -> None:
     about = "namespace of topics and services, and prefix of the robot's frames (default: none)"
     add("--namespace", "NAME", about, "", ros_namespace)
     add("--observe", "", "let nodes see the robot, but not steer it")
+    add("--no-navigation", "", "leave the action navigate_to_pose to Nav2")
     add("--rep-105", "", "let base_link move in the frame odom, and odom be a frame in map")
     pod = bridge.add_argument_group("in the container of the chart")
     add = flags(pod)
@@ -111,7 +113,8 @@ def _open(stack: ExitStack, options: Options, flight: _Flight) -> tuple[Any, Any
     bodies = read_shapes(world)
     markers = encode_markers(0, scene_shapes(bodies, scene_of(world).tubes, frames.prefix))
     description = urdf(world.robot, frames, bodies.robot)
-    shown = Shown(frames, markers, description, covariances(world.sensors))
+    exactness = covariances(world.sensors)
+    shown = Shown(frames, markers, description, exactness, not options.no_navigation)
 
     def tell(text: str) -> None:
         print_line(f"ros: {text}")

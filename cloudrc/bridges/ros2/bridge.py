@@ -79,6 +79,7 @@ class Shown(NamedTuple):
     scene: bytes  # markers of robot and scene, a visualization_msgs/MarkerArray
     description: str  # URDF
     covariances: Covariances = (EXACT, EXACT)  # of the measured pose and twist
+    navigates: bool = True  # whether it serves Nav2's action
 
 
 class RosBridge(OwnNode):
@@ -122,7 +123,8 @@ class RosBridge(OwnNode):
             self.node.create_service(
                 Trigger, f"cloudrc/{name}", self._server(name), callback_group=self._group
             )
-        self._navigator = self._serve_navigation(tell)
+        if shown.navigates:
+            self._navigator = self._serve_navigation(tell)
         self._ended = False
         self._listener = threading.Thread(target=self._listen, daemon=True)
         tell(f"{self._odometry.topic_name} and more topics in {self.domain}")
