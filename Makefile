@@ -264,7 +264,7 @@ kind-load: ## load the images into the kind cluster CLUSTER (cloudrc)
 
 lock: $(VENV)/bin/python ## update the locked requirements of images and tests
 	$(bin)/python -m pip install --quiet uv
-	$(COMPILE) pyproject.toml --extra world --extra record --extra console --extra mpc \
+	$(COMPILE) pyproject.toml --extra world --extra record --extra console --extra mpc --extra bucket \
 		--output-file images/world/requirements.txt \
 		$(DRAWING:%=--no-emit-package %)
 	$(COMPILE) pyproject.toml --extra record --extra api --extra mpc --output-file images/cloud/requirements.txt

@@ -30,7 +30,7 @@ from cloudrc.trials.summary import count_verdicts, normalise
 from cloudrc.trials.workers import map_in_order, take_each
 from cloudrc.version import __version__
 
-FILE, SUMMARY = "sweep.yaml", "sweep.json"
+FILE, SUMMARY, PODS = "sweep.yaml", "sweep.json", "pods.json"
 TABLE, PARQUET = "table.csv", "table.parquet"
 NUMBERS = {int, float, type(None)}
 """Types of the values of an axis of numbers; None is the value null."""
