@@ -45,7 +45,7 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench results docs site dist images kind-load lock clean
+.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-cell results docs site dist images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -226,6 +226,9 @@ api: $(VENV)/dev ## list changes of the public Python API since the last release
 
 bench: $(VENV)/all ## measure the closed loop against raw physics
 	$(bin)/cloudrc bench
+
+bench-cell: $(VENV)/all ## measure how punctual the cell of 50 robots is
+	$(bin)/python -m tools.bench_cell $(BENCH_CELL)
 
 results: $(VENV)/dev ## fly the results of docs/results.md and write them into it: two minutes
 	$(bin)/python -m tools.results
