@@ -24,10 +24,10 @@ from tools.api import PAGE, public_names
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = {
+    **{path.name: path.name.lower() for path in ROOT.glob("*.md")},
     "README.md": "index.md",
     "docs/README.md": "pages.md",
     "charts/cloudrc/README.md": "chart.md",
-    **{f"{name}.md": f"{name.lower()}.md" for name in ("CHANGELOG", "CONTRIBUTING", "SECURITY")},
 }
 """Page of the repository -> page of the site, where it is not that below docs/."""
 FENCE = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)

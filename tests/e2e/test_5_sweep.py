@@ -28,11 +28,11 @@ CLAIM = {
 def sweep(tmp_path):
     """Return a function that writes the file of a sweep with so many flights."""
 
-    def write(flights):
+    def write(flights, steps=5):
         file = tmp_path / "sweep.yaml"
         document = {
             "experiment": "steps",
-            "set": {"link.profile": "paper-p2", "mission.steps.count": 5},
+            "set": {"link.profile": "paper-p2", "mission.steps.count": steps},
             "grid": {"cloud.predictor": ["last_sample", "./mine.py"]},
             "seeds": flights // 2,
         }
@@ -103,13 +103,14 @@ def rows_of_claim():
 
 
 @pytest.mark.parametrize(
-    ("flights", "shards", "kills"), [(16, 4, 2), pytest.param(200, 8, 4, marks=pytest.mark.full)]
+    ("flights", "shards", "kills", "steps"),
+    [(12, 3, 2, 10), pytest.param(200, 8, 4, 5, marks=pytest.mark.full)],
 )
 def test_every_row_is_flown_once_though_pods_and_client_are_killed(
-    cluster, sweep, start, tmp_path, flights, shards, kills
+    cluster, sweep, start, tmp_path, flights, shards, kills, steps
 ):
     apply(CLAIM)
-    file, out = sweep(flights), tmp_path / "pods"
+    file, out = sweep(flights, steps), tmp_path / "pods"
     try:
         client = start(file, out, shards, "--claim=rows")
         seen = out / "rows.jsonl"
