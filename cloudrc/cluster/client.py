@@ -19,7 +19,7 @@ from threading import Lock
 from typing import IO, Any
 
 from cloudrc.drivers.machine import await_or_kill
-from cloudrc.errors import CloudrcError, MissingPrerequisiteError, TimedOutError
+from cloudrc.errors import CloudrcError, MissingPrerequisiteError, TimedOutError, to_one_line
 
 DEFAULT_RELEASE = "cloudrc"
 COMPONENTS = ("world", "cloud")
@@ -64,6 +64,10 @@ class ClusterError(CloudrcError):
 
 class NotFoundError(ClusterError):
     """Report that the cluster does not have an object."""
+
+
+class ExpiredError(ClusterError):
+    """Report that the API server no longer has the changes since a version of an object."""
 
 
 class NoAnswerError(ClusterError):
@@ -246,8 +250,12 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
     try:
         yield
     except ApiException as error:
-        kind = NotFoundError if error.status == 404 else ClusterError
+        kind = {404: NotFoundError, 410: ExpiredError}.get(error.status, ClusterError)
         raise kind(f"cannot {doing} {where}: {_refusal(error, doing)}") from error
+    except ValueError as error:  # of the client, which checks an object before it sends it
+        words = to_one_line(str(error))
+        text = words.partition(" body.")[2].partition(" [type=")[0] or words
+        raise ClusterError(f"cannot {doing} {where}: {text}") from error
     except (HTTPError, OSError) as error:
         why = str(getattr(error, "reason", error)).rpartition(": ")[2]  # after repeated attempts
         text = f"cannot {doing} {where}: the API server does not answer ({why})"

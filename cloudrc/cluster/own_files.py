@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,15 @@ def _check_size(name: str) -> None:
         radius = float(hull_of(name).radii[0])
         text = f"in a cluster a robot needs its size; add the line hull_m: {radius + 0.0005:.3f}"
         raise problem_at("world.robot", f"{Path(name) / ROBOT_FILE}: {text}")
+
+
+def check_size(paths: Iterable[str]) -> None:
+    """Check that a ConfigMap can hold the files of a sweep."""
+    sizes = {path: Path(path).stat().st_size for path in paths}
+    if (total := sum(sizes.values())) > SIZE_MAX:
+        largest = max(sizes, key=sizes.__getitem__)
+        text = f"your files have {total} bytes, but a ConfigMap takes {SIZE_MAX} (1 MiB)"
+        raise problem_at("--on", f"{largest}: {text}; fly without it, or install it in an image")
 
 
 def check_local_files(values: Mapping[str, Any], remedy: str) -> None:

@@ -18,7 +18,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from cloudrc.cluster.client import ClusterError, Release, end_process, last_words, program, run
+from cloudrc.cluster.client import (
+    REQUEST_TIMEOUT,
+    ClusterError,
+    ExpiredError,
+    NoAnswerError,
+    Release,
+    end_process,
+    explain_errors,
+    last_words,
+    program,
+    run,
+)
 from cloudrc.cluster.releases import no_release
 from cloudrc.errors import BadInputError, TimedOutError, to_one_line
 
@@ -79,6 +90,43 @@ def list_pods(release: Release, component: str) -> list[Any]:
         and number in (None, pod.metadata.labels.get(INDEX))
     ]
     return sorted(alive, key=lambda pod: str(pod.metadata.creation_timestamp), reverse=True)
+
+
+class PodWatch:
+    """The pods with a label, as the API server tells of their changes."""
+
+    def __init__(self, release: Release, selector: str) -> None:
+        """Watch the pods that a label selector selects."""
+        self._release, self._selector = release, selector
+        self.pods = dict[str, Any]()  # UID -> pod
+        self._version: str | None = None  # resource version of the newest change
+
+    def look(self) -> None:
+        """Take the changes of about a second; at first, all pods.
+
+        If the API server does not answer, nothing has changed: another request tells the error.
+        """
+        from kubernetes import client, watch
+
+        changes: Any = watch  # not annotated
+        call = client.CoreV1Api(self._release.client).list_namespaced_pod
+        where = {"namespace": self._release.namespace, "label_selector": self._selector}
+        limits = {"timeout_seconds": 1, "_request_timeout": REQUEST_TIMEOUT}
+        given = {**where, **limits, "resource_version": self._version}
+        try:
+            with explain_errors("watch pods", self._release.where):
+                for change in changes.Watch().stream(call, **given):
+                    self._take(change["type"], change["object"])
+        except ExpiredError:  # nothing happened for minutes: begin again with all pods
+            self.pods, self._version = {}, None
+        except NoAnswerError:
+            pass
+
+    def _take(self, kind: str, pod: Any) -> None:
+        self._version = pod.metadata.resource_version
+        self.pods[pod.metadata.uid] = pod
+        if kind == "DELETED":
+            del self.pods[pod.metadata.uid]
 
 
 def find_pod(release: Release, component: str) -> Any:

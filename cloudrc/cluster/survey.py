@@ -35,6 +35,7 @@ NEEDED = {
 """API group -> the objects that an install, an upgrade and a mission create, change and delete."""
 VERBS = ("create", "patch", "delete")
 ALSO = (
+    ("", "watch", "pods"),
     ("", "get", "pods/log"),
     ("", "create", "pods/portforward"),
     ("", "create", "pods/exec"),

@@ -81,14 +81,15 @@ def keep_report(
 def _experiment(
     experiment: Path, profile: Path, order: Mapping[str, Any], robot: int | None = None
 ) -> ResolvedExperiment:
-    """Return a release's experiment with its link; with an `order`, with this mission.
+    """Return a release's experiment with its link, and with the waypoints of `order`, if any.
 
     `robot` is the number of a robot in a fleet.
     """
     tree: dict[str, Any] = parse_yaml(experiment.read_text("utf-8"), experiment.name)[0] or {}
     link = load_link(profile, experiment).model_dump(mode="json", include=set(DIRECTIONS))
     tree["link"] = link
-    if order:
+    tree.setdefault("name", order.get("name", "mission").replace("/", "-"))
+    if "waypoints" in order:
         tree["mission"] = {key: order[key] for key in MissionConfig.model_fields if key in order}
         if limit := order.get("time_limit_s"):
             tree["criteria"] = {**(tree.get("criteria") or {}), "time_limit_s": limit}
@@ -149,7 +150,7 @@ def _report_of_pods(
             for found in release.find("configmaps", component):
                 for key, text in (found.data or {}).items():
                     (Path(name) / key).write_text(text, encoding="utf-8")
-        session = _experiment(*files, {}, release.robot)
+        session = _experiment(*files, {"name": record.order.name or release.name}, release.robot)
         about = f"Mission {record.id} ({record.order.name}) of {release.name}"
         experiment = experiment_of(session, record, folder, about)
         recording = fetch_all(release, folder, tell, want_end=True, number=record.number)

@@ -42,3 +42,8 @@ def test_values_that_have_gone_are_named_and_reach_no_pod():
     data = of_kind(render(values), "ConfigMap")["experiment"]["data"]["experiment.yaml"]
     assert yaml.safe_load(data) == {"world": {"plant": {"mass_factor": 1.1}}, "criteria": {}}
     assert "no effect" not in notes({})
+
+
+def test_a_default_that_has_gone_is_not_named():
+    (first,) = (path for path in PACKED if "guests" in path.name)
+    assert "no effect" not in notes(reused=defaults_of(first), upgrade=True)

@@ -41,6 +41,8 @@ class FakeApi:
         self.hooks = []  # each gets the path that is read; what it returns is the reply
         self.lock = threading.RLock()
         self._clock = itertools.count()
+        self.forgotten = 0  # a watch from an earlier resource version gets error 410
+        self.changes = []  # (kind, plural, object) in the order of their resource versions
         self.server = serve(lambda request, body: self.answer(request.command, request.path, body))
         self.url = f"http://127.0.0.1:{self.server.server_port}"
 
@@ -55,7 +57,18 @@ class FakeApi:
         body = {"status": {}, **body, "metadata": {**made, **body["metadata"]}}
         with self.lock:
             self.objects[plural, body["metadata"]["name"]] = body
+            self._note("MODIFIED", plural, body)
         return body
+
+    def drop(self, plural, name):
+        with self.lock:
+            body = self.objects.pop((plural, name))
+            self._note("DELETED", plural, body)
+        return body
+
+    def _note(self, kind, plural, body):
+        self.changes.append((kind, plural, body))
+        body["metadata"]["resourceVersion"] = str(len(self.changes))
 
     def get(self, plural, name):
         return self.objects[plural, name]
@@ -86,6 +99,8 @@ class FakeApi:
                 return 201, body
             if method == "POST":
                 return 201, self.put(plural, body)
+            if "watch=" in address.query:
+                return 200, self._watch(plural, parse_qs(address.query))
             if not name:
                 query = parse_qs(address.query)
                 labels = _terms(query.get("labelSelector", [""])[0])
@@ -110,8 +125,21 @@ class FakeApi:
                     (200, log) if log is not None else (403, {"message": "no right", "code": 403})
                 )
             if method == "DELETE":
-                return 200, self.objects.pop((plural, name))
+                return 200, self.drop(plural, name)
             return 200, self.objects[plural, name]
+
+    def _watch(self, plural, query):
+        """Return the changes since a version as lines; the real server waits for more."""
+        labels = _terms(query["labelSelector"][0])
+        since = int(query.get("resourceVersion", ["0"])[0])
+        if 0 < since < self.forgotten:
+            status = {"code": 410, "reason": "Expired", "message": "too old"}
+            return json.dumps({"type": "ERROR", "object": status}) + "\n"
+        return "".join(
+            json.dumps({"type": kind, "object": body}) + "\n"
+            for kind, changed, body in self.changes[since:]
+            if changed == plural and labels.items() <= body["metadata"].get("labels", {}).items()
+        )
 
     def jobs(self):
         return [body for (kind, _), body in self.objects.items() if kind == "jobs"]

@@ -22,6 +22,8 @@ from tests.e2e.conftest import (
     value,
 )
 
+pytestmark = pytest.mark.real_time
+
 NAME = "fleet"
 POINT = {"position_m": [0.5, 0.0, 0.7], "tolerance_m": 0.1, "dwell_s": 6.0}
 MISSION = {"start": "spawn", "waypoints": [POINT]}

@@ -39,7 +39,7 @@ def test_a_kept_report_is_a_run_of_the_last_mission_and_of_the_links_profile(dat
     recording, experiment, run = read_run(keep(data, "m2"))
     assert experiment.mission.waypoints[0].position_m == (0.5, 0.0, 1.0)
     assert (experiment.uplink.delay_ms, experiment.criteria.time_limit_s) == (70.0, 77.0)
-    assert (run.mode, run.shaper) == ("cluster", "relay")
+    assert (experiment.name, run.mode, run.shaper) == ("x", "cluster", "relay")
     assert recording["/mission"]["event"].tolist().count("started") == 1
     assert recording["/mission"]["stamp_ns"][0] > HOUR
 

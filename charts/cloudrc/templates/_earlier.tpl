@@ -33,8 +33,11 @@
 {{- $part = kindIs "map" $part | ternary (get (kindIs "map" $part | ternary $part dict) .) "" -}}
 {{- end -}}
 {{- if and (kindIs "map" $part) (hasKey (kindIs "map" $part | ternary $part dict) (last $keys)) -}}
-{{- $_ := unset $part (last $keys) }}
+{{- $value := get $part (last $keys) -}}
+{{- $_ := unset $part (last $keys) -}}
+{{- if $value }}
 - {{ $path }}: {{ $instead }} takes its place
+{{- end -}}
 {{- end -}}
 {{- end -}}
 {{- end }}
