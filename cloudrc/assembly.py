@@ -24,6 +24,7 @@ from cloudrc.cloud.news import SendOnDelta
 from cloudrc.cloud.operator import Operator
 from cloudrc.cloud.planar import Planar
 from cloudrc.config import schema
+from cloudrc.config.compute import compute_times
 from cloudrc.config.overrides import build_for, build_plugin
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import RobotFacts, facts, is_planar
@@ -31,6 +32,7 @@ from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.errors import ControllerLostError
 from cloudrc.geometry.fence import Fence
+from cloudrc.link.cell import FRAME_NS, Bulk, Cell, Video
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.queue import PacketQueue
 from cloudrc.link.traces import link_profile
@@ -128,13 +130,12 @@ def start_mission(experiment: ResolvedExperiment, now_ns: int = 0) -> Teleop:
 def fly(
     experiment: ResolvedExperiment,
     see: Sink,
-    make_loop: Callable[..., ControlLoop] = ControlLoop,
     gone: Callable[[], bool] = lambda: False,
 ) -> None:
     """Fly in virtual time until the mission is over.
 
     Every 100 ms of virtual time, call `see` with the new records of world and of cloud, both on
-    world's clock. `make_loop` is that of `build_cloud`.
+    world's clock.
 
     `gone` returns whether a program that controls the robot from outside has ended. Raise a
     ControllerLostError if such a program is lost.
@@ -145,7 +146,7 @@ def fly(
         see([], [Fault(0, error.code, str(error))])
         raise
     with way as channel:
-        _, _, teleop, run = assemble(experiment, make_loop, channel)
+        _, _, teleop, run = assemble(experiment, channel=channel)
         lost = list[ControllerLostError]()
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
@@ -283,9 +284,10 @@ def build_compute_time(
     if not (cloud.compute_ms or cpu_clock):
         return None
     scale = MS_TO_NS / cloud.speed
-    times = cloud.compute_ms * scale, cloud.compute_deviation_ms * scale
+    times = [each * scale for each in compute_times(cloud.compute_ms)]
     draws = generator(experiment.seed, "compute time", experiment.stream)
-    return ComputeTime(*times, draws, cpu_clock, cloud.cpu_share)
+    deviation, drawn = cloud.compute_deviation_ms * scale, times if len(times) > 1 else ()
+    return ComputeTime(times[0], deviation, draws, cpu_clock, cloud.cpu_share, drawn)
 
 
 def build_controller(experiment: ResolvedExperiment) -> Controller:
@@ -300,16 +302,36 @@ def _facts_of(experiment: ResolvedExperiment) -> RobotFacts:
     return facts(experiment.world, guard.acceleration_max_mps2, guard.speed_max_mps)
 
 
-def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDirection]:
-    """Build the uplink and the downlink of the emulated network."""
+def build_links(
+    experiment: ResolvedExperiment, origin_ns: int = 0
+) -> tuple[LinkDirection, LinkDirection]:
+    """Build the uplink and the downlink of the link; their time lines begin at `origin_ns` [ns]."""
     up, down = map(link_profile, (experiment.uplink, experiment.downlink))
     if experiment.cell.rate_kbit is not None:  # packets get their order behind the cell
         up, down = replace(up, keep_order=False), replace(down, keep_order=False)
     seed, stream = experiment.seed, experiment.stream
     return (
-        LinkDirection(up, seed, uplink=True, stream=stream),
-        LinkDirection(down, seed, uplink=False, stream=stream),
+        LinkDirection(up, seed, uplink=True, origin_ns=origin_ns, stream=stream),
+        LinkDirection(down, seed, uplink=False, origin_ns=origin_ns, stream=stream),
     )
+
+
+def build_cells(experiment: ResolvedExperiment, origin_ns: int = 0) -> list[Cell]:
+    """Build the cell of each direction, or one for both, with the traffic of others.
+
+    The traffic begins at `origin_ns` [ns].
+    """
+    given = experiment.cell
+    if given.rate_kbit is None:
+        return []
+    limits = given.queue, given.queue_packets, round(given.airtime_us * 1e3)
+    cells = [Cell(given.rate_kbit * 1e3, *limits) for _ in range(1 if given.shared else 2)]
+    for flow, each in enumerate(given.traffic, start=-len(given.traffic)):
+        start_ns = int(generator(experiment.seed, f"traffic {flow}").integers(FRAME_NS))
+        video = Video(flow, each.rate_kbit * 1e3, origin_ns + start_ns)
+        source = video if each.kind == "video" else Bulk(flow, origin_ns + start_ns)
+        cells[-1 if each.direction == "downlink" else 0].traffic[flow] = source
+    return cells
 
 
 def phase_ns(experiment: ResolvedExperiment) -> int:

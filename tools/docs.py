@@ -84,6 +84,7 @@ OPEN = {
     "sensor": "the name in `robot.yaml`",
     "unit": "the unit in `robot.yaml`",
     "body": "the name of the body in the scene",
+    "robot": "the number of the robot in its fleet",
 }
 """Label of a metric that has too many values for a list -> description of the values."""
 GRAFANA = {symbol: name for name, symbol in UNITS.items()}

@@ -32,6 +32,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "compare": "say whether a setting differs from another, and how sure that is",
         "margin": "find the delay, or other value, up to which the loop is stable",
         "place": "find out where the controller should run: robot, edge or cloud",
+        "measure": "measure how long a controller computes",
         "capacity": "find how many robots a radio cell and a cloud carry",
         "eval": "measure whether a policy survives a network",
         "policy": "serve a policy that controls robots elsewhere",
@@ -53,6 +54,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "world": "the robot: physics, sensors, guard, low-level control",
         "cloud": "the remote controller",
         "teleop": "missions and the operator's HTTP API",
+        "cell": "the radio cell that all robots of a fleet share",
     },
 }
 """Group of commands -> command -> help line. `cloudrc/cli/<command>.py` contains the command."""

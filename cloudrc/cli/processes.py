@@ -7,13 +7,20 @@ import re
 import socket
 from types import SimpleNamespace
 
-from cloudrc.cli.parser import Options, Parser, flags, settings_from
+from cloudrc.cli.parser import Options, Parser, flags, settings_from, whole_number
 from cloudrc.drivers.process import StopSignal
 from cloudrc.drivers.realtime import Address, split_address
 
 
 def process_arguments(parser: Parser) -> None:
     """Declare the flags that world, cloud, link and teleop have in common."""
+    status_arguments(parser)
+    about = "number in the experiment's fleet (default: no fleet)"
+    flags(parser)("--robot", "K", about, read=whole_number(0, 999))
+
+
+def status_arguments(parser: Parser) -> None:
+    """Declare the flags that all processes have in common."""
     add = flags(parser)
     add("--config", "FILE", "experiment file (YAML)", required=True)
     add("--feed", "", "write status for a supervisor to stdout (default: events only)")

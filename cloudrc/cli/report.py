@@ -7,13 +7,18 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.output import output_argument, paint, print_lines, print_result
 from cloudrc.cli.parser import Options, Parser, figure_arguments, flags
 from cloudrc.errors import BadInputError
 from cloudrc.text import escape
 
+if TYPE_CHECKING:
+    from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.record.columns import Recording
+
+PAGE = "report.html"
 EPILOG = """\
 examples:
   cloudrc report runs/latest
@@ -58,33 +63,45 @@ def execute(options: Options) -> int:
     from cloudrc.metrics.verdict import exit_code
     from cloudrc.record.topics import TOPICS
     from cloudrc.report.figures.style import Look
-    from cloudrc.report.folder import read_run
+    from cloudrc.report.fleet import summarize_fleet
+    from cloudrc.report.folder import check_ended, read_run, robots_in
     from cloudrc.report.write import write_report
-    from cloudrc.runs.session import check_ended, restore_mission
+    from cloudrc.runs.fleet import write_again
+    from cloudrc.runs.session import restore_mission
 
     measure.check(options.metric)
-    look = Look(options.width, options.font_size)
+    look, is_fleet = Look(options.width, options.font_size), bool(robots_in(options.run))
     with Progress(f"reads the recording of {options.run}") as view:
-        check_ended(options.run)
-        restore_mission(options.run)
-        recording, experiment, run = read_run(options.run)
-        # The run may come from somebody else: never execute files that it names.
-        unmeasured = measure.not_measured(experiment.report.metrics, options.metric)
-        run = replace(run, notes=(*run.notes, *unmeasured))
-        count = sum(len(recording[topic]) for topic in TOPICS)
-        view.tell(f"measures {count:,} messages and draws the figures")
-        document = write_report(
-            *(options.run, recording, experiment, run),
-            own=options.metric,
-            figures=options.figures,
-            look=look,
-        )
+
+        def write(folder: Path) -> tuple[Recording, ResolvedExperiment, dict[str, Any]]:
+            check_ended(folder)
+            restore_mission(folder)
+            recording, experiment, run = read_run(folder)
+            # The run may come from somebody else: never execute files that it names.
+            unmeasured = measure.not_measured(experiment.report.metrics, options.metric)
+            run = replace(run, notes=(*run.notes, *unmeasured))
+            count = sum(len(recording[topic]) for topic in TOPICS)
+            view.tell(f"measures {count:,} messages and draws the figures")
+            document = write_report(
+                *(folder, recording, experiment, run),
+                own=options.metric,
+                page=not is_fleet,
+                figures=options.figures,
+                look=look,
+            )
+            return recording, experiment, document
+
+        document = write_again(options.run, write) if is_fleet else write(options.run)[2]
     print_traceback(options, document)
-    print_result(options.output, document, summary(document, options.run))
+    if is_fleet:
+        text = f"\n{summarize_fleet(document, paint)}\n\n{escape(str(options.run / PAGE))}"
+    else:
+        text = summary(document, options.run)
+    print_result(options.output, document, text)
     return exit_code(document)
 
 
-def summary(report: Mapping[str, Any], folder: Path, last: str = "report.html") -> str:
+def summary(report: Mapping[str, Any], folder: Path, last: str = PAGE) -> str:
     """Summarize a report as text, and say where the replay and the file `last` are."""
     from cloudrc.report.summary import summarize
 

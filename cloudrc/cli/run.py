@@ -56,6 +56,7 @@ examples:
   cloudrc run pillars --mode virtual --report none        no report.html
   cloudrc run my.yaml --mode virtual --set cloud.predictor=./my_predictor.py
   cloudrc run --set cloud.controller=remote --with "node controller.js"
+  cloudrc run steps --mode local --set fleet.robots=3 --set cell.rate_kbit=1000
   cloudrc run --mode cluster --context kind-cloudrc -n demo --release demo
   cloudrc run runs/latest/config.yaml --mode virtual     the same run again
 
@@ -130,7 +131,7 @@ def fly_once(options: Options, mode: str, ready: Ready | None = None) -> int:
 
     experiment = _experiment(options, is_session=ready is not None)
     if experiment.is_fleet:
-        return _fly_fleet(experiment, options)
+        return _fly_fleet(experiment, options, is_session=ready is not None)
     check_mode(experiment, mode)
     warn(experiment)
     if changes := describe_changes(options.experiment, experiment):
@@ -169,33 +170,38 @@ def _experiment(options: Options, *, is_session: bool) -> ResolvedExperiment:
     return load(options.experiment, ["mission.touch=null", *options.set], options.seed)
 
 
-def _fly_fleet(experiment: ResolvedExperiment, options: Options) -> int:
-    """Fly a fleet in virtual time, print the summary, and return the exit code."""
+def _fly_fleet(experiment: ResolvedExperiment, options: Options, *, is_session: bool) -> int:
+    """Fly a fleet, print the summary, and return the exit code."""
     from cloudrc.cli.progress import Progress
     from cloudrc.config.overrides import OUTSIDE
     from cloudrc.metrics.verdict import exit_code
     from cloudrc.report.fleet import summarize_fleet
-    from cloudrc.runs.experiment import check_mode, robots_of
+    from cloudrc.runs.experiment import check_carried, check_mode, robots_of
     from cloudrc.runs.fleet import fly_fleet
+    from cloudrc.runs.own_files import describe_changes
 
+    mode = "local" if is_session else options.mode or "virtual"
     beside = options.beside or experiment.cloud.controller.name in OUTSIDE
-    if beside or options.figures or options.mode not in (None, "virtual"):
-        text = "a fleet flies in virtual time, without --figures and a controller outside"
+    if beside or is_session or mode == "cluster" or options.figures:
+        text = "a fleet flies with 'cloudrc run' here, without --figures and a controller outside"
         raise BadInputError(f"{text}; fleet.only=0 is its robot 0 alone")
+    load = check_carried(experiment) if mode == "local" else ""
     robots = robots_of(experiment, options.experiment, options.set, options.seed)
     for robot in robots:
-        check_mode(robot, "virtual")
+        check_mode(robot, mode)
     warn(*robots)
-    folder, page = run_folder(experiment, "virtual", options.out), options.report == "page"
+    if changes := describe_changes(options.experiment, experiment):
+        tell(f"warning: {changes}")
+    folder, page = run_folder(experiment, mode, options.out), options.report == "page"
     if options.output == "table":
         cell, count = experiment.cell, f"{len(robots)} robot{'s' * (len(robots) > 1)}"
         place = f" in a cell of {cell.rate_kbit:g} kbit/s ({cell.queue})" if cell.rate_kbit else ""
-        facts = f"mode virtual, seed {experiment.seed}, {experiment.network}"
+        facts = f"mode {mode}, seed {experiment.seed}, {experiment.network}"
         contents = experiment.mission.contents
-        print_or_drop(escape(f"{experiment.name}: {facts}, {count}{place}, {contents}"))
+        print_or_drop(escape(f"{experiment.name}: {facts}, {count}{place}, {contents}{load}"))
     with Progress("flies the fleet") as view:
         judging = partial(view.tell, "judges each robot")
-        report = fly_fleet(experiment, robots, folder, page=page, landed=judging)
+        report = fly_fleet(experiment, robots, mode, folder, page=page, landed=judging)
     last = folder / ("report.html" if page else "report.json")
     text = f"\n{summarize_fleet(report, paint)}\n\n{escape(str(last))}"
     print_result(options.output, report, text)

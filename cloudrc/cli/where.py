@@ -23,8 +23,8 @@ from cloudrc.runs.requirements import require
 from cloudrc.teleop.client import VARIABLE
 
 if TYPE_CHECKING:
+    from cloudrc.cli.under_way import RunInFlight
     from cloudrc.cluster.client import Release
-    from cloudrc.runs.under_way import RunInFlight
 
 READY_LIMIT = 300.0
 """Default time limit for the pods of a release to become ready [s]."""
@@ -90,7 +90,7 @@ def find_local_run(
 ) -> RunInFlight | None:
     """Find the run in flight that a command means; None if its flags name a cluster.
 
-    The parameters and errors are those of `runs.under_way.find_run`.
+    The parameters and errors are those of `cli.under_way.find_run`.
     """
     in_cluster = options.context or options.namespace or options.release
     if options.run is None and (in_cluster or Path(sys.argv[0]).name == KUBECTL_PLUGIN):
@@ -101,8 +101,8 @@ def find_local_run(
 
 
 def find_run_here(run: Path | None, *, steers: bool, links: bool = False) -> RunInFlight | None:
-    """Find a run as `runs.under_way.find_run` does; tell which one was chosen."""
-    from cloudrc.runs.under_way import find_run
+    """Find a run as `cli.under_way.find_run` does; tell which one was chosen."""
+    from cloudrc.cli.under_way import find_run
 
     found = find_run(run, steers=steers, links=links)
     if found is not None and found.note:

@@ -10,7 +10,7 @@ the operator's requests.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import nan
 from typing import Any
 
@@ -87,12 +87,15 @@ class ComputeTime:
         rng: np.random.Generator,
         cpu_clock: Callable[[], int] | None = None,
         cpu_share: float = 1.0,
+        times_ns: Sequence[float] = (),
     ) -> None:
         """Set mean `mean_ns` and standard deviation `deviation_ns` of the compute time [ns].
 
         `cpu_clock` returns the CPU time used so far [ns]. If it is given, the CPU time between
-        `begin` and `end` is added. `cpu_share` is the CPU limit, in processors [1].
+        `begin` and `end` is added. `cpu_share` is the CPU limit, in processors [1]. Of `times_ns`,
+        if there are any, each computation takes a random one [ns].
         """
+        self._times_ns = times_ns
         self._mean_ns, self._deviation_ns, self._rng = mean_ns, deviation_ns, rng
         self._cpu_clock, self._began_ns = cpu_clock, 0
         self._quota_ns = round(cpu_share * QUOTA_PERIOD_NS)
@@ -109,7 +112,9 @@ class ComputeTime:
         It began at `began_ns` [ns], cloud's clock.
         """
         time_ns = self._mean_ns
-        if self._deviation_ns:
+        if self._times_ns:
+            time_ns = self._times_ns[int(self._rng.integers(len(self._times_ns)))]
+        elif self._deviation_ns:
             shape = (self._mean_ns / self._deviation_ns) ** 2
             time_ns = self._rng.gamma(shape, self._mean_ns / shape)
         if self._cpu_clock is not None:

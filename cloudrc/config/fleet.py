@@ -11,7 +11,7 @@ from cloudrc.link.profile import NotNegative, Positive
 
 
 class FleetConfig(Section):
-    """Robots that fly at the same time, each in a world of its own; virtual time only."""
+    """Robots that fly at the same time, each in a world of its own."""
 
     robots: Annotated[int, Field(ge=1, le=1000)] = 1
     """Number of robots. Each has random numbers of its own; those of robot 0 are those of a flight
@@ -45,7 +45,7 @@ class TrafficConfig(Section):
 
 
 class CellConfig(Section):
-    """The radio cell that all robots of a fleet share; virtual time only.
+    """The radio cell that all robots of a fleet share.
 
     A packet is lost on its robot's link or else waits in the cell; then follow the link's delays.
     """

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
+from cloudrc.config.compute import compute_times
 from cloudrc.config.ground import put_on_ground
 from cloudrc.config.heading import without_held_yaws
 from cloudrc.config.hull import hull_of
@@ -147,6 +148,14 @@ def _combine(
     if isinstance(names := document.get("report", "metrics"), str):  # one metric without a list
         document.tree["report"]["metrics"] = [names]
     return document, found
+
+
+def robot_settings(robot: int | None) -> list[str]:
+    """Return the settings of a process that works for a robot of a fleet, or for no fleet (None).
+
+    A fleet in a cluster may grow, so the experiment's number of robots is no limit.
+    """
+    return [] if robot is None else [f"fleet.robots={robot + 1}", f"fleet.only={robot}"]
 
 
 def _settings_of_robot(document: Document, changes: Settings) -> Settings:
@@ -450,6 +459,7 @@ def _resolve_paths(document: Document) -> list[ConfigProblem]:
     """Make all paths in an experiment absolute, and check the files; return problems."""
     found = resolve_files(document, ("link",))
     paths: list[KeyPath] = [("mission", "setpoints"), ("world", "robot"), ("world", "scene")]
+    paths.append(("cloud", "compute_ms"))
     metrics = document.get("report", "metrics")
     if isinstance(metrics, list):
         named = [n for n, name in enumerate(metrics) if plugins.is_path(str(name))]
@@ -465,5 +475,7 @@ def _resolve_paths(document: Document) -> list[ConfigProblem]:
                 name = str(source.absolute(name))
             if key == "robot":
                 known_robot(name)
+            elif key == "compute_ms":
+                compute_times(name)
             document.set_value(path, name, source)
     return found

@@ -331,6 +331,16 @@ ComputeSpeed = Annotated[float, Field(ge=0.01, le=100)]
 """Speed of a processor, as a multiple of that of the reference."""
 
 
+def _compute_tag(value: Any) -> str:
+    return "<file>" if isinstance(value, str) else "<time>"
+
+
+ComputeMs = Annotated[
+    Annotated[float, Field(ge=0, le=1000), Tag("<time>")] | Annotated[str, Tag("<file>")],
+    Discriminator(_compute_tag),
+]
+
+
 class Cloud(Section):
     """The remote controller."""
 
@@ -360,10 +370,11 @@ class Cloud(Section):
     command_rate_hz: Annotated[int, Field(ge=COMMAND_RATE_MIN_HZ, le=COMMAND_RATE_MAX_HZ)] = 100
     """Rate of the commands [Hz]. At less than 20 Hz the guard would never leave HOLD, which takes
     10 commands within 500 ms"""
-    compute_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
-    """Mean of the emulated computing time of a command [ms]. In real time, the true computing time
-    is added. Cloud begins the next command only after this time. Reports count this time as part
-    of the downlink delay"""
+    compute_ms: ComputeMs = 0.0
+    """Mean of the emulated computing time of a command [ms]; or a file with a time in each line, of
+    which each command takes a random one: `cloudrc measure compute` writes it. In real time, the
+    true computing time is added. Cloud begins the next command only after this time. Reports count
+    this time as part of the downlink delay"""
     compute_deviation_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
     """Standard deviation of the time compute_ms [ms], which then has a gamma distribution; needs
     compute_ms above 0"""
@@ -394,10 +405,11 @@ class Cloud(Section):
 
     @model_validator(mode="after")
     def _check_compute(self) -> Cloud:
-        timed = self.compute_ms > 0 or self.place is not None
+        timed = self.compute_ms or self.place is not None
         if self.cores and (not timed or self.compute_measured or self.cpu_share < 1):
             raise ValueError("cores needs compute_ms above 0, not compute_measured or cpu_share")
-        if self.compute_deviation_ms > 0 and self.compute_ms == 0:
+        mean = self.compute_ms if isinstance(self.compute_ms, float) else 0.0
+        if self.compute_deviation_ms > 0 and not mean:
             raise ValueError("compute_deviation_ms needs compute_ms, the mean, above 0")
         if self.cpu_share < 1 and not (self.compute_ms or self.compute_measured):
             raise ValueError("cpu_share needs compute_ms above 0 or compute_measured")

@@ -18,7 +18,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.metrics_core import Metric as Family
 
 from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.exposition.live import LinkMetrics, LiveMetrics
+from cloudrc.exposition.live import CellMetrics, LinkMetrics, LiveMetrics
 from cloudrc.exposition.parts import Histogram, Readings, samples
 from cloudrc.exposition.table import Labels, LiveMetric, MetricKind, of_role
 from cloudrc.link.state import LinkState
@@ -137,7 +137,7 @@ class Exporter:
     """
 
     def __init__(self, role: str, config: str = "") -> None:
-        """Set the role of the process: "world", "cloud", "teleop" or "link".
+        """Set the role of the process, one of `ROLES`.
 
         `config` is the hash of the process's configuration.
         """
@@ -157,7 +157,7 @@ class Exporter:
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether this process is ready; only teleop and link call this method.
+        """Set whether this process is ready; teleop, link and cell call this method.
 
         World and cloud are ready while the peer sends.
         """
@@ -169,6 +169,12 @@ class Exporter:
         """The metrics of the emulated link; only an exporter with the role "link" has them."""
         assert self._live.link is not None, "only a link is shaped"
         return self._live.link
+
+    @property
+    def cell(self) -> CellMetrics:
+        """The metrics of the cell of a fleet; only an exporter with the role "cell" has them."""
+        assert self._live.cell is not None, "this is no cell"
+        return self._live.cell
 
     def shaped(self, state: LinkState) -> None:
         """Take the state of the direction that this process shapes: now it is ready."""

@@ -14,49 +14,12 @@ from __future__ import annotations
 from bisect import insort
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from heapq import heapreplace
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 from cloudrc.drivers.virtual import PERIOD_NS, Sink, VirtualRun, without_collections
-from cloudrc.link.cell import Cell, CellPacket
-from cloudrc.link.model import HEADER_BYTES, LinkDirection
-from cloudrc.link.queue import NOTHING_NS, PacketQueue
-
-
-class CellQueue(PacketQueue):
-    """The packets of a robot in flight behind a cell; new ones are sent through the cell."""
-
-    def __init__(
-        self, robot: int, cells: Sequence[Cell], orders: Sequence[bool], downlink: LinkDirection
-    ) -> None:
-        """Set the robot's number, the cells of both ways, and which ways keep the order."""
-        super().__init__()
-        self._robot, self._cells, self._orders = robot, cells, orders
-        self._downlink = downlink
-        self._last_ns, self._numbers = [0, 0], 0
-
-    def send(
-        self, link: LinkDirection, header: tuple[int, int, int], size: int, data: Any, now_ns: int
-    ) -> None:
-        """Send a packet through the cell, unless the link loses it; each copy takes its place."""
-        kind, epoch, counter = header
-        arrivals = link.send(epoch, kind, counter, size, now_ns)
-        if arrivals and link.corrupts:
-            data = link.corrupted(epoch, kind, counter, data)
-        way = int(link is self._downlink)
-        for arrival_ns in arrivals:
-            self._numbers += 1
-            leave = partial(self._leave, way, link, data, arrival_ns - now_ns)
-            what = self._robot, self._numbers, kind, size + HEADER_BYTES, leave
-            self._cells[way].inbox.append(CellPacket(now_ns, way, *what))
-
-    def _leave(self, way: int, link: LinkDirection, data: Any, delay_ns: int, now_ns: int) -> None:
-        """Take a packet that has left the cell at `now_ns` [ns]."""
-        arrival_ns = now_ns + delay_ns
-        if self._orders[way]:
-            arrival_ns = self._last_ns[way] = max(arrival_ns, self._last_ns[way])
-        self.put(link, (arrival_ns,), data)
+from cloudrc.link.cell import Cell
+from cloudrc.link.queue import NOTHING_NS
 
 
 class Computation(NamedTuple):

@@ -1,4 +1,8 @@
-"""Read the key file of world or cloud, and reload it in flight: an operator may rotate the key."""
+"""Read the key file of world or cloud, and reload it in flight: an operator may rotate the key.
+
+The robots of a fleet have keys of their own, derived from one file: the world of one robot thus
+never obeys the cloud of another, even if somebody mixes up their ports.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +24,14 @@ SIZE_MAX = 4096
 class KeyFile:
     """Reloads the key file of world or cloud when it changes; `ring` holds the valid keys."""
 
-    def __init__(self, path: Path, now_ns: int) -> None:
-        """Read the file at `now_ns` [ns, monotonic clock]; raise the errors of `read_keys`."""
-        self._file = Watched(path, PERIOD_NS)
+    def __init__(self, path: Path, now_ns: int, robot: int | None = None) -> None:
+        """Read the file at `now_ns` [ns, monotonic clock]; raise the errors of `read_keys`.
+
+        `robot` is the number of a robot in a fleet, whose keys are derived from those of the file.
+        """
+        self._file, self._robot = Watched(path, PERIOD_NS), robot
         self._file.is_new(now_ns)
-        self.ring = KeyRing(read_keys(path))
+        self.ring = KeyRing(self._read())
 
     def follow(self, now_ns: int) -> list[Fault]:
         """Reload the file if it has changed and a check is due at `now_ns` [ns, monotonic clock].
@@ -36,7 +43,7 @@ class KeyFile:
             return []
         before = self.ring.keys
         try:
-            keys = read_keys(self._file.path)
+            keys = self._read()
         except CloudrcError as error:
             return [Fault(now_ns, "key", f"the old keys stay in use: {error}")]
         if keys == before:
@@ -45,6 +52,13 @@ class KeyFile:
         new = "new " if keys.current != before.current else ""
         also = f"{keys.previous.name} is accepted, too" if keys.previous else "no other is accepted"
         return [Fault(now_ns, "key", f"{new}key {keys.current.name}; {also}")]
+
+    def _read(self) -> KeySet:
+        keys = read_keys(self._file.path)
+        if self._robot is None:
+            return keys
+        use = b"robot %d" % self._robot
+        return KeySet(*(Key(key.derive(b"", use)) for key in keys.accepted))  # HKDF-SHA256
 
 
 def read_keys(path: Path, named: str = "--key ") -> KeySet:

@@ -63,6 +63,8 @@ LINK_FOLDER, ROUTE_FILE = "link", "route"
 the address of the relay (`ROUTE_FILE`) and the state of the link."""
 JOURNAL_FILE = "missions.journal"
 """File in a session's folder: teleop's store of the missions."""
+RECEIVERS = ("world", "cloud", "uplink", "downlink")
+"""Processes that receive datagrams."""
 LINK_LOG = "uplink.log"
 """File in the folder of every run in real time."""
 CONTROLLER = "controller"
@@ -175,12 +177,17 @@ def end_session(run: Path, limit: float) -> None:
 class Child:
     """A process of a local run, such as world, which the supervisor has started."""
 
-    name: str  # "world", "cloud", "teleop", "uplink" or "downlink"
+    name: str  # "world", "cloud", "teleop", "uplink" or "downlink"; in a fleet "robot-0/world"
     process: subprocess.Popen[bytes]
     log: Path  # file with the process's standard error
     unread: bytes = b""  # start of a line of output whose end has not arrived yet
     heard: float = 0.0  # time at which the last line arrived [s], the run's clock
     ready: bool = False  # whether the process can receive datagrams
+
+    @property
+    def is_teleop(self) -> bool:
+        """Whether it commands a robot, and ends after the mission."""
+        return self.log.stem == "teleop"
 
     def take(self, data: bytes, now: float) -> list[Record]:
         """Parse output that arrives at `now` [s]; return the records in complete lines."""
@@ -193,6 +200,19 @@ class Child:
             else:
                 records.append(from_line(line.decode()))
         return records
+
+
+class RobotProcesses(NamedTuple):
+    """The files and addresses of the processes of a robot."""
+
+    folder: Path  # of the recording
+    sockets: Path  # private folder
+    at: Mapping[str, str]  # process -> HOST:PORT at which it receives
+
+    @property
+    def url(self) -> str:
+        """Address of the API."""
+        return f"unix:{self.sockets}/api.sock"
 
 
 class LocalRun:
@@ -245,85 +265,106 @@ class LocalRun:
             TimedOutError: If the limit is reached, or if a process hangs; the message names it.
             KeyboardInterrupt: If the user interrupts.
         """
-        # The sockets are not in the run's folder, whose path may be too long for a Unix socket.
-        # Their folder is private: it also contains this run's key.
-        with tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder()) as sockets:
-            url = f"unix:{sockets}/api.sock"
-            kind = SESSION if self._session else RUN
-            self.announcement.enter_context(announced(self._folder, url, kind))
+        with contextlib.ExitStack() as files:
+            if not self._session:
+                files.callback(self.announcement.close)
             try:
-                key = Path(sockets, "key")
-                key.touch(0o600)
-                key.write_text(write(KeySet(Key(os.urandom(KEY_SIZE)))), encoding="ascii")
-                self._fly(limit, Path(sockets), url)
+                self._fly(limit, files)
             finally:
                 self._stop()
-                (self._folder / API_FILE).unlink(missing_ok=True)
-                shutil.rmtree(self._folder / LINK_FOLDER, ignore_errors=True)
-                if not self._session:
-                    self.announcement.close()
 
-    def _fly(self, limit: float, sockets: Path, url: str) -> None:
-        folder, session = self._folder, self._session
+    def _fly(self, limit: float, files: contextlib.ExitStack) -> None:
+        session = self._session
         ports = [f"127.0.0.1:{port}" for port in free_ports(9 if session else 4)]
-        at = dict(zip(("world", "cloud", "uplink", "downlink"), ports, strict=False))
         names = ("world", "cloud", "teleop", "uplink", "downlink")
         self._metrics = dict(zip(names, ports[4:], strict=False))
-
-        flights = ("--record-flights",) if session else ()
-
-        def start_end(name: str, way: str, **more: object) -> None:
-            self._start(
-                name,
-                name,
-                *flights,
-                listen=at[name],
-                route=folder / LINK_FOLDER / way / ROUTE_FILE,
-                key=sockets / "key",
-                record=folder / f"{name}.mcap",
-                **more,
-            )
-
-        start_end("world", "uplink")
-        # Only this user can open the socket of the API: no token is needed.
-        self._start(
-            "teleop",
-            "teleop",
-            *([f"--journal={folder / JOURNAL_FILE}"] if session else ["--start"]),
-            f"--api-file={folder / API_FILE}",
-            socket=sockets,
-            api=url,
-            link=folder / LINK_FOLDER / "downlink" / STATE_FILE,
-        )
+        robot = self._open(self._folder, dict(zip(RECEIVERS, ports, strict=False)), files)
+        self._start_end(robot, "world", ROUTE_FILE)
+        self._start_teleop(robot)
         self._wait_until_ready()
         # With cloud, which sends first: the time lines of the link begin shortly before the flight.
-        origin_ns = time.monotonic_ns()  # one start for both directions
-        world, cloud = at["world"], at["cloud"]
-        self._start_link("uplink", url, origin_ns, listen=at["uplink"], end=world, peer=cloud)
-        self._start_link("downlink", url, origin_ns, listen=at["downlink"], end=cloud, peer=world)
+        self._start_links(robot, time.monotonic_ns())
         if self._remote:
-            self._start(CONTROLLER, "policy", "drive", socket=sockets)
+            self._start(robot.folder, CONTROLLER, "policy", "drive", socket=robot.sockets)
             self._wait_until_ready()
-        start_end("cloud", "downlink", teleop=sockets)
+        self._start_end(robot, "cloud", ROUTE_FILE, teleop=robot.sockets)
         self._wait_until_ready()
         if session:
-            session(url, self._metrics)
-        self._watch(limit, sockets)
+            session(robot.url, self._metrics)
+        self._watch(limit, robot.sockets)
 
-    def _start_link(self, way: str, url: str, origin_ns: int, **at: str) -> None:
-        words, control = link_words(self._folder / LINK_FOLDER, way), link_socket(url, way)
-        self._start(way, *words, mode="relay", origin=origin_ns, control=control, **at)
+    def _open(
+        self, folder: Path, at: Mapping[str, str], files: contextlib.ExitStack
+    ) -> RobotProcesses:
+        """Make the files of a robot's processes; `files` removes those that only a flight needs."""
+        files.callback((folder / API_FILE).unlink, missing_ok=True)
+        files.callback(shutil.rmtree, folder / LINK_FOLDER, ignore_errors=True)
+        # The sockets are not in the run's folder, whose path may be too long for a Unix socket.
+        # Their folder is private: it also contains this run's key.
+        private = tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder())
+        robot = RobotProcesses(folder, Path(files.enter_context(private)), at)
+        kind = SESSION if self._session else RUN
+        self.announcement.enter_context(announced(folder, robot.url, kind))
+        key = robot.sockets / "key"
+        key.touch(0o600)
+        key.write_text(write(KeySet(Key(os.urandom(KEY_SIZE)))), encoding="ascii")
+        return robot
 
-    def _start(self, name: str, *words: str, **options: object) -> None:
-        options["config"] = self._folder / "config.yaml"
+    def _start_end(self, robot: RobotProcesses, name: str, route: str, **more: object) -> None:
+        """Start world or cloud; the file `route` will have the address to which it sends."""
+        way = "uplink" if name == "world" else "downlink"
+        self._start(
+            robot.folder,
+            name,
+            name,
+            *(["--record-flights"] if self._session else []),
+            listen=robot.at[name],
+            route=robot.folder / LINK_FOLDER / way / route,
+            key=robot.sockets / "key",
+            record=robot.folder / f"{name}.mcap",
+            **more,
+        )
+
+    def _start_teleop(self, robot: RobotProcesses) -> None:
+        folder = robot.folder
+        # Only this user can open the socket of the API: no token is needed.
+        self._start(
+            folder,
+            "teleop",
+            "teleop",
+            *([f"--journal={folder / JOURNAL_FILE}"] if self._session else ["--start"]),
+            f"--api-file={folder / API_FILE}",
+            socket=robot.sockets,
+            api=robot.url,
+            link=folder / LINK_FOLDER / "downlink" / STATE_FILE,
+        )
+
+    def _start_links(self, robot: RobotProcesses, origin_ns: int) -> None:
+        """Start both directions of a robot's link; their time lines begin at `origin_ns` [ns]."""
+        for way, end, peer in (("uplink", "world", "cloud"), ("downlink", "cloud", "world")):
+            self._start(
+                robot.folder,
+                way,
+                *link_words(robot.folder / LINK_FOLDER, way),
+                mode="relay",
+                origin=origin_ns,
+                control=link_socket(robot.url, way),
+                listen=robot.at[way],
+                end=robot.at[end],
+                peer=robot.at[peer],
+            )
+
+    def _start(self, folder: Path, name: str, *words: str, **options: object) -> None:
+        options["config"] = folder / "config.yaml"
         if name in self._metrics:
             options["metrics"] = self._metrics[name]
-        log = self._folder / f"{name}.log"
+        log = folder / f"{name}.log"
         with log.open("wb") as errors:
             process = start_process([*words, "--feed"], options, subprocess.PIPE, errors)
         assert process.stdout is not None
         os.set_blocking(process.stdout.fileno(), False)
-        self._children.append(Child(name, process, log))
+        label = str((folder / name).relative_to(self._folder))
+        self._children.append(Child(label, process, log))
         self._selector.register(process.stdout, selectors.EVENT_READ, self._children[-1])
 
     def _wait_until_ready(self) -> None:
@@ -336,8 +377,8 @@ class LocalRun:
 
     def _watch(self, limit: float, sockets: Path) -> None:
         until, paused = self._clock() + limit, self._clock.pause
-        teleop = next(child for child in self._children if child.name == "teleop")
-        while teleop.process.poll() is None:
+        teleops = [child for child in self._children if child.is_teleop]
+        while any(teleop.process.poll() is None for teleop in teleops):
             records = self._listen()
             self._see(records)
             self._lost(records)
@@ -355,7 +396,7 @@ class LocalRun:
                 paused = self._clock.pause
             self._check_alive()
             for child in self._children:
-                if now - child.heard > SILENCE_LIMIT:
+                if now - child.heard > SILENCE_LIMIT and child.process.poll() is None:
                     raise TimedOutError(
                         f"the {child.name} process was silent for {SILENCE_LIMIT:g} s and was "
                         f"ended; see {child.log}"
@@ -376,7 +417,7 @@ class LocalRun:
     def _check_alive(self) -> None:
         for child in self._children:
             code = child.process.poll()
-            is_over = child.name == "teleop" and code == 0 and not self._session
+            is_over = child.is_teleop and code == 0 and not self._session
             if code is None or is_over:
                 continue
             how = f"signal {-code}" if code < 0 else f"exit code {code}"

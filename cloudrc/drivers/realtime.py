@@ -12,7 +12,7 @@ import select
 import socket
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from ipaddress import ip_address
 from pathlib import Path
 
@@ -135,18 +135,21 @@ def bind(listen: Address) -> socket.socket:
     return udp
 
 
-def free_ports(count: int) -> list[int]:
+def free_ports(count: int, width: int = 1) -> list[int]:
     """Choose random ports on 127.0.0.1 that are unused for both UDP and TCP.
 
-    The kernel uses another range for outgoing connections, so the ports stay free.
+    The kernel uses another range for outgoing connections, so the ports stay free. Each is the
+    first of `width` unused ports.
     """
     found: list[int] = []
-    for port in random.SystemRandom().sample(PORTS, len(PORTS)):
-        with socket.socket(type=socket.SOCK_DGRAM) as udp, socket.socket() as tcp:
-            with suppress(OSError):
-                udp.bind(("127.0.0.1", port))
-                tcp.bind(("127.0.0.1", port))
-                found.append(port)
+    starts = PORTS[::width]
+    for port in random.SystemRandom().sample(starts, len(starts)):
+        with suppress(OSError), ExitStack() as opened:
+            for one in range(port, port + width):
+                for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM):
+                    tried = opened.enter_context(socket.socket(type=kind))
+                    tried.bind(("127.0.0.1", one))
+            found.append(port)
         if len(found) == count:
             return found
     raise MissingPrerequisiteError(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import nan
 from typing import Any, TypeAlias, get_args
 
@@ -309,6 +309,32 @@ class LinkMetrics:
         self._values["cloudrc_link_delay_seconds"] = dict(self._delays)
 
 
+class CellMetrics:
+    """Metrics of the radio cell of a fleet."""
+
+    def __init__(self, values: Values) -> None:
+        self._values = values
+
+    def take(
+        self, rows: Sequence[Mapping[str, Any]], dropped: Mapping[tuple[str, int], int]
+    ) -> None:
+        """Take the newest rows of a `CellLog`, each of a tenth of a second, and its `dropped`."""
+        lost = defaultdict[str, dict[str, int]](dict)
+        for (way, robot), count in sorted(dropped.items()):
+            if robot >= 0:
+                lost[str(robot)][way] = count
+        ways = {row["direction"]: row for row in rows}
+        self._values |= {  # new dictionaries: another thread may read the old ones
+            "cloudrc_cell_dropped_total": lost,
+            "cloudrc_cell_utilisation": {way: ways[way]["busy_ns"] * 1e-8 for way in ways},
+            "cloudrc_cell_queue_packets": {way: ways[way]["most"] for way in ways},
+            "cloudrc_cell_wait_seconds": {
+                way: row["waited_ns"] * 1e-9 / row["packets"] if row["packets"] else nan
+                for way, row in ways.items()
+            },
+        }
+
+
 NO_WAYPOINT = -1
 """Index of the waypoint while no mission is active."""
 HELD = table.MISSION_STATES.index("held")
@@ -371,6 +397,7 @@ PARTS = {
     table.CLOUD: CloudEnd,
     table.TELEOP: MissionMetrics,
     table.LINK: LinkMetrics,
+    table.CELL: CellMetrics,
 }
 """Role of a process -> what handles its records: method `_on_NAME` those of the class NAME."""
 
@@ -379,7 +406,7 @@ class LiveMetrics:
     """Current metrics of one process. One thread calls `see`, any other thread may call `read`."""
 
     def __init__(self, role: str) -> None:
-        """Set the role of the process: "world", "cloud", "teleop" or "link"."""
+        """Set the role of the process, one of `table.ROLES`."""
         # The exporter reads the metrics that all processes have.
         metrics = [metric for metric in of_role(role) if metric.roles != table.ROLES]
         # It has a key per metric from now on: another thread may read it at any time.
@@ -387,6 +414,7 @@ class LiveMetrics:
         part = PARTS[role](values)
         self.end = part if isinstance(part, End) else None
         self.link = part if isinstance(part, LinkMetrics) else None
+        self.cell = part if isinstance(part, CellMetrics) else None
         self._places = _places(metrics, values)
         self._handlers: dict[type, Callable[[Any], None]] = {Counted: self._on_counted}
         for kind in get_args(Record):

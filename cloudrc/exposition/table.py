@@ -17,8 +17,8 @@ from cloudrc.messages import Cause, GuardState
 from cloudrc.metrics.definitions import QUANTITIES
 from cloudrc.records import FAILURES, Control
 
-WORLD, CLOUD, TELEOP, LINK = "world", "cloud", "teleop", "link"
-ROLES = (WORLD, CLOUD, TELEOP, LINK)
+WORLD, CLOUD, TELEOP, LINK, CELL = "world", "cloud", "teleop", "link", "cell"
+ROLES = (WORLD, CLOUD, TELEOP, LINK, CELL)
 ENDS = (WORLD, CLOUD)
 
 AXES = ("x", "y", "z")
@@ -75,7 +75,7 @@ def numbered(names: tuple[str, ...]) -> str:
 
 
 _TABLE = f"""
-world cloud teleop link
+world cloud teleop link cell
 cloudrc_build_info[version, role, config]: Always 1; the labels name the process, its version and
     its configuration. Both ends of a run have the same configuration.
 cloudrc_ready: 1 while this process is ready, as /readyz on the same port says, else 0.
@@ -191,11 +191,21 @@ cloudrc_link_released_early_total = released_early: Datagrams that left the rela
     the relay has a bug; absent with netem.
 cloudrc_dns_errors_total = unresolved: Failed look-ups of the peer's name; the last known address
     stays in use.
+
+cell
+cloudrc_cell_utilisation[direction]: Part of the last tenth of a second in which the cell was busy.
+cloudrc_cell_queue_packets[direction]: Largest number of packets that waited in the last tenth of a
+    second.
+cloudrc_cell_dropped_total[robot, direction]: Packets of a robot that the full queue dropped, or
+    that a newer packet replaced.
+cloudrc_cell_wait_seconds[direction]: Mean wait of the packets that left in the last tenth of a
+    second; absent without packets.
 """
 """All metrics but those of `QUANTITIES`, in blocks: the processes that expose them, then
 name[labels] = count: meaning."""
+_OF_CELL = "utilisation", "queue_packets", "dropped_total", "wait_seconds"
 _LABELS: Mapping[str, Labels] = {
-    **dict.fromkeys(("version", "config", "sensor", "unit", "body"), ()),
+    **dict.fromkeys(("version", "config", "sensor", "unit", "body", "robot"), ()),
     "role": ROLES,
     "direction": DIRECTIONS,
     "axis": AXES,
@@ -215,6 +225,7 @@ _LABELS: Mapping[str, Labels] = {
     "cloudrc_link_step_lateness_seconds percentile": ("50", "99"),
     "cloudrc_link_release_error_seconds percentile": RELEASE_PERCENTILES,
     "cloudrc_link_datagrams_total outcome": LINK_OUTCOMES,
+    **{f"cloudrc_cell_{name} direction": (*DIRECTIONS, "both") for name in _OF_CELL},
 }
 """Label, or metric and label -> all values of the label; () if the values are not known."""
 _DELAYS = "uplink_delay downlink_delay age_of_information rtt command_age"

@@ -7,15 +7,16 @@ packets sent before an instant, and tells which leave until this instant.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from heapq import heappop, heappush
 from math import inf
 from typing import Any, Literal, NamedTuple
 
-from cloudrc.link.model import HEADER_BYTES
-from cloudrc.link.queue import NOTHING_NS
+from cloudrc.link.model import HEADER_BYTES, LinkDirection
+from cloudrc.link.queue import NOTHING_NS, PacketQueue
 
 QUANTUM = 1500
 """What a robot may send in its turn with the queue drr [bytes].
@@ -262,3 +263,80 @@ class Bulk:
         """Expect the confirmation of a packet that has left at `now_ns` [ns]."""
         heappush(self._confirmed, now_ns + ROUND_TRIP_NS)
         self.next_ns = min(self.next_ns, self._confirmed[0])
+
+
+class CellQueue(PacketQueue):
+    """The packets of a robot in flight behind a cell; new ones are sent through the cell."""
+
+    def __init__(
+        self, robot: int, cells: Sequence[Cell], orders: Sequence[bool], downlink: LinkDirection
+    ) -> None:
+        """Set the robot's number, the cells of both ways, and which ways keep the order."""
+        super().__init__()
+        self._robot, self._cells, self._orders = robot, cells, orders
+        self._downlink = downlink
+        self._last_ns, self._numbers = [0, 0], 0
+
+    def send(
+        self, link: LinkDirection, header: tuple[int, int, int], size: int, data: Any, now_ns: int
+    ) -> None:
+        """Send a packet through the cell, unless the link loses it; each copy takes its place."""
+        kind, epoch, counter = header
+        arrivals = link.send(epoch, kind, counter, size, now_ns)
+        if arrivals and link.corrupts:
+            data = link.corrupted(epoch, kind, counter, data)
+        way = int(link is self._downlink)
+        for arrival_ns in arrivals:
+            self._numbers += 1
+            leave = partial(self._leave, way, link, data, arrival_ns - now_ns)
+            what = self._robot, self._numbers, kind, size + HEADER_BYTES, leave
+            self._cells[way].inbox.append(CellPacket(now_ns, way, *what))
+
+    def _leave(self, way: int, link: LinkDirection, data: Any, delay_ns: int, now_ns: int) -> None:
+        """Take a packet that has left the cell at `now_ns` [ns]."""
+        arrival_ns = now_ns + delay_ns
+        if self._orders[way]:
+            arrival_ns = self._last_ns[way] = max(arrival_ns, self._last_ns[way])
+        self.put(link, (arrival_ns,), data)
+
+
+class CellLog:
+    """What the cells of a fleet do, in each tenth of a second.
+
+    Attributes:
+        ways: Directions: "uplink" and "downlink", or "both".
+        rows: The rows of a CSV file; `dropped_by` has a pair ROBOT:PACKETS for each robot.
+        dropped: Direction and robot, below 0 others, -> number of packets that were dropped.
+    """
+
+    def __init__(self, served: Sequence[Cell]) -> None:
+        """Take the cells of uplink and downlink, or the one that both share."""
+        self.ways: tuple[str, ...] = {0: (), 1: ("both",), 2: ("uplink", "downlink")}[len(served)]
+        self._cells, self.rows = served, list[dict[str, Any]]()
+        self.dropped = Counter[tuple[str, int]]()
+
+    @classmethod
+    def read(cls, rows: Iterable[Mapping[str, str]]) -> CellLog:
+        """Return the log whose rows a CSV file has; raise a ValueError or KeyError for others."""
+        log = cls(())
+        for row in rows:
+            way, by, numbers = row["direction"], row["dropped_by"], dict(row)
+            del numbers["direction"], numbers["dropped_by"]
+            time_s = float(numbers.pop("time_s"))
+            counts = {name: int(value) for name, value in numbers.items()}
+            log.rows.append({"time_s": time_s, "direction": way, **counts, "dropped_by": by})
+            for pair in by.split():
+                flow, _, count = pair.partition(":")
+                log.dropped[way, int(flow)] += int(count)
+        log.ways = tuple(dict.fromkeys(row["direction"] for row in log.rows))
+        return log
+
+    def take(self, now_ns: int) -> None:
+        """End a period at `now_ns` [ns]."""
+        for way, cell in zip(self.ways, self._cells, strict=True):
+            values, cell.usage = asdict(cell.usage), Usage()
+            dropped = values.pop("dropped")
+            self.dropped.update({(way, flow): count for flow, count in dropped.items()})
+            row = {"time_s": now_ns / 1e9, "direction": way, **values}
+            by = " ".join(f"{flow}:{count}" for flow, count in sorted(dropped.items()))
+            self.rows.append(row | {"dropped": sum(dropped.values()), "dropped_by": by})

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from cloudrc import assembly, source
 from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.cloud.controllers.ros2 import RosController
-from cloudrc.config.load import load_experiment, read_experiment
+from cloudrc.config.load import load_experiment, read_experiment, robot_settings
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import known_robot
 from cloudrc.drivers.keyfile import KeyFile
@@ -60,6 +60,7 @@ class EndSettings:
     metrics: Address | None = None  # serve metrics here
     record_flights: bool = False  # no periodic records while the robot does not fly
     record_max: float | None = None  # limit of both recordings [bytes]
+    robot: int | None = None  # number in a fleet
 
 
 def run_world(settings: EndSettings, stop: StopSignal) -> None:
@@ -151,11 +152,12 @@ def open_end(settings: EndSettings, name: str) -> tuple[ResolvedExperiment, Iden
     """
     feed = Feed.on_stdout(watched=settings.feed)  # before plug-ins are loaded: they may print
     path, clock, key = str(settings.config), clock_id(), settings.key
-    given = read_experiment(path)
+    own = robot_settings(settings.robot)
+    given = read_experiment(path, own)
     exporter = open_exporter(name, given, settings.metrics)
     # Only cloud loads the plug-ins, which fill in their default parameters.
-    experiment = load_experiment(path) if name == "cloud" else given
-    keys = KeyFile(key, time.monotonic_ns())
+    experiment = load_experiment(path, own) if name == "cloud" else given
+    keys = KeyFile(key, time.monotonic_ns(), settings.robot)
     warn_if_readable(key, warn)
     link = settings.route.with_name(STATE_FILE)
     with listening("--listen", settings.listen):
@@ -226,15 +228,17 @@ def link_monitor(experiment: ResolvedExperiment, *, uplink: bool, trusted: bool)
     """Make the monitor that compares the received datagrams with the link profile.
 
     `uplink` is True in cloud, False in world. If the link is not `trusted`, as in a pod, the
-    monitor refuses trace files that are larger than TRACE_MAX.
+    monitor refuses trace files that are larger than TRACE_MAX. It does not know how long packets
+    wait in a cell, so it does not judge a link behind one.
     """
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
     rate = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
     size = COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
     if uplink:
         size = TELEMETRY_SIZES[len(known_robot(experiment.world.robot).sensors)]
-    flow = Flow(experiment.seed, uplink, kind, size)
-    computes, file_max = experiment.cloud.compute_ms > 0, SIZE_MAX if trusted else TRACE_MAX
+    flow = Flow(experiment.seed, uplink, kind, size, experiment.stream)
+    computes, file_max = bool(experiment.cloud.compute_ms), SIZE_MAX if trusted else TRACE_MAX
     check = LinkMonitor(uplink, flow, period=1.0 / rate, computes=computes, file_max=file_max)
-    check.begin((link_profile(experiment.uplink), link_profile(experiment.downlink)))
+    if experiment.cell.rate_kbit is None:
+        check.begin((link_profile(experiment.uplink), link_profile(experiment.downlink)))
     return check

@@ -18,7 +18,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
 
-from cloudrc.config.load import load_link, read_experiment
+from cloudrc.config.load import load_link, read_experiment, robot_settings
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.drivers.link_control import ControlServer
 from cloudrc.drivers.process import Feed, StopSignal
 from cloudrc.drivers.programs import Programs, run_tool
@@ -62,12 +63,13 @@ class LinkSettings:
     control: Path | None = None  # Unix socket on which the link can be changed
     feed: bool = False  # write status for a supervisor to stdout
     metrics: Address | None = None  # serve metrics here
+    robot: int | None = None  # number in a fleet
 
 
 def run_link(settings: LinkSettings, stop: StopSignal) -> None:
     """Shape one direction of the link until `stop`."""
     feed = Feed.on_stdout(watched=settings.feed)
-    experiment = read_experiment(str(settings.config))
+    experiment = read_experiment(str(settings.config), robot_settings(settings.robot))
     exporter = open_exporter("link", experiment, settings.metrics)
     load = make_profile_loader(settings.direction, settings.config.absolute())
     profiles = Profiles(settings.profile, load, log)
@@ -75,7 +77,7 @@ def run_link(settings: LinkSettings, stop: StopSignal) -> None:
     with TemporaryDirectory(prefix="tc-", dir=settings.route.parent) as tables:
         programs = Programs(tables)
         sidecar = Sidecar(
-            machine=_machine(settings, experiment.seed, programs, Path(tables)),
+            machine=_machine(settings, experiment, programs, Path(tables)),
             profile=profile,
             mode=settings.mode,
             direction=settings.direction,
@@ -126,7 +128,10 @@ def make_profile_loader(direction: str, experiment: Path) -> Load:
     return load
 
 
-def _machine(settings: LinkSettings, seed: int, programs: Programs, tables: Path) -> Machine:
+def _machine(
+    settings: LinkSettings, experiment: ResolvedExperiment, programs: Programs, tables: Path
+) -> Machine:
+    seed, stream, is_up = experiment.seed, experiment.stream, settings.direction == "uplink"
     clock, wait = time.monotonic_ns, time.sleep
     netem = partial(Netem, programs, clock=clock, wait=wait, tables=tables, log=log)
 
@@ -134,7 +139,7 @@ def _machine(settings: LinkSettings, seed: int, programs: Programs, tables: Path
         settle()
         if ask_for_fifo():  # not in most pods, which do not need it
             log("the relay runs under SCHED_FIFO")
-        direction = LinkDirection(profile, seed, settings.direction == "uplink", origin_ns)
+        direction = LinkDirection(profile, seed, is_up, origin_ns, stream=stream)
         with listening("--listen", settings.listen):
             return Relay(settings.listen, direction, peek, settings.end)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc import assembly
 from cloudrc.config.hull import hull_of
-from cloudrc.config.load import read_experiment
+from cloudrc.config.load import read_experiment, robot_settings
 from cloudrc.config.robot import known_robot
 from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.drivers.link_news import LinkNews
@@ -58,11 +58,12 @@ class TeleopSettings:
     start: bool = False  # fly the experiment's mission, then exit
     feed: bool = False  # write status for a supervisor to stdout
     metrics: Address | None = None  # serve metrics here
+    robot: int | None = None  # number in a fleet
 
 
 def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
     """Run teleop until `stop` or, with `start`, until the mission has ended."""
-    experiment = read_experiment(str(settings.config))
+    experiment = read_experiment(str(settings.config), robot_settings(settings.robot))
     exporter = open_exporter("teleop", experiment, settings.metrics)
     world = experiment.world
     scene, hull, robot = scene_of(world), hull_of(world.robot), known_robot(world.robot)

@@ -184,18 +184,21 @@ def _moved(hole: Hole, moved: Callable[[list[int]], list[int]]) -> Hole:
     return Hole(begin_ns, end_ns if hole.end_ns < END_NS else END_NS)
 
 
-def cut_to_last_mission(mission: Recording, *, being_written: bool = False) -> bool:
+def cut_to_last_mission(
+    mission: Recording, *, being_written: bool = False, after_ns: int = AFTER_NS
+) -> bool:
     """Reduce a recording of several missions to the mission that was started last.
 
     `being_written` tells that pods still write the files. If such files contain the end of the
-    mission, they have lost nothing; files of a session that was killed may have.
+    mission, they have lost nothing; files of a session that was killed may have. The recording ends
+    `after_ns` after the end of the mission [ns].
 
     Return whether the recording contains the end of that mission.
     """
     *before, (began, ended) = _missions(mission) or [(None, None)]
     earlier = max((end for _, end in before if end is not None), default=-1)
     first = max((began or 0) - BEFORE_NS, earlier + 1)
-    last = ended + AFTER_NS if ended is not None else END_NS
+    last = ended + after_ns if ended is not None else END_NS
     until = mission.messages[-1][1] if mission.messages else 0
     mission.keep(first, last, first - COUNTED_NS)
     if ended is None or until <= ended:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from math import inf
 from statistics import median
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 from cloudrc import source
 from cloudrc.config.resolved import ResolvedExperiment, fingerprint
 from cloudrc.config.scene import scene_of
-from cloudrc.drivers.fleet import SharedCores
-from cloudrc.link.cell import Cell, Usage
+from cloudrc.drivers.fleet import FleetRun
+from cloudrc.link.cell import CellLog
 from cloudrc.link.waiting import md1, nddd1
 from cloudrc.record.columns import Recording
 from cloudrc.report.document import SCHEMA_VERSION
@@ -72,41 +71,17 @@ ORDER = "interrupted", "invalid", "failure", "success"
 """Verdicts; that of a fleet is the first one that a robot has."""
 
 
-class CellLog:
-    """What the cells of a fleet do, in each tenth of a second.
-
-    Attributes:
-        ways: Directions: "uplink" and "downlink", or "both".
-        rows: The rows of a CSV file.
-        dropped: Direction and robot, below 0 others, -> number of packets that were dropped.
-    """
-
-    def __init__(self, served: Sequence[Cell]) -> None:
-        """Take the cells of uplink and downlink, or the one that both share."""
-        self.ways = {0: (), 1: ("both",), 2: ("uplink", "downlink")}[len(served)]
-        self._cells, self.rows = served, list[dict[str, Any]]()
-        self.dropped = Counter[tuple[str, int]]()
-
-    def take(self, now_ns: int) -> None:
-        """End a period at `now_ns` [ns]."""
-        for way, cell in zip(self.ways, self._cells, strict=True):
-            values, cell.usage = asdict(cell.usage), Usage()
-            dropped = values.pop("dropped")
-            self.dropped.update({(way, flow): count for flow, count in dropped.items()})
-            row = {"time_s": now_ns / 1e9, "direction": way, **values}
-            self.rows.append(row | {"dropped": sum(dropped.values())})
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class FleetFlown:
     """A fleet that has flown."""
 
     experiment: ResolvedExperiment
     log: CellLog
-    cores: SharedCores | None
-    now_ns: int  # end of the flight [ns]
-    robots: list[dict[str, Any]]  # what the report says of each
-    paths: list[NDArray[np.float64]]  # of each, world frame [m], a row per `GRID_NS`, (n, 3)
+    cloud: Mapping[str, float] | None  # numbers of the shared cores
+    mode: str = "virtual"
+    robots: list[dict[str, Any]] = field(default_factory=list)  # what the report says of each
+    # Of each robot, world frame [m], a row per `GRID_NS`, shape (n, 3).
+    paths: list[NDArray[np.float64]] = field(default_factory=list)
 
     def add(
         self, recording: Recording, robot: ResolvedExperiment, document: Mapping[str, Any]
@@ -150,14 +125,14 @@ def fleet_document(flown: FleetFlown) -> dict[str, Any]:
         "experiment": experiment.name,
         "config_sha256": fingerprint(experiment),
         "code": source.code_hash(),
-        "mode": "virtual",
+        "mode": flown.mode,
         "seed": experiment.seed,
         "succeeded": len(robots) - len(failed),
         "robots": robots,
         "median": {name: median(known) for name, known in values.items() if known},
         "worst": {name: max(known) for name, known in values.items() if known},
         "cell": [cell_numbers(flown, way) for way in flown.log.ways if flown.log.rows],
-        "cloud": cloud_numbers(flown),
+        "cloud": flown.cloud,
         "separation_min_m": separation_min(flown.paths, scene_of(experiment.world).spawn),
     }
 
@@ -167,7 +142,7 @@ def cell_numbers(flown: FleetFlown, way: str) -> dict[str, Any]:
     rows = [row for row in flown.log.rows if row["direction"] == way]
     names = "packets", "dropped", "busy_ns", "waited_ns"
     packets, dropped, busy_ns, waited_ns = (sum(row[name] for row in rows) for name in names)
-    duration, senders = flown.now_ns * 1e-9, len(flown.robots)
+    duration, senders = round(rows[-1]["time_s"] * 1e9) * 1e-9, len(flown.robots)
     service, rate = busy_ns * 1e-9 / packets, (packets + dropped) / duration  # [s], offered [1/s]
     expected = dict[str, float]()
     if way != "both" and not flown.experiment.cell.traffic:
@@ -186,12 +161,15 @@ def cell_numbers(flown: FleetFlown, way: str) -> dict[str, Any]:
     }
 
 
-def cloud_numbers(flown: FleetFlown) -> dict[str, Any] | None:
-    """Return the numbers of the shared cores in SI units; None without shared cores."""
-    cores, duration, robots = flown.cores, flown.now_ns * 1e-9, len(flown.robots)
+def cloud_numbers(fleet: FleetRun, rate: float) -> dict[str, float] | None:
+    """Return the numbers of the shared cores in SI units; None without shared cores.
+
+    `rate` is that of commands [1/s].
+    """
+    cores, duration, robots = fleet.cores, fleet.now_ns * 1e-9, len(fleet.members)
     if cores is None or not cores.count:
         return None
-    busy, rate = cores.busy_ns * 1e-9 / cores.cores, flown.experiment.cloud.command_rate_hz
+    busy = cores.busy_ns * 1e-9 / cores.cores
     return {
         "utilisation": busy / duration,
         "rate_hz": cores.count / robots / duration,

@@ -6,6 +6,7 @@ file, cloudrc writes no report, and the old report stays unchanged.
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,19 +16,25 @@ from pydantic import TypeAdapter
 
 from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.drivers.local import JOURNAL_FILE, under_way
 from cloudrc.errors import BadInputError
 from cloudrc.files import read, read_json
+from cloudrc.link.cell import CellLog
 from cloudrc.outside.document import parse_yaml
 from cloudrc.outside.paths import check_there
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
 from cloudrc.record.reader import NothingReadableError
 from cloudrc.record.topics import TOPICS
+from cloudrc.record.writer import is_open
 from cloudrc.report.document import RUN, Run
 from cloudrc.report.views import views
+from cloudrc.text import list_some
 
 REPORT_BYTES_MAX = 16 << 20
 """Largest size of a report.json that cloudrc reads [bytes]; large enough for many notes."""
+ROBOT = "robot-"
+"""Beginning of the names of folders in the folder of a fleet; the robot's number follows."""
 JUDGEMENT = ("criteria", "description", "name", "report")
 """Keys of an experiment that affect the report, but not the flight."""
 
@@ -55,10 +62,50 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     return recording, experiment, run
 
 
+def check_ended(folder: Path) -> None:
+    """Raise a BadInputError if the flight whose files are in a folder has not ended."""
+    if folder.resolve() not in under_way() and not is_open(folder / "mission.mcap"):
+        return
+    if (folder / JOURNAL_FILE).is_file():
+        raise BadInputError(f"{folder}: the session has not ended; end it: cloudrc down")
+    raise BadInputError(f"{folder}: the flight has not ended; wait for its end")
+
+
+def open_recording(run: Path) -> tuple[Path, Recording]:
+    """Read the whole recording of a run that has ended: its folder, or its MCAP file.
+
+    Also return the path of the file.
+    """
+    file = run / "mission.mcap" if run.is_dir() else run
+    check_ended(file.parent)
+    check_there(file, "name the folder of a run, or a file")
+    return file, Recording.read(file, whole=True)
+
+
+def robots_in(folder: Path) -> list[Path]:
+    """Return the folders of the robots, by number, if `folder` is that of a fleet; else []."""
+    found = {path.name.removeprefix(ROBOT): path for path in folder.glob(f"{ROBOT}*")}
+    return [found[number] for number in sorted(filter(str.isdecimal, found), key=int)]
+
+
+def read_cell(path: Path) -> CellLog:
+    """Read cell.csv, what the cell of a fleet did; without this file there was no cell."""
+    if not path.exists():
+        return CellLog(())
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return CellLog.read(csv.DictReader(file))
+    except (ValueError, KeyError, TypeError) as error:
+        raise BadInputError(f"{path}: is not the record of a cell: {error}") from error
+
+
 def _read_merged(folder: Path) -> Recording | None:
     """Read mission.mcap; return None if it has to be made from world.mcap and cloud.mcap."""
     ends = [(folder / f"{end}.mcap").is_file() for end in ("world", "cloud")]
     if not (folder / "mission.mcap").exists():
+        if not any(ends) and (robots := robots_in(folder)):
+            names = list_some([robot.name for robot in robots], 5)
+            raise BadInputError(f"{folder}: is a fleet; name one of its robots: {names}")
         if not any(ends):
             check_there(folder / "mission.mcap", "name the folder of a run")
         return None

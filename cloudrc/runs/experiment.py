@@ -10,11 +10,15 @@ from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.scene import has_mujoco
 from cloudrc.config.schema import Parameters, World
+from cloudrc.drivers.machine import usable_cores
 from cloudrc.metrics import measure
 from cloudrc.outside.reuse import reuse
 from cloudrc.runs.requirements import require
 from cloudrc.warnings import advise
 
+CORES_OF_ROBOT, CORES_LEFT = 0.22, 0.2
+"""What a robot costs in real time, with its cloud and link, and what everything else needs: a cell,
+the supervisor [cores]. Source: docs/fleet.md."""
 ADVISED_MAX = 50
 """Number of points of a sweep for which warnings are looked for."""
 WARNINGS_MAX = 3
@@ -58,8 +62,25 @@ def robots_of(
 def check_alone(experiment: ResolvedExperiment) -> None:
     """Check that an experiment is the flight of one robot, which needs no cell."""
     if experiment.is_fleet:
-        text = "a fleet, or a robot in a cell, flies with `cloudrc run --mode virtual` only"
+        text = "a fleet, or a robot in a cell, flies with `cloudrc run` on this machine only"
         raise problem_at("fleet", f"{text}; fleet.only=0 is its robot 0 alone")
+
+
+def check_cell(experiment: ResolvedExperiment) -> None:
+    """Check that an experiment has a cell."""
+    if experiment.cell.rate_kbit is None:
+        raise problem_at("cell.rate_kbit", "the process 'cell' needs a rate, such as 1000")
+
+
+def check_carried(experiment: ResolvedExperiment) -> str:
+    """Check that this machine carries the robots of a fleet in real time; tell what they cost."""
+    robots = experiment.fleet.robots if experiment.fleet.only is None else 1
+    cores, needed = usable_cores(), robots * CORES_OF_ROBOT
+    if needed > cores - CORES_LEFT:
+        most = int((cores - CORES_LEFT) / CORES_OF_ROBOT)
+        text = f"{robots} robots need {needed:.1f} cores in real time, and this machine has {cores}"
+        raise problem_at("fleet.robots", f"{text}: fly at most {most}, or with --mode virtual")
+    return f"; needs about {needed:.1f} of {cores} cores"
 
 
 def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
@@ -67,7 +88,7 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
 
     `mode` is "virtual", "local" or "cluster".
     """
-    if mode != "virtual":
+    if mode == "cluster":
         check_alone(experiment)
     if mode != "virtual" and (experiment.cloud.clock_offset_s or experiment.cloud.clock_drift_ppm):
         text = "acts, as clock_drift_ppm, in virtual time only; use --mode virtual, or leave it out"

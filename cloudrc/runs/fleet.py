@@ -1,4 +1,4 @@
-"""Fly a fleet in virtual time: build its robots, its cell and its shared cloud, and judge each.
+"""Fly a fleet: build its robots, its cell and its shared cloud, and judge each.
 
 The folder of a fleet has a folder for each robot, `robot-0` and so on, with all that a run has but
 its page; `cell.csv`, what the cell did; and the report of the fleet.
@@ -15,40 +15,112 @@ from typing import Any
 
 from cloudrc import assembly
 from cloudrc.cloud.sharing import SharedCompute
+from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment, dump
-from cloudrc.drivers.fleet import CellQueue, Computation, FleetRun, Member, SharedCores
+from cloudrc.drivers.fleet import Computation, FleetRun, Member, SharedCores
+from cloudrc.drivers.local import LINK_FOLDER
+from cloudrc.drivers.local_fleet import CELL_FILE, LocalFleet
 from cloudrc.drivers.virtual import Sink
-from cloudrc.link.cell import FRAME_NS, Bulk, Cell, Video
+from cloudrc.errors import CloudrcError, InterruptedRunError
+from cloudrc.files import read_json
+from cloudrc.link.cell import CellLog, CellQueue
+from cloudrc.link.follow import make_folder
 from cloudrc.record.columns import Recording
+from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.records import Record
-from cloudrc.report.document import Run, write_json
-from cloudrc.report.fleet import CellLog, FleetFlown, fleet_document
+from cloudrc.report.document import ENVIRONMENT_FILE, Run, environment_document, write_json
+from cloudrc.report.fleet import FleetFlown, cloud_numbers, fleet_document
+from cloudrc.report.folder import ROBOT, read_cell, robots_in
 from cloudrc.report.write import write_report
-from cloudrc.runs.fly import VirtualRecorder, naming_files
+from cloudrc.runs.fly import VirtualRecorder, naming_files, write_merged
 from cloudrc.runs.interrupts import raise_if_interrupted
 from cloudrc.runs.own_files import hash_files
 from cloudrc.text import csv_table
+
+AFTER_NS = 200_000_000
+"""Time after its mission for which a robot is recorded [ns]; it flies on until all are over."""
 
 
 def fly_fleet(
     experiment: ResolvedExperiment,
     robots: Sequence[ResolvedExperiment],
+    mode: str,
     folder: Path,
     *,
     page: bool = True,
     landed: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
-    """Fly a fleet in virtual time; write all files into `folder`, and return the fleet's report.
+    """Fly a fleet in mode "virtual" or "local"; write all files into `folder`.
 
-    `page` and `landed` are those of `runs.fly.fly`.
+    Return the fleet's report. `page` and `landed` are those of `runs.fly.fly`.
     """
-    with naming_files(folder), ExitStack() as stack:
+    with naming_files(folder):
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+        for robot in robots:
+            _folder(folder, robot).mkdir()
+            (_folder(folder, robot) / "config.yaml").write_text(dump(robot), encoding="utf-8")
+        files = [*map(hash_files, robots)]  # now: the user may edit them during the flight
+        environment = environment_document(files=hash_files(experiment))
+        write_json(folder / ENVIRONMENT_FILE, environment)
+        fly = _fly_virtual if mode == "virtual" else _fly_local
+        flown, broken = fly(experiment, robots, folder, files, landed)
+        document = write_fleet(folder, flown, page=page)
+    if broken:
+        raise broken
+    return document
+
+
+def write_fleet(folder: Path, flown: FleetFlown, *, page: bool) -> dict[str, Any]:
+    """Write the report of a fleet and, if wanted, its page; return the report."""
+    document = fleet_document(flown)
+    write_json(folder / "report.json", document)
+    if page:
+        from cloudrc.report.fleet_page import write_fleet_page
+
+        write_fleet_page(folder, flown, document)
+    return document
+
+
+def write_again(
+    folder: Path, write: Callable[[Path], tuple[Recording, ResolvedExperiment, dict[str, Any]]]
+) -> dict[str, Any]:
+    """Write the report of a fleet again, from the recordings in its `folder`.
+
+    `write` writes the report of a robot, whose folder it gets; it returns the robot's recording,
+    experiment and report.
+    """
+    cloud = read_json(folder / "report.json").get("cloud")  # it is recorded nowhere else
+    flown = FleetFlown(
+        read_experiment(folder / "config.yaml", flown=True), read_cell(folder / CELL_FILE), cloud
+    )
+    for robot in robots_in(folder):
+        recording, experiment, document = write(robot)
+        flown.mode = document["mode"]
+        flown.add(recording, experiment, document)
+    return write_fleet(folder, flown, page=True)
+
+
+def _folder(folder: Path, robot: ResolvedExperiment) -> Path:
+    return folder / f"{ROBOT}{robot.fleet.only}"
+
+
+def _fly_virtual(
+    experiment: ResolvedExperiment,
+    robots: Sequence[ResolvedExperiment],
+    folder: Path,
+    files: Sequence[dict[str, str]],
+    landed: Callable[[], None],
+) -> tuple[FleetFlown, None]:
+    """Fly in virtual time; write recording and report of each robot."""
+
+    def see(records: list[Record]) -> None:
+        raise_if_interrupted()
+
+    with ExitStack() as stack:
         recorders = [
-            stack.enter_context(_record(robot, folder / f"robot-{robot.fleet.only}"))
+            stack.enter_context(VirtualRecorder(robot, _folder(folder, robot), see))
             for robot in robots
         ]
-        files = [*map(hash_files, robots)]  # now: the user may edit them during the flight
         fleet = assemble_fleet(experiment, robots, [each.sink for each in recorders])
         log, interrupted = CellLog(fleet.cells), False
         try:
@@ -56,25 +128,52 @@ def fly_fleet(
         except KeyboardInterrupt:
             interrupted = True
         landed()
-        flown = FleetFlown(experiment, log, fleet.cores, fleet.now_ns, [], [])
+        if log.rows:
+            (folder / CELL_FILE).write_text(csv_table(log.rows), encoding="utf-8")
+        cloud = cloud_numbers(fleet, experiment.cloud.command_rate_hz)
+        flown = FleetFlown(experiment, log, cloud)
         for recorder, hashes in zip(recorders, files, strict=True):
             report = partial(_report, flown, recorder.folder, hashes)
             recorder.finish(report, interrupted=interrupted)
-        document = fleet_document(flown)
-        write_json(folder / "report.json", document)
-        if log.rows:
-            (folder / "cell.csv").write_text(csv_table(log.rows), encoding="utf-8")
-        if page:
-            from cloudrc.report.fleet_page import write_fleet_page
-
-            write_fleet_page(folder, flown, document)
-    return document
+    return flown, None
 
 
-def _record(robot: ResolvedExperiment, folder: Path) -> VirtualRecorder:
-    folder.mkdir()
-    (folder / "config.yaml").write_text(dump(robot), encoding="utf-8")
-    return VirtualRecorder(robot, folder, lambda records: raise_if_interrupted())
+def _fly_local(
+    experiment: ResolvedExperiment,
+    robots: Sequence[ResolvedExperiment],
+    folder: Path,
+    files: Sequence[dict[str, str]],
+    landed: Callable[[], None],
+) -> tuple[FleetFlown, CloudrcError | None]:
+    """Fly in real time, as `_fly_virtual`; also return why the flight ended early."""
+    folders = {robot.fleet.only or 0: _folder(folder, robot) for robot in robots}
+    for robot, own in zip(robots, folders.values(), strict=True):
+        make_folder(own / LINK_FOLDER, robot.link_values)
+    has_cell, broken, interrupted = experiment.cell.rate_kbit is not None, None, True
+    local = LocalFleet(folder, folders, lambda records: raise_if_interrupted(), cell=has_cell)
+    try:
+        local.fly(max(map(assembly.flight_limit, robots)))
+        interrupted = False
+    except KeyboardInterrupt:
+        pass
+    except CloudrcError as error:
+        broken = error
+    landed()
+    flown = FleetFlown(experiment, read_cell(folder / CELL_FILE), None, "local")
+    for robot, own, hashes in zip(robots, folders.values(), files, strict=True):
+        try:
+            mission = merge(own / "world.mcap", own / "cloud.mcap")
+        except CloudrcError:
+            if broken or interrupted:
+                text = "interrupted, nothing was recorded"
+                raise broken or InterruptedRunError(text) from None
+            raise
+        cut_to_last_mission(mission, after_ns=AFTER_NS)
+        report = partial(_report, flown, own, hashes)
+        write_merged(
+            own, mission, robot, report, local.notes, interrupted=interrupted, broken=broken
+        )
+    return flown, broken
 
 
 def _report(
@@ -96,7 +195,7 @@ def assemble_fleet(
     experiment: ResolvedExperiment, robots: Sequence[ResolvedExperiment], sinks: Sequence[Sink]
 ) -> FleetRun:
     """Build the robots of a fleet and connect them; each of `sinks` gets the records of a robot."""
-    cells, cloud = _build_cells(experiment), experiment.cloud
+    cells, cloud = assembly.build_cells(experiment), experiment.cloud
     cores = SharedCores(cloud.cores, cloud.sharing) if cloud.cores and cloud.compute_ms else None
     members = list[Member]()
     for number, (robot, sink) in enumerate(zip(robots, sinks, strict=True)):
@@ -133,18 +232,3 @@ def _build(
 
     limit_ns = round(assembly.flight_limit(robot) * 1e9)
     return Member(run, lambda: teleop.over, limit_ns, see)
-
-
-def _build_cells(experiment: ResolvedExperiment) -> list[Cell]:
-    """Build the cell of each direction, or one for both, with the traffic of others."""
-    given = experiment.cell
-    if given.rate_kbit is None:
-        return []
-    limits = given.queue, given.queue_packets, round(given.airtime_us * 1e3)
-    cells = [Cell(given.rate_kbit * 1e3, *limits) for _ in range(1 if given.shared else 2)]
-    for flow, each in enumerate(given.traffic, start=-len(given.traffic)):
-        start_ns = int(assembly.generator(experiment.seed, f"traffic {flow}").integers(FRAME_NS))
-        video = Video(flow, each.rate_kbit * 1e3, start_ns)
-        source = video if each.kind == "video" else Bulk(flow, start_ns)
-        cells[-1 if each.direction == "downlink" else 0].traffic[flow] = source
-    return cells

@@ -249,15 +249,36 @@ def _fly_local(
         if broken or (interrupted and not session):
             raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
         raise
-    run = _describe("local", interrupted, experiment, local.notes, broken)
-    mission.metadata |= run.metadata
     try:
-        mission.views = views(mission, experiment)
-        _raise_if_refused(mission, broken)
-        document = report(mission, experiment, run)
+        document = write_merged(
+            folder, mission, experiment, report, local.notes, interrupted=interrupted, broken=broken
+        )
     finally:
-        mission.write(folder / "mission.mcap", attachments(folder))
         local.announcement.close()
     if broken:
         raise broken
     return document
+
+
+def write_merged(
+    folder: Path,
+    mission: Recording,
+    experiment: ResolvedExperiment,
+    report: Report,
+    notes: Iterable[str],
+    *,
+    interrupted: bool,
+    broken: CloudrcError | None,
+) -> dict[str, Any]:
+    """Write mission.mcap, the merged recording of a flight in real time, and return its report.
+
+    `broken` is the reason why the flight ended early.
+    """
+    run = _describe("local", interrupted, experiment, notes, broken)
+    mission.metadata |= run.metadata
+    try:
+        mission.views = views(mission, experiment)
+        _raise_if_refused(mission, broken)
+        return report(mission, experiment, run)
+    finally:
+        mission.write(folder / "mission.mcap", attachments(folder))

@@ -14,12 +14,12 @@ from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
-from cloudrc.drivers.local import JOURNAL_FILE, under_way
-from cloudrc.errors import BadInputError, InvalidRunError, NothingFlownError
+from cloudrc.drivers.local import JOURNAL_FILE
+from cloudrc.errors import InvalidRunError, NothingFlownError
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import cut_to_last_mission, merge
-from cloudrc.record.writer import is_open
 from cloudrc.report.document import Run
+from cloudrc.report.folder import check_ended
 from cloudrc.report.write import attachments
 from cloudrc.teleop.store import MissionRecord, open_store
 
@@ -62,15 +62,6 @@ def read_last_mission(folder: Path) -> tuple[Recording, ResolvedExperiment, bool
     config.write_text(dump(experiment), encoding="utf-8")
     cut_to_last_mission(recording)
     return recording, experiment, not last.ended
-
-
-def check_ended(folder: Path) -> None:
-    """Raise a BadInputError if the flight whose files are in a folder has not ended."""
-    if folder.resolve() not in under_way() and not is_open(folder / "mission.mcap"):
-        return
-    if (folder / JOURNAL_FILE).is_file():
-        raise BadInputError(f"{folder}: the session has not ended; end it: cloudrc down")
-    raise BadInputError(f"{folder}: the flight has not ended; wait for its end")
 
 
 def restore_mission(folder: Path) -> None:

@@ -10,9 +10,10 @@ import math
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
-from statistics import median_low
+from statistics import fmean, median_low
 from typing import Any
 
+from cloudrc.config.compute import compute_times
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import NothingFlownError
@@ -148,7 +149,8 @@ class Condition:
                 )
                 self.theory["N.D/D/1"] = next((n for n, fit in enumerate(fits) if not fit), top)
         if cloud.cores and cloud.compute_ms:
-            whole = cloud.cores / (cloud.compute_ms * 1e-3)  # commands a second for all
+            mean_ms = fmean(compute_times(cloud.compute_ms))
+            whole = cloud.cores / (mean_ms * 1e-3)  # commands a second for all
             self.arithmetic["cloud"] = whole / cloud.command_rate_hz
             self.theory["closed queue"] = int(whole / RESUME_HZ)
 

@@ -20,9 +20,9 @@ from cloudrc import source
 from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, to_one_line
 from cloudrc.files import read_json, write_atomically, write_json
 from cloudrc.outside.document import read_document, write_yaml
+from cloudrc.outside.paths import LOCK, lock_folder
 from cloudrc.runs.fly import fly
 from cloudrc.runs.folder import new_folder
-from cloudrc.runs.lock import LOCK, lock_folder
 from cloudrc.text import csv_table, table
 from cloudrc.trials.plan import PlannedFlight, SweepPlan, read_plan
 from cloudrc.trials.rows import SIZE_MAX, Row, Rows, read_rows

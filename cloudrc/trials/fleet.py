@@ -17,12 +17,13 @@ from typing import Any, NamedTuple
 from cloudrc import assembly, source
 from cloudrc.config.fleet import CellConfig
 from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.link.cell import CellLog
 from cloudrc.outside.code import apart
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.records import Control, Record
 from cloudrc.report.document import Assessment, Run
-from cloudrc.report.fleet import CellLog, FleetFlown, fleet_document
+from cloudrc.report.fleet import FleetFlown, cloud_numbers, fleet_document
 from cloudrc.report.write import assess
 from cloudrc.runs import flight
 from cloudrc.runs.fleet import assemble_fleet
@@ -138,7 +139,8 @@ class _Flight:
 
     def row(self) -> Row:
         """Measure all robots up to now; return the row."""
-        flown = FleetFlown(self._experiment, self._log, self.run.cores, self.run.now_ns, [], [])
+        rate = self._experiment.cloud.command_rate_hz
+        flown = FleetFlown(self._experiment, self._log, cloud_numbers(self.run, rate))
         rates = list[float]()  # of commands that reached the robot's controller [1/s]
         for number, robot in enumerate(self._robots):
             found = self._judge(number)

@@ -33,6 +33,26 @@ def test_a_fleet_is_told_as_tables_and_leaves_a_folder_for_each_robot(folder, ca
         assert json.loads((own / "report.json").read_text())["verdict"] == robot["verdict"]
     call("report", "fleet/robot-2")
     assert (folder / "fleet/robot-2/report.html").exists()
+    (folder / "fleet/report.html").unlink()
+    again = call("report", "fleet").out.splitlines()
+    assert again[-1] == "fleet/report.html"
+    assert again[1:] == lines[2:]
+    assert (folder / "fleet/report.html").exists()
+    assert json.loads((folder / "fleet/report.json").read_text()) == report
+    assert (
+        "fleet: is a fleet; name one of its robots: robot-0, " in call("replay fleet", code=2).err
+    )
+
+
+@pytest.mark.usefixtures("no_page")
+def test_a_fleet_that_flies_again_tells_which_own_files_have_changed(folder, call):
+    file, line = folder / "mine.py", [*FLY, *FLEET[:2], "--report", "none", "--out"]
+    file.write_text("from cloudrc.cloud.predictors.last_sample import build\n")
+    call(*line, "a", "--set", "cloud.predictor=./mine.py")
+    repeat = "run a/config.yaml --mode virtual --report none --out"
+    assert not call(f"{repeat} b").err
+    file.write_text(f"# new\n{file.read_text()}")
+    assert "changed since the flight of a: cloud.predictor" in call(f"{repeat} c").err
 
 
 def test_a_robot_flies_alone_as_in_a_fleet_without_a_cell(folder, call):
@@ -71,13 +91,15 @@ def test_a_robot_flies_alone_as_in_a_fleet_without_a_cell(folder, call):
 @pytest.mark.parametrize(
     "line",
     [
-        "run --mode local --set fleet.robots=2",
+        "run --mode local --set fleet.robots=999",
+        "run --mode cluster --set fleet.robots=2",
+        "up --set fleet.robots=2",
         "run --seeds 2 --set cell.rate_kbit=100",
         "run --figures --set fleet.robots=2",
         "run --set cloud.controller=remote --set cell.rate_kbit=100",
     ],
 )
-def test_a_fleet_flies_in_virtual_time_by_run_alone(line, refused):
+def test_a_fleet_flies_by_run_alone_and_in_real_time_if_the_machine_carries_it(line, refused):
     assert "fleet" in refused(line)
 
 

@@ -132,3 +132,11 @@ def test_a_container_with_a_cpu_limit_computes_as_long_as_the_model_says(cost_ms
     assert np.percentile(real, 99) == pytest.approx(np.percentile(model, 99), abs=10)
     stops = np.mean(real > cost_ms + 10), np.mean(model > cost_ms + 10)
     assert stops[0] == pytest.approx(stops[1], abs=0.1)
+
+
+def test_of_given_times_each_computation_takes_a_random_one():
+    given, draws = (1.0 * MS, 7.0 * MS), np.random.default_rng(1)
+    compute = ComputeTime(0.0, 0.0, draws, times_ns=given)
+    found = [compute.end(0) for _ in range(1000)]
+    assert {*found} == {*given}
+    assert np.mean(found) == pytest.approx(4 * MS, rel=0.1)

@@ -58,12 +58,15 @@ def flight():
 
 def exporter(role, flight):
     made = Exporter(role)
-    made.see(flight[role])
+    made.see(flight.get(role, ()))
     if role in ENDS:
         made.sync_age = lambda: 0.3
     if role == "link":
         made.link.shaped("netem", "uplink", "auto", 0.045)
         made.link.shaped("relay", "uplink", "auto", 0.045)  # takes the place of netem
+    if role == "cell":
+        row = {"direction": "both", "busy_ns": 5e7, "most": 3, "waited_ns": 4e6, "packets": 2}
+        made.cell.take([row], {("both", 7): 1, ("both", -1): 9})
     return made
 
 

@@ -65,3 +65,10 @@ def test_a_wrong_file_leaves_the_keys_and_is_told_once(wrong, path, keys):
     put(path, b"2" * 32)
     keys.follow(3 * PERIOD_NS)
     assert keys.ring.keys.current == SECOND
+
+
+def test_each_robot_of_a_fleet_has_keys_of_its_own(path):
+    keys = [KeyFile(path, 0, robot).ring.keys.current for robot in (None, 0, 1)]
+    assert len({key.name for key in keys}) == 3
+    put(path, write(KeySet(SECOND, FIRST)).encode())
+    assert KeyFile(path, 0, 1).ring.keys.previous == keys[2]

@@ -63,7 +63,8 @@ def test_a_clock_does_not_count_the_time_of_a_pause():
 def test_the_key_of_a_run_is_for_its_user_alone_and_goes_with_it(tmp_path, monkeypatch):
     seen = []
 
-    def look(run, limit, sockets, url):
+    def look(run, limit, files):
+        sockets = run._open(tmp_path, {}, files).sockets
         key = sockets / "key"
         seen.append((key, key.stat().st_mode, sockets.stat().st_mode))
 

@@ -80,6 +80,64 @@ class Stamps:
         return 0 if wall_ns is None else min(max(0, now_ns - wall_ns), AGE_MAX_NS)
 
 
+class Entrance:
+    """A socket at which the datagrams of a direction enter.
+
+    Attributes:
+        stamps: Arrival times and dropped datagrams of the socket.
+        malformed: Number of datagrams that are not from the tunnel.
+        stalled: Number of datagrams that waited `AGE_MAX_NS` or longer to be read.
+    """
+
+    def __init__(self, one: socket.socket, way: LinkWay, peek: Peek) -> None:
+        """Take in at a bound socket; `peek` reads kind, epoch and counter of a datagram."""
+        one.setblocking(False)
+        ask_for_stamps(one)
+        # Room for the datagrams that arrive while this process stands still.
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
+        self._socket, self._way, self._peek = one, way, peek
+        self.stamps, self.malformed, self.stalled = Stamps(), 0, 0
+
+    def take(self) -> Iterator[Packet]:
+        """Read up to `BATCH` datagrams; skip those that are not from the tunnel."""
+        for _ in range(BATCH):
+            try:
+                data, beside, flags, _ = self._socket.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
+            except OSError:  # no datagram waits
+                return
+            age_ns = self.stamps.age_ns(beside, time_ns())
+            # Read the wall clock first: then a pause between the readings makes no datagram early.
+            received_ns = monotonic_ns() - age_ns
+            self.stalled += age_ns >= AGE_MAX_NS
+            try:
+                if flags & socket.MSG_TRUNC:
+                    raise ValueError("too long")
+                header = self._peek(data)
+            except ValueError:
+                self.malformed += 1
+            else:
+                yield Packet(self._way, header, len(data), data, received_ns)
+
+
+class Exit:
+    """A socket from which datagrams leave to a peer, whose address may change."""
+
+    def __init__(self, one: socket.socket) -> None:
+        """Send from a socket; the peer is unknown."""
+        self._socket = one
+        self.peer: Address | None = None
+
+    def __call__(self, data: bytes) -> bool:
+        """Send a datagram to the peer; return whether it is known and the kernel agrees."""
+        if self.peer is None:
+            return False
+        try:
+            self._socket.sendto(data, self.peer)
+        except OSError:
+            return False
+        return True
+
+
 class Relay:
     """Shapes one direction of the link without the kernel's netem; same methods as `Netem`."""
 
@@ -105,17 +163,12 @@ class Relay:
         except OSError:
             self.close()
             raise
-        for one in (self._inside, self._outside):
-            one.setblocking(False)
-        ask_for_stamps(self._inside)
-        # Room for the datagrams that arrive while this process stands still.
-        self._inside.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
-        self._peer: Address | None = None
-        self._peek = peek
-        self._way = LinkWay(direction, self._give, PacketLog(0))
+        self._outside.setblocking(False)
+        self._exit = Exit(self._outside)
+        self._way = LinkWay(direction, self._exit, PacketLog(0))
+        self._entrance = Entrance(self._inside, self._way, peek)
+        self.take = self._entrance.take
         self._engine = Engine(self, (self._way,), IN_FLIGHT_MAX)
-        self._stamps = Stamps()
-        self._malformed = self._stalled = 0
         self._past: deque[ReleaseErrors] = deque([ReleaseErrors()], maxlen=_RECENT)
 
     def follow_peer(self, peer: Address) -> Address:
@@ -124,7 +177,7 @@ class Relay:
         Returns:
             The relay's own address, to which the sending end of the tunnel has to send.
         """
-        self._peer = peer
+        self._exit.peer = peer
         host, port = self._inside.getsockname()
         return host, port
 
@@ -154,8 +207,9 @@ class Relay:
         self._past.append(errors)
         recent.pop("released", None)
         outcomes = self._engine.counts()
-        outcomes["received"] += self._malformed
-        outcomes |= {"malformed": self._malformed, "unread": self._stamps.dropped}
+        malformed, unread = self._entrance.malformed, self._entrance.stamps.dropped
+        outcomes["received"] += malformed
+        outcomes |= {"malformed": malformed, "unread": unread}
         return {**outcomes, **recent, "released_early": errors.early}
 
     def released(self) -> dict[str, int]:
@@ -167,7 +221,7 @@ class Relay:
             `AGE_MAX_NS` or longer to be read (`stalled`); and percentiles of the lateness, such as
             `release_error_p99_ns` [ns]. Empty before the first datagram leaves.
         """
-        more = {"overflow": self._engine.queue.overflow, "stalled": self._stalled}
+        more = {"overflow": self._engine.queue.overflow, "stalled": self._entrance.stalled}
         return told | more if (told := self._engine.errors.in_ns()) else {}
 
     def close(self) -> None:
@@ -179,33 +233,3 @@ class Relay:
         """Wait until datagrams have come, or until a time [ns]; return whether some have come."""
         timeout = max(0.0, (until_ns - monotonic_ns()) * 1e-9)
         return bool(select.select([self._inside], (), (), timeout)[0])
-
-    def take(self) -> Iterator[Packet]:
-        """Read up to `BATCH` datagrams; skip those that are not from the tunnel."""
-        for _ in range(BATCH):
-            try:
-                data, beside, flags, _ = self._inside.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
-            except OSError:  # no datagram waits
-                return
-            age_ns = self._stamps.age_ns(beside, time_ns())
-            # Read the wall clock first: then a pause between the readings makes no datagram early.
-            received_ns = monotonic_ns() - age_ns
-            self._stalled += age_ns >= AGE_MAX_NS
-            try:
-                if flags & socket.MSG_TRUNC:
-                    raise ValueError("too long")
-                header = self._peek(data)
-            except ValueError:
-                self._malformed += 1
-            else:
-                yield Packet(self._way, header, len(data), data, received_ns)
-
-    def _give(self, data: bytes) -> bool:
-        """Send a datagram to the peer; return whether it is known and the kernel agrees."""
-        if self._peer is None:
-            return False
-        try:
-            self._outside.sendto(data, self._peer)
-        except OSError:
-            return False
-        return True

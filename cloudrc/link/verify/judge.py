@@ -59,6 +59,7 @@ class Flow(NamedTuple):
     uplink: bool
     kind: int  # as in the tunnel's header
     size: int  # UDP payload [bytes]
+    stream: str = ""  # as in `LinkDirection`
 
 
 class Judgement(NamedTuple):
@@ -131,8 +132,8 @@ class Measurement:
 
         The counters of the datagrams begin at `first`, in the session `epoch`.
         """
-        seed, uplink, kind, size = self.flow
-        link = LinkDirection(self.profile, seed, uplink)
+        seed, uplink, kind, size, name = self.flow
+        link = LinkDirection(self.profile, seed, uplink, stream=name)
         sent_ns = np.rint(sent * 1e9).astype(np.int64).tolist()
         stream = sample(link, kind, sent_ns, size, epoch=epoch, first=first, pause=self.pause)
         return replace(stream, sent=sent)

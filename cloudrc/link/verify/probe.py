@@ -94,7 +94,7 @@ class ProbeEnd:
 
     def _encode(self, number: int) -> bytes:
         """Encode a probe: its header, repeated up to the full size, so that damage is noticed."""
-        _, uplink, kind, size = self.plan.flow
+        _, uplink, kind, size, _ = self.plan.flow
         way = Direction.UPLINK if uplink else Direction.DOWNLINK
         header = encode_header(kind, way, 1, number)
         return (header * (size // len(header) + 1))[:size]

@@ -1,0 +1,33 @@
+"""Run `cloudrc cell`: the process through which the packets of a fleet pass."""
+
+from __future__ import annotations
+
+from cloudrc.cli.parser import Options, Parser, flags, settings_from, whole_number
+from cloudrc.cli.processes import read_address, status_arguments
+from cloudrc.drivers.process import StopSignal
+
+EPILOG = """\
+Robot k's world sends to the port of --uplink + k, its cloud to the port of
+--downlink + k. What leaves the cell goes to --clouds and --worlds: {robot} in
+HOST becomes the robot's number; without it, the number is added to PORT."""
+
+
+def arguments(parser: Parser) -> None:
+    """Declare the command's arguments."""
+    status_arguments(parser)
+    add = flags(parser)
+    for name, end, to in (("uplink", "worlds", "clouds"), ("downlink", "clouds", "worlds")):
+        about = f"where to receive what {end} send"
+        add(f"--{name}", "HOST:PORT", about, read=read_address, required=True)
+        add(f"--{to}", "HOST:PORT", f"where to send the {name}", read=read_address, required=True)
+    add("--record", "FILE", "CSV file for what the cell does", required=True)
+    about = "number of robots, as after 'kubectl scale' (default: that of the experiment)"
+    add("--robots", "N", about, read=whole_number(1, 1000))
+
+
+def execute(options: Options) -> None:
+    """Carry packets until SIGTERM."""
+    stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
+    from cloudrc.processes.cell import CellSettings, run_cell
+
+    run_cell(settings_from(options, CellSettings), stop)

@@ -1,0 +1,63 @@
+"""`cloudrc measure compute`: how long does a controller compute a command?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cloudrc.cli.output import print_line, tell
+from cloudrc.cli.parser import Options, Parser, add_verbs, flags, number
+from cloudrc.errors import BadInputError
+from cloudrc.outside.paths import check_new
+
+VERBS = {"compute": "measure how long a controller computes a command"}
+"""Verb -> its line in the help."""
+QUANTILES = {"median": 0.5, "p99": 0.99, "longest": 1.0}
+EPILOG = """\
+examples:
+  cloudrc measure compute mpc --cpus 0.2
+  cloudrc measure compute ./my_controller.py --seconds 40 --out times.txt
+  cloudrc measure compute runs/latest
+  cloudrc run steps --mode virtual --set cloud.compute_ms=./compute.txt
+
+A controller flies the experiment 'steps' in real time, and each computation is
+timed. --cpus limits this process as a container is limited: of each 100 ms it
+computes for a share, and then stands still. Of a RUN, the file gets the periods
+of cloud's loop in real time, or the times of cloud.compute_measured.
+
+The file has a duration in ms in each line; cloud.compute_ms takes it."""
+
+
+def arguments(parser: Parser) -> None:
+    """Declare the command's arguments."""
+    (compute,) = add_verbs(parser, VERBS).values()
+    compute.epilog = EPILOG
+    add = flags(compute)
+    add("what", "CONTROLLER|RUN", "name or file of a controller, or the folder of a run")
+    about = "limit of processors, such as 0.2; it needs the permission to make a control group"
+    add("--cpus", "N", about, read=number(0.01, 64, "processors"))
+    add("--seconds", "S", "longest duration (default: 20)", 20.0, number(1, 3600, "seconds"))
+    add("--set", "KEY=VALUE", "change one key of the experiment; repeatable")
+    add("--out", "FILE", "new file (default: compute.txt)", Path("compute.txt"))
+
+
+def execute(options: Options) -> None:
+    """Measure, write the file, and print a summary."""
+    check_new(options.out, "name another file with --out")
+    from cloudrc.cli.progress import Progress
+    from cloudrc.studies.compute import of_controller, of_run
+
+    with Progress(f"measures {options.what}"):
+        if Path(options.what).is_dir():
+            found = of_run(Path(options.what))
+        else:
+            found = of_controller(options.what, options.set, options.cpus, options.seconds)
+    if found.unlimited:
+        tell(f"warning: measured without a CPU limit: {found.unlimited}")
+    if not (times := sorted(found.times_ms)):
+        raise BadInputError(f"{options.what}: there is no computation to measure")
+    lines = [f"# computing times of {found.where} [ms]", *(f"{t:.4f}" for t in found.times_ms)]
+    options.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    mean, last = sum(times) / len(times), len(times) - 1
+    shown = [f"{name} {times[round(last * q)]:.3g}" for name, q in QUANTILES.items()]
+    print_line(f"{found.where}: {len(times)} times, mean {mean:.3g}, {', '.join(shown)} ms")
+    print_line(f"{options.out}: fly it with --set cloud.compute_ms=./{options.out}")

@@ -1,0 +1,111 @@
+"""Carry the packets of many robots through one cell, in real time.
+
+A packet is lost on its robot's link, or waits in the cell, and is then delayed by the link. The
+cell knows only what has been read from the sockets. So it goes on up to the instant at which the
+reading began: no earlier packet can follow.
+"""
+
+from __future__ import annotations
+
+import select
+import selectors
+from collections.abc import Callable, Iterator, Sequence
+from socket import socket
+from time import monotonic_ns
+from typing import Any
+
+from cloudrc.link.carry.engine import SPIN_NS, Engine, LinkWay, Packet, Port
+from cloudrc.link.carry.udp import Entrance
+from cloudrc.link.cell import Cell, CellQueue
+from cloudrc.link.model import LinkDirection
+from cloudrc.link.queue import NOTHING_NS
+
+
+class EntrancePort:
+    """Takes in at many sockets."""
+
+    def __init__(self) -> None:
+        """Create a port without sockets."""
+        self._selector = selectors.DefaultSelector()
+
+    def add(self, one: socket, entrance: Entrance) -> None:
+        """Take in at a socket, too, which `entrance` reads."""
+        self._selector.register(one, selectors.EVENT_READ, entrance)
+
+    def wait(self, until_ns: int) -> bool:
+        """Wait until datagrams have come, or until a time [ns]; return whether some have come."""
+        timeout = max(0.0, (until_ns - monotonic_ns()) * 1e-9)
+        # The selector itself waits for whole milliseconds.
+        return bool(select.select([self._selector], (), (), timeout)[0])
+
+    def take(self) -> Iterator[Packet]:
+        """Read up to `BATCH` datagrams from each socket."""
+        for key, _ in self._selector.select(0):
+            yield from key.data.take()
+
+
+class CellEngine(Engine):
+    """Carries the packets of robots over each one's link and through the cell of all."""
+
+    def __init__(self, port: Port, cells: Sequence[Cell]) -> None:
+        """Set where packets enter, and the cells of uplink and downlink, or the one of both."""
+        super().__init__(port, ())
+        self._cells, self._known_ns = cells, 0
+        self._queues = dict[LinkWay, CellQueue]()
+
+    def join(self, robot: int, ways: tuple[LinkWay, LinkWay], orders: Sequence[bool]) -> None:
+        """Add uplink and downlink of a robot; `orders` tells which of them keep the order."""
+        self._ways = (*self._ways, *ways)
+        cells = (*self._cells, *self._cells)[:2]
+        queue = _Behind(robot, cells, orders, ways[1].link)
+
+        def put(link: LinkDirection, arrivals: Sequence[int], data: Any) -> None:
+            self.queue.put(self._leave, arrivals, (ways[link is ways[1].link], 0, data))
+
+        queue.onward = put
+        self._queues |= dict.fromkeys(ways, queue)
+
+    def step(self, timeout: float) -> None:
+        """Wait at most `timeout` [s] until packets come, leave the cell or are due; handle them."""
+        cell_ns, due_ns = min(map(_soonest_ns, self._cells)), self.queue.next_ns
+        until_ns = min(monotonic_ns() + round(timeout * 1e9), due_ns - SPIN_NS, cell_ns)
+        has_come = self._port.wait(until_ns)
+        if due_ns - monotonic_ns() <= SPIN_NS:
+            while monotonic_ns() < due_ns:
+                pass
+            self._release()
+        if has_come or cell_ns <= monotonic_ns():
+            self.take_in()
+            self._release()
+
+    def take_in(self) -> None:
+        """Take packets from the port; put those on their links that have left the cell."""
+        now_ns = monotonic_ns()
+        for way, header, size, data, sent_ns in self._port.take():
+            way.received += 1
+            self._queues[way].send(way.link, header, size, data, max(sent_ns, self._known_ns))
+        self._known_ns = now_ns
+        for cell in self._cells:
+            later = [packet for packet in cell.inbox if packet.sent_ns >= now_ns]
+            cell.inbox = [packet for packet in cell.inbox if packet.sent_ns < now_ns]
+            for at_ns, _, leave in cell.advance(now_ns):
+                leave(at_ns)
+            cell.inbox = later
+
+
+class _Behind(CellQueue):
+    """Hands on what has left the cell."""
+
+    onward: Callable[..., None]
+
+    def put(self, link: Any, arrivals: Sequence[int], data: Any) -> None:
+        self.onward(link, arrivals, data)
+
+
+def _soonest_ns(cell: Cell) -> int:
+    """Return when a cell has to go on [ns], so that no packet behind it is late."""
+    if cell.inbox:
+        return 0
+    if cell.done_ns == NOTHING_NS:
+        return NOTHING_NS
+    return max(cell.done_ns, cell.done_ns + cell.delay_ns - 2 * SPIN_NS)

@@ -1,0 +1,181 @@
+"""Run the radio cell of a fleet as a process: the packets of all robots pass through it.
+
+Each world and each cloud sends to a port of its own, which names the robot. The process records
+what the cell does, as the file cell.csv of a fleet in virtual time.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from ipaddress import ip_address
+from itertools import product
+from pathlib import Path
+from typing import TextIO
+
+from cloudrc import assembly
+from cloudrc.config.load import read_experiment, robot_settings
+from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.drivers.exporter import Exporter
+from cloudrc.drivers.process import Feed, StopSignal
+from cloudrc.drivers.realtime import Address, bind
+from cloudrc.link.carry.cell import CellEngine, EntrancePort
+from cloudrc.link.carry.engine import LinkWay
+from cloudrc.link.carry.log import PacketLog
+from cloudrc.link.carry.punctual import ask_for_fifo, settle
+from cloudrc.link.carry.udp import Entrance, Exit
+from cloudrc.link.cell import Cell, CellLog
+from cloudrc.link.follow import PEER_PAUSE, PeerName
+from cloudrc.link.queue import NOTHING_NS
+from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, warn
+from cloudrc.runs.experiment import check_cell
+from cloudrc.text import csv_table
+from cloudrc.tunnel.codec import peek
+
+PERIOD_NS = 100_000_000
+"""Time of a row of the recording [ns]."""
+AT_ONCE = 10
+"""Largest number of names that are resolved within a pause of `PEER_PAUSE`."""
+log = partial(warn, process="cell")
+
+
+@dataclass(frozen=True)
+class CellSettings:
+    """Files and addresses of the process; a field is the flag of this name.
+
+    Robot k's world sends to the port `uplink` + k, its cloud to the port `downlink` + k.
+    """
+
+    config: Path  # experiment file of the fleet
+    uplink: Address  # where to receive what worlds send
+    downlink: Address  # where to receive what clouds send
+    worlds: Address  # where to send the downlink, see `address_of`
+    clouds: Address  # where to send the uplink
+    record: Path  # CSV file
+    robots: int | None = None  # number of robots; None: that of the experiment
+    feed: bool = False  # write status for a supervisor to stdout
+    metrics: Address | None = None  # serve metrics here
+
+
+def run_cell(settings: CellSettings, stop: StopSignal) -> None:
+    """Carry the packets of a fleet until `stop`."""
+    feed = Feed.on_stdout(watched=settings.feed)
+    experiment = read_experiment(str(settings.config))
+    check_cell(experiment)
+    exporter = open_exporter("cell", experiment, settings.metrics)
+    with ExitStack() as opened:
+        count = settings.robots or experiment.fleet.robots
+        engine, cells, exits = _open(settings, experiment, count, opened)
+        _follow(exits)
+        file = opened.enter_context(settings.record.open("w", encoding="utf-8", newline=""))
+        settle()
+        if ask_for_fifo():
+            log("the cell runs under SCHED_FIFO")
+        done = CellLog(cells)
+        done.dropped.update(dict.fromkeys(product(done.ways, range(count)), 0))
+        _carry(engine, done, feed.alive_while(stop), file, exporter)
+        log(json.dumps(engine.counts() | engine.errors.in_ns()))
+
+
+def address_of(peers: Address, robot: int) -> Address:
+    """Return the address of a robot's world or cloud.
+
+    It is `peers` with the number in place of {robot} in its host; without {robot}, the number is
+    added to the port.
+    """
+    host, port = peers
+    return (
+        (host.replace("{robot}", str(robot)), port) if "{robot}" in host else (host, port + robot)
+    )
+
+
+def _open(
+    settings: CellSettings, experiment: ResolvedExperiment, count: int, opened: ExitStack
+) -> tuple[CellEngine, list[Cell], list[tuple[Address, Exit]]]:
+    """Open the sockets of `count` robots; return what carries, the cells, and where to send."""
+    origin_ns = time.monotonic_ns()
+    cells = assembly.build_cells(experiment, origin_ns)
+    outside = opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    outside.setblocking(False)
+    port = EntrancePort()
+    engine, exits, shortest_ns = CellEngine(port, cells), list[tuple[Address, Exit]](), NOTHING_NS
+    for robot in range(count):
+        own = read_experiment(str(settings.config), robot_settings(robot))
+        ways = list[LinkWay]()
+        for name, to, link in zip(
+            ("uplink", "downlink"),
+            (settings.clouds, settings.worlds),
+            assembly.build_links(own, origin_ns),
+            strict=True,
+        ):
+            host, first = getattr(settings, name)
+            exits.append((address_of(to, robot), Exit(outside)))
+            ways.append(LinkWay(link, exits[-1][1], PacketLog(0)))
+            with listening(f"--{name}", (host, first + robot)):
+                one = opened.enter_context(bind((host, first + robot)))
+            port.add(one, Entrance(one, ways[-1], peek))
+            shortest_ns = min(shortest_ns, link.shortest_ns)
+        engine.join(robot, (ways[0], ways[1]), (own.uplink.keep_order, own.downlink.keep_order))
+    for cell in cells:
+        cell.delay_ns = shortest_ns
+    return engine, cells, exits
+
+
+def _follow(exits: Sequence[tuple[Address, Exit]]) -> None:
+    """Resolve the names of all peers again and again, on a thread of its own."""
+    names = list[tuple[PeerName, Exit]]()
+    for address, leave in exits:
+        if _is_number(address[0]):
+            leave.peer = address
+        else:
+            names.append((PeerName(address, ipv4_addresses, log), leave))
+
+    def work() -> None:
+        while True:
+            for name, leave in names:
+                leave.peer = name.poll() or leave.peer
+                time.sleep(random.uniform(*PEER_PAUSE) / min(len(names), AT_ONCE))
+
+    if names:
+        threading.Thread(target=work, daemon=True).start()
+
+
+def _is_number(host: str) -> bool:
+    try:
+        ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _carry(
+    engine: CellEngine,
+    cells: CellLog,
+    stop: Callable[[], bool],
+    file: TextIO,
+    exporter: Exporter | None,
+) -> None:
+    """Carry packets until `stop()`; record each `PERIOD_NS` in which a packet has left."""
+    until_ns, start_ns = time.monotonic_ns(), 0
+    while not stop():
+        until_ns += PERIOD_NS
+        while (rest_ns := until_ns - time.monotonic_ns()) > 0:
+            engine.step(rest_ns * 1e-9)
+        if not start_ns and engine.counts()["received"]:
+            start_ns = until_ns - PERIOD_NS
+        cells.rows.clear()
+        cells.take(until_ns - start_ns)
+        if any(row["packets"] for row in cells.rows):
+            lines = csv_table(cells.rows).split("\n", 1)
+            file.write(f"{lines[0]}\n" * (not file.tell()) + f"{lines[1]}\n")
+            file.flush()
+        if exporter:
+            exporter.cell.take(cells.rows, cells.dropped)
+            exporter.ready(True)
