@@ -45,7 +45,7 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link bench-cell results docs dist images kind-load lock clean
+.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-cell results docs site dist images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -145,7 +145,7 @@ mutants: $(VENV)/dev ## mutate guard, tunnel and store, list the mutants that te
 # kind, helm and kubectl.
 NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults.json \
 	search-adversarial.json $(ROBOTS:%=search-%.json) search-random.json \
-	link.json mujoco-oldest.json mujoco-newest.json delayed-cartpole.md) \
+	mujoco-oldest.json mujoco-newest.json delayed-cartpole.md) \
 	mutants night-tun night-ros2 night-netem e2e-full
 
 nightly: $(VENV)/dev ## run every test, search and bench; writes build/evidence (needs what e2e needs)
@@ -169,9 +169,6 @@ $(ROBOTS:%=$(EVIDENCE)/search-%.json): $(EVIDENCE)/search-%.json:
 
 $(EVIDENCE)/search-random.json:
 	$(SEARCH) --minutes 10 -o json > $@
-
-$(EVIDENCE)/link.json:
-	$(bin)/python -m tools.bench_link $(BENCH_LINK) -o json > $@
 
 # The paper's mission on the oldest and on the newest MuJoCo that pyproject.toml allows.
 $(EVIDENCE)/mujoco-oldest.json: MUJOCO = mujoco==$(shell sed -n 's/.*"mujoco>=\([0-9.]*\),.*/\1/p' pyproject.toml)
@@ -230,17 +227,19 @@ api: $(VENV)/dev ## list changes of the public Python API since the last release
 bench: $(VENV)/all ## measure the closed loop against raw physics
 	$(bin)/cloudrc bench
 
-bench-link: $(VENV)/all ## compare the relay with its profiles
-	$(bin)/python -m tools.bench_link $(BENCH_LINK)
-
 bench-cell: $(VENV)/all ## measure how punctual the cell of 50 robots is
 	$(bin)/python -m tools.bench_cell $(BENCH_CELL)
 
-results: $(VENV)/dev ## fly the README's results and write them into it: two minutes
+results: $(VENV)/dev ## fly the results of docs/results.md and write them into it: two minutes
 	$(bin)/python -m tools.results
 
 docs: $(VENV)/dev ## write the generated tables of docs/, and the chart's schema, table and copied files
 	$(bin)/python -m tools.docs
+
+site: $(VENV)/site ## build all pages into build/site; a link that leads nowhere is an error
+	$(bin)/python -m tools.site pages build/pages
+	$(bin)/zensical build --strict --clean
+	$(bin)/python -m tools.site check build/site
 
 # The time of all files in them: two builds of one commit are byte-equal.
 EPOCH = $(shell git log -1 --format=%ct)
@@ -267,7 +266,7 @@ kind-load: ## load the images into the kind cluster CLUSTER (cloudrc)
 
 lock: $(VENV)/bin/python ## update the locked requirements of images and tests
 	$(bin)/python -m pip install --quiet uv
-	$(COMPILE) pyproject.toml --extra world --extra record --extra console --extra mpc \
+	$(COMPILE) pyproject.toml --extra world --extra record --extra console --extra mpc --extra bucket \
 		--output-file images/world/requirements.txt \
 		$(DRAWING:%=--no-emit-package %)
 	$(COMPILE) pyproject.toml --extra record --extra api --extra mpc --output-file images/cloud/requirements.txt
@@ -302,3 +301,8 @@ $(VENV)/dev: pyproject.toml | $(VENV)/bin/python
 	@echo "installs cloudrc, its packages and its test tools into $(VENV), once: a minute, 900 MB"
 	$(INSTALL) '.[dev]'
 	@touch $(VENV)/all $@
+
+# Not an extra: pip would install cloudrc again, while .ci/run flies with it.
+$(VENV)/site: tools/site-requirements.txt | $(VENV)/dev
+	$(bin)/python -m pip install --disable-pip-version-check --quiet --requirement $<
+	@touch $@

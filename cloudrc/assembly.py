@@ -130,13 +130,12 @@ def start_mission(experiment: ResolvedExperiment, now_ns: int = 0) -> Teleop:
 def fly(
     experiment: ResolvedExperiment,
     see: Sink,
-    make_loop: Callable[..., ControlLoop] = ControlLoop,
     gone: Callable[[], bool] = lambda: False,
 ) -> None:
     """Fly in virtual time until the mission is over.
 
     Every 100 ms of virtual time, call `see` with the new records of world and of cloud, both on
-    world's clock. `make_loop` is that of `build_cloud`.
+    world's clock.
 
     `gone` returns whether a program that controls the robot from outside has ended. Raise a
     ControllerLostError if such a program is lost.
@@ -147,7 +146,7 @@ def fly(
         see([], [Fault(0, error.code, str(error))])
         raise
     with way as channel:
-        _, _, teleop, run = assemble(experiment, make_loop, channel)
+        _, _, teleop, run = assemble(experiment, channel=channel)
         lost = list[ControllerLostError]()
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:

@@ -221,6 +221,7 @@ class Drive(NamedTuple):
     until_ns: int  # time at which the setpoint begins to brake [ns], the clock of `begin_ns`
     low: Vector  # the setpoint stays in the box from this corner [m], world frame
     high: Vector  # to this one [m], world frame
+    yaw_rate: float = 0.0  # of the heading until `until_ns` [rad/s]
 
 
 class Setpoint(NamedTuple):
@@ -233,6 +234,7 @@ class Setpoint(NamedTuple):
     velocity: Vector = ZERO  # velocity of the target [m/s]
     motion: Motion | Drive | None = None  # how the target moves; None: it rests
     turns: bool = False  # whether the robot has to turn to `yaw`; else it keeps its heading
+    yaw_rate: float = 0.0  # of the target [rad/s]
 
 
 class Passed(NamedTuple):

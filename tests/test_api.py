@@ -171,12 +171,3 @@ def test_a_link_is_verified(capfd):
     (mean,) = (r for r in found["directions"]["uplink"]["rows"] if r["name"] == "mean")
     assert mean["asked"] == pytest.approx(0.1)
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("path", [*ROOT.glob("docs/notebooks/*.ipynb")], ids=lambda path: path.stem)
-def test_a_notebook_runs(path, tmp_path):
-    cells = json.loads(path.read_text())["cells"]
-    code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-    environment = {**os.environ, "MPLBACKEND": "Agg", "PYTHONPATH": str(ROOT)}
-    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)

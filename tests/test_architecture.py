@@ -15,7 +15,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 
 ROS = (
     *("rclpy", "diagnostic_msgs", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs"),
-    *("std_msgs", "std_srvs", "tf2_msgs", "visualization_msgs"),
+    *("std_msgs", "std_srvs", "nav2_msgs", "tf2_msgs", "visualization_msgs"),
 )
 # Packages of a sourced ROS 2, which no package registry is asked for.
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it. Ruff checks
@@ -25,7 +25,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "yaml": ("outside/", "config/", "record/", "report/", "cli/", "cluster/"),
     "pydantic": (
         *("config/", "link/", "cli/", "teleop/", "trials/plan", "report/folder"),
-        *("drivers/process", "faults/schedule"),
+        *("drivers/process", "faults/schedule", "exercise/task"),
     ),
     "matplotlib": ("report/",),
     "viser": ("console/", "report/replay"),

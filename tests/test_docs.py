@@ -7,6 +7,7 @@ import pytest
 
 from cloudrc.record.topics import TOPICS
 from tools import docs
+from tools.site import dead_links, relinked, site_name
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), ROOT / "charts" / "cloudrc" / "README.md"]
@@ -51,3 +52,37 @@ def test_the_list_of_pages_names_every_page():
     listed = {path for path, _ in LINK.findall((ROOT / "docs" / "README.md").read_text())}
     pages = {path.relative_to(ROOT / "docs").as_posix() for path in ROOT.glob("docs/**/*.md")}
     assert pages - {"README.md"} <= listed
+
+
+def test_the_navigation_of_the_site_names_every_page():
+    nav = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
+    pages = {path.relative_to(ROOT).as_posix() for path in PAGES}
+    assert set(re.findall(r"[\w/-]+\.md$", nav, re.MULTILINE)) == {
+        site_name(each) for each in pages
+    }
+
+
+@pytest.mark.parametrize(
+    ("link", "there"),
+    [
+        ("../CHANGELOG.md", "changelog.md"),
+        ("link.md#traps", "link.md#traps"),
+        ("../examples/fork.py", "source/examples/fork.py.md"),
+        ("https://example.org/a.md", "https://example.org/a.md"),
+    ],
+)
+def test_a_link_of_a_page_leads_to_a_page_of_the_site(link, there):
+    code = "\n```\n[a](b.md)\n```\n"
+    assert relinked("docs/gym.md", f"[x]({link}){code}") == f"[x]({there}){code}"
+
+
+def test_a_dead_link_of_the_site_is_named(tmp_path):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "index.html").write_text('<h2 id="head"></h2><a href="../#no"></a>')
+    alive = (
+        '<a href="there/#head"></a><a href="https://example.org/"></a><a href="#own" id="own"></a>'
+    )
+    dead = '<a href="gone/"></a><img src="gone.png">'
+    (tmp_path / "index.html").write_text(alive + dead)
+    found = ["index.html: gone.png", "index.html: gone/", "there/index.html: ../#no"]
+    assert sorted(dead_links(tmp_path)) == found

@@ -15,6 +15,7 @@ from tests.conftest import nightly
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
     "README.md",
+    "docs/tour.md",
     "docs/experiment.md",
     "docs/plugins.md",
     "docs/plugins-predictor.md",
@@ -38,7 +39,7 @@ REFUSED = [
     for line in body.splitlines()[:1]
 ]
 """Commands that cloudrc refuses, with what it prints."""
-UNTESTED = {"", ". .venv/bin/activate", ".venv/bin/cloudrc up --console"}
+UNTESTED = {"", ".venv/bin/cloudrc up --console"}
 """Lines that are not run here; the last one runs until Ctrl-C, and tests/console tests it."""
 COMMANDS = [line for line in LINES if line not in UNTESTED]
 ANSWERS = {"compare": "B has a lower", "margin": "settles up to", "capacity": "runs/capacity"}
@@ -139,7 +140,7 @@ def test_another_flight_works(command, is_whole, call):
 
 
 @pytest.mark.usefixtures("numbers_only")
-def test_the_readme_s_way_to_read_a_recording_works(folder, call):
+def test_the_tour_s_way_to_read_a_recording_works(folder, call):
     call("run hover --mode virtual --set mission.waypoints.0.dwell_s=1")
     done = execute(f"{sys.executable} read_recording.py", folder)
     assert done.returncode == 0, done.stderr

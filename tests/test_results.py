@@ -1,7 +1,6 @@
-"""The numbers in README.md are those of this version: within the intervals of a new sweep."""
+"""The numbers in docs/results.md are those of this version: within the intervals of a new sweep."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +8,8 @@ import pytest
 from cloudrc.statistics import median_interval
 from tests.conftest import nightly
 from tests.flights.conftest import both_ways, fly, numbers
+from tools.results import PAGE, results
 from tools.results import fly as fly_sweep
-from tools.results import results
 
 STEPPED = (
     "link.profile=ideal",
@@ -23,7 +22,7 @@ STEPPED = (
 
 @pytest.mark.full
 def test_the_table_of_predictors_is_that_of_this_version(tmp_path):
-    text = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
+    text = PAGE.read_text("utf-8")
     found = results(fly_sweep("predictors", tmp_path / "sweep"))
     for name, (errors, done) in found.items():
         (line,) = re.findall(rf"^\| `{name}`.*$", text, re.MULTILINE)
@@ -43,7 +42,7 @@ def test_the_mission_over_a_satellite_needs_a_predictor(predictor, done):
 
 @pytest.mark.full
 @pytest.mark.parametrize(("limit", "error_mm"), [(0.10, 32.5), (0.30, 0.07)])
-def test_the_hover_is_as_far_from_its_setpoint_as_the_readme_says(limit, error_mm):
+def test_the_hover_is_as_far_from_its_setpoint_as_the_page_says(limit, error_mm):
     flight = fly("hover", f"world.onboard.integral_limit_xy={limit}")
     error = numbers(flight)["steady_error_x"] * 1e3
     assert error == pytest.approx(error_mm, abs=0.005 if error_mm < 1 else 0.05)

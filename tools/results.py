@@ -1,4 +1,4 @@
-"""Write the table and the picture of results in README.md: `make results` takes two minutes.
+"""Write the table and the picture of results in docs/results.md: `make results` takes two minutes.
 
 A nightly test flies again: each number in the table must lie within the interval of its sweep.
 """
@@ -19,7 +19,7 @@ from cloudrc.statistics import median_interval
 from tools.docs import insert, table
 
 ROOT = Path(__file__).resolve().parents[1]
-README, SWEEPS = ROOT / "README.md", ROOT / "docs" / "sweeps"
+PAGE, SWEEPS = ROOT / "docs" / "results.md", ROOT / "docs" / "sweeps"
 LINKS = "paper-p3", "far"
 """Link profiles in `predictors.yaml`."""
 ERROR = "prediction_error_rms"
@@ -58,7 +58,7 @@ def cells(rows: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
 
 
 def main() -> None:
-    """Fly both sweeps; write the table into README.md, and the picture beside the pages."""
+    """Fly both sweeps; write the table into the page, and the picture beside the pages."""
     with TemporaryDirectory() as folder:
         made = table(
             "predictor | prediction error at 70 ± 40 ms | successful flights at 70 ± 40 ms | "
@@ -68,7 +68,7 @@ def main() -> None:
         fly("delay", delay := Path(folder, "delay"))
         cloudrc("sweep", "figure", delay, "--number", ERROR, "--by", "predictor")
         shutil.copy(delay / "figure.png", ROOT / "docs" / "delay.png")
-    README.write_text(insert(README, made)[README], encoding="utf-8")
+    PAGE.write_text(insert(PAGE, made)[PAGE], encoding="utf-8")
 
 
 if __name__ == "__main__":

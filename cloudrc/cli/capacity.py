@@ -58,9 +58,9 @@ def execute(options: Options) -> None:
     """Find the capacity of each queue and controller; write and print it, and draw the figure."""
     from cloudrc.cli.progress import Progress
     from cloudrc.files import write_atomically, write_json
+    from cloudrc.outside.paths import lock_folder
     from cloudrc.report.figures.style import Look
     from cloudrc.runs.folder import new_folder
-    from cloudrc.runs.lock import lock_folder
     from cloudrc.runs.requirements import MODES, require
     from cloudrc.studies.capacity import Capacity, Sought, describe
     from cloudrc.studies.capacity_text import (

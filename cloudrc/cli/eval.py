@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.cli.output import TABLES, output_argument, print_result, tell
 from cloudrc.cli.parser import COUNT_MAX, Options, Parser, flags, number, read_count, whole_number
 from cloudrc.errors import CloudrcError
+from cloudrc.outside.paths import lock_folder
 from cloudrc.outside.refusal import naming
 from cloudrc.runs.folder import new_folder
-from cloudrc.runs.lock import lock_folder
 from cloudrc.runs.requirements import require
 from cloudrc.text import cells, csv_table, escape, latex_table
 

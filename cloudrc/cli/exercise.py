@@ -1,59 +1,111 @@
-"""`cloudrc class`: hand out and score the exercise of docs/exercise.md.
+"""`cloudrc class`: hand out and score a task, by default the exercise of docs/exercise.md.
 
-The students' functions run in a process of their own for each part of the exercise, so that a crash
+The students' functions run in a process of their own for each part of the task, so that a crash
 costs the points of this part only. The process is no sandbox: a student's file has all rights of
 the user.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from shlex import quote
+from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.output import format_document, output_argument, print_line, print_result
-from cloudrc.cli.parser import Options, Parser, add_verbs, flags
+from cloudrc.cli.output import format_document, output_argument, print_line, print_result, tell
+from cloudrc.cli.parser import Options, Parser, add_verbs, flags, read_count
 from cloudrc.errors import BadInputError
 from cloudrc.outside.paths import check_there
 
-VERBS = {"new": "write the files that students fill in", "check": "score a student's files"}
+if TYPE_CHECKING:
+    from cloudrc.exercise.task import Task
+
+VERBS = {"new": "write the files that students fill in", "check": "score students' files"}
 EPILOG = """\
 examples:
   cloudrc class new exercise        three files to fill in
   cloudrc class check exercise      the points of each part
+  cloudrc class new TASK.yaml       a task of your own, see docs/exercise.md
+  cloudrc class check hand-ins/* --task TASK.yaml > points.csv
   cloudrc class check /autograder/submission -o gradescope > results.json
 
 'check' runs the files in DIR with all your rights; it is no sandbox."""
+JOBS_MAX = 1000
 
 
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     new, check = add_verbs(parser, VERBS).values()
-    flags(new)("folder", "DIR", "folder for the files")
-    flags(check)("folder", "DIR", "folder with the files")
-    output_argument(check, forms=("gradescope",))
+    flags(new)(
+        "task", "TASK", "file of your own task (.yaml), beside the files to fill in", nargs="?"
+    )
+    flags(new)("folder", "DIR", "folder for the files (default: named as TASK)")
+    check.add_argument("folders", metavar="DIR", nargs="+", type=Path, help="folder with the files")
+    add = flags(check)
+    about = "the task (default: task.yaml in DIR, or else the exercise)"
+    add("--task", "TASK", about, None, Path)
+    add("--jobs", "N", "hand-ins at once (default: one per usable core)", JOBS_MAX, read_count)
+    output_argument(check, "output format, csv for several DIR", forms=("gradescope", "csv"))
 
 
 def execute(options: Options) -> None:
-    """Write a student's files, or score the files in a folder; return 0 whatever the score."""
-    from cloudrc.exercise.files import write_files
-
-    folder: Path = options.folder
+    """Write a student's files, or score the files in folders; return 0 whatever the score."""
     if options.verb == "new":
-        names = write_files(folder)
-        command = f"cloudrc class check {quote(str(folder))}"
-        print_line(f"fill in {', '.join(names)} in {folder}, then: {command}")
+        _new(options.task, options.folder)
         return
-    check_there(folder, "'cloudrc class new' makes one")
-    if options.output != "gradescope":  # there, a hand-in without the files gets 0 points
-        _check_files(folder)
+    folders = [folder for folder in options.folders if folder.is_dir()]
+    for other in options.folders:
+        if other not in folders:
+            if len(options.folders) == 1:
+                check_there(other, "'cloudrc class new' makes one")
+            tell(f"{other}: no folder; left out")
+    if len(options.folders) > 1 or options.output == "csv":
+        _check_all(options, folders)
+    elif folders:
+        _check(options, folders[0])
+
+
+def _new(task: str | None, folder: Path) -> None:
+    from cloudrc.exercise.files import write_files
+    from cloudrc.exercise.task import SHIPPED
+
+    if task is None and folder.suffix in (".yaml", ".yml"):
+        task, folder = str(folder), Path(folder.stem)
+    source = Path(task) if task else SHIPPED
+    _read(source)
+    names = write_files(folder, source)
+    command = f"cloudrc class check {quote(str(folder))}"
+    print_line(f"fill in {', '.join(names)} in {folder}, then: {command}")
+
+
+def _read(source: Path) -> Task:
+    """Read a task, and check the flights of a lecturer's own."""
+    from cloudrc.exercise.task import SHIPPED, read_task
+
+    task = read_task(source)
+    if source != SHIPPED:
+        from cloudrc.exercise.checks import check_flights
+
+        check_flights(task, source.resolve().parent)
+    return task
+
+
+def _check(options: Options, folder: Path) -> None:
+    """Score a hand-in, and show each test as it ends."""
     from cloudrc.cli.progress import Progress
     from cloudrc.exercise import score
     from cloudrc.exercise.scoring import check
+    from cloudrc.exercise.task import task_of
 
+    source = task_of(folder, options.task)
+    task = _read(source)
+    if options.output != "gradescope":  # there, a hand-in without the files gets 0 points
+        _check_files(folder, [*task.files.values()])
     rows = []
     with Progress(f"scores {folder}") as view:
         view.say(f"scores {folder}")
-        for row in check(folder.resolve()):
+        for row in check(folder.resolve(), source.resolve()):
             rows.append(row)
             view.say(f"  {row['part']}, {row['test']}: {row['points']:g}/{row['max_points']}")
     result = score.sum_up(rows)
@@ -61,11 +113,33 @@ def execute(options: Options) -> None:
     print_result(options.output, result, score.as_text(result), **forms)
 
 
-def _check_files(folder: Path) -> None:
-    """Check that a folder has files of a student."""
-    from cloudrc.exercise.files import FILES
+def _check_all(options: Options, folders: Sequence[Path]) -> None:
+    """Score several hand-ins at once."""
+    from cloudrc.cli.progress import Progress
+    from cloudrc.exercise.score import as_csv
+    from cloudrc.exercise.scoring import score
+    from cloudrc.trials.workers import map_in_order
 
-    names = FILES.values()
+    if options.output == "gradescope":
+        raise BadInputError("-o gradescope: give one DIR")
+    task = options.task and options.task.resolve()
+    if task:
+        _read(task)
+    results = dict[str, Any]()
+    work = [folder.resolve() for folder in folders]
+    with Progress(f"scores {len(folders)} hand-ins") as view:
+        for folder, result in zip(
+            folders, map_in_order(partial(score, task), work, options.jobs), strict=True
+        ):
+            results[folder.name] = result
+            view.say(f"{folder}: {result['score']:g}/{result['max_score']:g}")
+    print_result(options.output, {"hand_ins": results}, as_csv(results), csv=as_csv(results))
+
+
+def _check_files(folder: Path, names: Sequence[str]) -> None:
+    """Check that a folder has files of a student."""
+    from cloudrc.exercise.files import describe_missing
+
     if not any((folder / name).exists() for name in names):
-        text = f"has none of {', '.join(names)}; name the folder that 'cloudrc class new' made"
-        raise BadInputError(f"{folder}: {text}")
+        hint = describe_missing(folder, names) or "name the folder that 'cloudrc class new' made"
+        raise BadInputError(f"{folder}: has none of {', '.join(names)}; {hint}")

@@ -14,10 +14,12 @@ from cloudrc.cli.parser import (
     settings_from,
     whole_number,
 )
+from cloudrc.errors import BadInputError
 from cloudrc.files import at_place
 from cloudrc.outside.paths import check_picture
 from cloudrc.text import escape
 
+PACKETS_MAX = 10_000_000  # in one direction
 EPILOG = """\
 examples:
   cloudrc link show lossy
@@ -42,13 +44,16 @@ def arguments(parser: Parser) -> None:
     add("--seed", "S", "seed of the random draws (default: 1)", 1, read_seed)
     add("--rate", "HZ", "packets per second (default: 100)", 100.0, number(1, 10_000, "Hz"))
     packets = "packets for the statistics of an unchanging link (default: 100000)"
-    add("--packets", "N", packets, 100_000, whole_number(1, 10_000_000))
+    add("--packets", "N", packets, 100_000, whole_number(1, PACKETS_MAX))
 
 
 def execute(options: Options) -> None:
     """Write a picture of a profile; print statistics and, in the last line, the file's path."""
     output = options.output or Path(f"{Path(options.profile).stem}.png")
     check_picture(output, "-o")
+    if (options.seconds or 0.0) * options.rate > PACKETS_MAX:
+        text = f"are more than {PACKETS_MAX} packets; give less with --seconds or --rate"
+        raise BadInputError(f"--seconds {options.seconds:g} at --rate {options.rate:g} {text}")
     from cloudrc.cli.progress import Progress
 
     with Progress(f"draws {options.profile}"):

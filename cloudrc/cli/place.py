@@ -7,8 +7,8 @@ from typing import Any
 
 from cloudrc.cli.output import TABLE, output_argument, print_result, tell, warn
 from cloudrc.cli.parser import COUNT_MAX, Options, Parser, flags, number, read_count, settings_from
+from cloudrc.outside.paths import lock_folder
 from cloudrc.runs.folder import new_folder
-from cloudrc.runs.lock import lock_folder
 from cloudrc.text import escape
 
 EPILOG = """\

@@ -33,7 +33,7 @@ def execute(options: Options) -> None:
     """Copy a recording; print what is in the copy, and what is missing."""
     from cloudrc.cli.progress import Progress
     from cloudrc.record.columns import Recording
-    from cloudrc.runs.session import check_ended
+    from cloudrc.report.folder import check_ended
 
     source: Path = options.file
     check_ended(source.resolve().parent)

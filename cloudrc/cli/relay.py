@@ -7,6 +7,7 @@ from typing import Any
 from cloudrc.cli.output import output_argument, print_result, tell
 from cloudrc.cli.parser import Options, Parser, add_verbs, flags, read_seed, settings_from
 from cloudrc.cli.processes import read_address
+from cloudrc.errors import BadInputError
 
 VERBS = {
     "tcp": "carry TCP connections to a server over the emulated link",
@@ -84,6 +85,9 @@ def execute(options: Options) -> None:
         from cloudrc.processes.ports import warn_if_exposed
         from cloudrc.runs.links.streams import RelaySettings, relay_tcp
 
+        if options.to == options.listen:
+            text = "is the address of --listen, too; name the server's host and port"
+            raise BadInputError(f"--to: {':'.join(map(str, options.to))} {text}")
         warn_if_exposed(options.listen)
         report = relay_tcp(settings_from(options, RelaySettings), tell)
         text = _as_text(report)

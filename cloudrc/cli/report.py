@@ -64,10 +64,10 @@ def execute(options: Options) -> int:
     from cloudrc.record.topics import TOPICS
     from cloudrc.report.figures.style import Look
     from cloudrc.report.fleet import summarize_fleet
-    from cloudrc.report.folder import read_run, robots_in
+    from cloudrc.report.folder import check_ended, read_run, robots_in
     from cloudrc.report.write import write_report
     from cloudrc.runs.fleet import write_again
-    from cloudrc.runs.session import check_ended, restore_mission
+    from cloudrc.runs.session import restore_mission
 
     measure.check(options.metric)
     look, is_fleet = Look(options.width, options.font_size), bool(robots_in(options.run))

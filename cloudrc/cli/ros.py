@@ -21,10 +21,11 @@ examples:
   cloudrc ros bridge --namespace drone1  /drone1/odom and so on
   cloudrc ros bridge --observe           nodes see the robot, but cannot steer
 
-It needs a sourced ROS 2 with rclpy for this Python. It publishes odom, /tf,
-cloudrc/guard, cloudrc/scene, cloudrc/path and /diagnostics, takes goal_pose and
-cmd_vel, and serves cloudrc/hold, resume, cancel, estop and acknowledge. It ends
-with the flight. docs/ros2.md describes the topics."""
+It needs a ROS 2 with rclpy for this Python. It publishes odom, /tf,
+robot_description, cloudrc/mission, guard, scene, path and /diagnostics, takes
+goal_pose and cmd_vel, and serves navigate_to_pose and cloudrc/hold, resume,
+cancel, estop and acknowledge. It ends with the flight. docs/ros2.md describes
+the topics."""
 
 
 def arguments(parser: Parser) -> None:
@@ -36,6 +37,8 @@ def arguments(parser: Parser) -> None:
     about = "namespace of topics and services, and prefix of the robot's frames (default: none)"
     add("--namespace", "NAME", about, "", ros_namespace)
     add("--observe", "", "let nodes see the robot, but not steer it")
+    add("--no-navigation", "", "leave the action navigate_to_pose to Nav2")
+    add("--rep-105", "", "let base_link move in the frame odom, and odom be a frame in map")
     pod = bridge.add_argument_group("in the container of the chart")
     add = flags(pod)
     add("--config", "FILE", "experiment file")
@@ -92,7 +95,8 @@ def _in_pod(options: Options) -> _Flight:
 
 def _open(stack: ExitStack, options: Options, flight: _Flight) -> tuple[Any, Any]:
     """Open the bridge and the reader of cloud's records; `stack` closes them."""
-    from cloudrc.bridges.ros2.bridge import RosBridge
+    from cloudrc.bridges.ros2.bridge import RosBridge, Shown
+    from cloudrc.bridges.ros2.description import RobotFrames, covariances, urdf
     from cloudrc.bridges.ros2.requests import RosRequests
     from cloudrc.config.load import read_experiment
     from cloudrc.config.robot import find_robot
@@ -105,8 +109,12 @@ def _open(stack: ExitStack, options: Options, flight: _Flight) -> tuple[Any, Any
     world = read_experiment(str(flight.config)).world
     robot = find_robot(world.robot)
     name = options.namespace.strip("/")
-    prefix = f"{name}/" if name else ""
-    shapes = scene_shapes(read_shapes(world), scene_of(world).tubes, prefix)
+    frames = RobotFrames(f"{name}/" if name else "", options.rep_105)
+    bodies = read_shapes(world)
+    markers = encode_markers(0, scene_shapes(bodies, scene_of(world).tubes, frames.prefix))
+    description = urdf(world.robot, frames, bodies.robot)
+    exactness = covariances(world.sensors)
+    shown = Shown(frames, markers, description, exactness, not options.no_navigation)
 
     def tell(text: str) -> None:
         print_line(f"ros: {text}")
@@ -116,11 +124,11 @@ def _open(stack: ExitStack, options: Options, flight: _Flight) -> tuple[Any, Any
         steering,
         tell,
         planar=robot.planar,
-        turns=robot.heading == "free",
-        prefix=prefix,
+        heading=robot.heading,
+        frames=frames,
         observes=options.observe or not flight.has_api,
     )
-    bridge = RosBridge(name, prefix, encode_markers(0, shapes), steering, requests, tell)
+    bridge = RosBridge(name, shown, steering, requests, tell)
     stack.callback(bridge.close)
     reader = RecordReader(flight.records)
     stack.callback(reader.close)

@@ -83,7 +83,7 @@ def _up(options: Options) -> int:
             words = str(run), str(options.foxglove)
             stack.enter_context(_beside(say, "cloudrc.processes.foxglove_live", *words))
 
-    from cloudrc.runs.under_way import short
+    from cloudrc.cli.under_way import short
 
     more = [name for name in ("console", "foxglove") if getattr(options, name)]
     require("a session", (*MODES["local"], *more))
@@ -139,9 +139,9 @@ def _beside(say: Say, *words: str) -> Iterator[None]:
 
 def _down(options: Options) -> None:
     """End a session, and print the path of its report."""
+    from cloudrc.cli.under_way import find_session, short
     from cloudrc.drivers.local import end_session
     from cloudrc.runs.session import last_mission
-    from cloudrc.runs.under_way import find_session, short
 
     run, note = find_session(options.run)
     if note:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import secrets
 from collections.abc import Generator, Sequence
+from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import leave_message, print_line, print_or_drop, print_result, tell, warn
 from cloudrc.cli.parser import Options
 from cloudrc.cli.progress import Progress, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.cli.where import release_from_flags
+from cloudrc.config.overrides import parse_settings
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.files import write_atomically
+from cloudrc.files import read_json, write_atomically, write_json
 from cloudrc.metrics.verdict import EXIT_CODES
 from cloudrc.outside.paths import check_picture
 from cloudrc.runs.experiment import check_mode
@@ -21,11 +24,20 @@ from cloudrc.studies import sweep
 from cloudrc.studies.pods import fly_in_pods
 from cloudrc.text import escape
 from cloudrc.trials import summary as summaries
+from cloudrc.trials.bucket import open_rows
 from cloudrc.trials.plan import PlannedFlight, SweepPlan, check, draft_of, read_draft, unpack
-from cloudrc.trials.play import keep, play
+from cloudrc.trials.play import keep
 from cloudrc.trials.play import run as play_missing
 from cloudrc.trials.rows import Row
-from cloudrc.trials.workers import map_in_order, take_each
+
+if TYPE_CHECKING:
+    from cloudrc.cluster.batch import PodSettings
+
+POD_FLAGS = (
+    *("context", "namespace", "release", "shards", "image", "cpu", "queue", "parallelism"),
+    *("cpu_limit", "memory", "claim", "bucket", "set_job"),
+)
+"""Flags of a sweep on Kubernetes that `sweep attach` repeats."""
 
 
 def run(options: Options) -> int:
@@ -34,6 +46,8 @@ def run(options: Options) -> int:
     plan = _check(options)  # before there is a folder
     with sweep.open_folder(options.out, f"sweep-{options.file.stem}", options.shard) as folder:
         rows = sweep.begin(folder, plan, options.shard)
+        if options.on:
+            write_json(folder / sweep.PODS, {name: getattr(options, name) for name in POD_FLAGS})
         mine = sweep.flights_of(plan, options.shard)
         missing = [each for each in mine if each.key not in rows.kept]
         with SweepView(_head(options, plan, mine, missing), len(missing)) as view:
@@ -47,7 +61,8 @@ def run(options: Options) -> int:
                     mine, rows.kept, options.record, folder, options.jobs
                 )
         if stopped:
-            tell(f"{stopped}; to continue, add --out {folder}")
+            again = f"cloudrc sweep attach {folder}" if options.on else f"add --out {folder}"
+            tell(f"{stopped}; to continue, {again}")
         done = sweep.finish(folder, plan)
         name = sweep.TABLE if len(done) == len(plan.flights) else sweep.SUMMARY
         text = f"\n{summaries.count_verdicts(done.values())}\n\n{escape(str(folder / name))}"
@@ -78,6 +93,8 @@ def _check_flags(options: Options) -> None:
         require("a sweep", MODES["virtual"] if options.record else ("world",))
     elif options.record or options.shard:
         raise BadInputError("--on kubernetes has no --record and no --shard; see --shards")
+    elif options.claim and options.bucket:
+        raise BadInputError("--claim and --bucket are two places for the rows; give one")
     if options.shard and options.out is None:
         raise BadInputError("--shard needs --out, the folder that all shards share")
 
@@ -88,12 +105,23 @@ def _check(options: Options) -> SweepPlan:
     with Progress(f"checks {draft.size}"):
         plan = check(draft)
     if options.on:
-        from cloudrc.cluster.own_files import check_local_files
+        from cloudrc.cluster.own_files import check_size
 
-        for point in plan.points:
-            check_local_files(point.model_dump(mode="json"), "or fly without --on")
+        _pods(options)
+        check_size(plan.own_files)
     warn(*plan.points)
     return plan
+
+
+def attach(options: Options) -> int:
+    """Go on with a sweep on Kubernetes: find its Job, or create it again; return the exit code."""
+    known = read_json(options.folder / sweep.PODS)
+    if not known:
+        text = "is no folder of 'cloudrc sweep run --on kubernetes'; name one"
+        raise BadInputError(f"{options.folder}: {text}")
+    own = {"file": options.folder / sweep.FILE, "out": options.folder, "on": "kubernetes"}
+    vars(options).update(known, **own, max_flights=None, record=None, shard=None)
+    return run(options)
 
 
 def fly(options: Options) -> None:
@@ -148,15 +176,24 @@ def figure(options: Options) -> None:
 def _fly_in_pods(
     options: Options, plan: SweepPlan, flights: Sequence[PlannedFlight]
 ) -> Generator[Row]:
-    from cloudrc.cluster.batch import PodSettings
+    return fly_in_pods(release_from_flags(options), _pods(options), plan, flights, tell)
 
-    pods = PodSettings(options.shards, options.image, options.cpu, options.queue)
-    return fly_in_pods(release_from_flags(options), pods, plan, flights, tell)
+
+def _pods(options: Options) -> PodSettings:
+    """Return the pods that the flags ask for."""
+    require("a cluster", ("kube",))
+    from cloudrc.cluster.batch import PodSettings, check_changes
+
+    settings = parse_settings(options.set_job, "--set-job", "priorityClassName=low")
+    check_changes(changes := {path: each.value for path, each in settings.items()})
+    given = {name: getattr(options, name) for name in PodSettings._fields if name in POD_FLAGS}
+    return PodSettings(**given, changes=changes)
 
 
 def rows(options: Options) -> None:
     """Fly one shard (part) of the flights in a file; print the result of each flight as a row.
 
+    With `--out`, keep the rows there, and fly only those that are missing.
     If the shard cannot be finished, leave the reason for Kubernetes, which flies the shard again.
     """
     shard, count = options.shard
@@ -165,10 +202,14 @@ def rows(options: Options) -> None:
         print(json.dumps(row, allow_nan=False), flush=True)
 
     try:
+        kept = open_rows(options.out, f"{shard}-{secrets.token_hex(4)}")
         flights = unpack(options.file)[shard - 1 :: count]
-        if stopped := take_each(map_in_order(play, flights, jobs=1), print_row):
+        for flight in flights:
+            if flight.key in kept.kept:
+                print_row(kept.kept[flight.key])
+        if stopped := play_missing(flights, kept, 1, print_row):
             raise stopped
-    except CloudrcError as error:
+    except (CloudrcError, OSError) as error:
         leave_message(str(error))
         raise
 

@@ -10,11 +10,12 @@ import argparse
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import tell
-from cloudrc.cli.parser import KUBECTL_PLUGIN, Add, Options, Parser, flags, number
+from cloudrc.cli.parser import KUBECTL_PLUGIN, Add, Options, Parser, flags, number, whole_number
 from cloudrc.cluster.client import DEFAULT_RELEASE as DEFAULT_RELEASE
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.files import warn_if_readable
@@ -23,8 +24,8 @@ from cloudrc.runs.requirements import require
 from cloudrc.teleop.client import VARIABLE
 
 if TYPE_CHECKING:
+    from cloudrc.cli.under_way import RunInFlight
     from cloudrc.cluster.client import Release
-    from cloudrc.runs.under_way import RunInFlight
 
 READY_LIMIT = 300.0
 """Default time limit for the pods of a release to become ready [s]."""
@@ -37,6 +38,7 @@ def release_arguments(parser: Parser, default: str = "the only one of the namesp
     """
     add = cluster_arguments(parser, "(default: the context's, or default)")
     add("--release", "NAME", f"Helm release (default: {default})")
+    add("--robot", "K", "number of a robot, if the release is a fleet", read=whole_number(0, 999))
     return add
 
 
@@ -77,7 +79,8 @@ def flown_release(options: Options) -> Release:
     require("a cluster", ("kube",))
     from cloudrc.cluster.releases import choose_release
 
-    return choose_release(options.context, options.namespace, options.release)
+    found = choose_release(options.context, options.namespace, options.release)
+    return replace(found, robot=options.robot)
 
 
 def run_argument(parser: Parser) -> None:
@@ -90,7 +93,7 @@ def find_local_run(
 ) -> RunInFlight | None:
     """Find the run in flight that a command means; None if its flags name a cluster.
 
-    The parameters and errors are those of `runs.under_way.find_run`.
+    The parameters and errors are those of `cli.under_way.find_run`.
     """
     in_cluster = options.context or options.namespace or options.release
     if options.run is None and (in_cluster or Path(sys.argv[0]).name == KUBECTL_PLUGIN):
@@ -101,8 +104,8 @@ def find_local_run(
 
 
 def find_run_here(run: Path | None, *, steers: bool, links: bool = False) -> RunInFlight | None:
-    """Find a run as `runs.under_way.find_run` does; tell which one was chosen."""
-    from cloudrc.runs.under_way import find_run
+    """Find a run as `cli.under_way.find_run` does; tell which one was chosen."""
+    from cloudrc.cli.under_way import find_run
 
     found = find_run(run, steers=steers, links=links)
     if found is not None and found.note:

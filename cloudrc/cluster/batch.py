@@ -1,13 +1,15 @@
 """Fly the flights of a sweep as an Indexed Job; each pod prints the results of its flights as rows.
 
 If a pod is lost, Kubernetes starts another pod, and the same flights give the same rows. Therefore
-the sweep needs only the Job and a ConfigMap, and no volume.
+the sweep needs only the Job and a ConfigMap. With a claim or a bucket each pod also keeps its rows
+there, and the next pod prints those that it finds, instead of flying again.
 """
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from cloudrc.cluster.client import ClusterError, Release
@@ -20,18 +22,26 @@ from cloudrc.cluster.jobs import (
     read_example,
 )
 from cloudrc.errors import BadInputError, to_one_line
+from cloudrc.outside.document import KeyPath
+from cloudrc.text import suggest_name
 
 COMPONENT = "sweep"
 """Label `component` of the Jobs and pods of sweeps, and name of their container."""
 FILE = "flights.json.gz"
 """Key in the ConfigMap under which the flights are stored."""
-REMEDY = "repeat the command, perhaps with a smaller request, --cpu 500m, or with fewer --shards"
+REMEDY = (
+    "repeat the command, perhaps with --cpu 500m, --cpu-limit 1, --memory 512Mi or fewer --shards"
+)
 """What a user can do if the cluster does not run the pods."""
 OUT_OF_MEMORY = (
     "it used more memory than the limit of its container (OOMKilled); "
-    "fly shorter missions, or without --on"
+    "raise it, such as --memory 1Gi, or fly shorter missions"
 )
 """How a pod has ended whose flight needs too much memory."""
+FAILED_SHARE = 10
+"""The Job ends early once more than one shard of so many has failed: then all would."""
+STORE = "/rows"
+"""Folder in which the pods mount the claim."""
 
 
 class PodSettings(NamedTuple):
@@ -41,33 +51,98 @@ class PodSettings(NamedTuple):
     image: str | None  # with the simulator; None: that of the chart's example
     cpu: str  # CPU request of a pod, such as "500m"
     queue: str | None = None  # of Kueue
+    parallelism: int | None = None  # number of pods at once; None: all
+    cpu_limit: str | None = None
+    memory: str | None = None  # request and limit; None: those of the chart's example
+    claim: str | None = None  # PersistentVolumeClaim that keeps the rows
+    bucket: str | None = None  # folder of a bucket that keeps the rows, such as s3://lab/sweeps
+    changes: Mapping[KeyPath, Any] = {}  # path of a field of the Job -> value
+
+    def place(self, name: str) -> str | None:
+        """Return where the pods of a Job keep their rows; None: in their logs alone."""
+        above = self.bucket or (STORE if self.claim else "")
+        return f"{above.rstrip('/')}/{name}" if above else None
 
 
-def start(release: Release, name: str, flights: bytes, settings: PodSettings) -> None:
+def check_changes(changes: Mapping[KeyPath, Any]) -> None:
+    """Raise a BadInputError if the Job has no field of this name."""
+    fields = [name for kind in _kinds() for name in kind.attribute_map.values()]
+    for path in changes:
+        if path[0] not in fields:
+            text = "neither a Job nor its pod or container has this field"
+            hint = suggest_name(path[0], fields)
+            raise BadInputError(f"--set-job {'.'.join(path)}: {text}{hint}")
+
+
+def _kinds() -> tuple[Any, Any, Any]:
+    """Return the kinds of what has the fields of a Job: its spec, the pod's, the container."""
+    from kubernetes import client
+
+    return client.V1JobSpec, client.V1PodSpec, client.V1Container
+
+
+def start(
+    release: Release,
+    name: str,
+    flights: bytes,
+    settings: PodSettings,
+    own_files: Iterable[str] = (),
+) -> None:
     """Create the Job `name` whose pods fly `flights`, a file made by `trials.plan.pack`.
 
     A failed Job of this name is replaced; a Job that runs or is complete stays as it is. The Job
-    belongs to no Helm release.
+    belongs to no Helm release. The pods have `own_files` at the same paths as this machine.
 
     Raises:
         ClusterError: If the cluster refuses the Job, for example because the sweep is too large.
     """
-    shards, image, cpu, queue = settings
     if (earlier := find_job(release, name)) is not None:
         if not failure_of(earlier):  # flies, or is complete
             return
         delete_job(release, name)
     files, job = read_example(release, COMPONENT, name)
-    if queue:
-        labels = job["metadata"]["labels"]  # the pods keep theirs
-        job["metadata"]["labels"] = {**labels, "kueue.x-k8s.io/queue-name": queue}
-    job["spec"] |= {"completions": shards, "parallelism": shards}
-    (container,) = job["spec"]["template"]["spec"]["containers"]
-    container["image"] = image or container["image"]
-    container["args"] = [str(shards)]
-    container["resources"]["requests"]["cpu"] = cpu
     files["binaryData"] = {FILE: base64.b64encode(flights).decode()}
-    create_job(release, job, files)
+    _set_up(job, name, settings)
+    pod = job["spec"]["template"]["spec"]
+    (container,) = pod["containers"]
+    for number, own in enumerate(own_files):
+        key = f"own-{number}"
+        files["binaryData"][key] = base64.b64encode(Path(own).read_bytes()).decode()
+        mount = {"name": "flights", "mountPath": own, "subPath": key, "readOnly": True}
+        container["volumeMounts"].append(mount)
+    for path, value in settings.changes.items():
+        kinds = zip(_kinds(), (job["spec"], pod, container), strict=True)
+        node = next(node for kind, node in kinds if path[0] in kind.attribute_map.values())
+        for part in path[:-1]:
+            node = node.setdefault(part, {})
+        node[path[-1]] = value
+    create_job(release, job, files, field_validation="Strict")
+
+
+def _set_up(job: Any, name: str, settings: PodSettings) -> None:
+    """Give the Job its number of pods, and the pods what they ask for."""
+    shards, spec = settings.shards, job["spec"]
+    pod = spec["template"]["spec"]
+    (container,) = pod["containers"]
+    if settings.queue:
+        labels = job["metadata"]["labels"]  # the pods keep theirs
+        job["metadata"]["labels"] = {**labels, "kueue.x-k8s.io/queue-name": settings.queue}
+    spec |= {"completions": shards, "parallelism": min(settings.parallelism or shards, shards)}
+    spec["maxFailedIndexes"] = max(1, shards // FAILED_SHARE)
+    container["image"] = settings.image or container["image"]
+    container["args"] = [str(shards)]
+    requests, limits = container["resources"]["requests"], container["resources"]["limits"]
+    requests["cpu"] = settings.cpu
+    if settings.cpu_limit:
+        limits["cpu"] = settings.cpu_limit
+    if settings.memory:
+        requests["memory"] = limits["memory"] = settings.memory
+    if place := settings.place(name):
+        container["args"].append(f"--out={place}")
+    if settings.claim:
+        claim = {"claimName": settings.claim}
+        pod["volumes"].append({"name": "rows", "persistentVolumeClaim": claim})
+        container["volumeMounts"].append({"name": "rows", "mountPath": STORE})
 
 
 def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iterator[str]:

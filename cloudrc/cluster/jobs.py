@@ -20,10 +20,12 @@ from cloudrc.cluster.client import ClusterError, NotFoundError, Release, chart_f
 from cloudrc.cluster.incidents import ReleaseWatch
 from cloudrc.cluster.pods import (
     UNSCHEDULED,
+    PodWatch,
     container_statuses,
     describe_end,
     events_of,
-    find_deployment,
+    find_workload,
+    fleet_size,
     pod_failure,
     pod_log,
 )
@@ -51,7 +53,12 @@ KEEP_FINISHED = 3600
 LOOK_PERIOD = 1.0
 """Time between two requests for the state of a Job and its pods [s]."""
 OVERLAP = 10
-"""Age of the oldest lines that are read from the log of a running pod [s]."""
+"""Time before the last read of the log of a running pod from which lines are read again [s]."""
+TOGETHER, EACH = 10.0, 0.3
+"""Time after which the robots of a fleet begin together, and more for each robot [s]: meanwhile
+their pods start, and their metrics are read."""
+AT = "--at="
+"""Flag of the Job's container: the Unix time at which a robot begins [s]."""
 NO_LOG = "unable to retrieve container logs for "
 """What the kubelet sends in place of the log of a container that is gone."""
 DELETE_LIMIT = 40.0
@@ -85,18 +92,22 @@ def run_job(
     """
     # A Job's pod has a longer name than the Job; the limit is 63 characters.
     name = name or f"{release.name[:40].rstrip('-.')}-mission-{secrets.token_hex(3)}"
-    deployment = find_deployment(release, "cloud")
     job = _read_template(release)
     labels = {**release.labels(COMPONENT), "app.kubernetes.io/managed-by": "cloudrc"}
-    owner = owner_of("apps/v1", "Deployment", deployment)
+    labels |= job.get("metadata", {}).get("labels", {})  # of Kueue
+    owner = owner_of("apps/v1", *find_workload(release, "cloud"))
     job["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
     given = mission.get("time_limit_s")
     # The API takes a mission with such a limit only.
     limit = ceil(given) if isinstance(given, int | float) and 0 < given <= 1e6 else LIMIT_MAX
     deadline = limit + START_ALLOWANCE + queue * QUEUE_ALLOWANCE
     job["spec"] |= {"activeDeadlineSeconds": deadline, "ttlSecondsAfterFinished": KEEP_FINISHED}
+    arguments = job["spec"]["template"]["spec"]["containers"][0]["args"]
     if queue:
-        job["spec"]["template"]["spec"]["containers"][0]["args"].append("--queue")
+        arguments.append("--queue")
+    if robots := fleet_size(release):  # may have changed since the chart was installed
+        job["spec"] |= {"completions": robots, "parallelism": robots}
+        arguments.append(f"{AT}{ceil(time.time() + TOGETHER + EACH * robots)}")
     data = {FILE: json.dumps(mission, indent=2) + "\n"}
     create_job(release, job, {"apiVersion": "v1", "kind": "ConfigMap", "data": data})
     return name
@@ -124,16 +135,16 @@ def read_example(release: Release, component: str, name: str) -> tuple[Any, Any]
     return files, job
 
 
-def create_job(release: Release, job: Any, files: Any) -> None:
+def create_job(release: Release, job: Any, files: Any, **given: str) -> None:
     """Create a Job, and `files` as a ConfigMap of the same name, which its pods mount.
 
-    If the ConfigMap cannot be created, delete the Job.
+    If the ConfigMap cannot be created, delete the Job. `given` are arguments of the client.
     """
     name = job["metadata"]["name"]
     for volume in job["spec"]["template"]["spec"]["volumes"]:
         if "configMap" in volume:
             volume["configMap"]["name"] = name
-    created = release.request("create", "jobs", body=job)
+    created = release.request("create", "jobs", body=job, **given)
     owner = owner_of("batch/v1", "Job", created)
     labels = job["metadata"]["labels"]
     files["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
@@ -241,27 +252,37 @@ class JobReader:
         self._release, self._name, self._tell = release, name, tell
         self._see_end, self._look = see_end, look
         self._told, self._read = set[str](), set[str]()  # sentences; UIDs of pods
+        self._read_at = dict[str, float]()  # UID of a running pod -> time of its last read [s]
         self._seen = set[int]()  # hashes of lines
         self.key = ""  # UID of the Job
         self.job: Any = None  # as it was seen last
 
     def read(self) -> Iterator[str]:
-        """Yield each different line of the logs of all pods."""
+        """Yield each different line of the logs of all pods.
+
+        However many pods there are, a look takes four requests, one of them to read the log of one
+        running pod, in turn; and each pod that has ended takes one more, once.
+        """
+        self._look_at_job()
+        selector = f"{UID_LABEL}={self.key}"
+        watch = PodWatch(self._release, selector)
         while True:
-            self._look_at_job()
-            has_ended = failure_of(self.job) is not None
-            selector = f"{UID_LABEL}={self.key}"
-            pods = self._release.request("list", "pods", label_selector=selector)
+            began = time.monotonic()
+            if has_ended := failure_of(self.job) is not None:
+                pods = self._release.request("list", "pods", label_selector=selector)
+            else:
+                watch.look()
+                pods = [*watch.pods.values()]
             pods.sort(key=lambda pod: str(pod.metadata.creation_timestamp))
             self._tell_once("waiting: the Job is suspended" if self.job.spec.suspend else "")
-            self._tell_once("" if has_ended else _why_waiting(self._release, self.job, pods))
-            for pod in pods:
-                yield from self._read_pod(pod)
+            self._tell_once("" if has_ended else why_waiting(self._release, self.job, pods))
+            yield from self._read_pods(pods, has_ended=has_ended)
             for sentence in self._look():
                 self._tell(sentence)
             if has_ended:
                 return
-            time.sleep(LOOK_PERIOD)
+            time.sleep(max(0.0, began + LOOK_PERIOD - time.monotonic()))
+            self._look_at_job()
 
     def _look_at_job(self) -> None:
         try:
@@ -274,32 +295,50 @@ class JobReader:
         if self.job.metadata.deletion_timestamp is not None:
             raise JobGoneError("its Job was deleted", self.key)
 
-    def _read_pod(self, pod: Any) -> Iterator[str]:
-        """Yield the new lines of a pod's log; tell how the pod has ended."""
-        uid, component = pod.metadata.uid, self.job.metadata.labels[COMPONENT_LABEL]
-        if pod.status.phase == "Pending" or uid in self._read:
-            return
+    def _read_pods(self, pods: list[Any], *, has_ended: bool) -> Iterator[str]:
+        """Yield the new lines of the pods that have ended, and of one that runs.
+
+        If the Job `has_ended`, nothing more comes: read all pods to their end.
+        """
+        running = list[Any]()
+        for pod in pods:
+            if pod.status.phase == "Pending" or pod.metadata.uid in self._read:
+                continue
+            ended = self._end_of(pod)
+            if ended is None and pod.status.phase == "Running" and not has_ended:
+                running.append(pod)
+                continue
+            self._read.add(pod.metadata.uid)
+            self._tell_once(self._see_end(ended) if ended else "")
+            yield from self._read_log(pod, None)
+        if running:
+            pod = min(running, key=lambda each: self._read_at.get(each.metadata.uid, 0.0))
+            now, before = time.monotonic(), self._read_at.get(pod.metadata.uid)
+            self._read_at[pod.metadata.uid] = now
+            last = None if before is None else ceil(now - before) + OVERLAP
+            yield from self._read_log(pod, last)
+
+    def _end_of(self, pod: Any) -> Any:
+        """Return the final state of the Job's container in a pod; None if it has not ended."""
         # A service mesh may add containers, which end later.
-        own = (each for each in container_statuses(pod) if each.name == component)
-        ended = next((each.state.terminated for each in own), None)
-        is_done = ended is not None or pod.status.phase in ("Succeeded", "Failed")
-        if is_done:
-            self._read.add(uid)
-        if ended is not None:
-            self._tell_once(self._see_end(ended))
-        for line in self._log_of(pod, component, is_done).splitlines():
+        own = (each for each in container_statuses(pod) if each.name == self._container)
+        return next((each.state.terminated for each in own), None)
+
+    @property
+    def _container(self) -> str:
+        return str(self.job.metadata.labels[COMPONENT_LABEL])
+
+    def _read_log(self, pod: Any, last: int | None) -> Iterator[str]:
+        """Yield the new lines of the last `last` [s] of a pod's log; None: of the whole log."""
+        try:
+            log = pod_log(self._release, pod.metadata.name, self._container, last)
+        except ClusterError as error:  # the pod may be gone
+            self._tell_once(str(error) if last is None else "")
+            return
+        for line in () if log.startswith(NO_LOG) else log.splitlines():
             if hash(line) not in self._seen:
                 self._seen.add(hash(line))
                 yield line
-
-    def _log_of(self, pod: Any, container: str, is_done: bool) -> str:
-        try:
-            last = None if is_done else OVERLAP
-            log = pod_log(self._release, pod.metadata.name, container, last)
-            return "" if log.startswith(NO_LOG) else log
-        except ClusterError as error:  # the pod may be gone
-            self._tell_once(str(error) if is_done else "")
-            return ""
 
     def _tell_once(self, text: str | None) -> None:
         if text and text not in self._told:
@@ -307,7 +346,7 @@ class JobReader:
             self._tell(text)
 
 
-def _why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
+def why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
     """Return a sentence on why pods of a Job wait; "" if none waits.
 
     Raise a ClusterError if a pod will never run, or if the cluster denies the pods.

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from cloudrc.cluster.client import NotFoundError, Release, run
 from cloudrc.cluster.jobs import owner_of
-from cloudrc.cluster.pods import find_deployment
+from cloudrc.cluster.pods import find_workload
 from cloudrc.config.hull import hull_of
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment, local_files
@@ -76,6 +76,15 @@ def _check_size(name: str) -> None:
         raise problem_at("world.robot", f"{Path(name) / ROBOT_FILE}: {text}")
 
 
+def check_size(paths: Iterable[str]) -> None:
+    """Check that a ConfigMap can hold the files of a sweep."""
+    sizes = {path: Path(path).stat().st_size for path in paths}
+    if (total := sum(sizes.values())) > SIZE_MAX:
+        largest = max(sizes, key=sizes.__getitem__)
+        text = f"your files have {total} bytes, but a ConfigMap takes {SIZE_MAX} (1 MiB)"
+        raise problem_at("--on", f"{largest}: {text}; fly without it, or install it in an image")
+
+
 def check_local_files(values: Mapping[str, Any], remedy: str) -> None:
     """Check that `values` have no path of a local file; `remedy` is the end of the error's text."""
     for key, path in local_files(values).items():
@@ -132,7 +141,7 @@ def _make_namespace(release: Release) -> None:
 def give_to_release(release: Release, names: Mapping[str, str]) -> None:
     """Make the ConfigMaps of `send_own_files` part of an installed release, to end with it."""
     for name in names.values():
-        owner = owner_of("apps/v1", "Deployment", find_deployment(release, "world"))
+        owner = owner_of("apps/v1", *find_workload(release, "world"))
         patch = json.dumps({"metadata": {"ownerReferences": [owner]}})
         words = ["patch", "configmap", name, "--type=merge", f"--patch={patch}"]
         run("kubectl", [*release.flags, *words])

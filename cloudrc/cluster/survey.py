@@ -28,13 +28,14 @@ from cloudrc.errors import to_one_line
 
 NEEDED = {
     "": "pods services configmaps secrets serviceaccounts persistentvolumeclaims",
-    "apps": "deployments",
+    "apps": "deployments statefulsets",
     "batch": "jobs",
     "networking.k8s.io": "networkpolicies",
 }
 """API group -> the objects that an install, an upgrade and a mission create, change and delete."""
 VERBS = ("create", "patch", "delete")
 ALSO = (
+    ("", "watch", "pods"),
     ("", "get", "pods/log"),
     ("", "create", "pods/portforward"),
     ("", "create", "pods/exec"),
@@ -123,7 +124,7 @@ def pods_of_chart(rendered: list[Any]) -> dict[str, dict[str, Any]]:
             "serviceAccountName": "default",  # the chart's own accounts do not exist yet
         }
         for thing in rendered
-        if thing["kind"] == "Deployment"
+        if thing["kind"] in ("Deployment", "StatefulSet")
     }
 
 

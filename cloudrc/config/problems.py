@@ -73,15 +73,26 @@ def problem_at(key: str, reason: str) -> ProblemsError:
     return ProblemsError([ConfigProblem(tuple(key.split(".")), "", reason)])
 
 
-def from_pydantic(
-    error: ValidationError, model: type[BaseModel], prefix: KeyPath = (), limit: int | None = None
-) -> list[ConfigProblem]:
-    """Convert the first `limit` validation errors of `model`.
+@contextmanager
+def at_key(key: str, place: str = "") -> Iterator[None]:
+    """Turn a BadInputError of the `with` block into one about the value of a key.
 
-    `prefix` is the key path of the model in the document.
+    `place` precedes its text. An error that names its key already stays as it is.
     """
+    try:
+        yield
+    except ProblemsError:
+        raise
+    except BadInputError as error:
+        raise problem_at(key, f"{place}{error}") from error
+
+
+def from_pydantic(
+    error: ValidationError, model: type[BaseModel], limit: int | None = None
+) -> list[ConfigProblem]:
+    """Convert the first `limit` validation errors of `model`."""
     details = error.errors(include_url=False)[:limit]
-    return [_problem(detail, model, prefix) for detail in details]
+    return [_problem(detail, model) for detail in details]
 
 
 def raise_problems(document: Document, problems: Iterable[ConfigProblem], name: str) -> None:
@@ -102,21 +113,19 @@ def validate(
     name: str,
     found: Sequence[ConfigProblem] = (),
     *,
-    described: type[BaseModel] | None = None,
     context: object = None,
 ) -> _Model:
     """Convert a document to `model`; `name` names the document in error messages.
 
-    Messages say what is valid in the model `described`, by default `model`: that of the user's file
-    if `model` is more than this file. The model's validators see `context`. If there are problems,
-    raise one BadInputError for all: the new ones and those in `found`.
+    The model's validators see `context`. If there are problems, raise one BadInputError for all:
+    the new ones and those in `found`.
     """
     known = {problem.path for problem in found}
     try:
         # In JSON mode pydantic accepts lists for tuples and is still strict.
         result = model.model_validate_json(json.dumps(document.tree), context=context)
     except ValidationError as error:
-        more = from_pydantic(error, described or model)
+        more = from_pydantic(error, model)
         found = [*found, *(problem for problem in more if problem.path not in known)]
     raise_problems(document, found, name)
     return result
@@ -152,7 +161,7 @@ _WORDS = {
 """Words in pydantic's messages -> those of ours."""
 
 
-def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> ConfigProblem:
+def _problem(detail: ErrorDetails, model: type[BaseModel]) -> ConfigProblem:
     kind, keys = detail["type"], tuple(map(str, detail["loc"]))
     # Drop the tags of unions, such as <name>, and the tag of names: they are not keys. Keep an
     # unknown key unchanged.
@@ -169,4 +178,4 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> C
             reason = reason.replace(old, new)
         reason = f"{reason} {unit_at(model, path)}".strip()
     value = "" if kind in _WITHOUT_VALUE else in_words(detail["input"])
-    return ConfigProblem(prefix + path, value, reason)
+    return ConfigProblem(path, value, reason)

@@ -15,9 +15,9 @@ from cloudrc.config.scene import scene_of
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import Page
 from cloudrc.console.steering import LinkControl, Steering
-from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.files import try_lock
+from cloudrc.errors import CloudrcError
 from cloudrc.geometry.obstacles import has_surface, obstacles
+from cloudrc.outside.paths import lock
 from cloudrc.teleop.client import Api
 
 SWITCH_PERIOD = 5e-4
@@ -50,15 +50,15 @@ def serve(
     """
     with ExitStack() as opened:
         sys.setswitchinterval(SWITCH_PERIOD)
-        config = opened.enter_context(flight.config.open())
-        if try_lock(config) is False:
-            text = "this run has a console already; open its page, or end it first"
-            raise BadInputError(text)
+        text = "this run has a console already; open its page, or end it first"
+        lock(opened.enter_context(flight.config.open()), text)
         experiment = read_experiment(str(flight.config))
         known = obstacles(scene_of(experiment.world), touch=experiment.mission.touched)
         feed = FlightFeed(tuple(filter(has_surface, known)), known_hull(experiment.world.robot))
         steering = Steering(flight.api, flight.link)
-        page = Page(experiment, feed, steering, port, flight.token, origins)
+        # A proxy reaches a pod at its own address, which the NetworkPolicy guards.
+        host = "0.0.0.0" if flight.token and origins else "127.0.0.1"
+        page = Page(experiment, feed, steering, port, flight.token, origins, host)
         opened.callback(page.close)
         steering.watch()
         steering.start()

@@ -100,6 +100,7 @@ class Steering:
         self._drive = threading.Thread(target=self._drive_loop, daemon=True)
         self._drives = True
         self._held: dict[str, tuple[Vector, float]] = {}  # key -> velocity, and end of the hold
+        self._turn: float | None = None  # yaw rate of the newest key [rad/s]
         self._changes: dict[str, float] = {}
         self._mission = ""
 
@@ -175,15 +176,16 @@ class Steering:
         words = f"going to ({', '.join(f'{value:g}' for value in place)})"
         return self.ask(words, "/v1/goto", {"position_m": place, **yaw})
 
-    def hold_key(self, key: str, velocity: Vector, lasts: float) -> None:
+    def hold_key(self, key: str, velocity: Vector, lasts: float, turn: float | None = None) -> None:
         """Drive the robot with `velocity` [m/s] for `lasts` [s], because the user holds `key`.
 
-        The velocities of several held keys add up.
+        The velocities of several held keys add up. With a yaw rate `turn` [rad/s] the robot also
+        turns, and the velocity is in the frame of its heading.
         """
         now = time.monotonic()
-        before = self.velocity(now)
-        self._held = {**self._held, key: (velocity, now + lasts)}
-        if self.velocity(now) != before:
+        before = self.velocity(now), self._turn
+        self._held, self._turn = {**self._held, key: (velocity, now + lasts)}, turn
+        if (self.velocity(now), turn) != before:
             self._moved.set()
 
     def release_keys(self, *keys: str) -> None:
@@ -232,14 +234,21 @@ class Steering:
 
     def _drive_loop(self) -> None:
         """Send the velocity while a key is held, and once more when the last key is released."""
-        last = ZERO
-        while self._drives or last != ZERO:
-            due = time.monotonic() + DRIVE_PERIOD
-            velocity = self.velocity(time.monotonic())
-            if velocity != ZERO or last != ZERO:
-                words = "driving" if velocity != ZERO else "drive ends: holding"
-                self.ask(words, "/v1/drive", {"velocity_mps": velocity})
-            last = velocity
+        moved = False
+        while self._drives or moved:
+            due = now = time.monotonic()
+            due += DRIVE_PERIOD
+            velocity, turn = self.velocity(now), self._turn
+            if not any(now < until for _, until in self._held.values()):
+                turn = None
+            moves = velocity != ZERO or bool(turn)
+            if moves or moved:
+                words = "driving" if moves else "drive ends: holding"
+                body: dict[str, Any] = {"velocity_mps": velocity}
+                if turn is not None:
+                    body["yaw_rate_radps"] = turn
+                self.ask(words, "/v1/drive", body)
+            moved = moves
             self._moved.wait(max(0.0, due - time.monotonic()))
             self._moved.clear()
 

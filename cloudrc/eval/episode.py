@@ -116,6 +116,7 @@ def _numbers_of(loop: Mapping[str, Any]) -> dict[str, float]:
     found = {"loop_age": loop["loop_age"]}
     for name in ("observation_age", "action_age"):
         parts = {name: "mean", f"{name}_p99": "p99", f"{name}_of": "of"}
+        parts |= {f"{name}_max": "max", f"{name}_peak": "peak_mean"}
         found |= {key: loop[f"{name}_{part}"] for key, part in parts.items()}
     found |= {name: loop[name] for name in ("late_share", "misses_in_10")}
     for way in ("uplink", "downlink"):

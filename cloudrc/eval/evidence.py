@@ -23,10 +23,17 @@ WEIGHTS = {
     "action_age": "action_age_of",
     "late_share": "action_age_of",
     **dict.fromkeys(("loop_age", "observation_age_p99", "action_age_p99", "seam_jump")),
+    **dict.fromkeys(("observation_age_peak", "action_age_peak")),
     **dict.fromkeys(("delay_measured_uplink", "delay_measured_downlink")),
     **dict.fromkeys(("loss_uplink", "loss_downlink")),
 }
 """Number of an episode whose mean a summary has -> steps that it is of; None: episodes count."""
+LARGEST = (
+    ("misses_in_10", "", 1),
+    ("observation_age_max", "_ms", 1e3),
+    ("action_age_max", "_ms", 1e3),
+)
+"""Numbers of an episode whose largest a summary has: name, suffix and factor of its unit."""
 SURVIVES = (
     "Survives up to N ms: with 95 % confidence, at each asked round trip up to N ms the policy "
     "succeeds in more than half of the episodes in which it succeeds without a network. It takes "
@@ -51,7 +58,8 @@ def summarize(rtt_ms: float | None, executor: str, rows: Sequence[Row]) -> dict[
     """Summarise a condition, of the mean round trip `rtt_ms` [ms], in plain values.
 
     Medians and rates have their 95 % interval: `_low` and `_high`. Means of steps are pooled, and
-    `_of` is the number of steps. Of the missed steps, the worst window counts. Ages and delays are
+    `_of` is the number of steps. Of the missed steps the worst window counts, of ages also the
+    largest. Ages and delays are
     in ms, `age_counts` has steps. What is not known is left out.
     """
     numbers: list[Mapping[str, float]] = [row["numbers"] for row in rows]
@@ -63,8 +71,9 @@ def summarize(rtt_ms: float | None, executor: str, rows: Sequence[Row]) -> dict[
     if all("success" in each for each in numbers):
         found["successes"] = done = int(sum(each["success"] for each in numbers))
         found |= _estimate("success", done / count, exact_interval(done, count))
-    if misses := [each["misses_in_10"] for each in numbers if "misses_in_10" in each]:
-        found["misses_in_10"] = int(max(misses))
+    for name, unit, factor in LARGEST:
+        if known := [each[name] for each in numbers if name in each]:
+            found[f"{name}{unit}"] = max(known) * factor
     counts = (row.get("age_counts", ()) for row in rows)
     found["age_counts"] = list(map(sum, zip_longest(*counts, fillvalue=0)))
     found |= {end: ends.count(end) for end in ("terminated", "truncated", "limit")}

@@ -53,7 +53,7 @@ COLUMNS = {
     "p99": "{action_age_p99_ms:.0f} ms",
     "late": "{late_share:.1%}",
     "of steps": "{action_age_of:.0f}",
-    "worst": "{misses_in_10}/10",
+    "worst": "{misses_in_10:g}/10",
 }
 """Head -> cell of the table of outcomes."""
 TESTS = {

@@ -1,8 +1,8 @@
-"""Score the exercise of docs/exercise.md: formulas on given samples, then flights in virtual time.
+"""Score the parts of a task: formulas on given samples, and flights in virtual time.
 
-The exercise has three parts: estimator, predictor and controller. The reference is cloudrc's own
-plug-ins. A flight that scores one part uses the reference for the other two parts, so that an error
-in one part costs no points of another part.
+A flight that scores one part flies with the experiment's own plug-ins for all other parts, so that
+an error in one part costs no points of another part. The references of the formulas are cloudrc's
+own plug-ins.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,10 +20,11 @@ import numpy as np
 from cloudrc import plugins
 from cloudrc.cloud.estimators import DelaySample
 from cloudrc.config.load import load_experiment
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import CloudrcError, PlacedError, describe_error
-from cloudrc.exercise.files import FILES
-from cloudrc.exercise.points import POINTS
+from cloudrc.exercise.task import FormulaName, Task, TestConfig
 from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
+from cloudrc.metrics import measure
 from cloudrc.outside import code
 from cloudrc.outside.values import WHOLE, InvalidValueError
 from cloudrc.runs.flight import fly_in_memory
@@ -84,13 +85,12 @@ class Formula(NamedTuple):
 
     measure: Callable[[Callable[..., Any]], Any]
 
-    def score(self, parts: Sequence[str], folder: Path) -> tuple[float, str]:
+    def score(self, part: str, file: Path) -> tuple[float, str]:
         """Return 1.0 and "right" if the student's results agree with those of the reference.
 
-        Otherwise raise an InvalidValueError. `parts` has one entry.
+        Otherwise raise an InvalidValueError. `file` is that of the `part`.
         """
-        (part,) = parts
-        names = str(folder / FILES[part]), REFERENCES[part]
+        names = str(file), REFERENCES[part]
         builds = [partial(plugins.load, f"{part}s", name) for name in names]
         seen, wanted = (np.asarray(self.measure(build), dtype=float) for build in builds)
         if seen.shape == wanted.shape:
@@ -102,76 +102,75 @@ class Formula(NamedTuple):
         raise InvalidValueError(f"gives {seen.round(3).tolist()}, not {wanted.round(3).tolist()}")
 
 
-class Exam(NamedTuple):
-    """A test flight; the value of one metric decides how many of the points the student gets.
-
-    The value `full` or better gives all points, `none` or worse gives 0; linear in between.
-    """
-
-    experiment: str
-    link: str
-    metric: str
-    full: float  # any unit
-    none: float  # any unit
-
-    def score(self, parts: Sequence[str], folder: Path) -> tuple[float, str]:
-        """Fly with the student's `parts`; return the earned share of points [1], and why."""
-        own = [f"cloud.{part}={json.dumps(str(folder / FILES[part]))}" for part in parts]
-        experiment = load_experiment(self.experiment, [f"link.profile={self.link}", *own])
-        found = fly_in_memory(experiment)
-        known = found.numbers.get(self.metric)
-        value = self.none if known is None else known.value
-        share = min(max((value - self.none) / (self.full - self.none), 0.0), 1.0)
-        seen = f"{self.metric} {value:.3g} (all points: {self.full:g}, none: {self.none:g})"
-        if failures := found.verdict.failures:
-            texts = {failure.code: failure.text for failure in failures}
-            share *= 0.0 if "plugin_failed" in texts else FAILED
-            seen += f"; {texts.get('plugin_failed', failures[0].text)}"
-        return share, seen
-
-
-CHECKS: dict[str, tuple[Formula | Exam, ...]] = {
-    "estimator": (
-        Formula(lambda build: _horizons(build, 0.08, 0.14, 0.05, 0.11, 0.2)),
-        Formula(lambda build: _horizons(build, 0.1, hold=0.04)),
-        Exam("steps", "paper-p3", "delay_estimate_error_rms", 0.025, 0.06),
-    ),
-    "predictor": (
-        Formula(partial(_predict, select=lambda o: o.position)),
-        Formula(partial(_predict, select=lambda o: o.orientation_wxyz)),
-        Formula(partial(_predict, select=_velocity_and_stamp)),
-        Exam("steps", "paper-p3", "prediction_error_rms", 0.015, 0.04),
-    ),
-    "controller": (
-        Formula(partial(_command, sign=True, gain_p=(0.5, 1.0, 2.0))),
-        Formula(partial(_command, n=1000, gain_i=(0.25, 0.25, 0.25))),
-        Formula(partial(_command, n=9, speed=0.5, gain_d=(0.4, 0.4, 0.4))),
-        Formula(partial(_command, velocity_max=(0.3, 0.4, 0.5))),
-        Exam("steps", "paper-p3", "iae_mean", 1.8, 4.0),
-    ),
-    "together": (
-        Exam("paper", "paper-p2", "waypoints_reached", 7, 0),
-        Exam("paper", "satellite", "waypoints_reached", 7, 0),
-    ),
+FORMULAS: dict[FormulaName, Formula] = {
+    "mean": Formula(lambda build: _horizons(build, 0.08, 0.14, 0.05, 0.11, 0.2)),
+    "hold time": Formula(lambda build: _horizons(build, 0.1, hold=0.04)),
+    "position": Formula(partial(_predict, select=lambda o: o.position)),
+    "orientation": Formula(partial(_predict, select=lambda o: o.orientation_wxyz)),
+    "velocity, stamp": Formula(partial(_predict, select=_velocity_and_stamp)),
+    "P": Formula(partial(_command, sign=True, gain_p=(0.5, 1.0, 2.0))),
+    "I": Formula(partial(_command, n=1000, gain_i=(0.25, 0.25, 0.25))),
+    "D": Formula(partial(_command, n=9, speed=0.5, gain_d=(0.4, 0.4, 0.4))),
+    "limit": Formula(partial(_command, velocity_max=(0.3, 0.4, 0.5))),
 }
-"""Part, or all parts together -> how each of its tests is scored, in the order of POINTS."""
 
 
-def run(part: str, folder: Path) -> Iterator[dict[str, Any]]:
-    """Score the tests of a part, or of all "together"; yield a row per test, as it ends.
+def check_flights(task: Task, beside: Path) -> None:
+    """Raise a BadInputError if an experiment of a task, a key or a number is none."""
+    files = {task.key(part): beside / name for part, name in task.files.items()}
+    there = {key: file for key, file in files.items() if file.is_file()}
+    for part in task.parts.values():
+        for test in part.tests.values():
+            if test.number:
+                own = _experiment(test, there, beside).report.metrics
+                if test.number not in map(measure.name_of, own):
+                    measure.find(test.number, look=True)
 
-    A test that cannot be scored gives 0.
+
+def _experiment(test: TestConfig, own: Mapping[str, Path], beside: Path) -> ResolvedExperiment:
+    file = beside / test.experiment
+    name = str(file) if file.is_file() else test.experiment
+    values = {**test.set, **{key: str(file) for key, file in own.items()}}
+    return load_experiment(name, [f"{key}={json.dumps(value)}" for key, value in values.items()])
+
+
+def fly(test: TestConfig, own: Mapping[str, Path], beside: Path) -> tuple[float, str]:
+    """Fly a test with the student's files; return the earned share of points [1], and why.
+
+    `own` are the keys of the experiment that get the files.
     """
-    parts = tuple(FILES) if part == "together" else (part,)
-    for check, points in zip(CHECKS[part], POINTS[part].values(), strict=True):
+    found = fly_in_memory(_experiment(test, own, beside))
+    known = found.numbers.get(test.number)
+    value = test.none if known is None else known.value
+    share = min(max((value - test.none) / (test.full - test.none), 0.0), 1.0)
+    seen = f"{test.number} {value:.3g} (all points: {test.full:g}, none: {test.none:g})"
+    if failures := found.verdict.failures:
+        texts = {failure.code: failure.text for failure in failures}
+        share *= 0.0 if "plugin_failed" in texts else FAILED
+        seen += f"; {texts.get('plugin_failed', failures[0].text)}"
+    return share, seen
+
+
+def run(task: Task, part: str, folder: Path, beside: Path) -> Iterator[dict[str, Any]]:
+    """Score the tests of a part of a task; yield a row per test, as it ends.
+
+    A test that cannot be scored gives 0. Files of experiments are in the folder `beside`.
+    """
+    files = task.files
+    parts = (part,) if part in files else tuple(files)
+    own = {task.key(each): folder / files[each] for each in parts}
+    for test in task.parts[part].tests.values():
         try:
-            share, seen = check.score(parts, folder)
+            if test.formula:
+                share, seen = FORMULAS[test.formula].score(part, folder / files[part])
+            else:
+                share, seen = fly(test, own, beside)
         except code.FAILURES as error:
-            share, seen = 0.0, _explain(error, folder, parts[0])
-        yield {"points": points * share, "seen": seen}
+            share, seen = 0.0, _explain(error, folder, files[parts[0]])
+        yield {"points": test.points * share, "seen": seen}
 
 
-def _explain(error: BaseException, folder: Path, part: str) -> str:
+def _explain(error: BaseException, folder: Path, file: str) -> str:
     """Describe an error; begin with FILE:LINE, the place in the student's files that failed."""
     while isinstance(error, CloudrcError) and error.__cause__ is not None:
         error = error.__cause__
@@ -185,5 +184,5 @@ def _explain(error: BaseException, folder: Path, part: str) -> str:
     if places:
         text = f"{places[-1][0]}:{places[-1][1]}: {text}"
     elif not isinstance(error, PlacedError):
-        text = f"{FILES[part]}: {text}"
+        text = f"{file}: {text}"
     return text.replace(f"{folder}{os.sep}", "")

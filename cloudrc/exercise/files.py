@@ -1,26 +1,43 @@
-"""The files of the exercise in a student's folder."""
+"""The files of a task in a student's folder."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from difflib import get_close_matches
 from pathlib import Path
 
+from cloudrc.exercise.task import COPY, SHIPPED, read_task
 from cloudrc.files import write_atomically
-from cloudrc.outside.paths import check_new
-
-FILES = {
-    "estimator": "delay_estimator.py",
-    "predictor": "predictor.py",
-    "controller": "controller.py",
-}
-"""Part -> the student's file."""
+from cloudrc.outside.paths import check_new, check_there
 
 
-def write_files(folder: Path) -> list[str]:
-    """Write the files that students fill in, none of which may exist; return their names."""
-    names = [*FILES.values()]
-    for name in names:
+def write_files(folder: Path, source: Path = SHIPPED) -> list[str]:
+    """Write the files that students fill in, none of which may exist; return their names.
+
+    The files lie beside the task `source`. That of a lecturer is copied, too, with its experiments.
+    """
+    task = read_task(source)
+    names = [*task.files.values()]
+    given = {name: source.with_name(name) for name in names}
+    if source != SHIPPED:
+        beside = {name: source.parent / name for name in sorted(task.experiments)}
+        given |= {name: path for name, path in beside.items() if path.is_file()}
+        given[COPY] = source
+    for name, path in given.items():
+        check_there(path, f"{source} names it; write it as students shall get it")
         check_new(folder / name, "name another folder")
     folder.mkdir(parents=True, exist_ok=True)
-    for name in names:
-        write_atomically(folder / name, Path(__file__).with_name(name).read_bytes())
+    for name, path in given.items():
+        write_atomically(folder / name, path.read_bytes())
     return names
+
+
+def describe_missing(folder: Path, names: Collection[str]) -> str:
+    """Say which files in a folder look like those of the `names` that it lacks; "" if none does."""
+    lacks = [name for name in names if not (folder / name).exists()]
+    others = {path.name.lower(): path.name for path in folder.iterdir() if path.name not in names}
+    found = list[str]()
+    for name in lacks:
+        for near in get_close_matches(name.lower(), others, n=1, cutoff=0.7):
+            found.append(f"there is '{others[near]}': rename it to {name}")
+    return "; ".join(found)

@@ -1,4 +1,4 @@
-"""Score one part of a hand-in, in a process of its own: `python -m ... PART DIR LIMIT`.
+"""Score one part of a hand-in, in a process of its own: `python -m ... PART DIR LIMIT TASK`.
 
 Each test is a line of JSON on the process's stdout; what the student's files print goes nowhere.
 The reader (`scoring`) bounds the points and the time.
@@ -30,16 +30,18 @@ def end_with_check() -> None:
     os.killpg(0, signal.SIGKILL)
 
 
-def score(part: str, folder: Path) -> None:
+def score(part: str, folder: Path, source: Path) -> None:
     """Print a row per test of a part, as it ends; work in the hand-in's folder."""
     rows = os.fdopen(os.dup(1), "w", encoding="utf-8")
     nowhere = os.open(os.devnull, os.O_RDWR)
     for standard in (0, 1, 2):
         os.dup2(nowhere, standard)
     from cloudrc.exercise import checks
+    from cloudrc.exercise.task import read_task
 
+    task = read_task(source)
     os.chdir(folder)  # a file may open one beside it by its name
-    for row in checks.run(part, folder):
+    for row in checks.run(task, part, folder, source.parent):
         rows.write(f"{json.dumps(row)}\n")
         rows.flush()
 
@@ -48,5 +50,5 @@ if __name__ == "__main__":
     end_with_check()
     limit = int(sys.argv[3])  # of processor time [s]: SIGXCPU or, if blocked, SIGKILL
     resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1))
-    score(sys.argv[1], Path(sys.argv[2]))
+    score(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[4]))
     os._exit(0)  # the student's files may have started threads

@@ -1,8 +1,10 @@
-"""The score of a student's files: as values for JSON, as a table and for Gradescope."""
+"""The score of a student's files: for JSON, as a table, for Gradescope; those of a class as CSV."""
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping, Sequence
+from io import StringIO
 from typing import Any
 
 from cloudrc.text import table
@@ -40,3 +42,24 @@ def for_gradescope(result: Mapping[str, Any]) -> dict[str, Any]:
     ]
     found = {"score": result["score"], "visibility": "visible", "tests": tests}
     return found if result["valid"] else {**found, "output": NOT_VALID}
+
+
+def as_csv(scores: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the scores of several hand-ins by their names: a line each, a column for each test.
+
+    The column `remarks` says what tests without points found.
+    """
+    out = StringIO()
+    names = {f"{row['part']}: {row['test']}": 0 for s in scores.values() for row in s["checks"]}
+    first = ("hand_in", "score", "max_score", "valid")
+    writer = csv.DictWriter(out, [*first, *names, "remarks"], lineterminator="\n")
+    writer.writeheader()
+    for hand_in, result in scores.items():
+        rows = {f"{row['part']}: {row['test']}": row for row in result["checks"]}
+        remarks = {f"{name}: {row['seen']}" for name, row in rows.items() if not row["points"]}
+        writer.writerow(
+            {name: row["points"] for name, row in rows.items()}
+            | {"hand_in": hand_in, "remarks": " | ".join(sorted(remarks))}
+            | {name: result[name] for name in first[1:]}
+        )
+    return out.getvalue().rstrip("\n")

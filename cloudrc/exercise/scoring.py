@@ -1,4 +1,4 @@
-"""Score a student's files, each part of the exercise in a process of its own.
+"""Score a student's files, each part of the task in a process of its own.
 
 So a crash costs the points of this part only. The process is no sandbox: a student's file has all
 rights of the user.
@@ -17,8 +17,9 @@ from typing import Any
 from cloudrc.drivers.machine import interpreter, signal_group
 from cloudrc.errors import to_one_line
 from cloudrc.exercise import hand_in
-from cloudrc.exercise.files import FILES
-from cloudrc.exercise.points import POINTS
+from cloudrc.exercise.files import describe_missing
+from cloudrc.exercise.score import sum_up
+from cloudrc.exercise.task import SHIPPED, read_task, task_of
 
 TIME_LIMIT = 60
 """Limit of each part [s] of processor time; the solution needs 5 s."""
@@ -28,7 +29,9 @@ ROWS_MAX = 64 << 10
 """Largest size of all rows of a part [bytes]."""
 
 
-def run_part(part: str, folder: Path, limit: int, wait: float) -> tuple[bytes, str]:
+def run_part(
+    part: str, folder: Path, limit: int, wait: float, source: Path = SHIPPED
+) -> tuple[bytes, str]:
     """Score a part in a process; return what it has written, and why it writes no more.
 
     The process has a session of its own, which ends with it. It has `limit` [s] of processor time,
@@ -37,7 +40,7 @@ def run_part(part: str, folder: Path, limit: int, wait: float) -> tuple[bytes, s
     why = "ended the process of the check, or sent something else than its results"
     with TemporaryFile() as rows:
         process = subprocess.Popen(
-            interpreter("-m", hand_in.__name__, part, str(folder), str(limit)),
+            interpreter("-m", hand_in.__name__, part, str(folder), str(limit), str(source)),
             start_new_session=True,
             stdin=subprocess.PIPE,
             stdout=rows,
@@ -68,26 +71,32 @@ def read_rows(data: bytes) -> list[tuple[float, str]]:
 
 
 def check(
-    folder: Path, limit: int = TIME_LIMIT, patience: float = PATIENCE
+    folder: Path, source: Path = SHIPPED, limit: int = TIME_LIMIT, patience: float = PATIENCE
 ) -> Iterator[dict[str, Any]]:
     """Score the student's files in a folder, each part within `limit` [s] of processor time.
 
-    Yield one dictionary per test, when its part has ended: the test's name, its points, the result
-    in words, and whether the points are valid. They are not if a part took `patience` times the
-    limit in real time.
+    `source` is the task. Yield one dictionary per test, when its part has ended: the test's name,
+    its points, the result in words, and whether the points are valid. They are not if a part took
+    `patience` times the limit in real time.
     """
-    wait = limit * patience
-    for part, tests in POINTS.items():
-        data, why = run_part(part, folder, limit, wait)
+    wait, task = limit * patience, read_task(source)
+    for part, about in task.parts.items():
+        data, why = run_part(part, folder, limit, wait, source)
         slow = f"too slow here: no end after {wait:g} s; the score is not valid"
+        hint = describe_missing(folder, [about.file] if about.file else [])
         rows = iter(read_rows(data))
-        for test, most in tests.items():
-            points, seen = next(rows, (0.0, f"{FILES.get(part, 'a file')}: {why or slow}"))
+        for test, asked in about.tests.items():
+            points, seen = next(rows, (0.0, f"{about.file or 'a file'}: {why or slow}"))
             yield {
                 "part": part,
                 "test": test,
-                "points": round(min(points, most), 1) if points > 0.0 else 0.0,
-                "max_points": most,
-                "seen": to_one_line(seen),
+                "points": round(min(points, asked.points), 1) if points > 0.0 else 0.0,
+                "max_points": asked.points,
+                "seen": to_one_line(f"{seen}; {hint}" if hint else seen),
                 "valid": bool(why),
             }
+
+
+def score(source: Path | None, folder: Path) -> dict[str, Any]:
+    """Return the score of a hand-in; `source` is the task, None: that of its folder."""
+    return sum_up([*check(folder, task_of(folder, source))])

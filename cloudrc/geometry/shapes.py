@@ -107,23 +107,15 @@ class Shapes:
 
 
 def _read(file: dict[str, NDArray[Any]]) -> Shapes:
-    """Read surfaces; a surface of an earlier version has several blocks of polygons."""
-    counts, blocks = file["sizes"].reshape(-1, 2).T
-    points = np.split(file["corners"].astype(float).reshape(-1, 3), np.cumsum(counts)[:-1])
-    indices = np.split(file["indices"], np.cumsum(file["faces"].prod(axis=1))[:-1])
-    polygons = [
-        _fan(each.reshape(shape)) for each, shape in zip(indices, file["faces"], strict=False)
-    ]
-    ends = np.cumsum(blocks).tolist()
+    counts = file["sizes"].reshape(-1, 2)[:, 0]
+    points = np.split(file["corners"].astype(float), np.cumsum(counts)[:-1])
+    triangles = np.split(file["indices"].reshape(-1, 3), np.cumsum(file["faces"][:, 0])[:-1])
+    colours = np.clip(file["rgba"], 0.0, 1.0).tolist()
     found = [
-        Surface(
-            str(body),
-            points[number],
-            np.concatenate(polygons[end - blocks[number] : end]),
-            tuple(np.clip(file["rgba"][number], 0.0, 1.0).tolist()),
-            bool(file["convex"][number]),
+        Surface(str(body), corners, faces, tuple(rgba), bool(convex))
+        for body, corners, faces, rgba, convex in zip(
+            file["bodies"], points, triangles, colours, file["convex"], strict=False
         )
-        for number, (body, end) in enumerate(zip(file["bodies"], ends, strict=True))
     ]
     return Shapes.of(found, bool(file["planar"]))
 

@@ -287,8 +287,8 @@ class RemoteLoop:
         return {
             "ticks": ticks,
             "loop_age": float(np.mean(self._loop_ages)) * dt if self._loop_ages else nan,
-            **_describe("observation_age", np.array(self._observation_ages) * dt),
-            **_describe("action_age", actions),
+            **_describe("observation_age", np.array(self._observation_ages) * dt, dt),
+            **_describe("action_age", actions, dt),
             "age_counts": np.bincount(rounded.astype(int)).tolist(),
             "late_share": late,
             "misses_in_10": most_missed(~is_new) if len(is_new) else nan,
@@ -298,7 +298,16 @@ class RemoteLoop:
         }
 
 
-def _describe(name: str, ages: Floats) -> dict[str, float]:
-    """Return mean and 99th percentile of ages [s], shape (n,), and of how many steps they are."""
-    mean, p99 = (ages.mean(), np.percentile(ages, 99.0)) if len(ages) else (nan, nan)
-    return {f"{name}_mean": float(mean), f"{name}_p99": float(p99), f"{name}_of": len(ages)}
+def _describe(name: str, ages: Floats, dt: float) -> dict[str, float]:
+    """Return numbers of the ages [s] in successive steps of `dt` [s], shape (n,).
+
+    A peak is the age in the last step before that of a fresher observation.
+    """
+    found = {"mean": nan, "p99": nan, "max": nan, "peak_mean": nan}
+    if len(ages):
+        found |= {"mean": ages.mean(), "p99": np.percentile(ages, 99.0), "max": ages.max()}
+    peaks = ages[:-1][np.diff(ages) < dt - 1e-9]
+    if len(peaks):
+        found["peak_mean"] = peaks.mean()
+    numbers = {f"{name}_{part}": float(value) for part, value in found.items()}
+    return {**numbers, f"{name}_of": len(ages)}

@@ -17,7 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from cloudrc.errors import BadInputError
+from cloudrc.errors import CloudrcError
 from cloudrc.files import version
 from cloudrc.link.profile import DIRECTIONS, summary
 from cloudrc.link.state import CHANGE_FILE, ChangeFacts, LinkState, publish, read_change, to_text
@@ -66,7 +66,7 @@ def publish_state(
 
 
 Load = Callable[[Path], Loaded]
-"""Function that reads and checks a profile's file; raises a BadInputError if it is invalid."""
+"""Function that reads and checks a profile's file; raises a CloudrcError if it is invalid."""
 
 
 def make_folder(folder: Path, values: Mapping[str, Any]) -> Path:
@@ -123,7 +123,7 @@ class Profiles:
         self._seen = version(self.file)
 
     def first(self) -> Loaded:
-        """Read the profile for the first time; raise a BadInputError if it is invalid."""
+        """Read the profile for the first time; raise a CloudrcError if it is invalid."""
         self._seen = version(self.file)
         loaded = self._read_profile(self.file)
         self._known[loaded.change.number] = loaded.values
@@ -132,7 +132,7 @@ class Profiles:
     def take(self, document: bytes, folder: Path) -> Loaded:
         """Read the files of a change that is sent, with `folder` for temporary files.
 
-        Raise a BadInputError or a ValueError if the change is invalid.
+        Raise a CloudrcError or a ValueError if the change is invalid.
         """
         files = read_handed(document)
         with TemporaryDirectory(prefix="handed-", dir=folder) as made:
@@ -154,7 +154,7 @@ class Profiles:
             return None
         try:
             loaded = self._read_profile(self.file)
-        except (BadInputError, OSError, ValueError) as error:
+        except (CloudrcError, OSError, ValueError) as error:
             self.log(f"the new profile is refused, the old one stays: {error}")
             return None
         number = loaded.change.number

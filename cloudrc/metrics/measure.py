@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cloudrc import plugins
-from cloudrc.errors import BadInputError, describe_error
+from cloudrc.errors import describe_error
 from cloudrc.metrics import control, link, mission, response
 from cloudrc.metrics.flight import SHIPPED, Flight, Metric, add_quantities
 from cloudrc.outside import code
 from cloudrc.outside.patience import telling_if_slow
-from cloudrc.outside.refusal import check_names
-from cloudrc.outside.values import RESULT
+from cloudrc.outside.refusal import check_names, naming
+from cloudrc.outside.values import RESULT, InvalidValueError
 from cloudrc.record.holes import goes_on
 
 # The imported modules add the metrics of cloudrc to SHIPPED.
@@ -64,9 +64,6 @@ def find(choice: str, *, look: bool = False) -> Metric:
     """Find a metric by its name, or by the path of a Python file, which is executed.
 
     With `look`, the caller does not measure.
-
-    Raises:
-        BadInputError: If the metric does not exist, or if the file defines no metric.
     """
     if choice in SHIPPED:
         return SHIPPED[choice]
@@ -74,14 +71,13 @@ def find(choice: str, *, look: bool = False) -> Metric:
     name, is_path = name_of(choice), plugins.is_path(choice)
     if not is_path:
         check_names("metric", [choice], sorted(known))
-    if is_path and name in known:
-        raise BadInputError(f"metric {choice!r}: {name} is a metric already; rename the file")
-    found = plugins.find("metrics", choice, look=look)
-    unit, measure = found.get("UNIT"), found.get("measure")
-    if not isinstance(unit, str) or not callable(measure):
-        raise BadInputError(
-            f"metric {choice!r} needs a text UNIT and a function measure(flight); write both"
-        )
+    with naming(f"metric {choice!r}"):
+        if is_path and name in known:
+            raise InvalidValueError(f"{name} is a metric already; rename the file")
+        found = plugins.find("metrics", choice, look=look)
+        unit, measure = found.get("UNIT"), found.get("measure")
+        if not isinstance(unit, str) or not callable(measure):
+            raise InvalidValueError("needs a text UNIT and a function measure(flight); write both")
     return Metric(name, unit, found.doc, measure)
 
 
@@ -91,14 +87,14 @@ def name_of(choice: str) -> str:
 
 
 def check(own: Iterable[str]) -> None:
-    """Check the user's metrics before the flight; `own` lists their names or file paths.
+    """Check the user's metrics before the flight: each can be used, and has a name of its own.
 
-    Raises:
-        BadInputError: If a metric is invalid, or if two metrics have the same name.
+    `own` lists their names or file paths.
     """
     for name, count in Counter(find(choice, look=True).name for choice in own).items():
-        if count > 1:
-            raise BadInputError(f"{count} metrics are named {name}; rename a file")
+        with naming(f"metric {name}"):
+            if count > 1:
+                raise InvalidValueError(f"{count} metrics have this name; rename a file")
 
 
 def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import IO, Any, TypeVar
 
 from cloudrc.errors import BadInputError
-from cloudrc.files import SIZE_MAX, read
+from cloudrc.files import SIZE_MAX, read, try_lock
 
 PICTURES = {
     "png": re.compile(rb"\x89PNG\r\n\x1a\n"),
@@ -16,6 +17,8 @@ PICTURES = {
     "pdf": re.compile(rb"%PDF-"),
 }
 """Kind of a picture -> how its files begin."""
+LOCK = ".lock"
+"""File of a folder that each command locks; the names of further locks begin so."""
 _TOKEN = re.compile(rb"[!-~]{16,512}")
 _Secret = TypeVar("_Secret")
 
@@ -60,10 +63,36 @@ def make_folder(folder: Path, named: str = "") -> None:
         raise BadInputError(f"{named}{folder}: {text}")
 
 
-def check_there(path: Path, remedy: str, what: str = "no such file or folder") -> None:
+def lock(file: IO[Any], text: str, *, shared: bool = False) -> None:
+    """Lock a file for this command alone, or `shared` with others of its kind, until it is closed.
+
+    Raise a BadInputError with the `text` if another command has locked it. On NFS, a process loses
+    the lock when it closes any other handle of the file.
+    """
+    if try_lock(file, shared=shared) is False:
+        raise BadInputError(text)
+
+
+@contextmanager
+def lock_folder(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[None]:
+    """Lock a folder of results for a shard, a number and how many there are, or for one command.
+
+    Shards lock it together, and each its own number. Raise a BadInputError if another command flies
+    the same flights into the folder.
+    """
+    names = [LOCK, *(["{}-{}-of-{}".format(LOCK, *shard)] if shard else [])]
+    text = f"--out {folder}: another command flies into it now; wait for its end"
+    with ExitStack() as stack:
+        for name in names:
+            file = stack.enter_context((folder / name).open("a+"))
+            lock(file, text, shared=bool(shard) and name == LOCK)
+        yield
+
+
+def check_there(path: Path, remedy: str) -> None:
     """Raise a BadInputError if nothing is at `path`."""
     if not path.exists():
-        raise BadInputError(f"{path}: {what}; {remedy}")
+        raise BadInputError(f"{path}: no such file or folder; {remedy}")
 
 
 def read_secret(
@@ -86,6 +115,24 @@ def read_secret(
 def read_token(path: Path, named: str) -> str:
     """Read the token of teleop's API from a file, as `read_secret` does."""
     return read_secret(path, named, _parse_token, f"(umask 077; openssl rand -hex 32 > {path})")
+
+
+def read_tokens(folder: Path, roles: Iterable[str]) -> dict[str, str]:
+    """Read the tokens of the first of the `roles` and of those that have a file in `folder`.
+
+    Return token -> role. Raise a BadInputError, which contains no token, if one is not valid, or if
+    two roles have the same.
+    """
+    found = dict[str, str]()
+    for role in roles:
+        path = folder / role
+        if found and not path.exists():
+            continue
+        token = read_token(path, f"--tokens: {path}")
+        if token in found:  # then a reader's token would allow commands
+            raise BadInputError(f"--tokens {folder}: both roles have the same token")
+        found[token] = role
+    return found
 
 
 def _parse_token(data: bytes) -> str:

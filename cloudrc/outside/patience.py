@@ -12,10 +12,9 @@ SILENT = 3.0
 
 
 @contextmanager
-def telling_if_slow(text: str, silent: float | None = None) -> Iterator[None]:
-    """Log `text` if the block takes longer than `silent` [s] (SILENT), while it runs."""
-    silent = SILENT if silent is None else silent
-    timer = threading.Timer(silent, logging.getLogger("cloudrc").warning, ("%s", text))
+def telling_if_slow(text: str) -> Iterator[None]:
+    """Log `text` if the block takes longer than `SILENT`, while it runs."""
+    timer = threading.Timer(SILENT, logging.getLogger("cloudrc").warning, ("%s", text))
     timer.daemon = True
     timer.start()
     try:

@@ -11,6 +11,7 @@ from math import cos, sin
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cloudrc.messages import UPRIGHT, Quaternion, Vector
 from cloudrc.record.ros import STORE, header, pack, rotate
@@ -18,7 +19,10 @@ from cloudrc.records import Control
 
 WORLD, BASE = "world", "base_link"
 """Frame of poses and of commanded velocities, and frame of the robot's base."""
-_NO_COVARIANCE = np.zeros(36)
+Covariance: TypeAlias = NDArray[np.float64]
+"""Covariance of six values, in SI units, shape (36,)."""
+EXACT: Covariance = np.zeros(36)
+"""That of values without errors, or with unknown ones."""
 Pose: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Position [m], shape (3,), and orientation wxyz [1], shape (4,)."""
 
@@ -30,6 +34,8 @@ def encode_odometry(
     velocity: Sequence[float],
     angular_velocity_body: Sequence[float],
     child: str = BASE,
+    parent: str = WORLD,
+    covariances: tuple[Covariance, Covariance] = (EXACT, EXACT),
 ) -> bytes:
     """Encode a nav_msgs/Odometry as CDR.
 
@@ -40,12 +46,22 @@ def encode_odometry(
         velocity: Velocity [m/s], world frame, shape (3,).
         angular_velocity_body: Angular velocity [rad/s], body frame, shape (3,).
         child: Name of the body frame.
+        parent: Name of the frame of the pose; its origin and axes are the world's.
+        covariances: Those of pose and twist.
     """
     w, x, y, z = orientation_wxyz
     pose = position, (x, y, z, w)
     twist = rotate((w, -x, -y, -z), velocity), angular_velocity_body
-    covered = (pose, _NO_COVARIANCE), (twist, _NO_COVARIANCE)
-    return pack("nav_msgs/msg/Odometry", header(stamp_ns), child, *covered)
+    covered = zip((pose, twist), covariances, strict=True)
+    return pack("nav_msgs/msg/Odometry", header(stamp_ns, parent), child, *covered)
+
+
+def covariance(linear: float, angular: float) -> Covariance:
+    """Return the covariance of three linear and three angular values with these deviations.
+
+    The standard deviations are in [m] and [rad], or in [m/s] and [rad/s].
+    """
+    return np.diag(np.square([linear] * 3 + [angular] * 3)).ravel()
 
 
 def encode_pose(stamp_ns: int, position: Sequence[float], yaw: float) -> bytes:
@@ -73,10 +89,10 @@ def frames_of(control: Control, prefix: str = "") -> dict[str, Pose]:
     }
 
 
-def encode_transforms(stamp_ns: int, poses: Mapping[str, Pose]) -> bytes:
-    """Encode a tf2_msgs/TFMessage as CDR: frame -> its pose in `world` at `stamp_ns` [ns]."""
+def encode_transforms(stamp_ns: int, poses: Mapping[str, Pose], parent: str = WORLD) -> bytes:
+    """Encode a tf2_msgs/TFMessage as CDR: frame -> its pose in `parent` at `stamp_ns` [ns]."""
     transforms = [
-        (header(stamp_ns), frame, (position, (x, y, z, w)))
+        (header(stamp_ns, parent), frame, (position, (x, y, z, w)))
         for frame, (position, (w, x, y, z)) in poses.items()
     ]
     return pack("tf2_msgs/msg/TFMessage", transforms)
@@ -102,8 +118,17 @@ class HealthStatus(NamedTuple):
 
 def encode_diagnostics(stamp_ns: int, statuses: Iterable[HealthStatus], robot: str = "") -> bytes:
     """Encode a diagnostic_msgs/DiagnosticArray as CDR; `robot` is the name of the robot."""
-    found = [(each.level, each.name, each.text, robot, each.values.items()) for each in statuses]
+    found = [_fields(each, robot) for each in statuses]
     return pack("diagnostic_msgs/msg/DiagnosticArray", header(stamp_ns, ""), found)
+
+
+def encode_status(status: HealthStatus, robot: str = "") -> bytes:
+    """Encode a diagnostic_msgs/DiagnosticStatus as CDR; `robot` is the name of the robot."""
+    return pack("diagnostic_msgs/msg/DiagnosticStatus", *_fields(status, robot))
+
+
+def _fields(status: HealthStatus, robot: str) -> tuple[Any, ...]:
+    return status.level, status.name, status.text, robot, status.values.items()
 
 
 def decode_stamped_twist(data: bytes) -> tuple[int, str, Vector, float]:

@@ -16,6 +16,7 @@ from pydantic import TypeAdapter
 
 from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.drivers.local import JOURNAL_FILE, under_way
 from cloudrc.errors import BadInputError
 from cloudrc.files import read, read_json
 from cloudrc.link.cell import CellLog
@@ -25,6 +26,7 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
 from cloudrc.record.reader import NothingReadableError
 from cloudrc.record.topics import TOPICS
+from cloudrc.record.writer import is_open
 from cloudrc.report.document import RUN, Run
 from cloudrc.report.views import views
 from cloudrc.text import list_some
@@ -58,6 +60,26 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
         recording.views = views(recording, experiment)
         recording.write(merged)
     return recording, experiment, run
+
+
+def check_ended(folder: Path) -> None:
+    """Raise a BadInputError if the flight whose files are in a folder has not ended."""
+    if folder.resolve() not in under_way() and not is_open(folder / "mission.mcap"):
+        return
+    if (folder / JOURNAL_FILE).is_file():
+        raise BadInputError(f"{folder}: the session has not ended; end it: cloudrc down")
+    raise BadInputError(f"{folder}: the flight has not ended; wait for its end")
+
+
+def open_recording(run: Path) -> tuple[Path, Recording]:
+    """Read the whole recording of a run that has ended: its folder, or its MCAP file.
+
+    Also return the path of the file.
+    """
+    file = run / "mission.mcap" if run.is_dir() else run
+    check_ended(file.parent)
+    check_there(file, "name the folder of a run, or a file")
+    return file, Recording.read(file, whole=True)
 
 
 def robots_in(folder: Path) -> list[Path]:

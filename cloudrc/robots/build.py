@@ -9,13 +9,12 @@ from typing import Any
 from cloudrc import plugins
 from cloudrc.config.disturbances import Plant
 from cloudrc.config.overrides import BRAKING, build_plugin, default_parameters
-from cloudrc.config.problems import ProblemsError, problem_at
+from cloudrc.config.problems import ProblemsError, at_key, problem_at
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotFiles, known_robot, parameters
 from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.config.schema import PlugIn, World
 from cloudrc.config.shipped import ROBOT_FILE, file_of
-from cloudrc.errors import BadInputError
 from cloudrc.messages import ZERO, Vector
 from cloudrc.outside.document import KeyPath
 from cloudrc.outside.refusal import naming
@@ -53,11 +52,9 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     robot, scene = known_robot(world.robot), file_of(world.scene)
     with naming(f"robot {world.robot}"):
         nominal = compile_model(robot.model, scene)
-    try:
+    with at_key("world.robot", f"{_file_of(world)}: onboard: "):
         # The build below uses the same import of the file.
         plugin = plugins.find(KIND, robot.onboard.name)
-    except BadInputError as error:
-        raise _problem(world, (), str(error)) from error
     onboard = _build_onboard(world, robot, nominal)
     model = _change(world, robot, nominal)
     actuators = _build_actuators(plugin, nominal, parameters(robot, world))
@@ -154,31 +151,32 @@ def _build_onboard(world: World, robot: RobotFiles, model: Any) -> Onboard:
     """Build the onboard controller for a compiled `MjModel`."""
     name, more = robot.onboard.name, {}
     choice = PlugIn.model_validate({**parameters(robot, world), "name": name})
-    try:
-        if BRAKING in plugins.signature(KIND, name).parameters:
-            more = {BRAKING: robot.guard.braking_mps2}
-        return build_plugin(KIND, choice, model=model, **more)  # type: ignore[no-any-return]
-    except ProblemsError as error:  # about its parameters
-        first = error.problems[0]
-        raise _problem(world, first.path, f"{first._replace(path=())} ({name})") from error
-    except BadInputError as error:
-        where = f"{robot.model} in {file_of(world.scene)}"
-        raise problem_at("world.robot", f"{where}: {error}") from error
+    with at_key("world.robot", f"{robot.model} in {file_of(world.scene)}: "):
+        try:
+            if BRAKING in plugins.signature(KIND, name).parameters:
+                more = {BRAKING: robot.guard.braking_mps2}
+            return build_plugin(KIND, choice, model=model, **more)  # type: ignore[no-any-return]
+        except ProblemsError as error:  # about its parameters
+            first = error.problems[0]
+            raise _problem(world, first.path, f"{first._replace(path=())} ({name})") from error
 
 
 def _problem(world: World, path: KeyPath, reason: str) -> ProblemsError:
     """Return the error at the key that gives a parameter of the onboard controller.
 
-    `path` is the parameter, and the keys inside its value; () means the controller itself.
+    `path` is the parameter, and the keys inside its value.
     """
-    if path and path[0] in (world.onboard.model_extra or {}):
+    if path[0] in (world.onboard.model_extra or {}):
         return problem_at(".".join(("world.onboard", *path)), reason)
-    file = world.robot if world.robot.endswith(".xml") else f"{world.robot}/{ROBOT_FILE}"
     tuning = known_robot(world.robot).tunings.get(world.tuning or "")
     where, key = ".".join(("onboard", *path)), "world.robot"
-    if path and tuning and path[0] in (tuning.model_extra or {}):
+    if tuning and path[0] in (tuning.model_extra or {}):
         where, key = ".".join(("tunings", str(world.tuning), *path)), "world.tuning"
-    return problem_at(key, f"{file}: {where}: {reason}")
+    return problem_at(key, f"{_file_of(world)}: {where}: {reason}")
+
+
+def _file_of(world: World) -> str:
+    return world.robot if world.robot.endswith(".xml") else f"{world.robot}/{ROBOT_FILE}"
 
 
 def _change(world: World, robot: RobotFiles, nominal: Any) -> Any:

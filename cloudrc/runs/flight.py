@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any, TypeAlias
 
 from cloudrc import assembly, plugins
-from cloudrc.cloud.loop import ControlLoop
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import describe_error, machine_error
 from cloudrc.metrics.measure import METRIC_NOTE, SHIPPED, find
@@ -89,14 +88,9 @@ def units(own: Iterable[str]) -> dict[str, str]:
 
 
 @reuse_results()  # a flight looks ten times at the file of its robot
-def fly_in_memory(
-    experiment: ResolvedExperiment, make_loop: Callable[..., ControlLoop] = ControlLoop
-) -> Assessment:
-    """Fly an experiment in virtual time, and measure and judge it, without any file.
-
-    `make_loop` is called in place of `ControlLoop`, for example to use other plug-ins.
-    """
+def fly_in_memory(experiment: ResolvedExperiment) -> Assessment:
+    """Fly an experiment in virtual time, and measure and judge it, without any file."""
     store = RecordStore()
-    assembly.fly(experiment, store.add, make_loop)
+    assembly.fly(experiment, store.add)
     run = Run("virtual", "virtual", notes=assembly.virtual_notes(experiment))
     return assess(Recording(records=store), experiment, run, experiment.report.metrics)

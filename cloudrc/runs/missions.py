@@ -7,17 +7,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cloudrc.drivers.machine import AwakeClock
-from cloudrc.errors import BadInputError, TimedOutError
+from cloudrc.errors import TimedOutError
 from cloudrc.teleop.client import Api, UnreachableError, describe_mission, mission_path
 
 BEGINS = ("queued", "starting")
 """States of a mission that nobody has followed yet."""
 POLL_PERIOD = 0.5
 """Time between two requests for the state of a mission [s]."""
-TURN_MAX = 30.0
-"""Longest time that a request and the pause after the request take [s]. If more time has passed,
-this process was suspended; the suspension does not count towards a time limit."""
 Tell = Callable[[str], None]
 """Function that receives one line of text."""
 
@@ -29,17 +25,10 @@ def read_mission(name: str, shown: str = "") -> Json:
     """Read a mission file, or a mission that cloudrc ships; the API checks the content later.
 
     `shown` is the mission's name in lists and messages, by default the name of the file.
-
-    Raises:
-        BadInputError: If the file does not exist, or if it contains no mission.
     """
     from cloudrc.config import shipped
 
-    mission = dict(shipped.read("mission", name, Path()).tree)
-    if mission.pop("steps", None) is not None:
-        raise BadInputError(
-            f"{name}: steps are for experiments; fly them with 'cloudrc run', or give waypoints"
-        )
+    mission = shipped.read("mission", name, Path()).tree
     return {"name": Path(name).stem, **mission, **({"name": shown} if shown else {})}
 
 
@@ -87,12 +76,12 @@ class MissionFollower:
 
     def _retry(self, request: Callable[[], _Answer]) -> _Answer:
         """Repeat a request until the API answers; raise a TimedOutError if this takes too long."""
-        clock, reported = AwakeClock(TURN_MAX), False
+        deadline, reported = time.monotonic() + self._patience, False
         while True:
             try:
                 return request()
             except UnreachableError as error:
-                if clock() > self._patience:
+                if time.monotonic() > deadline:
                     raise TimedOutError(f"{error}; gave up after {self._patience:g} s") from None
                 if not reported:
                     self._tell(f"{error}; waiting")

@@ -6,11 +6,9 @@ from pathlib import Path
 
 from cloudrc.config.load import read_attached
 from cloudrc.files import write_atomically
-from cloudrc.record.columns import Recording
 from cloudrc.report.flown import flight_of
-from cloudrc.report.folder import read_run
+from cloudrc.report.folder import check_ended, open_recording, read_run
 from cloudrc.report.replay import write_page
-from cloudrc.runs.session import check_ended
 
 
 def write_replay(run: Path, out: Path | None = None) -> Path:
@@ -18,11 +16,11 @@ def write_replay(run: Path, out: Path | None = None) -> Path:
 
     By default the page is replay.html beside the recording, and replaces an earlier one.
     """
-    check_ended(run if run.is_dir() else run.parent)
     if run.is_dir():
+        check_ended(run)
         recording, experiment, _ = read_run(run)
     else:
-        recording = Recording.read(run, whole=True)
+        _, recording = open_recording(run)
         experiment = read_attached(recording.attachments, str(run))
     page = write_page(flight_of(recording, experiment), experiment)
     path = out or (run if run.is_dir() else run.parent) / "replay.html"

@@ -18,6 +18,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "gym": ("gymnasium",),
     "foxglove": ("foxglove",),
     "mpc": ("daqp",),
+    "bucket": ("s3fs",),
 }
 """Name of an extra in pyproject.toml -> the modules that it installs."""
 PACKAGES = {"foxglove": "foxglove-sdk"}

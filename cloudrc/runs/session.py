@@ -14,12 +14,12 @@ from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
-from cloudrc.drivers.local import JOURNAL_FILE, under_way
-from cloudrc.errors import BadInputError, InvalidRunError, NothingFlownError
+from cloudrc.drivers.local import JOURNAL_FILE
+from cloudrc.errors import InvalidRunError, NothingFlownError
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import cut_to_last_mission, merge
-from cloudrc.record.writer import is_open
 from cloudrc.report.document import Run
+from cloudrc.report.folder import check_ended
 from cloudrc.report.write import attachments
 from cloudrc.teleop.store import MissionRecord, open_store
 
@@ -52,25 +52,25 @@ def read_last_mission(folder: Path) -> tuple[Recording, ResolvedExperiment, bool
         text = f"the recording ends before mission {last.id}, the last one, so there is no report"
         raise InvalidRunError(f"{folder}: {text}; world.mcap and cloud.mcap have the flight before")
     config = folder / "config.yaml"
-    session = read_experiment(config, flown=True)
-    if last.order.plan.by_hand:  # rest at the start, until the report has the setpoints
-        rest = [(time, last.order.plan.legs[0].position) for time in (0.0, 1.0)]
-        drive = write_setpoints(rest, steered_in(session.world))
-        (folder / DRIVE_FILE).write_text(drive, encoding="utf-8")
     about = f"Mission {last.id} ({last.order.name}), the last one of a session"
-    experiment = with_order(session, last.order, about)
+    experiment = experiment_of(read_experiment(config, flown=True), last, folder, about)
     config.write_text(dump(experiment), encoding="utf-8")
     cut_to_last_mission(recording)
     return recording, experiment, not last.ended
 
 
-def check_ended(folder: Path) -> None:
-    """Raise a BadInputError if the flight whose files are in a folder has not ended."""
-    if folder.resolve() not in under_way() and not is_open(folder / "mission.mcap"):
-        return
-    if (folder / JOURNAL_FILE).is_file():
-        raise BadInputError(f"{folder}: the session has not ended; end it: cloudrc down")
-    raise BadInputError(f"{folder}: the flight has not ended; wait for its end")
+def experiment_of(
+    session: ResolvedExperiment, mission: MissionRecord, folder: Path, about: str
+) -> ResolvedExperiment:
+    """Return the experiment of a session with one mission; `about` describes it.
+
+    A mission that was driven by hand gets a file of setpoints in `folder`.
+    """
+    if mission.order.plan.by_hand:  # rest at the start, until the report has the setpoints
+        rest = [(time, mission.order.plan.legs[0].position) for time in (0.0, 1.0)]
+        drive = write_setpoints(rest, steered_in(session.world))
+        (folder / DRIVE_FILE).write_text(drive, encoding="utf-8")
+    return with_order(session, mission.order, about)
 
 
 def restore_mission(folder: Path) -> None:

@@ -15,7 +15,7 @@ from cloudrc.metrics.velocity_loop import DT, INPUT, OUTPUT, Fit
 from cloudrc.outside.refusal import naming
 from cloudrc.record.columns import Recording
 from cloudrc.report.flown import flown_world
-from cloudrc.runs.session import check_ended
+from cloudrc.report.folder import open_recording
 from cloudrc.text import table
 
 NAMES = ("time_constant", "dead_time", "gain")
@@ -26,9 +26,7 @@ def identify(run: Path) -> tuple[list[Fit], float, str]:
 
     Also return its duration [s], and the key of robot.yaml to which the model belongs.
     """
-    path = run / "mission.mcap" if run.is_dir() else run
-    check_ended(path.parent)
-    recording = Recording.read(path, whole=True)
+    path, recording = open_recording(run)
     planar, tuning = _flown(recording, path.parent)
     fits = []
     with naming(str(path)):

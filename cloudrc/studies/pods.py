@@ -28,14 +28,17 @@ def fly_in_pods(
     Raises:
         ClusterError: If a Job fails or yields no row, or if a pod will never run.
     """
-    every = "".join(plan.flights).encode() + str(settings.shards).encode()
+    every = "".join(plan.flights).encode()
     name = f"sweep-{hashlib.sha256(every).hexdigest()[:12]}"
     missing = {flight.key: flight for flight in flights}
     while missing:
         before = len(missing)
-        batch.start(release, name, pack(missing.values()), settings)
+        settings = settings._replace(shards=min(settings.shards, before))
+        batch.start(release, name, pack(missing.values()), settings, plan.own_files)
         where = f"{release.where}, {settings.shards} pods"
-        tell(f"Job '{name}' {where}; it goes on without this command")
+        store = settings.claim or settings.bucket
+        kept = f", rows in {store}/{name}" if store else ""
+        tell(f"Job '{name}' {where}{kept}; it goes on without this command")
         for line in batch.read_lines(release, name, tell):
             row = parse_row(line)
             if row is not None and missing.pop(row["key"], None) is not None:

@@ -20,9 +20,9 @@ from cloudrc import source
 from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, to_one_line
 from cloudrc.files import read_json, write_atomically, write_json
 from cloudrc.outside.document import read_document, write_yaml
+from cloudrc.outside.paths import LOCK, lock_folder
 from cloudrc.runs.fly import fly
 from cloudrc.runs.folder import new_folder
-from cloudrc.runs.lock import LOCK, lock_folder
 from cloudrc.text import csv_table, table
 from cloudrc.trials.plan import PlannedFlight, SweepPlan, read_plan
 from cloudrc.trials.rows import SIZE_MAX, Row, Rows, read_rows
@@ -30,7 +30,7 @@ from cloudrc.trials.summary import count_verdicts, normalise
 from cloudrc.trials.workers import map_in_order, take_each
 from cloudrc.version import __version__
 
-FILE, SUMMARY = "sweep.yaml", "sweep.json"
+FILE, SUMMARY, PODS = "sweep.yaml", "sweep.json", "pods.json"
 TABLE, PARQUET = "table.csv", "table.parquet"
 NUMBERS = {int, float, type(None)}
 """Types of the values of an axis of numbers; None is the value null."""

@@ -5,10 +5,12 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Callable
 from math import dist
+from operator import add
 
 from cloudrc.geometry.fence import Fence
+from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import NEVER_NS, Drive, Motion, Setpoint, Vector
-from cloudrc.teleop.carrot import ACCELERATION, arrival_ns, steer
+from cloudrc.teleop.carrot import ACCELERATION, arrival_ns, setpoint_at, steer
 from cloudrc.teleop.wire import Leg, Plan, RobotStatus
 
 NO_WAYPOINT = -1
@@ -17,6 +19,10 @@ NO_PLAN = Plan(())
 """Plan before the first mission."""
 JUMP_SPEED = 6.0
 """Highest speed of the setpoint on a track [m/s]; along a faster part the setpoint jumps."""
+
+
+COAST = 0.3
+"""Time that the robot needs to stop at the end of a turn by hand [s]."""
 
 
 class Aim:
@@ -77,10 +83,25 @@ class Aim:
         if not self.stays:
             self.select(self._setpoint_of(leg, waypoint)._replace(motion=motion))
 
-    def steer(self, velocity: Vector, now_ns: int) -> None:
-        """Move the setpoint with `velocity` [m/s], world frame, from `now_ns` [ns] on."""
-        assert self.setpoint is not None, "the setpoint is where the robot was held"
-        self.select(steer(self.setpoint, velocity, now_ns, self._fence))
+    def steer(self, velocity: Vector, now_ns: int, yaw_rate: float | None = None) -> None:
+        """Move the setpoint with `velocity` [m/s], world frame, from `now_ns` [ns] on.
+
+        With a `yaw_rate` [rad/s] it also turns, from the robot's heading on, and `velocity` is in
+        the frame of its heading. After a turn the setpoint rests ahead of the robot: one beside it
+        would let a robot on wheels turn once more.
+        """
+        setpoint, seen = self.setpoint, self.seen
+        assert setpoint is not None, "the setpoint is where the robot was held"
+        assert seen is not None, "telemetry has shown the start"
+        turned = self.is_driven and setpoint.turns
+        if turned and not (any(velocity) or yaw_rate):
+            x, y, z = map(add, seen.position, (COAST * speed for speed in seen.velocity))
+            self.select_point(Leg((x, y, z)))
+            return
+        if yaw_rate is not None and not turned:
+            yaw = -turn_to(0.0, seen.orientation_wxyz)
+            setpoint = setpoint_at(setpoint, now_ns)._replace(yaw=yaw, motion=None)
+        self.select(steer(setpoint, velocity, now_ns, self._fence, yaw_rate))
 
     def follow(self, began_ns: int, now_ns: int) -> None:
         """Move the setpoint from point to point of the track, which began at `began_ns` [ns]."""

@@ -324,8 +324,8 @@ async def drive(body: Body, bridge: Bridged, request: Request) -> Any:
     rest, and the robot holds there. After a hold, a stop or the end of a mission, let go first:
     send the velocity zero, or nothing for 0.5 s. The answer is 409 while a mission flies.
     """
-    velocity = request.app.state.reader.drive(body)
-    return await bridge.move(lambda service, now_ns: service.drive(velocity, now_ns).summary())
+    velocity, turn = request.app.state.reader.drive(body)
+    return await bridge.move(lambda service, now: service.drive(velocity, now, turn).summary())
 
 
 @router.post("/estop", response_model=models.Stopped)

@@ -18,9 +18,9 @@ from fastapi.security import HTTPBearer
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from cloudrc.errors import BadInputError, to_one_line
+from cloudrc.errors import CloudrcError, to_one_line
 from cloudrc.files import warn_if_readable
-from cloudrc.outside.paths import read_token
+from cloudrc.outside.paths import read_tokens
 
 OPERATOR, READER = "operator", "reader"
 """Roles of callers; the token of a role is in a file with the name of the role."""
@@ -63,11 +63,7 @@ class Tokens:
     """Hashes of the tokens in a folder: file `operator`, and file `reader` if it exists."""
 
     def __init__(self, folder: Path, warn: Callable[[str], None] = lambda text: None) -> None:
-        """Read the tokens; `warn` receives one line for each file that other users can read.
-
-        Raises:
-            BadInputError: If a file has no valid token; the message does not contain the token.
-        """
+        """Read the tokens; `warn` receives one line for each file that other users can read."""
         self._folder = folder
         self._read()
         for role in (OPERATOR, READER):
@@ -81,19 +77,14 @@ class Tokens:
         """
         try:
             return self._read().get(hashlib.sha256(token.encode()).digest())
-        except BadInputError:
+        except CloudrcError:
             return None
 
     def _read(self) -> dict[bytes, Caller]:
         known: dict[bytes, Caller] = {}
-        for role in (OPERATOR, READER):
-            path = self._folder / role
-            if role == OPERATOR or path.exists():
-                token = read_token(path, f"--tokens: {path}")
-                digest = hashlib.sha256(token.encode()).digest()
-                if digest in known:  # then a reader's token would allow commands
-                    raise BadInputError(f"--tokens {self._folder}: both roles have the same token")
-                known[digest] = Caller(role, f"{role}-{digest.hex()[:8]}")
+        for token, role in read_tokens(self._folder, (OPERATOR, READER)).items():
+            digest = hashlib.sha256(token.encode()).digest()
+            known[digest] = Caller(role, f"{role}-{digest.hex()[:8]}")
         return known
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from math import dist, sqrt
+from math import cos, dist, sin, sqrt
 
 from cloudrc.geometry.fence import Fence
 from cloudrc.messages import ZERO, Drive, Motion, Setpoint, Vector
@@ -22,6 +22,8 @@ HEARTBEAT_NS = 500_000_000
 SPEED_MAX, ACCELERATION = 1.5, 2.0
 """Largest speed [m/s] and acceleration [m/s^2] of a setpoint that is driven by hand. The guard
 limits the acceleration of the robot to 3 m/s^2."""
+TURN_MAX = 1.0
+"""Largest yaw rate of such a setpoint [rad/s]: what the guard allows by default."""
 _new = tuple.__new__  # makes a named tuple in half the time of a call of its class
 
 
@@ -72,7 +74,7 @@ def _moved(setpoint: Setpoint, distance: float, ramp: float, total: float, now_n
     x, y, z = (bx - ax) / distance, (by - ay) / distance, (bz - az) / distance
     position = (ax + way * x, ay + way * y, az + way * z)
     velocity = (speed * x, speed * y, speed * z)
-    _, yaw, waypoint, epoch, _, _, turns = setpoint
+    _, yaw, waypoint, epoch, _, _, turns, _ = setpoint
     return _new(Setpoint, (position, yaw, waypoint, epoch, velocity, motion, turns))
 
 
@@ -85,21 +87,30 @@ def _profile(setpoint: Setpoint) -> tuple[float, float, float]:
     return distance, ramp, distance / (acceleration * ramp) + ramp if ramp else 0.0
 
 
-def steer(setpoint: Setpoint, velocity: Vector, now_ns: int, fence: Fence) -> Setpoint:
+def steer(
+    setpoint: Setpoint, velocity: Vector, now_ns: int, fence: Fence, yaw_rate: float | None = None
+) -> Setpoint:
     """Return a setpoint that moves with `velocity` [m/s], world frame, from `now_ns` [ns] on.
 
     It begins where `setpoint` is at `now_ns`. It stays in the box in which the guard lets the robot
     fly inside `fence`, and slows down before a wall.
+
+    With a `yaw_rate` [rad/s] it also turns from the heading of `setpoint`, and `velocity` is in the
+    frame of this heading: x ahead, y to the left.
     """
-    start, yaw, _, _, before, _, _ = setpoint_at(setpoint, now_ns)
+    start, yaw, _, _, before, *_ = setpoint_at(setpoint, now_ns)
+    if yaw_rate is not None:
+        u, v, w = velocity
+        velocity = u * cos(yaw) - v * sin(yaw), u * sin(yaw) + v * cos(yaw), w
     low, high = fence.inner_low, fence.inner_high
     x, y, z = (
         max(-_speed_within(at - below), min(asked, _speed_within(above - at)))
         for asked, at, below, above in zip(velocity, start, low, high, strict=True)
     )
     until_ns = now_ns + HEARTBEAT_NS
-    motion = Drive(start, now_ns, before, (x, y, z), ACCELERATION, until_ns, low, high)
-    moving = Setpoint(start, yaw, motion=motion)
+    turn = yaw_rate or 0.0
+    motion = Drive(start, now_ns, before, (x, y, z), ACCELERATION, until_ns, low, high, turn)
+    moving = Setpoint(start, yaw, motion=motion, turns=yaw_rate is not None)
     return moving._replace(position=setpoint_at(moving, now_ns + 4 * HEARTBEAT_NS).position)
 
 
@@ -114,16 +125,18 @@ def _speed_within(distance: float) -> float:
 
 
 def _driven(setpoint: Setpoint, drive: Drive, now_ns: int) -> Setpoint:
-    start, begin_ns, before, target, acceleration, until_ns, lowest, highest = drive
+    start, begin_ns, before, target, acceleration, until_ns, lowest, highest, yaw_rate = drive
     time = max(min(now_ns, until_ns) - begin_ns, 0) * 1e-9
     position, velocity = _change(start, before, target, acceleration, time)
+    yaw = setpoint.yaw + yaw_rate * time
     if now_ns > until_ns:
-        time = (now_ns - until_ns) * 1e-9
+        time, yaw_rate = (now_ns - until_ns) * 1e-9, 0.0
         position, velocity = _change(position, velocity, ZERO, acceleration, time)
     sides = zip(position, lowest, highest, strict=True)
     x, y, z = inside = tuple(max(low, min(at, high)) for at, low, high in sides)
     u, v, w = (s if a == b else 0.0 for s, a, b in zip(velocity, position, inside, strict=True))
-    return setpoint._replace(position=(x, y, z), velocity=(u, v, w))
+    place, moves = (x, y, z), (u, v, w)
+    return setpoint._replace(position=place, velocity=moves, yaw=yaw, yaw_rate=yaw_rate)
 
 
 def _change(

@@ -127,8 +127,10 @@ class MissionFlight:
         self._aim.select_here()
         self._report("held", f"held {self.route.where}", now_ns)
 
-    def drive(self, now_ns: int, velocity: Vector) -> None:
+    def drive(self, now_ns: int, velocity: Vector, yaw_rate: float | None = None) -> None:
         """Move the setpoint with `velocity` [m/s], world frame, for at most `HEARTBEAT_NS`.
+
+        With a `yaw_rate` [rad/s] it also turns, and `velocity` is in the frame of its heading.
 
         The mission must be held; a hand-driven mission may also be starting. In other states,
         raise a ConflictError. The call has no effect while the mission starts, or while telemetry
@@ -141,11 +143,11 @@ class MissionFlight:
         assert seen is not None, "telemetry has shown the start"
         if seen.guard is not TRACK or now_ns - aim.seen_ns > GAP_MAX_NS:
             return
-        moves = velocity != ZERO
+        moves = velocity != ZERO or bool(yaw_rate)
         if moves and not self._is_driven:
             self._report("driving", "driven by hand", now_ns, NO_WAYPOINT)
         self._released_ns = now_ns + HEARTBEAT_NS if moves else NEVER_NS
-        aim.steer(velocity, now_ns)
+        aim.steer(velocity, now_ns, yaw_rate)
 
     def resume(self, now_ns: int) -> None:
         """Continue a held mission; raise ConflictError unless the mission is held."""

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cloudrc.config.ground import on_ground, put_on_ground
-from cloudrc.config.heading import Heading, without_held_yaws
+from cloudrc.config.heading import WHY, Heading, without_held_yaws
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import ConfigProblem, from_pydantic
 from cloudrc.config.schema import (
@@ -88,6 +88,9 @@ class DriveRequest(Section):
 
     velocity_mps: tuple[Finite, Finite, Finite]
     """Velocity of the setpoint [m/s], world frame; above 1.5 m/s it is scaled down"""
+    yaw_rate_radps: Finite | None = None
+    """Yaw rate [rad/s], at most 1, for a robot that turns; with it, also with 0, the velocity is in
+    the frame of the robot's heading: x ahead, y to the left. null: no turn"""
 
 
 EXAMPLES: dict[type[Section], dict[str, Any]] = {
@@ -356,13 +359,17 @@ class RequestReader:
         (waypoint,) = without_held_yaws(mission, self.heading).waypoints
         return Leg(position, None if waypoint.yaw_deg is None else radians(waypoint.yaw_deg))
 
-    def drive(self, body: bytes) -> Vector:
-        """Read a velocity [m/s]."""
-        velocity = _parse(body, DriveRequest).velocity_mps
+    def drive(self, body: bytes) -> tuple[Vector, float | None]:
+        """Read a velocity [m/s] and a yaw rate [rad/s]."""
+        request = _parse(body, DriveRequest)
+        velocity, yaw_rate = request.velocity_mps, request.yaw_rate_radps
+        if yaw_rate and self.heading == "fixed":
+            reason = f"{WHY['fixed']}; leave it out, or choose another robot, such as x2"
+            raise RefusedError([ConfigProblem(("yaw_rate_radps",), f"{yaw_rate:g}", reason)])
         if self.planar and velocity[2] != 0.0:
             reason = "leads up or down, but this robot stays on the ground; set it to 0"
             raise RefusedError([ConfigProblem(("velocity_mps", "2"), f"{velocity[2]:g}", reason)])
-        return velocity
+        return velocity, yaw_rate
 
     def _check(self, mission: MissionConfig) -> list[ConfigProblem]:
         how: Any = {"planar": self.planar, "heading": self.heading}

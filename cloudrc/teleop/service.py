@@ -16,7 +16,7 @@ from cloudrc.geometry.placement import find_crossed
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Start, Vector
 from cloudrc.metrics.verdict import FlightFailure, FlightVerdict
-from cloudrc.teleop.carrot import HEARTBEAT_NS, SPEED_MAX
+from cloudrc.teleop.carrot import HEARTBEAT_NS, SPEED_MAX, TURN_MAX
 from cloudrc.teleop.refusals import ConflictError, UnavailableError
 from cloudrc.teleop.runner import STOP_IS_SENT, MissionRunner
 from cloudrc.teleop.store import MissionRecord, MissionStore, Order
@@ -45,11 +45,11 @@ class Hand:
         """Return whether the operator has driven within `HEARTBEAT_NS` before `now_ns` [ns]."""
         return now_ns - self._driven_ns <= HEARTBEAT_NS
 
-    def limit(self, velocity: Vector, now_ns: int) -> Vector:
-        """Return the velocity [m/s] for a request at `now_ns` [ns]."""
+    def limit(self, velocity: Vector, now_ns: int, *, turns: bool) -> Vector:
+        """Return the velocity [m/s] for a request at `now_ns` [ns]; `turns`: it asks for a turn."""
         x, y, z = velocity
         scale = self._speed_max / max(hypot(x, y, z), self._speed_max)
-        if not any(velocity) or not self.is_there(now_ns):
+        if not (any(velocity) or turns) or not self.is_there(now_ns):
             self.has_to_let_go = False
         self._driven_ns = now_ns
         return scale * x, scale * y, scale * z
@@ -159,18 +159,22 @@ class MissionService(MissionRunner):
         self._check_way(leg, waiting[0].order)
         return self.operate(lambda flight: flight.go_to(now_ns, leg), now_ns)
 
-    def drive(self, velocity: Vector, now_ns: int) -> MissionRecord:
+    def drive(self, velocity: Vector, now_ns: int, yaw_rate: float | None = None) -> MissionRecord:
         """Drive the setpoint with `velocity` [m/s], in a held mission or in a new one.
+
+        With a `yaw_rate` [rad/s] it also turns, and `velocity` is in the frame of its heading.
 
         The setpoint brakes and rests if the next request comes later than `HEARTBEAT_NS`.
         """
-        velocity = self._hand.limit(velocity, now_ns)
+        velocity = self._hand.limit(velocity, now_ns, turns=bool(yaw_rate))
+        if yaw_rate:
+            yaw_rate = max(-TURN_MAX, min(yaw_rate, TURN_MAX))
         self._check_can_fly()
         if self._hand.has_to_let_go:
             raise ConflictError("a hold, a stop or an end came in between; let go, then drive on")
         waiting, seen = self.book.open(), self.seen
         if not waiting:
-            if seen is None or not any(velocity):
+            if seen is None or not (any(velocity) or yaw_rate):
                 text = "no mission is under way; a velocity other than zero makes the robot start"
                 raise ConflictError(f"{text}, once telemetry has arrived")
             x, y, z = seen.position
@@ -179,7 +183,7 @@ class MissionService(MissionRunner):
             self.create(Order(plan, "drive"), now_ns)
         elif waiting[0].state != HELD and not waiting[0].order.plan.by_hand:
             raise _busy(waiting[0], "hold or cancel it first")
-        return self.operate(lambda flight: flight.drive(now_ns, velocity), now_ns)
+        return self.operate(lambda flight: flight.drive(now_ns, velocity, yaw_rate), now_ns)
 
     def switch_off(self, now_ns: int) -> MissionRecord | None:
         """Switch the robot off at once, in any state; return the mission that this ends, if any."""

@@ -22,7 +22,7 @@ from cloudrc.config import problems, shipped
 from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import Settings, collect_settings, parse_settings
 from cloudrc.config.problems import ConfigProblem, ProblemsError, validate
-from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.resolved import ResolvedExperiment, local_files
 from cloudrc.config.schema import Link
 from cloudrc.config.section import Section
 from cloudrc.errors import BadInputError
@@ -110,6 +110,12 @@ class SweepPlan:
     def axes(self) -> dict[str, list[Any]]:
         """Axis -> its values or names."""
         return {axis: [label for label, _ in each] for axis, each in self.draft.axes.items()}
+
+    @property
+    def own_files(self) -> list[str]:
+        """Paths of the user's files on which a flight depends, as they are named and found."""
+        named = (local_files(each.model_dump(mode="json")) for each in self.points)
+        return sorted({*self.files, *(path for each in named for path in each.values())})
 
 
 class Draft(NamedTuple):

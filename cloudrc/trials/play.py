@@ -6,7 +6,7 @@ from collections.abc import Callable, Generator, Iterable
 from typing import Protocol
 
 from cloudrc import source
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import CloudrcError, InvalidRunError
 from cloudrc.trials.rows import Row, Rows
 from cloudrc.trials.workers import map_in_order, take_each
 
@@ -51,7 +51,7 @@ def keep(
 
     def take(row: Row) -> None:
         if row["code"] != source.code_hash():
-            raise BadInputError("the code of cloudrc has changed meanwhile; begin again")
+            raise InvalidRunError("the code of cloudrc has changed meanwhile; begin again")
         rows.add(row)
         see(row)
 

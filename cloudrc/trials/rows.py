@@ -25,11 +25,11 @@ SIZE_MAX = 1 << 32
 class Rows:
     """The rows of trials by their keys; with a folder, those that its files have.
 
-    Each shard of the work appends to a file of its own.
+    Each shard of the work, or each pod, appends to a file of its own.
     """
 
-    def __init__(self, folder: Path | None = None, shard: int | None = None) -> None:
-        """Read the rows in `folder`; None: keep them in memory alone."""
+    def __init__(self, folder: Path | None = None, shard: int | str | None = None) -> None:
+        """Read the rows in `folder`; None: keep them in memory alone. `shard` names its file."""
         self.kept: dict[str, Row] = read_rows(folder) if folder else {}
         self._path = folder and folder / f"rows{f'-{shard}' if shard else ''}.jsonl"
         if self._path and self._path.exists():
@@ -38,13 +38,19 @@ class Rows:
 
     def add(self, row: Row) -> None:
         """Add a row, unless one of its key is there."""
-        if row["key"] in self.kept:
-            return
+        if row["key"] not in self.kept:
+            self._write(row)
+            self.kept[row["key"]] = row
+
+    def _write(self, row: Row) -> None:
         if self._path:
-            line = json.dumps(row, allow_nan=False) + "\n"
             with files.at_place(self._path), self._path.open("ab") as file:
-                file.write(line.encode())
-        self.kept[row["key"]] = row
+                file.write(line_of(row))
+
+
+def line_of(row: Row) -> bytes:
+    """Return a row as a line of a file."""
+    return f"{json.dumps(row, allow_nan=False)}\n".encode()
 
 
 def read_rows(folder: Path) -> dict[str, Row]:
@@ -54,14 +60,19 @@ def read_rows(folder: Path) -> dict[str, Row]:
     """
     found: dict[str, Row] = {}
     for path in sorted(folder.glob("rows*.jsonl")):
-        *lines, _ = files.read(path, SIZE_MAX).split(b"\n")
-        for number, line in enumerate(lines, start=1):
-            row = parse_row(line)
-            if row is None:
-                text = "is not a row; delete this line to play its trial again"
-                raise BadInputError(f"{path}:{number}: {text}")
-            found.setdefault(row["key"], row)
+        take_lines(files.read(path, SIZE_MAX), path, found)
     return found
+
+
+def take_lines(data: bytes, place: object, found: dict[str, Row]) -> None:
+    """Add the rows in the content of a file to those found before; `place` names the file."""
+    *lines, _ = data.split(b"\n")
+    for number, line in enumerate(lines, start=1):
+        row = parse_row(line)
+        if row is None:
+            text = "is not a row; delete this line to play its trial again"
+            raise BadInputError(f"{place}:{number}: {text}")
+        found.setdefault(row["key"], row)
 
 
 def parse_row(line: bytes | str) -> Row | None:

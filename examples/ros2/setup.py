@@ -11,7 +11,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/cloudrc_nodes"]),
         ("share/cloudrc_nodes", ["package.xml"]),
-        ("share/cloudrc_nodes/launch", ["launch/paper.launch.py"]),
+        ("share/cloudrc_nodes/launch", ["launch/paper.launch.py", "launch/robot.launch.py"]),
     ],
     install_requires=["setuptools"],
     entry_points={"console_scripts": [f"{name} = cloudrc_nodes.{name}:main" for name in NODES]},

@@ -1,13 +1,18 @@
 """What the bridge of a flight to ROS 2 publishes and asks for, without a ROS."""
 
-from math import nan
+import time
+from math import nan, pi
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from cloudrc.bridges.ros2.description import RobotFrames, covariances, urdf
 from cloudrc.bridges.ros2.health import FlightHealth
+from cloudrc.bridges.ros2.mission import MissionNews, Navigation
 from cloudrc.bridges.ros2.requests import RosRequests
+from cloudrc.config.disturbances import SensorsConfig
 from cloudrc.console.steering import Steering
 from cloudrc.geometry.shapes import Shapes, Surface
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
@@ -40,11 +45,11 @@ def telemetry(stamp_ns=0, guard=GuardState.TRACK):
 class Asking:
     """Requests of nodes for a robot, and what came of them."""
 
-    def __init__(self, *, planar=False, turns=True, **options):
+    def __init__(self, *, planar=False, heading="free", **options):
         self.said = []
         self.api = FakeApi()
         self.steering = Steering(self.api)
-        options |= {"planar": planar, "turns": turns}
+        options |= {"planar": planar, "heading": heading}
         self.requests = RosRequests(self.steering, self.said.append, **options)
 
     def velocity(self, now=0.0):
@@ -62,8 +67,8 @@ def test_a_goal_is_a_goto_with_its_yaw():
 @pytest.mark.parametrize(
     ("options", "height", "goal"),
     [
-        ({"turns": False}, 2.0, {"position_m": [1.0, 0.0, 2.0]}),
-        ({"turns": False, "planar": True}, 0.1, {"position_m": [1.0, 0.0]}),
+        ({"heading": "velocity"}, 2.0, {"position_m": [1.0, 0.0, 2.0]}),
+        ({"heading": "velocity", "planar": True}, 0.1, {"position_m": [1.0, 0.0]}),
     ],
 )
 def test_a_goal_on_the_ground_as_rviz_sends_keeps_the_height(options, height, goal):
@@ -78,19 +83,30 @@ def test_a_goal_on_the_ground_as_rviz_sends_keeps_the_height(options, height, go
     [("", (0.0, 0.5)), ("drone1/base_link", (0.0, 0.5)), ("world", (0.5, 0.0)), ("map", (0.5, 0))],
 )
 def test_a_velocity_is_turned_from_the_base_to_the_world(frame, flown):
-    asking = Asking(prefix="drone1/")
+    asking = Asking(frames=RobotFrames("drone1/"))
     asking.requests.see(ZERO, LEFT)
     asking.requests.drive(frame, (0.5, 0.0, 0.1), 0.0)
     assert asking.velocity() == pytest.approx((*flown, 0.1))
     assert asking.said == []
 
 
-def test_a_robot_on_the_ground_gets_no_vertical_velocity_and_a_turn_is_ignored_with_a_word():
-    asking = Asking(planar=True)
+@pytest.mark.parametrize(
+    ("frame", "heading", "velocity", "turn"),
+    [
+        ("", "velocity", (0.5, 0.0, 0.0), -0.2),
+        ("map", "free", (0.0, -0.5, 0.0), -0.2),
+        ("", "fixed", (0.0, 0.5, 0.0), None),
+    ],
+)
+def test_a_turn_is_asked_for_in_the_frame_of_the_heading(frame, heading, velocity, turn):
+    asking = Asking(planar=True, heading=heading)
+    asking.requests.see(ZERO, LEFT)
     for _ in range(3):
-        asking.requests.drive("", (0.5, 0.0, 0.3), 0.2)
-    assert asking.velocity() == (0.5, 0.0, 0.0)
-    assert ["angular.z is ignored" in text for text in asking.said] == [True]
+        asking.requests.drive(frame, (0.5, 0.0, 0.3), -0.2)
+    assert asking.velocity() == pytest.approx(velocity)
+    assert asking.steering._turn == turn
+    ignored = ["angular.z is ignored" in text for text in asking.said]
+    assert ignored == [True] * (heading == "fixed")
 
 
 @pytest.mark.parametrize("frame", ["odom"])
@@ -149,6 +165,96 @@ def test_a_refusal_of_teleop_is_the_answer_and_an_emergency_stop_is_asked_for_ag
     assert not asking.steering._stops.is_set()
     assert asking.requests.serve("estop") == (False, "not now")
     assert asking.steering._stops.is_set()
+
+
+def test_the_mission_and_the_last_refused_goal_are_news():
+    asking = Asking()
+    news = MissionNews(asking.api, asking.requests)
+    mission = {"id": "m1", "name": "pipes", "state": "flying", "waypoint": 1, "waypoints": 7}
+    mission |= {"reached": [{}], "verdict": None}
+    assert news.look({}) is None
+    flying = news.look({"mission": mission})
+    assert (flying.level, flying.values["waypoints reached"]) == (OK, "1 of 7")
+    assert news.look({"mission": mission}) is None, "nothing new"
+    asking.api.refused["/v1/goto"] = "behind a wall"
+    asking.requests.go_to("map", (9.0, 0.0, 1.0), UPRIGHT)
+    values = news.look({"mission": mission}).values
+    assert values["refused goal"] == "(9.00, 0.00, 1.00) m in map"
+    assert values["refused because"] == "behind a wall"
+    verdict = {"outcome": "failure", "failures": [{"code": "timed_out", "text": "too slow"}]}
+    asking.api.answers["/v1/missions/m1"] = {**mission, "state": "failed", "verdict": verdict}
+    failed = news.look({"mission": None})
+    assert (failed.level, "too slow" in failed.text) == (ERROR, True)
+
+
+class Pilot(Asking):
+    """A robot that flies to a goal in a mission with one state after the other."""
+
+    def __init__(self, states):
+        super().__init__()
+        self.states, self.fed, self.wants_end = states, [], False
+        self.api.get = self.get
+
+    def get(self, path):
+        verdict = {"outcome": "failure", "failures": [{"code": "guard", "text": "hit a pipe"}]}
+        mission = {"id": "m1", "state": self.states[0], "verdict": verdict}
+        del self.states[: len(self.states) > 1]
+        return {"mission": mission} if path == "/v1/state" else mission
+
+    def fly(self, goal=(1.0, 0.0, 1.0)):
+        def tell(*given):
+            self.fed.append(given)
+            self.requests.see((0.8 + 0.1 * len(self.fed), 0.0, 1.0), UPRIGHT)
+
+        navigation = Navigation(self.api, self.requests)
+        return navigation.fly(("map", goal, UPRIGHT), lambda: self.wants_end, tell)
+
+
+def test_to_navigate_is_to_fly_a_mission_to_its_end(monkeypatch):
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    pilot = Pilot(["starting", "flying", "done"])
+    assert pilot.fly() == ""
+    assert len(pilot.fed) == 3
+    assert pilot.fed[1][:2] == ((0.9, 0.0, 1.0), pytest.approx(0.1))
+    assert "hit a pipe" in Pilot(["starting", "failed"]).fly()
+
+
+def test_a_goal_beside_a_held_mission_ends_there_and_a_cancelled_one_here(monkeypatch):
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    monkeypatch.setattr("cloudrc.bridges.ros2.mission.DWELL", 0.0)
+    assert Pilot(["held"]).fly() == ""
+    assert "resumed" in Pilot(["held", "flying"]).fly((9.0, 0.0, 1.0))
+    held, flying = Pilot(["held"]), Pilot(["flying"])
+    for pilot, path in ((held, "/v1/goto"), (flying, "/v1/missions/m1/cancel")):
+        pilot.wants_end = True
+        assert pilot.fly((9.0, 0.0, 1.0)) == "cancelled"
+        assert pilot.api.posted[-1][0] == path
+
+
+def test_a_refused_goal_is_not_flown():
+    pilot = Pilot(["done"])
+    pilot.api.refused["/v1/goto"] = "outside the fence"
+    assert pilot.fly() == "outside the fence"
+    assert pilot.fed == []
+
+
+def test_the_description_has_a_box_for_each_part_of_the_robot():
+    corners = np.array([[-0.2, -0.1, 0.0], [0.2, 0.1, 0.05], [0.0, 0.0, 0.0]])
+    part = Surface("", corners, np.array([[0, 1, 2]], np.int32))
+    text = urdf("rover", RobotFrames("drone1/", rep_105=True), [part])
+    robot = ElementTree.fromstring(text)
+    assert robot.find("link").get("name") == "drone1/base_link"
+    assert robot.find(".//visual//box").get("size") == "0.4 0.2 0.05"
+    assert robot.find(".//visual/origin").get("xyz") == "0 0 0.025"
+
+
+def test_an_odometry_says_how_exact_it_is():
+    errors = SensorsConfig(position_noise_m=0.1, attitude_noise_deg=180 / pi, rate_noise_radps=0.2)
+    data = encode_odometry(0, ZERO, UPRIGHT, ZERO, ZERO, "b", "odom", covariances(errors))
+    odometry = STORE.deserialize_cdr(data, "nav_msgs/msg/Odometry")
+    assert odometry.header.frame_id == "odom"
+    found = [np.diag(each.covariance.reshape(6, 6)) for each in (odometry.pose, odometry.twist)]
+    assert np.concatenate(found) == pytest.approx([0.01] * 3 + [1.0] * 3 + [0.0] * 3 + [0.04] * 3)
 
 
 def health(*records, now_ns=1_000_000_000, dropped=0):

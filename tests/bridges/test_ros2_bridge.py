@@ -1,13 +1,17 @@
 """A plain node of ROS 2 sees a flight and steers it: `make ros2-test` runs this in a real ROS 2."""
 
 import os
+import subprocess
+import sys
 import threading
 import time
 from contextlib import contextmanager
 from importlib.util import find_spec
+from shutil import which
 
 import pytest
 
+from cloudrc.bridges.ros2.description import RobotFrames, urdf
 from cloudrc.bridges.ros2.requests import RosRequests
 from cloudrc.console.steering import Steering
 from cloudrc.drivers.readers import RecordReader, RecordSender
@@ -22,6 +26,8 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # of ROS's own packages
     pytest.mark.skipif(find_spec("rclpy") is None, reason="needs a sourced ROS 2: make ros2-test"),
 ]
+SUCCEEDED, ABORTED = 4, 6
+"""Status of an action that has ended, as in action_msgs/GoalStatus."""
 PERIOD = 0.01
 """Time between two telemetries of the tests' cloud [s]."""
 
@@ -100,15 +106,17 @@ def fly(sender, ended):
 @contextmanager
 def bridge(folder, said):
     """Run a bridge beside a cloud that flies; yield the API that it calls."""
-    from cloudrc.bridges.ros2.bridge import RosBridge
+    from cloudrc.bridges.ros2.bridge import RosBridge, Shown
 
     api, ended = FakeApi(), threading.Event()
     api.answers["/v1/state"] = {"mission": None}
     steering, sender = Steering(api), RecordSender(folder)
-    robot = {"planar": False, "turns": True, "prefix": "drone1/"}
+    frames = RobotFrames("drone1/", rep_105=True)
+    robot = {"planar": False, "heading": "free", "frames": frames}
     requests = RosRequests(steering, said.append, **robot)
     scene = encode_markers(0, scene_shapes(Shapes(), (), "drone1/"))
-    node = RosBridge("drone1", "drone1/", scene, steering, requests, said.append)
+    shown = Shown(frames, scene, urdf("x2", frames, ()))
+    node = RosBridge("drone1", shown, steering, requests, said.append)
     reader = RecordReader(folder)
     steering.start()
     threads = [
@@ -140,6 +148,7 @@ def test_a_plain_node_sees_the_robot_and_steers_it(tmp_path, watcher):
         watcher.wait(lambda: len(got["odom"]) > 100 and all(got.values()))
         stamps = [each.header.stamp.sec + each.header.stamp.nanosec * 1e-9 for each in got["odom"]]
         assert time.time() - 5.0 < stamps[-1] <= time.time()
+        assert got["odom"][-1].header.frame_id == "drone1/odom"
         assert got["odom"][-1].child_frame_id == "drone1/base_link"
         assert got["odom"][-1].pose.pose.position.z == 3.0
         assert {each.data for each in got["guard"]} == {"TRACK"}
@@ -165,15 +174,115 @@ def test_a_plain_node_sees_the_robot_and_steers_it(tmp_path, watcher):
     assert "/drone1/odom" in " ".join(said)
 
 
+@pytest.fixture
+def nav2(tmp_path, monkeypatch):
+    """A nav2_msgs with the action, of which there is no wheel."""
+    if find_spec("nav2_msgs") is None:
+        make = [sys.executable, "-m", "tests.bridges.make_nav2", tmp_path / "nav2"]
+        subprocess.run(make, check=True)
+        monkeypatch.syspath_prepend(tmp_path / "nav2")
+
+
+@pytest.mark.skipif(not which("g++"), reason="needs g++")
+@pytest.mark.usefixtures("nav2")
+def test_a_goal_of_nav2_is_flown_and_a_refused_one_says_why(tmp_path):
+    from nav2_msgs.action import NavigateToPose
+    from rclpy.action import ActionClient
+
+    watcher, fed = Watcher(), []
+    client = ActionClient(watcher.node, NavigateToPose, "/drone1/navigate_to_pose")
+
+    def navigate():
+        goal = NavigateToPose.Goal()
+        goal.pose.pose.position.x, goal.pose.pose.position.z = 1.5, 1.0
+        sent = client.send_goal_async(goal, feedback_callback=fed.append)
+        watcher.wait(sent.done)
+        ended = sent.result().get_result_async()
+        watcher.wait(ended.done)
+        return ended.result()
+
+    with bridge(tmp_path, []) as api:
+        watcher.wait(client.server_is_ready)
+        api.refused["/v1/goto"] = "outside the fence"
+        answer = navigate()
+        assert (answer.status, answer.result.error_msg) == (ABORTED, "outside the fence")
+        api.refused.clear()
+        api.answers["/v1/missions"] = {"missions": [{"id": "m1", "state": "flying"}]}
+        api.answers["/v1/missions/m1"] = {"state": "done"}
+        assert navigate().status == SUCCEEDED
+    assert fed, "no feedback"
+    client.destroy()
+    watcher.close()
+
+
+def teleop_keyboard(twist):
+    """Fill what teleop_twist_keyboard sends for its key `u`: ahead and to the left."""
+    twist.linear.x, twist.angular.z = 0.5, 1.0
+
+
+def nav2_controller(command):
+    """Fill what Nav2's controller server sends: stamped, in the frame of the base."""
+    command.header.frame_id = "base_link"
+    command.twist.linear.x, command.twist.angular.z = 0.3, -0.4
+
+
+def up(folder, *words):
+    """Begin a session; return its process once missions can fly."""
+    session = start(folder, "up", *words)
+    for said in session.stdout:
+        if "to end" in said:
+            return session
+    pytest.fail("the session has not begun")
+
+
+@pytest.fixture
+def rover(tmp_path, monkeypatch):
+    """A session with a rover and its bridge; yield what the command has said."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    session = up(tmp_path, "pillars", "--set", "world.scene=empty")
+    command = start(tmp_path, "ros", "bridge", "--rep-105")
+    yield
+    session.terminate()
+    output, _ = command.communicate(timeout=30)
+    assert command.returncode == 0, output
+    session.communicate(timeout=30)
+
+
+@pytest.mark.usefixtures("rover")
+def test_the_messages_of_teleop_keyboard_and_of_nav2_turn_a_rover():
+    from diagnostic_msgs.msg import DiagnosticStatus
+    from geometry_msgs.msg import Twist, TwistStamped
+    from nav_msgs.msg import Odometry as RosOdometry
+
+    watcher = Watcher(odom=("/odom", RosOdometry), mission=("/cloudrc/mission", DiagnosticStatus))
+    got = watcher.got
+    watcher.wait(lambda: len(got["odom"]) > 10, 60.0)
+    assert got["odom"][-1].header.frame_id == "odom"
+    for kind, fill in ((Twist, teleop_keyboard), (TwistStamped, nav2_controller)):
+        commands = watcher.node.create_publisher(kind, "/cmd_vel", 1)
+        watcher.wait(lambda commands=commands: commands.get_subscription_count(), 20.0)
+        command = kind()
+        fill(command)
+        wanted = getattr(command, "twist", command).angular.z
+        rates = []
+        for _ in range(30):
+            commands.publish(command)
+            end = time.monotonic() + 0.1
+            watcher.wait(lambda end=end: time.monotonic() > end)
+            rates.append(got["odom"][-1].twist.twist.angular.z)
+        assert sum(rates[10:]) / 20 == pytest.approx(wanted, rel=0.25)
+        commands.publish(kind())
+        watcher.node.destroy_publisher(commands)
+    assert "held" in {each.key: each.value for each in got["mission"][-1].values}["state"]
+    watcher.close()
+
+
 def test_the_bridge_of_a_session_ends_with_it(tmp_path, monkeypatch):
     from nav_msgs.msg import Odometry as RosOdometry
 
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     watcher = Watcher(odom=("/odom", RosOdometry))
-    session = start(tmp_path, "up", "hover")
-    said = session.stdout.readline()
-    while "to end" not in said:
-        said = session.stdout.readline()
+    session = up(tmp_path, "hover")
     command = start(tmp_path, "ros", "bridge")
     watcher.wait(lambda: len(watcher.got["odom"]) > 100, 30.0)
     assert watcher.call("/cloudrc/acknowledge").message

@@ -16,7 +16,7 @@ import pytest
 from cloudrc.assembly import assemble
 from cloudrc.cluster import batch
 from cloudrc.source import code_hash
-from cloudrc.trials.plan import PlannedFlight, read_plan
+from cloudrc.trials.plan import PlannedFlight, read_plan, unpack
 from cloudrc.trials.rows import read_rows
 from tests.cli.conftest import SHORT
 from tests.conftest import wait_until
@@ -226,13 +226,70 @@ def test_lost_rows_are_flown_again_as_long_as_rows_arrive(make, code, count, sai
     assert said in error
 
 
-def test_files_that_no_pod_has_are_refused(write_sweep, tmp_path, call):
-    source = "from cloudrc.cloud.predictors.last_sample import build\n"
-    (tmp_path / "mine.py").write_text(source)
-    path = write_sweep({"cloud.predictor": ["./mine.py"]})
-    error = call("sweep run --out grid --on kubernetes", path, code=2).err
-    assert "mine.py: the pods do not have this file" in error
-    assert not Path("grid").exists()
+@pytest.fixture
+def started(monkeypatch):
+    """What each new Job gets: settings, own files. Its pods print all rows."""
+    jobs = []
+
+    def start(release, name, flights, settings, own):
+        jobs.append((settings, own))
+        Path("flights").write_bytes(flights)
+
+    def read_lines(*given):
+        return [json.dumps(flight.row(flown())) for flight in unpack(Path("flights"))]
+
+    monkeypatch.setattr("cloudrc.cli.sweep_run.release_from_flags", lambda options: Release())
+    monkeypatch.setattr(batch, "start", start)
+    monkeypatch.setattr(batch, "read_lines", read_lines)
+    return jobs
+
+
+def test_files_of_plug_ins_travel_with_the_flights(write_sweep, started, tmp_path, call):
+    (tmp_path / "mine.py").write_text("from helper import build\n")
+    (tmp_path / "helper.py").write_text("from cloudrc.cloud.predictors.last_sample import build\n")
+    path = write_sweep({"cloud.predictor": ["./mine.py"]}, set={})
+    call("sweep run --out grid --on kubernetes", path)
+    ((settings, own),) = started
+    assert own == [str(tmp_path / name) for name in ("helper.py", "mine.py")]
+    assert settings.shards == 1, "at most one per flight"
+    with (tmp_path / "helper.py").open("a") as file:
+        file.write("# " + "x" * (1 << 20))
+    error = call("sweep run --out large --on kubernetes", path, code=2).err
+    assert "helper.py: your files have 1048" in error
+    assert not Path("large").exists()
+
+
+def test_a_client_that_has_gone_attaches_with_the_same_flags(
+    write_sweep, started, monkeypatch, call
+):
+    def leave(*given):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(batch, "read_lines", leave)
+        line = "sweep run --out grid --on kubernetes --claim rows --set-job nodeSelector.disk=ssd"
+        error = call(line, write_sweep(), code=130).err
+    assert "to continue, cloudrc sweep attach grid" in error
+    assert "rows in rows/sweep-" in error
+    call("sweep attach grid")
+    (first, _), (second, _) = started
+    assert first == second
+    assert first.changes == {("nodeSelector", "disk"): "ssd"}
+    assert Path("grid/table.csv").exists()
+    assert "no folder of" in call("sweep attach .", code=2).err
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        ("--set-job toleration=1", "did you mean tolerations?"),
+        ("--claim a --bucket s3://b", "two places"),
+        ("--bucket lab", "is not s3://BUCKET"),
+    ],
+)
+def test_odd_flags_of_pods_are_refused(write_sweep, flags, said, call):
+    assert said in call(f"sweep run --on kubernetes {flags}", write_sweep(ONE), code=2).err
+    assert not Path("runs").exists()
 
 
 # `cloudrc run --seeds N`.

@@ -1,6 +1,7 @@
 """The Job of a sweep is created once, its log is read, and its failures are named."""
 
 import base64
+import itertools
 import subprocess
 
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from cloudrc import __version__
 from cloudrc.cluster import batch
 from cloudrc.cluster.batch import PodSettings
+from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import UID_LABEL
 from cloudrc.errors import BadInputError
 from tests.cluster.conftest import pod, terminated
@@ -48,6 +50,7 @@ def test_the_job_flies_each_index_with_its_flights(started, api, release):
     ]
     wanted = "sweep rows /flights/flights.json.gz --shard={}/4\n"
     assert [each.stdout for each in said] == [wanted.format(1), wanted.format(4)]
+    assert "--out" not in str(container)
     batch.start(release, "sweep-2", b"flights", PODS._replace(image=None, queue="lab"))
     queued = api.get("jobs", "sweep-2")
     (container,) = queued["spec"]["template"]["spec"]["containers"]
@@ -55,6 +58,32 @@ def test_the_job_flies_each_index_with_its_flights(started, api, release):
     assert queued["metadata"]["labels"]["kueue.x-k8s.io/queue-name"] == "lab"
     pods = queued["spec"]["template"]["metadata"]["labels"]
     assert "kueue.x-k8s.io/queue-name" not in pods, "the queue takes the whole Job"
+
+
+def test_the_flags_of_the_job_reach_it(api, release, tmp_path):
+    (tmp_path / "p.py").write_text("# mine")
+    changes = {("nodeSelector", "disk"): "ssd", ("ttlSecondsAfterFinished",): 60, ("env",): []}
+    asked = {"parallelism": 2, "cpu_limit": "2", "memory": "1Gi", "claim": "rows"}
+    pods = PODS._replace(**asked, changes=changes)
+    batch.start(release, "sweep-1", b"flights", pods, [str(tmp_path / "p.py")])
+    spec, data = api.get("jobs", "sweep-1")["spec"], api.get("configmaps", "sweep-1")
+    assert (spec["parallelism"], spec["ttlSecondsAfterFinished"]) == (2, 60)
+    pod = spec["template"]["spec"]
+    (container,) = pod["containers"]
+    assert pod["nodeSelector"] == {"disk": "ssd"}
+    assert container["env"] == []
+    assert container["args"] == ["4", "--out=/rows/sweep-1"]
+    assert container["resources"]["limits"] == {"cpu": "2", "memory": "1Gi"}
+    assert {"name": "rows", "mountPath": "/rows"} in container["volumeMounts"]
+    assert pod["volumes"][-1]["persistentVolumeClaim"] == {"claimName": "rows"}
+    own = container["volumeMounts"][-1]
+    assert own["mountPath"] == str(tmp_path / "p.py"), "as on this machine: the path is in the key"
+    assert base64.b64decode(data["binaryData"][own["subPath"]]) == b"# mine"
+    batch.start(release, "sweep-2", b"", PODS._replace(bucket="s3://lab/x/"))
+    (container,) = api.get("jobs", "sweep-2")["spec"]["template"]["spec"]["containers"]
+    assert container["args"] == ["4", "--out=s3://lab/x/sweep-2"]
+    with pytest.raises(BadInputError, match=r"--set-job toleration\.x: .* did you mean tolera"):
+        batch.check_changes({("toleration", "x"): 1})
 
 
 def test_a_running_job_is_kept_and_a_failed_job_is_replaced(started, api, release):
@@ -73,7 +102,7 @@ def test_the_lines_of_lost_and_complete_pods_are_read(started, api, release):
     api.logs["e"] = None  # refused
 
     def replace():
-        api.objects.pop(("pods", "a"))
+        api.drop("pods", "a")
         add_pod(api, "c", "Succeeded", "row 1\nrow 3\n")
         api.end("sweep-1", "Complete")
 
@@ -95,3 +124,54 @@ def test_the_first_pod_that_refuses_the_flights_ends_the_job(started, api, relea
     with pytest.raises(BadInputError, match=f"^the pods refuse the flights: {said}$"):
         lines(release)
     assert api.jobs() == []
+
+
+@pytest.mark.parametrize("pods", [100, pytest.param(1000, marks=pytest.mark.full)])
+def test_a_minute_takes_few_requests_even_if_all_pods_end_in_it(started, api, release, pods):
+    """A look is once a second; before, it read the log of each pod: 60,000 requests."""
+    looks = itertools.count(1)
+
+    def end_some(path):
+        if "/jobs" not in path:
+            return
+        look = next(looks)
+        for number in range(pods * (look - 1) // 60, pods * look // 60):
+            add_pod(api, f"pod-{number}", "Succeeded", f"row {number}\n", state=terminated(0, ""))
+        if look == 60:
+            api.end("sweep-1", "Complete")
+
+    for number in range(pods):
+        add_pod(api, f"pod-{number}", "Running")
+    before = len(api.seen)
+    api.hooks.append(end_some)
+    found = [*batch.JobReader(release, "sweep-1", print, lambda state: "").read()]
+    assert {*found} == {f"row {number}" for number in range(pods)}
+    assert len(found) == pods
+    assert len(api.seen) - before <= pods + 200
+
+
+def test_running_pods_are_read_in_turn_and_a_forgotten_watch_begins_again(started, api, release):
+    """So a client sees progress; and it follows a Job for days."""
+    for name in ("a", "b"):
+        add_pod(api, name, "Running", f"row {name}\n")
+
+    def forget():
+        add_pod(api, "c", "Succeeded", "row c\n", state=terminated(0, ""))
+        api.forgotten = len(api.changes)
+
+    def end():
+        assert "row c" in found
+        api.end("sweep-1", "Complete")
+
+    found = []
+    api.at_look(4, forget)
+    api.at_look(8, end)
+    for line in batch.JobReader(release, "sweep-1", print, lambda state: "").read():
+        found.append(line)
+    assert found == ["row a", "row b", "row c"]
+
+
+def test_a_field_that_kubernetes_does_not_know_is_named(release):
+    pods = PODS._replace(changes={("tolerations",): [{"kee": "x"}]})
+    with pytest.raises(ClusterError, match=r"spec.template.spec.tolerations.0.kee Extra inputs"):
+        batch.start(release, "sweep-1", b"flights", pods)

@@ -27,10 +27,11 @@ def test_held_keys_add_up_and_a_released_one_counts_no_more(steering):
 
 def test_a_drive_ends_with_a_request_to_rest(api, steering):
     steering.start()
-    steering.hold_key("up", (0.0, 0.0, 0.4), 60.0)
+    steering.hold_key("turn", ZERO, 60.0, 0.3)
     wait_until(lambda: len(api.posted) > 3)
     steering.end_drive()
-    assert [body["velocity_mps"][2] for _, body in api.posted[-2:]] == [0.4, 0.0]
+    turning = {"velocity_mps": ZERO, "yaw_rate_radps": 0.3}
+    assert [body for _, body in api.posted[-2:]] == [turning, {"velocity_mps": ZERO}]
 
 
 @pytest.mark.parametrize("loss", [0.02, {"good_to_bad": 0.1}])

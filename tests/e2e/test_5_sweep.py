@@ -1,26 +1,78 @@
-"""A sweep in pods gives the table of a sweep on this machine, even if pods are lost."""
+"""A sweep in pods gives the table of a sweep on this machine, even if pods and client are lost."""
 
 import csv
+import json
+import signal
 import subprocess
 import sys
 
+import pytest
 import yaml
 
-from tests.e2e.conftest import NAMESPACE, ROOT, eventually, kubectl, read
+from tests.e2e.conftest import EXAMPLES, NAMESPACE, ROOT, apply, command, eventually, kubectl, read
 
-SWEEP = {
-    "experiment": "steps",
-    "set": {"link.profile": "paper-p2", "mission.steps.count": 5},
-    "grid": {"cloud.predictor": ["last_sample", "constant_velocity"]},
-    "seeds": 16,
+RUN = [sys.executable, "-m", "cloudrc", "sweep"]
+SWEEP = "--selector=app.kubernetes.io/component=sweep"
+FLOWN = (0, 1)
+"""Exit codes of a sweep whose flights have all ended: 1 if one has failed its mission."""
+CLAIM = {
+    "apiVersion": "v1",
+    "kind": "PersistentVolumeClaim",
+    "metadata": {"name": "rows"},
+    "spec": {
+        "accessModes": ["ReadWriteOnce"],
+        "resources": {"requests": {"storage": "100Mi"}},
+    },
 }
-SHARDS = 8
+
+
+@pytest.fixture
+def sweep(tmp_path):
+    """Return a function that writes the file of a sweep with so many flights."""
+
+    def write(flights, steps=5):
+        file = tmp_path / "sweep.yaml"
+        document = {
+            "experiment": "steps",
+            "set": {"link.profile": "paper-p2", "mission.steps.count": steps},
+            "grid": {"cloud.predictor": ["last_sample", "./mine.py"]},
+            "seeds": flights // 2,
+        }
+        file.write_text(yaml.safe_dump(document))
+        mine = "from cloudrc.cloud.predictors.constant_velocity import build as build\n"
+        (tmp_path / "mine.py").write_text(mine)
+        return file
+
+    return write
 
 
 def running():
-    selector = "--selector=app.kubernetes.io/component=sweep"
-    found = read("pods", selector, "--field-selector=status.phase=Running")["items"]
+    found = read("pods", SWEEP, "--field-selector=status.phase=Running")["items"]
     return [f"pod/{each['metadata']['name']}" for each in found]
+
+
+@pytest.fixture
+def start():
+    """Return a function that starts a sweep in pods, and returns its process once they run."""
+    clients = []
+
+    def run(file, out, shards, *flags):
+        words = ["--on=kubernetes", f"--shards={shards}", "--cpu=20m", "-n", NAMESPACE, *flags]
+        command = [*RUN, "run", str(file), f"--out={out}", *words]
+        clients.append(subprocess.Popen(command, cwd=ROOT))
+        eventually(lambda: len(running()) == shards, "all pods fly", timeout=90.0)
+        return clients[-1]
+
+    yield run
+    for each in clients:
+        each.kill()
+
+
+def here(file, out):
+    """Fly a sweep on this machine; return its table."""
+    done = subprocess.run([*RUN, "run", str(file), f"--out={out}"], cwd=ROOT)
+    assert done.returncode in FLOWN
+    return table(out)
 
 
 def table(folder):
@@ -32,19 +84,107 @@ def table(folder):
     return rows
 
 
-def test_two_of_eight_pods_are_killed_and_the_table_is_the_same(cluster, tmp_path):
-    file = tmp_path / "sweep.yaml"
-    file.write_text(yaml.safe_dump(SWEEP))
-    words = [sys.executable, "-m", "cloudrc", "sweep", "run", str(file)]
-    pods = ["--on=kubernetes", f"--shards={SHARDS}", "--cpu=50m", "-n", NAMESPACE]
-    flight = subprocess.Popen([*words, f"--out={tmp_path}/pods", *pods], cwd=ROOT)
+def keys(lines):
+    return [json.loads(line)["key"] for line in lines.splitlines()]
+
+
+def rows_of_claim():
+    """Return the lines of all files of rows in the claim, by a pod that prints them."""
+    (job,) = (
+        d for d in yaml.safe_load_all((EXAMPLES / "sweep-job.yaml").read_text()) if "spec" in d
+    )
+    spec = job["spec"]["template"]["spec"]
+    (container,) = spec["containers"]
+    container["command"] = ["sh", "-c", "cat /rows/*/rows*.jsonl"]
+    container["volumeMounts"] = [{"name": "rows", "mountPath": "/rows"}]
+    container["resources"]["requests"]["cpu"] = "50m"
+    spec["volumes"] = [{"name": "rows", "persistentVolumeClaim": {"claimName": "rows"}}]
+    apply({"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "rows"}, "spec": spec})
+    ended = "--for=jsonpath={.status.phase}=Succeeded"
+    kubectl("wait", "pod/rows", ended, "--timeout=100s")
+    return kubectl("logs", "rows")
+
+
+@pytest.mark.parametrize(
+    ("flights", "shards", "kills", "steps"),
+    [(12, 3, 2, 10), pytest.param(200, 8, 4, 5, marks=pytest.mark.full)],
+)
+def test_every_row_is_flown_once_though_pods_and_client_are_killed(
+    cluster, sweep, start, tmp_path, flights, shards, kills, steps
+):
+    apply(CLAIM)
+    file, out = sweep(flights, steps), tmp_path / "pods"
     try:
-        eventually(lambda: len(running()) == SHARDS, "all pods fly", timeout=90.0)
-        kubectl("delete", "--grace-period=0", "--force", *running()[:2])
-        assert flight.wait(180) == 0
+        client = start(file, out, shards, "--claim=rows")
+        seen = out / "rows.jsonl"
+        eventually(lambda: seen.exists() and len(keys(seen.read_text())) > 1, "rows", 120.0)
+        client.send_signal(signal.SIGKILL)
+        kubectl("delete", "--grace-period=1", *running()[:kills])
+        attached = subprocess.run([*RUN, "attach", str(out)], cwd=ROOT, timeout=600)
+        assert attached.returncode in FLOWN
+        assert table(out) == here(file, tmp_path / "here")
+        kept = keys(rows_of_claim())
+        assert len(kept) == len({*kept}) == len(keys(seen.read_text())) == flights
     finally:
-        flight.kill()
-    subprocess.run([*words, f"--out={tmp_path}/here"], cwd=ROOT, check=True)
-    in_pods, here = table(tmp_path / "pods"), table(tmp_path / "here")
-    assert in_pods == here
-    assert read("jobs", "--selector=app.kubernetes.io/component=sweep")["items"] == []
+        kubectl("delete", "pod/rows", "--ignore-not-found")
+        kubectl("delete", "pvc/rows", "--wait=false")
+    assert read("jobs", SWEEP)["items"] == []
+
+
+@pytest.mark.full
+def test_without_a_claim_the_rows_of_lost_pods_are_flown_again(cluster, sweep, start, tmp_path):
+    file = sweep(32)
+    client = start(file, tmp_path / "pods", 8)
+    kubectl("delete", "--grace-period=0", "--force", *running()[:2])
+    assert client.wait(180) in FLOWN
+    assert table(tmp_path / "pods") == here(file, tmp_path / "here")
+
+
+KINDS = {
+    "kueue.x-k8s.io/v1beta2": {
+        "ResourceFlavor": "Cluster",
+        "ClusterQueue": "Cluster",
+        "LocalQueue": "Namespaced",
+    },
+    "jobset.x-k8s.io/v1alpha2": {"JobSet": "Namespaced"},
+}
+"""API version -> kind -> its scope."""
+
+
+def definitions():
+    """Yield the definition of each kind that the examples need, which takes any fields."""
+    for api, kinds in KINDS.items():
+        group, version = api.split("/")
+        for kind, scope in kinds.items():
+            plural = f"{kind.lower()}s"
+            schema = {"type": "object", "x-kubernetes-preserve-unknown-fields": True}
+            one = {"name": version, "served": True, "storage": True}
+            names = {"kind": kind, "plural": plural, "singular": kind.lower()}
+            note = {"api-approved.kubernetes.io": "unapproved, of a test"}
+            yield {
+                "apiVersion": "apiextensions.k8s.io/v1",
+                "kind": "CustomResourceDefinition",
+                "metadata": {"name": f"{plural}.{group}", "annotations": note},
+                "spec": {
+                    **{"group": group, "names": names, "scope": scope},
+                    "versions": [{**one, "schema": {"openAPIV3Schema": schema}}],
+                },
+            }
+
+
+def test_the_examples_for_kueue_and_jobset_are_taken(cluster):
+    """By the API server, with definitions of this test; the Job of the JobSet by its own rules."""
+    made = yaml.safe_dump_all(definitions())
+    command("kubectl", "create", "--filename=-", given=made)
+    try:
+        names = [f"crd/{each['metadata']['name']}" for each in definitions()]
+        command("kubectl", "wait", "--for=condition=Established", "--timeout=60s", *names)
+        for name in ("kueue-queue", "sweep-jobset"):
+            kubectl("apply", "--dry-run=server", f"--filename={EXAMPLES / name}.yaml")
+        _, jobset = yaml.safe_load_all((EXAMPLES / "sweep-jobset.yaml").read_text())
+        for each in jobset["spec"]["replicatedJobs"]:
+            job = {"apiVersion": "batch/v1", "kind": "Job", "metadata": {"name": each["name"]}}
+            text = yaml.safe_dump({**job, **each["template"]})
+            kubectl("create", "--dry-run=server", "--validate=strict", "--filename=-", given=text)
+    finally:
+        command("kubectl", "delete", "--ignore-not-found", "--filename=-", given=made)

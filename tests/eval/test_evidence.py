@@ -88,10 +88,12 @@ def test_means_of_steps_are_those_of_all_steps_and_say_of_how_many():
 
 
 def test_ages_are_counted_over_all_episodes_and_the_worst_window_is_that_of_any():
-    some_rows = rows("newest", 50.0, [True, True], misses_in_10=(2.0, 3.0))
+    largest = {"misses_in_10": (2.0, 3.0), "action_age_max": (0.4, 0.2)}
+    some_rows = rows("newest", 50.0, [True, True], **largest)
     some_rows[0]["age_counts"], some_rows[1]["age_counts"] = [0, 5, 1], [0, 6]
     found = summarize(50.0, "newest", some_rows)
     assert (found["age_counts"], found["misses_in_10"]) == ([0, 11, 1], 3)
+    assert found["action_age_max_ms"] == pytest.approx(400.0)
 
 
 def test_executors_are_tested_in_pairs_of_equal_seeds():

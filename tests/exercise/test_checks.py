@@ -1,39 +1,46 @@
 """The checks of the exercise: full points for the solution, none for the files to fill in."""
 
+import csv
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from itertools import chain
 from pathlib import Path
 
 import pytest
 
 from cloudrc import exercise
 from cloudrc.exercise import checks, scoring
-from cloudrc.exercise.files import FILES
-from cloudrc.exercise.points import POINTS
+from cloudrc.exercise.task import SHIPPED, read_task
 from tests.conftest import nightly, wait_until
 
 SOLUTION = Path(__file__).with_name("solution")
-ALL = {part: [*tests] for part, tests in POINTS.items()}
+TASK = read_task(SHIPPED)
+FILES = TASK.files
+ALL = {part: [*about.tests] for part, about in TASK.parts.items()}
 STUBS = Path(exercise.__file__).parent
 
 
 def score(part, folder):
     """Score a part; the student's functions run in this process."""
-    rows = zip(POINTS[part].items(), checks.run(part, folder), strict=True)
-    return [{"test": test, "max_points": most, **row} for (test, most), row in rows]
+    rows = checks.run(TASK, part, folder, STUBS)
+    tests = TASK.parts[part].tests.items()
+    return [
+        {"test": test, "max_points": about.points, **row}
+        for (test, about), row in zip(tests, rows, strict=True)
+    ]
 
 
-@pytest.mark.parametrize("part", checks.CHECKS)
+@pytest.mark.parametrize("part", ALL)
 def test_the_solution_scores_all(part):
     for row in score(part, SOLUTION):
         assert row["points"] == row["max_points"], row
 
 
-@pytest.mark.parametrize("part", sorted(checks.CHECKS.keys() - {"together"}) + nightly("together"))
+@pytest.mark.parametrize("part", sorted(ALL.keys() - {"together"}) + nightly("together"))
 def test_a_stub_scores_nothing(part):
     assert [row for row in score(part, STUBS) if row["points"]] == []
 
@@ -72,12 +79,18 @@ def test_whatever_a_file_does_the_other_parts_are_scored(tmp_path):
     (tmp_path / "controller.py").write_text("import os\nos._exit(0)\n")
     rows = list(scoring.check(tmp_path, limit=4))
     seen = {row["part"]: row["seen"] for row in rows}
-    assert [row["test"] for row in rows] == [test for tests in POINTS.values() for test in tests]
+    assert [row["test"] for row in rows] == [*chain(*ALL.values())]
     assert seen["estimator"] == "delay_estimator.py: no end after 4 s of processor time"
     assert seen["predictor"] == "predictor.py:2: SystemExit: no (sys.exit() was called)"
     assert seen["controller"].startswith("controller.py: ended the process of the check")
     assert {row["points"] for row in rows} == {0.0}
     assert {row["valid"] for row in rows} == {True}
+
+
+def only(monkeypatch, part):
+    """Let the exercise have one part."""
+    task = TASK.model_copy(update={"parts": {part: TASK.parts[part]}})
+    monkeypatch.setattr(scoring, "read_task", lambda source: task)
 
 
 # What a file writes in place of rows, and the points of the part's tests then.
@@ -97,8 +110,8 @@ def test_forged_rows_cost_or_give_the_points_of_their_part_at_most(name, tmp_pat
     data, points = FORGERIES[name]
     write = f"for n in range(3, 9):\n    try: os.write(n, {data!r})\n    except OSError: pass\n"
     (tmp_path / "predictor.py").write_text(f"import os\n{write}os._exit(0)\n")
-    monkeypatch.setattr(scoring, "POINTS", {"predictor": POINTS["predictor"]})
-    rows = list(scoring.check(tmp_path, 20))
+    only(monkeypatch, "predictor")
+    rows = list(scoring.check(tmp_path, limit=20))
     assert [row["points"] for row in rows] == points
     json.dumps(rows, allow_nan=False).encode()
     assert all("\n" not in row["seen"] and len(row["seen"]) < 2500 for row in rows)
@@ -111,7 +124,7 @@ def test_a_wait_costs_no_processor_time_and_ends_with_a_score_that_is_not_valid(
     """A loaded computer gives a right hand-in too little processor time, which costs no points."""
     text = (SOLUTION / "predictor.py").read_text()
     (tmp_path / "predictor.py").write_text(f"import time\ntime.sleep(60.0)\n{text}")
-    monkeypatch.setattr(scoring, "POINTS", {"predictor": POINTS["predictor"]})
+    only(monkeypatch, "predictor")
     first, *_ = scoring.check(tmp_path, limit=10, patience=0.1)
     assert "too slow here" in first["seen"]
     assert not first["valid"]
@@ -195,6 +208,67 @@ def test_gradescope_gets_the_points_of_new_files(tmp_path, call, monkeypatch):
     assert sum(test["max_score"] for test in found["tests"]) == 100
     assert found["tests"][3]["output"].endswith("'predictor.py': there is no such file")
     assert {test["visibility"] for test in found["tests"]} == {"visible"}
+
+
+OWN = """
+parts:
+  predictor:
+    file: predictor.py
+    tests:
+      short: {points: 3, experiment: mine.yaml, number: duration, full: 0.5, none: 100}
+"""
+
+
+@pytest.fixture
+def lecture(tmp_path, monkeypatch):
+    """A folder with a lecturer's task, its experiment and the file to fill in."""
+    monkeypatch.chdir(tmp_path)
+    Path("own.yaml").write_text(OWN)
+    point = "{position_m: [0.5, 0, 1]}"
+    limit = "criteria: {time_limit_s: 1}"
+    Path("mine.yaml").write_text(f"mission: {{waypoints: [{point}]}}\n{limit}\n")
+    Path("predictor.py").write_text((SOLUTION / "predictor.py").read_text())
+    return tmp_path
+
+
+@pytest.mark.process
+def test_a_class_with_its_own_task_gets_one_table(lecture, call):
+    call("class new own.yaml")
+    assert sorted(path.name for path in Path("own").iterdir()) == [
+        "mine.yaml",
+        "predictor.py",
+        "task.yaml",
+    ]
+    Path("own").rename("anna")
+    call("class new own.yaml bert")
+    Path("bert/predictor.py").rename("bert/Predictor(1).py")
+    Path("bert/task.yaml").write_text("parts: {}")  # the lecturer's task counts
+    lines = call("class check anna bert notes.txt --task own.yaml --jobs 2").out.splitlines()
+    header, anna, bert = csv.reader(lines)
+    assert header[-2:] == ["predictor: short", "remarks"]
+    assert (anna[0], anna[2], bert[:2]) == ("anna", "3", ["bert", "0.0"])
+    assert 0.0 < float(anna[1]) <= 3.0
+    assert "'Predictor(1).py': rename it to predictor.py" in bert[-1]
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "said"),
+    [
+        ("number: duration", "number: duratoin", "did you mean duration?"),
+        ("file: predictor.py", "file: ../predictor.py", "own.yaml:4: parts.predictor.file"),
+        ("number: duration, ", "", "either a formula, or a number"),
+        ("none: 100", "none: 0.5", "give two different values"),
+        ("file: predictor.py", "file: null", "no part has a file"),
+    ],
+)
+def test_a_task_that_cannot_be_scored_is_refused_at_once(lecture, refused, right, wrong, said):
+    Path("own.yaml").write_text(OWN.replace(right, wrong))
+    assert said in refused("class new own.yaml")
+
+
+def test_a_file_with_another_name_is_named(tmp_path, refused):
+    (tmp_path / "Controller(1).py").touch()
+    assert "'Controller(1).py': rename it to controller.py" in refused("class check", tmp_path)
 
 
 def test_files_are_not_overwritten_and_a_folder_must_exist(tmp_path, refused):

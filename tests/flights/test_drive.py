@@ -5,6 +5,7 @@ import pytest
 
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.schedule import Schedule, generator
+from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.records import Arrival, CommandApplied, Control, TelemetrySent
@@ -21,23 +22,24 @@ ESTOP, GROUND = GuardState.ESTOP, GuardState.GROUND
 class Drive:
     """A flight whose operator drives; it takes off at 0.5 s."""
 
-    def __init__(self, profile="paper-p3", seed=1, link=()):
+    def __init__(self, profile="paper-p3", seed=1, link=(), robot="pelican"):
         settings = "world.scene=empty", "mission.touch=null", *link
-        self.flight = FaultRun(Schedule(seed, profile), *settings, start=False)
+        self.flight = FaultRun(Schedule(seed, profile, robot=robot), *settings, start=False)
         ways = self.flight.experiment.uplink, self.flight.experiment.downlink
         self.rtt = sum(way.delay_ms for way in ways) * 1e-3
         self.random = generator(seed, 46).uniform
-        self.press(0.5, 1.0, UP)
-        self.press(1.5, 0.1, ZERO)
+        if robot != "rover":
+            self.press(0.5, 1.0, UP)
+            self.press(1.5, 0.1, ZERO)
 
     def at(self, time, call):
         self.flight.cloud.at(time, lambda now_ns: self.flight.teleop.ask(call))
 
-    def press(self, time, lasts, velocity):
+    def press(self, time, lasts, velocity, turn=None):
         """Repeat a request at 10 Hz; return the time of the last request [s]."""
         times = [time + 0.1 * k for k in range(round(10 * lasts))]
         for each in times:
-            self.at(each, lambda service, now_ns: service.drive(velocity, now_ns))
+            self.at(each, lambda service, now_ns: service.drive(velocity, now_ns, turn))
         return times[-1]
 
     def fly(self, until):
@@ -95,6 +97,27 @@ def test_the_robot_holds_when_the_operator_is_lost(count, figure):
         "operator_lost"
     ] * count
     figure("operator lost: braking on board after", max(took), "<=", 0.6, "s", count=count)
+
+
+@pytest.mark.parametrize("robot", ["rover", "x2"])
+@pytest.mark.parametrize(("velocity", "turn"), [(EAST, 0.5), (WEST, -0.5), (ZERO, 0.8)])
+def test_a_robot_that_is_asked_to_turn_drives_a_circle(robot, velocity, turn):
+    drive = Drive(robot=robot)
+    drive.press(2.0, 3.0, velocity, turn)
+    drive.press(5.0, 0.1, ZERO)
+    drive.fly(7.0)
+    seen = [record.telemetry.odometry for record in drive.records[TelemetrySent]]
+    times = [odometry.stamp_ns * 1e-9 for odometry in seen]
+    yaws = np.unwrap([-turn_to(0.0, odometry.orientation_wxyz) for odometry in seen])
+    begin, end, rest = np.interp([3.0, 5.0, 7.0], times, yaws)
+    assert (end - begin) / 2.0 == pytest.approx(turn, rel=0.1)
+    assert rest == pytest.approx(end, abs=0.2), "it turns on after the end"
+    ahead = [
+        odometry.velocity[0] * np.cos(yaw) + odometry.velocity[1] * np.sin(yaw)
+        for odometry, yaw, time in zip(seen, yaws, times, strict=True)
+        if 4.0 < time < 5.0
+    ]
+    assert np.mean(ahead) == pytest.approx(velocity[0], rel=0.1, abs=0.01)
 
 
 def test_a_drive_can_be_flown_again(tmp_path):

@@ -134,6 +134,18 @@ def test_the_worst_window_counts_steps_that_are_late_or_without_a_new_action():
     assert [env.summary(limit)["misses_in_10"] for limit in (None, 0.015, 0.005)] == [2, 9, 10]
 
 
+def test_the_largest_age_and_the_mean_peak_are_told():
+    """Each second observation has an answer, 10 ms later: the ages are 1, 2, 1, 2... steps."""
+    gone = [{"start_s": 0.02 * n, "duration_s": 0.01} for n in range(1, 10)]
+    env = Networked(Counter(limit=20), {"downlink": {"delay_ms": 10, "blackouts": gone}}, 1)
+    env.reset()
+    for _ in range(20):
+        _, _, _, _, info = env.step(np.zeros(1, np.float32))
+    found = info["cloudrc"]["episode"]
+    names = ("action_age_mean", "action_age_max", "action_age_peak_mean", "observation_age_max")
+    assert [found[name] for name in names] == pytest.approx([0.015, 0.02, 0.02, 0.0])
+
+
 def test_a_bottleneck_sees_the_sizes_of_observations_and_answers():
     slow = both_ways(0, 0, rate_kbit=1000)
     env = Networked(Counter(), slow, observation_bytes=10_000 - 28, action_bytes=2_500 - 28)

@@ -288,3 +288,26 @@ def test_a_constant_delay_has_no_deviation_and_no_correlation():
     found = numbers(sample(link(profile), 3, range(0, 1000 * PERIOD_NS, PERIOD_NS), 191))
     assert found.deviation == 0.0
     assert isnan(found.correlation)
+
+
+@given(profiles)
+def test_no_delay_is_below_the_shortest(profile):
+    shortest_ns = link(profile).shortest_ns
+    assert all(delay >= shortest_ns for copies in flow(profile, 100) for delay in copies)
+
+
+@pytest.mark.parametrize(
+    ("profile", "shortest"),
+    [
+        (profile_of(0.1, 0.01), 0.09),
+        (profile_of(0.1, 0.01, "normal"), 0.01),
+        (profile_of(0.1, 0.01, "pareto"), 0.093),
+        (profile_of(0.1, 0.01, "table", quantiles=(-2.0, 0.0, 2.0)), 0.08),
+        (profile_of(0.1, changes=(change(1.0, 0.05, 0.01),)), 0.04),
+        (profile_of(0.1, 0.01, reorder=0.1), 0.0),
+        (profile_of(0.01, 0.02), 0.0),
+    ],
+)
+def test_the_shortest_delay_is_that_of_the_largest_jitter(profile, shortest):
+    assert link(profile).shortest_ns * 1e-9 == pytest.approx(shortest, abs=3e-9)
+    assert link(changed(profile, corrupt=0.5)).corrupts > link(profile).corrupts

@@ -81,7 +81,7 @@ def test_a_later_report_measures_a_file_only_if_named(folder, monkeypatch):
     [
         (["bad.py"], "def measure(flight): ...", "needs a text UNIT"),
         (["duration.py"], OVERSHOOT, "duration is a metric already; rename the file"),
-        (["bad.py", "mine/../bad.py"], OVERSHOOT, "2 metrics are named bad"),
+        (["bad.py", "mine/../bad.py"], OVERSHOOT, "2 metrics have this name"),
     ],
 )
 def test_an_invalid_metric_is_refused_in_one_line(folder, refused, names, text, reason):

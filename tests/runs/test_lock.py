@@ -3,7 +3,7 @@
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.runs.lock import lock_folder
+from cloudrc.outside.paths import lock_folder
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,6 @@ ARRAYS = {
     "commands": ("/cmd_vel", ("stamp_ns", "command", "yaw_rate")),
 }
 """Name of a hash -> the topic and the columns that it covers."""
-MORE = "records", "numbers", "failures"
-"""What is not compared with `--path`."""
 STEPS = {"link.profile": "paper-p2", "mission.steps.count": 3}
 PID = {"name": "pid", "gain_p": [2.5, 2.5, 2.5]}
 SLOW = {"link.uplink.delay_ms": 300, "link.downlink.delay_ms": 300, "guard.command_age_max_ms": 900}

@@ -141,8 +141,6 @@ def openapi() -> Any:
     Path("operator").chmod(0o600)
     words = "teleop --config run/config.yaml --socket . --api 0 --api-file api.json --tokens ."
     command = [sys.executable, "-m", "cloudrc", *words.split()]
-    if "--audit" in call("teleop", "--help")[1]:
-        command += ["--audit", "audit.jsonl"]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as teleop:
         try:
             for _ in range(200):

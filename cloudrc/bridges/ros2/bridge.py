@@ -12,9 +12,9 @@ from collections import deque
 from collections.abc import Callable, Collection
 from importlib.util import find_spec
 from math import dist
-from typing import Any
+from typing import Any, NamedTuple
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -25,16 +25,19 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from cloudrc.bridges.ros2.description import MAP, Covariances, RobotFrames
 from cloudrc.bridges.ros2.health import FlightHealth
+from cloudrc.bridges.ros2.mission import MissionNews, Navigation
 from cloudrc.bridges.ros2.own_node import NEWEST, QUEUED, OwnNode
 from cloudrc.bridges.ros2.requests import RosRequests
 from cloudrc.console.steering import VERBS, Steering
 from cloudrc.drivers.readers import RecordReader
-from cloudrc.messages import UPRIGHT, ZERO, GuardState, Telemetry, Vector
+from cloudrc.messages import UPRIGHT, ZERO, GuardState, Quaternion, Telemetry, Vector
 from cloudrc.record.live import (
-    BASE,
+    EXACT,
     encode_diagnostics,
     encode_odometry,
+    encode_status,
     encode_text,
     encode_transforms,
     frames_of,
@@ -55,8 +58,8 @@ WAKE = 0.05
 """Longest wait for records [s]."""
 THREADS = 4
 """Number of threads that serve requests: an emergency stop does not wait for another request."""
-MAP = {"map": (ZERO, UPRIGHT)}
-"""Static frame: RViz and others start with `map`, which is the world."""
+HERE = ZERO, UPRIGHT
+"""Pose of a frame in another one with the same origin and axes."""
 TRAIL_STEP, TRAIL_MAX = 0.05, 1000
 """Shortest distance between two points of the flown path [m], and their largest number."""
 JUMP = 0.5
@@ -69,28 +72,34 @@ def load_messages() -> None:
         check_for_type_support(kind)
 
 
+class Shown(NamedTuple):
+    """What the bridge publishes of the robot that does not change."""
+
+    frames: RobotFrames
+    scene: bytes  # markers of robot and scene, a visualization_msgs/MarkerArray
+    description: str  # URDF
+    covariances: Covariances = (EXACT, EXACT)  # of the measured pose and twist
+    navigates: bool = True  # whether it serves Nav2's action
+
+
 class RosBridge(OwnNode):
     """The node of a flight."""
 
     def __init__(
         self,
         namespace: str,
-        prefix: str,
-        scene: bytes,
+        shown: Shown,
         steering: Steering,
         requests: RosRequests,
         tell: Callable[[str], None],
     ) -> None:
-        """Open the node below `namespace`; `tell` gets words for the user.
-
-        `prefix` is that of the robot's frames, such as "drone1/"; `scene` has the markers of robot
-        and scene, a visualization_msgs/MarkerArray.
-        """
+        """Open the node below `namespace`; `tell` gets words for the user."""
         super().__init__("cloudrc_bridge", namespace)
         self._robot = namespace.strip("/")
-        self._prefix, self._markers = prefix, scene
+        self._frames, self._markers = shown.frames, shown.scene
+        self._covariances = shown.covariances
         self._steering, self._requests = steering, requests
-        self._health = FlightHealth()
+        self._health, self._news = FlightHealth(), MissionNews(steering.api, requests)
         self._guard: GuardState | None = None
         self._trail: deque[Vector] = deque(maxlen=TRAIL_MAX)
         self._watchers = 0  # subscriptions to the scene
@@ -101,6 +110,8 @@ class RosBridge(OwnNode):
         self._scene = publisher(MarkerArray, "cloudrc/scene", KEPT)
         self._path = publisher(MarkerArray, "cloudrc/path", KEPT)
         self._diagnostics = publisher(DiagnosticArray, "/diagnostics", QUEUED)
+        self._mission = publisher(DiagnosticStatus, "cloudrc/mission", KEPT)
+        publisher(String, "robot_description", KEPT).publish(encode_text(shown.description))
         self._transforms = self._open_transforms(tell)
         self._group = ReentrantCallbackGroup()
         self._kind: Any = Twist
@@ -112,6 +123,8 @@ class RosBridge(OwnNode):
             self.node.create_service(
                 Trigger, f"cloudrc/{name}", self._server(name), callback_group=self._group
             )
+        if shown.navigates:
+            self._navigator = self._serve_navigation(tell)
         self._ended = False
         self._listener = threading.Thread(target=self._listen, daemon=True)
         tell(f"{self._odometry.topic_name} and more topics in {self.domain}")
@@ -124,6 +137,8 @@ class RosBridge(OwnNode):
             for record in reader.take(WAKE):
                 self._publish(record)
             self._requests.pass_on()
+            if status := self._news.look(self._steering.state):
+                self._mission.publish(encode_status(status, self._robot))
             if (now := time.monotonic()) >= due:
                 due = now + PERIOD
                 if has_ended():
@@ -145,7 +160,10 @@ class RosBridge(OwnNode):
         from tf2_msgs.msg import TFMessage
 
         self._static = self.node.create_publisher(TFMessage, "/tf_static", KEPT)
-        self._static.publish(encode_transforms(time.time_ns(), MAP))
+        tree = encode_transforms(time.time_ns(), {MAP: HERE})
+        if self._frames.rep_105:
+            tree = encode_transforms(time.time_ns(), {self._frames.odom: HERE}, MAP)
+        self._static.publish(tree)
         return self.node.create_publisher(TFMessage, "/tf", QUEUED)
 
     def _publish(self, record: Record) -> None:
@@ -154,17 +172,19 @@ class RosBridge(OwnNode):
             self._publish_telemetry(record.telemetry)
         elif isinstance(record, Control) and self._transforms is not None:
             stamp_ns = record.stamp_ns + self._offset_ns
-            frames = frames_of(record, self._prefix)
+            frames = frames_of(record, self._frames.prefix)
             self._transforms.publish(encode_transforms(stamp_ns, frames))
 
     def _publish_telemetry(self, telemetry: Telemetry) -> None:
         stamp_ns, position, orientation, velocity, rates = telemetry.odometry
         stamp_ns += telemetry.slip_ns + self._offset_ns
-        base = self._prefix + BASE
+        base, odom = self._frames.base, self._frames.odom
         pose = position, orientation
-        self._odometry.publish(encode_odometry(stamp_ns, *pose, velocity, rates, base))
+        self._odometry.publish(
+            encode_odometry(stamp_ns, *pose, velocity, rates, base, odom, self._covariances)
+        )
         if self._transforms is not None:
-            self._transforms.publish(encode_transforms(stamp_ns, {base: pose}))
+            self._transforms.publish(encode_transforms(stamp_ns, {base: pose}, odom))
         if telemetry.guard is not self._guard:
             self._guard = telemetry.guard
             self._guards.publish(encode_text(telemetry.guard.name))
@@ -232,10 +252,18 @@ class RosBridge(OwnNode):
 
         return serve
 
+    def _serve_navigation(self, tell: Callable[[str], None]) -> Any:
+        """Serve Nav2's action, where ROS has its messages."""
+        if find_spec("nav2_msgs") is None:
+            tell("the action navigate_to_pose is left out: this ROS 2 has no nav2_msgs")
+            return None
+        from cloudrc.bridges.ros2.navigate import serve_navigation
+
+        navigation = Navigation(self._steering.api, self._requests)
+        return serve_navigation(self.node, navigation, read_goal, self._group)
+
     def _go_to(self, goal: PoseStamped) -> None:
-        place, turn = goal.pose.position, goal.pose.orientation
-        wxyz = (turn.w, turn.x, turn.y, turn.z)
-        self._requests.go_to(goal.header.frame_id, (place.x, place.y, place.z), wxyz)
+        self._requests.go_to(*read_goal(goal))
 
     def _drive(self, command: Any) -> None:
         frame, twist = "", command
@@ -243,6 +271,13 @@ class RosBridge(OwnNode):
             frame, twist = command.header.frame_id, command.twist
         linear = (twist.linear.x, twist.linear.y, twist.linear.z)
         self._requests.drive(frame, linear, twist.angular.z)
+
+
+def read_goal(goal: PoseStamped) -> tuple[str, Vector, Quaternion]:
+    """Return frame, position [m] and orientation [1] of a goal."""
+    place, turn = goal.pose.position, goal.pose.orientation
+    wxyz = (turn.w, turn.x, turn.y, turn.z)
+    return goal.header.frame_id, (place.x, place.y, place.z), wxyz
 
 
 def _line(points: Collection[Vector]) -> Collection[Vector]:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from math import cos, degrees, hypot, inf, isfinite, sin
+from math import cos, degrees, dist, hypot, inf, isfinite, sin
 
+from cloudrc.bridges.ros2.description import RobotFrames
+from cloudrc.config.heading import WHY, Heading
 from cloudrc.console.steering import Steering
 from cloudrc.geometry.vectors import turn_to
 from cloudrc.messages import ZERO, Quaternion, Vector
-from cloudrc.record.live import BASE, WORLD
+from cloudrc.record.live import WORLD
+from cloudrc.text import describe_point
 
-GROUND_FRAMES = ("map", WORLD)
-"""Frames with the origin and the axes of the world; RViz starts with `map`."""
+WITHOUT_PREFIX = RobotFrames()
 DRIVE_LASTS = 0.5
 """Time for which a velocity is flown [s]; then the robot holds, unless a new one has arrived."""
 DRIVE_PERIOD = 0.05
@@ -32,6 +34,7 @@ class RosRequests:
     Attributes:
         position: The robot's newest position [m], world frame, shape (3,).
         yaw: Its newest yaw [rad].
+        refusal: The newest goal that was refused, in words, and why; () if there is none.
     """
 
     def __init__(
@@ -40,8 +43,8 @@ class RosRequests:
         tell: Callable[[str], None],
         *,
         planar: bool,
-        turns: bool,
-        prefix: str = "",
+        heading: Heading,
+        frames: RobotFrames = WITHOUT_PREFIX,
         observes: bool = False,
     ) -> None:
         """Make it.
@@ -50,16 +53,19 @@ class RosRequests:
             steering: Sends requests to teleop.
             tell: Gets words for the user.
             planar: Whether the robot stays on the ground.
-            turns: Whether it obeys a yaw.
-            prefix: Prefix of the robot's frames.
+            heading: What decides about its heading.
+            frames: Names of the robot's frames.
             observes: Whether to take no request.
         """
         self._steering, self._tell_user = steering, tell
-        self._planar, self._turns = planar, turns
-        self._base, self._observes = prefix + BASE, observes
+        self._planar, self._heading = planar, heading
+        self._frames, self._observes = frames, observes
         self.position: Vector = ZERO
         self.yaw = 0.0
-        self._wanted: tuple[Vector, float] | None = None  # velocity, and end of its time [s]
+        self.refusal: tuple[str, ...] = ()
+        self._goal: Vector = ZERO
+        # Velocity, end of its time [s], yaw rate [rad/s].
+        self._wanted: tuple[Vector, float, float | None] | None = None
         self._passed = -inf  # time at which the newest velocity was passed on [s]
         self._said: dict[str, float] = {}  # words -> when they were said last [s]
 
@@ -73,16 +79,34 @@ class RosRequests:
             self._steering.stop()  # asks again until teleop answers
         return not answer.is_refusal, answer.text
 
-    def go_to(self, frame: str, position: Sequence[float], wxyz: Quaternion) -> None:
-        """Let the robot go to a pose: `position` [m] and orientation `wxyz` [1] in `frame`."""
+    def go_to(self, frame: str, position: Sequence[float], wxyz: Quaternion) -> str:
+        """Let the robot go to a pose: `position` [m] and orientation `wxyz` [1] in `frame`.
+
+        Return why it does not; "" if it does.
+        """
         x, y, z = position
-        if not self._accepts("goal_pose", frame, GROUND_FRAMES, (*position, *wxyz)):
-            return
-        if z == 0.0:  # RViz clicks on the ground
-            z = max(self.position[2], HEIGHT)
-        place = (x, y) if self._planar else (x, y, z)
-        answer = self._steering.go_to(place, _yaw_deg(wxyz) if self._turns else None)
-        self._tell(answer.text)
+        why = self._refuse("goal_pose", frame, self._frames.ground, (*position, *wxyz))
+        if not why:
+            if z == 0.0:  # RViz clicks on the ground
+                z = max(self.position[2], HEIGHT)
+            self._goal = (x, y, self.position[2] if self._planar else z)
+            place = (x, y) if self._planar else self._goal
+            turns = self._heading == "free"
+            answer = self._steering.go_to(place, _yaw_deg(wxyz) if turns else None)
+            self._tell(answer.text)
+            why = answer.text if answer.is_refusal else ""
+        if why:
+            self.refusal = f"{describe_point(position)} m in {frame or WORLD}", why
+        return why
+
+    def stay(self) -> None:
+        """Let the robot go to where it is."""
+        self.go_to(WORLD, self.position, (0.0, 0.0, 0.0, 0.0))
+
+    @property
+    def distance(self) -> float:
+        """Distance to the newest goal [m]."""
+        return dist(self.position, self._goal)
 
     def drive(self, frame: str, linear: Sequence[float], yaw_rate: float) -> None:
         """Drive with a velocity in `frame`; an empty frame is that of the base.
@@ -90,20 +114,22 @@ class RosRequests:
         Args:
             frame: Frame of the velocity.
             linear: Velocity [m/s], shape (3,).
-            yaw_rate: Yaw rate [rad/s], which is ignored.
+            yaw_rate: Yaw rate [rad/s].
         """
-        frame = frame or self._base
-        if not self._accepts("cmd_vel", frame, (self._base, *GROUND_FRAMES), linear):
+        base = self._frames.base
+        frame = frame or base
+        if self._refuse("cmd_vel", frame, (base, *self._frames.ground), (*linear, yaw_rate)):
             return
-        if yaw_rate:
-            self._tell("cmd_vel: angular.z is ignored; a drive does not turn the robot")
+        if yaw_rate and self._heading == "fixed":
+            self._tell(f"cmd_vel: angular.z is ignored: {WHY['fixed']}")
+            yaw_rate = 0.0
         x, y, z = linear
-        if frame == self._base:
-            x, y = (
-                x * cos(self.yaw) - y * sin(self.yaw),
-                x * sin(self.yaw) + y * cos(self.yaw),
-            )
-        self._wanted = (x, y, 0.0 if self._planar else z), time.monotonic() + DRIVE_LASTS
+        # A turn is flown in the frame of the robot's heading, a plain velocity in the world's.
+        turn = (frame == base) * self.yaw - (self.yaw if yaw_rate else 0.0)
+        if turn:
+            x, y = x * cos(turn) - y * sin(turn), x * sin(turn) + y * cos(turn)
+        velocity = x, y, 0.0 if self._planar else z
+        self._wanted = velocity, time.monotonic() + DRIVE_LASTS, yaw_rate or None
 
     def pass_on(self) -> None:
         """Pass the newest velocity on, if it is due; say why teleop has not taken a request."""
@@ -111,7 +137,8 @@ class RosRequests:
         wanted = self._wanted
         if wanted is not None and now - self._passed >= DRIVE_PERIOD:
             self._passed, self._wanted = now, None
-            self._steering.hold_key("cmd_vel", wanted[0], wanted[1] - now)
+            velocity, until, turn = wanted
+            self._steering.hold_key("cmd_vel", velocity, until - now, turn)
         text, is_refusal, said = self._steering.answer
         if is_refusal and max(now - self._passed, now - said) < DRIVE_LASTS:
             self._tell(text)
@@ -120,18 +147,20 @@ class RosRequests:
         """Note where the robot is: `position` [m] and orientation `wxyz` [1]."""
         self.position, self.yaw = position, -turn_to(0.0, wxyz)
 
-    def _accepts(
+    def _refuse(
         self, topic: str, frame: str, known: Sequence[str], numbers: Sequence[float]
-    ) -> bool:
+    ) -> str:
+        """Say why a message is not taken; "" if it is."""
+        why = ""
         if self._observes:
-            self._tell(f"{topic}: {OBSERVES}")
+            why = OBSERVES
         elif frame and frame not in known:
-            self._tell(f"{topic}: unknown frame '{frame}'; use {' or '.join(known)}")
+            why = f"unknown frame '{frame}'; use {' or '.join(known)}"
         elif not all(map(isfinite, numbers)):
-            self._tell(f"{topic}: a number is not finite")
-        else:
-            return True
-        return False
+            why = "a number is not finite"
+        if why:
+            self._tell(f"{topic}: {why}")
+        return why
 
     def _tell(self, text: str) -> None:
         now = time.monotonic()

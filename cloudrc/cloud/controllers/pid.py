@@ -29,7 +29,7 @@ class Pid(Controller):
       with positive gains.
     - The derivative acts on the velocity of the setpoint minus that of the robot. A setpoint that
       jumps has the velocity 0, so that it causes no kick.
-    - The velocity of the setpoint is added to the output (feed-forward).
+    - Velocity and yaw rate of the setpoint are added to the output (feed-forward).
     - The integral term, the velocity per axis and the speed are limited; the published code has no
       limits. While the output of an axis is limited, the axis does not integrate an error that
       would push the output further (conditional anti-windup).
@@ -105,6 +105,8 @@ class Pid(Controller):
         yaw_rate = 0.0
         if self._always_turns or setpoint.turns:
             yaw_rate = self._gain_yaw * turn_to(setpoint.yaw, estimate.orientation_wxyz)
+            if setpoint.yaw_rate:
+                yaw_rate += setpoint.yaw_rate
         return _new(ControlOutput, (velocity, yaw_rate, proportional, integral, derivative))
 
     def _limit(self, wanted: Vector) -> Vector:

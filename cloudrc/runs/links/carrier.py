@@ -26,6 +26,7 @@ from cloudrc.link.state import STATE_FILE, LinkState
 from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.packets import Period
 from cloudrc.outside.document import Document
+from cloudrc.outside.refusal import naming
 from cloudrc.runs.folder import new_folder
 
 STEP = 0.05  # longest time until the engine reacts to a change or a signal [s]
@@ -158,7 +159,8 @@ class LiveLink:
         """Read one direction of a profile's file."""
         profile = load_profile(path)
         direction = link_profile(getattr(profile, way))
-        self._check(direction, way)
+        with naming(way):
+            self._check(direction, way)
         return Loaded(direction, profile.model_dump(mode="json", exclude_defaults=True))
 
     def _take(self, way: str, document: bytes) -> str:

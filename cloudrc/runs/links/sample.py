@@ -10,7 +10,6 @@ from pathlib import Path
 from statistics import fmean
 
 from cloudrc.config.profile import DIRECTIONS, DirectionConfig, Profile, load_profile
-from cloudrc.errors import BadInputError
 from cloudrc.link.doubts import describe_heavy_loss
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Timeline, Trace
@@ -20,7 +19,6 @@ from cloudrc.report.figures.link import DirectionSample
 from cloudrc.text import table
 from cloudrc.tunnel.codec import SIZES, TELEMETRY_SIZES, Kind
 
-PACKETS_MAX = 10_000_000  # in one direction
 ROWS = 1000  # least number of packets for a trace that has shares of losses
 SECONDS = 30.0  # time that a figure shows by default [s]; a longer time line is shown in full
 
@@ -87,11 +85,6 @@ def _sample(
     else:
         seconds = settings.seconds or max(SECONDS, 1.1e-9 * timeline.last_ns)
         count = max(1, round(seconds * settings.rate))
-        if count > PACKETS_MAX:
-            raise BadInputError(
-                f"{seconds:g} s at {settings.rate:g} packets a second are more than {PACKETS_MAX} "
-                "packets; give less with --seconds or --rate"
-            )
         shown = send(range(0, count * period_ns, period_ns))
     many = shown
     if timeline.only() is not None:

@@ -11,12 +11,12 @@ from typing import Any
 
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.drivers.realtime import Address, show_address
-from cloudrc.errors import BadInputError
 from cloudrc.files import at_place
 from cloudrc.link.carry.punctual import settle
 from cloudrc.link.carry.tcp.medium import Medium
 from cloudrc.link.carry.tcp.relay import StreamRelay
 from cloudrc.link.profile import DirectionProfile
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.runs.interrupts import is_interrupted, noted_interrupts
 from cloudrc.runs.links.carrier import STEP, CarrySettings, LiveLink
 
@@ -32,21 +32,12 @@ class RelaySettings(CarrySettings):
 
 
 def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str, Any]:
-    """Relay connections until a signal interrupts; return counts, and the times of turns [s].
-
-    Raises:
-        BadInputError: If the profile or an address cannot be used.
-    """
+    """Relay connections until a signal interrupts; return counts, and the times of turns [s]."""
     with contextlib.ExitStack() as stack:
-        link = LiveLink(settings, "relay tcp", tell, stack, check=refuse_unsupported)
+        link = LiveLink(settings, "relay tcp", tell, stack, check=check_keys)
         family, to = _find(settings.to)
         listening = stack.enter_context(_listen(settings.listen))
         where = show_address(listening.getsockname()[:2])
-        if listening.getsockname()[:2] == to:
-            raise BadInputError(
-                f"--to {show_address(settings.to)}: this is the relay's own address, --listen"
-                f" {where}; name the server's host and port"
-            )
         now_ns = link.begin()
         up, down = (
             Medium(link.profile(way), settings.seed, way == "uplink", now_ns) for way in DIRECTIONS
@@ -62,13 +53,13 @@ def relay_tcp(settings: RelaySettings, tell: Callable[[str], None]) -> dict[str,
         return _summary(relay)
 
 
-def refuse_unsupported(profile: DirectionProfile, name: str) -> None:
-    """Raise a BadInputError if bytes of a TCP connection cannot show a key of the profile."""
+def check_keys(profile: DirectionProfile, name: str) -> None:
+    """Check that bytes of a TCP connection can show all keys of the profile."""
     for key in ("duplicate", "corrupt", "reorder"):
         if getattr(profile, key):
-            raise BadInputError(
-                f"{name}.{key}: TCP hands bytes on once, undamaged and in order, so a relay of"
-                f" bytes cannot show it; set {name}.{key}=0, or use 'cloudrc link exec'"
+            raise InvalidValueError(
+                f"{key}: TCP hands bytes on once, undamaged and in order, so a relay of bytes"
+                f" cannot show it; set {name}.{key}=0, or use 'cloudrc link exec'"
             )
 
 

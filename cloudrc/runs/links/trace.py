@@ -67,14 +67,10 @@ def _read_run(path: Path, ways: tuple[Direction, ...], halve: bool) -> dict[Dire
     if halve:
         raise InvalidValueError("a run has one-way delays; leave out --halve-rtt")
     require("a trace of a run", ("record",))
-    from cloudrc.record.columns import Recording
     from cloudrc.record.holes import SOMEWHERE
-    from cloudrc.runs.session import check_ended
+    from cloudrc.report.folder import open_recording
 
-    file = path / "mission.mcap" if path.is_dir() else path
-    check_ended(file.parent)
-    check_there(file, "name the folder of a run, or a file")
-    recording = Recording.read(file, whole=True)
+    _, recording = open_recording(path)
     if SOMEWHERE in recording.holes:
         raise InvalidValueError(
             f"{recording.note}: nobody knows when, so what the link has lost is not known; give "

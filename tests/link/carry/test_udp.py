@@ -13,17 +13,21 @@ from threading import Event, Thread, Timer
 import numpy as np
 import pytest
 
+from cloudrc.config.shipped import names
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.exposition.table import LINK_OUTCOMES
 from cloudrc.link.carry import udp as module
 from cloudrc.link.carry.udp import Relay, ask_for_stamps
 from cloudrc.link.model import LinkDirection
+from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE
+from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.judge import Flow, Measurement
-from cloudrc.link.verify.probe import PROBE, ProbeEnd
+from cloudrc.link.verify.probe import FIRST_PROBE, PROBE, ProbeEnd
+from cloudrc.runs.links.under_test import WAYS, measure, run_link
 from cloudrc.runs.links.verify import find_experiment
+from cloudrc.tunnel.codec import SIZES
 from tests.conftest import wait_until
 from tests.link.profiles import profile_of
-from tools.bench_link import compare
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 20.0
@@ -138,17 +142,51 @@ def test_the_peer_can_restart_and_can_change_in_flight(bench):
         assert other.recv(100) == packet(4)
 
 
+def carried(experiment, duration, rate):
+    """Send probes over a link; return what was measured, what was drawn, and the relays' counts."""
+    # Half a period away from the instants at which time lines change: a probe takes time.
+    sent = FIRST_PROBE + (np.arange(round(duration * rate)) + 0.5) / rate
+    plans = {
+        way: Measurement(
+            link_profile(getattr(experiment, way)),
+            Flow(experiment.seed, way == "uplink", PROBE, SIZES[kind]),
+            sent,
+        )
+        for way, (_, _, kind) in WAYS.items()
+    }
+    with run_link(experiment, "relay") as ways:
+        for way, measured in measure(ways, plans).items():
+            released = (ways[way].folder / STATE_FILE).with_suffix(RELEASED_SUFFIX)
+            yield measured, plans[way].draw(measured.sent), json.loads(released.read_text())
+
+
 @pytest.mark.process
 @pytest.mark.alone
 @pytest.mark.promise("link-follows-the-seed")
-@pytest.mark.parametrize("profile", ["lossy", "lte"])
+@pytest.mark.parametrize(
+    "profile",
+    ["lossy", "lte", *(pytest.param(each, marks=pytest.mark.full) for each in names("profile"))],
+)
 def test_a_relay_draws_the_virtual_sequence(profile):
-    """`lossy` has bursts, `lte` a rate and kept order; `make bench-link` measures all profiles."""
-    for judged in compare(find_experiment(profile, []), 2.0, 100.0).values():
-        assert judged.wrong == 0
-        assert judged.errors.min() >= 0.0
-        assert np.median(judged.errors) < 5e-3
-        assert judged.swapped <= 0.01 * judged.errors.size
+    """`lossy` has bursts, `lte` a rate and kept order."""
+    for measured, drawn, _ in carried(find_experiment(profile, []), 2.0, 100.0):
+        both = np.isfinite(measured.delays) & np.isfinite(drawn.delays)
+        arrived, due = ((one.sent + one.delays)[both] for one in (measured, drawn))
+        assert (measured.copies == drawn.copies).all()
+        assert (arrived - due).min() >= 0.0
+        assert np.median(arrived - due) < 5e-3
+        assert (np.diff(due[np.argsort(arrived)]) < -5e-6).mean() <= 0.01
+
+
+@pytest.mark.process
+@pytest.mark.alone
+@pytest.mark.full
+def test_packets_leave_on_time_at_1_khz():
+    experiment = find_experiment("ideal", [f"link.{way}.delay_ms=20" for way in WAYS])
+    found = [next(carried(experiment, 20.0, 1000.0))[2] for _ in range(5)]
+    p50, p99 = (np.median([one[f"release_error_{q}_ns"] for one in found]) for q in ("p50", "p99"))
+    assert (p50 <= 60_000, p99 <= 400_000) == (True, True), (p50, p99)
+    assert sum(one["released_early"] for one in found) == 0
 
 
 @pytest.mark.process

@@ -1,0 +1,46 @@
+"""cloudrc on macOS and Windows, as far as a Linux can show it."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+LINUX_ALONE = {
+    "os": "sched_getaffinity sched_setaffinity sched_setscheduler sched_getscheduler sched_param "
+    "SCHED_FIFO SCHED_RR pidfd_open memfd_create eventfd splice copy_file_range setns unshare "
+    "getrandom posix_fadvise posix_fallocate O_TMPFILE O_DIRECT O_PATH setresuid getresuid",
+    "select": "epoll",
+    "socket": "AF_PACKET AF_NETLINK AF_VSOCK SO_MARK SO_BINDTODEVICE TCP_QUICKACK TCP_CORK "
+    "TCP_USER_TIMEOUT SOCK_NONBLOCK SOCK_CLOEXEC SO_PEERCRED SO_DOMAIN SO_PROTOCOL",
+    "signal": "sigwaitinfo sigtimedwait SIGRTMIN SIGRTMAX",
+    "time": "CLOCK_BOOTTIME CLOCK_TAI",
+    "resource": "prlimit RLIMIT_RTPRIO",
+    "fcntl": "F_SETPIPE_SZ F_GETPIPE_SZ F_ADD_SEALS F_OFD_SETLK",
+}
+"""Module -> names that it has on Linux, but not on macOS. Source: the documentation of Python."""
+
+
+@pytest.mark.process
+def test_a_flight_in_real_time_uses_nothing_that_macos_lacks(tmp_path):
+    lines = ["import importlib", f"for module, names in {LINUX_ALONE}.items():"]
+    lines.append("    module = importlib.import_module(module)")
+    lines.append("    [delattr(module, name) for name in names.split() if hasattr(module, name)]")
+    (tmp_path / "sitecustomize.py").write_text("\n".join(lines))
+    words = "run hover --mode local --report none".split()
+    flown = subprocess.run(
+        [sys.executable, "-m", "cloudrc", *words],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+    assert "Error" not in flown.stderr, flown.stderr
+    assert flown.stdout.endswith("report.json\n"), flown.stdout
+
+
+def test_windows_is_sent_to_wsl2():
+    program = "import sys; sys.platform = 'win32'; import cloudrc.cli.main"
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (found.returncode, found.stderr.count("\n")) == (3, 1)
+    assert "WSL2" in found.stderr
