@@ -4,6 +4,7 @@
 {{- $image := include "cloudrc.image" (dict "root" . "role" "cloud") -}}
 {{- $onboard := include "cloudrc.onboard" . | empty | not -}}
 {{- $metrics := $onboard | ternary 9103 9100 -}}
+{{- $port := $onboard | ternary "cloud-metrics" "metrics" -}}
 # The control loop alone. teleop and `ros` connect through sockets without tokens, so no other
 # container mounts their folder.
 - name: cloud
@@ -26,8 +27,8 @@
     {{- if not $onboard }}
     - {name: tunnel, containerPort: 7400, protocol: UDP}
     {{- end }}
-    - {name: metrics, containerPort: {{ $metrics }}, protocol: TCP}
-  {{- include "cloudrc.probes" "metrics" | nindent 2 }}
+    - {name: {{ $port }}, containerPort: {{ $metrics }}, protocol: TCP}
+  {{- include "cloudrc.probes" $port | nindent 2 }}
   terminationMessagePolicy: FallbackToLogsOnError
   {{- include "cloudrc.containerSecurity" $ | nindent 2 }}
   resources:
