@@ -3,13 +3,18 @@
 A key with a comment above it is a value or a section; the comment is its description. The type of a
 value is that of its default, unless `RULES` has a schema for it. Units and other keys are those of
 the models in `cloudrc/config/schema.py`.
+
+An upgrade may bring the values of an earlier chart: it lacks keys that came later, `added`, which
+are never required, and has some that have gone, files/retired.yaml, which have no effect.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import tarfile
 from collections.abc import Iterator
+from pathlib import Path as FilePath
 from typing import Any, TypeAlias
 
 import yaml
@@ -39,6 +44,10 @@ def _ref(name: str) -> Schema:
     return {"$ref": f"#/$defs/{name}"}
 
 
+ROOT = FilePath(__file__).resolve().parents[1]
+RETIRED = ROOT / "charts" / "cloudrc" / "files" / "retired.yaml"
+EARLIEST = ROOT / "tests" / "fixtures" / "charts" / "cloudrc-before-guests.tgz"
+"""The earliest chart that can be upgraded."""
 NULL, OBJECT, STRING = {"type": "null"}, {"type": "object"}, {"type": "string"}
 TEXTS = {**OBJECT, "additionalProperties": STRING}
 NAME = _text(r"^$|^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$")
@@ -56,6 +65,9 @@ PEERS = {
 LABELS = {**TEXTS, "propertyNames": {"not": {"pattern": r"^app\.kubernetes\.io/"}}}
 OBJECTS = {"type": "array", "items": OBJECT}
 NAMED = {**OBJECT, "required": ["name"]}
+SECRET = {**OBJECT, "properties": {"name": NAME}, "additionalProperties": False}
+PULL_SECRETS = {"type": "array", "items": _either(STRING, {**SECRET, "required": ["name"]})}
+HOST = _text(r"^$|^([a-z0-9]([-a-z0-9]*[a-z0-9])?\.)*[a-z0-9]([-a-z0-9]*[a-z0-9])?$")
 PORT = {"type": "integer", "minimum": 1, "maximum": 65_535}
 RULES = {
     "fullnameOverride": _text(r"^$|^[a-z]([-a-z0-9]*[a-z0-9])?$"),
@@ -63,6 +75,9 @@ RULES = {
     "digest": _text(r"^$|^sha256:[0-9a-f]{64}$"),
     "pullPolicy": _one_of("Always", "IfNotPresent", "Never"),
     "experiment": _ref("Experiment"),
+    "robots": _either({"type": "integer", "minimum": 1, "maximum": 1000}, NULL),
+    "queueName": NAME,
+    "schedulerName": NAME,
     "configMap": NAME,
     "mode": _one_of("auto", "netem", "relay"),
     "profile": _either(STRING, _ref("Profile"), NULL),
@@ -87,6 +102,18 @@ RULES = {
     "recordingSizeLimit": QUANTITY,
     "workers": {"type": "integer", "minimum": 1, "maximum": 64},
     "existingClaim": NAME,
+    "storage": _either(*QUANTITY["anyOf"], _one_of("")),
+    "accessMode": _one_of("ReadWriteOnce", "ReadWriteOncePod", "ReadWriteMany"),
+    "memory": QUANTITY,
+    "keepMissions": {"type": "integer", "minimum": 1},
+    "keepDays": {"type": "number", "exclusiveMinimum": 0},
+    "apiHost": HOST,
+    "consoleHost": HOST,
+    "tlsSecret": NAME,
+    "className": NAME,
+    "parentRefs": {"type": "array", "items": NAMED},
+    "pullSecrets": PULL_SECRETS,
+    "schedule": _text(r"^$|^(@[a-z]+|[-*,/0-9A-Za-z]+( [-*,/0-9A-Za-z?#]+){4})$"),
     "existingSecret": NAME,
     "size": QUANTITY,
     "type": _one_of("ClusterIP", "NodePort", "LoadBalancer"),
@@ -147,9 +174,30 @@ def table_rows(text: str) -> Iterator[tuple[str, str, str]]:
             yield f"`{'.'.join(path)}`", f"`{json.dumps(default)}`", about
 
 
+def earliest() -> dict[str, Any]:
+    """Return the default values of the earliest chart that can be upgraded."""
+    with tarfile.open(EARLIEST) as chart:
+        file = chart.extractfile("cloudrc/values.yaml")
+        assert file is not None
+        return dict(yaml.safe_load(file))
+
+
+def added(values: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
+    """Return the part of the default `values` whose keys a chart with the values `before` lacks."""
+    found = {}
+    for key, value in values.items():
+        if key not in before:
+            found[key] = value
+        elif isinstance(value, dict) and isinstance(before[key], dict):
+            if inner := added(value, before[key]):
+                found[key] = inner
+    return found
+
+
 def make_schema(text: str) -> Schema:
     """Make the JSON schema of the values: draft 7, unknown keys are not allowed."""
     described = descriptions(text)
+    new = added(yaml.safe_load(text), earliest())
 
     def part(path: Path, value: Any, about: str) -> Schema:
         if not any(other[:-1] == path for other in described):
@@ -158,31 +206,50 @@ def make_schema(text: str) -> Schema:
             key: part((*path, key), each, described[*path, key]) for key, each in value.items()
         }
         # Templates need the sections, so null is refused for them.
-        needed = [key for key, each in parts.items() if "$ref" in each or "properties" in each]
+        lacked = _at(new, path)
+        needed = [
+            key
+            for key, each in parts.items()
+            if ("$ref" in each or "properties" in each) and lacked.get(key) != value[key]
+        ]
         return {**_closed(about, parts), "required": needed}
 
     made = part((), yaml.safe_load(text), "All values of the chart")
-    about = "Values that Helm passes to subcharts; this chart ignores them"
-    made["properties"]["global"] = {**_either(OBJECT, NULL), "description": about}
+    about = "Values that Helm passes to all charts of a larger chart"
+    shared = {"imageRegistry": _either(STRING, NULL), "imagePullSecrets": PULL_SECRETS}
+    some = {**OBJECT, "properties": shared}
+    made["properties"]["global"] = {**_either(some, NULL), "description": about}
     about = "A larger chart's condition for this one: if it is false, Helm leaves this one out"
     made["properties"]["enabled"] = {"enum": [True], "description": about}
     models = [(model, "validation") for model in (Experiment, MissionConfig, Profile)]
     defined = _adapt(models_json_schema(models)[1]["$defs"])
-    fleet, cell = (defined[name]["properties"] for name in ("FleetConfig", "CellConfig"))
-    for owner in (defined["PlugIn"], defined["Parameters"], fleet["vary"]["items"]):
+    vary = defined["FleetConfig"]["properties"]["vary"]
+    for owner in (defined["PlugIn"], defined["Parameters"], vary["items"]):
         owner["additionalProperties"] = {
             "description": "A parameter of the plug-in, in the unit that its `build` documents",
             "type": ["number", "string", "boolean", "array", "null"],
         }
-    fleet["robots"] |= {"maximum": 1}  # a release is one robot
-    cell["rate_kbit"] = {"description": cell["rate_kbit"]["description"], "type": "null"}
     amount = _either(*QUANTITY["anyOf"], NULL)
     about = "CPU [cores; 250m is a quarter of a core] and memory [bytes; 64Mi is 64 * 2^20]"
     amounts = _closed(about, {"cpu": amount, "memory": amount})
     about = "Requests and limits of one container; if all are equal, the QoS class is Guaranteed"
     defined["Resources"] = _closed(about, {"requests": amounts, "limits": amounts})
+    for path, instead in yaml.safe_load(RETIRED.read_text()).items():
+        *sections, key = path.split(".")
+        node = made
+        for section in sections:
+            node = node["properties"][section]
+            node = defined[node["$ref"].rpartition("/")[2]] if "$ref" in node else node
+        node["properties"][key] = {"description": f"Has no effect; {instead} takes its place"}
     head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "cloudrc"}
     return {**head, **made, "$defs": defined}
+
+
+def _at(values: Any, path: Path) -> dict[str, Any]:
+    """Return the mapping at a path of nested mappings, empty if it is not there."""
+    for key in path:
+        values = values.get(key) if isinstance(values, dict) else None
+    return values if isinstance(values, dict) else {}
 
 
 def _adapt(part: Any) -> Any:

@@ -32,7 +32,7 @@ from cloudrc.exposition.table import METRICS, ROLES
 from cloudrc.metrics.definitions import QUANTITIES, RecordQuantity
 from cloudrc.outside.values import to_plain
 from cloudrc.record.topics import TOPICS
-from tools.chart_values import make_schema, table_rows
+from tools.chart_values import added, earliest, make_schema, table_rows
 from tools.dashboards import UNITS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -99,6 +99,9 @@ LIMITS = {
     "maxItems": "of at most",
 }
 """Limit in a JSON schema -> the page's sign."""
+ADDED = """\
+# Made by `make docs`: values that the earliest chart lacks that can be upgraded, with defaults.
+"""
 COPIED = ("profile", "mission")
 """Kinds of shipped files of which the chart has copies."""
 
@@ -107,6 +110,7 @@ def outputs() -> dict[Path, str]:
     """Generate everything that `make docs` writes: file -> text."""
     values = (CHART / "values.yaml").read_text()
     rows = table("key | default | meaning", table_rows(values))
+    new = added(yaml.safe_load(values), earliest())
     return {
         **insert(ROOT / "docs" / "experiment.md", _experiment()),
         **insert(ROOT / "docs" / "topics.md", _topics()),
@@ -114,6 +118,7 @@ def outputs() -> dict[Path, str]:
         **insert(CHART / "README.md", f"\n{rows}"),
         **insert(CHART / "files" / "dashboards" / "missions.yaml", f"{panels(QUANTITIES)}# "),
         CHART / "values.schema.json": json.dumps(make_schema(values), indent=2) + "\n",
+        CHART / "files" / "added.yaml": ADDED + yaml.safe_dump(new, sort_keys=False),
         **{
             CHART / "files" / f"{kind}s" / path.name: path.read_text()
             for kind in COPIED

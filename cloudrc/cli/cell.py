@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cloudrc.cli.parser import Options, Parser, flags, settings_from, whole_number
-from cloudrc.cli.processes import read_address, status_arguments
+from cloudrc.cli.processes import read_address, read_size, status_arguments
 from cloudrc.drivers.process import StopSignal
 
 EPILOG = """\
@@ -21,6 +21,7 @@ def arguments(parser: Parser) -> None:
         add(f"--{name}", "HOST:PORT", about, read=read_address, required=True)
         add(f"--{to}", "HOST:PORT", f"where to send the {name}", read=read_address, required=True)
     add("--record", "FILE", "CSV file for what the cell does", required=True)
+    add("--record-max", "SIZE", "at this size, such as 20M, the file begins anew", read=read_size)
     about = "number of robots, as after 'kubectl scale' (default: that of the experiment)"
     add("--robots", "N", about, read=whole_number(1, 1000))
 

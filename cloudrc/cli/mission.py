@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -21,7 +22,7 @@ from cloudrc.cli.output import (
     print_result,
     tell,
 )
-from cloudrc.cli.parser import Options, Parser, add_verbs, flags, number
+from cloudrc.cli.parser import Options, Parser, add_verbs, flags, number, whole_number
 from cloudrc.cli.where import (
     find_local_run,
     given_token,
@@ -65,6 +66,7 @@ examples:
   cloudrc mission estop
   cloudrc mission run my.yaml --queue --context kind-cloudrc -n demo
   cloudrc mission logs --follow
+  cloudrc mission report my-release m3
 
 A mission is a file with 'waypoints'; 'cloudrc list missions' names those that
 ship. The exit code of 'run' and 'fly' is the verdict: 0 done, 1 failed, 6 not
@@ -88,6 +90,7 @@ ignores this code."""
 def arguments(parser: Parser) -> None:
     """Declare the command's arguments."""
     verbs = add_verbs(parser, {name: line for name, (line, _) in VERBS.items()})
+    _report_arguments(verbs.pop("report"))
     for name, verb in verbs.items():
         url = "http://HOST:PORT[/PATH] or unix:PATH of a run or release"
         flags(verb)("--api", "URL", url, required=name == "fly")
@@ -104,6 +107,9 @@ def arguments(parser: Parser) -> None:
     add("--key", None, "a mission posted twice under one key flies once", "")
     lease = f"seconds that the mission flies on after the end of this command (default: {LEASE:g})"
     add("--lease", "S", lease, LEASE, number(5, 3600, "seconds"))
+    together = "Unix time at which to post it: the robots of a fleet begin together"
+    add("--at", "T", together, 0.0, number(0, 1e11, "seconds"))
+    _keep_arguments(fly)
     for verb in (run, fly):
         flags(verb)("--queue", "", "wait for the current mission to end")
     for name in ("list", "status"):
@@ -120,16 +126,39 @@ def arguments(parser: Parser) -> None:
     add("--yaw", "DEG", about, read=number(-360, 360, "degrees"))
 
 
+def _report_arguments(parser: Parser) -> None:
+    add = flags(parser)
+    add("where", "RELEASE", "the release (default: the only one of the namespace)", nargs="?")
+    about = "id of the mission, such as m3, or name of a kept report (default: the last mission)"
+    add("mission", "MISSION", about, "", nargs="?")
+    add("--out", "DIR", "folder of the report (default: a new one in runs/)")
+    output_argument(parser)
+    release_arguments(parser)
+
+
+def _keep_arguments(fly: Parser) -> None:
+    """Declare the arguments of a Job that keeps a report in the volume of the recordings."""
+    add = flags(fly)
+    add("--report", "DIR", "keep a report of the mission beside the recordings in this folder")
+    add("--config", "FILE", "experiment file of the release")
+    add("--profile", "FILE", "profile of its link")
+    add("--keep", "N", "largest number of reports (default: 100)", 100, whole_number(1, 10**6))
+    about = "largest age of a report in days (default: 30)"
+    add("--keep-days", "DAYS", about, 30.0, number(1e-3, 1e5, "days"))
+
+
 def execute(options: Options) -> int | None:
     """Run the chosen action."""
     verb: str = options.verb
+    if verb == "report":
+        return _report(options)
     _, carry_out = VERBS[verb]
     if options.api:
         return carry_out(options, Api(options.api, given_token(options) or str))
     if (found := find_local_run(options, steers=verb not in READS)) is not None:
         api = Api(found.url, place=str(found.folder))  # it needs no token: send none
         return carry_out(options, api)
-    if verb == "run":
+    if verb == "run" and options.robot is None:
         return _run_job(options)
     with _forwarded_api(options) as forwarded:
         return carry_out(options, forwarded)
@@ -164,11 +193,59 @@ def _fly(options: Options, api: Api) -> int:
     signal.signal(signal.SIGTERM, _leave)
     follower = MissionFollower(api, API_TIMEOUT, options.lease, print_line)
     order = {**read_mission(options.mission), "key": options.key}
-    return _follow(options, follower, order, stopped)
+    if (left := options.at - time.time()) > 0:
+        time.sleep(left)
+    elif options.at:
+        print_line(f"{-left:.1f} s after the time at which the fleet begins")
+
+    def ended(mission: str) -> None:
+        if options.report:
+            _keep_report(options, order, api.get(mission_path(mission)))
+
+    return _follow(options, follower, order, stopped, ended)
+
+
+def _keep_report(options: Options, order: Json, view: Json) -> None:
+    """Keep a report of a mission; without one, say why: the verdict counts."""
+    from cloudrc.runs.kept import keep_report
+
+    if not (options.config and options.profile):
+        raise BadInputError("--report needs --config and --profile")
+    files, most = (options.config, options.profile), (options.keep, options.keep_days)
+    try:
+        folder = keep_report(options.report, files, order, view, keep=most[0], days=most[1])
+        print_line(f"report: {folder.name}")
+    except (CloudrcError, OSError) as error:
+        print_line(f"no report is kept: {error}")
+
+
+def _report(options: Options, _: Api | None = None) -> int:
+    """Write the report of a mission of a release; return the exit code of its verdict."""
+    from cloudrc.cli import report
+    from cloudrc.cli.where import flown_release
+    from cloudrc.runs.folder import new_folder
+    from cloudrc.runs.kept import fetch_mission
+
+    options.release = options.where or options.release
+    release = flown_release(options)
+    folder = new_folder(options.out, f"{release.name}-{options.mission or 'last'}")
+    try:
+        fetch_mission(release, options.mission, folder, tell)
+    except CloudrcError:
+        with suppress(OSError):
+            folder.rmdir()  # nothing was fetched
+        raise
+    options.run, options.metric, options.figures = folder, [], False
+    options.width, options.font_size = 7.16, 9.0
+    return report.execute(options)
 
 
 def _follow(
-    options: Options, follower: MissionFollower, order: Json, stopped: Callable[[str], None]
+    options: Options,
+    follower: MissionFollower,
+    order: Json,
+    stopped: Callable[[str], None],
+    ended: Callable[[str], None] = lambda mission: None,
 ) -> int:
     mission = follower.post({**order, "queue": options.queue})
     try:
@@ -178,6 +255,7 @@ def _follow(
         raise
     text = describe_verdict(verdict)
     print_line(text)
+    ended(mission)
     leave_message(text)
     return int(verdict["exit_code"])
 
@@ -298,6 +376,7 @@ VERBS: dict[str, tuple[str, Callable[[Options, Api], int | None]]] = {
         "allow flights again after a stop or a landing; does not start the robot",
         _acknowledge,
     ),
+    "report": ("write the report of a mission of a release, as 'run' does", _report),
     "fly": ("fly a mission inside a Job: post it, follow it, exit with the verdict", _fly),
 }
 """Verb -> help line, and function that carries it out."""
@@ -328,11 +407,14 @@ def _forwarded_api(options: Options) -> Iterator[Api]:
 def _run_job(options: Options) -> int:
     """Create the Job of a mission, follow its log, and return the exit code of its verdict."""
     mission, release = read_mission(options.mission, options.name), need_release(options)
+    from cloudrc.cluster.fleet_mission import follow_fleet
     from cloudrc.cluster.flight import begin_job, cancelling_command, follow_job
+    from cloudrc.cluster.pods import fleet_size
 
     job = begin_job(release, mission, print_line, options.timeout, queue=options.queue)
+    follow = follow_fleet if fleet_size(release) else follow_job
     try:
-        return follow_job(release, job, print_line).exit_code
+        return follow(release, job, print_line).exit_code
     except KeyboardInterrupt:
         remedy = cancelling_command(release, job)
         tell(f"Job {job} is still running; cancel its mission: {remedy}")

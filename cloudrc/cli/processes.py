@@ -40,6 +40,8 @@ def _end_arguments(parser: Parser) -> None:
     add("--key", "FILE", "the tunnel's key ('cloudrc key new FILE')", required=True)
     route = "the link's file with the address to send to; the link's state is beside it"
     add("--route", "FILE", route, required=True)
+    peer = "where to send without a link process; to robot 0's PORT, the number is added"
+    add("--peer", "HOST:PORT", peer, read=read_address)
 
 
 def _cloud_arguments(parser: Parser) -> None:

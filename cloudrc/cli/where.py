@@ -10,11 +10,12 @@ import argparse
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import tell
-from cloudrc.cli.parser import KUBECTL_PLUGIN, Add, Options, Parser, flags, number
+from cloudrc.cli.parser import KUBECTL_PLUGIN, Add, Options, Parser, flags, number, whole_number
 from cloudrc.cluster.client import DEFAULT_RELEASE as DEFAULT_RELEASE
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.files import warn_if_readable
@@ -37,6 +38,7 @@ def release_arguments(parser: Parser, default: str = "the only one of the namesp
     """
     add = cluster_arguments(parser, "(default: the context's, or default)")
     add("--release", "NAME", f"Helm release (default: {default})")
+    add("--robot", "K", "number of a robot, if the release is a fleet", read=whole_number(0, 999))
     return add
 
 
@@ -77,7 +79,8 @@ def flown_release(options: Options) -> Release:
     require("a cluster", ("kube",))
     from cloudrc.cluster.releases import choose_release
 
-    return choose_release(options.context, options.namespace, options.release)
+    found = choose_release(options.context, options.namespace, options.release)
+    return replace(found, robot=options.robot)
 
 
 def run_argument(parser: Parser) -> None:

@@ -34,10 +34,13 @@ def list_releases(
             raise
         tell(f"only the releases {here.where}: {error}")
         found = look(here, everywhere=False)
-    places = [replace(here, namespace=each["namespace"], name=each["name"]) for each in found]
+    single = [each for each in found if "mission" not in each]
+    places = [replace(here, namespace=each["namespace"], name=each["name"]) for each in single]
     with ThreadPoolExecutor(AT_ONCE) as pool:
         missions = pool.map(partial(_mission_of, tell=tell), places)
-    return [{**each, "mission": one} for each, one in zip(found, missions, strict=True)]
+    for each, mission in zip(single, missions, strict=True):
+        each["mission"] = mission
+    return found
 
 
 def as_text(releases: Sequence[dict[str, str]]) -> str:

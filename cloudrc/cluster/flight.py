@@ -115,7 +115,8 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
 def _why_not_ready(release: Release) -> tuple[str, str]:
     """Say why the pods of a release are not ready, and why they will never be; "" if not so."""
     words, never = list[str](), list[str]()
-    for component in COMPONENTS:
+    cell = [pods.CELL] if release.find("statefulsets", pods.CELL) else []
+    for component in (*COMPONENTS, *cell):
         why, is_fatal = _state(release, component)
         words += [f"{component}: {why}"] * bool(why)
         never += [f"the {component} pod cannot run: {why}"] * is_fatal
@@ -124,19 +125,20 @@ def _why_not_ready(release: Release) -> tuple[str, str]:
 
 def _state(release: Release, component: str) -> tuple[str, bool]:
     """Return why a component is not ready ("" if ready), and whether it can never be ready."""
-    deployment = pods.find_deployment(release, component)
-    for condition in deployment.status.conditions or []:  # for example Pod Security or a quota
+    workload = pods.find_workload(release, component)[1]
+    for condition in workload.status.conditions or []:  # for example Pod Security or a quota
         if condition.type == "ReplicaFailure" and condition.status == "True":
             return str(condition.message), True
     found = pods.list_pods(release, component)
     for pod in found:
         if why := pods.pod_failure(pod):
             return why, True
-    status = deployment.status
-    is_observed = (status.observed_generation or 0) >= deployment.metadata.generation
-    if not (found and is_observed and status.updated_replicas == status.replicas == 1):
+    status, wanted = workload.status, workload.spec.replicas
+    is_observed = (status.observed_generation or 0) >= workload.metadata.generation
+    if not (is_observed and len(found) >= wanted == status.updated_replicas == status.replicas):
         return "its pod is being created", False
-    return _pod_state(release, found[0])
+    states = (_pod_state(release, pod) for pod in found[:wanted])
+    return next((state for state in states if state[0]), ("", False))
 
 
 def _pod_state(release: Release, pod: Any) -> tuple[str, bool]:
@@ -264,7 +266,7 @@ def fly_in_cluster(
         raise
     (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
     mission = fetch_all(release, folder, tell, want_end=not interrupted)
-    return _report(experiment, folder, mission, interrupted, page=page, figures=figures)
+    return report_flight(experiment, folder, mission, interrupted, page=page, figures=figures)
 
 
 def chart_values(
@@ -308,11 +310,14 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> bool:
     return ended.exit_code != InterruptedRunError.exit_code
 
 
-def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Recording:
-    """Fetch recordings and logs into a folder; return the merged recording.
+def fetch_all(
+    release: Release, folder: Path, tell: Tell, *, want_end: bool, number: int | None = None
+) -> Recording:
+    """Fetch recordings and logs into a folder; return the merged recording of one mission.
 
-    If logs cannot be fetched, `tell` receives the error. With `want_end`, fetch the recordings
-    again until they contain the end of the mission.
+    It is the last mission, or the one with this `number` in telemetry. If logs cannot be fetched,
+    `tell` receives the error. With `want_end`, fetch the recordings again until they contain the
+    end of the mission.
     """
     from cloudrc.record.merge import cut_to_last_mission, merge
 
@@ -327,7 +332,7 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
             tell(f"{error}; trying again")
             continue
         mission = merge(folder / "world.mcap", folder / "cloud.mcap")
-        if cut_to_last_mission(mission, being_written=True) or not want_end:
+        if cut_to_last_mission(mission, being_written=True, number=number) or not want_end:
             break
     for component in COMPONENTS:
         _fetch_previous(release, component, folder / f"{component}.before.mcap", tell)
@@ -353,7 +358,7 @@ def _fetch_previous(release: Release, component: str, path: Path, tell: Tell) ->
         tell(f"{component} was restarted; no earlier recording: {error}")
 
 
-def _report(
+def report_flight(
     experiment: ResolvedExperiment,
     folder: Path,
     mission: Recording,
@@ -362,6 +367,11 @@ def _report(
     page: bool,
     figures: bool,
 ) -> dict[str, Any]:
+    """Write report and mission.mcap of a flight of a release into a folder; return the report.
+
+    `interrupted` says whether the flight was cut short; `page` and `figures` are those of
+    `write_report`.
+    """
     from cloudrc.report.document import Run
     from cloudrc.report.views import views
     from cloudrc.report.write import attachments, write_report

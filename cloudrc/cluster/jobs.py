@@ -24,7 +24,8 @@ from cloudrc.cluster.pods import (
     container_statuses,
     describe_end,
     events_of,
-    find_deployment,
+    find_workload,
+    fleet_size,
     pod_failure,
     pod_log,
 )
@@ -53,6 +54,11 @@ LOOK_PERIOD = 1.0
 """Time between two requests for the state of a Job and its pods [s]."""
 OVERLAP = 10
 """Time before the last read of the log of a running pod from which lines are read again [s]."""
+TOGETHER, EACH = 10.0, 0.3
+"""Time after which the robots of a fleet begin together, and more for each robot [s]: meanwhile
+their pods start, and their metrics are read."""
+AT = "--at="
+"""Flag of the Job's container: the Unix time at which a robot begins [s]."""
 NO_LOG = "unable to retrieve container logs for "
 """What the kubelet sends in place of the log of a container that is gone."""
 DELETE_LIMIT = 40.0
@@ -86,18 +92,22 @@ def run_job(
     """
     # A Job's pod has a longer name than the Job; the limit is 63 characters.
     name = name or f"{release.name[:40].rstrip('-.')}-mission-{secrets.token_hex(3)}"
-    deployment = find_deployment(release, "cloud")
     job = _read_template(release)
     labels = {**release.labels(COMPONENT), "app.kubernetes.io/managed-by": "cloudrc"}
-    owner = owner_of("apps/v1", "Deployment", deployment)
+    labels |= job.get("metadata", {}).get("labels", {})  # of Kueue
+    owner = owner_of("apps/v1", *find_workload(release, "cloud"))
     job["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
     given = mission.get("time_limit_s")
     # The API takes a mission with such a limit only.
     limit = ceil(given) if isinstance(given, int | float) and 0 < given <= 1e6 else LIMIT_MAX
     deadline = limit + START_ALLOWANCE + queue * QUEUE_ALLOWANCE
     job["spec"] |= {"activeDeadlineSeconds": deadline, "ttlSecondsAfterFinished": KEEP_FINISHED}
+    arguments = job["spec"]["template"]["spec"]["containers"][0]["args"]
     if queue:
-        job["spec"]["template"]["spec"]["containers"][0]["args"].append("--queue")
+        arguments.append("--queue")
+    if robots := fleet_size(release):  # may have changed since the chart was installed
+        job["spec"] |= {"completions": robots, "parallelism": robots}
+        arguments.append(f"{AT}{ceil(time.time() + TOGETHER + EACH * robots)}")
     data = {FILE: json.dumps(mission, indent=2) + "\n"}
     create_job(release, job, {"apiVersion": "v1", "kind": "ConfigMap", "data": data})
     return name
@@ -265,7 +275,7 @@ class JobReader:
                 pods = [*watch.pods.values()]
             pods.sort(key=lambda pod: str(pod.metadata.creation_timestamp))
             self._tell_once("waiting: the Job is suspended" if self.job.spec.suspend else "")
-            self._tell_once("" if has_ended else _why_waiting(self._release, self.job, pods))
+            self._tell_once("" if has_ended else why_waiting(self._release, self.job, pods))
             yield from self._read_pods(pods, has_ended=has_ended)
             for sentence in self._look():
                 self._tell(sentence)
@@ -336,7 +346,7 @@ class JobReader:
             self._tell(text)
 
 
-def _why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
+def why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
     """Return a sentence on why pods of a Job wait; "" if none waits.
 
     Raise a ClusterError if a pod will never run, or if the cluster denies the pods.

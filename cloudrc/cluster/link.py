@@ -21,6 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, run
+from cloudrc.cluster.pods import INDEX
 from cloudrc.cluster.releases import INSTANCE, no_release, several_releases
 from cloudrc.config.link_edit import Edit, edit_profile
 from cloudrc.config.load import load_link
@@ -71,6 +72,10 @@ def read_link(release: Release) -> LinkParts:
     pods = _running_pods(found)
     if not pods.keys() >= set(COMPONENTS):
         raise ClusterError(f"a pod of {release} does not run")
+    if any(each["kind"] == "Pod" and INDEX in each["metadata"]["labels"] for each in found):
+        raise ClusterError(
+            f"{release} is a fleet; change its link: helm upgrade --set link.profile=NAME"
+        )
     experiments = [each["data"] for each in found if EXPERIMENT in each.get("data", {})]
     files = {EXPERIMENT: "{}", **(experiments[0] if experiments else {}), **maps[0]["data"]}
     return LinkParts(release.name, maps[0]["metadata"]["name"], files, pods)

@@ -13,7 +13,7 @@ from typing import Any
 
 from cloudrc.cluster.client import NotFoundError, Release, run
 from cloudrc.cluster.jobs import owner_of
-from cloudrc.cluster.pods import find_deployment
+from cloudrc.cluster.pods import find_workload
 from cloudrc.config.hull import hull_of
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment, local_files
@@ -141,7 +141,7 @@ def _make_namespace(release: Release) -> None:
 def give_to_release(release: Release, names: Mapping[str, str]) -> None:
     """Make the ConfigMaps of `send_own_files` part of an installed release, to end with it."""
     for name in names.values():
-        owner = owner_of("apps/v1", "Deployment", find_deployment(release, "world"))
+        owner = owner_of("apps/v1", *find_workload(release, "world"))
         patch = json.dumps({"metadata": {"ownerReferences": [owner]}})
         words = ["patch", "configmap", name, "--type=merge", f"--patch={patch}"]
         run("kubectl", [*release.flags, *words])

@@ -31,7 +31,7 @@ from cloudrc.cluster.client import (
     run,
 )
 from cloudrc.cluster.releases import no_release
-from cloudrc.errors import TimedOutError, to_one_line
+from cloudrc.errors import BadInputError, TimedOutError, to_one_line
 
 NO_IMAGE = ("ErrImagePull", "ImagePullBackOff", "ErrImageNeverPull", "InvalidImageName")
 NOT_MADE = ("CreateContainerConfigError", "CreateContainerError", "RunContainerError")
@@ -58,8 +58,12 @@ METRICS = {
     "cloud": {"cloud": 9100, "teleop": 9101, "link": 9102},
 }
 """Component -> container -> TCP port of the container's metrics."""
+INDEX = "apps.kubernetes.io/pod-index"
+"""Label of a fleet's pods: the number of the robot."""
+CELL = "cell"
+"""Component of a fleet's cell, and name of its container."""
 DATA = "/var/lib/cloudrc"
-"""Folder of the recordings in the pods of world and cloud."""
+"""Folder of the recordings in the pods of world, cloud and cell."""
 NO_PROXY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 """Opens URLs of this machine directly, even if environment variables name a proxy."""
 START_LIMIT = 20.0
@@ -70,9 +74,21 @@ _FORWARDING = re.compile(rb"Forwarding from 127\.0\.0\.1:(\d+) -> (\d+)")
 
 
 def list_pods(release: Release, component: str) -> list[Any]:
-    """List the pods of a component, the newest first; omit pods that are being deleted."""
+    """List the pods of a component, the newest first; omit pods that are being deleted.
+
+    In a fleet these are the pods of all robots, or of `release.robot`. On board, world's pod has
+    the container of cloud, too.
+    """
     found = release.find("pods", component)
-    alive = [pod for pod in found if pod.metadata.deletion_timestamp is None]
+    if component == "cloud" and not found:
+        found = [pod for pod in release.find("pods", "world") if has_container(pod, component)]
+    number = None if release.robot is None else str(release.robot)
+    alive = [
+        pod
+        for pod in found
+        if pod.metadata.deletion_timestamp is None
+        and number in (None, pod.metadata.labels.get(INDEX))
+    ]
     return sorted(alive, key=lambda pod: str(pod.metadata.creation_timestamp), reverse=True)
 
 
@@ -116,23 +132,40 @@ class PodWatch:
 def find_pod(release: Release, component: str) -> Any:
     """Find the newest running pod of a component; else raise a ClusterError with the cause."""
     pods = list_pods(release, component)
+    if (robots := len({pod.metadata.labels.get(INDEX) for pod in pods})) > 1:
+        raise BadInputError(f"{release} has {robots} robots; name one: --robot K")
     for pod in pods:
         if pod.status.phase == "Running":
             return pod
-    name = find_deployment(release, component).metadata.name
+    kind, workload = find_workload(release, component)
     why = (pod_failure(pods[0]) or f"it is {pods[0].status.phase}") if pods else "there is none"
     raise ClusterError(
         f"the {component} pod of {release} does not run: {why}; "
-        f"see: {release.kubectl} describe deployment {name}"
+        f"see: {release.kubectl} describe {kind.lower()} {workload.metadata.name}"
     )
 
 
-def find_deployment(release: Release, component: str) -> Any:
-    """Find the Deployment of a component; raise a ClusterError if the release does not exist."""
-    found = release.find("deployments", component)
-    if not found:
-        raise no_release(release)
-    return found[0]
+def find_workload(release: Release, component: str) -> tuple[str, Any]:
+    """Find the Deployment of a component, or its StatefulSet in a fleet; return kind and object.
+
+    On board, cloud is in that of world. Raise a ClusterError if the release does not exist.
+    """
+    for found in release.find("deployments", component):
+        return "Deployment", found
+    for each in (component, "world"):
+        for found in release.find("statefulsets", each):
+            return "StatefulSet", found
+    raise no_release(release)
+
+
+def fleet_size(release: Release) -> int:
+    """Return the number of robots of a fleet; 0 if the release is none."""
+    return sum(each.spec.replicas for each in release.find("statefulsets", "world"))
+
+
+def has_container(pod: Any, name: str) -> bool:
+    """Return whether a pod has a container of this name."""
+    return name in {container.name for container in pod.spec.containers}
 
 
 def pod_failure(pod: Any) -> str:
@@ -194,7 +227,7 @@ def operator_token(release: Release) -> str:
 
     No error message contains the token.
     """
-    volumes = find_deployment(release, "cloud").spec.template.spec.volumes
+    volumes = find_workload(release, "cloud")[1].spec.template.spec.volumes
     name = next(volume.secret.secret_name for volume in volumes if volume.name == TOKENS)
     secret = release.request("get", "secrets", name=name)
     try:
@@ -255,11 +288,11 @@ def follow_page(release: Release, port: int, tell: Callable[[str], None]) -> Ite
         ClusterError: If the release has no console, or if the port cannot be forwarded.
     """
     pod = find_pod(release, "cloud")
-    if CONSOLE not in {container.name for container in pod.spec.containers}:
+    if not has_container(pod, CONSOLE):
         raise ClusterError(
             f"{release} has no console; add it: helm upgrade "
-            f"{release.name} charts/cloudrc {' '.join(release.helm_flags)} --reuse-values "
-            "--set console.enabled=true"
+            f"{release.name} charts/cloudrc {' '.join(release.helm_flags)} "
+            "--reset-then-reuse-values --set console.enabled=true"
         )
     name = pod.metadata.name
     words = ["logs", f"pod/{name}", f"--container={CONSOLE}", "--follow", "--since=1s"]

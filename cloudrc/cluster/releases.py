@@ -22,8 +22,8 @@ INSTANCE = "app.kubernetes.io/instance"
 """Label with the name of the release."""
 COMPONENT = "app.kubernetes.io/component"
 CLOUDRC = "app.kubernetes.io/name=cloudrc"
-SELECTOR = "app.kubernetes.io/name=cloudrc,app.kubernetes.io/component=cloud"
-"""Selects the one Deployment that each release has for its cloud."""
+SELECTOR = "app.kubernetes.io/name=cloudrc,app.kubernetes.io/component=world"
+"""Selects the one Deployment, or in a fleet StatefulSet, that each release has for its worlds."""
 
 
 class Place(NamedTuple):
@@ -36,38 +36,67 @@ class Place(NamedTuple):
 def look(release: Release, *, everywhere: bool) -> list[dict[str, str]]:
     """Describe the releases in the namespace of `release`, or in all namespaces.
 
-    Raise a ClusterError if the user may not list Deployments or ConfigMaps there.
+    Raise a ClusterError if the user may not list Deployments, StatefulSets or ConfigMaps there. A
+    fleet has a mission, from its Job, too.
     """
     verb, chosen = "list all" if everywhere else "list", {"label_selector": CLOUDRC}
-    deployments = release.request(verb, "deployments", **chosen)
+    workloads = release.request(verb, "deployments", **chosen)
+    fleets = release.request(verb, "statefulsets", **chosen)
+    jobs = release.request(verb, "jobs", **chosen) if fleets else []
     files = defaultdict[Place, dict[str, str]](dict)
     for each in release.request(verb, "configmaps", **chosen):
         if each.metadata.labels.get(COMPONENT) in ("experiment", "link"):
             files[_place(each)] |= each.data or {}
     waits = defaultdict[Place, list[str]](list)
-    for each in deployments:
-        not_ready = [] if each.status.available_replicas else [each.metadata.labels[COMPONENT]]
+    for each in [*workloads, *fleets]:
+        ready, wanted = each.status.available_replicas or 0, each.spec.replicas or 1
+        count = f" {ready}/{wanted}" if wanted > 1 else ""
+        not_ready = [] if ready >= wanted else [each.metadata.labels[COMPONENT] + count]
         waits[_place(each)] += not_ready
+    robots = {_place(each): each.spec.replicas for each in fleets if _is_world(each)}
     return [
         {
             "name": place.name,
             "namespace": place.namespace,
-            "robot": _robot(files[place].get("experiment.yaml", "")),
+            "robot": f"{robots.get(place, '')} {_robot(files[place])}".strip(),
             "link": _link(files[place]),
             "state": f"{' and '.join(sorted(waits[place]))} not ready" if waits[place] else "ready",
+            **({"mission": _mission(place, jobs)} if place in robots else {}),
         }
         for place in sorted(waits)
     ]
+
+
+def _is_world(thing: Any) -> bool:
+    return bool(thing.metadata.labels[COMPONENT] == "world")
+
+
+def _mission(place: Place, jobs: list[Any]) -> str:
+    """Describe the Job that a fleet flies, by the number of robots; "-" for none."""
+    for job in jobs:
+        if _place(job) == place and job.status.active and job.spec.completion_mode == "Indexed":
+            counts = {
+                "flying": job.status.active,
+                "done": job.status.succeeded,
+                "failed": job.status.failed,
+            }
+            words = [f"{word} {count}" for word, count in counts.items() if count]
+            return f"{job.metadata.name} {', '.join(words)}"
+    return "-"
 
 
 def _place(thing: Any) -> Place:
     return Place(thing.metadata.namespace, thing.metadata.labels.get(INSTANCE, ""))
 
 
-def _robot(experiment: str) -> str:
+def _section(files: dict[str, str], name: str) -> dict[str, Any]:
+    return (yaml.safe_load(files.get("experiment.yaml", "")) or {}).get(name) or {}
+
+
+def _robot(files: dict[str, str]) -> str:
     from cloudrc.config.schema import World
 
-    robot = (yaml.safe_load(experiment) or {}).get("world", {}).get("robot") or World().robot
+    robot = _section(files, "world").get("robot") or World().robot
     return Path(robot).name  # of the user's robot, the name of its ConfigMap
 
 
@@ -89,7 +118,9 @@ def _link(files: dict[str, str]) -> str:
             return "invalid"
     values = link.model_dump(mode="json", exclude_defaults=True)
     texts = [_way(values.get(way, {})) for way in DIRECTIONS]
-    return texts[0] if texts[0] == texts[1] else " / ".join(texts)
+    rate = _section(files, "cell").get("rate_kbit")
+    cell = f", cell {rate:g}" if rate else ""
+    return (texts[0] if texts[0] == texts[1] else " / ".join(texts)) + cell
 
 
 def _way(way: dict[str, Any]) -> str:
@@ -105,8 +136,12 @@ def only_release(release: Release) -> Release:
         BadInputError: If the namespace has several releases.
         ClusterError: If the namespace does not exist, or has no release.
     """
-    found = release.request("list", "deployments", label_selector=SELECTOR)
-    names = [_place(each).name for each in found]
+    kinds = "deployments", "statefulsets"
+    names = [
+        _place(each).name
+        for kind in kinds
+        for each in release.request("list", kind, label_selector=SELECTOR)
+    ]
     if len(names) > 1:
         raise several_releases(release, names)
     if not names:

@@ -28,7 +28,7 @@ from cloudrc.errors import to_one_line
 
 NEEDED = {
     "": "pods services configmaps secrets serviceaccounts persistentvolumeclaims",
-    "apps": "deployments",
+    "apps": "deployments statefulsets",
     "batch": "jobs",
     "networking.k8s.io": "networkpolicies",
 }
@@ -124,7 +124,7 @@ def pods_of_chart(rendered: list[Any]) -> dict[str, dict[str, Any]]:
             "serviceAccountName": "default",  # the chart's own accounts do not exist yet
         }
         for thing in rendered
-        if thing["kind"] == "Deployment"
+        if thing["kind"] in ("Deployment", "StatefulSet")
     }
 
 

@@ -91,19 +91,19 @@ class _Protocol(H11Protocol):
 
 
 class Door(ThreadServer):
-    """The console's server at 127.0.0.1."""
+    """The console's server."""
 
-    def __init__(self, port: int, access: Access, page: Page, scene: str) -> None:
+    def __init__(self, listen: tuple[str, int], access: Access, page: Page, scene: str) -> None:
         """Open the port (0: any free one); answer after `start`.
 
         Args:
-            port: TCP port.
+            listen: IP address and TCP port.
             access: Rules by which requests are admitted.
             page: Carries out what browsers ask for.
             scene: HTML of the page with the scene.
         """
-        with at_place(f"--port {port}"):
-            opened = socket.create_server(("127.0.0.1", port), backlog=512)
+        with at_place(f"--port {listen[1]}"):
+            opened = socket.create_server(listen, backlog=512)
         self.port: int = opened.getsockname()[1]
         self._folder = TemporaryDirectory(prefix="cloudrc-", dir=socket_folder())
         self.viser = f"{self._folder.name}/viser.sock"  # only this user may enter its folder

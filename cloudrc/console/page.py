@@ -84,8 +84,9 @@ class Page:
         port: int = 0,
         token: Callable[[], str] | None = None,
         origins: Collection[str] = (),
+        host: str = "127.0.0.1",
     ) -> None:
-        """Serve the page on this machine only; one browser at a time gets the controls.
+        """Serve the page at the address `host`; one browser at a time gets the controls.
 
         Args:
             experiment: What flies.
@@ -94,6 +95,7 @@ class Page:
             port: TCP port; 0 means any free port.
             token: Function that returns the page's present token; None makes one.
             origins: Origins of proxies that may serve the page.
+            host: IP address to listen at, by default this machine's own.
         """
         own = token_hex(16)
         self._access = Access(token or (lambda: own), origins)
@@ -103,7 +105,7 @@ class Page:
         viser_page = Path(viser.__file__).parent / "client" / "build" / "index.html"
         labels = {code: label for code, (label, _) in KEYS.items()}
         html = scene_page(viser_page.read_text(encoding="utf-8"), labels)
-        self._door = Door(port, self._access, self, html)
+        self._door = Door((host, port), self._access, self, html)
         rich.get_console().quiet = True  # viser prints about itself
         with viser_at(self._door.viser):
             self._server = viser.ViserServer(label="cloudrc", verbose=False)

@@ -56,7 +56,9 @@ def serve(
         known = obstacles(scene_of(experiment.world), touch=experiment.mission.touched)
         feed = FlightFeed(tuple(filter(has_surface, known)), known_hull(experiment.world.robot))
         steering = Steering(flight.api, flight.link)
-        page = Page(experiment, feed, steering, port, flight.token, origins)
+        # A proxy reaches a pod at its own address, which the NetworkPolicy guards.
+        host = "0.0.0.0" if flight.token and origins else "127.0.0.1"
+        page = Page(experiment, feed, steering, port, flight.token, origins, host)
         opened.callback(page.close)
         steering.watch()
         steering.start()

@@ -17,8 +17,9 @@ from dataclasses import dataclass
 from functools import partial
 from ipaddress import ip_address
 from itertools import product
+from math import inf
 from pathlib import Path
-from typing import TextIO
+from typing import TextIO, TypeAlias
 
 from cloudrc import assembly
 from cloudrc.config.load import read_experiment, robot_settings
@@ -44,6 +45,8 @@ PERIOD_NS = 100_000_000
 AT_ONCE = 10
 """Largest number of names that are resolved within a pause of `PEER_PAUSE`."""
 log = partial(warn, process="cell")
+WayOut: TypeAlias = tuple[Address, Exit, list[LinkWay]]
+"""Where packets of a direction go, what sends them there, and both directions of the robot."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,7 @@ class CellSettings:
     clouds: Address  # where to send the uplink
     record: Path  # CSV file
     robots: int | None = None  # number of robots; None: that of the experiment
+    record_max: float | None = None  # size at which `record` begins anew [bytes]
     feed: bool = False  # write status for a supervisor to stdout
     metrics: Address | None = None  # serve metrics here
 
@@ -80,7 +84,8 @@ def run_cell(settings: CellSettings, stop: StopSignal) -> None:
             log("the cell runs under SCHED_FIFO")
         done = CellLog(cells)
         done.dropped.update(dict.fromkeys(product(done.ways, range(count)), 0))
-        _carry(engine, done, feed.alive_while(stop), file, exporter)
+        limit = settings.record_max or inf
+        _carry(engine, done, feed.alive_while(stop), file, exporter, limit)
         log(json.dumps(engine.counts() | engine.errors.in_ns()))
 
 
@@ -98,14 +103,14 @@ def address_of(peers: Address, robot: int) -> Address:
 
 def _open(
     settings: CellSettings, experiment: ResolvedExperiment, count: int, opened: ExitStack
-) -> tuple[CellEngine, list[Cell], list[tuple[Address, Exit]]]:
+) -> tuple[CellEngine, list[Cell], list[WayOut]]:
     """Open the sockets of `count` robots; return what carries, the cells, and where to send."""
     origin_ns = time.monotonic_ns()
     cells = assembly.build_cells(experiment, origin_ns)
     outside = opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
     outside.setblocking(False)
     port = EntrancePort()
-    engine, exits, shortest_ns = CellEngine(port, cells), list[tuple[Address, Exit]](), NOTHING_NS
+    engine, exits, shortest_ns = CellEngine(port, cells), list[WayOut](), NOTHING_NS
     for robot in range(count):
         own = read_experiment(str(settings.config), robot_settings(robot))
         ways = list[LinkWay]()
@@ -116,7 +121,7 @@ def _open(
             strict=True,
         ):
             host, first = getattr(settings, name)
-            exits.append((address_of(to, robot), Exit(outside)))
+            exits.append((address_of(to, robot), Exit(outside), ways))
             ways.append(LinkWay(link, exits[-1][1], PacketLog(0)))
             with listening(f"--{name}", (host, first + robot)):
                 one = opened.enter_context(bind((host, first + robot)))
@@ -128,20 +133,25 @@ def _open(
     return engine, cells, exits
 
 
-def _follow(exits: Sequence[tuple[Address, Exit]]) -> None:
-    """Resolve the names of all peers again and again, on a thread of its own."""
-    names = list[tuple[PeerName, Exit]]()
-    for address, leave in exits:
+def _follow(exits: Sequence[WayOut]) -> None:
+    """Resolve the names of all peers again and again, on a thread of its own.
+
+    A robot that has sent nothing may not exist: it takes seconds to learn that a name is unknown.
+    """
+    names = list[tuple[PeerName, Exit, list[LinkWay]]]()
+    for address, leave, ways in exits:
         if _is_number(address[0]):
             leave.peer = address
         else:
-            names.append((PeerName(address, ipv4_addresses, log), leave))
+            names.append((PeerName(address, ipv4_addresses, log), leave, ways))
 
     def work() -> None:
         while True:
-            for name, leave in names:
+            used = [one for one in names if any(way.received for way in one[2])]
+            for name, leave, _ in used:
                 leave.peer = name.poll() or leave.peer
-                time.sleep(random.uniform(*PEER_PAUSE) / min(len(names), AT_ONCE))
+                time.sleep(random.uniform(*PEER_PAUSE) / min(len(used), AT_ONCE))
+            time.sleep(PEER_PAUSE[0] / AT_ONCE)
 
     if names:
         threading.Thread(target=work, daemon=True).start()
@@ -161,8 +171,12 @@ def _carry(
     stop: Callable[[], bool],
     file: TextIO,
     exporter: Exporter | None,
+    record_max: float,
 ) -> None:
-    """Carry packets until `stop()`; record each `PERIOD_NS` in which a packet has left."""
+    """Carry packets until `stop()`; record each `PERIOD_NS` in which a packet has left.
+
+    At a size of `record_max` [bytes] the record begins anew.
+    """
     until_ns, start_ns = time.monotonic_ns(), 0
     while not stop():
         until_ns += PERIOD_NS
@@ -173,6 +187,9 @@ def _carry(
         cells.rows.clear()
         cells.take(until_ns - start_ns)
         if any(row["packets"] for row in cells.rows):
+            if file.tell() > record_max:
+                file.seek(0)
+                file.truncate()
             lines = csv_table(cells.rows).split("\n", 1)
             file.write(f"{lines[0]}\n" * (not file.tell()) + f"{lines[1]}\n")
             file.flush()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import random
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -21,15 +23,16 @@ from cloudrc.drivers.link_monitor import LinkMonitor
 from cloudrc.drivers.machine import clock_id
 from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
 from cloudrc.drivers.readers import RecordSender
-from cloudrc.drivers.realtime import Address, Peer, bind
+from cloudrc.drivers.realtime import Address, Peer, bind, show_address
 from cloudrc.drivers.teleop import RemoteTeleop, UnixDatagrams, UnixPeer
-from cloudrc.files import warn_if_readable
+from cloudrc.files import warn_if_readable, write_atomically
+from cloudrc.link.follow import PEER_PAUSE, PeerName
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import SIZE_MAX, link_profile
 from cloudrc.link.verify.judge import Flow
 from cloudrc.messages import GuardState, plan_length
 from cloudrc.outside.code import apart
-from cloudrc.processes.ports import listening, open_exporter, warn
+from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, warn
 from cloudrc.records import Fault
 from cloudrc.runs.requirements import require
 from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES, Kind
@@ -61,6 +64,7 @@ class EndSettings:
     record_flights: bool = False  # no periodic records while the robot does not fly
     record_max: float | None = None  # limit of both recordings [bytes]
     robot: int | None = None  # number in a fleet
+    peer: Address | None = None  # where to send without a link process; its port is robot 0's
 
 
 def run_world(settings: EndSettings, stop: StopSignal) -> None:
@@ -160,6 +164,9 @@ def open_end(settings: EndSettings, name: str) -> tuple[ResolvedExperiment, Iden
     keys = KeyFile(key, time.monotonic_ns(), settings.robot)
     warn_if_readable(key, warn)
     link = settings.route.with_name(STATE_FILE)
+    if settings.peer:
+        host, port = settings.peer
+        follow_peer((host, port + (settings.robot or 0)), settings.route)
     with listening("--listen", settings.listen):
         peer = Peer(bind(settings.listen), settings.route)
     attached = dict[str, bytes]()
@@ -180,6 +187,21 @@ def open_end(settings: EndSettings, name: str) -> tuple[ResolvedExperiment, Iden
         check=link_monitor(experiment, uplink=name == "cloud", trusted=settings.feed),
     )
     return experiment, Identity(clock, os.urandom(16), keys.ring), end
+
+
+def follow_peer(peer: Address, route: Path) -> None:
+    """Keep the address of `peer` in the file `route`, as a link process does, on a thread."""
+    name = PeerName(peer, ipv4_addresses, warn)
+
+    def work() -> None:
+        written = None
+        while True:
+            if (found := name.poll()) != written and found:
+                write_atomically(route, f"{show_address(found)}\n".encode())
+                written = found
+            time.sleep(random.uniform(*PEER_PAUSE))
+
+    threading.Thread(target=work, daemon=True).start()
 
 
 def open_recorder(

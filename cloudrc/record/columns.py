@@ -96,14 +96,15 @@ class Recording(Content):
         return Recording(records=store)
 
     @staticmethod
-    def read(path: Path, *, whole: bool = False) -> Recording:
+    def read(path: Path, *, whole: bool = False, last_ns: int | None = None) -> Recording:
         """Read an MCAP file up to its end or to its first damaged part.
 
-        With `whole`, damage is an error, as is a file of which nothing can be read.
+        With `whole`, damage is an error, as is a file of which nothing can be read. With `last_ns`,
+        read the messages of the last time [ns] at least.
         """
         from cloudrc.record.reader import read
 
-        return Recording(**vars(read(path, whole=whole)))
+        return Recording(**vars(read(path, whole=whole, last_ns=last_ns)))
 
     def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
         """Write the messages and further `attachments` to a file, atomically; may raise OSError."""

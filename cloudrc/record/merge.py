@@ -119,8 +119,10 @@ def _lag_ns(
     return lag_ns
 
 
-def merge(world: Path, cloud: Path) -> Recording:
+def merge(world: Path, cloud: Path, last_ns: int | None = None) -> Recording:
     """Merge the files of world and cloud, complete or torn, into one mission on world's clock.
+
+    With `last_ns`, read the messages of the last time [ns] at least.
 
     If one file cannot be read, the result contains only the other file, on that file's own clock,
     and a note. It is an error if neither file can be read.
@@ -129,7 +131,7 @@ def merge(world: Path, cloud: Path) -> Recording:
     failures = []
     for end, path in (("world", world), ("cloud", cloud)):
         try:
-            found[end] = Recording.read(path)
+            found[end] = Recording.read(path, last_ns=last_ns)
         except CloudrcError as error:
             failures.append(error)
     if not found:
@@ -185,9 +187,15 @@ def _moved(hole: Hole, moved: Callable[[list[int]], list[int]]) -> Hole:
 
 
 def cut_to_last_mission(
-    mission: Recording, *, being_written: bool = False, after_ns: int = AFTER_NS
+    mission: Recording,
+    *,
+    being_written: bool = False,
+    after_ns: int = AFTER_NS,
+    number: int | None = None,
 ) -> bool:
     """Reduce a recording of several missions to the mission that was started last.
+
+    With `number`, which telemetry has as `mission_id`, reduce it to this mission.
 
     `being_written` tells that pods still write the files. If such files contain the end of the
     mission, they have lost nothing; files of a session that was killed may have. The recording ends
@@ -195,10 +203,13 @@ def cut_to_last_mission(
 
     Return whether the recording contains the end of that mission.
     """
-    *before, (began, ended) = _missions(mission) or [(None, None)]
-    earlier = max((end for _, end in before if end is not None), default=-1)
+    found = _missions(mission) or [(None, None)]
+    index = len(found) - 1 if number is None else _index(mission, found, number)
+    (began, ended), after = found[index], found[index + 1 : index + 2]
+    earlier = max((end for _, end in found[:index] if end is not None), default=-1)
     first = max((began or 0) - BEFORE_NS, earlier + 1)
     last = ended + after_ns if ended is not None else END_NS
+    last = min([last, *(start - 1 for start, _ in after if start is not None)])
     until = mission.messages[-1][1] if mission.messages else 0
     mission.keep(first, last, first - COUNTED_NS)
     if ended is None or until <= ended:
@@ -209,6 +220,17 @@ def cut_to_last_mission(
         mission.lacking = ""
         mission.holes = tuple(hole for hole in mission.holes if hole.begin_ns < ended)
     return True
+
+
+def _index(mission: Recording, missions: list[tuple[int | None, int | None]], number: int) -> int:
+    """Return which of the `missions` has this number in telemetry, else the last one."""
+    telemetry = mission["/telemetry"]
+    seen_ns = telemetry["stamp_ns"][telemetry["mission_id"] == number]
+    if len(seen_ns):
+        for index, (_, ended) in enumerate(missions):
+            if ended is None or ended >= seen_ns[0]:
+                return index
+    return len(missions) - 1
 
 
 def _missions(mission: Recording) -> list[tuple[int | None, int | None]]:

@@ -10,10 +10,12 @@ from __future__ import annotations
 import json
 import os
 from array import array
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from io import BufferedReader
 from itertools import pairwise
+from operator import itemgetter
 from pathlib import Path
 from shlex import quote
 from typing import IO, Any
@@ -39,6 +41,10 @@ KINDS = {
 """First bytes of a file that is not MCAP -> text of the error about the file."""
 
 
+TRIM_EVERY = 20_000
+"""Number of messages after which a reader of a file's end removes older ones [count]."""
+
+
 class NothingReadableError(BadInputError):
     """The file contains no readable message, for example because the process was killed early."""
 
@@ -61,8 +67,10 @@ class _WholeReads:
 class _Reader:
     """Reads the records of a file into a `Content`."""
 
-    def __init__(self, path: Path, file: IO[bytes]) -> None:
+    def __init__(self, path: Path, file: IO[bytes], last_ns: int | None = None) -> None:
         self.content = Content(source=str(path))
+        self._last_ns = last_ns  # only messages of the last time are kept [ns]; None: all
+        self._trim_at = TRIM_EVERY  # number of messages at which older ones go
         self._file = _WholeReads(file)
         self._channels: dict[int, mcap.Channel] = {}
         self._schemas: dict[int, mcap.Schema] = {}
@@ -155,6 +163,15 @@ class _Reader:
         else:
             self.content.messages.append((channel.topic, message.log_time, message.data))
             self._sequences.append(message.sequence)
+            if self._last_ns is not None and len(self._sequences) >= self._trim_at:
+                self._trim(message.log_time - self._last_ns)
+
+    def _trim(self, first_ns: int) -> None:
+        """Remove the messages before a log time [ns]: memory then holds twice the kept ones."""
+        messages = self.content.messages
+        count = bisect_left(messages, first_ns, key=itemgetter(1))
+        del messages[:count], self._sequences[:count]
+        self._trim_at = 2 * len(messages) + TRIM_EVERY
 
     def _is_ours(self, channel: mcap.Channel) -> bool:
         """Return whether cloudrc records the topic of a channel in this layout."""
@@ -191,7 +208,7 @@ class _Reader:
             return
         if metadata.get(COUNTS) == "" and MISSING not in metadata:
             yield "it was torn, and another program added an end"
-        if stored := metadata.get(COUNTS):
+        if self._last_ns is None and (stored := metadata.get(COUNTS)):
             counts, read = (
                 Counter(json.loads(stored)),
                 Counter(each[0] for each in content.messages),
@@ -201,8 +218,10 @@ class _Reader:
                 yield f"messages were removed or added: it holds {list_some(wrong)}"
 
 
-def read(path: Path, *, whole: bool = False) -> Content:
+def read(path: Path, *, whole: bool = False, last_ns: int | None = None) -> Content:
     """Read an MCAP file up to its end or to its first damage.
+
+    With `last_ns`, keep the messages of the last time [ns] at least, in little memory.
 
     Raises:
         BadInputError: If the file cannot be read or is not MCAP; with `whole`, also if it is torn,
@@ -225,7 +244,7 @@ def read(path: Path, *, whole: bool = False) -> Content:
             text = next(known, "is not an MCAP file; name a recording (.mcap)")
             raise BadInputError(f"{path}: {text}")
         file.seek(0)
-        content = _Reader(path, file).read()
+        content = _Reader(path, file, last_ns).read()
     if whole and content.lacking:
         copy = f"to copy what is readable: cloudrc recover {quote(str(path))}"
         raise BadInputError(f"{path}: {content.lacking}; {copy}")

@@ -109,7 +109,22 @@ class FleetFlown:
 
 def fleet_document(flown: FleetFlown) -> dict[str, Any]:
     """Return the content of the fleet's report.json."""
-    experiment, robots = flown.experiment, flown.robots
+    experiment, alone = flown.experiment, not flown.experiment.cell.traffic
+    return {
+        **judge_robots(flown.robots),
+        "experiment": experiment.name,
+        "config_sha256": fingerprint(experiment),
+        "code": source.code_hash(),
+        "mode": flown.mode,
+        "seed": experiment.seed,
+        "cell": cell_rows(flown.log, len(flown.robots), alone=alone),
+        "cloud": flown.cloud,
+        "separation_min_m": separation_min(flown.paths, scene_of(experiment.world).spawn),
+    }
+
+
+def judge_robots(robots: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the part of the fleet's report.json about its robots, from what it says of each."""
     failed = [
         f"robot {robot['robot']} ({robot.get('why', robot['verdict'])})"
         for robot in robots
@@ -122,30 +137,31 @@ def fleet_document(flown: FleetFlown) -> dict[str, Any]:
         "schemaVersion": SCHEMA_VERSION,
         "verdict": min((robot["verdict"] for robot in robots), key=ORDER.index),
         "failures": [{"code": "robots_failed", "text": text}] if failed else [],
-        "experiment": experiment.name,
-        "config_sha256": fingerprint(experiment),
-        "code": source.code_hash(),
-        "mode": flown.mode,
-        "seed": experiment.seed,
         "succeeded": len(robots) - len(failed),
-        "robots": robots,
+        "robots": [*robots],
         "median": {name: median(known) for name, known in values.items() if known},
         "worst": {name: max(known) for name, known in values.items() if known},
-        "cell": [cell_numbers(flown, way) for way in flown.log.ways if flown.log.rows],
-        "cloud": flown.cloud,
-        "separation_min_m": separation_min(flown.paths, scene_of(experiment.world).spawn),
     }
 
 
-def cell_numbers(flown: FleetFlown, way: str) -> dict[str, Any]:
-    """Return the numbers of a cell; a wait without end is None."""
-    rows = [row for row in flown.log.rows if row["direction"] == way]
+def cell_rows(log: CellLog, senders: int, *, alone: bool) -> list[dict[str, Any]]:
+    """Return `cell_numbers` of each direction in which packets have left."""
+    used = {row["direction"] for row in log.rows if row["packets"]}
+    return [cell_numbers(log, way, senders, alone=alone) for way in log.ways if way in used]
+
+
+def cell_numbers(log: CellLog, way: str, senders: int, *, alone: bool) -> dict[str, Any]:
+    """Return the numbers of a cell; a wait without end is None.
+
+    `senders` is the number of robots, which are `alone` if there is no other traffic.
+    """
+    rows = [row for row in log.rows if row["direction"] == way]
     names = "packets", "dropped", "busy_ns", "waited_ns"
     packets, dropped, busy_ns, waited_ns = (sum(row[name] for row in rows) for name in names)
-    duration, senders = round(rows[-1]["time_s"] * 1e9) * 1e-9, len(flown.robots)
+    duration = round(rows[-1]["time_s"] * 1e9) * 1e-9
     service, rate = busy_ns * 1e-9 / packets, (packets + dropped) / duration  # [s], offered [1/s]
     expected = dict[str, float]()
-    if way != "both" and not flown.experiment.cell.traffic:
+    if way != "both" and alone:
         expected["nddd1_ms"] = nddd1(senders, senders / rate, service)
         expected["md1_ms"] = md1(rate * service, service)
     return {
@@ -207,7 +223,11 @@ def tables(document: Mapping[str, Any], most: int = 1000) -> Iterator[list[tuple
 
 
 def remarks(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences about cloud and the robots' distance."""
+    """Yield sentences about cell, cloud and the robots' distance."""
+    for way in document["cell"]:
+        if way["load"] > 1 and way["dropped"]:
+            words = f"load {way['load']:.2f}, {way['dropped']} packets dropped"
+            yield f"cell overloaded: {way['direction']}, {words}"
     if (cloud := document["cloud"]) is not None:
         yield (
             f"cloud: cores busy {cloud['utilisation']:.0%}, each robot gets "

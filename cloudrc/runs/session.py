@@ -52,16 +52,25 @@ def read_last_mission(folder: Path) -> tuple[Recording, ResolvedExperiment, bool
         text = f"the recording ends before mission {last.id}, the last one, so there is no report"
         raise InvalidRunError(f"{folder}: {text}; world.mcap and cloud.mcap have the flight before")
     config = folder / "config.yaml"
-    session = read_experiment(config, flown=True)
-    if last.order.plan.by_hand:  # rest at the start, until the report has the setpoints
-        rest = [(time, last.order.plan.legs[0].position) for time in (0.0, 1.0)]
-        drive = write_setpoints(rest, steered_in(session.world))
-        (folder / DRIVE_FILE).write_text(drive, encoding="utf-8")
     about = f"Mission {last.id} ({last.order.name}), the last one of a session"
-    experiment = with_order(session, last.order, about)
+    experiment = experiment_of(read_experiment(config, flown=True), last, folder, about)
     config.write_text(dump(experiment), encoding="utf-8")
     cut_to_last_mission(recording)
     return recording, experiment, not last.ended
+
+
+def experiment_of(
+    session: ResolvedExperiment, mission: MissionRecord, folder: Path, about: str
+) -> ResolvedExperiment:
+    """Return the experiment of a session with one mission; `about` describes it.
+
+    A mission that was driven by hand gets a file of setpoints in `folder`.
+    """
+    if mission.order.plan.by_hand:  # rest at the start, until the report has the setpoints
+        rest = [(time, mission.order.plan.legs[0].position) for time in (0.0, 1.0)]
+        drive = write_setpoints(rest, steered_in(session.world))
+        (folder / DRIVE_FILE).write_text(drive, encoding="utf-8")
+    return with_order(session, mission.order, about)
 
 
 def restore_mission(folder: Path) -> None:

@@ -98,14 +98,16 @@ def render_texts(
     apis=(),
     upgrade=False,
     alias="cloudrc",
+    reused=None,
 ):
     """Render every template: path -> text; raise if the schema refuses the values.
 
-    `alias` is the chart's name as a dependency of a larger chart.
+    `alias` is the chart's name as a dependency of a larger chart. `reused` are all values of an
+    earlier install, in place of this chart's defaults, as with `helm upgrade --reuse-values`.
     """
     import jsonschema
 
-    merged = laid_over(values_of(CHART / "values.yaml"), values or {})
+    merged = laid_over(reused or values_of(CHART / "values.yaml"), values or {})
     jsonschema.Draft7Validator(SCHEMA).validate(merged)
     context = {
         "Values": copy.deepcopy(merged),
@@ -150,11 +152,11 @@ def of_kind(objects, kind):
 
 
 def pod_specs(objects):
-    """Return all pod specs: by component for Deployments and Jobs, by container for Pods."""
+    """Return all pod specs: by container for Pods, by component for all others."""
     specs = {}
     for thing in objects:
         spec = thing.get("spec", {})
-        if thing["kind"] in ("Deployment", "Job"):
+        if thing["kind"] in ("Deployment", "StatefulSet", "Job"):
             component = thing["metadata"]["labels"]["app.kubernetes.io/component"]
             specs[component] = spec["template"]["spec"]
         elif thing["kind"] == "Pod":

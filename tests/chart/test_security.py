@@ -38,7 +38,7 @@ def test_a_release_passes_restricted_with_the_relay(path):
     values["link"] = {**values.get("link", {}), "mode": "relay"}
     objects = render(values)
     pods = pod_specs(objects)
-    assert {"world", "cloud", "test", "test-link"} <= pods.keys()
+    assert {"world", "test"} <= pods.keys()
     for pod in pods.values():
         assert breaches(pod) == []
         assert pod["automountServiceAccountToken"] is False

@@ -10,7 +10,7 @@ DEFAULTS = values_of(CHART / "values.yaml")
 # Values that Helm, Kubernetes or a plug-in defines and checks.
 CONTEXTS = {"podSecurityContext", "containerSecurityContext"}
 EXTRAS = {"extraEnv", "extraVolumes", "extraVolumeMounts"}
-OPEN = {"global", "affinity", "tolerations", "allowFrom", "dns"} | CONTEXTS | EXTRAS
+OPEN = {"global", "affinity", "tolerations", "allowFrom", "dns", "parentRefs"} | CONTEXTS | EXTRAS
 
 
 def parts(node, path=()):

@@ -201,3 +201,12 @@ def test_old_values_of_the_robot_are_marked_as_old(monkeypatch, call):
         "last seen 3.2 s ago at (1.00, 2.00, 0.70) m, with the guard in TRACK: fresh",
         "next: wait",
     ]
+
+
+def test_fly_waits_until_the_robots_of_its_fleet_begin_together(api, mission, monkeypatch):
+    clock = Mock(time=lambda: 100.0)
+    clock.sleep.side_effect = KeyboardInterrupt
+    monkeypatch.setattr(command, "time", clock)
+    mission("fly --mission two.yaml --at 112.5", 130)
+    clock.sleep.assert_called_once_with(12.5)
+    assert api.get("/v1/missions")["missions"] == []

@@ -14,7 +14,9 @@ import pytest
 
 from cloudrc.cluster import client, flight, jobs
 from cloudrc.cluster.client import connect
+from cloudrc.cluster.fleet_mission import ROBOT
 from cloudrc.cluster.jobs import UID_LABEL
+from cloudrc.cluster.pods import INDEX
 from tests.chart.conftest import render
 
 
@@ -111,6 +113,9 @@ class FakeApi:
                     and labels.items() <= body["metadata"].get("labels", {}).items()
                     and all(_value(body, path) == value for path, value in fields.items())
                 ]
+                if "watch" in query:
+                    events = ({"type": "ADDED", "object": body} for body in found)
+                    return 200, "".join(f"{json.dumps(event)}\n" for event in events)
                 return 200, {"items": found}
             if (plural, name) not in self.objects:
                 return 404, {"message": f'{plural} "{name}" not found', "code": 404}
@@ -148,6 +153,13 @@ class FakeApi:
         """Create the pod of a Job as Kubernetes does."""
         uid = self.get("jobs", job)["metadata"]["uid"]
         self.put("pods", pod(f"{job}-x", "mission", labels={UID_LABEL: uid}, **given))
+
+    def end_robot(self, job, robot, code, message):
+        """Create the ended pod of a fleet's Job that flies a robot."""
+        name, own = f"{job}-{robot}", {"batch.kubernetes.io/job-name": job}
+        body = pod(name, "mission", labels=own, state=terminated(code, message))
+        body["metadata"]["annotations"] = {ROBOT: str(robot)}
+        self.put("pods", body)
 
     def at_look(self, number, action, plural="jobs"):
         """Call `action` at the n-th request for objects of a kind, by default Jobs."""
@@ -280,7 +292,12 @@ def deployment(component, **status):
     settled = {"observedGeneration": 1, "replicas": 1, "updatedReplicas": 1}
     return {
         "metadata": {"name": f"cloudrc-{component}", "labels": labels(component)},
-        "spec": {"selector": {}, "template": {"spec": {**POD, "securityContext": SECURE}}},
+        "spec": {
+            "replicas": 1,
+            "selector": {},
+            "serviceName": "",
+            "template": {"spec": {**POD, "securityContext": SECURE}},
+        },
         "status": {**settled, **status},
     }
 
@@ -298,6 +315,7 @@ def api(tmp_path, monkeypatch):
     path.write_text(kubeconfig(server.url))
     monkeypatch.setattr(CONFIG_PLACE, str(path))
     monkeypatch.setattr(jobs, "LOOK_PERIOD", 0.01)
+    monkeypatch.setattr(client.PACE, "rate", 1e9)
     monkeypatch.setattr(client, "RETRIES", {**client.RETRIES, "backoff_factor": 0.01})
     monkeypatch.setattr(flight, "LOOK_PERIOD", 0.01)
     monkeypatch.setattr(flight, "FAILED_LOOKS", 0)
@@ -308,6 +326,29 @@ def api(tmp_path, monkeypatch):
 @pytest.fixture
 def release(api):
     return connect()
+
+
+@pytest.fixture
+def fleet(api, release):
+    """Make a fleet of N robots behind a cell, ready to fly, on the fake API server."""
+
+    def make(robots):
+        for component in ("world", "cloud", "cell"):
+            count = 1 if component == "cell" else robots
+            body = deployment(component, replicas=count, updatedReplicas=count)
+            body["spec"]["replicas"] = count
+            body["status"]["availableReplicas"] = count
+            api.put("statefulsets", body)
+            for number in range(count):
+                one = pod(f"cloudrc-{component}-{number}", component, labels={INDEX: str(number)})
+                api.put("pods", one)
+        values = {"robots": robots, "experiment": {"cell": {"rate_kbit": 500}}}
+        api.put("configmaps", job_template(values))
+        token = base64.b64encode(TOKEN.encode()).decode()
+        api.put("secrets", {"metadata": {"name": "cloudrc-tokens"}, "data": {"operator": token}})
+        return api
+
+    return make
 
 
 def job_template(values=None):

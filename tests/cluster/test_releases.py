@@ -7,15 +7,16 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.cluster.client import ClusterError
+from cloudrc.cluster.jobs import run_job
 from cloudrc.cluster.releases import only_release
 from cloudrc.errors import BadInputError
-from tests.cluster.conftest import deployment, labels
+from tests.cluster.conftest import MISSION, deployment, labels
 
 
 def put(api, name, namespace="demo"):
-    body = deployment("cloud")
+    body = deployment("world")
     body["metadata"]["labels"]["app.kubernetes.io/instance"] = name
-    body["metadata"] |= {"name": f"{namespace}-{name}-cloud", "namespace": namespace}
+    body["metadata"] |= {"name": f"{namespace}-{name}-world", "namespace": namespace}
     api.put("deployments", body)
 
 
@@ -67,3 +68,20 @@ def test_the_releases_of_all_namespaces_are_listed(api, call, monkeypatch):
     assert [line.split()[0] for line in call("list releases -n lab").out.splitlines()] == [
         "NAME", "b",
     ]  # fmt: skip
+
+
+def test_a_fleet_is_one_line_with_its_robots_and_what_its_job_does(fleet, release, call):
+    api = fleet(6)
+    for kind, text in (("experiment", "cell: {rate_kbit: 500}"), ("link", "profile: null")):
+        file = {"experiment": "experiment.yaml", "link": "profile.yaml"}[kind]
+        api.put(
+            "configmaps", {"metadata": {"name": kind, "labels": labels(kind)}, "data": {file: text}}
+        )
+    job = run_job(release, MISSION)
+    api.get("jobs", job)["status"] = {"active": 4, "succeeded": 1, "failed": 1}
+    api.get("statefulsets", "cloudrc-world")["status"]["availableReplicas"] = 5
+    (row,) = json.loads(call("list releases -o json").out)["releases"]
+    assert row["robot"] == "6 pelican"
+    assert row["link"] == "45\u00b125 ms, cell 500"
+    assert row["state"] == "world 5/6 not ready"
+    assert row["mission"] == f"{job} flying 4, done 1, failed 1"

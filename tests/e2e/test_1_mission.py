@@ -21,6 +21,8 @@ from tests.e2e.conftest import (
 )
 from tests.e2e.neighbours import promtool, queries, stranger
 
+pytestmark = pytest.mark.real_time
+
 MISSION = "paper-mission"
 LIMIT_TIME = 360.0
 """Time limit from `kind create cluster` to the completed Job [s]."""

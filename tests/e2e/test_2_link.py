@@ -29,6 +29,8 @@ from tests.e2e.conftest import (
 from tests.e2e.neighbours import queries
 from tools.dashboards import counts
 
+pytestmark = pytest.mark.real_time
+
 SET_WITHIN = 1.0
 """Time limit for `link set` until the change is in force [s]. The fastest of three calls counts,
 because the machine also runs the cluster."""
@@ -93,7 +95,7 @@ def changes(component):
 
 def change_profile(name):
     before = {component: changes(component) for component in ("world", "cloud")}
-    helm("upgrade", NAME, str(CHART), "--reuse-values", f"--set=link.profile={name}")
+    helm("upgrade", NAME, str(CHART), "--reset-then-reuse-values", f"--set=link.profile={name}")
     # The kubelet updates volumes about once a minute; after a change of the pod, at once.
     for component in before:
         one = pod(component)["metadata"]["name"]

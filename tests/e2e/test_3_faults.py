@@ -30,6 +30,8 @@ from tests.e2e.conftest import (
     value,
 )
 
+pytestmark = pytest.mark.real_time
+
 MISSION = load_experiment("paper").mission.model_dump(mode="json")
 PIPES = {name: MISSION[name] for name in ("waypoints", "touch")}
 ENDS_IN = 2.0

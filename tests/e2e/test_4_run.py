@@ -69,6 +69,7 @@ def test_an_image_that_is_not_loaded_is_named(cluster):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize(
     ("name", "setting", "instant"),
     [
@@ -101,6 +102,7 @@ def test_a_run_in_a_cluster_is_that_of_virtual_time(
     assert load_experiment(report / "config.yaml").name == name
 
 
+@pytest.mark.real_time
 def test_a_job_drives_another_robot_through_its_mission(rover):
     (job,) = read("jobs", f"--selector=app.kubernetes.io/instance={ROVER}")["items"]
     lines: list[str] = []

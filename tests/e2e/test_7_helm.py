@@ -19,6 +19,7 @@ def test_the_commands_of_the_notes_work_as_printed(installed):
     assert command(*logs).strip(), "the link names its shaper"
 
 
+@pytest.mark.real_time
 def test_helm_test_flies_and_passes(installed):
     wait_ready(place(), timeout=120.0)
     said = helm("test", NAME, "--timeout=300s", timeout=500.0)

@@ -14,7 +14,7 @@ from tests.e2e.conftest import CHART, NAME, NAMESPACE, ROOT, eventually, helm, k
 @pytest.fixture(scope="module")
 def console(installed):
     """`cloudrc console --cluster`, on the release with a console."""
-    helm("upgrade", NAME, str(CHART), "--reuse-values", "--set", "console.enabled=true")
+    helm("upgrade", NAME, str(CHART), "--reset-then-reuse-values", "--set", "console.enabled=true")
     wait_ready(place(), timeout=120.0)
     words = ["console", "--cluster", "--no-open", "-n", NAMESPACE, "--release", NAME]
     command = [sys.executable, "-m", "cloudrc", *words]

@@ -11,6 +11,7 @@ from tests.tutorials import Reader
 OWN = f"{NAMESPACE}-tutorial"
 
 
+@pytest.mark.real_time
 @pytest.mark.full
 @pytest.mark.usefixtures("cluster")
 def test_the_tutorial_on_a_cluster_works(tmp_path):

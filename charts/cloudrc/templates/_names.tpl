@@ -55,12 +55,13 @@ app.kubernetes.io/part-of: cloudrc
 {{- end }}
 
 {{/* Image of a role, "world", "cloud" or "ros", by digest if set, else by tag. That of cloud may be that
-     of ros. */}}
+     of ros. A registry for all charts comes first. */}}
 {{- define "cloudrc.image" -}}
 {{- $image := .root.Values.image -}}
+{{- $registry := (.root.Values.global | default dict).imageRegistry | default $image.registry -}}
 {{- $ros := .root.Values.cloud.ros -}}
 {{- $of := or (eq .role "ros") (and (eq .role "cloud") $ros.enabled) | ternary $ros.image (get $image .role) -}}
-{{- $name := $image.registry | empty | ternary $of.repository (printf "%s/%s" (trimSuffix "/" $image.registry) $of.repository) -}}
+{{- $name := $registry | empty | ternary $of.repository (printf "%s/%s" (trimSuffix "/" ($registry | default "")) $of.repository) -}}
 {{- if $of.digest -}}
 {{ $name }}@{{ $of.digest }}
 {{- else -}}
@@ -74,6 +75,23 @@ app.kubernetes.io/part-of: cloudrc
 
 {{- define "cloudrc.tokensName" -}}
 {{ .Values.teleop.tokens.existingSecret | default (printf "%s-tokens" (include "cloudrc.fullname" .)) }}
+{{- end }}
+
+{{/* Arguments of the console that name the origins of its page at host names. A Gateway has a
+     certificate, an Ingress may have none. */}}
+{{- define "cloudrc.consoleOrigins" -}}
+{{- with .Values.ingress }}
+{{- if and .enabled .consoleHost }}
+{{- range $scheme := .tlsSecret | empty | ternary (list "http" "https") (list "https") }}
+- --allow-origin={{ $scheme }}://{{ $.Values.ingress.consoleHost }}
+{{- end }}
+{{- end }}
+{{- end }}
+{{- with .Values.gateway }}
+{{- if and .enabled .consoleHost }}
+- --allow-origin=https://{{ .consoleHost }}
+{{- end }}
+{{- end }}
 {{- end }}
 
 {{- define "cloudrc.serviceAccountName" -}}

@@ -5,14 +5,17 @@
 serviceAccountName: {{ include "cloudrc.serviceAccountName" . }}
 automountServiceAccountToken: false
 enableServiceLinks: false
+{{- with (.root.Values.scheduling | default dict).schedulerName }}
+schedulerName: {{ . }}
+{{- end }}
 {{- with .root.Values.podSecurityContext }}
 securityContext:
   {{- toYaml . | nindent 2 }}
 {{- end }}
-{{- with .root.Values.image.pullSecrets }}
+{{- with concat ((.root.Values.global | default dict).imagePullSecrets | default list) .root.Values.image.pullSecrets }}
 imagePullSecrets:
   {{- range . }}
-  - name: {{ . }}
+  - name: {{ kindIs "map" . | ternary (get (kindIs "map" . | ternary . dict) "name") . }}
   {{- end }}
 {{- end }}
 {{- end }}
@@ -136,8 +139,28 @@ affinity:
     medium: Memory
     sizeLimit: 4Mi
 - name: data
+  {{- with include "cloudrc.recordingsClaim" .root }}
+  persistentVolumeClaim:
+    claimName: {{ . }}
+  {{- else }}
   emptyDir:
     sizeLimit: {{ (index .root.Values .component).recordingSizeLimit }}
+  {{- end }}
+{{- end }}
+
+{{/* Name of the claim for recordings and reports; "" without one. */}}
+{{- define "cloudrc.recordingsClaim" -}}
+{{- $made := .Values.recordings.storage | empty | ternary "" (printf "%s-recordings" (include "cloudrc.fullname" .)) -}}
+{{- .Values.recordings.existingClaim | default $made -}}
+{{- end }}
+
+{{/* Mount of this volume; several releases, and the robots of a fleet, may share a claim. */}}
+{{- define "cloudrc.dataMount" -}}
+{{- $folder := printf "subPath: %s" (include "cloudrc.fullname" .) -}}
+{{- if include "cloudrc.isFleet" . -}}
+{{- $folder = printf "subPathExpr: %s/$(ROBOT)" (include "cloudrc.fullname" .) -}}
+{{- end -}}
+{name: data, mountPath: /var/lib/cloudrc{{ if include "cloudrc.recordingsClaim" . }}, {{ $folder }}{{ end }}}
 {{- end }}
 
 {{/* Volume mounts of world and cloud. Argument: the root. */}}
@@ -145,5 +168,5 @@ affinity:
 {{ include "cloudrc.experimentMounts" . }}
 - {name: secret, mountPath: /etc/cloudrc-secret, readOnly: true}
 - {name: run, mountPath: /run/cloudrc}
-- {name: data, mountPath: /var/lib/cloudrc}
+- {{ include "cloudrc.dataMount" . }}
 {{- end }}

@@ -9,7 +9,7 @@
 {{- else -}}
 {{- $namespace := lookup "v1" "Namespace" "" .Release.Namespace | default dict -}}
 {{- $level := dig "metadata" "labels" "pod-security.kubernetes.io/enforce" "" $namespace -}}
-{{- $world := lookup "apps/v1" "Deployment" .Release.Namespace (printf "%s-world" (include "cloudrc.fullname" .)) | default dict -}}
+{{- $world := lookup "apps/v1" (include "cloudrc.isFleet" . | empty | ternary "Deployment" "StatefulSet") .Release.Namespace (printf "%s-world" (include "cloudrc.fullname" .)) | default dict -}}
 {{- $before := dig "spec" "template" "metadata" "annotations" "cloudrc/link-mode" "" $world -}}
 {{- if or (empty $namespace) (has $level (list "baseline" "restricted")) -}}
 relay
@@ -62,7 +62,10 @@ auto
     - --profile=/etc/cloudrc-link/profile.yaml
     - --direction={{ .direction }}
     - --mode={{ $mode }}
-    - --peer={{ include "cloudrc.fullname" .root }}-{{ .peer }}:7400
+    - --peer={{ include "cloudrc.hostOf" (dict "root" .root "component" .peer "number" "$(ROBOT)") }}:7400
+    {{- if include "cloudrc.isFleet" .root }}
+    - --robot=$(ROBOT)
+    {{- end }}
     - --end=127.0.0.1:7400
     - --listen=127.0.0.1:7401
     - --route=/run/cloudrc/route
@@ -86,7 +89,7 @@ auto
   {{- end }}
   resources:
     {{- toYaml .root.Values.link.resources | nindent 4 }}
-  {{- include "cloudrc.extraEnv" .root.Values.link | nindent 2 }}
+  {{- include "cloudrc.env" (list .root .root.Values.link) | nindent 2 }}
   volumeMounts:
     {{- include "cloudrc.experimentMounts" .root | nindent 4 }}
     - {name: link, mountPath: /etc/cloudrc-link, readOnly: true}

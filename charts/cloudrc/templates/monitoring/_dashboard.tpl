@@ -1,4 +1,4 @@
-{{/* A dashboard of Grafana as YAML. Argument: topic, panels, and name and namespace of the release. */}}
+{{/* A dashboard of Grafana as YAML. Argument: topic, panels, isFleet, and name and namespace of the release. */}}
 {{- define "cloudrc.dashboard" -}}
 uid: {{ printf "cloudrc-%s-%s" .topic (printf "%s/%s" .namespace .name | sha256sum | trunc 12) }}
 title: {{ printf "%s (%s/%s)" (title .topic) .namespace .name | quote }}
@@ -13,8 +13,14 @@ templating:
     - name: namespace
       {{- include "cloudrc.variable" (list "label_values(cloudrc_build_info, namespace)" .namespace) | nindent 6 }}
     - name: release
+      {{- if .isFleet }}
+      {{- include "cloudrc.variable" (list "label_values(cloudrc_build_info{namespace=~\"$namespace\"}, release)" .name) | nindent 6 }}
+    - name: robot
+      {{- include "cloudrc.variable" (list "label_values(cloudrc_build_info{release=~\"$release\"}, robot)" "$__all") | nindent 6 }}
+      {{- else }}
       regex: /^(.*)-(?:world|cloud)-[^-]+-[^-]+$/
       {{- include "cloudrc.variable" (list "label_values(cloudrc_build_info{namespace=~\"$namespace\"}, pod)" .name) | nindent 6 }}
+      {{- end }}
 panels:
   {{- range $i, $panel := .panels }}
   - id: {{ add1 $i }}
@@ -36,7 +42,7 @@ panels:
         {{- end }}
     targets:
       {{- range $legend, $query := $panel.queries }}
-      - {refId: {{ $legend | quote }}, legendFormat: {{ $legend | quote }}, expr: {{ $query | quote }}}
+      - {refId: {{ $legend | quote }}, legendFormat: {{ printf "%s%s" $legend ($.isFleet | ternary " {{robot}}" "") | quote }}, expr: {{ $query | quote }}}
       {{- end }}
   {{- end }}
 {{- end }}

@@ -33,9 +33,11 @@
 {{- end }}
 
 {{/* The values' `experiment` with the user's robot and scene, and with the controller of cloud.ros, in
-     the format of `cloudrc run`. */}}
+     the format of `cloudrc run`. That of a fleet lacks the number of robots, which may change without
+     restarts, and has the link of link.profile, because a cell follows no other file. */}}
 {{- define "cloudrc.experiment" -}}
 {{- $experiment := deepCopy .Values.experiment -}}
+{{- $_ := include "cloudrc.takeRetired" (dict "root" . "values" (dict "experiment" $experiment)) -}}
 {{- if and .Values.cloud.ros.enabled (not (include "cloudrc.controllerName" .)) -}}
 {{- $_ := set $experiment "cloud" (set ($experiment.cloud | default dict) "controller" "ros2") -}}
 {{- end -}}
@@ -44,6 +46,12 @@
 {{- with include "cloudrc.ownPath" (dict "root" $ "kind" $kind) -}}
 {{- $_ := set $world $kind . -}}
 {{- $_ := set $experiment "world" $world -}}
+{{- end -}}
+{{- end -}}
+{{- if include "cloudrc.isFleet" . -}}
+{{- $_ := set $experiment "fleet" (omit ($experiment.fleet | default dict) "robots") -}}
+{{- with .Values.link.profile -}}
+{{- $_ := set $experiment "link" (kindIs "map" . | ternary . (dict "profile" .)) -}}
 {{- end -}}
 {{- end -}}
 {{ toYaml $experiment }}

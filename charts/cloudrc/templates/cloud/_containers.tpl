@@ -1,0 +1,237 @@
+{{/* Containers and volumes of a robot's cloud: in a pod of their own, or in that of world if cloud.place is
+     onboard. Argument: the root. */}}
+{{- define "cloudrc.cloudContainers" -}}
+{{- $image := include "cloudrc.image" (dict "root" . "role" "cloud") -}}
+{{- $onboard := include "cloudrc.onboard" . | empty | not -}}
+{{- $metrics := $onboard | ternary 9103 9100 -}}
+# The control loop alone. teleop and `ros` connect through sockets without tokens, so no other
+# container mounts their folder.
+- name: cloud
+  image: {{ $image }}
+  imagePullPolicy: {{ .Values.image.pullPolicy }}
+  args:
+    - cloud
+    - --config=/etc/cloudrc/experiment.yaml
+    {{- include "cloudrc.endArgs" (dict "root" . "component" "cloud") | nindent 4 }}
+    - --teleop=/run/cloudrc-teleop
+    {{- if .Values.ros.enabled }}
+    - --records=/run/cloudrc-records
+    {{- end }}
+    - --key=/etc/cloudrc-secret/key
+    - --record=/var/lib/cloudrc/cloud.mcap
+    - --record-flights
+    - --record-max={{ .Values.cloud.recordingSizeLimit }}
+    - "--metrics=[::]:{{ $metrics }}"
+  ports:
+    {{- if not $onboard }}
+    - {name: tunnel, containerPort: 7400, protocol: UDP}
+    {{- end }}
+    - {name: metrics, containerPort: {{ $metrics }}, protocol: TCP}
+  {{- include "cloudrc.probes" "metrics" | nindent 2 }}
+  terminationMessagePolicy: FallbackToLogsOnError
+  {{- include "cloudrc.containerSecurity" $ | nindent 2 }}
+  resources:
+    {{- toYaml .Values.cloud.resources | nindent 4 }}
+  {{- include "cloudrc.env" (list . .Values.cloud) | nindent 2 }}
+  volumeMounts:
+    {{- include "cloudrc.endMounts" . | replace "name: data" (ternary "name: data-cloud" "name: data" (and $onboard (not (include "cloudrc.recordingsClaim" .)))) | nindent 4 }}
+    - {name: teleop, mountPath: /run/cloudrc-teleop}
+    {{- if .Values.ros.enabled }}
+    - {name: records, mountPath: /run/cloudrc-records}
+    {{- end }}
+    {{- include "cloudrc.extraMounts" .Values.cloud | nindent 4 }}
+- name: teleop
+  image: {{ $image }}
+  imagePullPolicy: {{ .Values.image.pullPolicy }}
+  args:
+    - teleop
+    - --config=/etc/cloudrc/experiment.yaml
+    {{- if include "cloudrc.isFleet" . }}
+    - --robot=$(ROBOT)
+    {{- end }}
+    - --socket=/run/cloudrc-teleop
+    - "--api=[::]:8080"
+    - --tokens=/etc/cloudrc-tokens
+    - --journal=/var/lib/cloudrc-journal/missions.journal
+    - --link=/run/cloudrc/link.json
+    - "--metrics=[::]:9101"
+  ports:
+    - {name: api, containerPort: 8080, protocol: TCP}
+    - {name: teleop-metrics, containerPort: 9101, protocol: TCP}
+  {{- include "cloudrc.probes" "teleop-metrics" | nindent 2 }}
+  terminationMessagePolicy: FallbackToLogsOnError
+  {{- include "cloudrc.containerSecurity" $ | nindent 2 }}
+  resources:
+    {{- toYaml .Values.teleop.resources | nindent 4 }}
+  {{- include "cloudrc.env" (list . .Values.teleop) | nindent 2 }}
+  volumeMounts:
+    {{- include "cloudrc.experimentMounts" . | nindent 4 }}
+    - {name: run, mountPath: /run/cloudrc, readOnly: true}
+    - {name: teleop, mountPath: /run/cloudrc-teleop}
+    - {name: tokens, mountPath: /etc/cloudrc-tokens, readOnly: true}
+    - {name: journal, mountPath: /var/lib/cloudrc-journal{{ include "cloudrc.isFleet" . | empty | ternary "" ", subPathExpr: robot-$(ROBOT)" }}}
+    {{- include "cloudrc.extraMounts" .Values.teleop | nindent 4 }}
+{{- if .Values.cloud.ros.enabled }}
+{{- $controls := dict "root" . "of" .Values.cloud.ros }}
+# cloudrc's own node: it publishes what the controller needs, and hears its answers.
+- name: ros
+  image: {{ $image }}
+  imagePullPolicy: {{ .Values.image.pullPolicy }}
+  args:
+    - policy
+    - drive
+    - --config=/etc/cloudrc/experiment.yaml
+    - --socket=/run/cloudrc-teleop
+  {{- include "cloudrc.rosSettings" $controls | nindent 2 }}
+  volumeMounts:
+    {{- include "cloudrc.experimentMounts" . | nindent 4 }}
+    - {name: teleop, mountPath: /run/cloudrc-teleop}
+    {{- include "cloudrc.rosMounts" (merge (dict "name" "ros") $controls) | nindent 4 }}
+# The user's nodes, which reach nothing but the topics.
+- name: nodes
+  image: {{ $image }}
+  imagePullPolicy: {{ .Values.image.pullPolicy }}
+  command: [with-ros]
+  args:
+    {{- toYaml .Values.cloud.ros.launch | nindent 4 }}
+  {{- include "cloudrc.rosSettings" $controls | nindent 2 }}
+  volumeMounts:
+    {{- include "cloudrc.rosMounts" (merge (dict "name" "nodes") $controls) | nindent 4 }}
+{{- end }}
+{{- if .Values.ros.enabled }}
+{{- $shows := dict "root" . "of" .Values.ros "name" "bridge" }}
+# Publishes cloud's records. It steers through the API, like any operator, or not at all.
+- name: bridge
+  image: {{ include "cloudrc.image" (dict "root" . "role" "ros") }}
+  imagePullPolicy: {{ .Values.image.pullPolicy }}
+  args:
+    - ros
+    - bridge
+    - --config=/etc/cloudrc/experiment.yaml
+    - --records=/run/cloudrc-records
+    - --api=http://127.0.0.1:8080
+    {{- if .Values.ros.steer }}
+    - --token-file=/etc/cloudrc-tokens/operator
+    {{- end }}
+    {{- with .Values.ros.namespace }}
+    - --namespace={{ . }}
+    {{- end }}
+  {{- include "cloudrc.rosSettings" $shows | nindent 2 }}
+  volumeMounts:
+    {{- include "cloudrc.experimentMounts" . | nindent 4 }}
+    - {name: records, mountPath: /run/cloudrc-records}
+    {{- if .Values.ros.steer }}
+    - {name: tokens, mountPath: /etc/cloudrc-tokens, readOnly: true}
+    {{- end }}
+    {{- include "cloudrc.rosMounts" $shows | nindent 4 }}
+{{- end }}
+{{- if .Values.console.enabled }}
+# Serves a page at the pod's loopback address, which only kubectl port-forward reaches, so no
+# probe can. It steers through the API, like any operator. It cannot change the link: 'cloudrc
+# console --cluster' reads the changes that it asks for in its log, and carries them out.
+- name: console
+  image: {{ include "cloudrc.image" (dict "root" . "role" "world") }}
+  imagePullPolicy: {{ .Values.image.pullPolicy }}
+  args:
+    - console
+    - --config=/etc/cloudrc/experiment.yaml
+    - --api=http://127.0.0.1:8080
+    - --token-file=/etc/cloudrc-tokens/operator
+    - --profile=/etc/cloudrc-link/profile.yaml
+    - --port=8090
+    {{- with include "cloudrc.consoleOrigins" . }}
+    {{- . | trimPrefix "\n" | nindent 4 }}
+    {{- end }}
+  env:
+    - {name: HOME, value: /tmp}
+    {{- with .Values.console.extraEnv }}
+    {{- toYaml . | nindent 4 }}
+    {{- end }}
+  terminationMessagePolicy: FallbackToLogsOnError
+  {{- include "cloudrc.containerSecurity" $ | nindent 2 }}
+  resources:
+    {{- toYaml .Values.console.resources | nindent 4 }}
+  volumeMounts:
+    {{- include "cloudrc.experimentMounts" . | nindent 4 }}
+    - {name: tokens, mountPath: /etc/cloudrc-tokens, readOnly: true}
+    - {name: link, mountPath: /etc/cloudrc-link, readOnly: true}
+    - {name: scratch, mountPath: /tmp}
+    {{- include "cloudrc.extraMounts" .Values.console | nindent 4 }}
+{{- end }}
+{{- with .Values.cloud.backgroundLoad }}
+{{- if .enabled }}
+# Burns CPU like a neighbour in the same cloud.
+- name: load
+  image: {{ $image }}
+  imagePullPolicy: {{ $.Values.image.pullPolicy }}
+  command:
+    - sh
+    - -c
+    - |
+      trap 'exit 0' TERM
+      for _ in $(seq {{ .workers }}); do
+        (while :; do :; done) &
+      done
+      wait
+  {{- include "cloudrc.containerSecurity" $ | nindent 2 }}
+  resources:
+    {{- toYaml .resources | nindent 4 }}
+  {{- include "cloudrc.extraEnv" . | nindent 2 }}
+  {{- with include "cloudrc.extraMounts" . }}
+  volumeMounts:
+    {{- . | nindent 4 }}
+  {{- end }}
+{{- end }}
+{{- end }}
+{{- end }}
+
+{{/* Volumes of these containers alone. */}}
+{{- define "cloudrc.cloudVolumes" -}}
+{{- with .Values.cloud.extraVolumes -}}
+{{ toYaml . }}
+{{ end -}}
+- name: teleop
+  emptyDir:
+    medium: Memory
+    sizeLimit: 1Mi
+{{- if .Values.cloud.ros.enabled }}
+- name: tmp-ros
+  emptyDir:
+    sizeLimit: 64Mi
+- name: tmp-nodes
+  emptyDir:
+    sizeLimit: 64Mi
+{{- end }}
+{{- if .Values.ros.enabled }}
+- name: tmp-bridge
+  emptyDir:
+    sizeLimit: 64Mi
+- name: records
+  emptyDir:
+    medium: Memory
+    sizeLimit: 1Mi
+{{- end }}
+{{- if or .Values.cloud.ros.enabled .Values.ros.enabled }}
+- name: shm
+  emptyDir:
+    medium: Memory
+    sizeLimit: 64Mi
+{{- end }}
+{{- if .Values.console.enabled }}
+- name: scratch
+  emptyDir:
+    sizeLimit: 64Mi
+{{- end }}
+- name: tokens
+  secret:
+    secretName: {{ include "cloudrc.tokensName" . }}
+    defaultMode: 0440
+- name: journal
+  {{- if and (include "cloudrc.isFleet" .) (not .Values.teleop.journal.existingClaim) }}
+  emptyDir:
+    sizeLimit: {{ .Values.teleop.journal.size }}
+  {{- else }}
+  persistentVolumeClaim:
+    claimName: {{ .Values.teleop.journal.existingClaim | default (printf "%s-journal" (include "cloudrc.fullname" .)) }}
+  {{- end }}
+{{- end }}

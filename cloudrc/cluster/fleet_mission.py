@@ -1,0 +1,179 @@
+"""Follow the Job of a fleet: a pod per robot, whose completion index is the robot's number.
+
+One watch tells which pods have ended, so the number of requests hardly grows with that of robots:
+only the metrics of each robot are read, once before and once after its mission.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+import time
+from collections.abc import Callable, Iterator
+from http.client import HTTPConnection
+from typing import Any
+
+from cloudrc.cluster.client import PACE, ClusterError, Release, explain_errors, run
+from cloudrc.cluster.jobs import AT, COMPONENT, KILLED_WATCHER, Ended, failure_of, why_waiting
+from cloudrc.cluster.pods import (
+    CELL,
+    DATA,
+    INDEX,
+    METRICS,
+    container_statuses,
+    find_pod,
+    list_pods,
+)
+from cloudrc.errors import CloudrcError, to_one_line
+
+ROBOT = "batch.kubernetes.io/job-completion-index"
+"""Annotation of a Job's pod: the robot that it flies."""
+JOB = "batch.kubernetes.io/job-name"
+"""Label of a Job's pods."""
+ROUND, FIRST = 60, 10
+"""Longest time between two looks at the Job, and until the first pod is missed [s]."""
+COUNTERS = {
+    "age_s": "cloudrc_command_age_seconds_sum",
+    "ages": "cloudrc_command_age_seconds_count",
+    "hold_s": "cloudrc_guard_held_seconds_total",
+}
+"""Name of a number -> counter in the metrics of world."""
+Numbers = dict[str, float]
+
+
+def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> Ended:
+    """Follow the Job of a fleet until all robots have ended; `tell` receives each verdict.
+
+    At the end, `tell` receives the summary that `cloudrc run` prints of a fleet. The exit code is
+    the largest of all robots.
+    """
+    from cloudrc.report.fleet import summarize_fleet
+
+    before = _read_robots(release)
+    job = release.request("get", "jobs", name=name)
+    words = job.spec.template.spec.containers[0].args
+    left = max(float(word.removeprefix(AT)) for word in words if AT in word) - time.time()
+    if left > 0:
+        tell(f"{job.spec.completions} robots begin together in {left:.0f} s")
+        time.sleep(left)
+    known = len(_read_cell(release))
+    ended = {
+        robot: Ended(ClusterError.exit_code, "INTERRUPTED: no_verdict")
+        for robot in range(job.spec.completions)
+    }
+    for robot, end in _ends(release, name, tell):
+        ended[robot] = end
+        tell(f"robot {robot}: {end.message}")
+    record, after = _read_cell(release), _read_robots(release)
+    rows = [
+        {"robot": robot, **_verdict(end), **_flown(before.get(robot), after.get(robot))}
+        for robot, end in ended.items()
+    ]
+    for line in ["", *summarize_fleet(_document(rows, record, known)).splitlines()]:
+        tell(line)
+    return Ended(max(end.exit_code for end in ended.values()), "")
+
+
+def _ends(release: Release, name: str, tell: Callable[[str], None]) -> Iterator[tuple[int, Ended]]:
+    """Yield robot and end of each mission, until all robots or the Job have ended."""
+    seen, robots, told = set[str](), set[int](), set[str]()
+    while True:
+        job = release.request("get", "jobs", name=name)
+        is_over = failure_of(job) is not None
+        if not (seen or is_over):
+            why_waiting(release, job, [])  # raises if the cluster denies the pods
+        limit = 1 if is_over else ROUND if seen else FIRST
+        for pod in release.watch("pods", limit, label_selector=f"{JOB}={name}"):
+            waits = why_waiting(release, job, [pod])
+            if waits and waits not in told:
+                told.add(waits)
+                tell(waits)
+            uid, gone = pod.metadata.uid, pod.metadata.deletion_timestamp is not None
+            own = (each for each in container_statuses(pod) if each.name == COMPONENT)
+            end = next((each.state.terminated for each in own), None)
+            if (end is None and not gone) or uid in seen:
+                continue
+            seen.add(uid)
+            if end is None or end.exit_code in KILLED_WATCHER:  # a new pod follows the mission
+                break
+            robots.add(number := int(pod.metadata.annotations[ROBOT]))
+            yield number, Ended(end.exit_code, to_one_line(end.message) or end.reason)
+            if len(robots) == job.spec.completions:
+                return
+        if is_over:
+            return
+
+
+def _verdict(end: Ended) -> dict[str, str]:
+    """Return the verdict of a robot and, after a failure, the codes of its causes."""
+    from cloudrc.metrics.verdict import EXIT_CODES
+
+    named = {code: verdict for verdict, code in EXIT_CODES.items()}
+    codes = re.findall(r"(?:^[A-Z]+|; also) ?:? (\w+)", end.message) if end.exit_code else []
+    why = {"why": ", ".join(codes)} if codes else {}
+    return {"verdict": named.get(end.exit_code, "interrupted"), **why}
+
+
+def _flown(before: Numbers | None, after: Numbers | None) -> Numbers:
+    """Return the numbers of a robot's mission from its counters before and after it."""
+    if before is None or after is None:
+        return {}
+    new = {name: after[name] - before[name] for name in COUNTERS}
+    age = {"age_ms": new["age_s"] / new["ages"] * 1e3} if new["ages"] > 0 else {}
+    return {"hold_s": new["hold_s"], **age}
+
+
+def _document(rows: list[dict[str, Any]], record: list[dict[str, str]], known: int) -> Any:
+    """Return what the summary of a fleet needs; its cell's rows from `known` on are its flight."""
+    from cloudrc.link.cell import CellLog
+    from cloudrc.report.fleet import cell_rows, judge_robots
+
+    log, start = CellLog.read(record[known:]), float(record[known - 1]["time_s"]) if known else 0.0
+    for row in log.rows:
+        row["time_s"] -= start
+    for row in rows if log.rows else ():
+        row["dropped"] = sum(log.dropped[way, row["robot"]] for way in log.ways)
+    cell = cell_rows(log, len(rows), alone=False)  # others may send, too
+    return {**judge_robots(rows), "cell": cell, "cloud": None, "separation_min_m": None}
+
+
+def _read_cell(release: Release) -> list[dict[str, str]]:
+    """Read what the cell has recorded so far; [] without a cell, or if it does not answer."""
+    if not release.find("statefulsets", CELL):
+        return []
+    try:
+        pod = find_pod(release, CELL).metadata.name
+        words = ["exec", pod, f"--container={CELL}", "--", "cat", f"{DATA}/cell.csv"]
+        text = run("kubectl", [*release.flags, *words])
+    except CloudrcError:  # the verdicts count
+        return []
+    return [*csv.DictReader(text.splitlines()[: text.count("\n")])]  # the last line may be cut
+
+
+def _read_robots(release: Release) -> dict[int, Numbers]:
+    """Read the counters of each robot's world; leave out a robot that does not answer."""
+    found = dict[int, Numbers]()
+    for pod in list_pods(release, "world"):
+        try:
+            text = read_page(release, pod.metadata.name, METRICS["world"]["world"])
+        except ClusterError:
+            continue
+        lines = (line.rpartition(" ") for line in text.splitlines() if not line.startswith("#"))
+        values = {name: float(value) for name, _, value in lines}
+        number = int(pod.metadata.labels[INDEX])
+        found[number] = {name: values.get(metric, 0.0) for name, metric in COUNTERS.items()}
+    return found
+
+
+def read_page(release: Release, pod: str, port: int) -> str:
+    """Read the metrics at a port of a pod, over one connection through the API server."""
+    from kubernetes import client, stream
+
+    PACE.wait()
+    call = client.CoreV1Api(release.client).connect_get_namespaced_pod_portforward
+    with explain_errors("forward ports", release.where):
+        forward = stream.portforward(call, pod, release.namespace, ports=str(port))
+        connection = HTTPConnection(pod, port)
+        connection.sock = forward.socket(port)
+        connection.request("GET", "/metrics")
+        return connection.getresponse().read().decode()

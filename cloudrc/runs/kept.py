@@ -1,0 +1,180 @@
+"""Reports of a release's missions: the Job of a mission keeps one, anybody else fetches one.
+
+With the chart's `recordings`, a volume has world.mcap and cloud.mcap of the pods, and the folder
+`missions` with a folder per report, named TIME-MISSION. Else the pods have the recordings.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from cloudrc.cluster.client import Release, run
+from cloudrc.cluster.flight import FETCHES, FLUSH, fetch_all, report_flight
+from cloudrc.cluster.link import EXPERIMENT
+from cloudrc.cluster.pods import DATA, find_pod
+from cloudrc.config.load import load_link, read_experiment, robot_settings
+from cloudrc.config.profile import DIRECTIONS
+from cloudrc.config.resolved import ResolvedExperiment, dump
+from cloudrc.config.schema import MissionConfig
+from cloudrc.errors import BadInputError, InvalidRunError
+from cloudrc.link.follow import PROFILE
+from cloudrc.outside.document import parse_yaml, write_yaml
+from cloudrc.record.columns import Recording
+from cloudrc.record.merge import cut_to_last_mission, merge
+from cloudrc.report.document import ENVIRONMENT_FILE
+from cloudrc.runs.session import experiment_of
+from cloudrc.teleop.store import MissionRecord, open_store
+
+REPORTS = "missions"
+"""Folder of the reports in the volume."""
+FILES = ("config.yaml", "report.json", ENVIRONMENT_FILE, "mission.mcap")
+"""Files of a kept report. Its page has to be drawn: the images have no matplotlib."""
+JOURNAL = "/var/lib/cloudrc-journal/missions.journal"
+"""File of the missions in the container teleop; its newest events are in the one with -wal."""
+BEFORE = 30.0
+"""Time before the first event and after the last one of a mission that is read, too [s]."""
+DAY = 86_400.0
+"""A day [s]."""
+
+
+def keep_report(
+    data: Path,
+    files: tuple[Path, Path],
+    order: Mapping[str, Any],
+    view: Mapping[str, Any],
+    *,
+    keep: int,
+    days: float,
+) -> Path:
+    """Write the report of the mission that has just ended, and remove old ones; return its folder.
+
+    Args:
+        data: The volume with the recordings that the pods write.
+        files: The release's experiment and the profile of its link.
+        order: The mission as it was posted.
+        view: The mission as the API shows it.
+        keep: Largest number of reports in the volume.
+        days: Largest age of a report [days].
+    """
+    experiment = _experiment(*files, order)
+    _remove_old(data / REPORTS, keep - 1, days)
+    seconds = max((event["time_s"] for event in view["events"]), default=0.0) + 2 * BEFORE
+    for _ in range(FETCHES):
+        time.sleep(FLUSH)
+        recording = merge(data / "world.mcap", data / "cloud.mcap", round(seconds * 1e9))
+        if cut_to_last_mission(recording, being_written=True):
+            break
+    stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+    folder = data / REPORTS / f"{stamp}-{view['id']}"
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+    report_flight(experiment, folder, recording, False, page=False, figures=False)
+    return folder
+
+
+def _experiment(
+    experiment: Path, profile: Path, order: Mapping[str, Any], robot: int | None = None
+) -> ResolvedExperiment:
+    """Return a release's experiment with its link, and with the waypoints of `order`, if any.
+
+    `robot` is the number of a robot in a fleet.
+    """
+    tree: dict[str, Any] = parse_yaml(experiment.read_text("utf-8"), experiment.name)[0] or {}
+    link = load_link(profile, experiment).model_dump(mode="json", include=set(DIRECTIONS))
+    tree["link"] = link
+    tree.setdefault("name", order.get("name", "mission").replace("/", "-"))
+    if "waypoints" in order:
+        tree["mission"] = {key: order[key] for key in MissionConfig.model_fields if key in order}
+        if limit := order.get("time_limit_s"):
+            tree["criteria"] = {**(tree.get("criteria") or {}), "time_limit_s": limit}
+    with TemporaryDirectory() as name:
+        config = Path(name) / "config.yaml"
+        config.write_text(write_yaml(tree), encoding="utf-8")
+        return read_experiment(config, robot_settings(robot), flown=True)
+
+
+def _remove_old(reports: Path, keep: int, days: float) -> None:
+    """Remove all but the newest `keep` reports, and those that are older than `days` [days]."""
+    kept = sorted(each for each in reports.glob("*-*") if each.is_dir())
+    for place, folder in enumerate(reversed(kept)):
+        if place >= keep or folder.stat().st_mtime < time.time() - days * DAY:
+            shutil.rmtree(folder)
+
+
+def fetch_mission(
+    release: Release, mission: str, folder: Path, tell: Callable[[str], None]
+) -> None:
+    """Fetch a flown mission of a release into a folder: recording, config.yaml and report.json.
+
+    `mission` is an id such as m3, or the name of a kept report; "" means the last mission. `tell`
+    gets a line about logs that cannot be fetched.
+
+    Raises:
+        BadInputError: If there is no such mission, or if it has not ended.
+        InvalidRunError: If the recordings of the pods begin after the mission.
+    """
+    known = _missions(release)
+    flown = [each.id for each in known.values() if "started" in each.happened]
+    wanted = mission or (flown[-1] if flown else "")
+    pod = find_pod(release, "cloud").metadata.name
+    inside = [*release.flags, "exec", pod, "--container=cloud", "--"]
+    names = run("kubectl", [*inside, "sh", "-c", f"ls {DATA}/{REPORTS} 2>/dev/null || true"])
+    kept = [name for name in names.split() if name == wanted or name.endswith(f"-{wanted}")]
+    if wanted and kept:
+        for name in FILES:
+            with (folder / name).open("wb") as file:
+                path = f"{DATA}/{REPORTS}/{kept[-1]}/{name}"
+                run("kubectl", [*inside, "cat", path], stdout=file)
+        return
+    if wanted not in flown:
+        raise BadInputError(
+            f"{release} has flown no mission '{wanted}'; it has flown: {', '.join(flown) or 'none'}"
+        )
+    if not known[wanted].ended:
+        raise BadInputError(f"mission {wanted} has not ended; wait for its end")
+    _report_of_pods(release, known[wanted], folder, tell)
+
+
+def _report_of_pods(
+    release: Release, record: MissionRecord, folder: Path, tell: Callable[[str], None]
+) -> None:
+    with TemporaryDirectory() as name:
+        files = Path(name) / EXPERIMENT, Path(name) / PROFILE
+        for component in ("experiment", "link"):
+            for found in release.find("configmaps", component):
+                for key, text in (found.data or {}).items():
+                    (Path(name) / key).write_text(text, encoding="utf-8")
+        session = _experiment(*files, {"name": record.order.name or release.name}, release.robot)
+        about = f"Mission {record.id} ({record.order.name}) of {release.name}"
+        experiment = experiment_of(session, record, folder, about)
+        recording = fetch_all(release, folder, tell, want_end=True, number=record.number)
+    _check_seen(recording, record)
+    (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+    report_flight(experiment, folder, recording, False, page=False, figures=False)
+
+
+def _check_seen(recording: Recording, record: MissionRecord) -> None:
+    if record.number not in recording["/telemetry"]["mission_id"]:
+        raise InvalidRunError(
+            f"the pods' recordings lack mission {record.id}: a pod has been replaced since, or its "
+            "volume was full; keep recordings by the value recordings.storage of the chart"
+        )
+
+
+def _missions(release: Release) -> dict[str, MissionRecord]:
+    """Read the missions that a release knows: id -> mission, the oldest first."""
+    pod = find_pod(release, "cloud").metadata.name
+    with TemporaryDirectory() as name:
+        journal = Path(name) / "missions.journal"
+        for ending in ("", "-wal"):
+            with Path(f"{journal}{ending}").open("wb") as file:
+                words = ["exec", pod, "--container=teleop", "--", "cat", f"{JOURNAL}{ending}"]
+                run("kubectl", [*release.flags, *words], stdout=file)
+        with closing(open_store(journal, b"")) as store:
+            return store.missions

@@ -1,0 +1,157 @@
+"""A fleet: StatefulSets, one cell, one Job; a single robot renders as before there were fleets."""
+
+import json
+import re
+import shlex
+
+import pytest
+import yaml
+
+from cloudrc.cli.parser import build_parser
+from tests.chart.conftest import CHART, containers, notes, of_kind, pod_specs, render
+from tests.chart.test_render import helm
+
+BEFORE = CHART.parents[1] / "tests" / "fixtures" / "charts" / "cloudrc-before-fleet.tgz"
+CELL = {"cell": {"rate_kbit": 800}}
+ON = {"enabled": True}
+ALL = {
+    "dashboards": ON,
+    "mission": ON,
+    "metrics": {"podMonitor": {**ON, "force": True}, "prometheusRule": {**ON, "force": True}},
+}
+FLEET = {**ALL, "robots": 3, "experiment": CELL}
+ONBOARD = {**ALL, "experiment": {"cloud": {"place": "onboard"}}}
+
+
+def manifests(chart, path):
+    """Render with helm: (kind, name) -> text, without what is random or tells the version."""
+    done = helm("template", "demo", str(chart), "--namespace", "lab", "--values", str(path))
+    assert done.returncode == 0, done.stderr
+    random = r"(?m)^  (key|operator|reader): .*$|^ +helm.sh/chart: .*$"
+    texts = re.split(r"(?m)^---\n# Source: .*\n", re.sub(random, "", done.stdout))[1:]
+    found = ((yaml.safe_load(each), each) for each in texts)
+    return {(thing["kind"], thing["metadata"]["name"]): each for thing, each in found}
+
+
+def test_one_robot_without_a_cell_renders_byte_by_byte_as_before_fleets(tmp_path):
+    path = tmp_path / "values.yaml"
+    values = {**ALL, "console": ON, "cloud": {"backgroundLoad": ON, "ros": ON}}
+    path.write_text(json.dumps(values))
+    before = manifests(BEFORE, path)
+    assert len(before) > 25
+    path.write_text(json.dumps({**values, "robots": 1}))
+    assert manifests(CHART, path).items() >= before.items()
+
+
+def test_a_fleet_has_few_objects_one_set_of_rules_and_five_dashboards():
+    objects = render({**FLEET, "robots": 50})
+    sets = of_kind(objects, "StatefulSet")
+    robots = {name: one["spec"]["replicas"] for name, one in sets.items()}
+    assert robots == {"world": 50, "cloud": 50, "cell": 1}
+    # Kubernetes adds an EndpointSlice per Service and family and a revision per set, Helm a Secret.
+    assert len(objects) + 2 * len(of_kind(objects, "Service")) + len(sets) + 1 <= 60
+    (rules,) = of_kind(objects, "PrometheusRule").values()
+    assert sum(len(group["rules"]) for group in rules["spec"]["groups"]) == 22
+    maps = [name for name in of_kind(objects, "ConfigMap") if name.startswith("grafana-")]
+    assert len(maps) == 5
+
+
+def test_every_tunnel_of_a_fleet_goes_through_the_cell_alone():
+    objects = render(FLEET)
+    pods, policies = pod_specs(objects), of_kind(objects, "NetworkPolicy")
+    for end, port in (("world", 7400), ("cloud", 8400)):
+        assert "link" not in containers(pods[end])
+        arguments = containers(pods[end])[end]["args"]
+        assert {f"--peer=demo-cloudrc-cell:{port}", "--robot=$(ROBOT)"} <= {*arguments}
+        spec = policies[end]["spec"]
+        for way, rules in (("from", spec["ingress"]), ("to", spec["egress"])):
+            tunnel = [r for r in rules if {"UDP"} == {p["protocol"] for p in r["ports"]}]
+            (rule,) = (each for each in tunnel if each["ports"][0]["port"] != 53)
+            (peer,) = rule[way]
+            labels = peer["podSelector"]["matchLabels"]
+            assert labels["app.kubernetes.io/component"] == "cell"
+
+
+def test_one_indexed_job_flies_each_robot_through_its_own_api():
+    (job,) = of_kind(render(FLEET), "Job").values()
+    spec = job["spec"]
+    assert (spec["completionMode"], spec["completions"], spec["parallelism"]) == ("Indexed", 3, 3)
+    assert (spec["backoffLimitPerIndex"], spec.get("backoffLimit")) == (0, None)
+    host = "http://demo-cloudrc-cloud-$(JOB_COMPLETION_INDEX).demo-cloudrc-cloud:8080"
+    assert f"--api={host}" in spec["template"]["spec"]["containers"][0]["args"]
+
+
+def test_on_board_the_controller_is_in_the_world_pod_without_a_link():
+    objects = render({**ONBOARD, "cloud": {"resources": {"limits": {"cpu": "200m"}}}})
+    assert of_kind(objects, "StatefulSet").keys() == {"world"}
+    assert "cloud" not in of_kind(objects, "NetworkPolicy")
+    found = containers(pod_specs(objects)["world"])
+    assert [*found] == ["world", "cloud", "teleop"]
+    assert found["cloud"]["resources"]["limits"]["cpu"] == "200m"
+    (experiment,) = (
+        m["data"] for n, m in of_kind(objects, "ConfigMap").items() if n == "experiment"
+    )
+    for end, other in (("world", "cloud"), ("cloud", "world")):
+        listens = next(word for word in found[other]["args"] if word.startswith("--listen="))
+        assert listens == f"--listen={experiment[f'route-{end}']}"
+
+
+def test_prometheus_tells_robots_and_releases_apart():
+    objects = render(FLEET)
+    (monitor,) = of_kind(objects, "PodMonitor").values()
+    for each in monitor["spec"]["podMetricsEndpoints"]:
+        robot, release = each["relabelings"]
+        assert robot["targetLabel"] == "robot"
+        for text, number in (("world;7", "7"), ("cloud;0", "0"), ("cell;0", None)):
+            found = re.fullmatch(robot["regex"], text)
+            assert (found and found[1]) == number
+        assert release == {"targetLabel": "release", "replacement": "demo"}
+    data = of_kind(objects, "ConfigMap")["grafana-link"]["data"]
+    board = json.loads(next(iter(data.values())))
+    names = [variable["name"] for variable in board["templating"]["list"]]
+    assert names == ["datasource", "namespace", "release", "robot"]
+    assert any("worst and median robot" in panel["title"] for panel in board["panels"])
+    for panel in board["panels"]:
+        for target in panel["targets"]:
+            selectors = re.findall(r"{(.*?)}", target["expr"])
+            assert all('release=~"$release",robot=~"$robot"' in each for each in selectors)
+
+
+def test_more_robots_restart_nothing():
+    def annotations(robots):
+        found = of_kind(render({**FLEET, "robots": robots}), "StatefulSet").values()
+        return [one["spec"]["template"]["metadata"]["annotations"] for one in found]
+
+    assert annotations(3) == annotations(4)
+
+
+def test_queue_and_scheduler_are_those_of_the_values():
+    given = {"queueName": "lab", "schedulerName": "volcano"}
+    objects = render({**FLEET, "scheduling": given})
+    assert {pod["schedulerName"] for pod in pod_specs(objects).values()} == {"volcano"}
+    for kind, count in (("StatefulSet", 3), ("Job", 1)):
+        labels = [one["metadata"]["labels"] for one in of_kind(objects, kind).values()]
+        assert [each["kueue.x-k8s.io/queue-name"] for each in labels] == ["lab"] * count
+    template = of_kind(objects, "ConfigMap")["mission-job"]["data"]["job.yaml"]
+    assert yaml.safe_load(template)["metadata"]["labels"] == {"kueue.x-k8s.io/queue-name": "lab"}
+
+
+@pytest.mark.parametrize(
+    ("experiment", "words"),
+    [
+        ({**CELL, "fleet": {"only": 0}}, "leave it out, or set robots=1"),
+        ({**CELL, "cloud": {"place": "onboard"}}, "leave one out"),
+    ],
+)
+def test_a_fleet_that_cannot_fly_is_refused(experiment, words):
+    with pytest.raises(Exception, match=words):
+        render({"robots": 2, "experiment": experiment})
+
+
+def test_the_notes_of_a_fleet_are_commands_for_it():
+    text = notes(FLEET, release="flight")
+    assert "has 3 robots behind one cell" in text
+    wait, fly, logs = (shlex.split(line) for line in text.splitlines() if line.startswith("  "))
+    assert wait[wait.index("--selector") + 1].startswith("app.kubernetes.io/instance=flight,")
+    assert build_parser([fly[1]]).parse_args(fly[1:]).release == "flight"
+    assert "statefulset/flight-cloudrc-cell" in logs

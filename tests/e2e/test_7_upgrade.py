@@ -1,0 +1,80 @@
+"""A release of an earlier chart, packed, is upgraded and rolled back in flight."""
+
+import tarfile
+
+import pytest
+
+from cloudrc.cluster.client import connect
+from cloudrc.cluster.flight import wait_ready
+from cloudrc.cluster.jobs import follow, run_job
+from tests.e2e.conftest import CHART, NAMESPACE, ROOT, eventually, helm, job_log, read
+
+OLD = "cloudrc-old"
+"""The release that is upgraded."""
+AUDIT = "--audit=/var/lib/cloudrc-journal/audit.jsonl"
+"""An argument of earlier charts, for the images of that time."""
+POINTS = [
+    {"position_m": [0.5, 0.0, 0.7]},
+    {"position_m": [0.5, 1.0, 0.7], "dwell_s": 40.0, "time_limit_s": 200.0},
+]
+"""The second point takes longer than upgrade and rollback."""
+
+
+@pytest.fixture
+def chart(before, tmp_path):
+    """The earlier chart; another argument takes the place of one that today's images lack."""
+    with tarfile.open(ROOT / "tests" / "fixtures" / "charts" / f"cloudrc-{before}.tgz") as packed:
+        packed.extractall(tmp_path, filter="data")
+    cloud = tmp_path / "cloudrc" / "templates" / "cloud" / "deployment.yaml"
+    cloud.write_text(cloud.read_text().replace(AUDIT, '"--metrics=[::]:9101"'))
+    yield tmp_path / "cloudrc"
+    helm("uninstall", OLD, "--wait")
+
+
+def ends():
+    """Return component -> identity of its pod, which changes if it restarts."""
+    release = f"app.kubernetes.io/instance={OLD},app.kubernetes.io/component in (world,cloud)"
+    found = [p for p in read("pods", f"--selector={release}")["items"]]
+    alive = [p["metadata"] for p in found if "deletionTimestamp" not in p["metadata"]]
+    return {p["labels"]["app.kubernetes.io/component"]: p["uid"] for p in alive}
+
+
+def changed(before, *command):
+    """Run a command of helm; return the components whose pods are replaced by it."""
+    release = connect(None, NAMESPACE, OLD)
+    helm(*command)
+    wait_ready(release, timeout=120.0)
+    return {component for component, uid in ends().items() if before[component] != uid}
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize(
+    ("before", "keeps", "restarts"),
+    [
+        ("before-fleet", "--reuse-values", set()),
+        pytest.param("before-light", "--reset-then-reuse-values", set(), marks=pytest.mark.full),
+        pytest.param("before-right", "--reuse-values", {"cloud"}, marks=pytest.mark.full),
+    ],
+)
+def test_a_mission_goes_on_while_its_release_is_upgraded_and_rolled_back(
+    installed, chart, before, keeps, restarts
+):
+    release = connect(None, NAMESPACE, OLD)
+    helm("install", OLD, str(chart), "--set=link.mode=relay")
+    wait_ready(release, timeout=120.0)
+    run_job(release, {"name": "old", "time_limit_s": 300.0, "waypoints": POINTS}, name="old")
+    eventually(lambda: "waypoint 1 of 2 reached" in job_log("old"), "the mission flies", 90.0)
+    assert changed(ends(), "upgrade", OLD, str(CHART), keeps) == restarts
+    assert changed(ends(), "rollback", OLD, "1") == restarts
+    assert "waypoint 2 of 2" not in job_log("old")
+    end = follow(release, "old", lambda line: None)
+    assert end.exit_code == 0, end
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("before", ["before-guests"])
+def test_the_earliest_chart_is_upgraded_with_both_pods(installed, chart, before):
+    helm("install", OLD, str(chart), "--set=link.mode=relay,world.epochs.a=b")
+    wait_ready(connect(None, NAMESPACE, OLD), timeout=120.0)
+    assert changed(ends(), "upgrade", OLD, str(CHART), "--reuse-values") == {"world", "cloud"}
+    assert "world.epochs" in helm("get", "notes", OLD)
