@@ -58,6 +58,9 @@ def name_extra(error: ModuleNotFoundError) -> MissingPrerequisiteError | None:
 
 
 def _error(purpose: str, modules: Iterable[str], extras: Iterable[str]) -> MissingPrerequisiteError:
+    extras = list(extras)
+    if set(SIM) <= set(extras):
+        extras = ["sim", *(extra for extra in extras if extra not in SIM)]
     return MissingPrerequisiteError(
         f"{purpose} needs {', '.join(modules)} (not installed); "
         f"run: pip install 'cloudrc[{','.join(extras)}]'"

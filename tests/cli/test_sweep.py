@@ -118,10 +118,10 @@ def test_failed_flights_are_recorded_if_asked_for(write_sweep, call):
 
 
 def test_an_error_becomes_a_row_and_the_others_fly(write_sweep, monkeypatch, call):
-    def fly(experiment, *given):
+    def fly(experiment, *given, **named):
         if experiment.seed == 2:
             raise RuntimeError("no\x1b luck")
-        return assemble(experiment, *given)
+        return assemble(experiment, *given, **named)
 
     monkeypatch.setattr("cloudrc.assembly.assemble", fly)
     told = call("sweep run --out grid", write_sweep(ONE, seeds=[2, 1]), code=1).err
@@ -138,10 +138,10 @@ def test_an_error_becomes_a_row_and_the_others_fly(write_sweep, monkeypatch, cal
 def broken_machine(monkeypatch):
     """Let the flight with seed 2 meet an error of the machine; return the error's text."""
 
-    def fly(experiment, *given):
+    def fly(experiment, *given, **named):
         if experiment.seed == 2:
             raise MemoryError
-        return assemble(experiment, *given)
+        return assemble(experiment, *given, **named)
 
     monkeypatch.setattr("cloudrc.assembly.assemble", fly)
     return "memory ran out"
