@@ -25,7 +25,7 @@ from tests.e2e.conftest import (
 pytestmark = pytest.mark.real_time
 
 NAME = "fleet"
-POINT = {"position_m": [0.5, 0.0, 0.7], "tolerance_m": 0.1, "dwell_s": 6.0}
+POINT = {"position_m": [0.5, 0.0, 0.7], "tolerance_m": 0.1, "dwell_s": 3.0}
 MISSION = {"start": "spawn", "waypoints": [POINT]}
 SETS = [f"statefulset/{NAME}-cloudrc-{component}" for component in ("world", "cloud")]
 
