@@ -9,13 +9,11 @@ import json
 import logging
 import shutil
 import subprocess
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from threading import Lock
 from typing import IO, Any
 
 from cloudrc.drivers.machine import await_or_kill
@@ -72,27 +70,6 @@ class ExpiredError(ClusterError):
 
 class NoAnswerError(ClusterError):
     """Report that the API server does not answer; what runs in the cluster goes on."""
-
-
-class Pace:
-    """Lets `rate` requests a second pass, after `burst` at once, as clients of Kubernetes do."""
-
-    def __init__(self, rate: float, burst: int) -> None:
-        """Set the rate [1/s] and the number of requests that need not wait."""
-        self.rate, self._burst = rate, burst
-        self._next, self._lock = 0.0, Lock()
-
-    def wait(self) -> None:
-        """Sleep until the next request may be sent."""
-        with self._lock:
-            now = time.monotonic()
-            self._next = max(self._next, now - self._burst / self.rate) + 1.0 / self.rate
-            pause = self._next - now
-        time.sleep(max(0.0, pause))
-
-
-PACE = Pace(5.0, 20)
-"""Pace of this process's requests to the API server, whatever the number of robots is."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +140,9 @@ class Release:
         Raises:
             ClusterError: If the API server denies it or does not answer.
         """
-        noun = _KINDS[kind][1]
+        from kubernetes import client
+
+        name, noun = _KINDS[kind]
         scope, where = {"namespace": self.namespace}, self.where
         method = f"{'read' if verb == 'get' else verb}_namespaced_{noun}"
         if verb == "list all":
@@ -171,31 +150,10 @@ class Release:
             method = f"list_{noun}_for_all_namespaces"
         elif kind in ("namespaces", "nodes", "selfsubjectaccessreviews"):
             scope, method = {}, method.replace("_namespaced", "")
-        call = self._method(kind, method)
+        call = getattr(getattr(client, name)(self.client), method)
         with explain_errors(f"{verb.partition(' ')[0]} {kind}", where):
             answer = call(_request_timeout=REQUEST_TIMEOUT, **scope, **arguments)
         return answer.items if verb.startswith("list") else answer
-
-    def _method(self, kind: str, name: str) -> Any:
-        """Return the method `name` of the class of the Kubernetes client for `kind`, in turn."""
-        from kubernetes import client
-
-        PACE.wait()
-        return getattr(getattr(client, _KINDS[kind][0])(self.client), name)
-
-    def watch(self, kind: str, limit: int, **arguments: Any) -> Iterator[Any]:
-        """Yield each object of a kind, now and whenever it changes, for `limit` [s].
-
-        One request does it. `arguments` are those of `request`.
-        """
-        from kubernetes import watch
-
-        call = self._method(kind, f"list_namespaced_{_KINDS[kind][1]}")
-        limits = {"timeout_seconds": limit, "_request_timeout": limit + REQUEST_TIMEOUT}
-        with explain_errors(f"watch {kind}", self.where):
-            watcher: Any = watch.Watch  # not annotated
-            stream = watcher().stream(call, self.namespace, **limits, **arguments)
-            yield from (event["object"] for event in stream)
 
     def find(self, kind: str, component: str) -> list[Any]:
         """List the objects of one kind, such as "pods", that belong to a component."""

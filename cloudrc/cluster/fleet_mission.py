@@ -1,7 +1,7 @@
 """Follow the Job of a fleet: a pod per robot, whose completion index is the robot's number.
 
-One watch tells which pods have ended, so the number of requests hardly grows with that of robots:
-only the metrics of each robot are read, once before and once after its mission.
+A watch tells which pods have ended: two requests a second for any number of robots. The metrics of
+each robot are read once before and once after its mission, five robots a second.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ from collections.abc import Callable, Iterator
 from http.client import HTTPConnection
 from typing import Any
 
-from cloudrc.cluster.client import PACE, ClusterError, Release, explain_errors, run
+from cloudrc.cluster.client import ClusterError, Release, explain_errors, run
 from cloudrc.cluster.jobs import AT, COMPONENT, KILLED_WATCHER, Ended, failure_of, why_waiting
 from cloudrc.cluster.pods import (
     CELL,
     DATA,
     INDEX,
     METRICS,
+    PodWatch,
     container_statuses,
     find_pod,
     list_pods,
@@ -30,8 +31,8 @@ ROBOT = "batch.kubernetes.io/job-completion-index"
 """Annotation of a Job's pod: the robot that it flies."""
 JOB = "batch.kubernetes.io/job-name"
 """Label of a Job's pods."""
-ROUND, FIRST = 60, 10
-"""Longest time between two looks at the Job, and until the first pod is missed [s]."""
+PAUSE = 0.2
+"""Time between the requests for the metrics of two robots [s]: 5 requests a second."""
 COUNTERS = {
     "age_s": "cloudrc_command_age_seconds_sum",
     "ages": "cloudrc_command_age_seconds_count",
@@ -77,30 +78,25 @@ def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> En
 def _ends(release: Release, name: str, tell: Callable[[str], None]) -> Iterator[tuple[int, Ended]]:
     """Yield robot and end of each mission, until all robots or the Job have ended."""
     seen, robots, told = set[str](), set[int](), set[str]()
+    watch = PodWatch(release, f"{JOB}={name}")
     while True:
         job = release.request("get", "jobs", name=name)
         is_over = failure_of(job) is not None
-        if not (seen or is_over):
-            why_waiting(release, job, [])  # raises if the cluster denies the pods
-        limit = 1 if is_over else ROUND if seen else FIRST
-        for pod in release.watch("pods", limit, label_selector=f"{JOB}={name}"):
-            waits = why_waiting(release, job, [pod])
-            if waits and waits not in told:
-                told.add(waits)
-                tell(waits)
-            uid, gone = pod.metadata.uid, pod.metadata.deletion_timestamp is not None
+        watch.look()
+        waits = "" if is_over else why_waiting(release, job, [*watch.pods.values()])
+        if waits and waits not in told:
+            told.add(waits)
+            tell(waits)
+        for uid, pod in watch.pods.items():
             own = (each for each in container_statuses(pod) if each.name == COMPONENT)
             end = next((each.state.terminated for each in own), None)
-            if (end is None and not gone) or uid in seen:
+            if end is None or uid in seen:
                 continue
             seen.add(uid)
-            if end is None or end.exit_code in KILLED_WATCHER:  # a new pod follows the mission
-                break
-            robots.add(number := int(pod.metadata.annotations[ROBOT]))
-            yield number, Ended(end.exit_code, to_one_line(end.message) or end.reason)
-            if len(robots) == job.spec.completions:
-                return
-        if is_over:
+            if end.exit_code not in KILLED_WATCHER:  # else a new pod follows the mission
+                robots.add(number := int(pod.metadata.annotations[ROBOT]))
+                yield number, Ended(end.exit_code, to_one_line(end.message) or end.reason)
+        if is_over or len(robots) == job.spec.completions:
             return
 
 
@@ -154,6 +150,7 @@ def _read_robots(release: Release) -> dict[int, Numbers]:
     """Read the counters of each robot's world; leave out a robot that does not answer."""
     found = dict[int, Numbers]()
     for pod in list_pods(release, "world"):
+        time.sleep(PAUSE)
         try:
             text = read_page(release, pod.metadata.name, METRICS["world"]["world"])
         except ClusterError:
@@ -169,7 +166,6 @@ def read_page(release: Release, pod: str, port: int) -> str:
     """Read the metrics at a port of a pod, over one connection through the API server."""
     from kubernetes import client, stream
 
-    PACE.wait()
     call = client.CoreV1Api(release.client).connect_get_namespaced_pod_portforward
     with explain_errors("forward ports", release.where):
         forward = stream.portforward(call, pod, release.namespace, ports=str(port))

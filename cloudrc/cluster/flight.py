@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 Tell = Callable[[str], None]
 
 
-LOOK_PERIOD = 1.0
+LOOK_PERIOD = 1.5
 """Time between two requests for the state of the pods [s]."""
 FAILED_LOOKS = 5
 """Number of looks in a row at which a pod fails before it is reported: at first, Kubernetes may not
@@ -115,17 +115,15 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
 def _why_not_ready(release: Release) -> tuple[str, str]:
     """Say why the pods of a release are not ready, and why they will never be; "" if not so."""
     words, never = list[str](), list[str]()
-    cell = [pods.CELL] if release.find("statefulsets", pods.CELL) else []
-    for component in (*COMPONENTS, *cell):
-        why, is_fatal = _state(release, component)
+    for component, workload in pods.workloads(release).items():
+        why, is_fatal = _state(release, component, workload)
         words += [f"{component}: {why}"] * bool(why)
         never += [f"the {component} pod cannot run: {why}"] * is_fatal
     return "; ".join(words), "; ".join(never)
 
 
-def _state(release: Release, component: str) -> tuple[str, bool]:
+def _state(release: Release, component: str, workload: Any) -> tuple[str, bool]:
     """Return why a component is not ready ("" if ready), and whether it can never be ready."""
-    workload = pods.find_workload(release, component)[1]
     for condition in workload.status.conditions or []:  # for example Pod Security or a quota
         if condition.type == "ReplicaFailure" and condition.status == "True":
             return str(condition.message), True

@@ -30,7 +30,7 @@ from cloudrc.cluster.client import (
     program,
     run,
 )
-from cloudrc.cluster.releases import no_release
+from cloudrc.cluster.releases import COMPONENT, INSTANCE, no_release
 from cloudrc.errors import BadInputError, TimedOutError, to_one_line
 
 NO_IMAGE = ("ErrImagePull", "ImagePullBackOff", "ErrImageNeverPull", "InvalidImageName")
@@ -143,6 +143,18 @@ def find_pod(release: Release, component: str) -> Any:
         f"the {component} pod of {release} does not run: {why}; "
         f"see: {release.kubectl} describe {kind.lower()} {workload.metadata.name}"
     )
+
+
+def workloads(release: Release) -> dict[str, Any]:
+    """Find the Deployments of a release by component, those of a fleet are StatefulSets.
+
+    Raise a ClusterError if the release does not exist.
+    """
+    selector = f"app.kubernetes.io/name=cloudrc,{INSTANCE}={release.name}"
+    for kind in ("deployments", "statefulsets"):
+        if found := release.request("list", kind, label_selector=selector):
+            return {each.metadata.labels[COMPONENT]: each for each in found}
+    raise no_release(release)
 
 
 def find_workload(release: Release, component: str) -> tuple[str, Any]:

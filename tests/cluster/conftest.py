@@ -113,9 +113,6 @@ class FakeApi:
                     and labels.items() <= body["metadata"].get("labels", {}).items()
                     and all(_value(body, path) == value for path, value in fields.items())
                 ]
-                if "watch" in query:
-                    events = ({"type": "ADDED", "object": body} for body in found)
-                    return 200, "".join(f"{json.dumps(event)}\n" for event in events)
                 return 200, {"items": found}
             if (plural, name) not in self.objects:
                 return 404, {"message": f'{plural} "{name}" not found', "code": 404}
@@ -315,7 +312,6 @@ def api(tmp_path, monkeypatch):
     path.write_text(kubeconfig(server.url))
     monkeypatch.setattr(CONFIG_PLACE, str(path))
     monkeypatch.setattr(jobs, "LOOK_PERIOD", 0.01)
-    monkeypatch.setattr(client.PACE, "rate", 1e9)
     monkeypatch.setattr(client, "RETRIES", {**client.RETRIES, "backoff_factor": 0.01})
     monkeypatch.setattr(flight, "LOOK_PERIOD", 0.01)
     monkeypatch.setattr(flight, "FAILED_LOOKS", 0)

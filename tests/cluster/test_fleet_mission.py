@@ -5,7 +5,6 @@ from itertools import cycle
 import pytest
 
 from cloudrc.cluster import fleet_mission, jobs
-from cloudrc.cluster.client import Pace
 from cloudrc.cluster.fleet_mission import follow_fleet
 from cloudrc.cluster.jobs import run_job
 from tests.cluster.conftest import MISSION
@@ -62,18 +61,6 @@ def test_a_fleet_ends_with_a_verdict_per_robot_and_a_summary_that_names_the_cell
 
 def test_the_number_of_requests_does_not_grow_with_that_of_robots(flown):
     assert len(flown(3)[2]) == len(flown(50)[2]) < 20
-
-
-def test_requests_keep_their_pace(monkeypatch):
-    now = [1000.0]
-    monkeypatch.setattr("cloudrc.cluster.client.time.monotonic", lambda: now[0])
-    monkeypatch.setattr(
-        "cloudrc.cluster.client.time.sleep", lambda seconds: now.__setitem__(0, now[0] + seconds)
-    )
-    pace = Pace(5.0, 20)
-    for _ in range(100):
-        pace.wait()
-    assert now[0] - 1000.0 == pytest.approx((100 - 20) / 5)
 
 
 def test_the_job_flies_as_many_robots_as_there_are_now_and_together(fleet, release):
