@@ -75,7 +75,7 @@ def _moved(setpoint: Setpoint, distance: float, ramp: float, total: float, now_n
     position = (ax + way * x, ay + way * y, az + way * z)
     velocity = (speed * x, speed * y, speed * z)
     _, yaw, waypoint, epoch, _, _, turns, _ = setpoint
-    return _new(Setpoint, (position, yaw, waypoint, epoch, velocity, motion, turns))
+    return _new(Setpoint, (position, yaw, waypoint, epoch, velocity, motion, turns, 0.0))
 
 
 def _profile(setpoint: Setpoint) -> tuple[float, float, float]:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import select
 import selectors
+import time
 from collections.abc import Callable, Iterator, Sequence
 from socket import socket
-from time import monotonic_ns
 from typing import Any
 
 from cloudrc.link.carry.engine import SPIN_NS, Engine, LinkWay, Packet, Port
@@ -34,7 +34,7 @@ class EntrancePort:
 
     def wait(self, until_ns: int) -> bool:
         """Wait until datagrams have come, or until a time [ns]; return whether some have come."""
-        timeout = max(0.0, (until_ns - monotonic_ns()) * 1e-9)
+        timeout = max(0.0, (until_ns - time.monotonic_ns()) * 1e-9)
         # The selector itself waits for whole milliseconds.
         return bool(select.select([self._selector], (), (), timeout)[0])
 
@@ -68,19 +68,19 @@ class CellEngine(Engine):
     def step(self, timeout: float) -> None:
         """Wait at most `timeout` [s] until packets come, leave the cell or are due; handle them."""
         cell_ns, due_ns = min(map(_soonest_ns, self._cells)), self.queue.next_ns
-        until_ns = min(monotonic_ns() + round(timeout * 1e9), due_ns - SPIN_NS, cell_ns)
+        until_ns = min(time.monotonic_ns() + round(timeout * 1e9), due_ns - SPIN_NS, cell_ns)
         has_come = self._port.wait(until_ns)
-        if due_ns - monotonic_ns() <= SPIN_NS:
-            while monotonic_ns() < due_ns:
+        if due_ns - time.monotonic_ns() <= SPIN_NS:
+            while time.monotonic_ns() < due_ns:
                 pass
             self._release()
-        if has_come or cell_ns <= monotonic_ns():
+        if has_come or cell_ns <= time.monotonic_ns():
             self.take_in()
             self._release()
 
     def take_in(self) -> None:
         """Take packets from the port; put those on their links that have left the cell."""
-        now_ns = monotonic_ns()
+        now_ns = time.monotonic_ns()
         for way, header, size, data, sent_ns in self._port.take():
             way.received += 1
             self._queues[way].send(way.link, header, size, data, max(sent_ns, self._known_ns))
