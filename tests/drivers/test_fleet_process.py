@@ -39,7 +39,7 @@ def test_two_robots_fly_together_and_are_judged_as_a_fleet(tmp_path, cell):
         assert not (tmp_path / f"run/robot-{number}/link").exists()
     assert abs(begins[0] - begins[1]) < 1_500_000_000
     for way in report["cell"]:
-        assert way["packets"] > 400
+        assert way["packets"] > 300  # of two robots at 100 Hz, in a flight of almost 2 s
         assert not way["dropped"]
 
 

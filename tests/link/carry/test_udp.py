@@ -108,7 +108,8 @@ def test_every_datagram_is_counted_once(bench, monkeypatch):
         pair.send(data)
     for n in range(5):
         pair.send(packet(n))
-    assert [pair.far.recv(100) for _ in range(3)] == [packet(n) for n in range(3)]
+    # A pause of this process between two readings of its clocks may exchange the packets.
+    assert {pair.far.recv(100) for _ in range(3)} == {packet(n) for n in range(3)}
     pair.relay.follow_profile(profile_of(loss=1.0))
     pair.send(packet(1))
     counts = {"received": 10, "malformed": 4, "overflow": 2, "lost": 1, "forwarded": 3}
