@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 
 GUARD_STEP = 0.002
 """Time between two looks of the guard at the age of a command [s]."""
+WITHOUT_MODEL = (
+    *("last_sample", "commanded_velocity"),
+    *("constant_velocity", "constant_acceleration"),
+)
+"""Predictors of cloudrc that know no model of the robot."""
 
 
 @reuse_results()  # several checks look at the file of the robot
@@ -51,6 +56,12 @@ def _advise(experiment: ResolvedExperiment) -> Iterator[str]:
             f"a plan of {cloud.plan_s:g} s lasts for less than 4 beats of {cloud.beat:g} s, so the "
             "robot holds after a few lost commands; a value that fits: --set "
             f"cloud.beat_s={cloud.plan_s / 4:g}"
+        )
+    if cloud.controller.name == "mpc" and cloud.predictor.name in WITHOUT_MODEL:
+        yield (
+            f"the controller mpc plans with the predictor's model, and {cloud.predictor.name} has "
+            "none, so the loop may be unstable; a value that fits: --set "
+            "cloud.predictor=model_based"
         )
     if not experiment.world.is_nominal and find_spec("mujoco") is not None:
         from cloudrc.robots.build import advise as advise_on_robot

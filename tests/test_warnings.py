@@ -34,6 +34,7 @@ def both(delay, jitter, **others):
             ],
             ("less than 4 beats", "cloud.beat_s=0.1"),
         ),
+        (["cloud.controller=mpc"], ("may be unstable", "cloud.predictor=model_based")),
         (["world.wind.velocity_mps=[0, -3]"], ("0.19 m from", "onboard.integral_limit_xy=")),
         (
             ["world.odometry_rate_hz=20", "cloud.compute_ms=60", "guard.command_age_max_ms=200"],
