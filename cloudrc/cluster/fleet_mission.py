@@ -57,7 +57,7 @@ def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> En
     if left > 0:
         tell(f"{job.spec.completions} robots begin together in {left:.0f} s")
         time.sleep(left)
-    known = len(_read_cell(release))
+    start = max((float(row["time_s"]) for row in _read_cell(release)), default=0.0)
     ended = {
         robot: Ended(ClusterError.exit_code, "INTERRUPTED: no_verdict")
         for robot in range(job.spec.completions)
@@ -70,7 +70,7 @@ def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> En
         {"robot": robot, **_verdict(end), **_flown(before.get(robot), after.get(robot))}
         for robot, end in ended.items()
     ]
-    for line in ["", *summarize_fleet(_document(rows, record, known)).splitlines()]:
+    for line in ["", *summarize_fleet(_document(rows, record, start)).splitlines()]:
         tell(line)
     return Ended(max(end.exit_code for end in ended.values()), "")
 
@@ -119,12 +119,17 @@ def _flown(before: Numbers | None, after: Numbers | None) -> Numbers:
     return {"hold_s": new["hold_s"], **age}
 
 
-def _document(rows: list[dict[str, Any]], record: list[dict[str, str]], known: int) -> Any:
-    """Return what the summary of a fleet needs; its cell's rows from `known` on are its flight."""
+def _document(rows: list[dict[str, Any]], record: list[dict[str, str]], start: float) -> Any:
+    """Return what the summary of a fleet needs.
+
+    The cell's rows after `start` [s] are its flight: all rows, if the cell has a new pod.
+    """
     from cloudrc.link.cell import CellLog
     from cloudrc.report.fleet import cell_rows, judge_robots
 
-    log, start = CellLog.read(record[known:]), float(record[known - 1]["time_s"]) if known else 0.0
+    if record and float(record[-1]["time_s"]) < start:
+        start = 0.0
+    log = CellLog.read([row for row in record if float(row["time_s"]) > start])
     for row in log.rows:
         row["time_s"] -= start
     for row in rows if log.rows else ():

@@ -196,7 +196,8 @@ def assemble_fleet(
 ) -> FleetRun:
     """Build the robots of a fleet and connect them; each of `sinks` gets the records of a robot."""
     cells, cloud = assembly.build_cells(experiment), experiment.cloud
-    cores = SharedCores(cloud.cores, cloud.sharing) if cloud.cores and cloud.compute_ms else None
+    computes = any(robot.cloud.compute_ms for robot in robots)
+    cores = SharedCores(cloud.cores, cloud.sharing) if cloud.cores and computes else None
     members = list[Member]()
     for number, (robot, sink) in enumerate(zip(robots, sinks, strict=True)):
         orders = robot.uplink.keep_order, robot.downlink.keep_order

@@ -150,7 +150,7 @@ class Condition:
                 self.theory["N.D/D/1"] = next((n for n, fit in enumerate(fits) if not fit), top)
         if cloud.cores and cloud.compute_ms:
             mean_ms = fmean(compute_times(cloud.compute_ms))
-            whole = cloud.cores / (mean_ms * 1e-3)  # commands a second for all
+            whole = cloud.cores * cloud.speed / (mean_ms * 1e-3)  # commands a second for all
             self.arithmetic["cloud"] = whole / cloud.command_rate_hz
             self.theory["closed queue"] = int(whole / RESUME_HZ)
 

@@ -59,6 +59,13 @@ def test_a_fleet_ends_with_a_verdict_per_robot_and_a_summary_that_names_the_cell
     assert "cell overloaded: uplink, load 1.6" in summary
 
 
+def test_the_cell_may_begin_a_new_record_in_flight(flown, monkeypatch):
+    """Its recording is full, or its pod is a new one; the summary has what it knows."""
+    records = cycle([HEAD + BEFORE, HEAD + FLIGHT])
+    monkeypatch.setattr(fleet_mission, "run", lambda program, words: next(records))
+    assert "cell overloaded: uplink, load 1.6" in "\n".join(flown(3)[0])
+
+
 def test_the_number_of_requests_does_not_grow_with_that_of_robots(flown):
     assert len(flown(3)[2]) == len(flown(50)[2]) < 20
 

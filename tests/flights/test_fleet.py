@@ -3,8 +3,9 @@
 import pytest
 
 from cloudrc.config.load import load_experiment
+from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording, RecordStore
-from cloudrc.runs.experiment import robots_of
+from cloudrc.runs.experiment import check_mode, robots_of
 from cloudrc.runs.fleet import assemble_fleet
 from cloudrc.runs.flight import fly_in_memory
 from tests.config.conftest import refused
@@ -64,6 +65,19 @@ def test_one_robot_in_a_cell_is_a_robot_behind_a_bottleneck(queue, rate, packets
 def test_one_cloud_on_shared_cores_computes_as_alone(sharing):
     flown = in_fleet(CLOCK, *LATE, "cell.rate_kbit=1e12", f"cloud.sharing={sharing}")
     assert flown == [alone(CLOCK, *LATE[:2])]
+
+
+def test_robots_share_cores_also_if_each_has_its_own_time_to_compute():
+    place = "fleet.robots=2", "cloud.place=edge", "cloud.cores=1"
+    each = in_fleet(*place, "fleet.vary=[{cloud.compute_ms: 20}]")
+    assert each == in_fleet(*place, "cloud.compute_ms=20")
+
+
+def test_cores_that_robots_share_need_virtual_time():
+    settings = "fleet.robots=2", *LATE
+    check_mode(load_experiment("steps", settings), "virtual")
+    with pytest.raises(BadInputError, match="share them in virtual time only"):
+        check_mode(load_experiment("steps", settings), "local")
 
 
 @pytest.mark.parametrize(
