@@ -119,10 +119,11 @@ def read_irtt(text: str, direction: Direction | None, *, halve: bool) -> Packets
         InvalidValueError: If the file is no output of irtt, or if it has no usable one-way delays
             and `halve` is false.
     """
-    if not (direction or halve):
-        raise InvalidValueError("irtt measures both ways; choose --direction, or --halve-rtt")
     try:
-        entries = _read_trips(json.loads(text)["round_trips"], None if halve else direction)
+        trips = json.loads(text)["round_trips"]
+        if not (direction or halve):
+            raise InvalidValueError("irtt measures both ways; choose --direction, or --halve-rtt")
+        entries = _read_trips(trips, None if halve else direction)
     except InvalidValueError:
         raise
     except _MISSHAPEN as error:

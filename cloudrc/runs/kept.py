@@ -131,7 +131,11 @@ def fetch_mission(
             with (folder / name).open("wb") as file:
                 path = f"{DATA}/{REPORTS}/{kept[-1]}/{name}"
                 run("kubectl", [*inside, "cat", path], stdout=file)
-        return
+        # Another install, whose volume this is, may have had a mission of this id.
+        if wanted not in known or _has(Recording.read(folder / "mission.mcap"), known[wanted]):
+            return
+        for name in FILES:
+            (folder / name).unlink()
     if wanted not in flown:
         raise BadInputError(
             f"{release} has flown no mission '{wanted}'; it has flown: {', '.join(flown) or 'none'}"
@@ -159,8 +163,12 @@ def _report_of_pods(
     report_flight(experiment, folder, recording, False, page=False, figures=False)
 
 
+def _has(recording: Recording, record: MissionRecord) -> bool:
+    return record.number in recording["/telemetry"]["mission_id"]
+
+
 def _check_seen(recording: Recording, record: MissionRecord) -> None:
-    if record.number not in recording["/telemetry"]["mission_id"]:
+    if not _has(recording, record):
         raise InvalidRunError(
             f"the pods' recordings lack mission {record.id}: a pod has been replaced since, or its "
             "volume was full; keep recordings by the value recordings.storage of the chart"

@@ -19,6 +19,7 @@ from tests.e2e.conftest import (
     value,
 )
 
+pytestmark = pytest.mark.real_time
 SHORT = ["--set", "mission.waypoints.0.dwell_s=6"]
 """Setting of `hover` that makes the flight long enough to be throttled."""
 RUN_LIMIT = 480.0
