@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from cloudrc.config.hull import doubts, hull_of
-from cloudrc.config.problems import ConfigProblem, collect
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotFiles, find_robot
 from cloudrc.config.schema import World
+from cloudrc.errors import BadInputError
 from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Vector
 from cloudrc.outside.code import calling
@@ -56,6 +56,9 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
 
     Args:
         name: Name of a shipped robot, or absolute path of a folder or an .xml file.
+
+    Raises:
+        BadInputError: If the robot does not compile or does not hold the contract.
     """
     world = World.model_validate({"robot": name, "scene": SCENE})
     robot = find_robot(name)
@@ -64,11 +67,11 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
     body = build_robot(world, ResolvedGuard.model_validate({}))
     facts = _read_facts(world, robot, body.simulator.model)
     changes = [*doubts(name), *_judge_tunings(robot, world)]
-    found = list[ConfigProblem]()
-    with collect(found, ()), calling(f"the onboard controller of {name} failed"):
-        motion, rest = _move(body, robot)
-    if found:
-        return facts, [*changes, *map(str, found)]
+    try:
+        with calling(f"the onboard controller of {name} failed", keep=BadInputError):
+            motion, rest = _move(body, robot)
+    except BadInputError as error:
+        return facts, [*changes, str(error)]
     facts |= motion
     if body.simulator.bad_values():
         return facts, [*changes, "the simulation diverged: check masses and inertias of the model"]
@@ -101,11 +104,11 @@ def _read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
 
 def _judge_tunings(robot: RobotFiles, world: World) -> Iterator[str]:
     """Yield what must change in the tunings, which an experiment may choose."""
-    found = list[ConfigProblem]()
     for name in robot.tunings:
-        with collect(found, ()):
+        try:
             check_robot(world.model_copy(update={"tuning": name}))
-    yield from map(str, found)
+        except BadInputError as error:
+            yield str(error)
 
 
 def _move(body: Robot, robot: RobotFiles) -> tuple[dict[str, float], float]:
@@ -168,7 +171,7 @@ def _follow(
         goal, brakes = reference or wanted, reference is None
         simulator.step(body.steer(simulator.readings, goal, yaw_rate, brakes=brakes))
         if simulator.readings.axes[8] < UPRIGHT_MIN:
-            raise ValueError("the robot turns over: check its gains")
+            raise BadInputError("the robot turns over: check the onboard controller's gains")
     return reference
 
 

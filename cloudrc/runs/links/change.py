@@ -11,7 +11,7 @@ from cloudrc.config.link_edit import Edit, edit_profile
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.drivers.link_control import ask
 from cloudrc.drivers.local import link_socket
-from cloudrc.errors import TimedOutError
+from cloudrc.errors import BadInputError, TimedOutError
 from cloudrc.link.control import APPLY_LIMIT, put_request
 from cloudrc.link.follow import PROFILE
 from cloudrc.link.state import (
@@ -23,8 +23,6 @@ from cloudrc.link.state import (
     write_change,
 )
 from cloudrc.outside.document import Document, write_yaml
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import InvalidValueError
 from cloudrc.text import table
 
 COLUMNS = ("delay_ms", "jitter_ms", "distribution", "loss", "rate_kbit")
@@ -49,11 +47,14 @@ def set_here(
     "uplink.delay_ms=120". `number` identifies the change.
 
     Raises:
+        BadInputError: If there is no link yet, or if a value cannot be used.
         TimedOutError: If a direction does not apply the change.
     """
-    if not (states := read_states(folder)):
-        with naming(str(folder.parent)):
-            raise InvalidValueError("no link is up there: the flight has not begun or has ended")
+    states = read_states(folder)
+    if not states:
+        raise BadInputError(
+            f"{folder.parent}: no link is up there: the flight has not begun or has ended"
+        )
     edit = edit_profile(Document(states[0].profile), profile, settings)
     note = write_change(ChangeFacts(number, edit.cause, edit.restart))
     request = put_request(json.dumps({CHANGE_FILE: note, PROFILE: write_yaml(edit.values)}))
@@ -68,8 +69,7 @@ def _change(folder: Path, way: str, url: str, request: bytes, number: str) -> Li
     except (OSError, ValueError) as error:
         raise TimedOutError(f"the {way} does not answer ({error}); see {log}") from None
     if state.refused == number:
-        with naming(f"the {way} is unchanged"):
-            raise InvalidValueError(state.refusal)
+        raise BadInputError(f"the {way} is unchanged: {state.refusal}")
     if state.change != number:
         text = f"the {way} did not apply the change within {APPLY_LIMIT:g} s"
         raise TimedOutError(f"{text}; see {log}")

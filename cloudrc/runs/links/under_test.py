@@ -22,6 +22,7 @@ from cloudrc.drivers.local import ROUTE_FILE, link_words, start_process
 from cloudrc.drivers.programs import run_tool
 from cloudrc.drivers.realtime import bind, free_ports, show_address, split_address
 from cloudrc.errors import (
+    BadInputError,
     CloudrcError,
     InvalidRunError,
     MissingPrerequisiteError,
@@ -42,7 +43,6 @@ WAYS = {
     "downlink": ("cloud", "world", Kind.COMMAND),
 }
 """Direction -> sender, receiver, and the kind of datagram that the sender sends."""
-EXPLAINED = (2, 3, 4)  # exit codes of cloudrc that the last line of its log explains
 _CLONE_NEWNET = 0x40000000  # linux include/uapi/linux/sched.h
 
 
@@ -116,11 +116,10 @@ def _start(name: str, way: Way, shaper: str) -> subprocess.Popen[bytes]:
 def _ended(name: str, code: int, log: str) -> CloudrcError:
     last = (log.strip().splitlines() or ["it left no message"])[-1]
     text = f"the {name} is not shaped: {last.removeprefix('cloudrc: error: ')}"
-    if code not in EXPLAINED:
-        return InvalidRunError(f"{text} (exit code {code})")
-    error = CloudrcError(text)
-    error.exit_code = code
-    return error
+    known = {one.exit_code: one for one in (BadInputError, MissingPrerequisiteError, TimedOutError)}
+    if code in known:
+        return known[code](text)
+    return InvalidRunError(f"{text} (exit code {code})")
 
 
 @contextlib.contextmanager
