@@ -58,11 +58,18 @@ def _shown(model: Any, bodies: list[str]) -> list[int]:
 
 
 def _rgba(model: Any, geom: int) -> Rgba:
-    """Return the colour of a geom, or of its material."""
+    """Return the colour of a geom, or of its material; of a texture, the mean colour."""
     own, material = tuple(map(float, model.geom_rgba[geom])), model.geom_matid[geom]
     if material < 0 or own != UNSET:
         return own  # type: ignore[return-value]
-    return tuple(map(float, model.mat_rgba[material]))  # type: ignore[return-value]
+    r, g, b, opacity = map(float, model.mat_rgba[material])
+    for texture in model.mat_texid[material]:
+        if texture >= 0 and (channels := model.tex_nchannel[texture]) >= 3:
+            first = model.tex_adr[texture]
+            last = first + model.tex_width[texture] * model.tex_height[texture] * channels
+            mean = model.tex_data[first:last].reshape(-1, channels)[:, :3].mean(axis=0) / 255
+            return r * float(mean[0]), g * float(mean[1]), b * float(mean[2]), opacity
+    return r, g, b, opacity
 
 
 def _surface(model: Any, geom: int) -> Surface | None:

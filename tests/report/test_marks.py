@@ -42,6 +42,11 @@ def test_the_band_follows_the_profile():
     assert band(subject_of(uplink=timed), 4.0) == pytest.approx((50, 90))
 
 
+def test_a_profile_that_another_version_recorded_is_left_out():
+    change = changed(2.0, CALM, "set")._replace(conditions='{"delay_ms": 5, "ecn": true}')
+    assert band(subject_of(change), 3.0) == pytest.approx((50, 50))
+
+
 def test_holds_are_marked():
     assert legend(subject_of()) == ""
     log = flown()

@@ -11,6 +11,8 @@ SCENE = """<mujoco>
   <option timestep=".002"/>
   <asset>
     <material name="green" rgba="0 1 0 .5"/>
+    <texture name="plain" type="2d" builtin="flat" rgb1=".2 .4 .8" width="8" height="8"/>
+    <material name="printed" texture="plain"/>
     <mesh name="wedge" vertex="0 0 0  1 0 0  0 1 0  0 0 1  1 0 1"/>
     <hfield name="hill" nrow="2" ncol="3" size="1 1 .5 .1" elevation="0 1 0 0 1 0"/>
   </asset>
@@ -21,7 +23,8 @@ SCENE = """<mujoco>
     </body>
     <body name="ball" pos="4 0 1"><geom type="sphere" size=".3" material="green"/></body>
     <body name="rod" pos="5 0 1"><geom type="capsule" size=".1 .5" euler="0 60 0"/></body>
-    <body name="can" pos="6 0 1"><geom type="cylinder" size=".2 .5" euler="0 60 0"/></body>
+    <body name="can" pos="6 0 1"><geom type="cylinder" size=".2 .5" euler="0 60 0"
+      material="printed"/></body>
     <body name="egg" pos="7 0 1"><geom type="ellipsoid" size=".2 .3 .5" euler="10 20 30"/></body>
     <body name="wedge" pos="8 0 1"><geom type="mesh" mesh="wedge" euler="10 20 30"/></body>
     <body name="hill" pos="9 0 0"><geom type="hfield" hfield="hill"/></body>
@@ -59,6 +62,7 @@ def test_every_type_of_geom_has_its_place_size_and_colour(scene):
             np.testing.assert_allclose(local.min(axis=0), -half, atol=0.02)
     assert found["box"].rgba == (1.0, 0.0, 0.0, 1.0)
     assert found["ball"].rgba == (0.0, 1.0, 0.0, 0.5)
+    assert found["can"].rgba == pytest.approx((0.2, 0.4, 0.8, 1.0), abs=0.01)
     assert np.ptp(found["twin"].corners, axis=0).max() == pytest.approx(0.2)
     assert np.ptp(found["wall"].corners, axis=0) == pytest.approx((4.0, 0.0, 2.0))
 

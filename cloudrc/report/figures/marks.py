@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from cloudrc.config.profile import DirectionConfig
-from cloudrc.errors import CloudrcError
+from cloudrc.errors import BadInputError
 from cloudrc.link.profile import Timeline
 from cloudrc.link.traces import link_profile
 from cloudrc.metrics.flight import Array
@@ -30,7 +30,7 @@ def delays_of(direction: DirectionConfig) -> Timeline | None:
     """Return a direction's link conditions over time; None if a file for them is unreadable."""
     try:
         return Timeline(link_profile(direction))
-    except CloudrcError:
+    except BadInputError:
         return None
 
 
@@ -68,7 +68,10 @@ def parts(subject: Subject, *, uplink: bool) -> list[LinkSpan]:
     for row in np.argsort(begins, kind="stable"):
         if table["uplink"][row] != uplink:
             continue
-        direction = DirectionConfig.model_validate_json(str(table["conditions"][row]))
+        try:
+            direction = DirectionConfig.model_validate_json(str(table["conditions"][row]))
+        except ValueError:  # another version of cloudrc has recorded this flight
+            continue
         origin = float(seconds(table["stamp_ns"][row]) - table["time_line"][row])
         found.append(LinkSpan(float(begins[row]), origin, direction, str(table["cause"][row])))
     return found
