@@ -21,7 +21,7 @@ from cloudrc.drivers.fleet import Computation, FleetRun, Member, SharedCores
 from cloudrc.drivers.local import LINK_FOLDER
 from cloudrc.drivers.local_fleet import CELL_FILE, LocalFleet
 from cloudrc.drivers.virtual import Sink
-from cloudrc.errors import CloudrcError, InterruptedRunError
+from cloudrc.errors import CloudrcError
 from cloudrc.files import read_json
 from cloudrc.link.cell import CellLog, CellQueue
 from cloudrc.link.follow import make_folder
@@ -32,7 +32,7 @@ from cloudrc.report.document import ENVIRONMENT_FILE, Run, environment_document,
 from cloudrc.report.fleet import FleetFlown, cloud_numbers, fleet_document
 from cloudrc.report.folder import ROBOT, read_cell, robots_in
 from cloudrc.report.write import write_report
-from cloudrc.runs.fly import VirtualRecorder, naming_files, write_merged
+from cloudrc.runs.fly import VirtualRecorder, end_of, explaining, naming_files, write_merged
 from cloudrc.runs.interrupts import raise_if_interrupted
 from cloudrc.runs.own_files import hash_files
 from cloudrc.text import csv_table
@@ -149,25 +149,15 @@ def _fly_local(
     folders = {robot.fleet.only or 0: _folder(folder, robot) for robot in robots}
     for robot, own in zip(robots, folders.values(), strict=True):
         make_folder(own / LINK_FOLDER, robot.link_values)
-    has_cell, broken, interrupted = experiment.cell.rate_kbit is not None, None, True
+    has_cell = experiment.cell.rate_kbit is not None
     local = LocalFleet(folder, folders, lambda records: raise_if_interrupted(), cell=has_cell)
-    try:
-        local.fly(max(map(assembly.flight_limit, robots)))
-        interrupted = False
-    except KeyboardInterrupt:
-        pass
-    except CloudrcError as error:
-        broken = error
+    limit = max(map(assembly.flight_limit, robots))
+    broken, interrupted = end_of(lambda: local.fly(limit))
     landed()
     flown = FleetFlown(experiment, read_cell(folder / CELL_FILE), None, "local")
     for robot, own, hashes in zip(robots, folders.values(), files, strict=True):
-        try:
+        with explaining(broken, interrupted=interrupted):
             mission = merge(own / "world.mcap", own / "cloud.mcap")
-        except CloudrcError:
-            if broken or interrupted:
-                text = "interrupted, nothing was recorded"
-                raise broken or InterruptedRunError(text) from None
-            raise
         cut_to_last_mission(mission, after_ns=AFTER_NS)
         report = partial(_report, flown, own, hashes)
         write_merged(

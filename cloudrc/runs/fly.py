@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import heapq
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from math import inf
 from operator import attrgetter
@@ -229,26 +230,16 @@ def _fly_local(
     With `session`, the report is that of its last mission. The other functions are those of `fly`.
     """
     make_folder(folder / LINK_FOLDER, experiment.link_values)
-    broken, interrupted = None, True
     remote = experiment.cloud.controller.name in OUTSIDE
     local = LocalRun(folder, see, session, remote=remote, lost=_raise_if_lost, gone=gone)
-    try:
-        local.fly(inf if session else assembly.flight_limit(experiment))
-        interrupted = False
-    except KeyboardInterrupt:
-        pass
-    except CloudrcError as error:
-        broken = error
+    limit = inf if session else assembly.flight_limit(experiment)
+    broken, interrupted = end_of(lambda: local.fly(limit))
     landed()
-    try:
+    with explaining(broken, interrupted=interrupted and not session):
         if session:
             mission, experiment, interrupted = read_last_mission(folder)
         else:
             mission = merge(folder / "world.mcap", folder / "cloud.mcap")
-    except CloudrcError:
-        if broken or (interrupted and not session):
-            raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
-        raise
     try:
         document = write_merged(
             folder, mission, experiment, report, local.notes, interrupted=interrupted, broken=broken
@@ -258,6 +249,28 @@ def _fly_local(
     if broken:
         raise broken
     return document
+
+
+def end_of(fly: Callable[[], None]) -> tuple[CloudrcError | None, bool]:
+    """Fly; return the error that ended the flight, if any, and whether it was cut short."""
+    try:
+        fly()
+    except KeyboardInterrupt:
+        return None, True
+    except CloudrcError as error:
+        return error, True
+    return None, False
+
+
+@contextmanager
+def explaining(broken: CloudrcError | None, *, interrupted: bool) -> Iterator[None]:
+    """Let an error of the block, which reads a flight cut short, say what ended the flight."""
+    try:
+        yield
+    except CloudrcError:
+        if broken or interrupted:
+            raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
+        raise
 
 
 def write_merged(
