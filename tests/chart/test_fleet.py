@@ -132,6 +132,10 @@ def test_queue_and_scheduler_are_those_of_the_values():
     for kind, count in (("StatefulSet", 3), ("Job", 1)):
         labels = [one["metadata"]["labels"] for one in of_kind(objects, kind).values()]
         assert [each["kueue.x-k8s.io/queue-name"] for each in labels] == ["lab"] * count
+    patrol = {"scheduling": given, "mission": {"cronJob": {"enabled": True}}}
+    (cron,) = of_kind(render(patrol), "CronJob").values()
+    labels = cron["spec"]["jobTemplate"]["metadata"]["labels"]
+    assert labels["kueue.x-k8s.io/queue-name"] == "lab"
     template = of_kind(objects, "ConfigMap")["mission-job"]["data"]["job.yaml"]
     assert yaml.safe_load(template)["metadata"]["labels"] == {"kueue.x-k8s.io/queue-name": "lab"}
 
