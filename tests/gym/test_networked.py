@@ -194,6 +194,11 @@ def test_an_argument_that_cannot_be_used_is_refused_in_one_line(options, words):
     assert "\n" not in str(caught.value)
 
 
+def test_an_argument_of_the_environment_has_a_place_of_its_own():
+    with pytest.raises(BadInputError, match=r"no argument of cloudrc/Networked-v0.*'g'.*env_args"):
+        gymnasium.make("cloudrc/Networked-v0", env="Pendulum-v1", link="lte", g=9.0)
+
+
 BOX = spaces.Box(-1, 1, (1,))
 
 
