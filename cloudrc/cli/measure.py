@@ -60,4 +60,5 @@ def execute(options: Options) -> None:
     mean, last = sum(times) / len(times), len(times) - 1
     shown = [f"{name} {times[round(last * q)]:.3g}" for name, q in QUANTILES.items()]
     print_line(f"{found.where}: {len(times)} times, mean {mean:.3g}, {', '.join(shown)} ms")
-    print_line(f"{options.out}: fly it with --set cloud.compute_ms=./{options.out}")
+    named = options.out if options.out.is_absolute() else f"./{options.out}"
+    print_line(f"{options.out}: fly it with --set cloud.compute_ms={named}")

@@ -235,9 +235,7 @@ def _report(options: Options, _: Api | None = None) -> int:
         with suppress(OSError):
             folder.rmdir()  # nothing was fetched
         raise
-    options.run, options.metric, options.figures = folder, [], False
-    options.width, options.font_size = 7.16, 9.0
-    return report.execute(options)
+    return report.write(options, folder)
 
 
 def _follow(

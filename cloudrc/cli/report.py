@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
@@ -58,6 +58,22 @@ def execute(options: Options) -> int:
     """Write the report from the recording; return the exit code of the run's verdict."""
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
+    look = options.width, options.font_size
+    return write(options, options.run, options.metric, figures=options.figures, look=look)
+
+
+def write(
+    options: Options,
+    run: Path,
+    metrics: Sequence[str] = (),
+    *,
+    figures: bool = False,
+    look: tuple[float, ...] = (),
+) -> int:
+    """Write the report of a run or fleet, with a user's `metrics`; return the verdict's exit code.
+
+    `look` are the width of figures [in] and the size of their text [points].
+    """
     from cloudrc.cli.progress import Progress
     from cloudrc.metrics import measure
     from cloudrc.metrics.verdict import exit_code
@@ -69,34 +85,34 @@ def execute(options: Options) -> int:
     from cloudrc.runs.fleet import write_again
     from cloudrc.runs.session import restore_mission
 
-    measure.check(options.metric)
-    look, is_fleet = Look(options.width, options.font_size), bool(robots_in(options.run))
-    with Progress(f"reads the recording of {options.run}") as view:
+    measure.check(metrics)
+    is_fleet = bool(robots_in(run))
+    with Progress(f"reads the recording of {run}") as view:
 
-        def write(folder: Path) -> tuple[Recording, ResolvedExperiment, dict[str, Any]]:
+        def write_one(folder: Path) -> tuple[Recording, ResolvedExperiment, dict[str, Any]]:
             check_ended(folder)
             restore_mission(folder)
-            recording, experiment, run = read_run(folder)
+            recording, experiment, facts = read_run(folder)
             # The run may come from somebody else: never execute files that it names.
-            unmeasured = measure.not_measured(experiment.report.metrics, options.metric)
-            run = replace(run, notes=(*run.notes, *unmeasured))
+            unmeasured = measure.not_measured(experiment.report.metrics, metrics)
+            facts = replace(facts, notes=(*facts.notes, *unmeasured))
             count = sum(len(recording[topic]) for topic in TOPICS)
             view.tell(f"measures {count:,} messages and draws the figures")
             document = write_report(
-                *(folder, recording, experiment, run),
-                own=options.metric,
+                *(folder, recording, experiment, facts),
+                own=metrics,
                 page=not is_fleet,
-                figures=options.figures,
-                look=look,
+                figures=figures,
+                look=Look(*look),
             )
             return recording, experiment, document
 
-        document = write_again(options.run, write) if is_fleet else write(options.run)[2]
+        document = write_again(run, write_one) if is_fleet else write_one(run)[2]
     print_traceback(options, document)
     if is_fleet:
-        text = f"\n{summarize_fleet(document, paint)}\n\n{escape(str(options.run / PAGE))}"
+        text = f"\n{summarize_fleet(document, paint)}\n\n{escape(str(run / PAGE))}"
     else:
-        text = summary(document, options.run)
+        text = summary(document, run)
     print_result(options.output, document, text)
     return exit_code(document)
 

@@ -100,14 +100,16 @@ def run_job(
     given = mission.get("time_limit_s")
     # The API takes a mission with such a limit only.
     limit = ceil(given) if isinstance(given, int | float) and 0 < given <= 1e6 else LIMIT_MAX
-    deadline = limit + START_ALLOWANCE + queue * QUEUE_ALLOWANCE
+    robots = fleet_size(release)  # may have changed since the chart was installed
+    together = TOGETHER + EACH * robots if robots else 0.0
+    deadline = limit + START_ALLOWANCE + queue * QUEUE_ALLOWANCE + ceil(together)
     job["spec"] |= {"activeDeadlineSeconds": deadline, "ttlSecondsAfterFinished": KEEP_FINISHED}
     arguments = job["spec"]["template"]["spec"]["containers"][0]["args"]
     if queue:
         arguments.append("--queue")
-    if robots := fleet_size(release):  # may have changed since the chart was installed
+    if robots:
         job["spec"] |= {"completions": robots, "parallelism": robots}
-        arguments.append(f"{AT}{ceil(time.time() + TOGETHER + EACH * robots)}")
+        arguments.append(f"{AT}{ceil(time.time() + together)}")
     data = {FILE: json.dumps(mission, indent=2) + "\n"}
     create_job(release, job, {"apiVersion": "v1", "kind": "ConfigMap", "data": data})
     return name

@@ -96,7 +96,8 @@ class FleetFlown:
                 row[name] = known[own]["value"] * factor
         if known.keys() >= {*SENT}:
             uplink, downlink, duration = (known[name]["value"] for name in SENT)
-            row["sent_kbit"] = (uplink + downlink) / duration * 8e-3
+            if duration:
+                row["sent_kbit"] = (uplink + downlink) / duration * 8e-3
         if self.log.ways:
             row["dropped"] = sum(self.log.dropped[way, number] for way in self.log.ways)
         self.robots.append(row | {"records_sha256": document["records_sha256"]})
@@ -158,7 +159,7 @@ def cell_numbers(log: CellLog, way: str, senders: int, *, alone: bool) -> dict[s
     rows = [row for row in log.rows if row["direction"] == way]
     names = "packets", "dropped", "busy_ns", "waited_ns"
     packets, dropped, busy_ns, waited_ns = (sum(row[name] for row in rows) for name in names)
-    duration = round(rows[-1]["time_s"] * 1e9) * 1e-9
+    duration = rows[-1]["time_s"]
     service, rate = busy_ns * 1e-9 / packets, (packets + dropped) / duration  # [s], offered [1/s]
     expected = dict[str, float]()
     if way != "both" and alone:

@@ -24,7 +24,7 @@ ARRIVAL = "epoch", "counter", "delay"
 
 
 class MeasuredTimes(NamedTuple):
-    """MeasuredTimes durations."""
+    """Measured durations."""
 
     times_ms: list[float]
     where: str  # what was measured, and how

@@ -19,8 +19,6 @@ NO_PLAN = Plan(())
 """Plan before the first mission."""
 JUMP_SPEED = 6.0
 """Highest speed of the setpoint on a track [m/s]; along a faster part the setpoint jumps."""
-
-
 COAST = 0.3
 """Time that the robot needs to stop at the end of a turn by hand [s]."""
 

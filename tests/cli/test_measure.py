@@ -19,6 +19,8 @@ def test_the_times_of_a_measured_flight_are_flown_again(folder, call):
     call(*FLY, *TIMES, "cloud.compute_measured=true", "--out", "a")
     out = call("measure compute a --out t.txt").out.splitlines()
     assert out[-1] == "t.txt: fly it with --set cloud.compute_ms=./t.txt"
+    there = folder / "there.txt"
+    assert call(f"measure compute a --out {there}").out.endswith(f"cloud.compute_ms={there}\n")
     measured = times(folder / "t.txt")
     assert 0 < min(measured) < max(measured) < 200
     call(*FLY, *TIMES, "cloud.compute_ms=./t.txt", "--out", "b")
