@@ -1,9 +1,11 @@
-"""Read a file of computing times, for `cloud.compute_ms`."""
+"""The time that cloud computes: files for `cloud.compute_ms`, and cores that robots share."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from cloudrc.config.problems import problem_at
+from cloudrc.config.schema import Cloud
 from cloudrc.errors import BadInputError
 from cloudrc.link.traces import read_lines
 from cloudrc.outside.reuse import reuse
@@ -18,6 +20,13 @@ def compute_times(given: float | str) -> tuple[float, ...]:
     Lines that are empty or begin with # do not count. Raise a BadInputError if the file is invalid.
     """
     return (given,) if isinstance(given, float) else reuse(("compute", given), lambda: _read(given))
+
+
+def check_unshared(cloud: Cloud) -> None:
+    """Check, for robots that fly in real time, that their clouds share no emulated cores."""
+    if cloud.cores and cloud.compute_ms:
+        text = "robots share them in virtual time only; use --mode virtual, or cloud.cores=null"
+        raise problem_at("cloud.cores", text)
 
 
 def _read(path: str) -> tuple[float, ...]:

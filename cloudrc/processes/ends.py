@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from cloudrc import assembly, source
 from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.cloud.controllers.ros2 import RosController
+from cloudrc.config.compute import check_unshared
 from cloudrc.config.load import load_experiment, read_experiment, robot_settings
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.robot import known_robot
@@ -158,6 +159,8 @@ def open_end(settings: EndSettings, name: str) -> tuple[ResolvedExperiment, Iden
     path, clock, key = str(settings.config), clock_id(), settings.key
     own = robot_settings(settings.robot)
     given = read_experiment(path, own)
+    if settings.robot is not None:
+        check_unshared(given.cloud)
     exporter = open_exporter(name, given, settings.metrics)
     # Only cloud loads the plug-ins, which fill in their default parameters.
     experiment = load_experiment(path, own) if name == "cloud" else given

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from cloudrc.config.compute import check_unshared
 from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import OUTSIDE, ROS2, parse_settings
 from cloudrc.config.problems import problem_at
@@ -93,10 +94,8 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
     if mode != "virtual" and (experiment.cloud.clock_offset_s or experiment.cloud.clock_drift_ppm):
         text = "acts, as clock_drift_ppm, in virtual time only; use --mode virtual, or leave it out"
         raise problem_at("cloud.clock_offset_s", text)
-    shares = experiment.cloud.cores and experiment.cloud.compute_ms
-    if mode != "virtual" and shares and experiment.fleet.robots > 1:
-        text = "robots share them in virtual time only; use --mode virtual, or cloud.cores=null"
-        raise problem_at("cloud.cores", text)
+    if mode != "virtual" and experiment.fleet.robots > 1:
+        check_unshared(experiment.cloud)
     if (controller := experiment.cloud.controller.name) in OUTSIDE:
         if mode == "cluster":
             text = f"{controller} flies on this machine only; use --mode virtual or local"

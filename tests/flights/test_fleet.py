@@ -4,6 +4,7 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
+from cloudrc.processes.ends import EndSettings, open_end
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.runs.experiment import check_mode, robots_of
 from cloudrc.runs.fleet import assemble_fleet
@@ -73,11 +74,17 @@ def test_robots_share_cores_also_if_each_has_its_own_time_to_compute():
     assert each == in_fleet(*place, "cloud.compute_ms=20")
 
 
-def test_cores_that_robots_share_need_virtual_time():
+def test_cores_that_robots_share_need_virtual_time(tmp_path):
     settings = "fleet.robots=2", *LATE
     check_mode(load_experiment("steps", settings), "virtual")
     with pytest.raises(BadInputError, match="share them in virtual time only"):
         check_mode(load_experiment("steps", settings), "local")
+    config = tmp_path / "config.yaml"
+    config.write_text("cloud: {compute_ms: 8, cores: 1}\n")
+    here, nowhere = ("127.0.0.1", 0), tmp_path / "nowhere"
+    pod = EndSettings(config, nowhere, here, nowhere, nowhere, robot=0)
+    with pytest.raises(BadInputError, match="share them in virtual time only"):
+        open_end(pod, "world")
 
 
 @pytest.mark.parametrize(
