@@ -17,6 +17,7 @@ from cloudrc.text import escape
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
     from cloudrc.record.columns import Recording
+    from cloudrc.report.figures.style import Look
 
 PAGE = "report.html"
 EPILOG = """\
@@ -74,19 +75,35 @@ def write(
 
     `look` are the width of figures [in] and the size of their text [points].
     """
-    from cloudrc.cli.progress import Progress
     from cloudrc.metrics import measure
     from cloudrc.metrics.verdict import exit_code
-    from cloudrc.record.topics import TOPICS
     from cloudrc.report.figures.style import Look
     from cloudrc.report.fleet import summarize_fleet
-    from cloudrc.report.folder import check_ended, read_run, robots_in
+    from cloudrc.report.folder import robots_in
+
+    measure.check(metrics)
+    is_fleet = bool(robots_in(run))
+    document = _write(run, metrics, is_fleet=is_fleet, figures=figures, look=Look(*look))
+    print_traceback(options, document)
+    if is_fleet:
+        text = f"\n{summarize_fleet(document, paint)}\n\n{escape(str(run / PAGE))}"
+    else:
+        text = summary(document, run)
+    print_result(options.output, document, text)
+    return exit_code(document)
+
+
+def _write(
+    run: Path, metrics: Sequence[str], *, is_fleet: bool, figures: bool, look: Look
+) -> dict[str, Any]:
+    from cloudrc.cli.progress import Progress
+    from cloudrc.metrics import measure
+    from cloudrc.record.topics import TOPICS
+    from cloudrc.report.folder import check_ended, read_run
     from cloudrc.report.write import write_report
     from cloudrc.runs.fleet import write_again
     from cloudrc.runs.session import restore_mission
 
-    measure.check(metrics)
-    is_fleet = bool(robots_in(run))
     with Progress(f"reads the recording of {run}") as view:
 
         def write_one(folder: Path) -> tuple[Recording, ResolvedExperiment, dict[str, Any]]:
@@ -103,18 +120,11 @@ def write(
                 own=metrics,
                 page=not is_fleet,
                 figures=figures,
-                look=Look(*look),
+                look=look,
             )
             return recording, experiment, document
 
-        document = write_again(run, write_one) if is_fleet else write_one(run)[2]
-    print_traceback(options, document)
-    if is_fleet:
-        text = f"\n{summarize_fleet(document, paint)}\n\n{escape(str(run / PAGE))}"
-    else:
-        text = summary(document, run)
-    print_result(options.output, document, text)
-    return exit_code(document)
+        return write_again(run, write_one) if is_fleet else write_one(run)[2]
 
 
 def summary(report: Mapping[str, Any], folder: Path, last: str = PAGE) -> str:
