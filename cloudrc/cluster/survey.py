@@ -81,10 +81,11 @@ def survey(release: Release, values: Sequence[str] = ()) -> Iterator[Finding]:
     yield (allowed := permissions(release))
     if allowed.state != "ok":
         return
-    pods = pods_of_chart(render_chart(release, values))
+    rendered = render_chart(release, values)
+    pods = pods_of_chart(rendered)
     for component, spec in pods.items():
         yield admission(release, component, spec)
-    yield from quotas(release, pods)
+    yield from quotas(release, pods, counts_of_chart(rendered))
     yield from nodes(release, pods)
 
 
@@ -116,16 +117,24 @@ def render_chart(release: Release, values: Sequence[str]) -> list[Any]:
     return [thing for thing in yaml.safe_load_all(run("helm", arguments)) if thing]
 
 
-def pods_of_chart(rendered: list[Any]) -> dict[str, dict[str, Any]]:
-    """Return component -> spec of its pod, of the chart's objects."""
+def _specs(rendered: list[Any]) -> dict[str, Any]:
+    """Return component -> spec of its Deployment or StatefulSet, of the chart's objects."""
     return {
-        thing["metadata"]["labels"]["app.kubernetes.io/component"]: {
-            **thing["spec"]["template"]["spec"],
-            "serviceAccountName": "default",  # the chart's own accounts do not exist yet
-        }
+        thing["metadata"]["labels"]["app.kubernetes.io/component"]: thing["spec"]
         for thing in rendered
         if thing["kind"] in ("Deployment", "StatefulSet")
     }
+
+
+def pods_of_chart(rendered: list[Any]) -> dict[str, dict[str, Any]]:
+    """Return component -> spec of its pod."""
+    account = {"serviceAccountName": "default"}  # the chart's own accounts do not exist yet
+    return {name: spec["template"]["spec"] | account for name, spec in _specs(rendered).items()}
+
+
+def counts_of_chart(rendered: list[Any]) -> Counter[str]:
+    """Return component -> number of its pods: a fleet has one for each robot."""
+    return Counter({name: spec["replicas"] for name, spec in _specs(rendered).items()})
 
 
 def admission(release: Release, component: str, spec: dict[str, Any]) -> Finding:
@@ -150,12 +159,17 @@ def create_pod(release: Release, name: str, spec: dict[str, Any], **how: Any) ->
     return name
 
 
-def quotas(release: Release, pods: dict[str, dict[str, Any]]) -> Iterator[Finding]:
-    """Compare the requests and limits of all pods together with what each quota has left."""
+def quotas(
+    release: Release, pods: dict[str, dict[str, Any]], counts: Counter[str]
+) -> Iterator[Finding]:
+    """Compare the requests and limits of all pods together with what each quota has left.
+
+    `counts` are component -> number of its pods.
+    """
     from kubernetes import utils
 
     amount: Any = utils.parse_quantity  # not annotated
-    needed = _needed(pods, amount)
+    needed = _needed(pods, counts, amount)
     for quota in release.request("list", "resourcequotas"):
         name, hard = f"quota {quota.metadata.name}", quota.status.hard or {}
         used = Counter(quota.status.used or {})
@@ -171,16 +185,18 @@ def quotas(release: Release, pods: dict[str, dict[str, Any]]) -> Iterator[Findin
             yield Finding(name, "ok", "has enough left for one release")
 
 
-def _needed(pods: dict[str, dict[str, Any]], amount: Callable[[Any], Any]) -> Counter[str]:
+def _needed(
+    pods: dict[str, dict[str, Any]], counts: Counter[str], amount: Callable[[Any], Any]
+) -> Counter[str]:
     """Return what all pods together need: name as in a quota, such as requests.cpu -> amount."""
     needed = Counter[str]()
-    for spec in pods.values():
+    for component, spec in pods.items():
         for container in [*spec.get("initContainers", []), *spec["containers"]]:
             for kind, amounts in container.get("resources", {}).items():
                 for resource, text in amounts.items():
-                    needed[f"{kind}.{resource}"] += amount(text)
+                    needed[f"{kind}.{resource}"] += counts[component] * amount(text)
     needed |= {"cpu": needed["requests.cpu"], "memory": needed["requests.memory"]}
-    needed |= {"pods": len(pods), "count/pods": len(pods)}
+    needed |= {"pods": counts.total(), "count/pods": counts.total()}
     return needed
 
 

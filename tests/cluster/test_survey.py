@@ -9,6 +9,7 @@ apiVersion: apps/v1
 kind: Deployment
 metadata: {name: x, labels: {app.kubernetes.io/component: COMPONENT}}
 spec:
+  replicas: REPLICAS
   template:
     spec:
       serviceAccountName: made-by-the-chart
@@ -22,8 +23,7 @@ SECURITY = 'pods "x" is forbidden: violates PodSecurity "restricted:latest"'
 @pytest.fixture
 def cluster(api, pretend, monkeypatch):
     """The fake API server, on which pods of the survey run and end."""
-    rendered = "".join(CHART.replace("COMPONENT", each) for each in ("world", "cloud"))
-    pretend("helm", f"cat <<'END'\n{rendered}END")
+    pretend_chart(pretend)
     monkeypatch.setattr(survey, "LOOK_PERIOD", 0.01)
     put = api.put
     api.ended = {"phase": "Succeeded"}
@@ -36,6 +36,13 @@ def cluster(api, pretend, monkeypatch):
 
     monkeypatch.setattr(api, "put", run_at_once)
     return api
+
+
+def pretend_chart(pretend, robots=1):
+    """Let `helm` render a chart whose world and cloud have a pod for each robot."""
+    chart = CHART.replace("REPLICAS", str(robots))
+    rendered = "".join(chart.replace("COMPONENT", each) for each in ("world", "cloud"))
+    pretend("helm", f"cat <<'END'\n{rendered}END")
 
 
 def found(release):
@@ -75,11 +82,15 @@ def test_pod_security_leads_to_the_relay(cluster, release):
     assert "link.mode=relay" in found(release)["cloud pod"].fix
 
 
-def test_a_quota_is_compared_with_both_pods_together(cluster, release):
-    status = {"hard": {"requests.cpu": "150m"}, "used": {"requests.cpu": "0"}}
+@pytest.mark.parametrize(("robots", "less", "enough"), [(1, "150m", "160m"), (3, "470m", "480m")])
+def test_a_quota_is_compared_with_all_pods_together(
+    robots, less, enough, cluster, release, pretend
+):
+    pretend_chart(pretend, robots)
+    status = {"hard": {"requests.cpu": less}, "used": {"requests.cpu": "0"}}
     cluster.put("resourcequotas", {"metadata": {"name": "small"}, "status": status})
     seen = found(release)["quota small"]
     assert seen.state == "missing"
-    assert "needs more requests.cpu: 0 of 150m are used" in seen.found
-    status["hard"]["requests.cpu"] = "160m"
+    assert f"needs more requests.cpu: 0 of {less} are used" in seen.found
+    status["hard"]["requests.cpu"] = enough
     assert found(release)["quota small"].state == "ok"
