@@ -116,7 +116,8 @@ def _in_pod(options: Options) -> ConsoleTarget:
     from cloudrc.console.in_pod import flight_of_pod
 
     token = given_token(options)
-    return flight_of_pod(options.config, options.profile, options.api, token, print_line)
+    flight = flight_of_pod(options.config, options.profile, options.api, token, print_line)
+    return flight._replace(robot=options.robot)
 
 
 def _show_release(options: Options) -> int:

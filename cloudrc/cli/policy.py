@@ -7,6 +7,7 @@ import sys
 
 from cloudrc.cli.output import print_line, tell
 from cloudrc.cli.parser import Options, Parser, add_verbs, flags, whole_number
+from cloudrc.cli.processes import number_argument
 from cloudrc.drivers.process import StopSignal
 from cloudrc.policy.address import KEY_VARIABLE
 
@@ -38,6 +39,7 @@ def arguments(parser: Parser) -> None:
     add = flags(drive)
     add("--config", "FILE", "experiment file (YAML)", required=True)
     add("--socket", "DIR", "folder of the sockets of 'cloudrc cloud --teleop DIR'", required=True)
+    number_argument(drive)
     add("--feed", "", "write status for a supervisor to stdout (default: events only)")
 
 
@@ -49,7 +51,7 @@ def execute(options: Options) -> None:
     stop = StopSignal()
     from cloudrc.processes.ends import run_remote
 
-    run_remote(options.config, options.socket, stop, watched=options.feed)
+    run_remote(options.config, options.socket, stop, watched=options.feed, robot=options.robot)
 
 
 def _serve(options: Options) -> None:

@@ -15,6 +15,11 @@ from cloudrc.drivers.realtime import Address, split_address
 def process_arguments(parser: Parser) -> None:
     """Declare the flags that world, cloud, link and teleop have in common."""
     status_arguments(parser)
+    number_argument(parser)
+
+
+def number_argument(parser: argparse._ActionsContainer) -> None:
+    """Declare the flag of processes that work for one robot of a fleet."""
     about = "number in the experiment's fleet (default: no fleet)"
     flags(parser)("--robot", "K", about, read=whole_number(0, 999))
 

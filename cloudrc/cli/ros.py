@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from cloudrc.cli.output import print_line, tell
 from cloudrc.cli.parser import Options, Parser, add_verbs, flags
+from cloudrc.cli.processes import number_argument
 from cloudrc.cli.where import given_token, need_run_here, token_argument
 from cloudrc.errors import BadInputError
 from cloudrc.teleop.client import Api
@@ -42,6 +43,7 @@ def arguments(parser: Parser) -> None:
     pod = bridge.add_argument_group("in the container of the chart")
     add = flags(pod)
     add("--config", "FILE", "experiment file")
+    number_argument(pod)
     add("--records", "DIR", "folder of 'cloudrc cloud --records DIR'")
     add("--api", "URL", "the API of teleop; without a token, nodes cannot steer")
     token_argument(pod)
@@ -55,6 +57,7 @@ class _Flight(NamedTuple):
     api: Api
     has_api: bool  # whether the API answers the bridge; otherwise nodes cannot steer
     has_ended: Callable[[], bool]
+    robot: int | None = None  # number in a fleet
 
 
 def execute(options: Options) -> None:
@@ -90,7 +93,8 @@ def _in_pod(options: Options) -> _Flight:
         raise BadInputError(f"--config, --records and --api {text}")
     token = given_token(options)
     api = Api(options.api, token or str)
-    return _Flight(options.config, options.records, api, token is not None, lambda: False)
+    steers = token is not None
+    return _Flight(options.config, options.records, api, steers, lambda: False, options.robot)
 
 
 def _open(stack: ExitStack, options: Options, flight: _Flight) -> tuple[Any, Any]:
@@ -98,7 +102,7 @@ def _open(stack: ExitStack, options: Options, flight: _Flight) -> tuple[Any, Any
     from cloudrc.bridges.ros2.bridge import RosBridge, Shown
     from cloudrc.bridges.ros2.description import RobotFrames, covariances, urdf
     from cloudrc.bridges.ros2.requests import RosRequests
-    from cloudrc.config.load import read_experiment
+    from cloudrc.config.load import read_experiment, robot_settings
     from cloudrc.config.robot import find_robot
     from cloudrc.config.scene import scene_of
     from cloudrc.console.steering import Steering
@@ -106,7 +110,7 @@ def _open(stack: ExitStack, options: Options, flight: _Flight) -> tuple[Any, Any
     from cloudrc.report.markers import encode_markers, scene_shapes
     from cloudrc.robots.shapes import read_shapes
 
-    world = read_experiment(str(flight.config)).world
+    world = read_experiment(str(flight.config), robot_settings(flight.robot)).world
     robot = find_robot(world.robot)
     name = options.namespace.strip("/")
     frames = RobotFrames(f"{name}/" if name else "", options.rep_105)

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cloudrc.config.hull import known_hull
-from cloudrc.config.load import read_experiment
+from cloudrc.config.load import read_experiment, robot_settings
+from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.scene import scene_of
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import Page
@@ -35,6 +36,11 @@ class ConsoleTarget(NamedTuple):
     link: LinkControl  # reads and changes the link
     has_ended: Callable[[], bool]
     token: Callable[[], str] | None = None  # of the page; None: a new one, which is printed
+    robot: int | None = None  # number in a fleet
+
+    def experiment(self) -> ResolvedExperiment:
+        """Read the experiment of the robot."""
+        return read_experiment(str(self.config), robot_settings(self.robot))
 
 
 def serve(
@@ -52,7 +58,7 @@ def serve(
         sys.setswitchinterval(SWITCH_PERIOD)
         text = "this run has a console already; open its page, or end it first"
         lock(opened.enter_context(flight.config.open()), text)
-        experiment = read_experiment(str(flight.config))
+        experiment = flight.experiment()
         known = obstacles(scene_of(experiment.world), touch=experiment.mission.touched)
         feed = FlightFeed(tuple(filter(has_surface, known)), known_hull(experiment.world.robot))
         steering = Steering(flight.api, flight.link)

@@ -125,16 +125,18 @@ def _remote_link(experiment: ResolvedExperiment, folder: Path) -> Iterator[Remot
         yield RemoteLink(peer, period, controller.start_limit)
 
 
-def run_remote(config: Path, folder: Path, stop: StopSignal, *, watched: bool) -> None:
+def run_remote(
+    config: Path, folder: Path, stop: StopSignal, *, watched: bool, robot: int | None = None
+) -> None:
     """Run the driver of a controller outside until `stop`.
 
     `folder` has the sockets between cloud and the driver. A supervisor reads the feed if it is
-    `watched`.
+    `watched`. `robot` is the number in a fleet.
     """
     from cloudrc.drivers.remote import DATAGRAM_MAX, RemoteDriver, sockets_of
 
     feed = Feed.on_stdout(watched=watched)
-    controller = assembly.build_controller(load_experiment(str(config)))
+    controller = assembly.build_controller(load_experiment(str(config), robot_settings(robot)))
     assert isinstance(controller, OutsideController), "the supervisor starts it for no other"
     other, own = sockets_of(folder)
     with closing(UnixDatagrams(own, other, DATAGRAM_MAX)) as peer:

@@ -114,7 +114,24 @@ def test_prometheus_tells_robots_and_releases_apart():
     for panel in board["panels"]:
         for target in panel["targets"]:
             selectors = re.findall(r"{(.*?)}", target["expr"])
-            assert all('release=~"$release",robot=~"$robot"' in each for each in selectors)
+            assert all('release=~"$release"' in each for each in selectors)
+            # The cell serves all robots, and "worst" means of all: whichever robot is chosen.
+            of_all = "cell" in target["expr"] or "worst" in panel["title"]
+            assert all(('robot=~"$robot"' in each) != of_all for each in selectors)
+
+
+def test_each_container_that_reads_the_experiment_knows_the_robots_number():
+    values = {**FLEET, "console": ON, "ros": ON, "cloud": {"ros": {**ON, "launch": ["true"]}}}
+    found = [each for pod in pod_specs(render(values)).values() for each in pod["containers"]]
+    readers = {
+        one["name"]: one
+        for one in found
+        if "--config=/etc/cloudrc/experiment.yaml" in one.get("args", []) and one["name"] != "cell"
+    }
+    assert readers.keys() == {"world", "cloud", "teleop", "ros", "bridge", "console"}
+    for one in readers.values():
+        assert "--robot=$(ROBOT)" in one["args"]
+        assert "ROBOT" in [each["name"] for each in one["env"]]
 
 
 def test_more_robots_restart_nothing():

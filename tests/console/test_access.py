@@ -166,6 +166,6 @@ def test_the_token_of_a_release_s_page_follows_from_that_of_its_api(tmp_path):
     secret.write_text("o" * 32)
     assert page_token("o" * 32) != page_token("p" * 32)
     assert "o" * 8 not in page_token("o" * 32)
-    flags = {"config": secret, "profile": secret, "api": "http://127.0.0.1:1"}
+    flags = {"config": secret, "profile": secret, "api": "http://127.0.0.1:1", "robot": None}
     options = type("Options", (), {**flags, "token_file": secret})
     assert console._in_pod(options).token() == page_token("o" * 32)

@@ -234,10 +234,18 @@ def test_controls_have_heights_only_for_a_robot_that_flies(filled, name, axes):
     assert len(controls._numbers.value) == axes
 
 
+def test_in_a_pod_the_page_shows_its_own_robot_of_a_fleet(tmp_path):
+    config = tmp_path / "experiment.yaml"
+    config.write_text("{fleet: {vary: [{world.robot: pelican}, {world.robot: nano}]}}")
+    flags = {"config": config, "profile": config, "api": "http://127.0.0.1:1", "token_file": None}
+    shown = [console._in_pod(Namespace(**flags, robot=number)).experiment() for number in (0, 1)]
+    assert [each.world.robot for each in shown] == ["pelican", "nano"]
+
+
 def test_in_a_pod_a_slider_requests_a_change_and_returns(monkeypatch, capsys, tmp_path):
     profile = tmp_path / "profile.yaml"
     profile.write_text("uplink: {delay_ms: 40}")
-    flags = {"config": profile, "profile": profile, "api": "http://127.0.0.1:1"}
+    flags = {"config": profile, "profile": profile, "api": "http://127.0.0.1:1", "robot": None}
     link = console._in_pod(Namespace(**flags, token_file=None)).link
     link.change(["uplink.delay_ms=120"])
     assert capsys.readouterr().out == "link set uplink.delay_ms=120\n"

@@ -67,6 +67,9 @@ env:
 env:
   - {name: ROS_AUTOMATIC_DISCOVERY_RANGE, value: LOCALHOST}
   - {name: HOME, value: /tmp}
+  {{- with include "cloudrc.robotVariable" .root }}
+  {{- . | nindent 2 }}
+  {{- end }}
   {{- with .of.extraEnv }}
   {{- toYaml . | nindent 2 }}
   {{- end }}

@@ -47,8 +47,8 @@
   args:
     - teleop
     - --config=/etc/cloudrc/experiment.yaml
-    {{- if include "cloudrc.isFleet" . }}
-    - --robot=$(ROBOT)
+    {{- with include "cloudrc.robotArg" . }}
+    {{- . | nindent 4 }}
     {{- end }}
     - --socket=/run/cloudrc-teleop
     - "--api=[::]:8080"
@@ -82,6 +82,9 @@
     - policy
     - drive
     - --config=/etc/cloudrc/experiment.yaml
+    {{- with include "cloudrc.robotArg" . }}
+    {{- . | nindent 4 }}
+    {{- end }}
     - --socket=/run/cloudrc-teleop
   {{- include "cloudrc.rosSettings" $controls | nindent 2 }}
   volumeMounts:
@@ -109,6 +112,9 @@
     - ros
     - bridge
     - --config=/etc/cloudrc/experiment.yaml
+    {{- with include "cloudrc.robotArg" . }}
+    {{- . | nindent 4 }}
+    {{- end }}
     - --records=/run/cloudrc-records
     - --api=http://127.0.0.1:8080
     {{- if .Values.ros.steer }}
@@ -136,6 +142,9 @@
   args:
     - console
     - --config=/etc/cloudrc/experiment.yaml
+    {{- with include "cloudrc.robotArg" . }}
+    {{- . | nindent 4 }}
+    {{- end }}
     - --api=http://127.0.0.1:8080
     - --token-file=/etc/cloudrc-tokens/operator
     - --profile=/etc/cloudrc-link/profile.yaml
@@ -145,6 +154,9 @@
     {{- end }}
   env:
     - {name: HOME, value: /tmp}
+    {{- with include "cloudrc.robotVariable" . }}
+    {{- . | nindent 4 }}
+    {{- end }}
     {{- with .Values.console.extraEnv }}
     {{- toYaml . | nindent 4 }}
     {{- end }}

@@ -37,22 +37,34 @@ updateStrategy:
   rollingUpdate: {maxUnavailable: 100%}
 {{- end }}
 
-{{/* Environment of a container of a robot. A pod's index is the robot's number. Argument: the container's values. */}}
-{{- define "cloudrc.robotEnv" -}}
-env:
-  - name: ROBOT
-    valueFrom:
-      fieldRef:
-        fieldPath: metadata.labels['apps.kubernetes.io/pod-index']
-  {{- with .extraEnv }}
-  {{- toYaml . | nindent 2 }}
-  {{- end }}
+{{/* Variable with the robot's number, which is the pod's index; nothing without a fleet. */}}
+{{- define "cloudrc.robotVariable" -}}
+{{- if include "cloudrc.isFleet" . -}}
+- name: ROBOT
+  valueFrom:
+    fieldRef:
+      fieldPath: metadata.labels['apps.kubernetes.io/pod-index']
+{{- end }}
+{{- end }}
+
+{{/* Argument of a process that works for one robot; nothing without a fleet. */}}
+{{- define "cloudrc.robotArg" -}}
+{{- if include "cloudrc.isFleet" . -}}
+- --robot=$(ROBOT)
+{{- end }}
 {{- end }}
 
 {{/* Environment of a container of world or cloud. Argument: (list $ VALUES), the values of the container. */}}
 {{- define "cloudrc.env" -}}
-{{- $of := include "cloudrc.isFleet" (index . 0) | empty | ternary "cloudrc.extraEnv" "cloudrc.robotEnv" -}}
-{{- include $of (index . 1) -}}
+{{- with include "cloudrc.robotVariable" (index . 0) -}}
+env:
+  {{- . | nindent 2 }}
+  {{- with (index $ 1).extraEnv }}
+  {{- toYaml . | nindent 2 }}
+  {{- end }}
+{{- else -}}
+{{- include "cloudrc.extraEnv" (index . 1) -}}
+{{- end }}
 {{- end }}
 
 {{/* Host of a robot's pod, whose number is NUMBER; without a fleet that of the only one.
@@ -75,8 +87,8 @@ env:
 {{- if include "cloudrc.hasCell" .root }}
 - --peer={{ include "cloudrc.fullname" .root }}-cell:{{ eq .component "world" | ternary 7400 8400 }}
 {{- end }}
-{{- if include "cloudrc.isFleet" .root }}
-- --robot=$(ROBOT)
+{{- with include "cloudrc.robotArg" .root }}
+{{ . }}
 {{- end }}
 {{- end }}
 
