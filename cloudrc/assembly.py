@@ -457,7 +457,7 @@ def _leg(
         limit,
         speed,
         acceleration,
-        radians(waypoint.yaw_tolerance_deg or schema.YAW_TOLERANCE_DEG),
+        waypoint.yaw_tolerance,
     )
 
 

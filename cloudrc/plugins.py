@@ -19,7 +19,12 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points, packages_distributions, version
+from importlib.metadata import (
+    EntryPoint,
+    entry_points,
+    packages_distributions,
+    version,
+)
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -219,7 +224,12 @@ def _distributions() -> Mapping[str, list[str]]:
 @cache  # the search takes milliseconds, which every flight of a sweep would pay
 def _entries(kind: str, path: tuple[str, ...]) -> dict[str, EntryPoint]:
     """Return the entry points of a kind in the packages on `path`, Python's search path."""
-    return {entry.name: entry for entry in entry_points(group=f"cloudrc.{kind}")}
+    return {entry.name: entry for entry in _all_entries(path).select(group=f"cloudrc.{kind}")}
+
+
+@cache
+def _all_entries(path: tuple[str, ...]) -> Any:
+    return entry_points()
 
 
 def one(kind: str) -> str:

@@ -19,9 +19,8 @@ from cloudrc.cli.parser import KUBECTL_PLUGIN, Add, Options, Parser, flags, numb
 from cloudrc.cluster.client import DEFAULT_RELEASE as DEFAULT_RELEASE
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.files import warn_if_readable
-from cloudrc.outside.paths import read_token
+from cloudrc.outside.paths import TOKEN_VARIABLE, read_token
 from cloudrc.runs.requirements import require
-from cloudrc.teleop.client import VARIABLE
 
 if TYPE_CHECKING:
     from cloudrc.cli.under_way import RunInFlight
@@ -133,7 +132,7 @@ def need_release(options: Options) -> Release:
 
 def token_argument(parser: argparse._ActionsContainer) -> None:
     """Declare the argument --token-file."""
-    text = f"file with the API's token (default: from {VARIABLE}, or the release's Secret)"
+    text = f"file with the API's token (default: from {TOKEN_VARIABLE}, or the release's Secret)"
     flags(parser)("--token-file", "FILE", text)
 
 
@@ -144,8 +143,8 @@ def given_token(options: Options) -> Callable[[], str] | None:
     """
     if path := options.token_file:
         named = f"--token-file {path}"
-    elif name := os.environ.get(VARIABLE):
-        path, named = Path(name), f"{VARIABLE}={name}"
+    elif name := os.environ.get(TOKEN_VARIABLE):
+        path, named = Path(name), f"{TOKEN_VARIABLE}={name}"
     else:
         return None
     warn_if_readable(path, tell)

@@ -8,6 +8,7 @@ loading the file.
 
 from __future__ import annotations
 
+from math import radians
 from pathlib import PurePath
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -120,6 +121,11 @@ class Waypoint(Section):
     speed_mps: Speed | None = None
     """Largest speed of the moving setpoint on the way to this point [m/s]; only with the key
     carrot. null: carrot.speed_mps"""
+
+    @property
+    def yaw_tolerance(self) -> float:
+        """Difference from the yaw within which the point counts as reached [rad]."""
+        return radians(self.yaw_tolerance_deg or YAW_TOLERANCE_DEG)
 
 
 class Carrot(Section):

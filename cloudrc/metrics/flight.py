@@ -12,12 +12,11 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial, reduce
 from math import isfinite
 from types import SimpleNamespace
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.config.schema import Criteria, MissionConfig
 from cloudrc.geometry.clearance import Spheres, clearance, inside_tube, least_clearance
 from cloudrc.geometry.obstacles import Obstacle, has_surface, obstacles
 from cloudrc.geometry.scene import Scene
@@ -28,6 +27,9 @@ from cloudrc.record.columns import Recording, Table, datagrams, join
 from cloudrc.record.holes import Hole
 from cloudrc.record.topics import BY_SOURCE
 from cloudrc.records import UNDER_WAY, Control, Record
+
+if TYPE_CHECKING:
+    from cloudrc.config.schema import Criteria, MissionConfig
 
 Array: TypeAlias = NDArray[Any]
 Columns: TypeAlias = dict[str, Array]

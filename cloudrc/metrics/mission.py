@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from math import radians
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cloudrc.config.schema import YAW_TOLERANCE_DEG, Waypoint
 from cloudrc.geometry.scene import is_obstacle
 from cloudrc.metrics.definitions import Holds
 from cloudrc.metrics.flight import (
@@ -27,6 +27,9 @@ from cloudrc.metrics.flight import (
 )
 from cloudrc.record.merge import machine_time_ns
 from cloudrc.rounding import differences, exceeds
+
+if TYPE_CHECKING:
+    from cloudrc.config.schema import Waypoint
 
 IMPACT_NS = 100_000_000
 """Time from the first touch over which the impulse is summed [ns]: the impact and its bounces."""
@@ -152,8 +155,7 @@ def _stay(flight: Flight, waypoint: Waypoint, until_ns: int) -> tuple[bool, str]
     if waypoint.yaw_deg is not None:
         yaws = yaw_of(truth["orientation_wxyz"])
         turn = np.abs(turn_between(yaws, radians(waypoint.yaw_deg)))
-        allowed = radians(waypoint.yaw_tolerance_deg or YAW_TOLERANCE_DEG)
-        there &= differences(allowed + NOISE * _yaw_noise(flight), turn) <= 0.0
+        there &= differences(waypoint.yaw_tolerance + NOISE * _yaw_noise(flight), turn) <= 0.0
         turned = " or not turned as asked"
     # If the mission has a `carrot` (a moving setpoint), a stay of any length is enough, because the
     # setpoint waits at the waypoint for the dwell time.

@@ -19,6 +19,8 @@ PICTURES = {
 """Kind of a picture -> how its files begin."""
 LOCK = ".lock"
 """File of a folder that each command locks; the names of further locks begin so."""
+TOKEN_VARIABLE = "CLOUDRC_TOKEN_FILE"
+"""Environment variable of a command that names the file with the API's token."""
 _TOKEN = re.compile(rb"[!-~]{16,512}")
 _Secret = TypeVar("_Secret")
 

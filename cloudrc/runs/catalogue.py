@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 
 from cloudrc.text import Paint, plain, table
 
@@ -45,11 +44,9 @@ def _onboard_of_robots() -> dict[str, str]:
     """Describe the onboard controllers that are files of a shipped robot, such as the Pelican's."""
     from cloudrc import plugins
     from cloudrc.config import shipped
-    from cloudrc.config.robot import find_robot
 
-    controllers = [find_robot(robot).onboard for robot in shipped.names("robot")]
-    files = [each.name for each in controllers if plugins.is_path(each.name)]
-    return {"/".join(Path(file).parts[-2:]): plugins.describe("onboard", file) for file in files}
+    files = shipped.FOLDERS["robot"].glob("*/onboard.py")
+    return {"/".join(file.parts[-2:]): plugins.describe("onboard", str(file)) for file in files}
 
 
 def _comment(kind: str, name: str) -> str:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
 
 from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.outside.paths import TOKEN_VARIABLE
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
@@ -38,8 +39,6 @@ FOREIGN = (
 ALL_MET = "every waypoint reached, every criterion met"
 """Says what a robot has done in a mission of waypoints that succeeded."""
 UNIX = "unix:"
-VARIABLE = "CLOUDRC_TOKEN_FILE"
-"""Environment variable of a command that names the file with the token."""
 
 
 class ApiError(CloudrcError):
@@ -163,7 +162,7 @@ def _refusal(answer: http.client.HTTPResponse, place: str, *, with_token: bool) 
     detail = _detail(answer)
     if answer.status == 401:
         which = "does not know this token" if with_token else "asks for a token"
-        detail = f"the API {which}; name its file: --token-file FILE or {VARIABLE}"
+        detail = f"the API {which}; name its file: --token-file FILE or {TOKEN_VARIABLE}"
     detail = f"{place}: {detail}" if place else detail
     if answer.status in (400, 413, 422):
         return BadInputError(detail)

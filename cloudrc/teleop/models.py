@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from math import radians
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
 from cloudrc.config.ground import on_ground, put_on_ground
 from cloudrc.config.heading import WHY, Heading, without_held_yaws
@@ -29,7 +29,7 @@ from cloudrc.config.schema import (
     Waypoint,
     Yaw,
 )
-from cloudrc.config.section import Section
+from cloudrc.config.section import Described, Section
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import Spheres
 from cloudrc.geometry.scene import Scene
@@ -108,8 +108,8 @@ EXAMPLES: dict[type[Section], dict[str, Any]] = {
 }
 
 
-class _Answer(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+class _Answer(Described):
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Reached(_Answer):
