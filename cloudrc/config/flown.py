@@ -31,8 +31,7 @@ class FlownWorld:
     @property
     def steered(self) -> Fence:
         """Fence inside which an operator steers; for a planar robot, at its height only."""
-        fence = fence_of(self.scene)
-        return replace(fence, ground=self.scene.spawn[2]) if self.planar else fence
+        return fence_of(self.scene, planar=self.planar)
 
     def to_bytes(self) -> bytes:
         """Return the content of a file, which `from_bytes` reads: every number is kept exactly."""

@@ -9,7 +9,6 @@ path, as in the paper's mission.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -46,12 +45,11 @@ def check_scene(
 
     Their paths are those of the experiment. A `planar` robot stays on the ground.
     """
-    fence, spawn = fence_of(scene), np.array([scene.spawn])
+    fence, spawn = fence_of(scene, planar=planar), np.array([scene.spawn])
     low, high = (*fence.inner_low[:2], fence.low[2]), fence.inner_high  # it stands on the ground
-    axes = slice(2 if planar else 3)
-    if (np.clip(spawn, low, high) != spawn)[0, axes].any():
-        where = _spans(low, high, planar=planar)
-        spawn_at = _point(scene.spawn)
+    spawn_at = _point(scene.spawn)
+    if (np.clip(spawn, low, high) != spawn)[0, fence.axes].any():
+        where = _spans(low, high, fence.axes)
         reason = f"the spawn, {spawn_at}, is outside or too near to a wall; it may be at {where}"
         return [ConfigProblem(("world", "fence_m"), "", reason)]
     known = obstacles(scene, touch=touch)
@@ -59,8 +57,8 @@ def check_scene(
     if hit < 0:
         return []
     reason = (
-        f"at the spawn, {_point(scene.spawn)}, the robot touches {surface(known[hit])}; every body "
-        "but floor is an obstacle"
+        f"at the spawn, {spawn_at}, the robot touches {surface(known[hit])}; every body but floor "
+        "is an obstacle"
     )
     return [ConfigProblem(("world", "scene"), scene.name, reason)]
 
@@ -84,16 +82,15 @@ def check_mission(
     problems += islice(check_yaws(mission, heading), _REPORTED)
     if problems:
         return problems
-    fence = fence_of(scene)
+    fence = fence_of(scene, planar=planar)
     if mission.setpoints is not None:
-        steered = replace(fence, ground=scene.spawn[2]) if planar else fence
         with collect(problems, ("setpoints",)):
-            read_setpoints(Path(mission.setpoints), steered)
+            read_setpoints(Path(mission.setpoints), fence)
         return problems
     if mission.steps is not None:
-        reason = _check_steps(mission, mission.steps, scene, robot, planar=planar)
+        reason = _check_steps(mission, mission.steps, scene, robot, fence)
         return [ConfigProblem(("steps",), "", reason)] if reason else []
-    return list(_check_fence(mission, fence, planar=planar) or _check_ways(mission, scene, robot))
+    return list(_check_fence(mission, fence) or _check_ways(mission, scene, robot))
 
 
 def _check_parts(mission: MissionConfig) -> ConfigProblem | None:
@@ -127,18 +124,16 @@ def _check_touch(mission: MissionConfig, scene: Scene) -> ConfigProblem | None:
     return ConfigProblem(("touch", "body"), body, f"{text}; null: nothing to touch")
 
 
-def _check_fence(mission: MissionConfig, fence: Fence, *, planar: bool) -> list[ConfigProblem]:
+def _check_fence(mission: MissionConfig, fence: Fence) -> list[ConfigProblem]:
     """List the waypoints beyond the fence.
 
     A waypoint may be outside by half its tolerance; the other half is for control errors.
     """
     positions = _positions(mission)
     slack = np.array([0.5 * waypoint.tolerance_m for waypoint in mission.waypoints])
-    found = []
-    for index in np.flatnonzero(outside_fence(fence, positions, slack, planar=planar)).tolist():
-        reason = f"beyond the fence, or too near to it; {_allowed(fence, planar=planar)}"
-        found.append(_at_point(index, positions[index], reason))
-    return found[:_REPORTED]
+    reason = f"beyond the fence, or too near to it; {_allowed(fence)}"
+    outside = np.flatnonzero(outside_fence(fence, positions, slack)).tolist()
+    return [_at_point(index, positions[index], reason) for index in outside[:_REPORTED]]
 
 
 def _check_ways(mission: MissionConfig, scene: Scene, robot: Spheres) -> Iterator[ConfigProblem]:
@@ -172,15 +167,15 @@ def _starts(mission: MissionConfig, scene: Scene) -> Array:
 
 
 def _check_steps(
-    mission: MissionConfig, steps: Steps, scene: Scene, robot: Spheres, *, planar: bool
+    mission: MissionConfig, steps: Steps, scene: Scene, robot: Spheres, fence: Fence
 ) -> str:
     """Check the box that contains all random setpoints; return the problem, "" if none."""
-    fence, axis = fence_of(scene), np.linspace(-1, 1, 9)
+    axis = np.linspace(-1, 1, 9)
     box = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     with np.errstate(over="ignore"):  # an infinite position is outside the fence, too
         positions = np.array(steps.centre_m) + box * np.array(steps.range_m)
-    if outside_fence(fence, positions, planar=planar).any():
-        where = _allowed(fence, planar=planar)
+    if outside_fence(fence, positions).any():
+        where = _allowed(fence)
         return f"steps reach beyond the fence, or too near to it; {where}; choose a smaller range_m"
     known = obstacles(scene, touch=mission.touched)
     hit = find_overlapped(known, robot, positions).max()
@@ -190,18 +185,18 @@ def _check_steps(
     return ""
 
 
-def _allowed(fence: Fence, *, planar: bool) -> str:
-    """Describe where the guard lets the robot fly or drive, world frame."""
-    verb = "drive" if planar else "fly"
-    where = _spans(fence.inner_low, fence.inner_high, planar=planar)
-    return f"the guard lets the robot {verb} at {where}"
+def _allowed(fence: Fence) -> str:
+    """Describe where the guard lets the robot be, world frame."""
+    return (
+        f"the guard keeps the robot within {_spans(fence.inner_low, fence.inner_high, fence.axes)}"
+    )
 
 
-def _spans(low: Vector, high: Vector, *, planar: bool) -> str:
-    """Describe a box by its corners [m]; without heights for a `planar` robot."""
+def _spans(low: Vector, high: Vector, axes: slice) -> str:
+    """Describe a box by its corners [m], along some axes."""
     sides = zip("xyz", low, high, strict=True)
     spans = [f"{axis} {below:g} to {above:g}" for axis, below, above in sides]
-    return ", ".join(spans[: 2 if planar else 3]) + " [m]"
+    return f"{', '.join(spans[axes])} [m]"
 
 
 def _at_point(index: int, position: Array, reason: str) -> ConfigProblem:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from importlib.util import find_spec
 
 from cloudrc.config.robot import is_planar
@@ -40,6 +39,4 @@ def _read(world: World) -> Scene:
 
 def steered_in(world: World) -> Fence:
     """Return the fence inside which an operator steers; for a planar robot, at its height only."""
-    scene = scene_of(world)
-    fence = fence_of(scene)
-    return replace(fence, ground=scene.spawn[2]) if is_planar(world.robot) else fence
+    return fence_of(scene_of(world), planar=is_planar(world.robot))

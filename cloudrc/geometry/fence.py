@@ -50,6 +50,11 @@ class Fence:
         highest = z - WALL_MARGIN if self.ground is None else self.ground
         return (x - WALL_MARGIN, y - WALL_MARGIN, highest)
 
+    @property
+    def axes(self) -> slice:
+        """Axes that the fence limits: x, y and z, or x and y if the robot stays on the ground."""
+        return slice(3 if self.ground is None else 2)
+
     def room(self, spawn: Vector) -> float:
         """Return the longest way along x or y from the spawn to where a robot may take off [m]."""
         walls = zip(self.low[:2], spawn[:2], self.high[:2], strict=True)

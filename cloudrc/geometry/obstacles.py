@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -39,8 +40,8 @@ def surface(obstacle: Obstacle) -> str:
     return obstacle.name
 
 
-def fence_of(scene: Scene) -> Fence:
-    """Return the fence of a scene.
+def fence_of(scene: Scene, *, planar: bool = False) -> Fence:
+    """Return the fence of a scene; a `planar` robot stays in it at the height of the spawn.
 
     Raises:
         MissingPrerequisiteError: If the scene declares no fence, and MuJoCo is missing.
@@ -51,7 +52,7 @@ def fence_of(scene: Scene) -> Fence:
             '<numeric name="fence" data="x0 y0 z0 x1 y1 z1"/>, set world.fence_m, or run: '
             "pip install 'cloudrc[world]'"
         )
-    return scene.own_fence
+    return replace(scene.own_fence, ground=scene.spawn[2]) if planar else scene.own_fence
 
 
 def _as_solid(plate: Plate) -> Solid:

@@ -19,16 +19,14 @@ STEP_MIN = 0.02
 shortest step would not end."""
 
 
-def outside_fence(
-    fence: Fence, positions: Array, slack: ArrayLike = 0.0, *, planar: bool = False
-) -> NDArray[np.bool_]:
+def outside_fence(fence: Fence, positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]:
     """Return which positions are outside the box in which the guard lets the robot fly.
 
     `positions` are in [m], world frame, shape (n, 3). A position counts as inside if its distance
     from the box is at most `slack` [m], shape () or (n,), unless it is outside the fence. Only the
-    walls concern a `planar` robot.
+    walls concern a robot that stays on the ground.
     """
-    axes = slice(2 if planar else 3)
+    axes = fence.axes
     at = positions[:, axes]
     within = np.clip(at, fence.low[axes], fence.high[axes])
     beyond = within - np.clip(within, fence.inner_low[axes], fence.inner_high[axes])

@@ -62,7 +62,7 @@ def test_fifty_problems_at_most_are_listed(mine):
         ("mission: {waypoints: [{tolerance_m: 1}]}",
          "mission.waypoints.0.position_m: is missing"),
         ("mission: {waypoints: [{position_m: [0, 0, 3]}]}",
-         "[0, 0, 3]: beyond the fence, or too near to it; the guard lets the robot fly at "
+         "[0, 0, 3]: beyond the fence, or too near to it; the guard keeps the robot within "
          "x -2.8 to 9, y -8.3 to 5.3, z 0.35 to 2.3 [m]"),
         ("mission: {waypoints: [{position_m: [0.5, 0, .7]}, {position_m: [-.6, 0, .8]}]}",
          "waypoints.1.position_m: [-0.6, 0, 0.8]: the robot would be within 0.04 m of the wall of "
