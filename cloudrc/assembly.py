@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import replace
-from itertools import pairwise
 from math import degrees, dist, inf, pi, radians
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,7 +25,7 @@ from cloudrc.cloud.planar import Planar
 from cloudrc.config import schema
 from cloudrc.config.compute import compute_times
 from cloudrc.config.overrides import build_for, build_plugin
-from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.resolved import ResolvedExperiment, ResolvedGuard
 from cloudrc.config.robot import RobotFacts, facts, is_planar
 from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
@@ -343,48 +342,30 @@ def phase_ns(experiment: ResolvedExperiment) -> int:
     return int(draws.integers(SECOND_NS // slower))
 
 
-def build_plan(experiment: ResolvedExperiment) -> Plan:
-    """Convert the experiment's mission to a plan for teleop."""
-    return mission_plan(
-        experiment.mission,
-        experiment.criteria.time_limit_s,
-        experiment.seed,
-        stream=experiment.stream,
-        fence=steered_in(experiment.world),
-        speed_max=experiment.guard.speed_max_mps,
-        turn_rate_max=experiment.guard.yaw_rate_max_radps,
-    )
-
-
-def mission_plan(
-    mission: schema.MissionConfig,
-    time_limit: float | None,
-    seed: int = 0,
-    *,
-    stream: str = "",
-    fence: Fence,
-    speed_max: float = inf,
-    turn_rate_max: float = inf,
+def build_plan(
+    experiment: ResolvedExperiment,
+    mission: schema.MissionConfig | None = None,
+    time_limit: float | None = None,
 ) -> Plan:
-    """Convert a valid mission to a plan for teleop.
+    """Convert a valid mission, by default that of the experiment, to a plan for teleop.
 
-    `time_limit` is the time limit of the mission [s]; None: as long as the mission may need. `seed`
-    and `stream` are those of random setpoints, `fence` that of the scene, `speed_max` the guard's
-    speed limit [m/s], `turn_rate_max` its limit of the yaw rate [rad/s].
+    `time_limit` is that of another mission [s]; None: as long as the mission may need.
     """
+    if mission is None:
+        mission, time_limit = experiment.mission, experiment.criteria.time_limit_s
+    fence = steered_in(experiment.world)
     track = read_setpoints(Path(mission.setpoints), fence) if mission.setpoints else ()
     if track:
         legs: tuple[Leg, ...] = (Leg(track[0][1], tolerance=inf, time_limit=inf),)
         needed = LEG_FACTOR * track[-1][0]
     elif mission.steps is not None:
-        legs = _step_legs(mission.steps, seed, stream)
+        legs = _step_legs(mission.steps, experiment)
         needed = LEG_FACTOR * mission.steps.count * mission.steps.period_s
     else:
-        limits = speed_max, turn_rate_max
+        points = mission.waypoints
         legs = tuple(
-            _leg(before, waypoint, fence, limits, mission.carrot)
-            for before, waypoint in pairwise((None, *mission.waypoints))
-            if waypoint is not None
+            _leg(before, waypoint, fence, experiment.guard, mission.carrot)
+            for before, waypoint in zip((None, *points), points, strict=False)
         )
         needed = sum(leg.time_limit for leg in legs)
     start = Start.SPAWN if mission.start == "spawn" else Start.HERE
@@ -432,11 +413,11 @@ def _leg(
     before: schema.Waypoint | None,
     waypoint: schema.Waypoint,
     fence: Fence,
-    limits: tuple[float, float],
+    guard: ResolvedGuard,
     carrot: schema.Carrot | None,
 ) -> Leg:
-    """Convert the waypoint at the end of a way; `limits` are those of `mission_plan`."""
-    (speed_max, turn_rate_max), speed, acceleration = limits, 0.0, 1.0
+    """Convert the waypoint at the end of a way."""
+    speed_max, speed, acceleration = guard.speed_max_mps, 0.0, 1.0
     if carrot is not None:
         speed_max = speed = min(waypoint.speed_mps or carrot.speed_mps, speed_max)
         acceleration = carrot.acceleration_mps2
@@ -447,7 +428,7 @@ def _leg(
         way = dist(fence.low, fence.high) if before is None else dist(start, end)
         expected = way / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
         if waypoint.yaw_deg is not None:
-            expected += pi / min(TURN_RATE, turn_rate_max)  # the longest turn
+            expected += pi / min(TURN_RATE, guard.yaw_rate_max_radps)  # the longest turn
         limit = round(LEG_FACTOR * expected, 1)
     return Leg(
         waypoint.position_m,
@@ -461,9 +442,9 @@ def _leg(
     )
 
 
-def _step_legs(steps: schema.Steps, seed: int, stream: str) -> tuple[Leg, ...]:
+def _step_legs(steps: schema.Steps, experiment: ResolvedExperiment) -> tuple[Leg, ...]:
     """Make random setpoints. Each lasts one period, even if the robot does not arrive."""
-    rng = generator(seed, "steps", stream)
+    rng = generator(experiment.seed, "steps", experiment.stream)
     offsets = rng.uniform(-1.0, 1.0, (steps.count, 3)) * steps.range_m + steps.centre_m
     limit = 10 * steps.period_s
     return tuple(

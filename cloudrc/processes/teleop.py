@@ -23,6 +23,7 @@ from cloudrc.drivers.process import Feed, GracefulStop, StopSignal
 from cloudrc.drivers.realtime import Address
 from cloudrc.drivers.teleop import TeleopLoop, UnixPeer
 from cloudrc.files import write_atomically
+from cloudrc.outside.reuse import reuse_results
 from cloudrc.processes.ports import open_exporter, warn, warn_if_exposed
 from cloudrc.records import Counted, Fault, Record
 from cloudrc.teleop.api import ApiServer, Bridge, create_app
@@ -61,19 +62,14 @@ class TeleopSettings:
     robot: int | None = None  # number in a fleet
 
 
+@reuse_results()  # robot and scene stay those of the start
 def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
     """Run teleop until `stop` or, with `start`, until the mission has ended."""
     experiment = read_experiment(str(settings.config), robot_settings(settings.robot))
     exporter = open_exporter("teleop", experiment, settings.metrics)
     world = experiment.world
     scene, hull, robot = scene_of(world), hull_of(world.robot), known_robot(world.robot)
-    plan = partial(
-        assembly.mission_plan,
-        fence=steered_in(world),
-        speed_max=experiment.guard.speed_max_mps,
-        turn_rate_max=experiment.guard.yaw_rate_max_radps,
-    )
-    touch = experiment.mission.touch
+    plan, touch = partial(assembly.build_plan, experiment), experiment.mission.touch
     reader = RequestReader(scene, hull, plan, touch, robot.planar, robot.heading)
     with ExitStack() as opened:
         server = _serve_api(settings, reader)

@@ -6,16 +6,13 @@ from functools import partial
 import pytest
 
 import cloudrc
-from cloudrc.assembly import mission_plan
+from cloudrc.assembly import build_plan
 from cloudrc.config.hull import hull_of
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
 from cloudrc.teleop.models import RefusedError, RequestReader
-from tests.fences import FENCE
 
-SCENE = load_scene("pillars")
-SIZE = hull_of("rover")
 ROVER = ["world.robot=rover", "world.scene=empty"]
 
 
@@ -77,15 +74,13 @@ def test_a_silent_link_makes_the_rover_hold_and_then_stop_for_good():
     assert speed.max() < 1e-3
 
 
-PLAN = partial(mission_plan, fence=FENCE)
-
-
 def order(point):
     return json.dumps({"waypoints": [{"position_m": point}]}).encode()
 
 
 def test_teleop_takes_two_numbers_and_refuses_heights():
-    read = RequestReader(SCENE, SIZE, PLAN, planar=True)
+    plan = partial(build_plan, load_experiment("pillars"))
+    read = RequestReader(load_scene("pillars"), hull_of("rover"), plan, planar=True)
     taken = read.order(order([1.5, 1.2]))
     assert taken.plan.legs[0].position == (1.5, 1.2, 0.1)
     with pytest.raises(RefusedError, match="has a height"):

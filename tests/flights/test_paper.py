@@ -6,7 +6,6 @@ from cloudrc import assembly
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import MissionConfig
 from tests.conftest import nightly
-from tests.fences import FENCE
 from tests.flights.conftest import fly, numbers
 
 PROFILES = ("paper-p1", "paper-p2", "paper-p3")
@@ -50,8 +49,9 @@ def test_the_limit_of_a_leg_defaults_to_three_times_its_time():
     points = [{"position_m": (0.0, 0.0, 1.0)}, {"position_m": (3.0, 4.0, 1.0), "dwell_s": 2.0}]
     points.append({**points[1], "time_limit_s": 7.5})
     mission = MissionConfig.model_validate({"start": "here", "waypoints": tuple(points)})
-    for options, second in (({}, 33.0), ({"speed_max": 0.5}, 48.0)):
-        plan = assembly.mission_plan(mission, None, fence=FENCE, **options)
+    for speed, second in ((6, 33.0), (0.5, 48.0)):
+        flown = load_experiment("hover", [f"guard.speed_max_mps={speed}"])
+        plan = assembly.build_plan(flown, mission)
         limits = [leg.time_limit for leg in plan.legs]
         assert limits[1:] == [second, 7.5]
         assert plan.time_limit == max(60.0, sum(limits))

@@ -14,9 +14,10 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
-from cloudrc import assembly
+from cloudrc.assembly import build_plan
 from cloudrc.cloud.operator import EmergencyStopRepeater
 from cloudrc.config.hull import hull_of
+from cloudrc.config.load import read_experiment
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import UPRIGHT, Cause, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, MissionEvent
@@ -34,7 +35,7 @@ from tests.conftest import wait_until
 from tests.fences import FENCE
 
 PERIOD_NS = 10_000_000
-PELICAN = hull_of("pelican")
+PELICAN, PAPER = hull_of("pelican"), read_experiment("paper")
 A, B, C = (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (3.0, 0.0, 1.0)
 AWAY = (0.0, -5.0, 1.0)
 ID = 7
@@ -348,8 +349,7 @@ class Running:
         self.flight.uplink = uplink
         self.alarms, self.complaints, self.log = [], [], []
         self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
-        plan = partial(assembly.mission_plan, fence=FENCE)
-        reader = RequestReader(self.scene, PELICAN, plan)
+        reader = RequestReader(self.scene, PELICAN, partial(build_plan, PAPER))
         app = create_app(self.bridge, reader, self.complaints.append)
         tokens = None if unix else Tokens(folder, self.complaints.append)
         self.gate = Gate(app, tokens, self.log.append)
