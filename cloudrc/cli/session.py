@@ -16,7 +16,7 @@ from threading import Thread
 from types import SimpleNamespace
 from typing import IO, Any
 
-from cloudrc.cli.output import print_line, tell
+from cloudrc.cli.output import print_line
 from cloudrc.cli.parser import Options, Parser, flags, whole_number
 from cloudrc.cli.report import report_arguments
 from cloudrc.cli.run import experiment_arguments, fly_once
@@ -143,9 +143,7 @@ def _down(options: Options) -> None:
     from cloudrc.drivers.local import end_session
     from cloudrc.runs.session import last_mission
 
-    run, note = find_session(options.run)
-    if note:
-        tell(note)
+    run = find_session(options.run)
     end_session(run, DOWN_LIMIT)
     name = short(run)
     page, report = run / "report.html", run / "report.json"

@@ -7,6 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
+from cloudrc.cli.output import tell
 from cloudrc.drivers.local import LINK_LOG, SESSION, flight_files, under_way
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.runs.folder import RUNS
@@ -17,7 +18,6 @@ class RunInFlight(NamedTuple):
 
     folder: Path
     url: str  # of its API
-    note: str = ""  # what to tell the user about the choice; "" for nothing
 
 
 def short(path: Path) -> str:
@@ -28,7 +28,7 @@ def short(path: Path) -> str:
 
 
 def find_run(run: Path | None, *, steers: bool = True, links: bool = False) -> RunInFlight | None:
-    """Find the run in flight that a user means: `run`, else the only one.
+    """Find the run in flight that a user means: `run`, else the only one; tell if it is another's.
 
     If the user's newest run here, ./runs/latest, has ended, a command that changes a flight rejects
     the only run in flight, which may belong to somebody else. A link without a flight is taken.
@@ -54,14 +54,12 @@ def find_run(run: Path | None, *, steers: bool = True, links: bool = False) -> R
             raise BadInputError(f"{run}: no run flies there; name another folder")
         return RunInFlight(run, url)
     without_flight = bool(flights) and flights.keys().isdisjoint(under_way())
-    note = ask_if_unclear(flights, steers=steers and not without_flight)
-    return next((RunInFlight(Path(short(run)), url, note) for run, url in flights.items()), None)
+    ask_if_unclear(flights, steers=steers and not without_flight)
+    return next((RunInFlight(Path(short(run)), url) for run, url in flights.items()), None)
 
 
-def find_session(run: Path | None) -> tuple[Path, str]:
-    """Find the session that a user means: the one in the folder `run`, else the only one here.
-
-    Return its folder, and what to tell the user about the choice ("" for nothing).
+def find_session(run: Path | None) -> Path:
+    """Return the folder of the session that a user means: `run`, else that of the only one here.
 
     Raises:
         BadInputError: If no session runs in `run`, or if it is unclear which one is meant.
@@ -71,16 +69,16 @@ def find_session(run: Path | None) -> tuple[Path, str]:
     if run is not None:
         if run.resolve() not in sessions:
             raise BadInputError(f"--run {run}: no session runs there")
-        return run.resolve(), ""
+        return run.resolve()
     if not sessions:
         text = "start one: cloudrc up; a flight of 'cloudrc run' ends by Ctrl-C there"
         raise MissingPrerequisiteError(f"no session runs here; {text}")
-    note = ask_if_unclear(sessions, steers=True)
-    return sessions[0], note
+    ask_if_unclear(sessions, steers=True)
+    return sessions[0]
 
 
-def ask_if_unclear(candidates: Collection[Path], *, steers: bool) -> str:
-    """Raise a BadInputError if it is unclear which flight the user means; return a note about it.
+def ask_if_unclear(candidates: Collection[Path], *, steers: bool) -> None:
+    """Raise a BadInputError if it is unclear which flight the user means; tell which it may be.
 
     It is unclear if there are several `candidates`, the folders of the local runs that the command
     can use. If the command changes a flight (`steers`), it is also unclear if ./runs/latest has
@@ -95,4 +93,5 @@ def ask_if_unclear(candidates: Collection[Path], *, steers: bool) -> str:
         others = names or "--release NAME (in a cluster)"
         text = f"has ended, or does not take this command; name another flight: {others}"
         raise BadInputError(f"{short(latest)}: {text}; or start one: cloudrc up")
-    return f"using the run in {names}" if candidates and not is_mine else ""
+    if candidates and not is_mine:
+        tell(f"using the run in {names}")

@@ -99,22 +99,16 @@ def find_local_run(
         return None
     if in_cluster:
         raise BadInputError("--run names a run here, the other flags a cluster; give one")
-    return find_run_here(options.run, steers=steers, links=links)
-
-
-def find_run_here(run: Path | None, *, steers: bool, links: bool = False) -> RunInFlight | None:
-    """Find a run as `cli.under_way.find_run` does; tell which one was chosen."""
     from cloudrc.cli.under_way import find_run
 
-    found = find_run(run, steers=steers, links=links)
-    if found is not None and found.note:
-        tell(found.note)
-    return found
+    return find_run(options.run, steers=steers, links=links)
 
 
 def need_run_here(run: Path | None, *, steers: bool = True) -> RunInFlight:
-    """Find a run as `find_run_here` does; raise a BadInputError if none flies."""
-    if (found := find_run_here(run, steers=steers)) is None:
+    """Find a run as `cli.under_way.find_run` does; raise a BadInputError if none flies."""
+    from cloudrc.cli.under_way import find_run
+
+    if (found := find_run(run, steers=steers)) is None:
         raise BadInputError("no run flies here; start one: cloudrc up")
     return found
 
