@@ -34,8 +34,3 @@ def exceeds(value: float, limit: float) -> bool:
         return False
     least = ROUNDING * (value if value > -limit else -limit)
     return above >= least if least > NOISE else above >= NOISE
-
-
-def format_limit(limit: float) -> str:
-    """Format a `limit` [any unit] with all the digits that its user wrote."""
-    return f"{limit:.15g}"

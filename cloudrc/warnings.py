@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.messages import ZERO
 from cloudrc.outside.reuse import reuse_results
-from cloudrc.rounding import exceeds, format_limit
+from cloudrc.rounding import exceeds
 
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
@@ -108,7 +108,7 @@ def _time(experiment: ResolvedExperiment, plan: Plan) -> Iterator[str]:
     if limit is not None and exceeds(lasts, limit):
         yield (
             f"the {what} of the mission last {lasts:,.6g} s, longer than criteria.time_limit_s "
-            f"{format_limit(limit)}; give times in seconds, or a longer limit"
+            f"{limit:g}; give times in seconds, or a longer limit"
         )
 
 

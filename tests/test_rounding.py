@@ -5,7 +5,7 @@ from math import inf, nan
 import numpy as np
 import pytest
 
-from cloudrc.rounding import differences, exceeds, format_limit
+from cloudrc.rounding import differences, exceeds
 
 
 @pytest.mark.parametrize(
@@ -28,8 +28,3 @@ def test_differences_of_arrays_are_taken_one_by_one():
     assert differences([0.3, 1.0], [0.1 + 0.2, 2.0]).tolist() == [0.0, 1.0]
     assert np.isnan(differences(nan, 1.0))
     assert not exceeds(3.0, inf)
-
-
-@pytest.mark.parametrize("written", ["0.15", "60", "0.1240012345", "1e-07", "120"])
-def test_a_limit_is_shown_as_it_was_written(written):
-    assert format_limit(float(written)) == written

@@ -139,7 +139,6 @@ def _combine(
         _take_place(document)
     with problems.collect(found, ("link", "profile")):
         _inline_profile(document)
-    _take_contact(document)
     overrides.apply_overrides(document, inner)
     _default(document, ("guard", "plan_max_s"), _plan_max(document))
     if ("mission", "setpoints") in inner and document.get("mission", "setpoints"):
@@ -306,18 +305,6 @@ def _inline_mission(document: Document) -> None:
         problems.validate(file, MissionConfig, name)
         document.tree["mission"] = file.tree
         document.sources |= {("mission", *key): source for key, source in file.sources.items()}
-
-
-def _take_contact(document: Document) -> None:
-    """Let `contact: false` of the criteria mean that the mission touches nothing.
-
-    Experiments of before the first release have it.
-    """
-    criteria, mission = document.get("criteria"), document.get("mission")
-    if isinstance(criteria, dict) and criteria.get("contact") is False:
-        del criteria["contact"]
-        if isinstance(mission, dict):
-            mission["touch"] = None
 
 
 def _take_place(document: Document) -> None:

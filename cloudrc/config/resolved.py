@@ -26,7 +26,6 @@ from cloudrc.config.schema import (
 )
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.outside.document import write_yaml
-from cloudrc.rounding import format_limit
 
 HORIZON_MAX_S = 1.0
 """Default of cloud.horizon_max_s [s]. Source: docs/reference/control.md, "Predictors"."""
@@ -84,7 +83,7 @@ class ResolvedGuard(GuardConfig):
         cap = speed_cap(age_max, plan_max, bounds)
         speed_max: float = cap if given is None else check(given)
         if speed_max > cap + 1e-6:
-            most = format_limit(cap)
+            most = f"{cap:.9g}"
             if cap == bounds.robot.speed_max_mps:
                 raise ValueError(f"must be at most {most} m/s, the largest speed of the robot")
             plan = f" and plans of {plan_max:g} s" if plan_max else ""
@@ -105,7 +104,7 @@ class ResolvedGuard(GuardConfig):
         acceleration: float = most if given is None else check(given)
         if info.context and acceleration > most + 1e-6:
             raise ValueError(
-                f"must be at most {format_limit(most)} m/s^2, the largest acceleration of the robot"
+                f"must be at most {most:.9g} m/s^2, the largest acceleration of the robot"
             )
         return acceleration
 

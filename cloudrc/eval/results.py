@@ -15,7 +15,6 @@ from cloudrc.eval.setup import Episode, EvalSetup
 from cloudrc.files import read_json, write_json
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.outside.values import InvalidValueError
-from cloudrc.rounding import format_limit
 from cloudrc.statistics import LEVEL
 from cloudrc.text import cells, table
 from cloudrc.trials.play import run
@@ -175,7 +174,7 @@ def read_versus(folder: Path, setup: EvalSetup, episodes: Sequence[Episode]) -> 
 def describe_success(setup: EvalSetup, outcomes: Sequence[Mapping[str, Any]]) -> str:
     """Say in words what counts as a success."""
     if setup.success_at is not None:
-        return f"a return of at least {format_limit(setup.success_at)}"
+        return f"a return of at least {setup.success_at:g}"
     if any("successes" not in each for each in outcomes):
         return "unknown: the environment's info has no success; the return is measured"
     return "the environment's info says success in some step"

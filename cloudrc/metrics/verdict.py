@@ -42,7 +42,7 @@ from cloudrc.metrics.response import responses
 from cloudrc.record.columns import Recording
 from cloudrc.record.holes import describe
 from cloudrc.records import CONTROLLER_LOST, REAL_TIME_FACTOR_MIN
-from cloudrc.rounding import exceeds, format_limit
+from cloudrc.rounding import exceeds
 
 if TYPE_CHECKING:
     from cloudrc.config.schema import Touch
@@ -174,7 +174,7 @@ def _too_fast(evidence: Evidence) -> Iterator[FlightFailure]:
     limit = wanted.speed_max_mps
     text = (
         f"the robot met {wanted.body} at {speed:.4g} m/s, above "
-        f"mission.touch.speed_max_mps {format_limit(limit)}"
+        f"mission.touch.speed_max_mps {limit:g}"
     )
     yield FlightFailure("contact_too_fast", text, *moment)
 
@@ -193,7 +193,7 @@ def _unmet_goals(evidence: Evidence) -> Iterator[FlightFailure]:
         text = f"the robot never touched {evidence.wanted.body}, which mission.touch requires"
         yield FlightFailure("not_touched", text)
     if end.time is not None and exceeds(end.time, evidence.time_limit):
-        key = f"criteria.time_limit_s {format_limit(evidence.time_limit)}"
+        key = f"criteria.time_limit_s {evidence.time_limit:g}"
         text = f"the mission took {end.time:.4g} s, more than {key}"
         yield FlightFailure("time_limit_exceeded", text, *end)
 
@@ -342,7 +342,7 @@ def _responses(flight: Flight, settle: float) -> Iterator[FlightFailure]:
         text = (
             f"{len(far)} of {len(whole)} steps did not settle: in step {first.waypoint + 1} the "
             f"robot was {first.last_error:.4g} m from the setpoint in the last 0.5 s, above "
-            f"criteria.settle_m {format_limit(settle)} m"
+            f"criteria.settle_m {settle:g} m"
         )
         yield FlightFailure("not_settled", text, first.start)
     if unstable := [step for step in found if step.unstable]:
@@ -361,7 +361,7 @@ def _missed_end(flight: Flight, settle: float) -> Iterator[FlightFailure]:
         return
     text = (
         f"setpoints flown to their end, but the robot was {away:.4g} m from the "
-        f"last one, above criteria.settle_m {format_limit(settle)} m; give the robot time there: "
+        f"last one, above criteria.settle_m {settle:g} m; give the robot time there: "
         "repeat the last row with a later time_s"
     )
     yield FlightFailure("not_settled", text, *_moment(flight, ending[0]))
