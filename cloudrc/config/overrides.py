@@ -27,7 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from cloudrc import plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.problems import ConfigProblem, ProblemsError
-from cloudrc.config.robot import RobotFacts, find_robot, parameters
+from cloudrc.config.robot import RobotFacts, known_robot, parameters
 from cloudrc.config.schema import Cloud, Experiment, PlugIn, Steps, World
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
@@ -154,8 +154,13 @@ def _parameters_at(document: Document, path: KeyPath) -> dict[str, Any]:
         return {}
     given = {key: document.get("world", key) for key in ("robot", "tuning")}
     world = World(**{key: value for key, value in given.items() if value is not None})
-    folder = document.source(("world", "robot")).folder
-    robot = find_robot(shipped.model_path("robot", world.robot, folder))
+    robot = shipped.model_path("robot", world.robot, document.source(("world", "robot")).folder)
+    return onboard_values(world.model_copy(update={"robot": robot}))
+
+
+def onboard_values(world: World) -> dict[str, Any]:
+    """Return all parameters of the onboard controller with their values, including defaults."""
+    robot = known_robot(world.robot)
     return default_parameters("onboard", robot.onboard.name) | parameters(robot, world)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from cloudrc import plugins
 from cloudrc.config.disturbances import Plant
-from cloudrc.config.overrides import BRAKING, build_plugin, default_parameters
+from cloudrc.config.overrides import BRAKING, build_plugin, onboard_values
 from cloudrc.config.problems import ProblemsError, at_key, problem_at
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotFiles, known_robot, parameters
@@ -105,12 +105,6 @@ def _connect(
         return faster.make(simulator, onboard, guard)  # type: ignore[no-any-return]
     with plugin.calling("accelerator"):
         return AcceleratedRobot(simulator, onboard, guard, name, faster.make)
-
-
-def onboard_values(world: World) -> dict[str, Any]:
-    """Return all parameters of the onboard controller with their values, including defaults."""
-    robot = known_robot(world.robot)
-    return default_parameters(KIND, robot.onboard.name) | parameters(robot, world)
 
 
 def advise(world: World, gains: Vector) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from cloudrc.config.hull import doubts, hull_of
+from cloudrc.config.overrides import onboard_values
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotFiles, find_robot
 from cloudrc.config.schema import World
@@ -21,7 +22,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Vector
 from cloudrc.outside.code import calling
-from cloudrc.robots.build import advise, build_robot, check_robot, onboard_values
+from cloudrc.robots.build import advise, build_robot, check_robot
 from cloudrc.sim.airframe import thrust_to_weight
 from cloudrc.sim.bodies import reach_of
 from cloudrc.sim.scene import ROBOT_PREFIX

@@ -9,12 +9,12 @@ from functools import cache
 from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc.ages import simulate_ages
+from cloudrc.config.overrides import onboard_values
 from cloudrc.config.problems import problem_at
 from cloudrc.config.profile import COMMAND_AGE_MS
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import CloudrcError
 from cloudrc.outside.document import child
-from cloudrc.robots.build import onboard_values
 from cloudrc.runs import flight
 from cloudrc.runs.experiment import check_no_seed, check_world, load
 from cloudrc.studies import stability

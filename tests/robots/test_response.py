@@ -5,11 +5,10 @@ import json
 import pytest
 
 import cloudrc
-from cloudrc.config.overrides import build_for
+from cloudrc.config.overrides import build_for, onboard_values
 from cloudrc.config.robot import facts, known_robot
 from cloudrc.config.schema import PlugIn, World
 from cloudrc.errors import BadInputError
-from cloudrc.robots.build import onboard_values
 from tests.conftest import nightly
 
 GROUND = {"steps": {"count": 3, "centre_m": [0, 0, 0.1], "range_m": [1.5, 1.5, 0]}}
