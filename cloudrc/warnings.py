@@ -7,18 +7,22 @@ prevents the flight.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from importlib.util import find_spec
 from itertools import pairwise
 from math import ceil, dist, inf
-from typing import TYPE_CHECKING
 
-from cloudrc.messages import ZERO
+from cloudrc.ages import DURATION_NS, simulate_ages
+from cloudrc.assembly import build_plan
+from cloudrc.config.profile import CLOUD_TIME_MAX, COMMAND_AGE_MS, DIRECTIONS
+from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.robot import known_robot
+from cloudrc.config.scene import has_mujoco, scene_of
+from cloudrc.link.doubts import describe_heavy_loss, describe_low_rate
+from cloudrc.link.model import HEADER_BYTES
+from cloudrc.messages import ZERO, plan_length
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.rounding import exceeds
-
-if TYPE_CHECKING:
-    from cloudrc.config.resolved import ResolvedExperiment
-    from cloudrc.teleop.wire import Plan
+from cloudrc.teleop.wire import Plan
+from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES
 
 GUARD_STEP = 0.002
 """Time between two looks of the guard at the age of a command [s]."""
@@ -36,11 +40,6 @@ def advise(experiment: ResolvedExperiment) -> list[str]:
 
 
 def _advise(experiment: ResolvedExperiment) -> Iterator[str]:
-    from cloudrc.ages import DURATION_NS, simulate_ages
-    from cloudrc.assembly import build_plan
-    from cloudrc.config.profile import DIRECTIONS
-    from cloudrc.link.doubts import describe_heavy_loss
-
     plan = build_plan(experiment)
     lost = [
         text for way in DIRECTIONS for text in describe_heavy_loss(getattr(experiment, way), way)
@@ -63,7 +62,7 @@ def _advise(experiment: ResolvedExperiment) -> Iterator[str]:
             "none, so the loop may be unstable; a value that fits: --set "
             "cloud.predictor=model_based"
         )
-    if not experiment.world.is_nominal and find_spec("mujoco") is not None:
+    if not experiment.world.is_nominal and has_mujoco():
         from cloudrc.robots.build import advise as advise_on_robot
 
         controller = experiment.cloud.controller
@@ -81,12 +80,6 @@ def _advise(experiment: ResolvedExperiment) -> Iterator[str]:
 
 def _low_rates(experiment: ResolvedExperiment) -> Iterator[str]:
     """Yield a warning for each direction whose bottleneck is slower than its packets need."""
-    from cloudrc.config.robot import known_robot
-    from cloudrc.link.doubts import describe_low_rate
-    from cloudrc.link.model import HEADER_BYTES
-    from cloudrc.messages import plan_length
-    from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES
-
     command = COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
     telemetry = TELEMETRY_SIZES[len(known_robot(experiment.world.robot).sensors)]
     needs = (
@@ -131,8 +124,6 @@ def _fast_track(experiment: ResolvedExperiment, plan: Plan) -> Iterator[str]:
 
 def _slow(experiment: ResolvedExperiment, plan: Plan) -> Iterator[str]:
     """Yield a warning if the robot may not move fast enough for its waypoints or steps."""
-    from cloudrc.config.scene import scene_of
-
     mission, controller = experiment.mission, experiment.cloud.controller
     settle, legs = experiment.criteria.settle_m or inf, plan.legs
     speeds = {"guard.speed_max_mps": experiment.guard.speed_max_mps}
@@ -163,8 +154,6 @@ def _long_link(
     which cloud computed the command that the robot follows. `echoes` has the age of the newest
     command that telemetry has confirmed.
     """
-    from cloudrc.config.profile import CLOUD_TIME_MAX, COMMAND_AGE_MS
-
     age_max, cloud = experiment.guard.command_age_max_ms * 1e-3, experiment.cloud
     mean, longest = sum(ages) / len(ages), max(ages)
     lasts = max(age_max, min(ages) + min(cloud.plan_s, experiment.guard.plan_max_s))

@@ -135,10 +135,7 @@ def _combine(
         _default(document, path, name)
     with problems.collect(found, ("mission",)):
         _inline_mission(document)
-    with problems.collect(found, ("cloud", "place")):
-        _take_place(document)
-    with problems.collect(found, ("link", "profile")):
-        _inline_profile(document)
+    _inline_link(document, found)
     overrides.apply_overrides(document, inner)
     _default(document, ("guard", "plan_max_s"), _plan_max(document))
     if ("mission", "setpoints") in inner and document.get("mission", "setpoints"):
@@ -274,10 +271,7 @@ def _link_of(document: Document, name: str) -> Profile:
     place = document.get("cloud", "place")
     document.tree = {"link": document.get("link") or {}, "cloud": {"place": place}}
     found: list[ConfigProblem] = []
-    with problems.collect(found, ("cloud", "place")):
-        _take_place(document)
-    with problems.collect(found, ("link", "profile")):
-        _inline_profile(document)
+    _inline_link(document, found)
     found += _resolve_paths(document)
     link = problems.validate(document, Experiment, name, found).link
     return Profile(uplink=link.uplink, downlink=link.downlink)
@@ -305,6 +299,14 @@ def _inline_mission(document: Document) -> None:
         problems.validate(file, MissionConfig, name)
         document.tree["mission"] = file.tree
         document.sources |= {("mission", *key): source for key, source in file.sources.items()}
+
+
+def _inline_link(document: Document, found: list[ConfigProblem]) -> None:
+    """Replace the names of place and link profile by what they give; add problems to `found`."""
+    with problems.collect(found, ("cloud", "place")):
+        _take_place(document)
+    with problems.collect(found, ("link", "profile")):
+        _inline_profile(document)
 
 
 def _take_place(document: Document) -> None:
