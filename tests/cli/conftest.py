@@ -1,4 +1,4 @@
-"""The working folder of each command, calls of commands, and text that would control a terminal."""
+"""The working folder of each command, and calls of commands."""
 
 import pytest
 
@@ -6,15 +6,6 @@ KEYS = "mission.steps.count=1", "mission.steps.period_s=1.0", "criteria.settle_m
 SHORT = [f"--set={key}" for key in KEYS]
 """Overrides of `steps` for one second of flight."""
 FLY = ["run", "steps", "--mode", "virtual", *SHORT]
-EVIL = "x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
-SHOWN = r"x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
-
-
-def assert_harmless(text, count=None):
-    """Check that a text shows EVIL, `count` times, without a control character."""
-    assert text.count(SHOWN) == count if count else SHOWN in text
-    assert [c for c in text if not c.isprintable() and c != "\n"] == []
-    assert [line for line in text.splitlines() if line.startswith("cloudrc: all")] == []
 
 
 @pytest.fixture(autouse=True)

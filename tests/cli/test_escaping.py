@@ -2,24 +2,12 @@
 
 import pytest
 
-from cloudrc.cli.main import main
-from tests.cli.conftest import EVIL, assert_harmless
-
-
-@pytest.fixture
-def printed(capsys):
-    """Return a function that checks the output for the escaped text, and returns the output."""
-
-    def check(count=None):
-        said = "".join(capsys.readouterr())
-        assert_harmless(said, count)
-        return said
-
-    return check
+EVIL = "x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
+SHOWN = r"x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
 
 
 @pytest.mark.parametrize("words", ["run", "report", "recover", "link show"])
-def test_a_name_in_an_error(words, printed):
-    assert main([*words.split(), EVIL]) != 0
-    (line,) = printed().splitlines()
-    assert line.startswith("cloudrc: error: ")
+def test_a_name_in_an_error(words, refused):
+    line = refused(words, EVIL)
+    assert SHOWN in line
+    assert line.removesuffix("\n").isprintable()

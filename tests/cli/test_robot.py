@@ -26,11 +26,8 @@ def replace(file, old, new):
 
 
 def test_a_new_robot_is_complete_and_its_test_flies_it(mine):
-    assert sorted(each.name for each in mine.iterdir()) == [
-        "robot.xml",
-        "robot.yaml",
-        "test_robot.py",
-    ]
+    names = {each.name for each in mine.iterdir()}
+    assert names == {"robot.xml", "robot.yaml", "test_robot.py"}
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(mine)]
     assert subprocess.run(command, cwd=mine, check=False).returncode == 0
 
@@ -40,24 +37,17 @@ def wheeled(tmp_path):
     return shutil.copytree(FOLDERS["robot"] / "rover", tmp_path / "wheeled")
 
 
-def changes_of(robot, capsys):
-    code = main(["robot", "check", str(robot), "-o", "json"])
-    found = json.loads(capsys.readouterr().out)["changes"]
-    assert code == (2 if found else 0)
-    return found
-
-
 @pytest.mark.parametrize(
     ("onboard", "count"),
     [("turn_rate_max: 0.05", 1), ("turn_rate_max: 1", 0)],
 )
-def test_the_check_lets_a_robot_with_wheels_turn(wheeled, capsys, onboard, count):
-    replace(
-        wheeled / "robot.yaml", "onboard: diff_drive", f"onboard: {{name: diff_drive, {onboard}}}"
-    )
-    found = changes_of(wheeled, capsys)
+def test_the_check_lets_a_robot_with_wheels_turn(wheeled, call, onboard, count):
+    given = f"onboard: {{name: diff_drive, {onboard}}}"
+    replace(wheeled / "robot.yaml", "onboard: diff_drive", given)
+    out = call("robot check -o json", wheeled, code=2 * count).out
+    found = json.loads(out)["changes"]
     assert [("to its left" in text, "turn_rate_max" in text) for text in found] == [
-        (True, True)
+        (True,) * 2
     ] * count
 
 

@@ -117,13 +117,23 @@ def test_failed_flights_are_recorded_if_asked_for(write_sweep, call):
     assert rows("grid") == [good, bad]
 
 
-def test_an_error_becomes_a_row_and_the_others_fly(write_sweep, monkeypatch, call):
-    def fly(experiment, *given, **named):
-        if experiment.seed == 2:
-            raise RuntimeError("no\x1b luck")
-        return assemble(experiment, *given, **named)
+@pytest.fixture
+def break_seed_2(monkeypatch):
+    """Return a function that lets the flight with seed 2 meet an error."""
 
-    monkeypatch.setattr("cloudrc.assembly.assemble", fly)
+    def use(error):
+        def fly(experiment, *given, **named):
+            if experiment.seed == 2:
+                raise error
+            return assemble(experiment, *given, **named)
+
+        monkeypatch.setattr("cloudrc.assembly.assemble", fly)
+
+    return use
+
+
+def test_an_error_becomes_a_row_and_the_others_fly(write_sweep, break_seed_2, call):
+    break_seed_2(RuntimeError("no\x1b luck"))
     told = call("sweep run --out grid", write_sweep(ONE, seeds=[2, 1]), code=1).err
     bad, good = rows("grid")
     assert (bad["verdict"], bad["failures"], bad["numbers"]) == ("error", ["error"], {})
@@ -134,23 +144,11 @@ def test_an_error_becomes_a_row_and_the_others_fly(write_sweep, monkeypatch, cal
 # An error of the machine says nothing about a flight: it ends the sweep, and no row is stored.
 
 
-@pytest.fixture
-def broken_machine(monkeypatch):
-    """Let the flight with seed 2 meet an error of the machine; return the error's text."""
-
-    def fly(experiment, *given, **named):
-        if experiment.seed == 2:
-            raise MemoryError
-        return assemble(experiment, *given, **named)
-
-    monkeypatch.setattr("cloudrc.assembly.assemble", fly)
-    return "memory ran out"
-
-
-def test_an_error_of_the_machine_ends_a_sweep_and_is_no_row(broken_machine, write_sweep, call):
+def test_an_error_of_the_machine_ends_a_sweep_and_is_no_row(break_seed_2, write_sweep, call):
+    break_seed_2(MemoryError())
     error = call("sweep run --out grid", write_sweep(ONE, seeds=[1, 2, 3]), code=3).err
     line = error.splitlines()[-1]
-    assert broken_machine in line
+    assert "memory ran out" in line
     assert "; to continue, add --out grid" in line
     assert [row["seed"] for row in rows("grid")] == [1]
 
