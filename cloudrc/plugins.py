@@ -16,7 +16,7 @@ import importlib
 import inspect
 import pkgutil
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import (
@@ -216,9 +216,8 @@ def versions_of(top: str) -> list[str]:
     return [f"{name} {version(name)}" for name in sorted({*_distributions().get(top, ())})]
 
 
-@cache
-def _distributions() -> Mapping[str, list[str]]:
-    return packages_distributions()
+_distributions = cache(packages_distributions)
+"""Return top-level package -> names of the packages that have installed it."""
 
 
 @cache  # the search takes milliseconds, which every flight of a sweep would pay

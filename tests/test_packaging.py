@@ -37,17 +37,32 @@ def build(root, folder, *targets):
     subprocess.run(command, cwd=root, check=True, capture_output=True)
 
 
-def build_wheel(folder):
-    """Build the wheel in `folder`; return its name and the names of the package's files in it."""
-    build(ROOT, folder, "wheel")
+def wheel_in(folder):
+    """Return the name of the wheel in `folder`, and the names of the package's files in it."""
     (wheel,) = folder.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         return wheel.name, {name for name in archive.namelist() if name.startswith("cloudrc/")}
 
 
-def test_the_wheel_holds_every_file_of_the_package(tmp_path, monkeypatch):
-    monkeypatch.delenv("CLOUDRC_NATIVE", raising=False)
-    name, packed = build_wheel(tmp_path)
+@pytest.fixture(scope="module", autouse=True)
+def stamp():
+    """Build as a release does."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+        patch.delenv("CLOUDRC_NATIVE", raising=False)
+        yield
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """Build wheel and source distribution of this tree."""
+    folder = tmp_path_factory.mktemp("built")
+    build(ROOT, folder, "wheel", "sdist")
+    return folder
+
+
+def test_the_wheel_holds_every_file_of_the_package(built):
+    name, packed = wheel_in(built)
     assert name.endswith("-py3-none-any.whl")
     source = {
         path.relative_to(ROOT).as_posix()
@@ -61,7 +76,8 @@ def test_the_wheel_holds_every_file_of_the_package(tmp_path, monkeypatch):
 @pytest.mark.skipif(not list(compilers()), reason="no compiler here")
 def test_a_platform_wheel_holds_the_machine_code(tmp_path, monkeypatch):
     monkeypatch.setenv("CLOUDRC_NATIVE", "1")
-    name, packed = build_wheel(tmp_path)
+    build(ROOT, tmp_path, "wheel")
+    name, packed = wheel_in(tmp_path)
     assert "-py3-none-any" not in name
     assert f"cloudrc/robots/pelican/native/{built_file().name}" in packed
     assert not built_file().exists()
@@ -92,13 +108,10 @@ def contents(folder):
     return {path.name: sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
 
 
-def test_two_builds_of_one_tree_are_byte_equal(copied, tmp_path, monkeypatch):
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
-    monkeypatch.delenv("CLOUDRC_NATIVE", raising=False)
-    for root, name in ((ROOT, "a"), (copied, "b")):
-        build(root, tmp_path / name, "wheel", "sdist")
-    assert len(contents(tmp_path / "a")) == 2
-    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+def test_two_builds_of_one_tree_are_byte_equal(copied, built, tmp_path):
+    build(copied, tmp_path / "again", "wheel", "sdist")
+    assert len(contents(built)) == 2
+    assert contents(tmp_path / "again") == contents(built)
 
 
 @pytest.mark.skipif(not shutil.which("helm"), reason="no helm here")
@@ -125,43 +138,36 @@ def test_every_image_of_a_releases_chart_is_in_the_registry_that_it_publishes_to
         assert images <= roles
 
 
-class Fresh:
-    """A new environment that has the wheel alone, and a folder far from the clone."""
-
-    def __init__(self, folder):
-        self.folder, self.bin = folder, folder / "venv" / "bin"
-        venv.create(folder / "venv", with_pip=True)
-        build_wheel(folder / "wheel")
-        (self.wheel,) = (folder / "wheel").iterdir()
-
-    def install(self, extras):
-        words = ["-m", "pip", "install", "--quiet", f"{self.wheel}{extras}"]
-        subprocess.run([self.bin / "python", *words], check=True, cwd=self.folder)
-
-    def cloudrc(self, *words):
-        clean = {key: text for key, text in os.environ.items() if key != "PYTHONPATH"}
-        command = [self.bin / "cloudrc", *words]
-        return subprocess.run(command, cwd=self.folder, env=clean, capture_output=True, text=True)
-
-
 @pytest.mark.full
-def test_the_wheel_alone_lists_then_flies_and_hands_out_the_exercise(tmp_path):
-    fresh = Fresh(tmp_path)
-    fresh.install("")
-    assert fresh.cloudrc("list").returncode == 0
+def test_the_wheel_alone_lists_then_flies_and_hands_out_the_exercise(built, tmp_path):
+    """It is installed in a new environment, far from the clone."""
+    programs, (wheel,) = tmp_path / "venv" / "bin", built.glob("*.whl")
+    venv.create(tmp_path / "venv", with_pip=True)
+    clean = {key: text for key, text in os.environ.items() if key != "PYTHONPATH"}
+
+    def install(extras):
+        words = ["-m", "pip", "install", "--quiet", f"{wheel}{extras}"]
+        subprocess.run([programs / "python", *words], check=True, cwd=tmp_path)
+
+    def cloudrc(*words):
+        how = {"cwd": tmp_path, "env": clean, "capture_output": True, "text": True}
+        return subprocess.run([programs / "cloudrc", *words], **how)
+
+    install("")
+    assert cloudrc("list").returncode == 0
     for words, extra in (
         (["run", "--mode", "virtual"], "cloudrc[sim]"),
         (["up", "--console"], "cloudrc[sim,api,console]"),
         (["console", "--cluster"], "cloudrc[kube]"),
     ):
-        refused = fresh.cloudrc(*words)
+        refused = cloudrc(*words)
         assert (refused.returncode, extra in refused.stderr) == (3, True), refused.stderr
-    fresh.install("[sim]")
-    flown = fresh.cloudrc("run", "--mode", "virtual", "--out", "run")
+    install("[sim]")
+    flown = cloudrc("run", "--mode", "virtual", "--out", "run")
     assert flown.returncode == 0, flown.stderr
     assert (tmp_path / "run" / "report.html").exists()
-    assert fresh.cloudrc("class", "new", "exercise").returncode == 0
-    assert "score 0 of 100" in fresh.cloudrc("class", "check", "exercise").stdout
+    assert cloudrc("class", "new", "exercise").returncode == 0
+    assert "score 0 of 100" in cloudrc("class", "check", "exercise").stdout
 
 
 BASE = """

@@ -100,18 +100,16 @@ def read_parameters(
 ) -> dict[str, tuple[tuple[str, Any], ...]]:
     """Read parameters of executors, given as KEY=VALUE: executor -> those that it has."""
     given = _pairs("--set", texts, "share=.5")
-    known = {each: _parameters_of(each) if given else () for each in executors}
+    known: dict[str, Collection[str]] = dict.fromkeys(executors, ())
+    if given:
+        from cloudrc.gym.options import full_name  # here, because it imports gymnasium
+
+        known = {each: signature("executors", full_name(each)).parameters for each in executors}
     check_names("parameter", given, [key for each in known.values() for key in each], "--set: ")
     return {
         each: tuple((key, value) for key, value in given.items() if key in known[each])
         for each in executors
     }
-
-
-def _parameters_of(executor: str) -> Collection[str]:
-    from cloudrc.gym.options import full_name  # here, because it imports gymnasium
-
-    return signature("executors", full_name(executor)).parameters
 
 
 def _pairs(flag: str, texts: list[str], example: str) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import leave_message, print_line, print_or_drop, print_result, tell, warn
@@ -52,7 +52,9 @@ def run(options: Options) -> int:
         missing = [each for each in mine if each.key not in rows.kept]
         with SweepView(_head(options, plan, mine, missing), len(missing)) as view:
             if options.on:
-                stopped = keep(_fly_in_pods(options, plan, missing), rows, view.see)
+                release = release_from_flags(options)
+                flown = fly_in_pods(release, _pods(options), plan, missing, tell)
+                stopped = keep(flown, rows, view.see)
             else:
                 stopped = play_missing(missing, rows, options.jobs, view.see, in_order=False)
             if options.record and not stopped:
@@ -171,12 +173,6 @@ def figure(options: Options) -> None:
 
 
 # Sweeps in pods, which run `cloudrc sweep rows`.
-
-
-def _fly_in_pods(
-    options: Options, plan: SweepPlan, flights: Sequence[PlannedFlight]
-) -> Generator[Row]:
-    return fly_in_pods(release_from_flags(options), _pods(options), plan, flights, tell)
 
 
 def _pods(options: Options) -> PodSettings:

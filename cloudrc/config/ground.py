@@ -5,27 +5,28 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from cloudrc.config.problems import ConfigProblem
-from cloudrc.config.schema import GROUND, MissionConfig
+from cloudrc.config.robot import is_planar
+from cloudrc.config.scene import scene_of
+from cloudrc.config.schema import GROUND, MissionConfig, Waypoint, World
 from cloudrc.geometry.scene import Scene
-from cloudrc.messages import Vector
 
 SAME = 1e-6
 """Largest difference from the height of the spawn [m]."""
 
 
-def on_ground(position: Vector, scene: Scene) -> Vector:
-    """Return a position [m], with the height of the spawn if it has none."""
-    x, y, z = position
-    return (x, y, scene.spawn[2] if z == GROUND else z)
+def put_on_ground(mission: MissionConfig, world: World) -> MissionConfig:
+    """Return a mission in which waypoints of two numbers have the height of the spawn.
 
-
-def put_on_ground(mission: MissionConfig, scene: Scene) -> MissionConfig:
-    """Return a mission in which waypoints of two numbers have the height of the spawn."""
-    placed = tuple(
-        waypoint.model_copy(update={"position_m": on_ground(waypoint.position_m, scene)})
-        for waypoint in mission.waypoints
-    )
-    return mission.model_copy(update={"waypoints": placed})
+    A mission of a robot that flies stays as it is.
+    """
+    if not is_planar(world.robot):
+        return mission
+    placed, height = list[Waypoint](), scene_of(world).spawn[2]
+    for waypoint in mission.waypoints:
+        x, y, z = waypoint.position_m
+        at = x, y, height if z == GROUND else z
+        placed.append(waypoint.model_copy(update={"position_m": at}))
+    return mission.model_copy(update={"waypoints": tuple(placed)})
 
 
 def check_heights(mission: MissionConfig, scene: Scene) -> Iterator[ConfigProblem]:

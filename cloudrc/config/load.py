@@ -20,7 +20,6 @@ from cloudrc.config import overrides, problems, shipped
 from cloudrc.config.compute import compute_times
 from cloudrc.config.ground import put_on_ground
 from cloudrc.config.heading import without_held_yaws
-from cloudrc.config.hull import hull_of
 from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.overrides import Settings
 from cloudrc.config.place import PlaceFile
@@ -40,11 +39,11 @@ from cloudrc.config.resolved import (
     PLAN_MAX_S,
     Bounds,
     ResolvedExperiment,
+    bounds_of,
     speed_cap,
 )
 from cloudrc.config.robot import DEFAULT_LIMITS, known_robot
 from cloudrc.config.robot import facts as facts_of
-from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import (
     Cloud,
     Experiment,
@@ -52,7 +51,6 @@ from cloudrc.config.schema import (
     World,
 )
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.obstacles import fence_of
 from cloudrc.link.traces import read_lines, read_trace
 from cloudrc.outside.document import Document, KeyPath, parse_value, read_document
 from cloudrc.outside.reuse import reuse, reuse_results
@@ -100,7 +98,7 @@ def load_experiment(
         bounds = _NO_BOUNDS
     else:
         with problems.collect(found, ("world", "scene")):
-            bounds = _bounds(draft)
+            bounds = bounds_of(draft.world, has_speed=guard.speed_max_mps is not None)
         with problems.collect(found, ("world", "tuning")):
             facts = facts_of(draft.world, guard.acceleration_max_mps2, guard.speed_max_mps)
         problems.raise_problems(document, found, name)
@@ -190,11 +188,10 @@ def _read_robots(path: Path) -> list[dict[str, Any]]:
 
 def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> ResolvedExperiment:
     """Check that the mission fits the scene and the robot, and complete it with what they give."""
-    mission, robot = experiment.mission, known_robot(experiment.world.robot)
-    mission = put_on_ground(mission, scene_of(experiment.world)) if robot.planar else mission
-    found = [*_without_effect(document, experiment), *_check_fit(mission, experiment.world)]
+    mission = put_on_ground(experiment.mission, experiment.world)
+    found = [*_without_effect(document, experiment), *_check_mission(mission, experiment.world)]
     problems.raise_problems(document, found, name)
-    mission = without_held_yaws(mission, robot.heading)
+    mission = without_held_yaws(mission, known_robot(experiment.world.robot).heading)
     return experiment.model_copy(update={"mission": mission})
 
 
@@ -215,15 +212,13 @@ def _without_effect(document: Document, experiment: ResolvedExperiment) -> Itera
                 yield ConfigProblem(path, str(document.get(*path)), text)
 
 
-def _check_fit(mission: MissionConfig, world: World) -> list[ConfigProblem]:
+def _check_mission(mission: MissionConfig, world: World) -> list[ConfigProblem]:
     """List the problems of a mission in a scene, with their paths in the experiment."""
-    robot, scene = known_robot(world.robot), scene_of(world)
 
     def check() -> list[ConfigProblem]:
-        size = hull_of(world.robot)
-        if above := check_scene(scene, size, touch=mission.touched, planar=robot.planar):
+        if above := check_scene(world, mission.touched):
             return above
-        wrong = check_mission(mission, scene, size, planar=robot.planar, heading=robot.heading)
+        wrong = check_mission(mission, world)
         return [problem._replace(path=("mission", *problem.path)) for problem in wrong]
 
     key = "mission", mission.model_dump_json(), world.scene, world.fence_m, world.robot
@@ -399,18 +394,6 @@ def _plan_max(document: Document) -> float:
     return PLAN_MAX_S if isinstance(plan, float | int) and plan > 0 else 0.0
 
 
-def _bounds(draft: Experiment) -> Bounds:
-    """Return the bounds of an experiment.
-
-    If the fence is not known without MuJoCo, it limits nothing, as long as the file gives the
-    speed.
-    """
-    scene, room = scene_of(draft.world), inf
-    if scene.own_fence or draft.guard.speed_max_mps is None:
-        room = fence_of(scene).room(scene.spawn)
-    return Bounds(known_robot(draft.world.robot).guard, room)
-
-
 def _remove_derived(document: Document, name: str, *, new_profile: bool) -> None:
     """Remove computed values from a resolved file.
 
@@ -422,7 +405,7 @@ def _remove_derived(document: Document, name: str, *, new_profile: bool) -> None
     guard = draft.guard
     derived: dict[KeyPath, Any] = {("guard", "plan_max_s"): _plan_max(document)}
     with suppress(BadInputError):  # another robot or scene may follow
-        bounds = _bounds(draft)
+        bounds = bounds_of(draft.world, has_speed=guard.speed_max_mps is not None)
         derived["guard", "acceleration_max_mps2"] = bounds.robot.acceleration_max_mps2
         age_max = guard.command_age_max_ms or COMMAND_AGE_MAX_MS
         derived["guard", "speed_max_mps"] = speed_cap(age_max, guard.plan_max_s or 0.0, bounds)

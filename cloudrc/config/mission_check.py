@@ -15,13 +15,16 @@ from pathlib import Path
 import numpy as np
 
 from cloudrc.config.ground import check_heights
-from cloudrc.config.heading import Heading, check_yaws
+from cloudrc.config.heading import check_yaws
+from cloudrc.config.hull import hull_of
 from cloudrc.config.problems import ConfigProblem, collect
-from cloudrc.config.schema import MissionConfig, Steps
+from cloudrc.config.robot import known_robot
+from cloudrc.config.scene import scene_of, steered_in
+from cloudrc.config.schema import MissionConfig, Steps, World
 from cloudrc.config.setpoints import read_setpoints
 from cloudrc.geometry.clearance import Array, Spheres
 from cloudrc.geometry.fence import Fence
-from cloudrc.geometry.obstacles import fence_of, obstacles, surface
+from cloudrc.geometry.obstacles import obstacles, surface
 from cloudrc.geometry.placement import (
     CLEARANCE_MIN,
     find_crossed,
@@ -38,14 +41,13 @@ TOUCHING = 1e-3
 """Distance from an obstacle below which the robot touches it [m]; it covers rounding errors."""
 
 
-def check_scene(
-    scene: Scene, robot: Spheres, *, touch: str | None, planar: bool = False
-) -> list[ConfigProblem]:
+def check_scene(world: World, touch: str | None) -> list[ConfigProblem]:
     """List the problems of a scene for a mission that has to touch the body `touch`.
 
-    Their paths are those of the experiment. A `planar` robot stays on the ground.
+    Their paths are those of the experiment.
     """
-    fence, spawn = fence_of(scene, planar=planar), np.array([scene.spawn])
+    scene, robot, fence = scene_of(world), hull_of(world.robot), steered_in(world)
+    spawn = np.array([scene.spawn])
     low, high = (*fence.inner_low[:2], fence.low[2]), fence.inner_high  # it stands on the ground
     spawn_at = _point(scene.spawn)
     if (np.clip(spawn, low, high) != spawn)[0, fence.axes].any():
@@ -63,34 +65,24 @@ def check_scene(
     return [ConfigProblem(("world", "scene"), scene.name, reason)]
 
 
-def check_mission(
-    mission: MissionConfig,
-    scene: Scene,
-    robot: Spheres,
-    *,
-    planar: bool = False,
-    heading: Heading = "free",
-) -> list[ConfigProblem]:
-    """List the problems of a mission in a scene, each with its path inside the mission.
-
-    A `planar` robot stays on the ground, at the height of the spawn. `heading` says whether the
-    robot obeys a yaw.
-    """
+def check_mission(mission: MissionConfig, world: World) -> list[ConfigProblem]:
+    """List the problems of a mission for a robot in its scene, with paths inside the mission."""
+    scene, robot = scene_of(world), known_robot(world.robot)
     if problem := _check_parts(mission) or _check_touch(mission, scene):
         return [problem]
-    problems = [*check_heights(mission, scene)] if planar else []
-    problems += islice(check_yaws(mission, heading), _REPORTED)
+    problems = [*check_heights(mission, scene)] if robot.planar else []
+    problems += islice(check_yaws(mission, robot.heading), _REPORTED)
     if problems:
         return problems
-    fence = fence_of(scene, planar=planar)
+    fence, hull = steered_in(world), hull_of(world.robot)
     if mission.setpoints is not None:
         with collect(problems, ("setpoints",)):
             read_setpoints(Path(mission.setpoints), fence)
         return problems
     if mission.steps is not None:
-        reason = _check_steps(mission, mission.steps, scene, robot, fence)
+        reason = _check_steps(mission, mission.steps, scene, hull, fence)
         return [ConfigProblem(("steps",), "", reason)] if reason else []
-    return list(_check_fence(mission, fence) or _check_ways(mission, scene, robot))
+    return list(_check_fence(mission, fence) or _check_ways(mission, scene, hull))
 
 
 def _check_parts(mission: MissionConfig) -> ConfigProblem | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from math import sqrt
+from math import inf, sqrt
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -161,10 +161,16 @@ class ResolvedExperiment(Experiment):
         return self.link.model_dump(mode="json", include={*DIRECTIONS}, exclude_defaults=True)
 
 
-def bounds_of(world: World) -> Bounds:
-    """Return what robot and scene of an experiment tell about the limits of the guard."""
-    scene = scene_of(world)
-    return Bounds(known_robot(world.robot).guard, fence_of(scene).room(scene.spawn))
+def bounds_of(world: World, *, has_speed: bool = False) -> Bounds:
+    """Return what robot and scene of an experiment tell about the limits of the guard.
+
+    If the fence is not known without MuJoCo, it limits nothing, as long as the experiment
+    `has_speed`: it gives guard.speed_max_mps.
+    """
+    scene, room = scene_of(world), inf
+    if scene.own_fence or not has_speed:
+        room = fence_of(scene).room(scene.spawn)
+    return Bounds(known_robot(world.robot).guard, room)
 
 
 def dump(experiment: ResolvedExperiment) -> str:

@@ -68,9 +68,8 @@ def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
     experiment = read_experiment(str(settings.config), robot_settings(settings.robot))
     exporter = open_exporter("teleop", experiment, settings.metrics)
     world = experiment.world
-    scene, hull, robot = scene_of(world), hull_of(world.robot), known_robot(world.robot)
     plan, touch = partial(assembly.build_plan, experiment), experiment.mission.touch
-    reader = RequestReader(scene, hull, plan, touch, robot.planar, robot.heading)
+    reader = RequestReader(world, plan, touch)
     with ExitStack() as opened:
         server = _serve_api(settings, reader)
         opened.callback(server.stop)
@@ -78,9 +77,10 @@ def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
         if book is None:  # stopped while another teleop process locked the journal
             return
         opened.callback(book.close)
-        units = {name: each.unit for name, each in robot.sensors.items()}
-        limit = experiment.guard.speed_max_mps
-        service = MissionService(book, steered_in(world), scene, hull, units, speed_max=limit)
+        sensors, limit = known_robot(world.robot).sensors, experiment.guard.speed_max_mps
+        units = {name: each.unit for name, each in sensors.items()}
+        place = steered_in(world), scene_of(world), hull_of(world.robot)
+        service = MissionService(book, *place, units, speed_max=limit)
         if settings.start:
             order = Order(assembly.build_plan(experiment), experiment.name, touch=touch)
             service.create(order, time.monotonic_ns())

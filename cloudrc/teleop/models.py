@@ -13,10 +13,11 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, ValidationError
 
-from cloudrc.config.ground import on_ground, put_on_ground
-from cloudrc.config.heading import WHY, Heading, without_held_yaws
+from cloudrc.config.ground import put_on_ground
+from cloudrc.config.heading import WHY, without_held_yaws
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import ConfigProblem, from_pydantic
+from cloudrc.config.robot import RobotFiles, known_robot
 from cloudrc.config.schema import (
     MAX_WAYPOINTS,
     Carrot,
@@ -27,12 +28,11 @@ from cloudrc.config.schema import (
     TimeLimit,
     Touch,
     Waypoint,
+    World,
     Yaw,
 )
 from cloudrc.config.section import Described, Section
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.clearance import Spheres
-from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Vector
 from cloudrc.records import FAILURES
 from cloudrc.teleop.store import SHOWN, Order
@@ -317,20 +317,14 @@ class RequestReader:
     """Reads and checks the bodies of requests; raises a RefusedError that lists all problems.
 
     Attributes:
-        scene: The robot flies in it.
-        robot: Hull of the robot.
+        world: Robot and scene.
         plan: Makes a plan from a mission and a time limit [s], which may be None.
         touch: What the experiment's mission has to touch: a point there is no problem.
-        planar: Whether the robot stays on the ground.
-        heading: Whether the robot obeys a yaw.
     """
 
-    scene: Scene
-    robot: Spheres
+    world: World
     plan: Callable[[MissionConfig, float | None], Plan]
     touch: Touch | None = None
-    planar: bool = False
-    heading: Heading = "free"
 
     def order(self, body: bytes) -> Order:
         """Read and plan a mission."""
@@ -339,41 +333,41 @@ class RequestReader:
             raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
         kept = ("start", "waypoints", "carrot", "judged_by", "touch")
         mission = MissionConfig(**{name: getattr(request, name) for name in kept})
-        mission = put_on_ground(mission, self.scene) if self.planar else mission
-        if problems := self._check(mission):
+        mission = put_on_ground(mission, self.world)
+        if problems := check_mission(mission, self.world):
             raise RefusedError(problems)
-        planned = self.plan(without_held_yaws(mission, self.heading), request.time_limit_s)
+        planned = self.plan(without_held_yaws(mission, self._robot.heading), request.time_limit_s)
         lease = request.lease_s or 0.0
         return Order(planned, request.name, request.key, request.touch, request.queue, lease)
 
     def goto(self, body: bytes) -> Leg:
         """Read a point."""
         request = _parse(body, GoToRequest)
-        place = request.position_m
-        position = on_ground(place, self.scene) if self.planar else place
-        waypoint = Waypoint(position_m=position, yaw_deg=request.yaw_deg)
+        waypoint = Waypoint(position_m=request.position_m, yaw_deg=request.yaw_deg)
         # What is an obstacle depends on the mission under way; the service checks the way there.
         mission = MissionConfig(start="here", waypoints=(waypoint,), touch=self.touch)
-        if problems := self._check(mission):
+        mission = put_on_ground(mission, self.world)
+        if problems := check_mission(mission, self.world):
             raise RefusedError([ConfigProblem(p.path[2:], p.value, p.reason) for p in problems])
-        (waypoint,) = without_held_yaws(mission, self.heading).waypoints
-        return Leg(position, None if waypoint.yaw_deg is None else radians(waypoint.yaw_deg))
+        (waypoint,) = without_held_yaws(mission, self._robot.heading).waypoints
+        yaw = None if waypoint.yaw_deg is None else radians(waypoint.yaw_deg)
+        return Leg(waypoint.position_m, yaw)
 
     def drive(self, body: bytes) -> tuple[Vector, float | None]:
         """Read a velocity [m/s] and a yaw rate [rad/s]."""
         request = _parse(body, DriveRequest)
         velocity, yaw_rate = request.velocity_mps, request.yaw_rate_radps
-        if yaw_rate and self.heading == "fixed":
+        if yaw_rate and self._robot.heading == "fixed":
             reason = f"{WHY['fixed']}; leave it out, or choose another robot, such as x2"
             raise RefusedError([ConfigProblem(("yaw_rate_radps",), f"{yaw_rate:g}", reason)])
-        if self.planar and velocity[2] != 0.0:
+        if self._robot.planar and velocity[2] != 0.0:
             reason = "leads up or down, but this robot stays on the ground; set it to 0"
             raise RefusedError([ConfigProblem(("velocity_mps", "2"), f"{velocity[2]:g}", reason)])
         return velocity, yaw_rate
 
-    def _check(self, mission: MissionConfig) -> list[ConfigProblem]:
-        how: Any = {"planar": self.planar, "heading": self.heading}
-        return check_mission(mission, self.scene, self.robot, **how)
+    @property
+    def _robot(self) -> RobotFiles:
+        return known_robot(self.world.robot)
 
 
 def as_json(problem: ConfigProblem) -> dict[str, str | int | None]:

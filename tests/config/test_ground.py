@@ -7,10 +7,8 @@ import pytest
 
 import cloudrc
 from cloudrc.assembly import build_plan
-from cloudrc.config.hull import hull_of
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.scene import load_scene
 from cloudrc.teleop.models import RefusedError, RequestReader
 
 ROVER = ["world.robot=rover", "world.scene=empty"]
@@ -79,8 +77,8 @@ def order(point):
 
 
 def test_teleop_takes_two_numbers_and_refuses_heights():
-    plan = partial(build_plan, load_experiment("pillars"))
-    read = RequestReader(load_scene("pillars"), hull_of("rover"), plan, planar=True)
+    experiment = load_experiment("pillars")
+    read = RequestReader(experiment.world, partial(build_plan, experiment))
     taken = read.order(order([1.5, 1.2]))
     assert taken.plan.legs[0].position == (1.5, 1.2, 0.1)
     with pytest.raises(RefusedError, match="has a height"):

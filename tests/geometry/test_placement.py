@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from cloudrc.config.hull import hull_of
 from cloudrc.config.mission_check import check_mission, check_scene
-from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import MissionConfig, Steps, Touch, Waypoint, World
 from cloudrc.geometry.clearance import clearance
 from cloudrc.geometry.obstacles import obstacles
@@ -20,8 +19,7 @@ from cloudrc.geometry.placement import (
 )
 from cloudrc.geometry.scene import SCENES, load_scene
 
-PIPES = load_scene("pipes")
-KNOWN = obstacles(PIPES, touch="board")
+KNOWN = obstacles(load_scene("pipes"), touch="board")
 FEW = hull_of("pelican")
 
 
@@ -37,7 +35,7 @@ def refusals(*positions, start="spawn", scene="pipes", **more):
     waypoints = tuple(Waypoint(position_m=position, **more) for position in positions)
     touch = Touch(body="board") if scene == "pipes" else None
     mission = MissionConfig(start=start, waypoints=waypoints, touch=touch)
-    problems = check_mission(mission, load_scene(scene), FEW)
+    problems = check_mission(mission, World(scene=scene))
     return "\n".join(map(str, problems))
 
 
@@ -74,11 +72,11 @@ def test_a_waypoint_that_the_guard_forbids_is_refused(position, tolerance, outsi
     ],
 )
 def test_steps_that_can_end_in_a_wall_are_refused(steps, scene, reason):
-    (problem,) = check_mission(MissionConfig(steps=Steps(**steps)), load_scene(scene), FEW)
+    (problem,) = check_mission(MissionConfig(steps=Steps(**steps)), World(scene=scene))
     assert problem.path == ("steps",)
     assert reason in problem.reason
     both = MissionConfig(waypoints=(Waypoint(position_m=(0.0, 0.0, 1.0)),), steps=Steps(**steps))
-    assert "not both" in str(check_mission(both, PIPES, FEW)[0])
+    assert "not both" in str(check_mission(both, World())[0])
 
 
 POST = '<body name="post" pos="1.2 0 1"><geom type="capsule" size=".05 1"/></body>'
@@ -87,13 +85,13 @@ GROUND = '<geom type="plane" size="5 5 .1"/>'
 
 @pytest.fixture
 def own_scene(tmp_path):
-    """Return a function that writes a scene with some bodies, and reads it."""
+    """Return a function that writes a scene with some bodies."""
 
     def write(bodies):
         path = tmp_path / "mine.xml"
         text = (SCENES / "empty.xml").read_text()
         path.write_text(text.replace("</worldbody>", f"{bodies}</worldbody>"))
-        return scene_of(World(scene=str(path)))
+        return World(scene=str(path))
 
     return write
 
@@ -109,7 +107,7 @@ def own_scene(tmp_path):
 )
 def test_every_body_of_a_scene_of_ones_own_is_in_the_way(own_scene, bodies, waypoints, reason):
     mission = MissionConfig(waypoints=tuple(Waypoint(position_m=each) for each in waypoints))
-    said = "\n".join(map(str, check_mission(mission, own_scene(bodies), FEW)))
+    said = "\n".join(map(str, check_mission(mission, own_scene(bodies))))
     assert reason in said if reason else said == ""
 
 
@@ -123,6 +121,6 @@ def test_every_body_of_a_scene_of_ones_own_is_in_the_way(own_scene, bodies, wayp
     ],
 )
 def test_a_scene_fits_its_missions(own_scene, bodies, touch, path, reason):
-    problems = check_scene(own_scene(bodies), FEW, touch=touch)
+    problems = check_scene(own_scene(bodies), touch)
     assert [problem.path for problem in problems] == ([path] if path else [])
     assert all(reason in problem.reason for problem in problems)

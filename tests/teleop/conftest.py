@@ -20,6 +20,7 @@ from cloudrc.config.hull import hull_of
 from cloudrc.config.load import read_experiment
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import UPRIGHT, Cause, GuardState, OperatorRequest, Request, Setpoint, Start
+from cloudrc.outside.reuse import reuse_results
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
 from cloudrc.teleop.api import STARTING, ApiServer, Bridge, create_app
@@ -349,7 +350,7 @@ class Running:
         self.flight.uplink = uplink
         self.alarms, self.complaints, self.log = [], [], []
         self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
-        reader = RequestReader(self.scene, PELICAN, partial(build_plan, PAPER))
+        reader = RequestReader(PAPER.world, partial(build_plan, PAPER))
         app = create_app(self.bridge, reader, self.complaints.append)
         tokens = None if unix else Tokens(folder, self.complaints.append)
         self.gate = Gate(app, tokens, self.log.append)
@@ -448,11 +449,12 @@ def head(method, path, *lines, token=OPERATOR):
 
 @contextmanager
 def running(**options):
-    one = Running(**options)
-    try:
-        yield one
-    finally:
-        one.stop()
+    with reuse_results():  # as in the process of teleop
+        one = Running(**options)
+        try:
+            yield one
+        finally:
+            one.stop()
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from cloudrc import assembly
-from cloudrc.config.hull import hull_of
 from cloudrc.config.load import read_experiment
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.scene import scene_of
@@ -207,7 +206,7 @@ def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
 )
 def _impossible(outcome: Outcome) -> None:
     experiment, first = read_experiment("paper"), (0.5, 0.0, 0.8)
-    scene, robot = scene_of(experiment.world), hull_of(experiment.world.robot)
+    scene = scene_of(experiment.world)
     points: dict[str, Vector] = {
         "1 m behind a wall of the fence": (fence_of(scene).high[0] + 1.0, 0.0, 1.0),
         "far below the floor": (0.0, 0.0, -5.0),
@@ -226,7 +225,7 @@ def _impossible(outcome: Outcome) -> None:
             mission = MissionConfig.model_validate(
                 {"waypoints": waypoints, "touch": experiment.mission.touch}
             )
-            problems = [str(each) for each in check_mission(mission, scene, robot)]
+            problems = [str(each) for each in check_mission(mission, experiment.world)]
         except ValueError as error:
             problems = [str(error)]
         outcome.true(f"{name}: rejected", bool(problems))
