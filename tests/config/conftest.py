@@ -1,9 +1,10 @@
-"""The error message of an experiment that cannot be loaded."""
+"""The error message of an experiment that cannot be loaded; files that are read once."""
 
 import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
+from cloudrc.outside.reuse import reuse_results
 
 
 def refused(name, *settings):
@@ -12,3 +13,10 @@ def refused(name, *settings):
         load_experiment(str(name), settings)
     assert caught.value.exit_code == 2
     return str(caught.value)
+
+
+@pytest.fixture
+def files_are_read_once():
+    """Let the loads of a test share what they read, as those of a sweep do: most of their time."""
+    with reuse_results():
+        yield

@@ -36,6 +36,7 @@ def again(experiment, folder, *settings):
         *((name, "lossy") for name in ("paper-verbatim", "steps", "hover")),
     ],
 )
+@pytest.mark.usefixtures("files_are_read_once")
 def test_a_dump_loads_to_the_same(experiment, profile, tmp_path):
     loaded = load_experiment(experiment, [f"link.profile={profile}"])
     assert again(loaded, tmp_path) == loaded

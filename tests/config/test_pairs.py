@@ -14,10 +14,10 @@ from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import dump
 from cloudrc.config.schema import Experiment
 from cloudrc.errors import BadInputError
-from cloudrc.outside.reuse import reuse_results
 from tests.conftest import nightly
 from tests.support.keys import forms_of
 
+pytestmark = pytest.mark.usefixtures("files_are_read_once")
 OWN = """\
 mission: {waypoints: [{position_m: [0, 0, 1.0]}]}
 world: {scene: empty}
@@ -89,12 +89,6 @@ def blames_another_key(file, *settings):
     return ""
 
 
-@pytest.fixture(autouse=True)
-def _files_are_read_once():
-    with reuse_results():
-        yield
-
-
 @pytest.fixture(params=["own", "resolved"])
 def file(request, tmp_path):
     """A small experiment without the sections cloud and link, also with all values."""
@@ -105,7 +99,7 @@ def file(request, tmp_path):
     return path
 
 
-@pytest.mark.parametrize("step", [20, *nightly(1)])
+@pytest.mark.parametrize("step", [60, *nightly(1)])
 def test_every_pair_of_valid_settings_loads_or_names_one_of_them(file, step):
     """Of pairs that are not of two chosen settings, try one of `step`."""
     single = valid_settings(file)
