@@ -63,5 +63,5 @@ def test_a_stop_is_repeated_until_the_api_answers(api, steering):
     api.refused.clear()
     wait_until(lambda: steering.answer.text == "switching the robot off")
     count = len(api.posted)
-    time.sleep(0.5)
+    time.sleep(0.3)  # longer than STOP_PERIOD
     assert len(api.posted) == count

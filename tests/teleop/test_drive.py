@@ -39,7 +39,7 @@ def inside(setpoint, axis):
     return FENCE.inner_low[axis] < setpoint.position[axis] < FENCE.inner_high[axis]
 
 
-@settings(deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(STEPS, st.tuples(*map(st.floats, FENCE.inner_low, FENCE.inner_high)))
 def test_the_setpoint_keeps_its_limits_and_rests(steps, start):
     """At the fence itself an axis may stop at once: the others can use up the acceleration."""

@@ -123,5 +123,5 @@ class MissionMachine(RuleBasedStateMachine):
             assert self.flight.setpoints[-1].waypoint in aims.get(self.flight.state, {-1})
 
 
-MissionMachine.TestCase.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
+MissionMachine.TestCase.settings = settings(max_examples=25, stateful_step_count=40, deadline=None)
 TestMissionMachine = MissionMachine.TestCase

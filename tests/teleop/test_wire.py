@@ -15,7 +15,7 @@ from tests.console.conftest import control
 messages = st.one_of(*map(st.from_type, (RobotStatus, Setpoint, OperatorRequest, MissionEvent)))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(messages)
 def test_a_message_comes_back_as_it_was(message):
     back = decode(encode(message))
