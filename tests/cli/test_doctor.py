@@ -35,12 +35,14 @@ def test_only_a_needed_check_gives_exit_code_3(mode, found, code, monkeypatch, c
 
 def test_every_problem_says_how_to_fix_it(monkeypatch):
     monkeypatch.setitem(requirements.EXTRAS, "world", ("no_such_module",))
+    monkeypatch.setattr(work, "PROGRAM", "raise SystemExit('no physics')")
     checks = {check.name: check for check in work.all_checks("local", None)}
     for check in checks.values():
         assert check.state == "ok" or check.fix, check.name
         assert len(f"  missing  {check.name}  {check.found}") < 160
     assert checks["extra world"].fix == "pip install 'cloudrc[world]'"
     assert checks["extra world"].modes == ("local", "virtual")
+    assert (checks["physics"].state, checks["physics"].found) == ("missing", "no physics")
     with pytest.raises(MissingPrerequisiteError, match=r"mode virtual needs no_such_module.*world"):
         requirements.require("mode virtual", ["world", "record"])
 

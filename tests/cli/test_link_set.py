@@ -115,7 +115,7 @@ def test_only_its_user_can_open_the_socket_of_a_link(flight):
 
 def test_a_link_that_does_not_answer_is_an_error(flight, monkeypatch, refused):
     flight[1].deaf = True
-    monkeypatch.setattr("cloudrc.drivers.link_control.APPLY_LIMIT", 0.05)
+    monkeypatch.setattr("cloudrc.drivers.link_control.APPLY_LIMIT", 0.2)
     said = refused("link set downlink.delay_ms=120", code=4)
     assert "the downlink did not apply the change within" in said
     assert "see runs/latest/downlink.log" in said

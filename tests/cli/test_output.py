@@ -14,6 +14,7 @@ from cloudrc.cli.output import is_live, paint
 from cloudrc.cli.progress import FlightView, Progress
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import Fault, GuardChange, MissionEvent, TelemetrySent
+from tests.cli.conftest import SHORT
 from tests.conftest import wait_until
 
 
@@ -106,8 +107,8 @@ from cloudrc.cloud.predictors.last_sample import LastSample as build
 
 def test_nothing_that_a_plugin_prints_gets_into_a_document(folder):
     (folder / "prints.py").write_text(PRINTS)
-    line = "run hover --seeds 1 --set cloud.predictor=./prints.py -o json"
-    command = [sys.executable, "-m", "cloudrc", *line.split()]
+    line = "run steps --seeds 1 --set cloud.predictor=./prints.py -o json"
+    command = [sys.executable, "-m", "cloudrc", *line.split(), *SHORT]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert json.loads(done.stdout)["schemaVersion"] == 1
     assert {"descriptor", "child"} <= set(done.stderr.splitlines())
