@@ -65,7 +65,7 @@ def speed_cap(command_age_max_ms: float, plan_max_s: float, bounds: Bounds) -> f
 class ResolvedGuard(GuardConfig):
     """The section `guard`, in which every limit has a value.
 
-    The context of its validation is the `RobotLimits` of the robot; without one, `DEFAULT_LIMITS`.
+    The context of its validation is the `Bounds` of robot and scene; without it, those of `World`.
     """
 
     command_age_max_ms: CommandAge = COMMAND_AGE_MAX_MS
