@@ -134,6 +134,7 @@ def _combine(
     with problems.collect(found, ("mission",)):
         _inline_mission(document)
     _inline_link(document, found)
+    _take_contact(document)
     overrides.apply_overrides(document, inner)
     _default(document, ("guard", "plan_max_s"), _plan_max(document))
     if ("mission", "setpoints") in inner and document.get("mission", "setpoints"):
@@ -302,6 +303,18 @@ def _inline_link(document: Document, found: list[ConfigProblem]) -> None:
         _take_place(document)
     with problems.collect(found, ("link", "profile")):
         _inline_profile(document)
+
+
+def _take_contact(document: Document) -> None:
+    """Let `contact: false` of the criteria mean that the mission touches nothing.
+
+    Experiments of before the first release have it.
+    """
+    criteria, mission = document.get("criteria"), document.get("mission")
+    if isinstance(criteria, dict) and criteria.get("contact") is False:
+        del criteria["contact"]
+        if isinstance(mission, dict):
+            mission["touch"] = None
 
 
 def _take_place(document: Document) -> None:
