@@ -196,25 +196,25 @@ def added(values: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
 
 def make_schema(text: str) -> Schema:
     """Make the JSON schema of the values: draft 7, unknown keys are not allowed."""
-    described = descriptions(text)
-    new = added(yaml.safe_load(text), earliest())
+    described, values = descriptions(text), yaml.safe_load(text)
 
-    def part(path: Path, value: Any, about: str) -> Schema:
+    def part(path: Path, value: Any, about: str, new: Any) -> Schema:
+        """Make the schema of a value, of which `new` are the keys that earlier charts lack."""
         if not any(other[:-1] == path for other in described):
             return {"description": about, **(RULES.get(path[-1]) or TYPES[type(value)])}
         parts = {
-            key: part((*path, key), each, described[*path, key]) for key, each in value.items()
+            key: part((*path, key), each, described[*path, key], new.get(key, {}))
+            for key, each in value.items()
         }
         # Templates need the sections, so null is refused for them.
-        lacked = _at(new, path)
         needed = [
             key
             for key, each in parts.items()
-            if ("$ref" in each or "properties" in each) and lacked.get(key) != value[key]
+            if ("$ref" in each or "properties" in each) and new.get(key) != value[key]
         ]
         return {**_closed(about, parts), "required": needed}
 
-    made = part((), yaml.safe_load(text), "All values of the chart")
+    made = part((), values, "All values of the chart", added(values, earliest()))
     about = "Values that Helm passes to all charts of a larger chart"
     shared = {"imageRegistry": _either(STRING, NULL), "imagePullSecrets": PULL_SECRETS}
     some = {**OBJECT, "properties": shared}
@@ -243,13 +243,6 @@ def make_schema(text: str) -> Schema:
         node["properties"][key] = {"description": f"Has no effect; {instead} takes its place"}
     head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "cloudrc"}
     return {**head, **made, "$defs": defined}
-
-
-def _at(values: Any, path: Path) -> dict[str, Any]:
-    """Return the mapping at a path of nested mappings, empty if it is not there."""
-    for key in path:
-        values = values.get(key) if isinstance(values, dict) else None
-    return values if isinstance(values, dict) else {}
 
 
 def _adapt(part: Any) -> Any:
