@@ -22,7 +22,6 @@ from cloudrc.metrics.definitions import (
     WAITING_MAX,
     DatagramTally,
     DelayJudge,
-    Echoes,
     Holds,
     PredictionJudge,
     age,
@@ -237,7 +236,7 @@ class CloudEnd(End):
     def __init__(self, values: Values) -> None:
         super().__init__(table.CLOUD, values)
         self._prediction, self._delay = PredictionJudge(), DelayJudge()
-        self._echoes, self._used_count = Echoes(), 0
+        self._used = list[Arrival]()  # since the last control period
         self._echoed: dict[int, None] = {}  # stamps of the commands whose echo arrived [ns]
         self._has_plans = False
 
@@ -248,9 +247,11 @@ class CloudEnd(End):
 
     def _on_arrival(self, record: Arrival) -> None:
         super()._on_arrival(record)
-        self._used_count += record.used
         echo_ns, echoed = record.echo_stamp_ns, self._echoed
-        if not record.used or echo_ns == NEVER_NS:
+        if not record.used:
+            return
+        self._used.append(record)
+        if echo_ns == NEVER_NS:
             return
         loop_delay = age(record.stamp_ns, echo_ns)
         if record.is_sample:
@@ -268,10 +269,9 @@ class CloudEnd(End):
     def _on_control(self, record: Control) -> None:
         self._count_age(record.stamp_ns)
         self._prediction.take(record)
-        if self._echoes.take(record.rtt, record.loop_delay) and self._used_count == 1:
-            # With several telemetries it is unknown which odometry had the echo.
-            self._delay.echoed(record, self._newest_ns)
-        self._used_count = 0
+        if len(self._used) == 1:  # of several, it is unknown which had the odometry
+            self._delay.echoed(self._used[0], record.basis_stamp_ns)
+        self._used.clear()
         self._delay.sent(record)
         values = self._values
         delay_error = nan if self._has_plans else self._delay.error
@@ -291,8 +291,7 @@ class LinkMetrics:
     def __init__(self, values: Values) -> None:
         self.tell: Callable[[], str] = lambda: "{}\n"  # content of /link.json, the shaper's state
         self._values = values
-        self._modes = dict[str, dict[str, dict[str, float]]]()
-        self._delays = dict[str, float]()
+        self._ways = dict[str, tuple[str, str, float]]()  # direction -> shaper, mode, delay [s]
 
     def shaped(self, shaper: str, direction: str, mode: str, delay: float) -> None:
         """Store which `shaper` ("relay" or "netem") shapes the direction.
@@ -300,13 +299,13 @@ class LinkMetrics:
         `mode` is the value of the key `link.mode`. `delay` is the mean delay that the profile now
         requests [s].
         """
-        for modes in self._modes.values():
-            modes.pop(direction, None)  # of the shaper before
-        self._modes.setdefault(shaper, {})[direction] = {mode: 1.0}
-        self._delays[direction] = delay
-        # Copies: another thread may read them.
-        self._values["cloudrc_link_info"] = {one: dict(ways) for one, ways in self._modes.items()}
-        self._values["cloudrc_link_delay_seconds"] = dict(self._delays)
+        self._ways[direction] = shaper, mode, delay
+        # New dictionaries: another thread may read the old ones.
+        info, delays = defaultdict[str, Values](dict), Values()
+        for way, (by, asked, mean) in self._ways.items():
+            info[by][way] = {asked: 1.0}
+            delays[way] = mean
+        self._values |= {"cloudrc_link_info": info, "cloudrc_link_delay_seconds": delays}
 
 
 class CellMetrics:
@@ -323,15 +322,16 @@ class CellMetrics:
         for (way, robot), count in sorted(dropped.items()):
             if robot >= 0:
                 lost[str(robot)][way] = count
-        ways = {row["direction"]: row for row in rows}
+        busy, queued, waits = Values(), Values(), Values()
+        for row in rows:
+            way, packets = row["direction"], row["packets"]
+            busy[way], queued[way] = row["busy_ns"] * 1e-8, row["most"]
+            waits[way] = row["waited_ns"] * 1e-9 / packets if packets else nan
         self._values |= {  # new dictionaries: another thread may read the old ones
             "cloudrc_cell_dropped_total": lost,
-            "cloudrc_cell_utilisation": {way: ways[way]["busy_ns"] * 1e-8 for way in ways},
-            "cloudrc_cell_queue_packets": {way: ways[way]["most"] for way in ways},
-            "cloudrc_cell_wait_seconds": {
-                way: row["waited_ns"] * 1e-9 / row["packets"] if row["packets"] else nan
-                for way, row in ways.items()
-            },
+            "cloudrc_cell_utilisation": busy,
+            "cloudrc_cell_queue_packets": queued,
+            "cloudrc_cell_wait_seconds": waits,
         }
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from enum import Enum
-from types import MappingProxyType
 from typing import NamedTuple
 
 from cloudrc.messages import Cause, GuardState
@@ -24,9 +23,9 @@ ENDS = (WORLD, CLOUD)
 AXES = ("x", "y", "z")
 TERMS = ("proportional", "integral", "derivative")
 DIRECTIONS = ("uplink", "downlink")
-OUTCOMES = (
-    *("sent", "used", "late", "stale", "repeated", "old_epoch", "range", "vertical", "future"),
-    *("malformed", "version", "direction", "accept_ignored", "tag", "hello", "busy", "unanswered"),
+OUTCOMES = tuple(
+    "sent used late stale repeated old_epoch range vertical future malformed version direction "
+    "accept_ignored tag hello busy unanswered".split()
 )
 """Outcomes of a datagram. The sender counts "sent", the receiver counts all other outcomes."""
 ONLY_WORLD = {"stale", "range", "vertical", "future", "hello", "unanswered"}
@@ -263,21 +262,15 @@ def _metrics() -> Iterator[LiveMetric]:
             kind = MetricKind.HISTOGRAM if buckets else kind
             one_line = " ".join(meaning.split())
             yield LiveMetric(name, kind, one_line, tuple(roles.split()), labels, buckets, count)
-    for quantity in QUANTITIES:
-        if quantity.live:
-            name, is_vector, _ = quantity.live.partition("[axis]")
-            labels = {"axis": AXES} if is_vector else {}
+        for quantity in QUANTITIES:
             role = CLOUD if quantity.source is Control else WORLD
-            yield LiveMetric(name, MetricKind.GAUGE, quantity.now, (role,), labels, (), "")
+            if quantity.live and role == roles:
+                name, is_vector, _ = quantity.live.partition("[axis]")
+                labels = {"axis": AXES} if is_vector else {}
+                yield LiveMetric(name, MetricKind.GAUGE, quantity.now, (role,), labels, (), "")
 
 
-_PROCESSES = [tuple(block.partition("\n")[0].split()) for block in _TABLE.strip().split("\n\n")]
-METRICS: Mapping[str, LiveMetric] = MappingProxyType(
-    {
-        metric.name: metric
-        for metric in sorted(_metrics(), key=lambda metric: _PROCESSES.index(metric.roles))
-    }
-)
+METRICS = {metric.name: metric for metric in _metrics()}
 """All metrics by name, in the order of the blocks of `_TABLE`."""
 
 

@@ -20,7 +20,7 @@ from math import nan
 from typing import Any, Literal
 
 from cloudrc.messages import Cause, GuardState, Vector
-from cloudrc.records import Control, GroundTruth
+from cloudrc.records import Arrival, Control, GroundTruth
 
 # Delays. Stamps are subtracted only from stamps of the same clock.
 
@@ -268,15 +268,13 @@ class DelayJudge:
         if len(self._sent) > WAITING_MAX:
             del self._sent[next(iter(self._sent))]  # the oldest
 
-    def echoed(self, control: Control, arrival_ns: int) -> None:
-        """Compute how wrong the estimated delay was for a command whose echo has arrived.
+    def echoed(self, telemetry: Arrival, stamp_ns: int) -> None:
+        """Compute how wrong the estimated delay was for the command that `telemetry` echoes.
 
-        The echo arrived at `arrival_ns` [ns], cloud's clock. `control` is the record of the first
-        control period after this arrival; it contains the delays that the echo shows.
+        `stamp_ns` is the stamp of this telemetry's odometry [ns], world's clock.
         """
-        sent = self._sent.get(arrival_ns - round(control.loop_delay * 1e9))
-        if sent is not None:
-            applied_ns = control.basis_stamp_ns - round((control.loop_delay - control.rtt) * 1e9)
+        if sent := self._sent.get(telemetry.echo_stamp_ns):
+            applied_ns = stamp_ns - telemetry.echo_hold_ns
             self.error = delay_error(sent.horizon, sent.basis_stamp_ns, applied_ns)
 
 
