@@ -206,4 +206,4 @@ def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write plain values as JSON, as `write_atomically` does."""
-    write_atomically(path, f"{json.dumps(document, indent=2)}\n".encode())
+    write_atomically(path, f"{json.dumps(document, indent=2, ensure_ascii=False)}\n".encode())

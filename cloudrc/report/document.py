@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cloudrc.config.resolved import ResolvedExperiment, fingerprint
-from cloudrc.files import write_atomically
 from cloudrc.metrics.flight import Flight
 from cloudrc.metrics.measure import Number
 from cloudrc.metrics.response import steps
@@ -25,10 +24,7 @@ ENVIRONMENT_FILE, FILES = "environment.json", "files"
 """Name of the file about the machine of a flight, and its key for the hashes of files."""
 INCOMPLETE = "The recording is incomplete"
 """Beginning of the note on what a recording has lost."""
-PACKAGES = (
-    *("cloudrc", "mujoco", "numpy", "pydantic", "pyyaml", "cryptography", "mcap", "rosbags"),
-    "matplotlib",
-)
+PACKAGES = "cloudrc mujoco numpy pydantic pyyaml cryptography mcap rosbags matplotlib".split()
 """Packages whose versions can change the results of a run or a report."""
 
 
@@ -150,12 +146,6 @@ def _processor() -> str:
         lines = []
     models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(models, platform.processor())
-
-
-def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a document as JSON; raise a ValueError if a number is not finite."""
-    text = json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False)
-    write_atomically(path, f"{text}\n".encode())
 
 
 def _verdict_document(verdict: FlightVerdict) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.errors import CloudrcError, describe_error
-from cloudrc.files import read_json, write_atomically
+from cloudrc.files import read_json, write_atomically, write_json
 from cloudrc.geometry.obstacles import has_surface, obstacles
 from cloudrc.metrics.flight import Flight, select
 from cloudrc.metrics.measure import measure_all
@@ -24,7 +24,6 @@ from cloudrc.report.document import (
     Assessment,
     Run,
     environment_document,
-    write_json,
 )
 from cloudrc.report.flown import flight_of, flown_shapes, flown_world
 

@@ -22,13 +22,13 @@ from cloudrc.drivers.local import LINK_FOLDER
 from cloudrc.drivers.local_fleet import CELL_FILE, LocalFleet
 from cloudrc.drivers.virtual import Sink
 from cloudrc.errors import CloudrcError
-from cloudrc.files import read_json
+from cloudrc.files import read_json, write_json
 from cloudrc.link.cell import CellLog, CellQueue
 from cloudrc.link.follow import make_folder
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.records import Record
-from cloudrc.report.document import ENVIRONMENT_FILE, Run, environment_document, write_json
+from cloudrc.report.document import ENVIRONMENT_FILE, Run, environment_document
 from cloudrc.report.fleet import FleetFlown, cloud_numbers, fleet_document
 from cloudrc.report.folder import ROBOT, read_cell, robots_in
 from cloudrc.report.write import write_report

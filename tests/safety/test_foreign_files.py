@@ -12,11 +12,10 @@ from cloudrc import files
 from cloudrc.config.load import read_experiment
 from cloudrc.config.profile import load_profile
 from cloudrc.errors import BadInputError
-from cloudrc.files import atomic_file, write_atomically
+from cloudrc.files import atomic_file, write_atomically, write_json
 from cloudrc.link.traces import read_trace
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
-from cloudrc.report.document import write_json
 from cloudrc.report.figures import FIGURES
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
