@@ -224,10 +224,10 @@ def _slip(flight: Flight) -> float | None:
 
 def _real_time_factor(flight: Flight) -> float | None:
     columns = wakes(flight, "world")
-    stamps_ns, slips_ns = columns["stamp_ns"].tolist(), columns["slip_ns"].tolist()
-    if not stamps_ns:
+    if not len(columns["stamp_ns"]):
         return None
-    return finite(real_time_factor(stamps_ns[-1] - stamps_ns[0], slips_ns[-1] - slips_ns[0]))
+    passed_ns, slip_ns = (int(np.ptp(columns[name])) for name in ("stamp_ns", "slip_ns"))
+    return finite(real_time_factor(passed_ns, slip_ns))
 
 
 def _missed_periods(flight: Flight) -> float | None:

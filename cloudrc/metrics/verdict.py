@@ -61,9 +61,9 @@ NOT_STARTED = (
     " start; look at the link: its loss, its damage (corrupt), and its delays beside"
     " guard.command_age_max_ms"
 )
-PROVEN_BY_ALL = {
-    *("not_recorded", "not_started", "mission_not_ended", "waypoint_not_reached", "not_touched"),
-}
+PROVEN_BY_ALL = (
+    "not_recorded not_started mission_not_ended waypoint_not_reached not_touched".split()
+)
 """Codes of failures that only a recording without holes proves: something never happened in it."""
 ADVICE = "close other programs or give the run more cores"
 

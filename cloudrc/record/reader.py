@@ -184,9 +184,9 @@ class _Reader:
     def _sort(self) -> None:
         messages = self.content.messages
         if late := sum(after[1] < before[1] for before, after in pairwise(messages)):
-            keys = zip((message[1] for message in messages), self._sequences, strict=True)
-            order = [row for _, row in sorted(zip(keys, range(len(messages)), strict=True))]
-            self.content.messages = [messages[row] for row in order]
+            rows = zip(messages, self._sequences, strict=True)
+            in_order = sorted(rows, key=lambda row: (row[0][1], row[1]))
+            self.content.messages = [message for message, _ in in_order]
             self.content.remarks += (f"was not in order of time: {late} messages were sorted",)
 
     def _changes(self) -> Iterator[str]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.metrics.control import prediction_errors, tracking_errors
-from cloudrc.metrics.flight import Array, Columns, Flight, select
+from cloudrc.metrics.flight import Array, Columns, select
 from cloudrc.record.columns import Recording
 from cloudrc.record.content import Message
 from cloudrc.record.live import encode_transforms
@@ -41,11 +41,13 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]
     shapes = scene_shapes(flown_shapes(recording, experiment), flight.scene.tubes)
     if len(path := poses["position"]) > 1:
         shapes.append(path_shape("path", path))
+    stamps_ns = flight.control["stamp_ns"]
+    tracking = tracking_errors(flight, flight.true_position(stamps_ns))
     return [
         ("/scene", first_ns, encode_markers(first_ns, shapes)),
         *_transforms(poses, base_link=("position", "orientation_wxyz")),
         *_transforms(control, estimate=("position", "orientation_wxyz"), setpoint=("setpoint", "")),
-        *_errors("/tracking_error", *_tracking(flight)),
+        *_errors("/tracking_error", stamps_ns, tracking),
         *_errors("/prediction_error", *prediction_errors(flight)[1:]),
     ]
 
@@ -67,12 +69,6 @@ def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[Message
             for frame, (place, turn) in frames.items()
         }
         yield "/tf", stamp_ns, encode_transforms(stamp_ns, poses)
-
-
-def _tracking(flight: Flight) -> tuple[Array, Array]:
-    """Return the stamps of all control periods [ns], and setpoint minus true position [m]."""
-    stamps_ns = flight.control["stamp_ns"]
-    return stamps_ns, tracking_errors(flight, flight.true_position(stamps_ns))
 
 
 def _errors(topic: str, stamps_ns: Array, errors: Array) -> Iterator[Message]:

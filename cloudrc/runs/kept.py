@@ -22,9 +22,10 @@ from cloudrc.config.load import load_link, read_experiment, robot_settings
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.config.schema import MissionConfig
-from cloudrc.errors import BadInputError, InvalidRunError
+from cloudrc.errors import InvalidRunError
 from cloudrc.link.follow import PROFILE
 from cloudrc.outside.document import parse_yaml, write_yaml
+from cloudrc.outside.refusal import check_names
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.report.document import ENVIRONMENT_FILE
@@ -101,8 +102,7 @@ def _experiment(
 
 def _remove_old(reports: Path, keep: int, days: float) -> None:
     """Remove all but the newest `keep` reports, and those that are older than `days` [days]."""
-    kept = sorted(each for each in reports.glob("*-*") if each.is_dir())
-    for place, folder in enumerate(reversed(kept)):
+    for place, folder in enumerate(sorted(reports.glob("*-*/"), reverse=True)):
         if place >= keep or folder.stat().st_mtime < time.time() - days * DAY:
             shutil.rmtree(folder)
 
@@ -136,12 +136,8 @@ def fetch_mission(
             return
         for name in FILES:
             (folder / name).unlink()
-    if wanted not in flown:
-        raise BadInputError(
-            f"{release} has flown no mission '{wanted}'; it has flown: {', '.join(flown) or 'none'}"
-        )
-    if not known[wanted].ended:
-        raise BadInputError(f"mission {wanted} has not ended; wait for its end")
+    ended = [name for name in flown if known[name].ended]
+    check_names("mission that has flown and ended", [wanted], ended, f"{release}: ")
     _report_of_pods(release, known[wanted], folder, tell)
 
 
@@ -158,21 +154,17 @@ def _report_of_pods(
         about = f"Mission {record.id} ({record.order.name}) of {release.name}"
         experiment = experiment_of(session, record, folder, about)
         recording = fetch_all(release, folder, tell, want_end=True, number=record.number)
-    _check_seen(recording, record)
+    if not _has(recording, record):
+        raise InvalidRunError(
+            f"the pods' recordings lack mission {record.id}: a pod has been replaced since, or its "
+            "volume was full; keep recordings by the value recordings.storage of the chart"
+        )
     (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
     report_flight(experiment, folder, recording, False, page=False, figures=False)
 
 
 def _has(recording: Recording, record: MissionRecord) -> bool:
     return record.number in recording["/telemetry"]["mission_id"]
-
-
-def _check_seen(recording: Recording, record: MissionRecord) -> None:
-    if not _has(recording, record):
-        raise InvalidRunError(
-            f"the pods' recordings lack mission {record.id}: a pod has been replaced since, or its "
-            "volume was full; keep recordings by the value recordings.storage of the chart"
-        )
 
 
 def _missions(release: Release) -> dict[str, MissionRecord]:

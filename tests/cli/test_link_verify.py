@@ -110,8 +110,3 @@ def test_what_is_not_judged_is_noted(release):
     assert "uplink: time_line NOT JUDGED; docs/link.md says why" in as_text(said)
     release.hears(cloud="ok")
     assert as_text(release.ask()).endswith("except what is NOT JUDGED (above)")
-
-
-def test_an_undecided_quantity_is_named_and_no_note_that_is_not_there(release):
-    release.hears(world="ok", cloud="open")
-    assert as_text(release.ask(0.0)).endswith("(--seconds) for mean of the uplink")

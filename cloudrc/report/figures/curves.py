@@ -95,12 +95,9 @@ ZOOM, BEFORE = 1.2, 0.1
 STEP_MIN = 0.2
 """Smallest step of the reference that is enlarged [m]."""
 LINES: dict[str, dict[str, Any]] = {
-    "setpoint": {
-        **{"label": "reference", "color": style.REFERENCE},
-        **{"ls": "--", "drawstyle": "steps-post"},
-    },
-    "measured": {"label": "measured", "color": style.MEASURED, "lw": 1.8},
-    "position": {"label": "estimated", "color": style.ESTIMATED},
+    "setpoint": dict(label="reference", color=style.BLACK, ls="--", drawstyle="steps-post"),
+    "measured": dict(label="measured", color=style.ORANGE, lw=1.8),
+    "position": dict(label="estimated", color=style.BLUE),
 }
 """Column of the control loop -> style of its line."""
 

@@ -96,7 +96,7 @@ def _draw_obstacles(axes: Axes, subject: Subject, sides: tuple[int, int]) -> Non
     bodies = [each for each in subject.shapes.scene if each.body not in names]
     for surface in [*(wall(tube, NO_COLOUR) for tube in tubes), *bodies]:
         triangles: Any = surface.corners[surface.triangles][..., sides]
-        colour = GREY if surface.body == subject.touch else LIGHT
+        colour = GREY if surface.body == subject.flight.mission.touched else LIGHT
         shadow = PolyCollection(triangles, color=colour, rasterized=True, zorder=1.5)
         shadow.set(lw=0, antialiased=False)  # else the edges of the triangles show
         axes.add_collection(shadow, autolim=False)

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from cloudrc.config.profile import DirectionConfig
-from cloudrc.errors import BadInputError
+from cloudrc.errors import CloudrcError
 from cloudrc.link.profile import Timeline
 from cloudrc.link.traces import link_profile
 from cloudrc.metrics.flight import Array
@@ -30,7 +30,7 @@ def delays_of(direction: DirectionConfig) -> Timeline | None:
     """Return a direction's link conditions over time; None if a file for them is unreadable."""
     try:
         return Timeline(link_profile(direction))
-    except BadInputError:
+    except CloudrcError:
         return None
 
 

@@ -26,7 +26,6 @@ BLUE, SKY, GREEN = "#0072B2", "#56B4E9", "#009E73"
 ORANGE, VERMILION, PURPLE = "#E69F00", "#D55E00", "#CC79A7"
 UPLINK, DOWNLINK = BLUE, ORANGE
 NOTHING = Shapes()
-REFERENCE, MEASURED, ESTIMATED = BLACK, ORANGE, BLUE
 COLOURS, DASHES = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, BLACK, SKY), ("-", "--", "-.", ":")
 """Lines of equal kind take them in turn."""
 
@@ -117,8 +116,3 @@ class Subject:
     def times(self) -> Array:
         """Times of the control periods since the start of the mission [s], shape (n,)."""
         return np.asarray(self.flight.seconds(self.flight.control["stamp_ns"]))
-
-    @property
-    def touch(self) -> str | None:
-        """Name of the body that the mission touches; None if there is none."""
-        return self.flight.mission.touched

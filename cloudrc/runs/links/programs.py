@@ -168,7 +168,12 @@ class _Run:
             if (code := self._wait_for_server(server, wait)) is not None:
                 return ExecOutcome(code, {"server": code, "client": None}, interrupted=False)
             carrier = self._start_link()
-            self._tell(_describe(self._link, client))
+            places = [
+                addresses.ipv4 + f" and {addresses.ipv6}" * client.has_ipv6
+                for addresses in ADDRESSES.values()
+            ]
+            about = f"{self._link.cause}, seed {self._link.seed}, by {client.way}"
+            self._tell(f"link: {about}; client {places[0]}, server {places[1]}")
             client.run(commands["client"])
             return self._supervise(carrier)
         except KeyboardInterrupt:
@@ -231,12 +236,3 @@ class _Run:
         if self._exporter and now - self._counted_at >= COUNT_PERIOD:
             self._counted_at = now
             self._exporter.counted(self._link.counts())
-
-
-def _describe(link: LiveLink, end: ProgramEnd) -> str:
-    way = f"by {end.way}"
-    client, server = (
-        addresses.ipv4 + (f" and {addresses.ipv6}" if end.has_ipv6 else "")
-        for addresses in (ADDRESSES["client"], ADDRESSES["server"])
-    )
-    return f"link: {link.cause}, seed {link.seed}, {way}; client {client}, server {server}"

@@ -56,7 +56,7 @@ VERDICTS = {"off": "not believed", "open": "undecided", "ok": "believed"}
 """Worst verdict on any quantity of the link -> verdict on the whole link."""
 MEANINGS = {
     "not believed": ("red", "does not match its profile"),
-    "undecided": ("yellow", "needs more packets (--seconds)"),
+    "undecided": ("yellow", "needs more packets (--seconds): see above"),
     "believed": ("green", "matches its profile"),
 }
 """Verdict on a link -> its colour, and what it means."""
@@ -235,16 +235,16 @@ def make_report(title: str, findings: Mapping[str, Findings]) -> Report:
         "directions": {
             way: {
                 "probes": found.probes,
-                "rows": [_as_json(row) for row in found.rows if row.verdict != "told"],
+                "rows": [
+                    {"name": row.name, "unit": row.unit} | _known(row._asdict())
+                    for row in found.rows
+                    if row.verdict != "told"
+                ],
                 "evidence": _known(found.evidence._asdict()),
             }
             for way, found in findings.items()
         },
     }
-
-
-def _as_json(row: Judgement) -> dict[str, Any]:
-    return {"name": row.name, "unit": row.unit} | _known(row._asdict())
 
 
 def _known(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -262,13 +262,9 @@ def as_text(report: Report, paint: Paint = plain) -> str:
         lines += ["", escape(f"{way}: {found['probes']}"), table(rows, [1, 2, 3])]
     causes = [f"  {one['way']}: {one['text']}  [{one['code']}]" for one in report["causes"]]
     lines += ["", *map(escape, [*report["notes"], *causes])]
-    partly = any(NOT_JUDGED in note for note in report["notes"]) and report["verdict"] == "believed"
     colour, text = MEANINGS[report["verdict"]]
-    text += f", except what is {NOT_JUDGED} (above)" * partly
-    if report["verdict"] == "undecided":
-        judged = [(way, row) for way, one in report["directions"].items() for row in one["rows"]]
-        names = [f"{row['name']} of the {way}" for way, row in judged if row["verdict"] == "open"]
-        text += f" for {', '.join(names)}" * bool(names) + ": see above" * bool(report["notes"])
+    if report["verdict"] == "believed" and any(NOT_JUDGED in note for note in report["notes"]):
+        text += f", except what is {NOT_JUDGED} (above)"
     return "\n".join([*lines, paint(f"{report['verdict'].upper()}: the link {text}", colour)])
 
 
