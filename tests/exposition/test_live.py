@@ -38,12 +38,14 @@ def told(at, position=(0.0, 0.0, 1.0), velocity=ZERO, **fields):
     return TelemetrySent(telemetry.stamp_ns, 0, 0, telemetry)
 
 
+def seen(role, *records):
+    live = LiveMetrics(role)
+    live.see(records)
+    return live
+
+
 def value(live, name, *label_values):
     return live.read()[name][label_values]
-
-
-def histogram(live, name):
-    return live.read()[name]
 
 
 def wake(at_ms, *, slip_ms=0.0, lateness=1e-4):
@@ -55,25 +57,24 @@ def test_without_a_shared_clock_one_way_delays_are_absent():
     experiment = load_experiment("hover", ["link.profile=paper-p1", "cloud.clock_offset_s=7"])
     both = records(experiment)
     for role, of_end in zip(table.ENDS, both, strict=True):
-        live = LiveMetrics(role)
-        live.see(of_end)
-        assert not any("age_of" in name or "link_delay" in name for name in live.read())
-    assert histogram(live, "cloudrc_rtt_seconds").cumulative()[-1] > 100  # needs no shared clock
+        found = seen(role, *of_end).read()
+        assert not any("age_of" in name or "link_delay" in name for name in found)
+    assert found["cloudrc_rtt_seconds"].cumulative()[-1] > 100  # needs no shared clock
 
 
 def test_command_age_is_that_of_its_odometry_in_track():
     """It needs no shared clock; on the ground and in HOLD no command is in use."""
-    live = LiveMetrics("world")
-    live.see([CommandApplied(90 * MS, 1, 1, 10 * MS, ZERO)])
-    for guard in (GuardState.GROUND, GuardState.TRACK, GuardState.HOLD):
-        live.see([told(0.1, guard=guard)])
-    age = histogram(live, "cloudrc_command_age_seconds")
+    guards = (GuardState.GROUND, GuardState.TRACK, GuardState.HOLD)
+    applied = CommandApplied(90 * MS, 1, 1, 10 * MS, ZERO)
+    live = seen("world", applied, *(told(0.1, guard=guard) for guard in guards))
+    age = live.read()["cloudrc_command_age_seconds"]
     assert (age.cumulative()[-1], age.total) == (1, pytest.approx(0.09))
 
 
 def test_control_periods_give_delays_errors_and_terms():
-    live, seen = LiveMetrics("cloud"), {"setpoint": (1.0, 2.0, 3.0), "measured": (0.0, 2.5, 3.0)}
-    live.see([control(0.01 * k, **seen, derivative=(0.0, 0.0, -0.7)) for k in range(5)])
+    known = {"setpoint": (1.0, 2.0, 3.0), "measured": (0.0, 2.5, 3.0)}
+    periods = (control(0.01 * k, **known, derivative=(0.0, 0.0, -0.7)) for k in range(5))
+    live = seen("cloud", *periods)
     assert value(live, "cloudrc_tracking_error_meters", "x") == 1.0
     assert value(live, "cloudrc_tracking_error_meters", "y") == -0.5
     assert value(live, "cloudrc_pid_output", "derivative", "z") == -0.7
@@ -81,18 +82,14 @@ def test_control_periods_give_delays_errors_and_terms():
 
 
 def test_guard_and_contacts_are_counted():
-    live = LiveMetrics("world")
-    assert value(live, "cloudrc_guard_state") == GuardState.GROUND
-    for state in (GuardState.TRACK, GuardState.HOLD, GuardState.LAND, GuardState.LAND):
-        live.see([GuardChange(0, state, "")])
-    bodies = ("board", "pipe_1", "pipe_3", "chair")
-    live.see([Contact(0, body, ZERO, ZERO, ZERO, True) for body in bodies])
+    assert value(LiveMetrics("world"), "cloudrc_guard_state") == GuardState.GROUND
+    states = (GuardState.TRACK, GuardState.HOLD, GuardState.LAND, GuardState.LAND)
+    touched = (Contact(0, body, ZERO, ZERO, ZERO, True) for body in ("board", "chair", "chair"))
+    live = seen("world", *(GuardChange(0, state, "") for state in states), *touched)
     assert value(live, "cloudrc_guard_state") == GuardState.LAND
     for state in ("hold", "land"):  # a touch-down repeats LAND
         assert value(live, "cloudrc_guard_transitions_total", state) == 1
-    assert live.read()["cloudrc_contacts_total"] == {(body,): 1 for body in bodies}
-    live.see([Contact(0, "chair", ZERO, ZERO, ZERO, True)])
-    assert value(live, "cloudrc_contacts_total", "chair") == 2
+    assert live.read()["cloudrc_contacts_total"] == {("board",): 1, ("chair",): 2}
 
 
 def test_each_own_sensor_of_the_robot_has_a_value_and_a_robot_without_has_none():
@@ -106,25 +103,17 @@ def test_each_own_sensor_of_the_robot_has_a_value_and_a_robot_without_has_none()
 
 
 def test_changes_of_the_guard_are_counted_by_cause():
-    live = LiveMetrics("world")
-    for guard, cause in (
-        (GuardState.GROUND, Cause.SPAWN),
-        (GuardState.TRACK, Cause.COMMAND),
-        (GuardState.HOLD, Cause.SILENCE),
-        (GuardState.HOLD, Cause.SILENCE),
-        (GuardState.TRACK, Cause.COMMANDS),
-        (GuardState.HOLD, Cause.SILENCE),
-    ):
-        live.see([told(0.0, guard=guard, cause=cause)])
+    hold = GuardState.HOLD, Cause.SILENCE
+    reasons = [(GuardState.GROUND, Cause.SPAWN), (GuardState.TRACK, Cause.COMMAND), hold, hold]
+    reasons += [(GuardState.TRACK, Cause.COMMANDS), hold]
+    live = seen("world", *(told(0.0, guard=guard, cause=cause) for guard, cause in reasons))
     causes = live.read()["cloudrc_guard_causes_total"]
     counted = {cause: number for (cause,), number in causes.items() if number}
     assert counted == {"fresh command": 1, "no fresh commands": 2, "fresh commands again": 1}
 
 
-def heard(role, *seen):
-    live = LiveMetrics(role)
-    live.see(seen)
-    return live.end.has_peer
+def heard(role, *records):
+    return seen(role, *records).end.has_peer
 
 
 def opened(role, at_ms, epoch):

@@ -13,6 +13,7 @@ from cloudrc.config.schema import Criteria, MissionConfig, Touch, Waypoint
 from cloudrc.geometry.scene import Plate, Scene, Tube
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.metrics.flight import Flight
+from cloudrc.metrics.measure import SHIPPED
 from cloudrc.record.columns import Recording
 from cloudrc.records import (
     Arrival,
@@ -52,6 +53,17 @@ def straight(seconds):
     return (seconds, 0.0, 1.0)
 
 
+def measured(flight, name):
+    """Return the number of a flight that a metric of cloudrc gives."""
+    return SHIPPED[name].measure(flight)
+
+
+def to_point(x, tolerance, dwell=0.0, **more):
+    """Make a mission to the point `x` [m] on the way along x."""
+    point = Waypoint(position_m=(x, 0.0, 1.0), tolerance_m=tolerance, dwell_s=dwell, **more)
+    return MissionConfig(waypoints=(point,))
+
+
 @dataclass
 class Log:
     """Records of both ends; a test may change them before it makes a flight of them."""
@@ -78,8 +90,8 @@ class Log:
     def flight(
         self, scene=OPEN_AIR, *, waypoints=1, mission=None, time_limit=60.0, touch=None, **criteria
     ):
-        anywhere = Waypoint(position_m=(10.0, 0.0, 1.0), tolerance_m=10.0, dwell_s=0.0)
-        mission = mission or MissionConfig(waypoints=(anywhere,) * waypoints)
+        anywhere = to_point(10.0, 10.0).waypoints
+        mission = mission or MissionConfig(waypoints=anywhere * waypoints)
         return Flight(
             Recording.from_records(*self.ends()),
             Criteria(time_limit_s=time_limit, **criteria),
@@ -130,11 +142,11 @@ def _step(log, counter, stamp, path):
         CommandApplied(applied, 2, counter, basis, ZERO),
     ]
     log.cloud.append(Arrival(arrival, True, 2, counter, UPLINK, True))
-    fields = {"epoch": 2, "counter": counter, "horizon": HORIZON, "measured": measured}
-    fields |= {"rtt": UPLINK + DOWNLINK, "loop_delay": UPLINK + DOWNLINK + 0.005}
-    fields |= {"position": (x + 0.003, y + 0.004, z), "velocity": (1.0, 0.0, 0.0)}
+    fields = dict(epoch=2, counter=counter, horizon=HORIZON, measured=measured)
+    fields |= dict(rtt=UPLINK + DOWNLINK, loop_delay=UPLINK + DOWNLINK + 0.005)
+    fields["position"] = (x + 0.003, y + 0.004, z)
     fields["setpoint"] = (measured[0] + 0.3, measured[1] + 0.4, measured[2])
-    log.cloud.append(control(stamp / SECOND, basis / SECOND, **fields))
+    log.cloud.append(control(stamp / SECOND, basis / SECOND, velocity=(1.0, 0.0, 0.0), **fields))
 
 
 @cache

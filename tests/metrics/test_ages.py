@@ -5,9 +5,8 @@ from random import Random
 import pytest
 
 from cloudrc.messages import ZERO, GuardState
-from cloudrc.metrics.measure import SHIPPED
 from cloudrc.records import CommandApplied, GuardChange, MissionEvent
-from tests.metrics.conftest import Log, at
+from tests.metrics.conftest import Log, at, measured
 
 # Time of application and stamp of the odometry, since the start of the flight [s].
 APPLIED = [
@@ -30,10 +29,6 @@ def flight(applied, end, changes=CHANGES[:1], limit=None):
     ]
     log.cloud.append(MissionEvent(at(end), "done", 0, ""))
     return log.flight(age_deadline_s=limit)
-
-
-def measured(flight, name):
-    return SHIPPED[name].measure(flight)
 
 
 def test_a_peak_is_the_age_just_before_a_command_that_lowers_it():

@@ -29,6 +29,7 @@ from cloudrc.metrics.definitions import (
 from cloudrc.metrics.flight import STATISTICS, _values
 from cloudrc.metrics.link import WINDOW_MAX, count_accepted, transit_ns
 from cloudrc.metrics.measure import SHIPPED
+from cloudrc.record.columns import Recording
 from cloudrc.records import (
     Arrival,
     CommandApplied,
@@ -39,9 +40,10 @@ from cloudrc.records import (
     MissionEvent,
     TelemetrySent,
 )
+from cloudrc.report.flown import flight_of
 from tests.console.conftest import control
-from tests.flights.conftest import fly, records
-from tests.metrics.conftest import SECOND, Log, at, flown
+from tests.flights.conftest import records
+from tests.metrics.conftest import SECOND, Log, at, flown, measured
 from tools.docs import panels
 
 
@@ -132,27 +134,14 @@ def test_one_row_is_a_number_a_live_metric_and_a_panel():
 
 
 @cache
-def ends(name, *settings):
-    """Fly, and return the records of world and of cloud."""
-    return records(load_experiment(name, settings))
+def of(name, *settings):
+    """Fly; return the flight, and the records of world and of cloud."""
+    experiment = load_experiment(name, settings)
+    both = records(experiment)
+    return flight_of(Recording.from_records(*both), experiment), *both
 
 
-@cache
-def lossy():
-    """Fly over a link that loses a tenth; return the flight and the records of both ends."""
-    settings = (
-        "hover",
-        "link.both.loss=0.1",
-        "link.both.delay_ms=30",
-        "link.both.jitter_ms=20",
-        "seed=3",
-    )
-    flight = fly(*settings).flight
-    return flight, *ends(*settings)
-
-
-def measured(flight, name):
-    return SHIPPED[name].measure(flight)
+LOSSY = ("hover", "link.both.loss=0.1", "link.both.delay_ms=30", "link.both.jitter_ms=20", "seed=3")
 
 
 def average(live, name):
@@ -160,12 +149,10 @@ def average(live, name):
     return histogram.total / histogram.cumulative()[-1]
 
 
-def seen_in(flight, cloud):
-    """Show the control periods of the flight to live metrics."""
-    live = LiveMetrics("cloud")
-    for record in cloud:
-        if not isinstance(record, Control) or flight.start_ns <= record.stamp_ns <= flight.end_ns:
-            live.see([record])
+def seen_in(flight, cloud, kind):
+    """Show live metrics all records of cloud but those of a class outside of the flight."""
+    live, (first, last) = LiveMetrics("cloud"), flight.span_ns
+    live.see(r for r in cloud if not isinstance(r, kind) or first <= r.stamp_ns <= last)
     return live
 
 
@@ -177,21 +164,16 @@ SAMPLED = [
 
 @pytest.mark.parametrize("flown", SAMPLED)
 def test_delays_of_the_loop_are_equal_live_and_in_the_report(flown):
-    flight, live = fly(*flown).flight, LiveMetrics("cloud")
-    _, cloud = ends(*flown)
-    live.see(
-        each
-        for each in cloud
-        if isinstance(each, Arrival) and flight.start_ns <= each.stamp_ns <= flight.end_ns
-    )
+    flight, _, cloud = of(*flown)
+    live = seen_in(flight, cloud, Arrival)
     for name in ("rtt", "loop_delay", "delay_sample"):
         true = measured(flight, f"{name}_mean")
         assert average(live, f"cloudrc_{name}_seconds") == pytest.approx(true, rel=1e-9), name
 
 
 def test_age_and_tracking_error_of_a_flight_are_equal_live_and_in_the_report():
-    flight, _, cloud = lossy()
-    live = seen_in(flight, cloud)
+    flight, _, cloud = of(*LOSSY)
+    live = seen_in(flight, cloud, Control)
     age = measured(flight, "age_of_information_mean")
     assert average(live, "cloudrc_age_of_information_seconds") == pytest.approx(age, rel=1e-9)
     newest = flight.control["setpoint"][-1] - flight.control["measured"][-1]
@@ -200,36 +182,27 @@ def test_age_and_tracking_error_of_a_flight_are_equal_live_and_in_the_report():
 
 
 def test_the_loss_of_a_flight_is_equal_live_and_in_the_report():
-    flight, world, cloud = lossy()
-    until = flight.recording["/telemetry"]["stamp_ns"][-1]
-    known_until = until - transit_ns(flight.recording, "uplink") - 1
-    sent = [
-        r.counter
-        for r in world
-        if isinstance(r, TelemetrySent)
-        and flight.start_ns <= r.stamp_ns <= min(flight.end_ns, known_until)
-    ]
-    arrivals = [r for r in cloud if isinstance(r, Arrival) and r.counter >= sent[0]]
+    flight, world, cloud = of(*LOSSY)
+    last_ns = flight.recording["/telemetry"]["stamp_ns"][-1]
+    last_ns = min(flight.end_ns, last_ns - transit_ns(flight.recording, "uplink") - 1)
+    stamps = {r.counter: r.stamp_ns for r in world if isinstance(r, TelemetrySent)}
+    sent = [n for n, stamp_ns in stamps.items() if flight.start_ns <= stamp_ns <= last_ns]
+    arrivals = [r for r in cloud if isinstance(r, Arrival) and r.counter in sent]
     live = LiveMetrics("cloud")
-    live.see([r for r in arrivals if r.counter <= sent[-1]])
-    live.see([arrivals[-1]._replace(counter=sent[-1] + WINDOW)])
+    live.see([*arrivals, arrivals[-1]._replace(counter=sent[-1] + WINDOW)])
     found = live.read()
-    lost, expected = (
-        found[f"cloudrc_datagrams_{name}_total"]["uplink",] for name in ("lost", "expected")
-    )
-    assert expected == len(sent), "the first one has arrived"
-    assert lost / expected == measured(flight, "loss_uplink") > 0.05
+    lost = found["cloudrc_datagrams_lost_total"]["uplink",]
+    assert found["cloudrc_datagrams_expected_total"]["uplink",] == len(sent)
+    assert lost / len(sent) == measured(flight, "loss_uplink") > 0.05
 
 
 def test_the_error_of_an_estimate_is_equal_live_and_in_the_report():
     """For the report, what cloud measured stands for the truth."""
-    flight, _, cloud = lossy()
+    flight, _, cloud = of(*LOSSY)
     periods = [r for r in cloud if isinstance(r, Control)]
     periods = [r for r in periods if flight.start_ns <= r.stamp_ns <= flight.end_ns]
-    log, live = (
-        Log(cloud=[*periods, MissionEvent(flight.end_ns, "done", 0, "")]),
-        LiveMetrics("cloud"),
-    )
+    log = Log(cloud=[*periods, MissionEvent(flight.end_ns, "done", 0, "")])
+    live = LiveMetrics("cloud")
     log.world.append(GuardChange(flight.start_ns, GuardState.TRACK, ""))
     for each in {r.basis_stamp_ns: r for r in periods}.values():
         known = Odometry(each.basis_stamp_ns, each.measured, UPRIGHT, ZERO, ZERO)
@@ -276,8 +249,7 @@ def test_the_holds_of_a_flight_are_equal_live_and_in_the_report(first):
 
 
 def test_delay_errors_of_a_flight_match_its_ground_truth():
-    experiment = load_experiment("hover", ["link.profile=paper-p2", "cloud.clock_offset_s=5"])
-    world, cloud = records(experiment)
+    _, world, cloud = of("hover", "link.profile=paper-p2", "cloud.clock_offset_s=5")
     controls = {(c.epoch, c.counter): c for c in cloud if isinstance(c, Control)}
     truth = set()
     for applied in (r for r in world if isinstance(r, CommandApplied)):
@@ -287,8 +259,8 @@ def test_delay_errors_of_a_flight_match_its_ground_truth():
     live, seen = LiveMetrics("cloud"), set()
     for record in cloud:
         live.see([record])
-        error = live.read().get("cloudrc_delay_estimate_error_seconds")
-        if isinstance(record, Control) and error:
-            seen.add(round(error[()] * 1e6))
+        if isinstance(record, Control):
+            error = live.read().get("cloudrc_delay_estimate_error_seconds")
+            seen |= {round(error[()] * 1e6)} if error else set()
     assert len(seen) > 100
     assert len(seen - truth) <= 0.01 * len(seen), "equal to 1 us, except for rounding"

@@ -34,6 +34,13 @@ def files(folder, world, cloud, ids):
     )
 
 
+def merged(folder):
+    """Merge the files of both ends; return the recording, and the one that its file has."""
+    mission = merge(folder / "world.mcap", folder / "cloud.mcap")
+    mission.write(folder / "mission.mcap")
+    return mission, Recording.read(folder / "mission.mcap")
+
+
 @pytest.mark.parametrize(
     ("start", "ahead"),
     [(9 * SECOND, 5 * SECOND), (0, -SECOND)],
@@ -44,10 +51,8 @@ def test_two_clocks_are_related_by_the_packets(tmp_path, start, ahead):
     In the last case cloud's first stamps become negative, but MCAP has no negative log times.
     """
     world, cloud = world_records(60, start), cloud_records(60, start - ahead)
-    mission = merge(*files(tmp_path, world, cloud, ("", "")))
-    target = tmp_path / "mission.mcap"
-    mission.write(target)
-    recording = Recording.read(target)
+    files(tmp_path, world, cloud, ("", ""))
+    mission, recording = merged(tmp_path)
     assert recording.note == ""
     noted = {
         "clock": "world",
@@ -108,8 +113,7 @@ def test_unrelated_clocks_begin_together_also_in_a_torn_file(tmp_path):
     noted = {"clock_offset_ns": str(6 * SECOND), "clock_offset_method": "first records"}
     assert noted.items() <= merge(*ends).metadata.items()
     ends[1].write_bytes(ends[1].read_bytes()[: ends[1].stat().st_size // 2])
-    (mission := merge(*ends)).write(tmp_path / "m.mcap")
-    recording = Recording.read(tmp_path / "m.mcap")
+    mission, recording = merged(tmp_path)
     assert recording.note == mission.note
     assert mission.note.startswith("cloud: cut short: ")
     assert len(recording["/odometry"]) == 150
@@ -118,10 +122,9 @@ def test_unrelated_clocks_begin_together_also_in_a_torn_file(tmp_path):
 
 @pytest.mark.parametrize(("lost", "rows"), [("world", (0, 9)), ("cloud", (9, 0))])
 def test_one_end_alone_is_better_than_nothing(tmp_path, lost, rows):
-    world, cloud = files(tmp_path, world_records(9), cloud_records(9), ("x", "y"))
+    files(tmp_path, world_records(9), cloud_records(9), ("x", "y"))
     (tmp_path / f"{lost}.mcap").write_bytes(b"")
-    merge(world, cloud).write(tmp_path / "m.mcap")
-    recording = Recording.read(tmp_path / "m.mcap")
+    _, recording = merged(tmp_path)
     assert f"{lost}.mcap: is empty" in recording.note
     assert recording.metadata["clock"] != lost
     assert (len(recording["/odometry"]), len(recording["/pid"])) == rows
@@ -174,9 +177,7 @@ def test_the_wall_time_of_the_start_is_kept(tmp_path):
     ):
         with McapWriter(tmp_path / f"{end}.mcap", clock=end, wall_offset_ns=offset_ns) as writer:
             writer.write(records)
-    target = tmp_path / "mission.mcap"
-    merge(tmp_path / "world.mcap", tmp_path / "cloud.mcap").write(target)
-    metadata = Recording.read(target).metadata
+    metadata = merged(tmp_path)[1].metadata
     assert metadata["started"] == "2026-07-25T17:20:08.995+00:00", "by the packets"
     assert metadata["wall_clock_offset_ns"] == str(day_ns)
 

@@ -10,10 +10,10 @@ from cloudrc.report.write import assess
 from tests.metrics.conftest import paper
 
 RUN = Run("virtual", "virtual")
-NAMES = {
-    *("schemaVersion", "verdict", "failures", "experiment", "mode", "seed", "shaper"),
-    *("config_sha256", "records_sha256", "numbers", "complete", "notes"),
-}
+NAMES = set(
+    "schemaVersion verdict failures experiment mode seed shaper config_sha256 records_sha256 "
+    "numbers complete notes".split()
+)
 
 
 def document(run=RUN, **criteria):

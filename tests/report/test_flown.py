@@ -5,12 +5,8 @@ import shutil
 
 import pytest
 
-from cloudrc.config.flown import FlownWorld
-from cloudrc.config.hull import hull_of
 from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import find_robot
-from cloudrc.config.scene import scene_of
-from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of
 from cloudrc.record.columns import Recording
 from cloudrc.report.flown import flown_shapes
@@ -76,22 +72,3 @@ def test_a_report_is_that_of_the_flight_without_the_users_files(run, call):
     assert measured(folder) == before
     assert "min_clearance_flight" in before
     assert "No replay in 3-D" not in (folder / "report.html").read_text()
-
-
-@pytest.fixture
-def flown(tmp_path):
-    """A world with one solid of each shape."""
-    sizes = {"box": ".1 .2 .3", "sphere": ".1", "capsule": ".1 .2", "cylinder": ".1 .2"}
-    sizes |= {"plane": "1 1 .1"}
-    geoms = [
-        f'<body name="{shape}" pos="{n} 1 2" euler="10 20 30">'
-        f'<geom type="{shape}" size="{size}"/></body>'
-        for n, (shape, size) in enumerate(sizes.items())
-    ]
-    corners = "0 0 0 1 0 0 0 1 0 0 0 1"
-    mesh = f'<asset><mesh name="m" vertex="{corners}"/></asset>'
-    geoms.append('<body name="mesh" pos="5 5 5"><geom type="mesh" mesh="m"/></body>')
-    text = file_of("pipes").read_text().replace("<worldbody>", f"{mesh}<worldbody>")
-    path = tmp_path / "mine.xml"
-    path.write_text(text.replace("</worldbody>", "".join(geoms) + "</worldbody>"))
-    return FlownWorld(scene_of(World(scene=str(path))), hull_of("pelican"), planar=False)

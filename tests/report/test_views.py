@@ -32,18 +32,17 @@ def flown(tmp_path_factory):
     return path, report, messages
 
 
+def xyz(vectors):
+    return np.array([(each.x, each.y, each.z) for each in vectors])
+
+
 def transforms(messages, frame):
-    """Return stamps [ns], positions and orientations (wxyz) of a frame."""
+    """Return stamps [ns] and transforms of a frame."""
     sent = [each for _, message in messages["/tf"] for each in message.transforms]
     found = [each for each in sent if each.child_frame_id == frame]
     assert {each.header.frame_id for each in found} == {"world"}
     stamps = [each.header.stamp.sec * 10**9 + each.header.stamp.nanosec for each in found]
-    moves, turns = [e.transform.translation for e in found], [e.transform.rotation for e in found]
-    return (
-        np.array(stamps),
-        np.array([(v.x, v.y, v.z) for v in moves]),
-        np.array([(q.w, q.x, q.y, q.z) for q in turns]),
-    )
+    return np.array(stamps), [each.transform for each in found]
 
 
 def test_frames_are_the_poses_of_the_recording(flown):
@@ -54,13 +53,14 @@ def test_frames_are_the_poses_of_the_recording(flown):
         ("estimate", "/estimated_odometry", "position"),
         ("setpoint", "/setpoint_position", "setpoint"),
     ):
-        stamps, positions, orientations = transforms(messages, frame)
+        stamps, poses = transforms(messages, frame)
         table = recording[topic]
         rows = np.searchsorted(table["stamp_ns"], stamps)
         np.testing.assert_array_equal(table["stamp_ns"][rows], stamps)
-        np.testing.assert_array_equal(table[column][rows], positions)
+        np.testing.assert_array_equal(table[column][rows], xyz(e.translation for e in poses))
         if frame != "setpoint":
-            np.testing.assert_array_equal(table["orientation_wxyz"][rows], orientations)
+            turns = [(e.rotation.w, *xyz([e.rotation])[0]) for e in poses]
+            np.testing.assert_array_equal(table["orientation_wxyz"][rows], turns)
         assert np.diff(stamps).max() <= 50_000_000, "smooth enough to be interpolated"
 
 
@@ -79,14 +79,13 @@ def test_the_scene_has_robot_pipes_board_and_path(flown):
     assert len({marker.id for marker in message.markers}) == len(message.markers)
     for pipe in scene.tubes:
         (tube,) = markers[pipe.name, "world"]
-        points = np.array([(p.x, p.y, p.z) for p in tube.points]) - pipe.centre
-        along = points @ np.array(pipe.axis)
-        np.testing.assert_allclose(np.abs(along), pipe.length / 2, atol=1e-5)
-        radii = np.linalg.norm(points - along[:, None] * pipe.axis, axis=1)
+        points = xyz(tube.points) - pipe.centre
+        np.testing.assert_allclose(np.abs(points @ pipe.axis), pipe.length / 2, atol=1e-5)
+        radii = np.linalg.norm(np.cross(points, pipe.axis), axis=1)
         np.testing.assert_allclose(radii, pipe.inner, atol=1e-5)
     (line,) = markers["path", "world"]
-    ends = [(p.x, p.y, p.z) for p in (line.points[0], line.points[-1])]
-    np.testing.assert_allclose(ends, truth["position"][[0, -1]], atol=0.05)
+    ends = truth["position"][[0, -1]]
+    np.testing.assert_allclose(xyz(line.points)[[0, -1]], ends, atol=0.05)
 
 
 def test_every_path_of_the_layout_is_in_a_recording(flown):

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from cloudrc.metrics.measure import SHIPPED
 from cloudrc.records import Arrival
 from cloudrc.runs.links.trace import one_way
-from tests.metrics.conftest import DONE, END, PERIOD, SECOND, START, UPLINK, flown
+from tests.metrics.conftest import DONE, END, PERIOD, SECOND, START, UPLINK, flown, measured
 
 TRANSIT = round(UPLINK * SECOND)
 ALL = (END - START + SECOND) // PERIOD + 1
@@ -39,7 +38,7 @@ def trace(log):
 
 
 def loss(log, way="uplink"):
-    return SHIPPED[f"loss_{way}"].measure(log.flight())
+    return measured(log.flight(), f"loss_{way}")
 
 
 def test_a_trace_has_all_datagrams_of_a_time_or_none():
