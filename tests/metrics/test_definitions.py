@@ -156,13 +156,7 @@ def seen_in(flight, cloud, kind):
     return live
 
 
-SAMPLED = [
-    ("paper-verbatim", "link.profile=paper-p3"),
-    ("hover", "link.profile=lossy", "cloud.estimator=running_mean"),
-]
-
-
-@pytest.mark.parametrize("flown", SAMPLED)
+@pytest.mark.parametrize("flown", [("paper-verbatim", "link.profile=paper-p3"), LOSSY])
 def test_delays_of_the_loop_are_equal_live_and_in_the_report(flown):
     flight, _, cloud = of(*flown)
     live = seen_in(flight, cloud, Arrival)

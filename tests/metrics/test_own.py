@@ -50,6 +50,8 @@ def report_of(run):
 
 def test_a_later_report_measures_a_file_only_if_named(folder, monkeypatch):
     run, names = folder / "run", ("exits", "huge", "overshoot", "raises")
+    monkeypatch.setattr("cloudrc.report.figures.FIGURES", {})
+    monkeypatch.setattr("cloudrc.report.write._replay", lambda assessment: "")
     asked = f"report.metrics=[{', '.join(f'mine/{name}.py' for name in names)}]"
     assert main(["run", *SHORT, "--set", asked, "--out", "run"]) == 0
     first = report_of(run)

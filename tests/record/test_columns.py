@@ -14,7 +14,7 @@ from tests.record.conftest import MS, any_record, assert_equal, cloud_records, w
 
 
 @given(st.lists(any_record(), max_size=12))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_a_file_gives_what_memory_gives(tmp_path_factory, records):
     records.sort(key=attrgetter("stamp_ns"))
     path = write(tmp_path_factory.getbasetemp() / "any.mcap", records)

@@ -9,6 +9,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import find_robot
 from cloudrc.config.shipped import file_of
 from cloudrc.record.columns import Recording
+from cloudrc.report.figures import FIGURES
 from cloudrc.report.flown import flown_shapes
 from cloudrc.runs.fly import fly
 
@@ -60,7 +61,8 @@ def test_the_report_of_a_flight_names_the_body_that_nothing_can_touch(run):
     assert [note for note in notes if note.startswith("The robot flies through ghost: ")]
 
 
-def test_a_report_is_that_of_the_flight_without_the_users_files(run, call):
+def test_a_report_is_that_of_the_flight_without_the_users_files(run, call, monkeypatch):
+    monkeypatch.setattr("cloudrc.report.figures.FIGURES", {"flight": FIGURES["flight"]})
     folder, files, _ = run
     before = measured(folder)
     away = files.rename(files.with_name("away"))

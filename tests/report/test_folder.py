@@ -123,9 +123,10 @@ def test_the_recordings_are_merged_if_they_are_not_yet(run):
     first = report(run)["numbers"]
     for what in (Path.unlink, lambda path: path.write_bytes(b"")):
         what(run / "mission.mcap")
-        assert write_report(run, *read_run(run), page=False)["numbers"] == first
+        recording, experiment, facts = read_run(run)
+        assert facts.interrupted, "the command was killed before it wrote mission.mcap"
+        assert write_report(run, recording, experiment, facts, page=False)["numbers"] == first
         assert Recording.read(run / "mission.mcap").note == ""
-        assert read_run(run)[2].interrupted, "the command was killed before it wrote mission.mcap"
 
 
 def test_a_folder_without_a_run_is_refused(run):
