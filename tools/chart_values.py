@@ -69,16 +69,18 @@ SECRET = {**OBJECT, "properties": {"name": NAME}, "additionalProperties": False}
 PULL_SECRETS = {"type": "array", "items": _either(STRING, {**SECRET, "required": ["name"]})}
 HOST = _text(r"^$|^([a-z0-9]([-a-z0-9]*[a-z0-9])?\.)*[a-z0-9]([-a-z0-9]*[a-z0-9])?$")
 PORT = {"type": "integer", "minimum": 1, "maximum": 65_535}
+NAMES = """
+queueName schedulerName configMap priorityClassName runtimeClassName existingClaim tlsSecret
+className existingSecret name
+"""
 RULES = {
+    **dict.fromkeys(NAMES.split(), NAME),
     "fullnameOverride": _text(r"^$|^[a-z]([-a-z0-9]*[a-z0-9])?$"),
     "tag": _text(r"^$|^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$"),
     "digest": _text(r"^$|^sha256:[0-9a-f]{64}$"),
     "pullPolicy": _one_of("Always", "IfNotPresent", "Never"),
     "experiment": _ref("Experiment"),
     "robots": _either({"type": "integer", "minimum": 1, "maximum": 1000}, NULL),
-    "queueName": NAME,
-    "schedulerName": NAME,
-    "configMap": NAME,
     "mode": _one_of("auto", "netem", "relay"),
     "profile": _either(STRING, _ref("Profile"), NULL),
     "traces": {
@@ -94,14 +96,11 @@ RULES = {
     "affinity": OBJECT,
     "commonLabels": LABELS,
     "podLabels": LABELS,
-    "priorityClassName": NAME,
-    "runtimeClassName": NAME,
     "extraEnv": {"type": "array", "items": NAMED},
     "extraVolumes": {"type": "array", "items": NAMED},
     "extraVolumeMounts": {"type": "array", "items": {**OBJECT, "required": ["name", "mountPath"]}},
     "recordingSizeLimit": QUANTITY,
     "workers": {"type": "integer", "minimum": 1, "maximum": 64},
-    "existingClaim": NAME,
     "storage": _either(*QUANTITY["anyOf"], _one_of("")),
     "accessMode": _one_of("ReadWriteOnce", "ReadWriteOncePod", "ReadWriteMany"),
     "memory": QUANTITY,
@@ -109,12 +108,9 @@ RULES = {
     "keepDays": {"type": "number", "exclusiveMinimum": 0},
     "apiHost": HOST,
     "consoleHost": HOST,
-    "tlsSecret": NAME,
-    "className": NAME,
     "parentRefs": {"type": "array", "items": NAMED},
     "pullSecrets": PULL_SECRETS,
     "schedule": _text(r"^$|^(@[a-z]+|[-*,/0-9A-Za-z]+( [-*,/0-9A-Za-z?#]+){4})$"),
-    "existingSecret": NAME,
     "size": QUANTITY,
     "type": _one_of("ClusterIP", "NodePort", "LoadBalancer"),
     "port": PORT,
@@ -124,7 +120,6 @@ RULES = {
     "dns": PEERS,
     "plan": _either(STRING, _ref("MissionConfig"), NULL),
     "interval": _text(r"^[0-9]+(ms|s|m)$"),
-    "name": NAME,
     "namespace": TypeAdapter(RosNamespace).json_schema(),
     "ipFamilyPolicy": _either(_one_of("SingleStack", "PreferDualStack", "RequireDualStack"), NULL),
     "podSecurityContext": _either(OBJECT, NULL),

@@ -127,10 +127,10 @@ def outputs() -> dict[Path, str]:
     }
 
 
-def leftovers() -> list[Path]:
-    """List copies in the chart whose original has been deleted."""
+def leftovers(made: dict[Path, str]) -> list[Path]:
+    """List copies in the chart whose original has been deleted; `made` are the generated files."""
     copies = {path for kind in COPIED for path in (CHART / "files" / f"{kind}s").glob("*.yaml")}
-    return sorted(copies - outputs().keys())
+    return sorted(copies - made.keys())
 
 
 def insert(page: Path, text: str) -> dict[Path, str]:
@@ -336,8 +336,9 @@ def _metrics() -> str:
 
 
 if __name__ == "__main__":
-    for target, content in outputs().items():
+    generated = outputs()
+    for target, content in generated.items():
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(content)
-    for leftover in leftovers():
+    for leftover in leftovers(generated):
         leftover.unlink()

@@ -334,9 +334,14 @@ def fetch_recording(
     """
     pod = find_pod(release, component).metadata.name
     path = f"{DATA}/{component}{'.before' if previous else ''}.mcap"
-    arguments = [*release.flags, "exec", pod, f"--container={component}", "--", "cat", path]
+    copy_file(release, pod, component, path, target)
+
+
+def copy_file(release: Release, pod: str, container: str, path: str, target: Path) -> None:
+    """Copy the file at `path` in a container of a pod to a file of this machine."""
+    words = [*release.flags, "exec", pod, f"--container={container}", "--", "cat", path]
     with target.open("wb") as file:
-        run("kubectl", arguments, stdout=file)
+        run("kubectl", words, stdout=file)
 
 
 def fetch_logs(release: Release, component: str) -> dict[str, str]:

@@ -17,7 +17,7 @@ from typing import Any
 from cloudrc.cluster.client import Release, run
 from cloudrc.cluster.flight import FETCHES, FLUSH, fetch_all, report_flight
 from cloudrc.cluster.link import EXPERIMENT
-from cloudrc.cluster.pods import DATA, find_pod
+from cloudrc.cluster.pods import DATA, copy_file, find_pod
 from cloudrc.config.load import load_link, read_experiment, robot_settings
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.config.resolved import ResolvedExperiment, dump
@@ -123,14 +123,13 @@ def fetch_mission(
     flown = [each.id for each in known.values() if "started" in each.happened]
     wanted = mission or (flown[-1] if flown else "")
     pod = find_pod(release, "cloud").metadata.name
-    inside = [*release.flags, "exec", pod, "--container=cloud", "--"]
-    names = run("kubectl", [*inside, "sh", "-c", f"ls {DATA}/{REPORTS} 2>/dev/null || true"])
+    words = ["exec", pod, "--container=cloud", "--", "sh", "-c", f"ls {DATA}/{REPORTS} || true"]
+    names = run("kubectl", [*release.flags, *words])
     kept = [name for name in names.split() if name == wanted or name.endswith(f"-{wanted}")]
     if wanted and kept:
         for name in FILES:
-            with (folder / name).open("wb") as file:
-                path = f"{DATA}/{REPORTS}/{kept[-1]}/{name}"
-                run("kubectl", [*inside, "cat", path], stdout=file)
+            path = f"{DATA}/{REPORTS}/{kept[-1]}/{name}"
+            copy_file(release, pod, "cloud", path, folder / name)
         # Another install, whose volume this is, may have had a mission of this id.
         if wanted not in known or _has(Recording.read(folder / "mission.mcap"), known[wanted]):
             return
@@ -173,8 +172,7 @@ def _missions(release: Release) -> dict[str, MissionRecord]:
     with TemporaryDirectory() as name:
         journal = Path(name) / "missions.journal"
         for ending in ("", "-wal"):
-            with Path(f"{journal}{ending}").open("wb") as file:
-                words = ["exec", pod, "--container=teleop", "--", "cat", f"{JOURNAL}{ending}"]
-                run("kubectl", [*release.flags, *words], stdout=file)
+            target = Path(f"{journal}{ending}")
+            copy_file(release, pod, "teleop", f"{JOURNAL}{ending}", target)
         with closing(open_store(journal, b"")) as store:
             return store.missions
