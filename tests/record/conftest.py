@@ -13,6 +13,7 @@ from mcap.writer import CompressionType, Writer
 
 from cloudrc import records as rec
 from cloudrc.messages import GuardState, Odometry, Telemetry
+from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
@@ -154,6 +155,12 @@ def rewrite(
             writer.add_metadata(entry.name, entry.metadata)
         writer.finish()
     return target
+
+
+def copied(path):
+    """Copy a recording, and read the copy."""
+    Recording.read(path).write(target := path.with_suffix(".copy.mcap"))
+    return Recording.read(target)
 
 
 def assert_equal(one, other):

@@ -10,7 +10,7 @@ from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted, MissionEvent
 from cloudrc.report.folder import open_recording
-from tests.record.conftest import MS, SECOND, cloud_records, world_records, write
+from tests.record.conftest import MS, SECOND, cloud_records, copied, world_records, write
 
 RECORDS = world_records(200)  # four chunks
 
@@ -30,11 +30,6 @@ def without(path, chunks, index=True):
 @pytest.fixture
 def path(tmp_path):
     return write(tmp_path / "x.mcap", RECORDS)
-
-
-def copy(path):
-    Recording.read(path).write(target := path.with_suffix(".copy.mcap"))
-    return Recording.read(target)
 
 
 def test_an_intact_recording_has_no_hole_and_one_that_ends_in_its_views_lacks_the_rest(tmp_path):
@@ -78,7 +73,7 @@ def test_the_last_mission_of_a_killed_session_and_of_its_copy_are_whole_alike(
     records += [MissionEvent(at * SECOND, word, 0, "") for at, word in events]
     records.sort(key=lambda record: record.stamp_ns)
     session = without(write(tmp_path / "session.mcap", records), [], index=False)
-    for mission in (Recording.read(session), copy(session)):
+    for mission in (Recording.read(session), copied(session)):
         cut_to_last_mission(mission)
         mission.write(target := tmp_path / "mission.mcap")
         for each in (mission, Recording.read(target)):

@@ -17,7 +17,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole
 from cloudrc.record.writer import McapWriter
-from tests.record.conftest import assert_equal, rewrite, world_records
+from tests.record.conftest import assert_equal, copied, rewrite, world_records
 
 RECORDS = world_records(160)
 
@@ -71,12 +71,6 @@ def path(tmp_path):
 def whole(tmp_path):
     (tmp_path / "whole.mcap").write_bytes(WHOLE)
     return tmp_path / "whole.mcap"
-
-
-def copied(path):
-    """Copy a recording, and read the copy."""
-    Recording.read(path).write(target := path.with_suffix(".copy.mcap"))
-    return Recording.read(target)
 
 
 @pytest.mark.parametrize("cut", [0, 8])

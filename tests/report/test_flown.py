@@ -1,42 +1,24 @@
 """A run is drawn and reported from its recording, without the user's files of robot and scene."""
 
 import json
-import shutil
 
 import pytest
 
-from cloudrc.config.load import load_experiment
-from cloudrc.config.robot import find_robot
-from cloudrc.config.shipped import file_of
+from cloudrc.config.load import read_experiment
 from cloudrc.record.columns import Recording
 from cloudrc.report.figures import FIGURES
 from cloudrc.report.flown import flown_shapes
-from cloudrc.runs.fly import fly
-
-GHOST = '<body name="ghost"><geom size=".1" contype="0" conaffinity="0"/></body>'
-"""Body that nothing can touch."""
+from tests.support.own_flight import fly_own
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """Fly the user's own rover; return the folders of the run and of the user's files."""
-    files = tmp_path_factory.mktemp("mine")
-    shutil.copytree(find_robot("rover").model.parent, files / "robot")
-    scene = file_of("pillars").read_text().replace("</worldbody>", f"{GHOST}</worldbody>")
-    (files / "scene.xml").write_text(scene)
-    folder = tmp_path_factory.mktemp("run")
-    sets = (
-        f"world.robot={files / 'robot'}",
-        f"world.scene={files / 'scene.xml'}",
-        "mission.waypoints=[{position_m: [0.5, 0.5], dwell_s: 0.0}]",
-    )
-    experiment = load_experiment("pillars", sets)
-    fly(experiment, "virtual", folder, page=False)
-    return folder, files, experiment
+    return fly_own(tmp_path_factory)
 
 
 def test_the_recordings_own_shapes_count_and_not_those_of_changed_files(run):
-    folder, files, experiment = run
+    folder, files = run
+    experiment = read_experiment(folder / "config.yaml", flown=True)
     recording, model = Recording.read(folder / "mission.mcap"), files / "robot" / "robot.xml"
     before, text = flown_shapes(recording, experiment), model.read_text()
     model.write_text(
@@ -63,7 +45,7 @@ def test_the_report_of_a_flight_names_the_body_that_nothing_can_touch(run):
 
 def test_a_report_is_that_of_the_flight_without_the_users_files(run, call, monkeypatch):
     monkeypatch.setattr("cloudrc.report.figures.FIGURES", {"flight": FIGURES["flight"]})
-    folder, files, _ = run
+    folder, files = run
     before = measured(folder)
     away = files.rename(files.with_name("away"))
     try:

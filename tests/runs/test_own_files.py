@@ -1,32 +1,16 @@
 """A run is repeated from its config.yaml: files that changed since its flight are named."""
 
-import shutil
-
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.config.robot import find_robot
-from cloudrc.config.shipped import file_of
-from cloudrc.runs.fly import fly
 from cloudrc.runs.own_files import describe_changes, hash_files
-
-PREDICTOR = "from cloudrc.cloud.predictors.last_sample import build\n"
+from tests.support.own_flight import PREDICTOR, fly_own
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """Fly with files of one's own; return the config.yaml of the run, and the folder of files."""
-    files, folder = tmp_path_factory.mktemp("mine"), tmp_path_factory.mktemp("run")
-    shutil.copytree(find_robot("rover").model.parent, files / "robot")
-    shutil.copy(file_of("pillars"), files / "scene.xml")
-    (files / "mine.py").write_text(PREDICTOR)
-    sets = (
-        f"world.robot={files / 'robot'}",
-        f"world.scene={files / 'scene.xml'}",
-        f"cloud.predictor={files / 'mine.py'}",
-        "mission.waypoints=[{position_m: [0.1, 0], dwell_s: 0.0}]",
-    )
-    fly(load_experiment("pillars", sets), "virtual", folder, page=False)
+    folder, files = fly_own(tmp_path_factory)
     return folder / "config.yaml", files
 
 
