@@ -60,12 +60,10 @@ def series(recording: Recording) -> tuple[Array, Array]:
     longest = int(tracks.argmax())
     start_ns, end_ns = begins_ns[longest] + int(TAKE_OFF * 1e9), ends_ns[longest]
     end_ns = end_ns if tracks[longest] else start_ns
-    if end_ns - start_ns < DURATION_MIN * 1e9:
-        flown = max(0, end_ns - start_ns) * 1e-9
-        where = " without lost messages" if recording.holes else ""
+    if (flown := (end_ns - start_ns) * 1e-9) < DURATION_MIN:
         raise InvalidValueError(
-            f"{flown:.4g} s of flight under commands after the take-off{where}, and the "
-            f"fit needs {DURATION_MIN:g} s; record a longer flight"
+            f"{max(0.0, flown):.4g} s of flight under commands after the take-off, without lost "
+            f"messages, and the fit needs {DURATION_MIN:g} s; record a longer flight"
         )
     at_ns = np.arange(start_ns, end_ns, int(DT * 1e9))
     held = source["stamp_ns"].searchsorted(at_ns, "right") - 1

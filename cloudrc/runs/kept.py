@@ -116,7 +116,7 @@ def fetch_mission(
     gets a line about logs that cannot be fetched.
 
     Raises:
-        BadInputError: If there is no such mission, or if it has not ended.
+        CloudrcError: If there is no such mission, or if it has not ended.
         InvalidRunError: If the recordings of the pods begin after the mission.
     """
     known = _missions(release)

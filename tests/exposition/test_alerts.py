@@ -16,6 +16,7 @@ from cloudrc.faults.scenarios import SCENARIOS
 from cloudrc.faults.schedule import Schedule
 from cloudrc.faults.search import run_fault
 from cloudrc.records import Counted
+from tests.conftest import nightly
 
 ROOT = Path(__file__).resolve().parents[2]
 RULES = ROOT / "charts" / "cloudrc" / "files" / "rules.yaml"
@@ -33,7 +34,7 @@ FIRES = {
     "F28": ["CloudrcMissionStuck"],
 }
 """Fault -> the alerts that its flight fires; a fault that is not listed fires none."""
-QUICK = ("F8", "F13", "F17", "F25", "F28")
+QUICK = ("F8", "F17", "F25", "F28")
 FLOWN = [
     pytest.param(each, marks=[] if each.id in QUICK else pytest.mark.full, id=each.name)
     for each in SCENARIOS.values()
@@ -140,7 +141,7 @@ def test_a_fault_fires_its_alerts_and_no_others(scenario, flights, tmp_path):
     assert sorted(set[str]().union(*found)) == FIRES.get(scenario.id, [])
 
 
-@pytest.mark.parametrize("profile", ["paper-p1", "paper-p3", "wifi"])
+@pytest.mark.parametrize("profile", ["paper-p3", *nightly("paper-p1", "wifi")])
 def test_a_clean_flight_fires_none(profile, flights, tmp_path):
     flight = FaultRun(Schedule(1, profile)).fly_mission()
     assert flight.mission.state == "done"

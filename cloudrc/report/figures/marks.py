@@ -16,7 +16,7 @@ from cloudrc.config.profile import DirectionConfig
 from cloudrc.errors import CloudrcError
 from cloudrc.link.profile import Timeline
 from cloudrc.link.traces import link_profile
-from cloudrc.metrics.flight import Array
+from cloudrc.metrics.flight import Array, rows_of, select
 from cloudrc.metrics.mission import holds
 from cloudrc.report.figures import style
 from cloudrc.report.figures.style import Subject
@@ -64,17 +64,16 @@ def parts(subject: Subject, *, uplink: bool) -> list[LinkSpan]:
     sent, table = recording["/telemetry"]["stamp_ns"], recording["/link"]
     start = float(seconds(sent[0])) if len(sent) else 0.0
     found = [LinkSpan(-inf, start, subject.uplink if uplink else subject.downlink, "")]
-    begins = seconds(table["stamp_ns"]) - table["age"]
-    for row in np.argsort(begins, kind="stable"):
-        if table["uplink"][row] != uplink:
-            continue
+    ours = select(table.columns, table["uplink"] == uplink)
+    names = "stamp_ns", "age", "time_line", "conditions", "cause"
+    for stamp_ns, age, time_line, conditions, cause in rows_of(ours, *names):
         try:
-            direction = DirectionConfig.model_validate_json(str(table["conditions"][row]))
+            direction = DirectionConfig.model_validate_json(conditions)
         except ValueError:  # another version of cloudrc has recorded this flight
             continue
-        origin = float(seconds(table["stamp_ns"][row]) - table["time_line"][row])
-        found.append(LinkSpan(float(begins[row]), origin, direction, str(table["cause"][row])))
-    return found
+        now = seconds(stamp_ns)
+        found.append(LinkSpan(now - age, now - time_line, direction, cause))
+    return sorted(found, key=lambda part: part.begin)
 
 
 def bounds(subject: Subject, time: Array, *, uplink: bool) -> Array:
