@@ -8,7 +8,7 @@ import pytest
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition import table
 from cloudrc.exposition.live import LiveMetrics
-from cloudrc.messages import UPRIGHT, ZERO, Cause, GuardState, Odometry, Telemetry
+from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.records import (
     Arrival,
     CommandApplied,
@@ -21,21 +21,12 @@ from cloudrc.records import (
     SensorLabel,
     SensorRead,
     SessionOpened,
-    TelemetrySent,
 )
 from tests.console.conftest import control
 from tests.flights.conftest import records
+from tests.support.told import told
 
 MS = 1_000_000
-
-
-def told(at, position=(0.0, 0.0, 1.0), velocity=ZERO, **fields):
-    """Make the record of telemetry of `at` [s]."""
-    odometry = Odometry(round(at * 1e9), position, UPRIGHT, velocity, ZERO)
-    whole = {"echo_stamp_ns": -1, "echo_hold_ns": 0, "slip_ns": 0, "mission": 0, "touch_speed": 0.0}
-    whole |= {"stamp_ns": odometry.stamp_ns, "odometry": odometry, "sensors": ()}
-    telemetry = Telemetry(**{**whole, "guard": GuardState.TRACK, **fields})
-    return TelemetrySent(telemetry.stamp_ns, 0, 0, telemetry)
 
 
 def seen(role, *records):
@@ -66,7 +57,7 @@ def test_command_age_is_that_of_its_odometry_in_track():
     """It needs no shared clock; on the ground and in HOLD no command is in use."""
     guards = (GuardState.GROUND, GuardState.TRACK, GuardState.HOLD)
     applied = CommandApplied(90 * MS, 1, 1, 10 * MS, ZERO)
-    live = seen("world", applied, *(told(0.1, guard=guard) for guard in guards))
+    live = seen("world", applied, *(told(100 * MS, guard) for guard in guards))
     age = live.read()["cloudrc_command_age_seconds"]
     assert (age.cumulative()[-1], age.total) == (1, pytest.approx(0.09))
 
@@ -106,7 +97,7 @@ def test_changes_of_the_guard_are_counted_by_cause():
     hold = GuardState.HOLD, Cause.SILENCE
     reasons = [(GuardState.GROUND, Cause.SPAWN), (GuardState.TRACK, Cause.COMMAND), hold, hold]
     reasons += [(GuardState.TRACK, Cause.COMMANDS), hold]
-    live = seen("world", *(told(0.0, guard=guard, cause=cause) for guard, cause in reasons))
+    live = seen("world", *(told(0, guard, cause=cause) for guard, cause in reasons))
     causes = live.read()["cloudrc_guard_causes_total"]
     counted = {cause: number for (cause,), number in causes.items() if number}
     assert counted == {"fresh command": 1, "no fresh commands": 2, "fresh commands again": 1}

@@ -2,17 +2,12 @@
 
 from rosbags.typesys import Stores, get_typestore
 
-from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
+from cloudrc.messages import GuardState
 from cloudrc.record.topics import VIEWS
-from cloudrc.records import TelemetrySent
 from cloudrc.report.live_views import REPEAT_NS, LiveViews
+from tests.support.told import told
 
 STORE = get_typestore(Stores.ROS2_KILTED)
-
-
-def sent(stamp_ns, guard):
-    pose = Odometry(stamp_ns, (1.0, 2.0, 3.0), UPRIGHT, ZERO, ZERO)
-    return TelemetrySent(stamp_ns, 1, 1, Telemetry(stamp_ns, pose, (), -1, 0, 0, 0, guard))
 
 
 def topics(views, record):
@@ -21,7 +16,7 @@ def topics(views, record):
 
 def test_telemetry_moves_the_robot_and_shows_the_guard():
     views = LiveViews([])
-    found = {topic: data for topic, _, data in views.of(sent(5, GuardState.GROUND))}
+    found = {topic: data for topic, _, data in views.of(told(5, GuardState.GROUND))}
     assert found.keys() == {"/odometry", "/telemetry", "/tf", "/guard", "/scene"}
     (frame,) = STORE.deserialize_cdr(found["/tf"], VIEWS["/tf"]).transforms
     place = frame.transform.translation
@@ -30,8 +25,8 @@ def test_telemetry_moves_the_robot_and_shows_the_guard():
 
 def test_the_guard_comes_at_a_change_and_with_the_scene_once_a_second():
     views = LiveViews([])
-    list(views.of(sent(0, GuardState.GROUND)))
-    assert "/guard" not in topics(views, sent(10, GuardState.GROUND))
-    changed = topics(views, sent(20, GuardState.TRACK))
+    list(views.of(told(0, GuardState.GROUND)))
+    assert "/guard" not in topics(views, told(10, GuardState.GROUND))
+    changed = topics(views, told(20, GuardState.TRACK))
     assert ("/guard" in changed, "/scene" in changed) == (True, False)
-    assert {"/guard", "/scene"} <= set(topics(views, sent(REPEAT_NS, GuardState.TRACK)))
+    assert {"/guard", "/scene"} <= set(topics(views, told(REPEAT_NS, GuardState.TRACK)))
