@@ -88,14 +88,14 @@ class End:
 
     def link_text(self) -> str:
         """Return the content of /link.json: the verdict on the link, and a row per quantity."""
-        rows = [record._asdict() for record in self._checked]
-        for row in rows:  # fields that are equal in all rows
-            del row["stamp_ns"], row["uplink"]
-        known = [{key: value for key, value in row.items() if value == value} for row in rows]
+        _, _, *names = LinkChecked._fields  # the first two are equal in all rows
         document = {
             "direction": self._incoming,
             "verdict": verdict_of(self._checked),
-            "rows": known,
+            "rows": [
+                {key: value for key, value in zip(names, values, strict=True) if value == value}
+                for _, _, *values in self._checked
+            ],
         }
         return json.dumps(document, indent=2) + "\n"
 

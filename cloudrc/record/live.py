@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.messages import UPRIGHT, Quaternion, Vector
-from cloudrc.record.ros import STORE, header, pack, rotate
+from cloudrc.record.ros import STORE, header, pack, rotate, stamp_of, twist_of
 from cloudrc.records import Control
 
 WORLD, BASE = "world", "base_link"
@@ -137,17 +137,9 @@ def decode_stamped_twist(data: bytes) -> tuple[int, str, Vector, float]:
     Return stamp [ns], frame, linear velocity [m/s], and angular velocity about z [rad/s].
     """
     message: Any = STORE.deserialize_cdr(data, "geometry_msgs/msg/TwistStamped")
-    stamp, twist = message.header.stamp, message.twist
-    linear = (twist.linear.x, twist.linear.y, twist.linear.z)
-    return (
-        stamp.sec * 1_000_000_000 + stamp.nanosec,
-        message.header.frame_id,
-        linear,
-        twist.angular.z,
-    )
+    return stamp_of(message), message.header.frame_id, *twist_of(message.twist)
 
 
 def decode_twist(data: bytes) -> tuple[Vector, float]:
     """Decode a geometry_msgs/Twist: linear velocity [m/s], angular velocity about z [rad/s]."""
-    twist: Any = STORE.deserialize_cdr(data, "geometry_msgs/msg/Twist")
-    return (twist.linear.x, twist.linear.y, twist.linear.z), twist.angular.z
+    return twist_of(STORE.deserialize_cdr(data, "geometry_msgs/msg/Twist"))

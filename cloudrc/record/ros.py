@@ -136,8 +136,18 @@ def header(stamp_ns: int, frame: str = "world") -> Values:
 def decode(topic: Topic, data: bytes) -> Row:
     """Decode CDR bytes with encapsulation header to a row."""
     message: Any = STORE.deserialize_cdr(data, topic.ros_type)
+    return stamp_of(message), *_PARSE[topic.name](message)
+
+
+def stamp_of(message: Any) -> int:
+    """Return the stamp in the header of a message [ns]."""
     stamp = message.header.stamp
-    return stamp.sec * _SECOND_NS + stamp.nanosec, *_PARSE[topic.name](message)
+    return int(stamp.sec * _SECOND_NS + stamp.nanosec)
+
+
+def twist_of(twist: Any) -> tuple[Vector, float]:
+    """Return the linear velocity of a twist [m/s], and its angular velocity about z [rad/s]."""
+    return _xyz(twist.linear), twist.angular.z
 
 
 def shifted(data: bytes, offset_ns: int) -> bytes:
@@ -175,10 +185,7 @@ def _xyz(vector: Any) -> Vector:
 _Parse: TypeAlias = Callable[[Any], Values]
 _PARSERS: dict[str, _Parse] = {
     "nav_msgs/msg/Odometry": _parse_odometry,
-    "geometry_msgs/msg/TwistStamped": lambda message: (
-        _xyz(message.twist.linear),
-        message.twist.angular.z,
-    ),
+    "geometry_msgs/msg/TwistStamped": lambda message: twist_of(message.twist),
     "geometry_msgs/msg/PointStamped": lambda message: (_xyz(message.point),),
 }
 """Standard ROS type -> function to decode it; a topic may use only its first fields."""

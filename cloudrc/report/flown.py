@@ -18,8 +18,8 @@ def flight_of(recording: Recording, experiment: ResolvedExperiment) -> Flight:
     """Return a flight for metrics and figures; raise errors as `flown_world` does."""
     flown = flown_world(recording, experiment)
     rate_hz = experiment.cloud.command_rate_hz
-    known = flown.scene, flown.hull, rate_hz
-    return Flight(recording, experiment.criteria, experiment.mission, *known)
+    asked = experiment.criteria, experiment.mission
+    return Flight(recording, *asked, flown.scene, flown.hull, rate_hz)
 
 
 def flown_world(recording: Recording, experiment: ResolvedExperiment) -> FlownWorld:
