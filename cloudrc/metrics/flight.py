@@ -174,6 +174,14 @@ class Flight:
         """All bodies that the robot must not touch, and from which clearances are known."""
         return tuple(filter(has_surface, obstacles(self.scene, touch=self.mission.touched)))
 
+    @cached_property
+    def first_touch(self) -> Columns | None:
+        """First row of /contact in which the robot touches what it has to; None if it never did."""
+        contact = self.during("/contact")
+        of_probe = contact["by_probe"].astype(bool)
+        touches = np.flatnonzero((contact["body"] == self.mission.touched) & of_probe)
+        return select(contact, touches[0]) if len(touches) else None
+
     def count(self, number: float) -> float | None:
         """Return `number` [any unit] as the value of a metric; None if the robot never flew."""
         return None if self.start_ns is None else float(number)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from math import radians
 from typing import TYPE_CHECKING
@@ -14,7 +13,6 @@ from cloudrc.metrics.definitions import Holds
 from cloudrc.metrics.flight import (
     Array,
     Flight,
-    Measure,
     add_metrics,
     between,
     finite,
@@ -49,15 +47,6 @@ Source: docs/reference/control.md, "Steady state": the slowest variant that sett
 to stay within 1 cm."""
 FAILURES = ("estimator_failed", "predictor_failed", "controller_failed")
 """Counters of cloud that are included in the number of faults."""
-
-
-def first_touch(flight: Flight) -> dict[str, Array] | None:
-    """Return the first row of /contact in which the robot touches what it has to, or None."""
-    contact = flight.during("/contact")
-    touches = np.flatnonzero(
-        (contact["body"] == flight.mission.touched) & contact["by_probe"].astype(bool)
-    )
-    return select(contact, touches[0]) if len(touches) else None
 
 
 def holds(flight: Flight) -> list[tuple[int, int]]:
@@ -197,48 +186,33 @@ def unconfirmed(flight: Flight) -> str:
     return ""
 
 
-def _of_touch(measure: Callable[[Flight, dict[str, Array]], float | None]) -> Measure:
-    """Make a metric that applies `measure` to the first touch of what the mission has to touch.
-
-    The metric is None if the robot never touches it.
-    """
-
-    def measured(flight: Flight) -> float | None:
-        touch = first_touch(flight)
-        return None if touch is None else measure(flight, touch)
-
-    return measured
-
-
-@_of_touch
-def _peak_force(flight: Flight, touch: dict[str, Array]) -> float | None:
+def _peak_force(flight: Flight) -> float | None:
     """Find the largest contact force [N]; it depends on the simulator's contact parameters."""
     force = flight.during("/contact_force")["force_peak"]
-    return float(force.max()) if len(force) else None
+    return float(force.max()) if flight.first_touch and len(force) else None
 
 
-@_of_touch
-def _impulse(flight: Flight, touch: dict[str, Array]) -> float | None:
+def _impulse(flight: Flight) -> float | None:
     """Integrate the force of the impact over time [N s].
 
     Unlike the peak force, the impulse does not depend on the simulator's contact parameters.
 
     Source: docs/reference/plant.md, "Contact".
     """
-    force = flight.during("/contact_force")
-    if not len(force["stamp_ns"]):
+    touch, force = flight.first_touch, flight.during("/contact_force")
+    if touch is None or not len(force["stamp_ns"]):
         return None
     since_ns = force["stamp_ns"] - touch["stamp_ns"]
     return float(force["impulse"][(since_ns >= 0) & (since_ns < IMPACT_NS)].sum())
 
 
-@_of_touch
-def _steady_force(flight: Flight, touch: dict[str, Array]) -> float | None:
+def _steady_force(flight: Flight) -> float | None:
     """Average the contact force in the last 2 s of a mission that succeeded [N].
 
     A steady force does not depend on the simulator's contact parameters.
     """
-    if flight.ending is None or flight.ending[1] != "done":
+    touch = flight.first_touch
+    if touch is None or flight.ending is None or flight.ending[1] != "done":
         return None
     begin_ns = flight.ending[0] - PRESSING_NS
     if touch["stamp_ns"] > begin_ns:
@@ -253,8 +227,8 @@ def _cross_track(flight: Flight) -> float | None:
     The first line begins where the flight does. Each position counts up to the first touch, with
     its distance from the nearest line. None for a mission without waypoints.
     """
-    path, touch = flight.truth["position"], first_touch(flight)
-    if touch is not None:
+    path = flight.truth["position"]
+    if touch := flight.first_touch:
         path = path[flight.truth["stamp_ns"] <= touch["stamp_ns"]]
     if not len(path) or not flight.mission.waypoints:
         return None
@@ -340,9 +314,11 @@ add_metrics(
      "floor and the body that the mission has to touch.",
      lambda flight: flight.count(len(obstacle_contacts(flight)["body"]))),
     ("contact_time", "s", "Time from the start of the mission to the first touch of what it has "
-     "to touch.", _of_touch(lambda flight, touch: float(flight.seconds(touch["stamp_ns"])))),
+     "to touch.", lambda flight: flight.first_touch and float(
+         flight.seconds(flight.first_touch["stamp_ns"]))),
     ("touch_speed", "m/s", "Speed of the probe (without one: of the base) just before this touch.",
-     _of_touch(lambda flight, touch: float(np.linalg.norm(touch["touch_velocity"])))),
+     lambda flight: flight.first_touch and float(
+         np.linalg.norm(flight.first_touch["touch_velocity"]))),
     ("peak_contact_force", "N", "Largest force on the probe in any physics step.", _peak_force),
     ("contact_impulse", "N s", "Force on the probe times time, over the first 0.1 s of the "
      "first touch.", _impulse),

@@ -32,7 +32,6 @@ from cloudrc.metrics.definitions import real_time_factor
 from cloudrc.metrics.flight import Flight, between, rows_of
 from cloudrc.metrics.measure import Number
 from cloudrc.metrics.mission import (
-    first_touch,
     missed_end,
     obstacle_contacts,
     reported,
@@ -219,7 +218,7 @@ def flight_evidence(
     """
     recording, end_ns = flight.recording, flight.end_ns
     reached, touch = numbers.get("waypoints_reached"), None
-    if row := first_touch(flight):
+    if row := flight.first_touch:
         speed = float(np.linalg.norm(row["touch_velocity"]))
         touch = speed, _moment(flight, int(row["stamp_ns"]))
     return Evidence(
@@ -389,7 +388,7 @@ def operator_verdict(
     """
     basis = flight.control["basis_stamp_ns"]
     seen_ns = int(basis[-1]) if len(basis) else 0
-    touch, factor = first_touch(flight), numbers.get("real_time_factor")
+    touch, factor = flight.first_touch, numbers.get("real_time_factor")
     seen = replace(
         evidence,
         reached=len(reported(flight)),
