@@ -114,7 +114,7 @@ def environment_document(
     unknown. `code` is a hash of the sources that have flown; None if this is unknown. `files` are
     the hashes of the user's files, by key.
     """
-    return {
+    document = {
         "schemaVersion": SCHEMA_VERSION,
         "python": platform.python_version(),
         "packages": versions(PACKAGES),
@@ -122,10 +122,11 @@ def environment_document(
         "architecture": platform.machine(),
         "processor": _processor(),
         "cores": os.cpu_count(),
-        **({"code": code} if code else {}),
-        **({"physics_steps": physics_steps} if physics_steps else {}),
-        **({FILES: dict(files)} if files else {}),
+        "code": code,
+        "physics_steps": physics_steps or None,
+        FILES: files or None,
     }
+    return _known(document)
 
 
 def versions(names: Iterable[str]) -> dict[str, str]:
