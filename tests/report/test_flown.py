@@ -50,7 +50,6 @@ def test_a_report_is_that_of_the_flight_without_the_users_files(run, call, monke
     away = files.rename(files.with_name("away"))
     try:
         call("report", folder)
-        call("replay --no-open", folder)
     finally:
         away.rename(files)
     assert measured(folder) == before

@@ -91,7 +91,6 @@ def test_a_torn_recording_has_a_report_that_says_so(run):
     assert found["notes"][0].startswith("The recording is incomplete: cut short")
     assert 0 < found["numbers"]["duration"]["value"] < 10
     assert "records_sha256" not in found
-    assert write_report(run, *read_run(run), page=False) == found
     assert summarize(found).startswith("INVALID (recording incomplete): ")
 
 
