@@ -193,11 +193,10 @@ def test_the_loss_of_a_flight_is_equal_live_and_in_the_report():
 def test_the_error_of_an_estimate_is_equal_live_and_in_the_report():
     """For the report, what cloud measured stands for the truth."""
     flight, _, cloud = of(*LOSSY)
-    periods = [r for r in cloud if isinstance(r, Control)]
-    periods = [r for r in periods if flight.start_ns <= r.stamp_ns <= flight.end_ns]
-    log = Log(cloud=[*periods, MissionEvent(flight.end_ns, "done", 0, "")])
-    live = LiveMetrics("cloud")
-    log.world.append(GuardChange(flight.start_ns, GuardState.TRACK, ""))
+    first, last = flight.span_ns
+    periods = [r for r in cloud if isinstance(r, Control) and first <= r.stamp_ns <= last]
+    log, live = Log(cloud=[*periods, MissionEvent(last, "done", 0, "")]), LiveMetrics("cloud")
+    log.world.append(GuardChange(first, GuardState.TRACK, ""))
     for each in {r.basis_stamp_ns: r for r in periods}.values():
         known = Odometry(each.basis_stamp_ns, each.measured, UPRIGHT, ZERO, ZERO)
         log.world.append(GroundTruth(known.stamp_ns, known, ZERO))
@@ -244,17 +243,13 @@ def test_the_holds_of_a_flight_are_equal_live_and_in_the_report(first):
 
 def test_delay_errors_of_a_flight_match_its_ground_truth():
     _, world, cloud = of("hover", "link.profile=paper-p2", "cloud.clock_offset_s=5")
-    controls = {(c.epoch, c.counter): c for c in cloud if isinstance(c, Control)}
-    truth = set()
-    for applied in (r for r in world if isinstance(r, CommandApplied)):
-        passed_ns = applied.stamp_ns - applied.basis_stamp_ns
-        horizon = controls[applied.epoch, applied.counter].horizon
-        truth.add(round((horizon - passed_ns * 1e-9) * 1e6))
+    horizons = {r.counter: r.horizon for r in cloud if isinstance(r, Control)}
+    applied = [r for r in world if isinstance(r, CommandApplied)]
+    truth = {horizons[r.counter] - (r.stamp_ns - r.basis_stamp_ns) * 1e-9 for r in applied}
     live, seen = LiveMetrics("cloud"), set()
     for record in cloud:
         live.see([record])
         if isinstance(record, Control):
-            error = live.read().get("cloudrc_delay_estimate_error_seconds")
-            seen |= {round(error[()] * 1e6)} if error else set()
+            seen |= {*live.read().get("cloudrc_delay_estimate_error_seconds", {}).values()}
     assert len(seen) > 100
-    assert len(seen - truth) <= 0.01 * len(seen), "equal to 1 us, except for rounding"
+    assert seen <= truth
