@@ -14,7 +14,12 @@ STEP = 5
 RATE_INTERVAL = "20s"
 """Value of Grafana's variable `$__rate_interval`: four scrapes, as in Grafana."""
 UNITS = {
-    **{"s": "s", "lengthm": "m", "velocityms": "m/s", "forceN": "N", "bytes": "B", "cps": "/s"},
+    "s": "s",
+    "lengthm": "m",
+    "velocityms": "m/s",
+    "forceN": "N",
+    "bytes": "B",
+    "cps": "/s",
     "percentunit": "share",
 }
 """Name of a unit in Grafana -> its symbol."""

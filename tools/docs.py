@@ -90,12 +90,20 @@ OPEN = {
 GRAFANA = {symbol: name for name, symbol in UNITS.items()}
 """Symbol of a unit -> its name in Grafana."""
 TYPES = {
-    **{"number": "number", "integer": "whole number", "string": "text", "null": "null"},
-    **{"boolean": "true or false", "array": "list", "object": "mapping"},
+    "number": "number",
+    "integer": "whole number",
+    "string": "text",
+    "null": "null",
+    "boolean": "true or false",
+    "array": "list",
+    "object": "mapping",
 }
 """Type in a JSON schema -> the page's word."""
 LIMITS = {
-    **{"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"},
+    "minimum": ">=",
+    "exclusiveMinimum": ">",
+    "maximum": "<=",
+    "exclusiveMaximum": "<",
     "maxItems": "of at most",
 }
 """Limit in a JSON schema -> the page's sign."""

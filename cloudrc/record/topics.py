@@ -87,8 +87,14 @@ class Topic:
 
 
 _KINDS: dict[Any, Kind] = {
-    **{int: "int", GuardState: "int", Cause: "int", float: "float", bool: "bool", str: "string"},
-    **{Vector: "vector", Quaternion: "quaternion"},
+    int: "int",
+    GuardState: "int",
+    Cause: "int",
+    float: "float",
+    bool: "bool",
+    str: "string",
+    Vector: "vector",
+    Quaternion: "quaternion",
 }
 
 

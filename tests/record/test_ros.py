@@ -40,7 +40,11 @@ def test_rows_are_converted_to_the_conventions_of_ros():
 
 
 EXAMPLES = {
-    **{"int": -(2**40), "float": 0.1, "bool": True, "string": "é", "vector": (0.1, -2.0, 3.0)},
+    "int": -(2**40),
+    "float": 0.1,
+    "bool": True,
+    "string": "é",
+    "vector": (0.1, -2.0, 3.0),
     "quaternion": (1.0, 0.0, 0.0, 0.0),
 }
 

@@ -44,7 +44,8 @@ RC: dict[Any, Any] = {
     "lines.linewidth": 1.1,
     "legend.handlelength": 1.6,
     "legend.borderaxespad": 0.2,
-    **{"svg.fonttype": "none", "pdf.fonttype": 42},  # text stays text
+    "svg.fonttype": "none",  # text stays text
+    "pdf.fonttype": 42,
     "svg.hashsalt": "cloudrc",  # the same flight gives an identical file
     "savefig.dpi": 200,
 }
