@@ -16,10 +16,10 @@ NAMES = set(
 )
 
 
-def document(run=RUN, **criteria):
+def document(**criteria):
     experiment, recording = paper()
     changed = experiment.criteria.model_copy(update=criteria)
-    return assess(recording, experiment.model_copy(update={"criteria": changed}), run).document
+    return assess(recording, experiment.model_copy(update={"criteria": changed}), RUN).document
 
 
 def test_names_and_values():

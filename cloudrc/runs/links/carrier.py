@@ -99,8 +99,8 @@ class LiveLink:
         self.engine: Engine | None = None
         self.export: Callable[[LinkState], None] = lambda state: None
         self._followers: Mapping[str, LinkWay | Medium] = {}
-        self._servers: list[ControlServer] = []
-        stack.callback(self.close)
+        self._stack = stack
+        stack.callback(shutil.rmtree, self.folder, ignore_errors=True)
 
     def profile(self, way: str) -> DirectionProfile:
         """Return the present profile of a direction."""
@@ -129,14 +129,9 @@ class LiveLink:
         for way in DIRECTIONS:
             self._publish(way, time.monotonic_ns())
             take, state = partial(self._take, way), partial(self.states.get, way)
-            self._servers.append(ControlServer(link_socket(self.url, way), take, state))
-
-    def close(self) -> None:
-        """Take no more changes, and remove the states."""
-        for server in self._servers:
-            server.shutdown()
-            server.server_close()
-        shutil.rmtree(self.folder, ignore_errors=True)
+            server = ControlServer(link_socket(self.url, way), take, state)
+            self._stack.callback(server.server_close)
+            self._stack.callback(server.shutdown)
 
     def status_page(self) -> str:
         """Return the states of both directions as JSON. Any thread may call this method."""
