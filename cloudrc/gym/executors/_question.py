@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from cloudrc.gym.executors import Executor
+from cloudrc.gym.executors import Chunk, Executor
 from cloudrc.outside.values import Quantity
 
 PATIENCE = Quantity("s", gt=0.0, le=3600.0)
@@ -15,19 +15,25 @@ class OneQuestion(Executor):
     """Asks when `wants` says so, unless a question is open.
 
     The observation of tick 0 is the first question.
+
+    Args:
+        patience: Time without an answer after which the robot asks again [s].
     """
 
-    def __init__(self, patience: float) -> None:
-        """Wait for `patience` [s] before asking again."""
+    def __init__(self, patience: float = 1.0) -> None:
         self._patience = PATIENCE.of(patience, "patience")
 
     def begin(self, ticks_late: int, period_ns: int) -> None:
         """Forget the last episode."""
-        self._asked, self._waits = 0, self._patience * 1e9 / period_ns
+        super().begin(ticks_late, period_ns)
+        self._waits = self._patience * 1e9 / period_ns
+        # Ticks of the newest question, and of that to which the newest answer belongs.
+        self._asked, self._answered = 0, -1
 
-    def answered(self) -> int:
-        """Return the tick of the observation to which the newest answer belongs; -1 if none."""
-        raise NotImplementedError
+    def receive(self, chunk: Chunk, tick: int) -> None:
+        """Take an answer, and note its question."""
+        self._answered = max(self._answered, chunk.basis)
+        super().receive(chunk, tick)
 
     def wants(self, tick: int) -> bool:
         """Return whether the robot needs a new answer."""
@@ -35,7 +41,7 @@ class OneQuestion(Executor):
 
     def asks(self, tick: int, observation: Any) -> bool:
         """Return whether the robot sends the observation of this tick."""
-        is_open = self._asked > self.answered() and tick - self._asked < self._waits
+        is_open = self._asked > self._answered and tick - self._asked < self._waits
         if is_open or not self.wants(tick):
             return False
         self._asked = tick

@@ -24,10 +24,18 @@ SHARE = Quantity(ge=0.0, le=1.0)
 
 
 class Asynchronous(OneQuestion):
-    """Plays a queue of numbered actions."""
+    """Plays a queue of numbered actions.
 
-    def __init__(self, share: float, aggregate: str, patience: float) -> None:
-        """See `build`; `share` [1], `patience` [s]."""
+    Args:
+        share: The robot asks when at most this share of a chunk is left [1].
+        aggregate: Which action counts where two answers overlap: latest, or a mean with the weight
+            .7 (weighted), .5 (average) or .3 (conservative) of the newer one.
+        patience: Time without an answer after which the robot asks again [s].
+    """
+
+    def __init__(
+        self, share: float = 0.5, aggregate: str = "weighted", patience: float = 1.0
+    ) -> None:
         super().__init__(patience)
         check_names("aggregate", [aggregate], AGGREGATES)
         self._share: float = SHARE.of(share, "share")
@@ -39,11 +47,7 @@ class Asynchronous(OneQuestion):
         self._queue = dict[int, Any]()  # number -> action, all of the newest answer
         self._next = 0  # number of the next action
         self._numbers = {0: 0}  # tick of a question -> number of the first action of its answer
-        self._size, self._answered = 1, -1
-
-    def answered(self) -> int:
-        """Return the tick of the observation to which the newest answer belongs."""
-        return self._answered
+        self._size = 1  # of the newest answer
 
     def wants(self, tick: int) -> bool:
         """Return whether few actions are left."""
@@ -88,13 +92,4 @@ class Asynchronous(OneQuestion):
         return self._queue.pop(self._next - 1)
 
 
-def build(share: float = 0.5, aggregate: str = "weighted", patience: float = 1.0) -> Asynchronous:
-    """Make the executor.
-
-    Args:
-        share: The robot asks when at most this share of a chunk is left [1].
-        aggregate: Which action counts where two answers overlap: latest, or a mean with the weight
-            .7 (weighted), .5 (average) or .3 (conservative) of the newer one.
-        patience: Time without an answer after which the robot asks again [s].
-    """
-    return Asynchronous(share, aggregate, patience)
+build = Asynchronous

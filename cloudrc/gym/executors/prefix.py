@@ -24,6 +24,4 @@ class Prefix(TimeIndexed):
         return Committed(actions, len(actions))
 
 
-def build() -> Prefix:
-    """Make the executor."""
-    return Prefix()
+build = Prefix

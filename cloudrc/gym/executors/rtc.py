@@ -22,23 +22,23 @@ STEPS = Quantity(ge=1, le=10_000, whole=True)
 
 
 class RealTimeChunking(OneQuestion, TimeIndexed):
-    """Asks when `execute` actions of a chunk are executed."""
+    """Asks when `execute` actions of a chunk are executed.
 
-    def __init__(self, execute: int | None, memory: int, patience: float) -> None:
-        """See `build`; `patience` [s]."""
+    Args:
+        execute: How many actions of a chunk the robot executes before it asks; None: half of them.
+        memory: Number of last answers whose largest delay is expected of the next.
+        patience: Time without an answer after which the robot asks again [s].
+    """
+
+    def __init__(self, execute: int | None = None, memory: int = 10, patience: float = 1.0) -> None:
         super().__init__(patience)
         self._execute = None if execute is None else STEPS.of(execute, "execute")
         self._memory = STEPS.of(memory, "memory")
 
     def begin(self, ticks_late: int, period_ns: int) -> None:
         """Forget the last episode."""
-        OneQuestion.begin(self, ticks_late, period_ns)
-        TimeIndexed.begin(self, ticks_late, period_ns)
+        super().begin(ticks_late, period_ns)
         self._delays = deque([ticks_late], maxlen=self._memory)
-
-    def answered(self) -> int:
-        """Return the tick of the observation to which the chunk is the answer."""
-        return self._chunk.basis
 
     def wants(self, tick: int) -> bool:
         """Return whether enough of the chunk is executed."""
@@ -54,15 +54,7 @@ class RealTimeChunking(OneQuestion, TimeIndexed):
         """Take the answer, and note how long it took."""
         if chunk.basis:  # the first answer may be there from the start
             self._delays.append(tick - chunk.basis)
-        TimeIndexed.receive(self, chunk, tick)
+        super().receive(chunk, tick)
 
 
-def build(execute: int | None = None, memory: int = 10, patience: float = 1.0) -> RealTimeChunking:
-    """Make the executor.
-
-    Args:
-        execute: How many actions of a chunk the robot executes before it asks; None: half of them.
-        memory: Number of last answers whose largest delay is expected of the next.
-        patience: Time without an answer after which the robot asks again [s].
-    """
-    return RealTimeChunking(execute, memory, patience)
+build = RealTimeChunking

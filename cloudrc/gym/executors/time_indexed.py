@@ -16,6 +16,4 @@ class TimeIndexed(Newest):
         super().receive(chunk, chunk.basis)
 
 
-def build() -> TimeIndexed:
-    """Make the executor."""
-    return TimeIndexed()
+build = TimeIndexed
