@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,8 @@ import gymnasium
 
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.eval.setup import EvalSetup
+from cloudrc.gym.step import layers
+from cloudrc.gym.values import leaves
 from cloudrc.outside.code import OWN
 from cloudrc.plugins import is_path
 from cloudrc.runs.own_files import hashes
@@ -41,8 +42,9 @@ def environment_code(env: gymnasium.Env[Any, Any], setup: EvalSetup) -> str:
     found: dict[str, Any] = {
         name: code_of(name) for name in sorted(_modules(env, setup)) if _is_foreign(name)
     }
-    for path in _files_in(dict(setup.env_args)):
-        found[path] = hashes(path)
+    for value in leaves(dict(setup.env_args)):
+        if isinstance(value, str) and os.path.isfile(value):
+            found[value] = hashes(value)
     experiment = getattr(env.unwrapped, "experiment", None)
     if isinstance(experiment, ResolvedExperiment):
         found["experiment"] = experiment_facts(experiment)
@@ -62,21 +64,7 @@ def _modules(env: gymnasium.Env[Any, Any], setup: EvalSetup) -> set[str]:
     """
     entry: Any = getattr(env.spec, "entry_point", None)
     made = entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "")
-    names, layer = {find_module(setup).rpartition(":")[0], made}, env
-    while isinstance(layer, gymnasium.Wrapper):
-        names |= {each.__module__ for each in type(layer).__mro__}
-        layer = layer.env
-    names |= {each.__module__ for each in type(layer).__mro__}
+    names = {find_module(setup).rpartition(":")[0], made}
+    names |= {each.__module__ for layer in layers(env) for each in type(layer).__mro__}
     parts = [name.split(".") for name in names]
     return {".".join(each[:count]) for each in parts for count in range(1, len(each) + 1)}
-
-
-def _files_in(value: Any) -> Iterator[str]:
-    """Yield each text in the value of an argument that is the path of a file."""
-    if isinstance(value, str) and os.path.isfile(value):
-        yield value
-    elif isinstance(value, Mapping):
-        yield from _files_in([*value.values()])
-    elif isinstance(value, list):
-        for each in value:
-            yield from _files_in(each)

@@ -23,7 +23,7 @@ from cloudrc.eval.environment import environment_code, find_module
 from cloudrc.eval.setup import BARE, SEED, Episode, EvalSetup, link_at
 from cloudrc.gym import Networked
 from cloudrc.gym.step import find_step
-from cloudrc.gym.values import size_of
+from cloudrc.gym.values import leaves, size_of
 from cloudrc.outside.code import calling
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import RESULT, InvalidValueError, to_arrays, to_boolean
@@ -61,17 +61,12 @@ class _Witness(gymnasium.Wrapper[Any, Any, Any, Any]):
             to_boolean(_one(each), name)
             for each, name in ((terminated, "terminated"), (truncated, "truncated"))
         ]
-        self._note(action, observation, reward)
+        self._note([action, observation, reward])
         return observation, reward, *ends, dict(info)
 
-    def _note(self, *values: Any) -> None:
-        for value in values:
-            if isinstance(value, Mapping):
-                self._note(*value.values())
-            elif isinstance(value, tuple | list):
-                self._note(*value)
-            else:
-                self.digest.update(np.asarray(to_arrays(value)).tobytes())
+    def _note(self, values: Any) -> None:
+        for value in leaves(values):
+            self.digest.update(np.asarray(to_arrays(value)).tobytes())
 
 
 def _reward_of(given: Any) -> float:

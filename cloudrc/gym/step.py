@@ -42,7 +42,7 @@ def find_step(env: Any, given: float | None) -> StepTime:
         if isnan(time := _seconds("dt", given)):
             raise InvalidValueError(f"the environment has the time step {given!r}; {WAY}")
         return StepTime(time, "given")
-    *wrappers, bare = _layers(env)
+    *wrappers, bare = layers(env)
     if isinstance(bare, AsyncVectorEnv):
         raise InvalidValueError(
             f"environments in other processes do not tell their time step; {WAY}"
@@ -63,13 +63,13 @@ def find_step(env: Any, given: float | None) -> StepTime:
     return StepTime(time, f"{name} of {who}" + ", a film's rate" * (name == "render_fps"))
 
 
-def _layers(env: Any) -> Iterator[Any]:
+def layers(env: Any) -> Iterator[Any]:
     """Yield the wrappers of an environment, of a vector also those of its first one, and itself."""
     if isinstance(env, gymnasium.Wrapper | VectorWrapper):
         yield env
-        yield from _layers(env.env)
+        yield from layers(env.env)
     elif getattr(env, "envs", None):
-        yield from _layers(env.envs[0])
+        yield from layers(env.envs[0])
     else:
         yield env
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
 from functools import partial
 from typing import Any
@@ -25,15 +25,23 @@ def copied(value: Any) -> Any:
     return deepcopy(value)
 
 
+def leaves(value: Any) -> Iterator[Any]:
+    """Yield what nested mappings, tuples and lists contain, in their order."""
+    if isinstance(value, Mapping):
+        value = [*value.values()]
+    if not isinstance(value, tuple | list):
+        yield value
+        return
+    for each in value:
+        yield from leaves(each)
+
+
 def size_of(value: Any) -> int:
     """Return the size of a value on the wire [bytes], without any framing."""
-    if isinstance(value, Mapping):
-        return sum(size_of(each) for each in value.values())
-    if isinstance(value, tuple | list):
-        return sum(size_of(each) for each in value)
-    if isinstance(value, str):
-        return len(value.encode())
-    return int(np.asarray(to_arrays(value)).nbytes)
+    return sum(
+        len(each.encode()) if isinstance(each, str) else np.asarray(to_arrays(each)).nbytes
+        for each in leaves(value)
+    )
 
 
 def neutral(space: spaces.Space[Any]) -> Any:
