@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from cloudrc.errors import CloudrcError
 from cloudrc.files import write_atomically
@@ -34,16 +34,6 @@ Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
 """Function that makes a shaper from a profile and the monotonic start of its time line [ns]."""
 
 
-class Machine(NamedTuple):
-    """Functions that a sidecar calls on its machine: shapers, clock, sleep and log."""
-
-    relay: Make  # makes a `Relay`
-    netem: Make  # makes a `Netem`, without changing the network yet
-    clock: Callable[[], int]  # returns the time on the monotonic clock [ns]
-    wait: Callable[[float], None]  # sleeps for a time [s]
-    log: Callable[[str], None]  # writes one line to the log
-
-
 @dataclass(eq=False, kw_only=True)
 class Sidecar:
     """Shapes the datagrams that the own end of the tunnel sends.
@@ -52,7 +42,11 @@ class Sidecar:
     forwards must not wait for a disk.
     """
 
-    machine: Machine
+    relay: Make  # makes a `Relay`
+    netem: Make  # makes a `Netem`, without changing the network yet
+    clock: Callable[[], int]  # returns the time on the monotonic clock [ns]
+    wait: Callable[[float], None]  # sleeps for a time [s]
+    log: Callable[[str], None]  # writes one line to the log
     profile: Loaded  # requested profile
     mode: Mode
     direction: str  # "uplink" or "downlink"
@@ -80,8 +74,8 @@ class Sidecar:
         while self.peer is None:
             if stop():
                 return
-            self.machine.wait(STEP)
-        self.origin_ns = self.origin_ns or self.machine.clock()
+            self.wait(STEP)
+        self.origin_ns = self.origin_ns or self.clock()
         try:
             while not stop():
                 self._shape(self.peer, stop)
@@ -97,17 +91,17 @@ class Sidecar:
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
         """Run netem or the relay until `stop()` is true, or until a profile needs the other."""
-        profile, machine = self.profile, self.machine
+        profile = self.profile
         if self.state and profile.change.restart:
-            self.origin_ns = machine.clock()
+            self.origin_ns = self.clock()
         shaper, route = self._choose(profile, peer)
         self._shaper = shaper
         try:
-            machine.log(f"{shaper.name} shapes the {self.direction} ({self._reason})")
+            self.log(f"{shaper.name} shapes the {self.direction} ({self._reason})")
             state = self._publish(shaper, profile)
             self._publish_route(route)  # others read the state once the route is there
             self.tell(state)
-            count_ns = machine.clock()
+            count_ns = self.clock()
             while not stop():
                 if self.peer is not None and self.peer != peer:
                     peer = self.peer
@@ -117,7 +111,7 @@ class Sidecar:
                     if not self._replace(shaper, profile):
                         return
                 shaper.step(STEP)
-                if (now_ns := machine.clock()) >= count_ns:
+                if (now_ns := self.clock()) >= count_ns:
                     count_ns = now_ns + COUNT_PERIOD_NS
                     self.count(shaper.counts())
         finally:
@@ -126,17 +120,16 @@ class Sidecar:
 
     def _choose(self, profile: Loaded, peer: Address) -> tuple[Shaper, Address]:
         """Choose netem or the relay, and store the reason; "auto" uses netem if it works."""
-        machine, mode = self.machine, self.mode
-        self._reason = f"link.mode={mode}"
-        if mode != "relay":
-            netem = machine.netem(profile.direction, self.origin_ns)
+        self._reason = f"link.mode={self.mode}"
+        if self.mode != "relay":
+            netem = self.netem(profile.direction, self.origin_ns)
             try:
                 return netem, netem.follow_peer(peer)
             except CloudrcError as error:
-                if mode == "netem":
+                if self.mode == "netem":
                     raise
                 self._reason = f"netem does not work here: {_cause(error)}"
-        relay = machine.relay(profile.direction, self.origin_ns)
+        relay = self.relay(profile.direction, self.origin_ns)
         return relay, relay.follow_peer(peer)
 
     def _replace(self, shaper: Shaper, profile: Loaded) -> bool:
@@ -146,17 +139,17 @@ class Sidecar:
             shaper.follow_profile(profile.direction, restart=restart)
         except CloudrcError as error:
             if self.mode == "auto":
-                self.machine.log(f"the shaper changes to the relay: {_cause(error)}")
+                self.log(f"the shaper changes to the relay: {_cause(error)}")
                 return False
-            self.machine.log(f"the new profile is refused, the old one stays: {error}")
+            self.log(f"the new profile is refused, the old one stays: {error}")
             if self.state:
                 number = profile.change.number
                 self.state = replace(self.state, refused=number, refusal=str(error))
                 publish(to_text(self.state), self._state_file)
             return True
         if restart:
-            self.origin_ns = self.machine.clock()
-        self.machine.log(f"the new profile is in force ({profile.change.cause})")
+            self.origin_ns = self.clock()
+        self.log(f"the new profile is in force ({profile.change.cause})")
         self.tell(self._publish(shaper, profile))
         return True
 
@@ -166,7 +159,7 @@ class Sidecar:
             self._state_file,
             self.state,
             profile,
-            self.machine.clock(),
+            self.clock(),
             shaper=shaper.name,
             reason=self._reason,
             mode=self.mode,

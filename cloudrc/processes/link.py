@@ -37,7 +37,7 @@ from cloudrc.link.follow import (
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.netem import Netem, find_netems
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.sidecar import Machine, Sidecar
+from cloudrc.link.sidecar import Make, Sidecar
 from cloudrc.link.traces import link_profile
 from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, warn
 from cloudrc.tunnel.codec import peek
@@ -75,9 +75,14 @@ def run_link(settings: LinkSettings, stop: StopSignal) -> None:
     profiles = Profiles(settings.profile, load, log)
     profile, peer = profiles.first(), PeerName(settings.peer, ipv4_addresses, log)
     with TemporaryDirectory(prefix="tc-", dir=settings.route.parent) as tables:
-        programs = Programs(tables)
+        programs, clock, wait = Programs(tables), time.monotonic_ns, time.sleep
+        netem = partial(Netem, programs, clock=clock, wait=wait, tables=Path(tables), log=log)
         sidecar = Sidecar(
-            machine=_machine(settings, experiment, programs, Path(tables)),
+            relay=_relay_maker(settings, experiment),
+            netem=netem,
+            clock=clock,
+            wait=wait,
+            log=log,
             profile=profile,
             mode=settings.mode,
             direction=settings.direction,
@@ -128,12 +133,8 @@ def make_profile_loader(direction: str, experiment: Path) -> Load:
     return load
 
 
-def _machine(
-    settings: LinkSettings, experiment: ResolvedExperiment, programs: Programs, tables: Path
-) -> Machine:
+def _relay_maker(settings: LinkSettings, experiment: ResolvedExperiment) -> Make:
     seed, stream, is_up = experiment.seed, experiment.stream, settings.direction == "uplink"
-    clock, wait = time.monotonic_ns, time.sleep
-    netem = partial(Netem, programs, clock=clock, wait=wait, tables=tables, log=log)
 
     def relay(profile: DirectionProfile, origin_ns: int) -> Relay:
         settle()
@@ -143,9 +144,7 @@ def _machine(
         with listening("--listen", settings.listen):
             return Relay(settings.listen, direction, peek, settings.end)
 
-    return Machine(
-        relay, lambda profile, origin_ns: netem(profile, origin_ns=origin_ns), clock, wait, log
-    )
+    return relay
 
 
 def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
-from cloudrc.link.sidecar import Machine, Sidecar
+from cloudrc.link.sidecar import Sidecar
 from cloudrc.link.state import ChangeFacts
 from tests.link.profiles import profile_of
 
@@ -65,7 +65,11 @@ class Bench:
             return Shaper(self, "netem", REFUSED if asked.delay_ms == 9e3 else refuses)
 
         self.sidecar = Sidecar(
-            machine=Machine(relay, netem, lambda: self.now_ns, self.wait, self.log.append),
+            relay=relay,
+            netem=netem,
+            clock=lambda: self.now_ns,
+            wait=self.wait,
+            log=self.log.append,
             profile=Loaded(profile_of(), {"description": "nothing"}),
             mode=mode,
             direction="uplink",
