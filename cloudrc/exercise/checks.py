@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -80,39 +80,34 @@ def _command(
     return both if sign else np.abs(both)
 
 
-class Formula(NamedTuple):
-    """A test that compares the results of the student's plug-in with those of a correct plug-in."""
-
-    measure: Callable[[Callable[..., Any]], Any]
-
-    def score(self, part: str, file: Path) -> tuple[float, str]:
-        """Return 1.0 and "right" if the student's results agree with those of the reference.
-
-        Otherwise raise an InvalidValueError. `file` is that of the `part`.
-        """
-        names = str(file), REFERENCES[part]
-        builds = [partial(plugins.load, f"{part}s", name) for name in names]
-        seen, wanted = (np.asarray(self.measure(build), dtype=float) for build in builds)
-        if seen.shape == wanted.shape:
-            wrong = ~np.isclose(seen, wanted, rtol=0.0, atol=TOLERANCE)
-            if not wrong.any():
-                return 1.0, "right"
-            first = int(np.argwhere(wrong)[0, 0]) if wrong.ndim > 1 else slice(None)
-            seen, wanted = seen[first], wanted[first]
-        raise InvalidValueError(f"gives {seen.round(3).tolist()}, not {wanted.round(3).tolist()}")
-
-
-FORMULAS: dict[FormulaName, Formula] = {
-    "mean": Formula(lambda build: _horizons(build, 0.08, 0.14, 0.05, 0.11, 0.2)),
-    "hold time": Formula(lambda build: _horizons(build, 0.1, hold=0.04)),
-    "position": Formula(partial(_predict, select=lambda o: o.position)),
-    "orientation": Formula(partial(_predict, select=lambda o: o.orientation_wxyz)),
-    "velocity, stamp": Formula(partial(_predict, select=_velocity_and_stamp)),
-    "P": Formula(partial(_command, sign=True, gain_p=(0.5, 1.0, 2.0))),
-    "I": Formula(partial(_command, n=1000, gain_i=(0.25, 0.25, 0.25))),
-    "D": Formula(partial(_command, n=9, speed=0.5, gain_d=(0.4, 0.4, 0.4))),
-    "limit": Formula(partial(_command, velocity_max=(0.3, 0.4, 0.5))),
+FORMULAS: dict[FormulaName, Callable[[Callable[..., Any]], Any]] = {
+    "mean": lambda build: _horizons(build, 0.08, 0.14, 0.05, 0.11, 0.2),
+    "hold time": lambda build: _horizons(build, 0.1, hold=0.04),
+    "position": partial(_predict, select=lambda o: o.position),
+    "orientation": partial(_predict, select=lambda o: o.orientation_wxyz),
+    "velocity, stamp": partial(_predict, select=_velocity_and_stamp),
+    "P": partial(_command, sign=True, gain_p=(0.5, 1.0, 2.0)),
+    "I": partial(_command, n=1000, gain_i=(0.25, 0.25, 0.25)),
+    "D": partial(_command, n=9, speed=0.5, gain_d=(0.4, 0.4, 0.4)),
+    "limit": partial(_command, velocity_max=(0.3, 0.4, 0.5)),
 }
+"""Name of a test -> function that returns the results of the plug-in that is built."""
+
+
+def compare(formula: FormulaName, part: str, file: Path) -> tuple[float, str]:
+    """Return 1.0 and "right" if the student's results agree with those of a correct plug-in.
+
+    Otherwise raise an InvalidValueError. `file` is that of the `part`.
+    """
+    builds = [partial(plugins.load, f"{part}s", name) for name in (str(file), REFERENCES[part])]
+    seen, wanted = (np.asarray(FORMULAS[formula](build), dtype=float) for build in builds)
+    if seen.shape == wanted.shape:
+        wrong = ~np.isclose(seen, wanted, rtol=0.0, atol=TOLERANCE)
+        if not wrong.any():
+            return 1.0, "right"
+        first = int(np.argwhere(wrong)[0, 0]) if wrong.ndim > 1 else slice(None)
+        seen, wanted = seen[first], wanted[first]
+    raise InvalidValueError(f"gives {seen.round(3).tolist()}, not {wanted.round(3).tolist()}")
 
 
 def check_flights(task: Task, beside: Path) -> None:
@@ -162,7 +157,7 @@ def run(task: Task, part: str, folder: Path, beside: Path) -> Iterator[dict[str,
     for test in task.parts[part].tests.values():
         try:
             if test.formula:
-                share, seen = FORMULAS[test.formula].score(part, folder / files[part])
+                share, seen = compare(test.formula, part, folder / files[part])
             else:
                 share, seen = fly(test, own, beside)
         except code.FAILURES as error:

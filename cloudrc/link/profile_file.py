@@ -6,12 +6,12 @@ The classes in `link/profile.py` say which keys there are, and which values each
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from types import NoneType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import DIRECTIONS, DirectionKeys, DirectionProfile, ProfileKeys
@@ -97,7 +97,7 @@ def _section(kind: Any, values: Mapping[str, Any], path: KeyPath) -> Any:
 
 def _value(kind: Any, value: Any, path: KeyPath) -> Any:
     """Convert the value of a key that may be of `kind`."""
-    options = list(_options(kind))
+    options = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
     for option in options:
         if is_dataclass(option) and isinstance(value, dict):
             return _section(option, value, path)
@@ -111,15 +111,6 @@ def _value(kind: Any, value: Any, path: KeyPath) -> Any:
             return value
     shown = f"{value!r:.60}" if isinstance(value, str | int | float) else type(value).__name__
     raise _WrongValueError(path, f"{shown}: must be {' or '.join(map(_words, options))}")
-
-
-def _options(kind: Any) -> Iterator[Any]:
-    """Yield the types of a union, or the only type."""
-    if get_origin(kind) in (Literal, tuple) or hasattr(kind, "__metadata__") or not get_args(kind):
-        yield kind
-        return
-    for one in get_args(kind):
-        yield from _options(one)
 
 
 def _words(kind: Any) -> str:

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any, NoReturn
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
-from websockets.frames import CloseCode
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
@@ -139,7 +138,9 @@ class PolicyClient:
             raise self._silent(f"no {what}") from None
         except ConnectionClosed as error:
             self.close()
-            raise SilentServerError(f"{self.url}: {_explain_end(error, what)}") from None
+            why = to_one_line(str(error))
+            text = f"the server closed the connection before its {what} ({why})"
+            raise SilentServerError(f"{self.url}: {text}") from None
         if isinstance(frame, str):
             self._fail_with(frame)
         try:
@@ -161,13 +162,3 @@ def _explain_status(code: int) -> str:
     if code in (401, 403):
         return f"the server denies the API key ({code}); set {KEY_VARIABLE}"
     return f"the server answers with HTTP status {code}; is it a policy's server?"
-
-
-def _explain_end(error: ConnectionClosed, what: str) -> str:
-    if error.sent is not None and error.sent.code == CloseCode.MESSAGE_TOO_BIG:
-        return f"its {what} is larger than {MESSAGE_MAX >> 20} MiB"
-    if error.rcvd is None:
-        return f"the server ended before its {what}"
-    reason = to_one_line(error.rcvd.reason)
-    why = f"{error.rcvd.code} {reason}".strip()
-    return f"the server closed the connection before its {what} ({why})"

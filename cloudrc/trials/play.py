@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
+from operator import methodcaller
 from typing import Protocol
 
 from cloudrc import source
@@ -36,12 +37,7 @@ def run(
     ready. Return why the work ended early, or None.
     """
     missing = [each for each in trials if each.key not in rows.kept]
-    return keep(map_in_order(play, missing, jobs, in_order=in_order), rows, see)
-
-
-def play(trial: Trial) -> Row:
-    """Play a trial; a worker process imports this function."""
-    return trial.play()
+    return keep(map_in_order(methodcaller("play"), missing, jobs, in_order=in_order), rows, see)
 
 
 def keep(
