@@ -24,7 +24,7 @@ from cloudrc.outside.paths import LOCK, lock_folder
 from cloudrc.runs.fly import fly
 from cloudrc.runs.folder import new_folder
 from cloudrc.text import csv_table, table
-from cloudrc.trials.plan import PlannedFlight, SweepPlan, read_plan
+from cloudrc.trials.plan import COLUMNS, PlannedFlight, SweepPlan, read_plan
 from cloudrc.trials.rows import SIZE_MAX, Row, Rows, read_rows
 from cloudrc.trials.summary import count_verdicts, normalise
 from cloudrc.trials.workers import map_in_order, take_each
@@ -84,18 +84,11 @@ def _why_others(folder: Path, plan: SweepPlan, rows: Rows) -> str:
     """Say why a folder has rows that are not in a plan."""
     if other := {row.get("code") for row in rows.kept.values()} - {source.code_hash()}:
         return f"its flights are of code {other.pop()}, this is code {source.code_hash()}"
-    changed = describe_changes(folder, plan.files)
-    return changed or f"has another sweep, see {FILE}, or a package has changed since"
-
-
-def describe_changes(folder: Path, own_files: Mapping[str, str]) -> str:
-    """Say which of the user's files (path -> hash) have changed since they were flown; "" if none.
-
-    Without a summary, nothing is known.
-    """
     before = read_summary(folder)["files"] if (folder / SUMMARY).exists() else {}
-    changed = [path for path, each in own_files.items() if before.get(path, each) != each]
-    return f"changed since its flights: {', '.join(changed)}" if changed else ""
+    changed = [path for path, each in plan.files.items() if before.get(path, each) != each]
+    if changed:
+        return f"changed since its flights: {', '.join(changed)}"
+    return f"has another sweep, see {FILE}, or a package has changed since"
 
 
 def finish(folder: Path, plan: SweepPlan) -> dict[str, Row]:
@@ -150,21 +143,12 @@ def columns_of(kept: Mapping[str, Row], plan: SweepPlan) -> dict[str, list[Any]]
     known = normalise(kept, plan.baselines)
     rows = [known[key] for key in plan.flights if key in known]
 
-    def column(name: str) -> list[Any]:
-        return [row.get(name, "") for row in rows]
-
     axes = {axis: _axis_column([row["point"][axis] for row in rows]) for axis in plan.axes}
     names = sorted({name for row in rows for name in row["numbers"]})
-    return {
-        "key": column("key"),
-        **axes,
-        "seed": column("seed"),
-        "verdict": column("verdict"),
-        "failures": [" ".join(row["failures"]) for row in rows],
-        "code": column("code"),
-        "physics_steps": column("physics_steps"),
-        **{name: [row["numbers"].get(name) for row in rows] for name in names},
-    }
+    own = {name: [row.get(name, "") for row in rows] for name in COLUMNS}
+    own["failures"] = [" ".join(codes) for codes in own["failures"]]
+    numbers = {name: [row["numbers"].get(name) for row in rows] for name in names}
+    return {"key": own.pop("key"), **axes, **own, **numbers}
 
 
 def _axis_column(values: list[Any]) -> list[Any]:

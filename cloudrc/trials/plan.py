@@ -10,7 +10,7 @@ import gzip
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import chain, product
+from itertools import chain, groupby, product
 from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -319,18 +319,15 @@ def _entries(
 def pack(flights: Iterable[PlannedFlight]) -> bytes:
     """Pack flights into a file for pods, which have none of the user's files.
 
-    The file has each point once, and for each flight the index of the point and the seed. Equal
+    The file has each point once, with the seeds of its flights, which follow each other. Equal
     flights give equal bytes.
     """
-    places = dict[str, int]()
-    points, chosen = list[Any](), list[list[int]]()
-    for each in flights:
-        if each.fingerprint not in places:
-            places[each.fingerprint] = len(points)
-            points.append([each.fingerprint, each.point, each.resolved.model_dump(mode="json")])
-        chosen.append([places[each.fingerprint], each.seed])
-    text = json.dumps({"points": points, "flights": chosen})
-    return gzip.compress(text.encode(), mtime=0)
+    points = list[Any]()
+    for told, group in groupby(flights, key=lambda each: each.fingerprint):
+        first, *more = group
+        seeds = [first.seed, *(each.seed for each in more)]
+        points.append([told, first.point, first.resolved.model_dump(mode="json"), seeds])
+    return gzip.compress(json.dumps(points).encode(), mtime=0)
 
 
 def unpack(path: Path) -> list[PlannedFlight]:
@@ -338,21 +335,19 @@ def unpack(path: Path) -> list[PlannedFlight]:
 
     It is also unusable if other code or plug-ins have packed it: the rows would be others.
     """
-    text = "is not a file of flights of this version of cloudrc"
+    text, flights = "is not a file of flights of this version of cloudrc", list[PlannedFlight]()
     try:
-        content = json.loads(gzip.decompress(files.read(path)))
-        points = list[tuple[str, dict[str, Any], ResolvedExperiment]]()
+        points = json.loads(gzip.decompress(files.read(path)))
         with reuse_results():
-            for told, point, values in content["points"]:
+            for told, point, values, seeds in points:
                 resolved = ResolvedExperiment.model_validate_json(json.dumps(values))
-                points.append((told, point, resolved))
+                flights += [PlannedFlight(told, point, seed, resolved) for seed in seeds]
                 if told != fingerprint(experiment_facts(resolved)):
                     text = "the flights come from other code or plug-ins than those of this image"
                     raise ValueError(f"code {source.code_hash()}")
-        flights = [(*points[index], seed) for index, seed in content["flights"]]
     except (OSError, EOFError, ValueError, LookupError, TypeError) as error:
         raise BadInputError(
             f"{path}: {text} ({error}); build the image from the code that runs this command, and "
             "install the same packages in both"
         ) from error
-    return [PlannedFlight(told, point, seed, resolved) for told, point, resolved, seed in flights]
+    return flights
