@@ -34,6 +34,8 @@ from cloudrc.rounding import exceeds
 
 SUCCESS = ("success", "is_success")
 """Keys of an environment's info that tell whether the task is done; one true value is enough."""
+AGE_NUMBERS = {"": "_mean", "_p99": "_p99", "_of": "_of", "_max": "_max", "_peak": "_peak_mean"}
+"""End of a number of ages in a row -> in the summary of a loop."""
 Ask = Callable[[dict[str, Any]], Any]
 """Function that returns a policy's answer to its observation."""
 
@@ -110,13 +112,12 @@ def _numbers_of(loop: Mapping[str, Any]) -> dict[str, float]:
     """Return what a row tells about the loop: ages [s], delays [s] and losses."""
     found = {"loop_age": loop["loop_age"]}
     for name in ("observation_age", "action_age"):
-        parts = {name: "mean", f"{name}_p99": "p99", f"{name}_of": "of"}
-        parts |= {f"{name}_max": "max", f"{name}_peak": "peak_mean"}
-        found |= {key: loop[f"{name}_{part}"] for key, part in parts.items()}
+        found |= {name + end: loop[name + key] for end, key in AGE_NUMBERS.items()}
     found |= {name: loop[name] for name in ("late_share", "misses_in_10")}
     for way in ("uplink", "downlink"):
         found |= {f"{name}_{way}": loop[way][name] for name in ("delay_asked", "delay_measured")}
-    return {**found, **{f"loss_{w}": loop[w]["loss_measured"] for w in ("uplink", "downlink")}}
+        found[f"loss_{way}"] = loop[way]["loss_measured"]
+    return found
 
 
 @contextmanager
@@ -243,14 +244,14 @@ def _play(
     observation, info = world.reset(seed=episode.seed)
     if times := setup.times:
         world.compute = lambda tick: times[(episode.seed + tick) % len(times)]
+    if setup.is_measured:
+        world.compute = lambda tick: policy.duration
     total, steps, stale, ended = 0.0, 0, 0, "limit"
     jumps, before, basis, success = list[float](), None, -1.0, None
     while steps < setup.max_steps and ended == "limit":
         about = info["cloudrc"]
         if about["asked"] and steps:
             chunk = policy(observation, about.get("prefix", ()), about.get("delay", 0))
-        if setup.is_measured:
-            world.compute = policy.duration
         observation, reward, terminated, truncated, info = world.step(chunk)
         steps, total = steps + 1, total + reward
         about = info["cloudrc"]

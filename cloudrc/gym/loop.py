@@ -115,8 +115,9 @@ class RemoteLoop:
     Attributes:
         seen: The newest observation that the policy has taken, and the environment's info about it.
         is_asked: Whether this observation is new, so that the policy's next answer is sent.
-        compute: Time for the next answers [s], or a function that returns it for the tick of an
-            observation; None: that of the settings.
+        compute: Function that returns how long the policy computes the answer to the observation
+            of a tick [s]; at first, it is that of the settings.
+        start: What the robot executes without any answer.
     """
 
     def __init__(
@@ -132,13 +133,14 @@ class RemoteLoop:
         `judge` raises an exception for a value of the executor that is no action.
         """
         self._settings, self._executor, self._judge = settings, executor, judge
+        self.start = settings.start
         link, seed = settings.link, settings.seed
         self._tick = -1  # before the first episode
         self._up = Lane(OneWay(link.uplink, seed, True, stream=stream), settings.observation_bytes)
         self._down = Lane(OneWay(link.downlink, seed, False, stream=stream), settings.action_bytes)
         self._stream, self._episode = stream, -1
         self._within_ns = round(settings.answer_within * 1e9)
-        self.compute: float | Callable[[int], float] | None = None
+        self.compute: Callable[[int], float] = self._draw_time
         self.seen: list[Any] = [None, {}]
 
     def begin(self, seed: int | None, observation: Any, info: Mapping[str, Any]) -> None:
@@ -155,7 +157,7 @@ class RemoteLoop:
         self.is_asked = True
         self._begin_ns = self._free_ns = 0  # when the policy began its last answer, and has it
         self._held = 0
-        self._last, self._basis = self._settings.start, -1.0
+        self._last, self._basis = self.start, -1.0
         self._is_held = False
         self._observation_ages = list[int]()  # [ticks], as the others
         self._action_ages, self._loop_ages = list[float](), list[int]()
@@ -189,7 +191,7 @@ class RemoteLoop:
         else:
             self._held += 1
             if not self._settings.repeats:
-                self._last, self._basis = self._settings.start, -1.0
+                self._last, self._basis = self.start, -1.0
         if self._basis > 0:
             self._action_ages.append(tick - self._basis)
         if self._action_ages:
@@ -242,17 +244,17 @@ class RemoteLoop:
 
     def _time_to_compute(self) -> int:
         """Return how long the policy computes the answer to its newest observation [ns]."""
-        if self.compute is not None:
-            time = self.compute(self._seen_tick) if callable(self.compute) else self.compute
-            return round(time * 1e9)
+        return round(self.compute(self._seen_tick) * 1e9)
+
+    def _draw_time(self, tick: int) -> float:
         mean, deviation = self._settings.compute
         if not deviation:
-            return round(mean * 1e9)
+            return mean
         key = stream_key(self._settings.seed, False, self._episode, _COMPUTE, self._stream)
-        counter = [0, 0, 0, self._seen_tick]
+        counter = [0, 0, 0, tick]
         bits = np.random.Philox(key=np.array(key, dtype=np.uint64), counter=counter)
         shape = (mean / deviation) ** 2
-        return round(np.random.Generator(bits).gamma(shape, mean / shape) * 1e9)
+        return np.random.Generator(bits).gamma(shape, mean / shape)
 
     def told(self) -> dict[str, Any]:
         """Return what the policy may know about the loop, as `info["cloudrc"]`."""

@@ -14,25 +14,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
-from cloudrc.gym.options import ANSWER
-from cloudrc.gym.values import copied, neutral
 from cloudrc.outside.values import Quantity, to_boolean
 
 ACTIONS = Quantity(ge=0, le=1000, whole=True)
 """Number of actions."""
-
-
-def remember(
-    both: tuple[spaces.Space[Any], spaces.Space[Any]], age: bool, count: int, start: Any
-) -> Remembering | None:
-    """Make the memory of `count` actions, and of the age if asked; None if nothing is asked.
-
-    `both` are the spaces of observations and actions, `start` is the option of this name.
-    """
-    if not age and not count:
-        return None
-    is_given = start is not None and not (isinstance(start, str) and start == ANSWER)
-    return Remembering(*both, age, count, start if is_given else neutral(both[1]))
 
 
 class Remembering:
@@ -41,24 +26,29 @@ class Remembering:
     Attributes:
         space: That of an observation with memory: `observation`, that of the environment; `age`
             [s], shape (1,); `actions`, the last ones that the policy has sent, the oldest first.
+            Without memory, it is that of the environment.
     """
 
     def __init__(
         self,
-        observations: spaces.Space[Any],
-        actions: spaces.Space[Any],
+        both: tuple[spaces.Space[Any], spaces.Space[Any]],
         age: bool,
         count: int,
         idle: Any,
     ) -> None:
-        """Remember `count` actions and the age if asked; `idle` stands for those not sent yet."""
-        self._idle, self._count = copied(idle), ACTIONS.of(count, "observe_actions")
-        parts = {"observation": observations}
+        """Remember `count` actions and the age if asked; `idle` stands for those not sent yet.
+
+        `both` are the spaces of observations and actions.
+        """
+        self._idle, self._count = idle, ACTIONS.of(count, "observe_actions")
+        self.space, self._actions = both
+        self._parts = {"observation": self.space}
         if to_boolean(age, "observe_age"):
-            parts["age"] = spaces.Box(0.0, np.inf, (1,), np.float32)
+            self._parts["age"] = spaces.Box(0.0, np.inf, (1,), np.float32)
         if self._count:
-            parts["actions"] = batch_space(actions, self._count)
-        self.space, self._actions = spaces.Dict(parts), actions
+            self._parts["actions"] = batch_space(self._actions, self._count)
+        if len(self._parts) > 1:
+            self.space = spaces.Dict(self._parts)
         self.begin()
 
     def begin(self) -> None:
@@ -69,10 +59,12 @@ class Remembering:
         """Remember an action that the policy has sent."""
         self._sent.append(action)
 
-    def beside(self, observation: Any, age: float) -> dict[str, Any]:
+    def beside(self, observation: Any, age: float) -> Any:
         """Return an observation of this `age` [s] with the memory."""
+        if len(self._parts) == 1:
+            return observation
         found = {"observation": observation}
-        if "age" in self.space.spaces:
+        if "age" in self._parts:
             found["age"] = np.array([age], np.float32)
         if self._count:
             out: Any = create_empty_array(self._actions, self._count)

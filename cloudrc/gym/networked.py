@@ -8,7 +8,7 @@ from typing import Any, Unpack
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
-from cloudrc.gym.memory import remember
+from cloudrc.gym.memory import Remembering
 from cloudrc.gym.options import (
     MEMORY,
     Options,
@@ -101,20 +101,19 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         both, chunk = (self.env.observation_space, self.env.action_space), options["chunk"]
         self.action_space, self._split = answer_space(both[1], chunk)
         self._check = checker(self.action_space, describe_answer(chunk))
-        self._memory = remember(both, age, count, options["start"])
-        if self._memory:
-            self.observation_space = self._memory.space
+        self._memory = Remembering(both, age, count, self._loop.start)
+        self.observation_space = self._memory.space
 
     @property
-    def compute(self) -> float | Callable[[int], float] | None:
-        """Time for the next answers [s], for whoever measures it; None: as the argument says.
+    def compute(self) -> Callable[[int], float]:
+        """Function that returns the time for the answer to the observation of a tick [s].
 
-        It may be a function that returns the time for the observation of a tick.
+        Whoever measures this time sets another one; at first, it is as the argument says.
         """
         return self._loop.compute
 
     @compute.setter
-    def compute(self, time: float | Callable[[int], float] | None) -> None:
+    def compute(self, time: Callable[[int], float]) -> None:
         self._loop.compute = time
 
     def summary(self, deadline: float | None = None) -> dict[str, Any]:
@@ -131,8 +130,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Begin an episode; the policy has the first observation at once."""
         observation, self.world_info = self.env.reset(seed=seed, options=options)
         self._loop.begin(seed, observation, self.world_info)
-        if self._memory:
-            self._memory.begin()
+        self._memory.begin()
         return self._seen()
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -140,7 +138,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         action = to_arrays(action)
         self._check(action)
         loop, answer = self._loop, self._split(action)
-        if self._memory and loop.is_asked:
+        if loop.is_asked:
             self._memory.add(answer[0])
         executed = loop.act(answer)
         observation, reward, terminated, truncated, self.world_info = self.env.step(executed)
@@ -153,6 +151,5 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def _seen(self) -> tuple[Any, dict[str, Any]]:
         observation, info = self._loop.seen
         observation, told = copied(observation), self._loop.told()
-        if self._memory:
-            observation = self._memory.beside(observation, told["observation_age"])
-        return observation, {**info, "cloudrc": told}
+        seen = self._memory.beside(observation, told["observation_age"])
+        return seen, {**info, "cloudrc": told}
