@@ -86,7 +86,7 @@ class EmergencyStopRepeater:
 
     def __init__(self) -> None:
         self.sounds = self._stopped = False
-        self._number = self._acted_on = self._due_ns = 0
+        self.restart_numbers()
 
     def sound(self) -> None:
         """Begin to send the emergency stop repeatedly."""

@@ -118,9 +118,7 @@ class Profiles:
     load: Load
     log: Callable[[str], None]
     _known: dict[str, dict[str, Any]] = field(default_factory=dict)  # number -> values
-
-    def __post_init__(self) -> None:
-        self._seen = version(self.file)
+    _seen: object = None  # what `version` said about the file
 
     def first(self) -> Loaded:
         """Read the profile for the first time; raise a CloudrcError if it is invalid."""

@@ -63,9 +63,8 @@ def _row(name: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
 def lacking_text(entry: tuple[str, Mapping[str, int]]) -> str:
     """Say which flights lack a number: `entry` is its name and an entry of `lacking`."""
     name, counts = entry
-    who = " and ".join(side.upper() for side in "ab" if counts[side])
-    pairs = "1 pair" if counts["left_out"] == 1 else f"{counts['left_out']} pairs"
-    return f"{who} {'have' if 'and' in who else 'has'} no {name}: {pairs} left out"
+    lack = f"flights without it: A {counts['a']}, B {counts['b']}"
+    return f"{name}: {lack}; pairs left out: {counts['left_out']}"
 
 
 def _scaled(entry: Mapping[str, Any]) -> tuple[float, str]:

@@ -8,6 +8,7 @@ present value is bisected.
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import groupby
 from typing import NamedTuple, TypeAlias
 
 Works: TypeAlias = Callable[[int], bool]
@@ -29,15 +30,8 @@ class ValueRange(NamedTuple):
 
 def grid(present: int, bottom: int, top: int) -> list[int]:
     """Return numbers from `bottom` to `top`: the ends, `present`, and its doubles and halves."""
-    numbers, step = {bottom, present, top}, present
-    while step < top:
-        step *= 2
-        numbers.add(min(step, top))
-    step = present
-    while step > bottom:
-        step //= 2
-        numbers.add(max(step, bottom))
-    return sorted(numbers)
+    every = (int(present * 2.0**power) for power in range(-60, 61))
+    return sorted({min(max(number, bottom), top) for number in every})
 
 
 def search(works: Works, present: int, bottom: int, top: int) -> ValueRange:
@@ -64,13 +58,9 @@ def search(works: Works, present: int, bottom: int, top: int) -> ValueRange:
 
 def _runs(answers: list[bool]) -> list[tuple[int, int]]:
     """Return the first and the last index of each group of neighbours that are true."""
-    runs = list[tuple[int, int]]()
-    for index, answer in enumerate(answers):
-        if answer and index and answers[index - 1]:
-            runs[-1] = runs[-1][0], index
-        elif answer:
-            runs.append((index, index))
-    return runs
+    every = groupby(range(len(answers)), answers.__getitem__)
+    runs = [[*indices] for answer, indices in every if answer]
+    return [(run[0], run[-1]) for run in runs]
 
 
 def bisect(works: Works, yes: int, no: int) -> tuple[int, int]:
