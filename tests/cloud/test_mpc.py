@@ -20,11 +20,9 @@ RESPONSE = Response(time_constant=(0.2,) * 3, dead_time=(0.1,) * 3, gain=(1.0,) 
 ROBOT = RobotFacts("mine", RESPONSE, None, ACCELERATION, SPEED)
 
 
-def body(robot=ROBOT):
-    """Return a model that is what the controller expects of `robot`, at rest at the origin."""
-    response = robot.response
-    axes = tuple(zip(response.time_constant, response.dead_time, response.gain, strict=True))
-    model = FirstOrder(axes, robot.acceleration_max)
+def body():
+    """Return a model that is what the controller expects of the robot, at rest at the origin."""
+    model = FirstOrder(((0.2, 0.1, 1.0),) * 3, ACCELERATION)
     model.basis, model.horizon = Odometry(0, ZERO, UPRIGHT, ZERO, ZERO), 0.0
     return model
 

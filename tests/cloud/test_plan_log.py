@@ -20,9 +20,9 @@ def log():
     return log
 
 
-def told(at_ms, echo_ms, guard=GuardState.TRACK):
+def told(at_ms, echo_ms):
     odometry = Odometry(round(at_ms * MS), ZERO, UPRIGHT, ZERO, ZERO)
-    return Telemetry(odometry.stamp_ns, odometry, (), echo_ms * MS, 0, 0, 1, guard)
+    return Telemetry(odometry.stamp_ns, odometry, (), echo_ms * MS, 0, 0, 1, GuardState.TRACK)
 
 
 @pytest.mark.parametrize(

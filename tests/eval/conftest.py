@@ -23,3 +23,10 @@ def law(tmp_path):
         return str(path)
 
     return write
+
+
+@pytest.fixture(autouse=True)
+def no_figures(monkeypatch):
+    """Draw no figures, which takes seconds; a test of them begins with `monkeypatch.undo()`."""
+    for name in ("draw_outcomes", "draw_ages"):
+        monkeypatch.setattr(f"cloudrc.eval.page.{name}", lambda *_: {"svg": b"<svg/>"})

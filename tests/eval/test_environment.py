@@ -72,16 +72,12 @@ def folder(tmp_path, monkeypatch):
     gymnasium.registry.pop("Arm-v0", None)
 
 
-def key_of(setup, executor="newest"):
-    with make_env(setup, 1) as env:
-        told = {**setup.identity(), "env_code": environment_code(env, setup)}
-    return Episode(None, executor, 1).key(told)
-
-
 def key_of_all():
     files = (("files", ["scene.txt", {"more": "other.txt"}]),)
     setup = EvalSetup(ENV, "./law.py", files, "./link.yaml", *read_compute("times.csv"))
-    return key_of(setup, "./hold.py")
+    with make_env(setup, 1) as env:
+        told = {**setup.identity(), "env_code": environment_code(env, setup)}
+    return Episode(None, "./hold.py", 1).key(told)
 
 
 def test_an_episode_of_a_changed_file_is_another(folder):

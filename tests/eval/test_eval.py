@@ -24,6 +24,7 @@ from cloudrc.policy.actions import PolicyAnswerError
 from cloudrc.policy.observation import Mapped, observe
 from tests.eval.conftest import LAW
 from tests.policy.conftest import serving, stock_like
+from tests.support.pages import blocks
 
 SHAKY = """
 import numpy as np
@@ -274,8 +275,7 @@ def test_a_server_that_fails_keeps_the_rows_and_is_one_line(tmp_path, capsys, la
 
 
 def test_the_policy_of_the_documentation_stands_where_the_table_says(law, tmp_path):
-    text = (Path(__file__).parents[2] / "docs" / "eval.md").read_text()
-    path = law(text.partition("```python\n")[2].partition("```")[0])
+    path = law(blocks("eval", "python")[0])
     setup = EvalSetup("CartPole-v1", path, link="lte", success_at=500)
     names = ("newest", "time-indexed", "broker")
     verdicts = [play(Episode(100.0, name, 1), setup)["verdict"] for name in names]
@@ -284,12 +284,11 @@ def test_the_policy_of_the_documentation_stands_where_the_table_says(law, tmp_pa
 
 @pytest.mark.full
 def test_the_command_of_the_documentation_prints_its_table(law, tmp_path, capsys, monkeypatch):
-    text = (Path(__file__).parents[2] / "docs" / "eval.md").read_text()
-    law(text.partition("```python\n")[2].partition("```")[0])
+    law(blocks("eval", "python")[0])
     monkeypatch.chdir(tmp_path)
-    command = text.partition("```bash\ncloudrc eval")[2].partition("```")[0]
-    assert main(["eval", *shlex.split(command.replace("\\\n", " "))]) == 0
-    table = text.partition("```text\n")[2].partition("```")[0].strip().splitlines()
+    command = next(each for each in blocks("eval", "bash") if each.startswith("cloudrc eval"))
+    assert main(shlex.split(command.replace("\\\n", " "))[1:]) == 0
+    table = blocks("eval", "text")[0].strip().splitlines()
     said = capsys.readouterr()
     assert table.pop(0) in said.err.splitlines()  # about the work, before it
     printed = iter(said.out.splitlines())  # in this order; "..." stands for lines between them

@@ -28,8 +28,8 @@ def rows(executor, rtt_ms, outcomes, **numbers):
     ]
 
 
-def some(done, count=20):
-    return [n < done for n in range(count)]
+def some(done):
+    return [n < done for n in range(20)]
 
 
 def flight(*kept, baseline=20):

@@ -46,7 +46,8 @@ def test_two_policies_are_compared_in_pairs_and_other_conditions_are_refused(law
     assert not (tmp_path / "c").exists()
 
 
-def test_the_page_has_figure_tests_notes_and_how_it_was_made(law, tmp_path, capsys):
+def test_the_page_has_figure_tests_notes_and_how_it_was_made(law, tmp_path, monkeypatch):
+    monkeypatch.undo()
     out, words = (
         tmp_path / "e",
         ["--policy", law(), "--seeds", 2, "--rtt", "200,0", "--deadline", 0.1],

@@ -10,15 +10,15 @@ from cloudrc.gym import Networked
 from tests.gym.envs import Counter, both_ways
 
 
-def flown(executor, link, chunk=4, steps=12, **options):
+def flown(executor, link, steps=12, **options):
     """Return the actions that the robot executes, in thousands: the tick of the observation.
 
     Action i of the chunk to the observation of tick n is n + i / 1000.
     """
-    env = Networked(Counter(), link, chunk=chunk, executor=executor, **options)
+    env = Networked(Counter(), link, chunk=4, executor=executor, **options)
     observation, _ = env.reset()
     for _ in range(steps):
-        answer = (observation[0] + np.arange(chunk) / 1000)[:, None].astype(np.float32)
+        answer = (observation[0] + np.arange(4) / 1000)[:, None].astype(np.float32)
         observation, *_ = env.step(answer)
     return [round(float(each[0]), 3) for each in env.unwrapped.executed]
 

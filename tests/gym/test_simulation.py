@@ -6,7 +6,7 @@ packets from the link library, and has the executors as functions of all answers
 
 from functools import cache
 from itertools import count
-from math import ceil, cos, exp, inf, sin
+from math import ceil, exp, inf
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -15,10 +15,14 @@ import pytest
 
 from cloudrc.gym import Networked
 from cloudrc.link.library import OneWay, read_profile
+from tests.conftest import nightly
 from tests.gym.envs import Counter, both_ways
 
 SEED = 1
-DT = {"CartPole-v1": 0.02, "Pendulum-v1": 0.05}
+ENV, DT = "Pendulum-v1", 0.05
+"""The environment, and its time of a step [s]."""
+IDLE = np.zeros(1, np.float32)
+"""Action of a robot without answers."""
 BYTES = {"observation_bytes": 60, "action_bytes": 40}
 LINKS = {
     "constant": both_ways(30, 30),
@@ -37,15 +41,14 @@ class Answer(NamedTuple):
 
 
 class Setup(NamedTuple):
-    """Environment, executor and times of an episode [s]."""
+    """Link, executor and times of an episode [s]."""
 
-    name: str
     link: str
     executor: str
     chunk: int | None = None
     compute: float = 0.0
     wait: float | None = None  # None: 5 % of a step
-    start: Any = "answer"
+    start: Any = "answer"  # or an action
     uses_prefix: bool = False
     times: tuple[float, ...] = ()  # of computing, by the tick of the observation, in turn
 
@@ -53,12 +56,8 @@ class Setup(NamedTuple):
         return round((self.times[tick % len(self.times)] if self.times else self.compute) * 1e9)
 
     @property
-    def dt(self):
-        return DT[self.name]
-
-    @property
     def wait_ns(self):
-        return round((0.05 * self.dt if self.wait is None else self.wait) * 1e9)
+        return round((0.05 * DT if self.wait is None else self.wait) * 1e9)
 
 
 class Episode(NamedTuple):
@@ -111,20 +110,21 @@ def asks(setup, got, asked, tick):
     if setup.executor != "broker":
         return True
     basis, start, actions = max(got, default=Answer(-1, 0, []))
-    is_open = asked > basis and (tick - asked) * setup.dt < 1.0 - 1e-9
+    is_open = asked > basis and (tick - asked) * DT < 1.0 - 1e-9
     return tick >= start + len(actions) and not is_open
 
 
-def simulate(env, setup, seed, answer, neutral):
+def simulate(env, setup, seed, answer):
     """Play an episode by the rule."""
     ways = links(setup.link)
     up, down = (OneWay(way, SEED, is_up) for way, is_up in zip(ways, (True, False), strict=True))
     number, late = (seed + 1) * EPISODES, ticks_late(setup)
-    observations, executed = [env.reset(seed=seed)[0]], neutral
+    observations = [env.reset(seed=seed)[0]]
+    executed = setup.start if isinstance(setup.start, np.ndarray) else IDLE
     at_policy, taken, free = {0: 0}, -1, 0  # arrivals [ns] of observations not yet taken
     flying, got, told_with, asked, basis = [], [], {0: []}, 0, None
     rewards, is_over, rows, loop = 0.0, False, [], []
-    if setup.start == "answer":
+    if isinstance(setup.start, str):
         got, at_policy, taken = [Answer(0, 0, answer(observations[0], []))], {}, 0
 
     def receive(until_ns, tick):
@@ -134,7 +134,7 @@ def simulate(env, setup, seed, answer, neutral):
             loop.append((tick - packet[1], packet[1]))
 
     for tick in count():
-        now_ns = round(tick * setup.dt * 1e9)
+        now_ns = round(tick * DT * 1e9)
         receive(now_ns, tick)
         if tick and asks(setup, got, asked, tick):
             asked, told_with[tick] = tick, []
@@ -180,13 +180,13 @@ def told(setup, rewards, rows, loop):
     means = {"observation_age_of": len(ages), "action_age_of": len(acted)}
     for name, found in (("observation_age", ages), ("action_age", acted), ("loop_age", crossed)):
         key = name if name == "loop_age" else f"{name}_mean"
-        means[key] = setup.dt * float(np.mean(found)) if found else None
+        means[key] = DT * float(np.mean(found)) if found else None
     rounded = [ceil(age - 1e-9) for age in acted]
     means["age_counts"] = [rounded.count(age) for age in range(max(rounded, default=-1) + 1)]
     return Episode(
         rewards,
-        [setup.dt * age for age, _ in after],
-        [setup.dt * age for age in old[:-1]],
+        [DT * age for age, _ in after],
+        [DT * age for age in old[:-1]],
         list(held[:-1]),
         list(asked[1:]),
         means,
@@ -201,81 +201,44 @@ def links(name):
 
 
 @cache
-def mean_delay(link, dt):
+def mean_delay(link):
     """Return the delay of both ways that the profile asks for [s]."""
     both = zip(links(link), (True, False), BYTES.values(), strict=True)
-    return sum(OneWay(way, SEED, is_up).expected(dt, size).mean for way, is_up, size in both)
+    return sum(OneWay(way, SEED, is_up).expected(DT, size).mean for way, is_up, size in both)
 
 
 def ticks_late(setup):
     """Return how many actions the executor `prefix` sends with an observation."""
     if setup.executor != "prefix":
         return 0
-    late = mean_delay(setup.link, setup.dt) + setup.compute - setup.wait_ns * 1e-9
-    return max(0, ceil(late / setup.dt))
-
-
-# Policies ---------------------------------------------------------------------------------------
-
-
-def push(x, speed, angle, turn):
-    """Choose an action for CartPole: the law of docs/eval.md."""
-    return int(10.0 * angle + 2.0 * turn + 0.1 * x + 0.3 * speed > 0.0)
-
-
-def moved(x, speed, angle, turn, action):
-    """Simulate a step of CartPole."""
-    sine, cosine = sin(angle), cos(angle)
-    force = ((10.0 if action else -10.0) + 0.05 * turn * turn * sine) / 1.1
-    turning = (9.8 * sine - cosine * force) / (0.5 * (4.0 / 3.0 - 0.1 * cosine**2 / 1.1))
-    moving = force - 0.05 * turning * cosine / 1.1
-    return x + 0.02 * speed, speed + 0.02 * moving, angle + 0.02 * turn, turn + 0.02 * turning
-
-
-@cache
-def hold_pole(state, known, many):
-    """Return actions for CartPole, the first of which are known."""
-    actions = []
-    for place in range(many):
-        actions.append(known[place] if place < len(known) else push(*state))
-        state = moved(*state, actions[-1])
-    return actions
-
-
-def swing(state, known, many):
-    """Return torques for Pendulum, the first of which are known; the others fade."""
-    torque = -2.0 * state[1] - 0.5 * state[2]
-    torques = [np.array([torque * (1.0 - 0.04 * place)], np.float32) for place in range(many)]
-    return [*known, *torques[len(known) :]][:many]
+    late = mean_delay(setup.link) + setup.compute - setup.wait_ns * 1e-9
+    return max(0, ceil(late / DT))
 
 
 def policy(setup):
-    """Return the policy: from observation and prefix to a list of actions."""
-    law = {"CartPole-v1": hold_pole, "Pendulum-v1": swing}[setup.name]
-    if setup.name == "Pendulum-v1":
-        return lambda observation, known: law(
-            observation.tolist(), known if setup.uses_prefix else [], setup.chunk or 1
-        )
-    return lambda observation, known: law(
-        tuple(observation.tolist()),
-        tuple(map(int, known)) if setup.uses_prefix else (),
-        setup.chunk or 1,
-    )
+    """Return the policy: from observation and prefix to a list of torques, which fade."""
+
+    def swing(observation, prefix):
+        torque, known = -2.0 * observation[1] - 0.5 * observation[2], prefix * setup.uses_prefix
+        fading = 1.0 - 0.04 * np.arange(setup.chunk or 1)
+        torques = [np.array([torque * share], np.float32) for share in fading]
+        return [*known, *torques[len(known) :]][: len(torques)]
+
+    return swing
 
 
 # Measured ---------------------------------------------------------------------------------------
 
 
-def make(setup, steps):
-    """Return the environment without a link, and the action of a robot without answers."""
-    env = gymnasium.make(setup.name, max_episode_steps=steps)
-    return env, 0 if setup.name == "CartPole-v1" else np.zeros(1, np.float32)
+def make(steps):
+    """Return the environment without a link."""
+    return gymnasium.make(ENV, max_episode_steps=steps)
 
 
 def networked(setup, steps):
     """Return the environment behind the link."""
     env = Networked(
-        make(setup, steps)[0],
+        make(steps),
         LINKS[setup.link],
         SEED,
         compute=setup.compute,
@@ -290,13 +253,13 @@ def networked(setup, steps):
     return env
 
 
-def measure(env, setup, seed, answer, idle):
+def measure(env, setup, seed, answer):
     """Play an episode with cloudrc. The action without a question is not used."""
 
     def packed(actions):
         return actions[0] if setup.chunk is None else np.stack(actions)
 
-    idle, rows = packed([idle] * (setup.chunk or 1)), []
+    idle, rows = packed([IDLE] * (setup.chunk or 1)), []
     observation, info = env.reset(seed=seed)
     is_over, rewards, asked = False, 0.0, info["cloudrc"]["asked"]
     while not is_over:
@@ -323,48 +286,36 @@ def assert_equal(found, expected):
     assert found.result == expected.result
 
 
-EXECUTORS = {
-    "one action": ("newest", None, False),
-    "newest": ("newest", 8, False),
-    "time_indexed": ("time_indexed", 16, False),
-    "prefix": ("prefix", 16, False),
-    "prefix, used": ("prefix", 16, True),
-    "broker": ("broker", 8, False),
-    "ensemble": ("ensemble", 16, False),
-}
-SETUPS = [
-    Setup(name, link, executor, chunk, compute, uses_prefix=uses)
-    for name in DT
-    for link in LINKS
-    for executor, chunk, uses in EXECUTORS.values()
-    for compute in (0.0, 0.025, 0.08)
-    if executor != "ensemble" or name == "Pendulum-v1"
+EXECUTORS = (
+    *(("newest", None, False), ("newest", 8, False), ("time_indexed", 16, False)),
+    *(("prefix", 16, False), ("prefix", 16, True), ("broker", 8, False), ("ensemble", 16, False)),
+)
+"""Name, size of a chunk (None: one action), and whether the policy uses the prefix."""
+LATE = [
+    Setup(link, *executor, 0.025, wait, start, uses)
+    for link, wait, start in (
+        *(("constant", None, "answer"), ("constant", 0.0, None), ("lte", None, "answer")),
+        *(("uniform, loss", None, "answer"), ("uniform, loss", 0.012, IDLE + 1.0)),
+    )
+    for *executor, uses in EXECUTORS
 ]
-OTHER_STARTS = [
-    Setup(name, link, executor, chunk, 0.025, wait, start, uses)
-    for name, start in (("CartPole-v1", 1), ("Pendulum-v1", None))
-    for link, wait in (("constant", 0.0), ("uniform, loss", 0.012), ("lte", None))
-    for executor, chunk, uses in EXECUTORS.values()
-    if executor != "ensemble" or name == "Pendulum-v1"
+OTHER_TIMES = [
+    Setup(link, *executor, compute, uses_prefix=uses)
+    for link in LINKS
+    for *executor, uses in EXECUTORS
+    for compute in (0.0, 0.08)
 ]
 
 
 def compare(setup, seeds, steps):
     """Compare episodes of cloudrc with those of the simulation."""
-    bare, neutral = make(setup, steps)
     env, answer = networked(setup, steps), policy(setup)
-    first = neutral if setup.start in (None, "answer") else setup.start
     for seed in seeds:
-        expected = simulate(bare, setup, seed, answer, first)
-        assert_equal(measure(env, setup, seed, answer, neutral), expected)
+        expected = simulate(make(steps), setup, seed, answer)
+        assert_equal(measure(env, setup, seed, answer), expected)
 
 
-def named(setup):
-    """Return the name of a test."""
-    return ", ".join(str(each) for each in setup)
-
-
-@pytest.mark.parametrize("setup", [*SETUPS, *OTHER_STARTS], ids=named)
+@pytest.mark.parametrize("setup", [*LATE, *nightly(*OTHER_TIMES)])
 def test_every_episode_equals_the_simulation(setup):
     compare(setup, range(2), 60)
 
@@ -376,12 +327,7 @@ def test_every_episode_equals_the_simulation(setup):
 @pytest.mark.parametrize("times", [(0.02, 0.15), (0.0, 0.06, 0.03, 0.2)])
 def test_each_answer_takes_its_own_time(link, times):
     """The time of the last answer once decided which observation the policy took next."""
-    setup = Setup("Pendulum-v1", link, "newest", None, times=times)
-    bare, neutral = make(setup, 100)
-    env, answer = networked(setup, 100), policy(setup)
-    for seed in range(5):
-        expected = simulate(bare, setup, seed, answer, neutral)
-        assert_equal(measure(env, setup, seed, answer, neutral), expected)
+    compare(Setup(link, "newest", times=times), range(5), 100)
 
 
 # The loop's age ---------------------------------------------------------------------------------

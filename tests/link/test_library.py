@@ -5,7 +5,6 @@ import runpy
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,12 +20,13 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.tunnel.codec import Kind
 from tests.link.profiles import blackout, change, profile_of
 from tests.link.test_model import profiles
+from tests.support.pages import blocks
 
 MS = 1_000_000
 LIVELY = profile_of(0.07, 0.04, loss=0.1)
 
 
-def sent(way, count, period_ns=10 * MS, first=0, episode=0):
+def sent(way, count, first, period_ns=10 * MS, episode=0):
     """Return the delays [s] of packets that are sent one by one; NaN if lost."""
     delays = np.full(count, np.nan)
     for n in range(count):
@@ -58,7 +58,7 @@ def test_a_link_without_a_name_has_the_random_numbers_of_the_testbed():
 def test_every_shipped_profile_opens_and_its_table_is_what_send_tells(name):
     for way in cloudrc.link.open(name, 5, stream="a"):
         found = way.table(600, 0.01, episode=2, first=100)
-        assert np.array_equal(found, sent(way, 600, first=100, episode=2), equal_nan=True)
+        assert np.array_equal(found, sent(way, 600, 100, episode=2), equal_nan=True)
 
 
 @settings(max_examples=60, deadline=None)
@@ -72,13 +72,13 @@ def test_a_table_is_what_send_tells_for_every_profile(profile, corrupt, first, s
     profile = replace(profile, corrupt=corrupt)
     way = OneWay(profile, 7, uplink=False, stream=stream)
     found = way.table(300, 0.01, first=first)
-    assert np.array_equal(found, sent(way, 300, first=first), equal_nan=True)
+    assert np.array_equal(found, sent(way, 300, first), equal_nan=True)
 
 
 def test_a_long_table_of_independent_delays_has_no_seams():
     way = OneWay(LIVELY, 1, uplink=True)
     found = way.table(40_000, 0.001, first=300)
-    assert np.array_equal(found, sent(way, 40_000, MS, first=300), equal_nan=True)
+    assert np.array_equal(found, sent(way, 40_000, 300, MS), equal_nan=True)
     assert way.table(0, 0.01).shape == (0,)
 
 
@@ -96,13 +96,6 @@ def test_an_episode_begins_with_an_empty_bottleneck_and_at_the_start_of_the_time
     assert first[0][0] < 200 * MS
     assert first[9][0] > 1700 * MS
     assert [way.send(2, n, 1000, n * 100 * MS) for n in range(10)] == first
-
-
-def test_the_expected_statistics_are_those_of_the_profile():
-    found = OneWay(LIVELY, 1, uplink=True).expected()
-    assert found.mean == pytest.approx(0.07, abs=1e-3)
-    assert (found.least, found.most) == pytest.approx((0.03, 0.11), abs=1e-4)
-    assert found.loss == pytest.approx(0.1, abs=0.01)
 
 
 def test_a_mapping_is_read_as_a_file_and_has_the_plain_classes(tmp_path):
@@ -142,9 +135,9 @@ def test_a_profile_that_cannot_be_used_is_refused_in_one_line(profile, words):
 
 
 def test_the_examples_of_the_page_run(tmp_path, capsys):
-    page = (Path(__file__).parents[2] / "docs" / "library.md").read_text()
+    code = "\n".join(blocks("library", "python"))
     program = tmp_path / "page.py"
-    program.write_text("\n".join(re.findall("```python\n(.*?)```", page, re.DOTALL)))
+    program.write_text(code)
     runpy.run_path(str(program))
-    told = re.search(r"print\(arrivals\)  # (\(.*?\)):", page)[1]
+    told = re.search(r"print\(arrivals\)  # (\(.*?\)):", code)[1]
     assert capsys.readouterr().out.startswith(told)

@@ -48,18 +48,13 @@ def link(profile, seed=1, uplink=True):
     return LinkDirection(profile, seed, uplink)
 
 
-def flow(profile, count, seed=1):
+def flow(profile, count):
     """Return the delays [ns] of each packet's copies, one packet per 10 ms."""
-    direction = link(profile, seed)
+    direction = link(profile)
     return [
         tuple(at - n * PERIOD_NS for at in direction.send(1, 3, n, SIZE, n * PERIOD_NS))
         for n in range(count)
     ]
-
-
-def delays(profile, count):
-    """Return the delays [s] of `count` packets, none lost or duplicated."""
-    return np.array([delay * 1e-9 for (delay,) in flow(profile, count)])
 
 
 def ask(direction, counters):
@@ -111,22 +106,19 @@ def pareto(z):
     ("shape", "cumulative", "deviation"),
     [("uniform", uniform, 1 / sqrt(3)), ("normal", normal, 1.0), ("pareto", pareto, 1.0)],
 )
-def test_many_draws_match_their_distribution(shape, cumulative, deviation, count, figure):
+def test_many_draws_match_their_distribution(shape, cumulative, deviation, count):
     delay, jitter, loss, root = 0.060, 0.005, 0.02, sqrt(count)
     fates = flow(profile_of(delay, jitter, shape, loss=loss), count)
     lost = np.array([not copies for copies in fates])
-    off, most = abs(lost.mean() - loss), 4 * sqrt(loss * (1 - loss)) / root
-    figure(f"{count:,} draws: loss off by", 100 * off, "<=", 100 * most, "%", count)
+    assert lost.mean() == pytest.approx(loss, abs=4 * sqrt(loss * (1 - loss)) / root)
     assert np.mean(loss_runs(stream_of(lost))) == pytest.approx(1 / (1 - loss), rel=10 / root)
     drawn = np.sort((np.array([one[0] for one in fates if one]) * 1e-9 - delay) / jitter)
-    off, most = abs(drawn.mean()) * jitter * 1e6, 4.04 * jitter * 1e6 / root
-    figure(f"{count:,} draws: mean off by", off, "<=", most, "us", count)
+    assert drawn.mean() == pytest.approx(0.0, abs=4.04 / root)
     assert drawn.std() == pytest.approx(deviation, rel=10 / root)
     some = drawn[:: count // 2000]
     share = np.linspace(0, 1, drawn.size)[:: count // 2000]
     # Kolmogorov-Smirnov distance that one in a thousand seeds exceeds by chance.
-    distance = np.abs(cumulative(some) - share).max()
-    figure(f"{count:,} draws: from their distribution", distance, "<=", 1.97 / root, count=count)
+    assert cumulative(some) == pytest.approx(share, abs=1.97 / root)
 
 
 def stream_of(lost):
@@ -137,19 +129,11 @@ def test_a_table_is_drawn_from_about_its_mean():
     """A quarter of the packets is late by 1.73 jitters; the others are early by 0.58."""
     table = (-1 / sqrt(3),) * 3 + (sqrt(3),)
     for correlation, least, most in ((0.0, -0.03, 0.03), (0.6, 0.3, 1.0)):
-        drawn = delays(profile_of(0.045, 0.005, "table", correlation, quantiles=table), COUNT)
+        profile = profile_of(0.045, 0.005, "table", correlation, quantiles=table)
+        drawn = 1e-9 * np.ravel(flow(profile, COUNT))
         assert set(np.round(drawn * 1e9)) == {round(45e6 + 5e6 * value) for value in set(table)}
         assert drawn.mean() == pytest.approx(0.045, abs=0.0002)
         assert least < np.corrcoef(drawn[:-1], drawn[1:])[0, 1] < most
-
-
-def test_200000_packets_have_the_specified_bursts(figure):
-    loss = in_bursts(0.02, 0.2)  # 1/11, in bursts of 5 packets
-    lost = np.array([not copies for copies in flow(profile_of(loss=loss), 200_000)])
-    length = np.mean(loss_runs(stream_of(lost)))
-    for name, found, asked in (("loss", lost.mean(), 1 / 11), ("burst", length, 5.0)):
-        off = 100 * abs(found / asked - 1)
-        figure(f"Gilbert-Elliott: {name} off by", off, "<=", 10.0, "%", lost.size)
 
 
 def test_the_bad_state_loses_or_delays_packets():

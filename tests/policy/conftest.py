@@ -56,19 +56,18 @@ def policy(tmp_path):
     return write
 
 
-def actions(value, shape=(1, 4)):
-    array = np.full(shape, value)
+def actions(value):
+    array = np.full((1, 4), value)
     data = {b"__ndarray__": True, b"data": array.tobytes(), b"dtype": array.dtype.str}
     return msgpack.packb({"actions": {**data, b"shape": array.shape}})
 
 
 @contextmanager
-def stock_like(answer, metadata=b"\x80"):
+def stock_like(answer):
     """Serve as openpi does: `answer(connection, frame)` returns the frame to send, or None."""
 
     def handle(connection):
-        if metadata is not None:
-            connection.send(metadata)
+        connection.send(b"\x80")  # no metadata
         for frame in connection:
             if (sent := answer(connection, frame)) is not None:
                 connection.send(sent)

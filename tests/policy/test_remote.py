@@ -1,7 +1,6 @@
 """A program outside controls the robot over a WebSocket, in lock step in virtual time."""
 
 import json
-import socket
 from collections import Counter
 
 import numpy as np
@@ -11,6 +10,7 @@ from cloudrc import assembly
 from cloudrc.cloud.controllers.remote import OutsideController
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers import remote
+from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import BadInputError, ControllerLostError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
 from cloudrc.policy.codec import unpack
@@ -42,9 +42,9 @@ def infer(seen):
 """
 
 
-def experiment(url, *settings, name="paper", short=SHORT):
+def experiment(url, *settings):
     controller = json.dumps({"name": "remote", "url": url})
-    return load_experiment(name, [*short, f"cloud.controller={controller}", *settings])
+    return load_experiment("paper", [*SHORT, f"cloud.controller={controller}", *settings])
 
 
 def true_path(flown):
@@ -71,21 +71,6 @@ def test_a_served_policy_that_returns_none_sends_nothing(policy):
     assert np.mean(sent == UNSENT) == pytest.approx(2 / 3, abs=0.01)
 
 
-def lost(answer, tmp_path, metadata=b"\x80", settings=()):
-    """Fly with a server that behaves as `answer`; return the error and the report."""
-    with stock_like(answer, metadata) as url, pytest.raises(ControllerLostError) as raised:
-        fly(experiment(url, *settings), "virtual", tmp_path, page=False)
-    assert url in str(raised.value)
-    assert "\n" not in str(raised.value)
-    assert raised.value.exit_code == 5
-    assert (tmp_path / "mission.mcap").stat().st_size > 1000
-    if not (tmp_path / "report.json").exists():
-        return raised.value, None
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert (report["verdict"], report["failures"][0]["code"]) == ("failure", raised.value.code)
-    return raised.value, report
-
-
 def after(count, last):
     """Answer `count` observations, then as `last` does."""
     left = iter(range(count))
@@ -108,23 +93,20 @@ def after(count, last):
     ids=range(3),
 )
 def test_a_wrong_answer_in_flight_ends_it_with_one_line_and_a_recording(tmp_path, last, code, text):
-    error, report = lost(after(20, last), tmp_path)
-    assert error.code == code
-    assert report is not None
-    with pytest.raises(ControllerLostError, match=text):
-        raise error
-
-
-@pytest.fixture
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        return taken.getsockname()[1]
-
-
-def test_nobody_listening_ends_a_flight_before_it_begins(tmp_path, free_port):
-    url = f"ws://127.0.0.1:{free_port}"
-    with pytest.raises(ControllerLostError, match="nobody listens") as raised:
+    with stock_like(after(20, last)) as url, pytest.raises(ControllerLostError, match=text) as lost:
         fly(experiment(url), "virtual", tmp_path, page=False)
+    assert url in str(lost.value)
+    assert "\n" not in str(lost.value)
+    assert (lost.value.code, lost.value.exit_code) == (code, 5)
+    assert (tmp_path / "mission.mcap").stat().st_size > 1000
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["verdict"], report["failures"][0]["code"]) == ("failure", code)
+
+
+def test_nobody_listening_ends_a_flight_before_it_begins(tmp_path):
+    (port,) = free_ports(1)
+    with pytest.raises(ControllerLostError, match="nobody listens") as raised:
+        fly(experiment(f"ws://127.0.0.1:{port}"), "virtual", tmp_path, page=False)
     assert raised.value.code == "controller_silent"
     assert not (tmp_path / "report.json").exists()
 

@@ -40,8 +40,8 @@ def install(tmp_path, monkeypatch):
         del sys.modules[name]
 
 
-def key(write_sweep, predictor="mine"):
-    path = write_sweep({"cloud.predictor": [predictor]})
+def key(write_sweep):
+    path = write_sweep({"cloud.predictor": ["mine"]})
     (found,) = read_plan(path).flights
     return found
 

@@ -4,13 +4,13 @@ A file of flights gives the same flights in a pod that has none of the user's fi
 """
 
 import re
-from pathlib import Path
 
 import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import SCENES
 from cloudrc.trials.plan import pack, read_plan, unpack
+from tests.support.pages import blocks
 from tests.support.sweeps import SHORT
 
 
@@ -129,8 +129,7 @@ def test_a_problem_is_refused_at_its_place(write_sweep, keys, reason):
 
 
 def test_the_file_of_the_page_is_a_sweep(tmp_path):
-    page = (Path(__file__).parents[2] / "docs/sweeps.md").read_text()
-    (tmp_path / "grid.yaml").write_text(re.search(r"```yaml\n(.*?)```", page, re.DOTALL)[1])
+    (tmp_path / "grid.yaml").write_text(blocks("sweeps", "yaml")[0])
     sweep = read_plan(tmp_path / "grid.yaml")
     assert (len(sweep.points), len(sweep.flights)) == (12, 240)
 

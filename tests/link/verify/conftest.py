@@ -27,14 +27,14 @@ OVERHEAD = 8e-5
 """Delay that a good relay and the network stack add [s]."""
 
 
-def rows_of(profile, real, *, stall=0.0, seconds=None, netem=False):
+def rows_of(profile, real, *, stall=0.0, netem=False):
     """Request `profile`, probe a link that has the profile `real`, and judge it.
 
     30 % of the probes are up to `stall` [s] late, as with a relay without CPU time. With `netem`,
     the random numbers do not follow the experiment's seed.
     """
     flow = Flow(SEED, True, PROBE, SIZES[Kind.TELEMETRY])
-    plan = plan_probes(profile, flow, seconds, drawn=netem)
+    plan = plan_probes(profile, flow, drawn=netem)
     link = replace(plan, profile=real)
     if netem:
         link = replace(link, profile=netem_makes(real), flow=flow._replace(seed=2))
@@ -68,19 +68,19 @@ def arrivals(profile, seconds=60.0, *, seed=SEED, overhead=5e-4, uplink=False):
     return sorted(found)
 
 
-def hearing(up, down, *, uplink=False, period=0.01, computes=False):
+def hearing(up, down, *, uplink=False):
     """Return the monitor of the end that receives a direction."""
     flow = Flow(SEED, uplink, KINDS[uplink], SIZES[KINDS[uplink]])
-    monitor = LinkMonitor(uplink, flow, period=period, computes=computes, file_max=1000)
+    monitor = LinkMonitor(uplink, flow, period=0.01, computes=False, file_max=1000)
     monitor.follow((up, down))
     return monitor
 
 
-def checked(monitor, records, since_ns=0):
+def checked(monitor, records):
     """Pass records one by one; return the rows of each verdict by quantity, and the faults."""
     moments, faults = list[dict[str, LinkChecked]](), list[Fault]()
     for record in records:
-        told = monitor.after([record], record.stamp_ns + since_ns)
+        told = monitor.after([record], record.stamp_ns)
         rows = {one.quantity: one for one in told if isinstance(one, LinkChecked)}
         moments += [rows] if rows else []
         faults += [one for one in told if isinstance(one, Fault)]
