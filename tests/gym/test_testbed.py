@@ -11,6 +11,7 @@ from cloudrc.gym import Networked
 from cloudrc.record.columns import Recording
 
 SHORT = {"mission": {"steps": {"count": 2}}}
+NEAR = {"mission.waypoints": [{"position_m": [0.8, 0.6], "tolerance_m": 0.2, "dwell_s": 0.5}]}
 
 
 @pytest.mark.parametrize(
@@ -18,7 +19,7 @@ SHORT = {"mission": {"steps": {"count": 2}}}
     [
         ("cloudrc/Steps-v0", {"settings": SHORT}, "steps", SHORT),
         pytest.param("cloudrc/Pipes-v0", {}, "paper", {}, marks=pytest.mark.full),
-        ("cloudrc/Steps-v0", {"experiment": "pillars"}, "pillars", {}),
+        ("cloudrc/Steps-v0", {"experiment": "pillars", "settings": NEAR}, "pillars", NEAR),
     ],
 )
 def test_the_same_actions_fly_the_true_path_of_a_flight(name, options, experiment, settings):

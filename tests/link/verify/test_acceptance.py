@@ -7,6 +7,7 @@ from cloudrc.config.shipped import names
 from cloudrc.link.verify import verdict_of
 from cloudrc.link.verify.causes import Findings, ShaperFacts, find_causes
 from cloudrc.link.verify.judge import look_twice
+from tests.conftest import nightly
 from tests.link.profiles import changed, profile_of
 from tests.link.verify.conftest import asked, random_profile, rows_of, verify
 
@@ -21,10 +22,11 @@ def doubts(rows):
 
 
 @pytest.mark.promise("verify-tells-the-link")
-def test_200_honest_links_of_200_are_believed():
+@pytest.mark.parametrize("count", [60, *nightly(200)])
+def test_every_honest_link_is_believed(count):
     rng = np.random.default_rng(1)
     links = [asked(name, way) for name in names("profile") for way in ("uplink", "downlink")]
-    links += [random_profile(rng) for _ in range(200 - len(links))]
+    links += [random_profile(rng) for _ in range(count - len(links))]
     found = {link: doubts(rows_of(link, link)) for link in links}
     assert {link: why for link, why in found.items() if why} == {}
 
