@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -144,8 +145,6 @@ def asking(setup: EvalSetup) -> Iterator[Ask]:
         policy.reset()
         yield policy.infer
         return
-    import os
-
     from cloudrc.policy.address import KEY_VARIABLE
     from cloudrc.policy.client import PolicyClient
 
@@ -153,9 +152,7 @@ def asking(setup: EvalSetup) -> Iterator[Ask]:
         yield client.infer
 
 
-@cache  # it may have to load weights
-def _load(name: str) -> LoadedPolicy:
-    return LoadedPolicy(name)
+_load = cache(LoadedPolicy)  # it may have to load weights
 
 
 class _Policy:
@@ -196,10 +193,8 @@ class _Policy:
 
 def width_of(space: spaces.Space[Any]) -> int:
     """Return the number of values of an action; raise an InvalidValueError if it has none."""
-    if isinstance(space, spaces.Box | spaces.MultiDiscrete | spaces.MultiBinary):
-        return int(np.prod(space.shape))
-    if isinstance(space, spaces.Discrete):
-        return 1
+    if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+        return int(np.prod(space.shape or ()))
     raise InvalidValueError(
         f"its actions are {type(space).__name__}, which no policy's chunk has; use an environment "
         "whose actions are numbers"

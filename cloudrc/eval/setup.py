@@ -111,12 +111,11 @@ class Episode:
         """Return the name of the row: equal keys mean equal episodes."""
         if self.is_baseline:
             identity = {**identity, **BARE}
-        own = reuse(("executor", self.executor), self._executor_code)
+        own = ""  # an executor of a package counts by its version
+        if is_path(self.executor):
+            file = Path(self.executor)
+            own = reuse(("executor", self.executor), lambda: hash_of(sources(file)))
         return fingerprint(identity, self.point, own, self.seed)
-
-    def _executor_code(self) -> str:
-        """Return the hash of an executor's file; one of a package counts by its version."""
-        return hash_of(sources(Path(self.executor))) if is_path(self.executor) else ""
 
 
 def _code_of_link(link: LinkProfile) -> str:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from math import inf
-from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
+from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 from cloudrc.outside.values import Quantity
 
@@ -241,16 +241,16 @@ class Timeline:
 def settled(profile: DirectionProfile) -> DirectionProfile:
     """Return the profile with constant conditions: those of the last piece of its time line."""
     last = Timeline(profile).pieces[-1]
-    constant: dict[str, Any] = {
-        "delay_ms": last.delay_ns * 1e-6,
-        "jitter_ms": last.jitter * 1e3,
-        "loss": 1.0 if last.blackout else last.loss,
-        "rate_kbit": None if last.rate is None else last.rate * 1e-3,
-        "changes": (),
-        "rows": None,
-        "blackouts": (),
-    }
-    return replace(profile, **constant)
+    return replace(
+        profile,
+        delay_ms=last.delay_ns * 1e-6,
+        jitter_ms=last.jitter * 1e3,
+        loss=1.0 if last.blackout else last.loss,
+        rate_kbit=None if last.rate is None else last.rate * 1e-3,
+        changes=(),
+        rows=None,
+        blackouts=(),
+    )
 
 
 @lru_cache(maxsize=2)  # both directions of a link; of a trace with millions of rows it takes long

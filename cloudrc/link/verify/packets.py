@@ -52,11 +52,11 @@ def judge_packets(log: PacketLog, period: Period) -> list[tuple[float, Judgement
     flow = Flow(period.seed, period.uplink, KIND, size)
     plan = Measurement(period.profile, flow, applied.sent)
     limited = any(piece.rate is not None for piece in Timeline(period.profile).pieces)
+    few = slice(None, None, 1 + len(applied.sent) // ASKED_PACKETS)
     if limited:  # a packet waits for those before it
-        asked = replace(plan, sent=applied.sent[:QUEUED_PACKETS]).asked()
-    else:
-        few = applied.sent[:: 1 + len(applied.sent) // ASKED_PACKETS]
-        asked = replace(plan, sent=few).asked()
+        few = slice(QUEUED_PACKETS)
+    asked = replace(plan, sent=applied.sent[few]).asked()
+    if not limited:
         asked["reordered"] = nan  # depends on how close to each other packets are sent
     rows = plan.judge_applied(applied, measured)
     return [(asked.get(row.name, row.asked), row) for row in rows if row.name not in UNJUDGED]
