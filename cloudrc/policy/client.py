@@ -93,11 +93,7 @@ class PolicyClient:
             frame = self._connection.recv(timeout=0)
         except (TimeoutError, ConnectionClosed):
             return
-        if isinstance(frame, bytes):
-            self.close()
-            text = f"{self.url}: the server sent an answer that belongs to no observation"
-            raise PolicyServerError(f"{text}; send one answer for each")
-        self._fail_with(frame)
+        self._fail_with(frame if isinstance(frame, str) else "an answer to no observation")
 
     def close(self) -> None:
         """Close the connection."""
