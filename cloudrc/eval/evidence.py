@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations, pairwise, zip_longest
 from statistics import fmean, median
-from typing import Any, TypeAlias
+from typing import Any
 
 from cloudrc.eval.setup import BASELINE
 from cloudrc.statistics import LEVEL, by_chance, exact_interval, median_interval, tail
 from cloudrc.trials.rows import Row
 from cloudrc.trials.summary import Pair, adjust, compare_number, compare_success
 
-Groups: TypeAlias = Mapping[str, Mapping[float | None, Sequence[Row]]]
+Groups = Mapping[str, Mapping[float | None, Sequence[Row]]]
 """Executor -> round trip [ms] -> the rows of this condition."""
 WEIGHTS = {
     "stale_share": "steps",

@@ -28,8 +28,16 @@ SEEDLESS = (
 )
 """Warning about an environment that does not follow the seed of its reset."""
 PAIRED = (
-    *("env", "env_args", "env_code", "link", "success_at", "dt", "max_steps", "code"),
-    *("answer_within", "observation_bytes"),
+    "env",
+    "env_args",
+    "env_code",
+    "link",
+    "success_at",
+    "dt",
+    "max_steps",
+    "code",
+    "answer_within",
+    "observation_bytes",
 )
 """What two evaluations must share for a comparison of their policies."""
 LEGEND = (

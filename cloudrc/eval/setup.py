@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from statistics import fmean
-from typing import Any, TypeAlias
+from typing import Any
 
 from cloudrc.gym.step import StepTime
 from cloudrc.link.library import LinkProfile, read_profile
@@ -20,7 +20,7 @@ from cloudrc.policy.observation import Mapped
 from cloudrc.runs.own_files import hash_of
 from cloudrc.trials.fingerprint import fingerprint
 
-Compute: TypeAlias = float | tuple[float, float] | tuple[str, str]
+Compute = float | tuple[float, float] | tuple[str, str]
 """Time for an answer [s]: constant; or mean and deviation; or (FILE, name) or (MEASURED, "")."""
 FILE, MEASURED = "file", "measured"
 SEED = "{seed}"

@@ -7,7 +7,7 @@ has tests by flights alone; formulas are those of the exercise.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
@@ -19,10 +19,10 @@ SHIPPED = Path(__file__).with_name("task.yaml")
 """The exercise."""
 COPY = "task.yaml"
 """Name of a task in a student's folder."""
-FormulaName: TypeAlias = Literal[
+FormulaName = Literal[
     "mean", "hold time", "position", "orientation", "velocity, stamp", "P", "I", "D", "limit"
 ]
-FileName: TypeAlias = Annotated[str, StringConstraints(pattern=r"^[\w-]+(\.[\w-]+)*\.\w+$")]
+FileName = Annotated[str, StringConstraints(pattern=r"^[\w-]+(\.[\w-]+)*\.\w+$")]
 
 
 class TestConfig(Section):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias, TypedDict, cast
+from typing import Any, TypedDict, cast
 
 import gymnasium
 from gymnasium.vector.utils import batch_space, iterate
@@ -18,7 +18,7 @@ from cloudrc.link.library import LinkProfile, read_profile
 from cloudrc.outside.refusal import check_names, naming
 from cloudrc.outside.values import InvalidValueError, Quantity
 
-Profile: TypeAlias = str | Path | Mapping[str, Any] | LinkProfile
+Profile = str | Path | Mapping[str, Any] | LinkProfile
 SIZE = Quantity("bytes", 0, 1_000_000_000, whole=True)
 """Size of a packet."""
 COUNTS = {
@@ -49,8 +49,14 @@ class Options(TypedDict, total=False):
 
 
 DEFAULTS: Options = {
-    **{"compute": 0.0, "answer_within": None, "chunk": None, "executor": "newest"},
-    **{"hold": "repeat", "start": None, "observation_bytes": None, "action_bytes": None},
+    "compute": 0.0,
+    "answer_within": None,
+    "chunk": None,
+    "executor": "newest",
+    "hold": "repeat",
+    "start": None,
+    "observation_bytes": None,
+    "action_bytes": None,
 }
 ARGUMENTS = ("env", "link", "seed", "dt", "stream", *DEFAULTS)
 """Names of the arguments of `Networked` and `NetworkedVector`."""

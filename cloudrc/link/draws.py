@@ -18,7 +18,6 @@ from __future__ import annotations
 from enum import IntEnum
 from functools import lru_cache
 from math import erf, erfc, sqrt
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,9 +38,9 @@ _PARETO_MEAN = 1.5 * (1.0 - PARETO_CUT ** (2 / 3)) / (1.0 - PARETO_CUT)
 _PARETO_SQUARE = 3.0 * (1.0 - PARETO_CUT ** (1 / 3)) / (1.0 - PARETO_CUT)
 _PARETO_DEVIATION = sqrt(_PARETO_SQUARE - _PARETO_MEAN**2)
 
-Floats: TypeAlias = NDArray[np.float64]
-StreamKey: TypeAlias = tuple[int, int]
-Fate: TypeAlias = tuple[int, ...]
+Floats = NDArray[np.float64]
+StreamKey = tuple[int, int]
+Fate = tuple[int, ...]
 
 
 class Purpose(IntEnum):

@@ -25,7 +25,7 @@ from hashlib import blake2b
 from math import ceil, inf
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -55,7 +55,7 @@ _PACKETS = 1_000  # assumed packet rate without a bottleneck [1/s]; tunnel and p
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
 
 
-Run: TypeAlias = Callable[[Sequence[str]], str]
+Run = Callable[[Sequence[str]], str]
 """Function that runs a program and returns its output; if that fails, it raises `explain`'s error.
 """
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from math import inf
-from typing import Annotated, Literal, NamedTuple, TypeAlias
+from typing import Annotated, Literal, NamedTuple
 
 from cloudrc.outside.values import Quantity
 
@@ -52,7 +52,7 @@ class GilbertElliott:
         return ""
 
 
-Loss: TypeAlias = Probability | GilbertElliott
+Loss = Probability | GilbertElliott
 
 
 @dataclass(frozen=True)

@@ -23,14 +23,14 @@ from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, publish, 
 if TYPE_CHECKING:
     from cloudrc.link.netem import Netem
 
-Mode: TypeAlias = Literal["auto", "netem", "relay"]
+Mode = Literal["auto", "netem", "relay"]
 """Setting `link.mode`: the only allowed shaper, or "auto": netem if it works, else the relay."""
 COUNT_PERIOD_NS = 1_000_000_000  # time between two updates of the metrics [ns]
 STEP = 0.05  # longest time until `run` reacts to a new peer or profile [s]
 
 Shaper: TypeAlias = "Relay | Netem"
 """Shapes the datagrams that the own end of the tunnel sends."""
-Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
+Make = Callable[[DirectionProfile, int], Shaper]
 """Function that makes a shaper from a profile and the monotonic start of its time line [ns]."""
 
 

@@ -18,7 +18,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import isnan, nan
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
 
@@ -27,8 +27,8 @@ from cloudrc.link.streams import Stream
 from cloudrc.link.traces import read_rows
 from cloudrc.outside.values import InvalidValueError, Quantity
 
-Direction: TypeAlias = Literal["uplink", "downlink"]
-Entry: TypeAlias = tuple[float, float, bool]
+Direction = Literal["uplink", "downlink"]
+Entry = tuple[float, float, bool]
 """Time of sending [s], delay [s] (NaN: not known), and whether the packet arrived."""
 BACK_MAX = 1.0  # a log whose times go back by this time is refused [s]
 LOST = Quantity(ge=0, le=1, whole=True)

@@ -11,8 +11,17 @@ from cloudrc.studies.compare import LEFT_OUT
 from cloudrc.text import FAILED_MARK, FAILED_NOTE, format_number, table
 
 TITLES = (
-    *("number", "A median", "B median", "B - A", "95 % interval", "B lower in", "p", "p Holm"),
-    *("p sign", "decided", "unit"),
+    "number",
+    "A median",
+    "B median",
+    "B - A",
+    "95 % interval",
+    "B lower in",
+    "p",
+    "p Holm",
+    "p sign",
+    "decided",
+    "unit",
 )
 
 
@@ -30,14 +39,17 @@ def as_text(document: Mapping[str, Any]) -> str:
         *(f"{side.upper()}: {document[side]}" for side in "ab"),
         f"of {document['of']}; pairs: {document['pairs']}"
         + (f"; {left_out} left out with {LEFT_OUT}" if left_out else ""),
-        *("", table(cells(document), right=(1, 2, 3)), ""),
+        "",
+        table(cells(document), right=(1, 2, 3)),
+        "",
         *map(lacking_text, document["lacking"].items()),
         f"success: {', '.join(rates)}, p = {success['p_mcnemar']:.2g}, "
         f"p Holm = {success['p_holm']:.2g}",
         document["method"],
         by_chance(1 + len(document["numbers"])),
         *([FAILED_NOTE] if any(failed) else []),
-        *("", _answer(document)),
+        "",
+        _answer(document),
     ]
     return "\n".join(lines)
 
@@ -54,7 +66,10 @@ def _row(name: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
         values[place] += FAILED_MARK if entry[f"{side}_failed"] else ""
     between = " .. ".join(format_number(bound * factor) for bound in entry["interval"] or ())
     return (
-        *(name, *values, between or "-", f"{entry['lower']} of {entry['count']}"),
+        name,
+        *values,
+        between or "-",
+        f"{entry['lower']} of {entry['count']}",
         *(f"{entry[key]:.2g}" for key in ("p_wilcoxon", "p_holm", "p_sign")),
         *("yes" if entry["decided"] else f"no: {_needed(entry)}", unit),
     )

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from functools import cache
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 from cloudrc.ages import simulate_ages
 from cloudrc.config.overrides import onboard_values
@@ -36,7 +36,7 @@ LIMIT_MAX = COMMAND_AGE_MS[1] * 1e-3
 STEPS_MAX = 32
 """Default of the largest value to try, as a multiple of the first value."""
 
-Answer: TypeAlias = dict[str, Any]
+Answer = dict[str, Any]
 """Result of the flights with one value: `value`, the guard's `speed_max_mps`, and the answer as
 `stable` or `settles`; for a constant delay `rtt_ms`; after a failure `code`, `text` and `seed`."""
 
@@ -281,9 +281,13 @@ def describe(margin: Margin) -> dict[str, Any]:
     """Return the result as values for JSON."""
     asked = margin.asked
     document: dict[str, Any] = {
-        **{"key": asked.key, "experiment": asked.experiment},
-        **{"overrides": list(asked.settings), "seeds": asked.seeds, "resolution": margin.size},
-        **{"smallest": margin.value(margin.bottom), "largest": margin.value(margin.top)},
+        "key": asked.key,
+        "experiment": asked.experiment,
+        "overrides": list(asked.settings),
+        "seeds": asked.seeds,
+        "resolution": margin.size,
+        "smallest": margin.value(margin.bottom),
+        "largest": margin.value(margin.top),
         "largest_why": margin.top_why,
     }
     for name, each in margin.found.items():

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import groupby
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
-Works: TypeAlias = Callable[[int], bool]
+Works = Callable[[int], bool]
 
 
 class ValueRange(NamedTuple):

@@ -12,7 +12,7 @@ oscillation, so that a loop that is unstable may seem to decay after a large ste
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from cloudrc.record.holes import END_NS
 from cloudrc.records import Control, Counted, Fault, GroundTruth, GuardChange, MissionEvent, Record
 from cloudrc.runs.flight import explain
 
-Array: TypeAlias = NDArray[np.float64]
+Array = NDArray[np.float64]
 SCENE = "empty"
 """Scene of the step, in which nothing is in the way."""
 SMALL, LARGE = 0.1, 1.0
@@ -59,7 +59,7 @@ KEPT = (Control, Counted, Fault, GroundTruth, GuardChange, MissionEvent)
 """Kinds of records that are kept of a flight; to keep all takes as long as to fly."""
 HELD_MAX = 0.5
 """Largest share of the time after the step in which the guard may hold the robot."""
-Answer: TypeAlias = dict[str, Any]
+Answer = dict[str, Any]
 """Result of `fly_step`: `stable`; if it is false, `code` and `text`; `left`, the response at the
 end as a share of the step; `speed_limited`, the share of commands after the step that the guard's
 speed cap shortened."""

@@ -14,7 +14,7 @@ from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 from cloudrc import source
 from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, to_one_line
@@ -34,7 +34,7 @@ FILE, SUMMARY, PODS = "sweep.yaml", "sweep.json", "pods.json"
 TABLE, PARQUET = "table.csv", "table.parquet"
 NUMBERS = {int, float, type(None)}
 """Types of the values of an axis of numbers; None is the value null."""
-Shard: TypeAlias = tuple[int, int] | None
+Shard = tuple[int, int] | None
 """Number of a part of the flights, from 1, and how many parts there are; None: all flights."""
 
 

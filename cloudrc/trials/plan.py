@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import chain, groupby, product
 from math import prod
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 from pydantic import Field
 
@@ -39,9 +39,9 @@ SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
 """Largest seed, and largest number of seeds."""
 COLUMNS = ("key", "seed", "verdict", "failures", "code", "physics_steps")
 """Columns of the table besides the axes and the numbers."""
-Entry: TypeAlias = tuple[str, Any, Source]
+Entry = tuple[str, Any, Source]
 """A setting's key and value, and their place in the file."""
-Choice: TypeAlias = tuple[Any, list[Entry]]
+Choice = tuple[Any, list[Entry]]
 """A value of an axis, or its name, and the settings that it means."""
 
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 from cloudrc import files
 from cloudrc.errors import BadInputError
 
-Row: TypeAlias = dict[str, Any]
+Row = dict[str, Any]
 """Result of a trial: `key`, `point` (axis -> value), `seed`, `verdict`, `failures` (codes), `text`
 (the first failure in words), `numbers` (metric -> value), `records_sha256`, and `code`, the hash of
 cloudrc's own code."""

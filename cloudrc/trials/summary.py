@@ -22,8 +22,14 @@ from cloudrc.text import FAILED_MARK, FAILED_NOTE, format_number, table
 from cloudrc.trials.rows import Row
 
 NUMBERS = (
-    *("prediction_error_rms", "tracking_error_p95", "iae_mean", "settling_time_mean"),
-    *("unsettled_steps", "overshoot_mean", "delay_estimate_error_rms", "min_clearance"),
+    "prediction_error_rms",
+    "tracking_error_p95",
+    "iae_mean",
+    "settling_time_mean",
+    "unsettled_steps",
+    "overshoot_mean",
+    "delay_estimate_error_rms",
+    "min_clearance",
 )
 """Metrics that are compared and drawn by default."""
 COST, RATIO = "control_cost", "J/J0"
@@ -175,9 +181,15 @@ def compare_success(pairs: Sequence[Pair]) -> dict[str, Any]:
     both = sum(count_successes((each.a, each.b)) == 2 for each in pairs)
     p = sign_test(a - both, b - both)
     return {
-        **{"count": count, "a": a, "a_interval": exact_interval(a, count)},
-        **{"b": b, "b_interval": exact_interval(b, count)},
-        **{"only_a": a - both, "only_b": b - both, "p_mcnemar": p, "decided": p < LEVEL},
+        "count": count,
+        "a": a,
+        "a_interval": exact_interval(a, count),
+        "b": b,
+        "b_interval": exact_interval(b, count),
+        "only_a": a - both,
+        "only_b": b - both,
+        "p_mcnemar": p,
+        "decided": p < LEVEL,
     }
 
 

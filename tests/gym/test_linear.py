@@ -10,8 +10,11 @@ from tests.conftest import nightly
 
 ROWS = {row.name: row for row in canon.rows() if row.name != canon.HEAVY}
 LIKE_ANOTHER = [
-    *("E[x²] through `Networked`, loss .1", "the same with loss in bursts"),
-    *("LQG, loss .3, UDP-like", "2 inputs in a packet", "all inputs in a packet"),
+    "E[x²] through `Networked`, loss .1",
+    "the same with loss in bursts",
+    "LQG, loss .3, UDP-like",
+    "2 inputs in a packet",
+    "all inputs in a packet",
     "Schenato 2009: 1 input, held",
 ]
 """Rows that differ from one that is measured daily in a parameter or in a rule."""

@@ -123,8 +123,10 @@ def test_a_predictor_that_replays_the_commands_is_stable_at_3_s(predictor, rtt, 
     [
         ["cloud.controller.gain_p=[0.4, 0.4, 0.4]"],
         [
-            *("world.wind.velocity_mps=[3, 1]", "world.wind.gust_mps=1"),
-            *("world.sensors.position_noise_m=0.02", "world.sensors.velocity_noise_mps=0.1"),
+            "world.wind.velocity_mps=[3, 1]",
+            "world.wind.gust_mps=1",
+            "world.sensors.position_noise_m=0.02",
+            "world.sensors.velocity_noise_mps=0.1",
         ],
         *nightly(
             ["cloud.controller.gain_p=[0.1, 0.1, 0.1]"],

@@ -7,7 +7,7 @@ returns a `Controller`; all parameters are annotated.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple
 
 from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
 
@@ -50,7 +50,7 @@ class Planned(NamedTuple):
     yaw_rate: float = 0.0
 
 
-Goals: TypeAlias = Callable[[float], Setpoint]
+Goals = Callable[[float], Setpoint]
 """Function that returns the setpoint after a time from now [s], >= 0."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
 

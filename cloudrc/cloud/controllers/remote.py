@@ -11,16 +11,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from math import nan
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol
 
 from cloudrc.cloud.controllers import STAND_STILL, Controller, ControlOutput
 from cloudrc.config.schema import Positive, ServerUrl
 from cloudrc.messages import Odometry, Setpoint
 
-Answer: TypeAlias = tuple[float, Sequence[Sequence[float]]]
+Answer = tuple[float, Sequence[Sequence[float]]]
 """Age of the answered observation [s], and the rows vx, vy, vz [m/s], world frame, yaw rate [rad/s]
 for its period and the following ones; without rows cloud sends nothing."""
-Surroundings: TypeAlias = Callable[[], tuple[int, Odometry | None, float, float]]
+Surroundings = Callable[[], tuple[int, Odometry | None, float, float]]
 """Function that returns cloud's time [ns], the newest odometry as it has arrived, the newest loop
 delay [s], NaN before the first, and the horizon [s]."""
 ROUNDING = 1e-6

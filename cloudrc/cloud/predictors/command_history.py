@@ -9,7 +9,6 @@ from bisect import bisect_right
 from copy import copy
 from math import ceil, exp
 from pathlib import Path
-from typing import TypeAlias
 
 from cloudrc.cloud.motion import Body
 from cloudrc.cloud.predictors._history import COUNT, PERIOD_NS, Replay
@@ -20,7 +19,7 @@ from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Command, Odometry, Vector
 from cloudrc.outside.document import read_document
 
-Axes: TypeAlias = tuple[Vector, ...]
+Axes = tuple[Vector, ...]
 """Time constant [s], dead time [s] and gain [1] of x, y and z."""
 ACCELERATION_MAX = DEFAULT_LIMITS.acceleration_max_mps2
 """Acceleration limit of the model of an unknown robot [m/s^2]."""

@@ -9,7 +9,7 @@ Source: docs/reference/control.md, "Predictors", (f).
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from cloudrc.config.robot import RobotFacts
 from cloudrc.config.schema import PlugIn, Positive
 from cloudrc.messages import Command, Odometry
 
-Array: TypeAlias = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 
 class Kalman(Predictor):

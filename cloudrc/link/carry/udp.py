@@ -16,7 +16,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from time import monotonic_ns, time_ns
-from typing import TypeAlias
 
 from cloudrc.files import at_place
 from cloudrc.link.carry.engine import BATCH, Engine, LinkWay, Packet
@@ -24,8 +23,8 @@ from cloudrc.link.carry.log import PacketLog, ReleaseErrors
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
 
-Address: TypeAlias = tuple[str, int]
-Peek: TypeAlias = Callable[[bytes], tuple[int, int, int]]
+Address = tuple[str, int]
+Peek = Callable[[bytes], tuple[int, int, int]]
 """Function that returns kind, epoch and counter of a datagram, or raises a ValueError."""
 
 IN_FLIGHT_MAX = 10_000  # datagrams in flight in one direction; more are dropped and counted

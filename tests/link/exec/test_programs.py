@@ -210,7 +210,12 @@ def test_link_set_changes_the_link_between_running_programs(folder):
 def test_metrics_and_an_exposed_port_are_on_this_machine(folder):
     metrics, exposed = free_ports(2)
     process = start(
-        *("--link", "paper-p3", "--metrics-port", str(metrics), "--expose", str(exposed)),
+        "--link",
+        "paper-p3",
+        "--metrics-port",
+        str(metrics),
+        "--expose",
+        str(exposed),
         server=f"exec {sys.executable} -m http.server {exposed}",
         client="sleep 60",
     )
@@ -258,7 +263,8 @@ def alive(namespaces):
 @pytest.mark.parametrize(
     "way",
     [
-        *("SIGTERM", "holder"),
+        "SIGTERM",
+        "holder",
         pytest.param("SIGKILL", marks=pytest.mark.smoke),
     ],
 )
