@@ -60,7 +60,12 @@ stamps = st.integers(0, 10**15)
 plans = st.lists(vectors, max_size=5).map(tuple)
 commands = st.builds(Command, stamps, stamps, st.just(0), vectors, numbers, plans, stamps)
 setpoints = st.builds(
-    Setpoint, vectors, st.floats(-10 * pi, 10 * pi), velocity=vectors, motion=st.none()
+    Setpoint,
+    vectors,
+    st.floats(-10 * pi, 10 * pi),
+    velocity=vectors,
+    motion=st.none(),
+    yaw_rate=numbers,
 )
 
 
