@@ -41,7 +41,7 @@ from cloudrc.world.robot import STEP_NS, Robot
 
 
 class RobotInvariants:
-    """Checks one robot after every step of its physics; an `Observer`."""
+    """Checks one robot after every step of its physics; times are on world's clock [ns]."""
 
     def __init__(self, robot: Robot, watch: Watch, start_ns: int, honest: bool) -> None:
         """Check a robot from `start_ns` [ns] on; check its contacts only if cloud is `honest`."""
@@ -55,7 +55,7 @@ class RobotInvariants:
         robot.observers.append(self)
 
     def see_step(self, now_ns: int, readings: Readings, commands: Commands) -> None:
-        """Implement `Observer.see_step`: check all invariants."""
+        """Check all invariants in a step that begins at `now_ns` [ns]."""
         steps, was, state = self._simulator.steps, self._was, self._guard.state
         motion, contacts, orders, watch = self._motion, self._contacts, self._orders, self._watch
         watch.now_ns = now_ns
@@ -87,13 +87,13 @@ class RobotInvariants:
         self._was = self._state = state
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """Implement `Observer.see_command`: check an accepted command's age, count invalid ones."""
+        """Check an accepted command's age, count invalid ones; `rejection` is None if accepted."""
         self._watch.now_ns = now_ns
         self._orders.see_command(command, rejection, self._state)
         self._state = self._guard.state
 
     def see_request(self, request: OperatorRequest, now_ns: int) -> None:
-        """Implement `Observer.see_request`: store what the request allows the robot to do."""
+        """Store what a request allows the robot to do, which it has carried out at `now_ns`."""
         self._watch.now_ns = now_ns
         if request.request is Request.START and request.start is Start.SPAWN:
             self._steps, self._contacts.is_asked = 0, True
@@ -105,5 +105,5 @@ class RobotInvariants:
         self._state = self._guard.state
 
     def see_session(self, now_ns: int) -> None:
-        """Implement `Observer.see_session`: forget the commands of the old session."""
+        """Forget the commands of the old session: the guard has forgotten them, too."""
         self._orders.forget_commands()

@@ -26,7 +26,7 @@ from cloudrc.sim.plant import Wind
 from cloudrc.sim.scene import compile_model, compile_true, find_part, find_sensors
 from cloudrc.sim.simulator import Simulator, rest_height
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.robot import STEP, AcceleratedRobot, Robot
+from cloudrc.world.robot import STEP, Robot
 
 KIND = "onboard"
 """Kind of plug-in."""
@@ -91,20 +91,15 @@ def _connect(
     onboard: Onboard,
     limits: ResolvedGuard,
 ) -> Robot:
-    """Make the robot of its parts, with the code that runs its usual steps faster if there is any.
-
-    A shipped accelerator runs no code of a user.
-    """
-    robot, faster = known_robot(world.robot), accelerator(world, plugin)
-    guard = Guard(limits, steered_in(world), robot.guard)
-    name = "" if plugin.is_shipped else Path(robot.onboard.name).name
-    if faster is None or faster.make is None:
-        with plugin.calling("build"):
-            return Robot(simulator, onboard, guard, name)
-    if plugin.is_shipped:
-        return faster.make(simulator, onboard, guard)  # type: ignore[no-any-return]
-    with plugin.calling("accelerator"):
-        return AcceleratedRobot(simulator, onboard, guard, name, faster.make)
+    """Make the robot of its parts, with what runs its usual steps faster, if there is any."""
+    files, faster = known_robot(world.robot), accelerator(world, plugin)
+    guard = Guard(limits, steered_in(world), files.guard)
+    make = Robot if faster is None else faster.make or Robot
+    with plugin.calling("build" if make is Robot else "accelerator"):
+        robot: Robot = make(simulator, onboard, guard)
+    if not plugin.is_shipped:
+        robot.name = Path(files.onboard.name).name
+    return robot
 
 
 def advise(world: World, gains: Vector) -> tuple[str, ...]:

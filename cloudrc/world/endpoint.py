@@ -181,7 +181,7 @@ class WorldEndpoint(TunnelEnd):
                 self._sample(tick_ns)
             sample_ns = self._sample_ns
             stop_ns = sample_ns if sample_ns < until_ns else until_ns
-            tick_ns = self._tick_ns = self.robot.run(tick_ns, stop_ns)
+            tick_ns = self._tick_ns = self.robot.advance(tick_ns, stop_ns)
         if samples and tick_ns == self._sample_ns:
             self._sample(tick_ns)
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from cloudrc.errors import describe_error
-from cloudrc.messages import Command, GuardState, OperatorRequest, Vector
+from cloudrc.messages import GuardState, Vector
 from cloudrc.outside.code import FAILURES, check_failure, locate, stack_of
 from cloudrc.outside.values import RESULT, InvalidValueError
 from cloudrc.records import Fault
@@ -23,40 +22,25 @@ STEP = STEP_NS * 1e-9
 TRACK, ESTOP = GuardState.TRACK, GuardState.ESTOP  # looking up a member of an enum is slow
 
 
-class Observer(Protocol):
-    """Object that a `Robot` informs of its steps and inputs. Times are on world's clock [ns]."""
-
-    def see_step(self, now_ns: int, readings: Readings, commands: Commands) -> None:
-        """Observe a physics step that begins at `now_ns` with these readings and commands."""
-
-    def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """Observe a command and the guard's answer; `rejection` is None if the guard accepts it."""
-
-    def see_request(self, request: OperatorRequest, now_ns: int) -> None:
-        """Observe that the robot has carried out an operator request at `now_ns`."""
-
-    def see_session(self, now_ns: int) -> None:
-        """Observe that a new session begins; the guard has forgotten all earlier commands."""
-
-
 class Robot:
     """Runs physics, guard and onboard controller step by step, and informs `observers`.
+
+    An observer has the methods of `faults.invariants.RobotInvariants`.
 
     Onboard controller and actuators may be code of a user. If it fails in flight, the guard stops
     the robot.
 
     Attributes:
         failure: Why the guard stopped the robot, until a caller sets None; None: no failure.
+        name: Name of the user's file whose code steers or steps the robot, which is judged; "" if
+            all code is cloudrc's.
     """
 
-    def __init__(
-        self, simulator: Simulator, onboard: Onboard, guard: Guard, name: str = ""
-    ) -> None:
-        """Connect the parts; `name` is that of a user's onboard controller, which is judged."""
+    def __init__(self, simulator: Simulator, onboard: Onboard, guard: Guard) -> None:
         self.simulator, self.onboard, self.guard = simulator, onboard, guard
-        self.observers: list[Observer] = []
+        self.observers = list[Any]()
         self.failure: Fault | None = None
-        self._name, self._size = name, len(onboard.stopped)
+        self.name, self._size = "", len(onboard.stopped)
         self._update, self._brake = onboard.update, onboard.brake
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
@@ -79,7 +63,23 @@ class Robot:
             commands = self._brake(readings, velocity)
         else:
             commands = self._update(readings, velocity, yaw_rate)
-        return RESULT.row(commands, self._size, "result") if self._name else commands
+        return RESULT.row(commands, self._size, "result") if self.name else commands
+
+    def advance(self, tick_ns: int, until_ns: int) -> int:
+        """Run steps as `run` does; if the user's code that runs them fails, Python runs them.
+
+        Then the guard has stopped the robot.
+        """
+        try:
+            ended_ns = self.run(tick_ns, until_ns)
+            if self.name:
+                RESULT.array(self.simulator.data.qvel, "velocity")
+            return ended_ns
+        except FAILURES as error:
+            if not self.name:
+                raise
+            self._fail(error, tick_ns)
+            return Robot.run(self, tick_ns, until_ns)
 
     def run(self, tick_ns: int, until_ns: int) -> int:
         """Run steps from `tick_ns` up to `until_ns`; return the time of the next step [ns]."""
@@ -116,51 +116,8 @@ class Robot:
         """Let the guard stop the robot because of `error` in the code of a user."""
         check_failure(error, "the onboard controller")
         if self.guard.state is not ESTOP:  # a stopped robot may fail in every step
-            place = self._name if isinstance(error, InvalidValueError) else locate(error)
+            place = self.name if isinstance(error, InvalidValueError) else locate(error)
             what = f"the onboard controller failed ({describe_error(error)}, {place})"
             text = f"{what}; the guard stopped the robot; fix the file"
             self.failure = Fault(now_ns, "onboard_failed", text, stack_of(error))
         self.guard.fail(now_ns)
-
-
-class AcceleratedRobot(Robot):
-    """A `Robot` whose steps run in code of a user, until this code fails.
-
-    Then the guard stops the robot, and Python runs all steps until the robot is on the ground.
-    """
-
-    def __init__(
-        self,
-        simulator: Simulator,
-        onboard: Onboard,
-        guard: Guard,
-        name: str,
-        make: Callable[..., Any],
-    ) -> None:
-        """Make the other code, a `Robot`, with `make`; `name` is that of the user's file."""
-        super().__init__(simulator, onboard, guard, name)
-        self._faster: Robot = make(simulator, onboard, guard)
-        self._faster.observers = self.observers
-        self._has_failed = False
-
-    def put_on_ground(self, now_ns: int, cause: str) -> None:
-        """Reset the robot to its spawn, stopped, and record the reason `cause`."""
-        self._has_failed = False
-        try:
-            self._faster.put_on_ground(now_ns, cause)
-        except FAILURES as error:
-            self._fail(error, now_ns)
-
-    def run(self, tick_ns: int, until_ns: int) -> int:
-        """Run steps from `tick_ns` up to `until_ns`; return the time of the next step [ns]."""
-        if self._has_failed:
-            return super().run(tick_ns, until_ns)
-        try:
-            ended_ns = self._faster.run(tick_ns, until_ns)
-            RESULT.array(self.simulator.data.qvel, "velocity")
-        except FAILURES as error:
-            self._has_failed = True
-            self._fail(error, tick_ns)
-            return super().run(tick_ns, until_ns)
-        self.failure, self._faster.failure = self._faster.failure or self.failure, None
-        return ended_ns
