@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import socket
 import socketserver
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +15,7 @@ from prometheus_client import CollectorRegistry, ProcessCollector, generate_late
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric as Family
 
+from cloudrc.drivers.servers import TEXT, HttpHandler, ThreadedServer
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.exposition.live import CellMetrics, LinkMetrics, LiveMetrics
 from cloudrc.exposition.parts import Histogram, Readings, samples
@@ -47,26 +46,23 @@ class Answer(NamedTuple):
 
     status: int
     content: str
-    kind: str = "text/plain; charset=utf-8"
+    kind: str = TEXT
 
 
-class _Server(socketserver.ThreadingTCPServer):
+class _Server(ThreadedServer, socketserver.TCPServer):
     """Answers each request on its own thread.
 
     Unlike `http.server.HTTPServer`, it never waits for a name server. The queue of new connections
     is long, so that health checks by Kubernetes succeed during a burst of connections.
     """
 
-    allow_reuse_address = True
-    daemon_threads = True
-    block_on_close = False
     request_queue_size = 1_024
 
     def __init__(self, address: tuple[str, int], pages: Mapping[str, Callable[[], Answer]]) -> None:
         self.pages, self._newest = pages, deque[socket.socket]()
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         super().__init__(address, _Handler)
-        threading.Thread(target=self.serve_forever, args=(0.25,), daemon=True).start()
+        self.start()
 
     def server_bind(self) -> None:
         """Bind the address; the host `::` accepts IPv6 and IPv4."""
@@ -82,28 +78,16 @@ class _Server(socketserver.ThreadingTCPServer):
                 self._newest.popleft().shutdown(socket.SHUT_RDWR)
         super().process_request(request, client_address)
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore the errors of clients that disconnect early."""
 
-
-class _Handler(BaseHTTPRequestHandler):
-    """Answers one request and closes the connection."""
-
+class _Handler(HttpHandler):
     server: _Server
     timeout = CLIENT_WAIT_MAX
 
-    def do_GET(self) -> None:
+    def do_GET(self) -> None:  # noqa: N802
         page = self.server.pages.get(self.path.partition("?")[0])
-        answer = page() if page else Answer(404, f"there are {', '.join(self.server.pages)}\n")
-        content = answer.content.encode()
-        self.send_response(answer.status)
-        self.send_header("Content-Type", answer.kind)
-        self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
-        self.wfile.write(content)
-
-    def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing, because a request arrives every few seconds."""
+        self.answer(
+            *(page() if page else Answer(404, f"there are {', '.join(self.server.pages)}\n"))
+        )
 
 
 def read_throttling(root: Path = CGROUP) -> Readings:
@@ -215,10 +199,9 @@ class Exporter:
         return int(self._server.server_address[1])
 
     def close(self) -> None:
-        """Stop the server; this takes up to 0.25 s."""
+        """Stop the server."""
         if self._server is not None:
-            self._server.shutdown()
-            self._server.server_close()
+            self._server.close()
             self._server = None
 
     def collect(self) -> Iterator[Family]:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 import socket
 import socketserver
-import threading
 import time
 from collections.abc import Callable
-from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
+from cloudrc.drivers.servers import HttpHandler, ThreadedServer
 from cloudrc.errors import CloudrcError
 from cloudrc.link.control import APPLY_LIMIT, OK, REFUSED, read_answer
 from cloudrc.link.state import LinkState, to_text
@@ -27,38 +26,32 @@ State = Callable[[], LinkState | None]
 """Function that returns the present state of the direction."""
 
 
-class ControlServer(socketserver.ThreadingMixIn, socketserver.UnixStreamServer):
+class ControlServer(ThreadedServer, socketserver.UnixStreamServer):
     """Answers on a socket that only the user of this process can open."""
-
-    daemon_threads = True
-    block_on_close = False
 
     def __init__(self, path: Path, change: Change, state: State) -> None:
         """Serve at `path`, on threads of its own."""
         self.change, self.state = change, state
         path.unlink(missing_ok=True)  # of an earlier process
         super().__init__(str(path), _Handler)
-        threading.Thread(target=self.serve_forever, args=(0.25,), daemon=True).start()
+        self.start()
 
     def server_bind(self) -> None:
         """Bind the socket; it has its rights before it listens."""
         super().server_bind()
         os.chmod(str(self.server_address), 0o600)
 
-    def handle_error(self, request: object, client_address: object) -> None:
-        """Ignore the errors of clients that disconnect early."""
 
-
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(HttpHandler):
     server: ControlServer
     timeout = APPLY_LIMIT
 
-    def do_PUT(self) -> None:
+    def do_PUT(self) -> None:  # noqa: N802
         size = int(self.headers.get("Content-Length") or 0)
         try:
             number = self.server.change(self.rfile.read(size))
         except (CloudrcError, ValueError, OSError) as error:
-            self._answer(REFUSED, str(error))
+            self.answer(REFUSED, str(error))
             return
         until = time.monotonic() + APPLY_LIMIT
         while (state := self.server.state()) is None or number not in (state.change, state.refused):
@@ -66,19 +59,9 @@ class _Handler(BaseHTTPRequestHandler):
                 break
             time.sleep(LOOK_PERIOD)
         if state is None:
-            self._answer(REFUSED, "the link waits for the address of its peer")
+            self.answer(REFUSED, "the link waits for the address of its peer")
         else:
-            self._answer(OK, to_text(state))
-
-    def _answer(self, status: int, text: str) -> None:
-        content = text.encode()
-        self.send_response(status)
-        self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
-        self.wfile.write(content)
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Log nothing: the sidecar logs each change."""
+            self.answer(OK, to_text(state), "application/json")
 
 
 def ask(path: Path, request: bytes) -> LinkState:

@@ -18,6 +18,7 @@ from functools import partial
 from typing import IO, Any, NamedTuple
 
 from cloudrc.drivers.machine import await_or_kill, interpreter
+from cloudrc.drivers.servers import ThreadedServer
 from cloudrc.errors import InvalidRunError, MissingPrerequisiteError
 from cloudrc.files import at_place
 from cloudrc.link.exec import namespace
@@ -178,24 +179,15 @@ class _Forwarded(socketserver.BaseRequestHandler):
             back.join()
 
 
-class Forwarder(socketserver.ThreadingTCPServer):
+class Forwarder(ThreadedServer, socketserver.TCPServer):
     """Forwards connections to a port of this machine to the same port in a namespace."""
-
-    daemon_threads = True
-    block_on_close = False
-    allow_reuse_address = True
 
     def __init__(self, end: ProgramEnd, port: int) -> None:
         """Listen at `port` on 127.0.0.1, on threads of its own."""
         self._end, self._port = end, port
         with at_place(f"--expose {port}"):
             super().__init__(("127.0.0.1", port), _Forwarded)
-        threading.Thread(target=self.serve_forever, args=(0.1,), daemon=True).start()
-
-    def close(self) -> None:
-        """Accept no more connections."""
-        self.shutdown()
-        self.server_close()
+        self.start()
 
     def connect(self) -> socket.socket:
         """Connect to the program: at the address of the link, else at its own loopback address."""
@@ -203,9 +195,6 @@ class Forwarder(socketserver.ThreadingTCPServer):
             return self._end.connect(namespace.ADDRESSES[self._end.name].ipv4, self._port)
         except OSError:
             return self._end.connect("127.0.0.1", self._port)
-
-    def handle_error(self, request: object, client_address: object) -> None:
-        """Ignore a program that does not listen, and clients that disconnect early."""
 
 
 def _pump(source: socket.socket, target: socket.socket) -> None:

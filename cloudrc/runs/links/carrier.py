@@ -129,9 +129,13 @@ class LiveLink:
         for way in DIRECTIONS:
             self._publish(way, time.monotonic_ns())
             take, state = partial(self._take, way), partial(self.states.get, way)
-            server = ControlServer(link_socket(self.url, way), take, state)
-            self._stack.callback(server.server_close)
-            self._stack.callback(server.shutdown)
+            self._servers.append(ControlServer(link_socket(self.url, way), take, state))
+
+    def close(self) -> None:
+        """Take no more changes, and remove the states."""
+        for server in self._servers:
+            server.close()
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def status_page(self) -> str:
         """Return the states of both directions as JSON. Any thread may call this method."""
