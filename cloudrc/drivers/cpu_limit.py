@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from cloudrc.drivers.machine import CGROUP, CGROUPS
@@ -62,7 +62,9 @@ def _groups(quota_us: int) -> Iterator[tuple[Path, Path, Mapping[str, str]]]:
 
 
 def _remove(group: Path) -> None:
-    with suppress(OSError):
+    """Remove a control group, unless a process is in it or it was not made."""
+    processes = group / "cgroup.procs"
+    if processes.exists() and not processes.read_text():
         group.rmdir()
 
 

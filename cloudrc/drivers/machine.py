@@ -96,7 +96,8 @@ def signal_group(process: subprocess.Popen[Any], number: int) -> None:
 
 def await_or_kill(process: subprocess.Popen[Any], limit: float) -> None:
     """Wait at most `limit` [s] for the end of a process, then kill it."""
-    with suppress(subprocess.TimeoutExpired):
+    try:
         process.wait(limit)
-    process.kill()
-    process.wait()
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

@@ -17,8 +17,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from cloudrc.drivers.process import from_line, to_line
-from cloudrc.drivers.teleop import bind_datagrams, receive_all
-from cloudrc.link.carry.datagrams import send_or_lose
+from cloudrc.drivers.teleop import bind_datagrams
+from cloudrc.link.carry.datagrams import receive_all, send_or_lose
 from cloudrc.messages import Telemetry
 from cloudrc.records import Record, TelemetrySent
 

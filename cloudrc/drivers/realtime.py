@@ -14,12 +14,13 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from ipaddress import ip_address
+from itertools import islice
 from pathlib import Path
 
 from cloudrc.endpoint import Endpoint
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.files import Watched, read
-from cloudrc.link.carry.datagrams import send_or_lose
+from cloudrc.link.carry.datagrams import receive_all, send_or_lose
 from cloudrc.records import Lateness, Record
 from cloudrc.tunnel.codec import DATAGRAM_MAX
 
@@ -95,15 +96,7 @@ class Peer:
 
         A datagram longer than DATAGRAM_MAX is cut to DATAGRAM_MAX + 1 bytes; decoding rejects it.
         """
-        datagrams: list[bytes] = []
-        while len(datagrams) < most:
-            try:
-                datagrams.append(self.socket.recv(DATAGRAM_MAX + 1))
-            except BlockingIOError:
-                break
-            except ConnectionRefusedError:  # nobody received a datagram that we sent before
-                continue
-        return datagrams
+        return list(islice(receive_all(self.socket, DATAGRAM_MAX + 1), most))
 
     def send(self, datagrams: list[bytes]) -> None:
         """Send datagrams; drop them if the address is unknown or the socket rejects them."""

@@ -8,7 +8,6 @@ operating system still writes the data to the disk.
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import threading
 import time
@@ -118,10 +117,8 @@ class Recorder:
         queue = self._queue
         queue.extend(records)
         while len(queue) > CAPACITY:
-            # The other thread may have emptied the queue in the meantime.
-            with contextlib.suppress(IndexError):
-                self._lose(queue.popleft())
-                self._overflowed += 1
+            self._lose(queue.popleft())
+            self._overflowed += 1
 
     def _lose(self, record: Record) -> None:
         """Remember when a record was lost."""

@@ -10,13 +10,13 @@ from __future__ import annotations
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.files import at_place
+from cloudrc.link.carry.datagrams import receive_all
 from cloudrc.messages import OperatorRequest, Request, Setpoint
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop.wire import Message, Output, RobotStatus, decode, encode
@@ -44,13 +44,6 @@ EVENTS_KEPT = 256
 """Largest number of mission events that teleop stores while cloud does not accept them."""
 Make = Callable[[int], None]
 """Function that makes the calls that other threads have queued, at a time [ns], monotonic clock."""
-
-
-def receive_all(one: socket.socket, size_max: int) -> Iterator[bytes]:
-    """Yield the datagrams that have arrived, each of at most `size_max` bytes."""
-    with suppress(BlockingIOError, ConnectionResetError):
-        while True:
-            yield one.recv(size_max)
 
 
 def bind_datagrams(path: Path) -> socket.socket:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
-import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -33,7 +31,7 @@ from cloudrc.link.traces import SIZE_MAX, link_profile
 from cloudrc.link.verify.judge import Flow
 from cloudrc.messages import GuardState, plan_length
 from cloudrc.outside.code import apart
-from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, warn
+from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, repeat, warn
 from cloudrc.records import Fault
 from cloudrc.runs.requirements import require
 from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES, Kind
@@ -196,17 +194,15 @@ def open_end(settings: EndSettings, name: str) -> tuple[ResolvedExperiment, Iden
 
 def follow_peer(peer: Address, route: Path) -> None:
     """Keep the address of `peer` in the file `route`, as a link process does, on a thread."""
-    name = PeerName(peer, ipv4_addresses, warn)
+    name, written = PeerName(peer, ipv4_addresses, warn), None
 
-    def work() -> None:
-        written = None
-        while True:
-            if (found := name.poll()) != written and found:
-                write_atomically(route, f"{show_address(found)}\n".encode())
-                written = found
-            time.sleep(random.uniform(*PEER_PAUSE))
+    def look() -> None:
+        nonlocal written
+        if (found := name.poll()) != written and found:
+            write_atomically(route, f"{show_address(found)}\n".encode())
+            written = found
 
-    threading.Thread(target=work, daemon=True).start()
+    repeat(look, *PEER_PAUSE)
 
 
 def open_recorder(
@@ -214,7 +210,7 @@ def open_recorder(
     limit: float | None,
     clock: str,
     clock_id: bytes,
-    attached: Mapping[str, bytes] | None = None,
+    attached: Mapping[str, bytes],
 ) -> Recorder:
     """Make the recorder of world or cloud, which writes to `path`.
 
@@ -244,7 +240,7 @@ def open_recorder(
             code=source.code_hash(),
             index=False,
         )
-        for name, data in (attached or {}).items():
+        for name, data in attached.items():
             writer.attach(name, data)
         return writer
 

@@ -8,10 +8,7 @@ and ip for this answer.
 from __future__ import annotations
 
 import json
-import random
-import threading
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -39,7 +36,7 @@ from cloudrc.link.netem import Netem, find_netems
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.sidecar import Make, Sidecar
 from cloudrc.link.traces import link_profile
-from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, warn
+from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, repeat, warn
 from cloudrc.tunnel.codec import peek
 
 RELEASED_PERIOD = 1.0
@@ -110,9 +107,9 @@ def run_link(settings: LinkSettings, stop: StopSignal) -> None:
         if settings.control:
             ControlServer(settings.control, change, lambda: sidecar.state)
         try:
-            _repeat(poll_profile, PROFILE_PERIOD, PROFILE_PERIOD)
-            _repeat(resolve_peer, *PEER_PAUSE)
-            _repeat(sidecar.publish_released, RELEASED_PERIOD, RELEASED_PERIOD)
+            repeat(poll_profile, PROFILE_PERIOD, PROFILE_PERIOD)
+            repeat(resolve_peer, *PEER_PAUSE)
+            repeat(sidecar.publish_released, RELEASED_PERIOD, RELEASED_PERIOD)
             alive = feed.alive_while(stop)
             sidecar.run(lambda: alive() if sidecar.state else stop())
         finally:
@@ -145,15 +142,6 @@ def _relay_maker(settings: LinkSettings, experiment: ResolvedExperiment) -> Make
             return Relay(settings.listen, direction, peek, settings.end)
 
     return relay
-
-
-def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None:
-    def work() -> None:
-        while True:
-            action()
-            time.sleep(random.uniform(shortest, longest))
-
-    threading.Thread(target=work, daemon=True).start()
 
 
 def status_page(sidecar: Sidecar) -> str:

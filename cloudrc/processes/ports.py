@@ -1,11 +1,14 @@
-"""Open the ports of a process, and warn if other machines can reach them."""
+"""Open the ports of a process, and warn if other machines can reach them; repeat an action."""
 
 from __future__ import annotations
 
 import os
+import random
 import socket
 import sys
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -44,6 +47,17 @@ def warn_if_exposed(listen: Address) -> None:
         return
     if not listen[0].startswith("127.") and listen[0] not in ("localhost", "::1"):
         warn(f"warning: {listen[0]} can be reached from outside")
+
+
+def repeat(action: Callable[[], None], shortest: float, longest: float) -> None:
+    """Repeat an action on a thread, with random pauses between two lengths [s]."""
+
+    def work() -> None:
+        while True:
+            action()
+            time.sleep(random.uniform(shortest, longest))
+
+    threading.Thread(target=work, daemon=True).start()
 
 
 @contextmanager

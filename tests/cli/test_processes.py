@@ -90,7 +90,7 @@ def test_sizes_are_read_as_in_kubernetes():
 
 
 def started(path, size_max=None):
-    return ends.open_recorder(path, size_max, "world", b"id")
+    return ends.open_recorder(path, size_max, "world", b"id", {})
 
 
 def write_down(recorder, records):
