@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import pairwise
-from math import dist, hypot, isfinite, nan
+from math import dist, hypot, nan
 from typing import Any, Literal, TypeAlias
 
 from cloudrc.faults.adversary import Lie
@@ -53,8 +53,7 @@ class Requirement:
     @property
     def passed(self) -> bool:
         """Whether `measured` complies with `limit`; False if `measured` is NaN (not measured)."""
-        known = isfinite(self.measured)
-        return known and bool(_COMPARE[self.relation](self.measured, self.limit))
+        return bool(_COMPARE[self.relation](self.measured, self.limit))
 
     def show(self) -> str:
         """Format the check on one line: its text, the measured value and the limit."""
@@ -214,9 +213,10 @@ def changes_into(flight: FaultRun, state: GuardState) -> list[GuardChange]:
     return [c for c in flight.changes if c.state is state and c.cause != ENDED]
 
 
-def first_into(flight: FaultRun, state: GuardState) -> float:
-    """Return when the guard first changed to `state` [s]; NaN if it never did."""
-    return next((c.stamp_ns * 1e-9 for c in changes_into(flight, state)), nan)
+def first_into(flight: FaultRun, state: GuardState, since: float = 0.0) -> float:
+    """Return when the guard first changed to `state`, from `since` on [s]; NaN if it never did."""
+    times = (change.stamp_ns * 1e-9 for change in changes_into(flight, state))
+    return next((time for time in times if time >= since - 1e-9), nan)
 
 
 def held(flight: FaultRun) -> list[GuardChange]:
@@ -231,12 +231,6 @@ def basis_age_at_hold(flight: FaultRun) -> float:
         before = [each.basis_stamp_ns for each in applied if each.stamp_ns <= change.stamp_ns]
         ages += [(change.stamp_ns - max(before)) * 1e-9] if before else []
     return max(ages, default=nan)
-
-
-def resumed_after(flight: FaultRun, back: float) -> float:
-    """Return the time from `back` [s] until the guard next changed to TRACK [s]; NaN if never."""
-    delays = [c.stamp_ns * 1e-9 - back for c in changes_into(flight, GuardState.TRACK)]
-    return next((delay for delay in delays if delay >= -1e-9), nan)
 
 
 def busiest_second(changes: Sequence[GuardChange]) -> int:

@@ -21,7 +21,6 @@ from cloudrc.faults.measures import (
     epochs,
     events_of_missions,
     first_into,
-    resumed_after,
     scenario,
     told,
 )
@@ -57,7 +56,9 @@ def _cloud_killed(outcome: Outcome) -> None:
     commands = [r.stamp_ns * 1e-9 - at for r in flight.of(CommandApplied)]
     again = min((t for t in commands if t > down), default=nan)
     outcome.most("the new process commands after", again, 2.0, "s")
-    outcome.most("TRACK again after its start", resumed_after(flight, at + down), 1.0, "s")
+    back = at + down
+    tracked = first_into(flight, GuardState.TRACK, back) - back
+    outcome.most("TRACK again after its start", tracked, 1.0, "s")
     outcome.least("epochs opened", len(epochs(flight)), 3)
 
 

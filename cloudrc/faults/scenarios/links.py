@@ -13,7 +13,6 @@ from cloudrc.faults.measures import (
     first_into,
     held,
     number,
-    resumed_after,
     scenario,
 )
 from cloudrc.faults.schedule import WAYS, FaultEvent
@@ -64,7 +63,8 @@ def _silence(outcome: Outcome) -> None:
             began = first_into(flight, GuardState.HOLD)
             outcome.most(f"{what}: below 0.05 m/s after", calm_after(flight, began, back), 1.0, "s")
             outcome.most(f"{what}: drift", drift(flight, began + 2.0, back), 0.10, "m")
-        outcome.most(f"{what}: resumed after", resumed_after(flight, back), 1.0, "s")
+        resumed = first_into(flight, GuardState.TRACK, back) - back
+        outcome.most(f"{what}: resumed after", resumed, 1.0, "s")
 
 
 @scenario(
