@@ -9,7 +9,7 @@ from cloudrc.sim.engine import mujoco
 def place(folder, name, content):
     file = folder / name
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(content if isinstance(content, bytes) else content.encode())
+    file.write_text(content)
     return file
 
 
@@ -17,20 +17,19 @@ def mjcf(inner):
     return f"<mujoco>{inner}</mujoco>"
 
 
-CORNERS = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
 
 @pytest.mark.parametrize(
     ("compiler", "name", "mesh"),
     [
         ("", "m.obj", "m.obj"),
-        ("", "m.obj", "sub/m.obj"),
+        ("", "sub/m.obj", "sub/m.obj"),
         ('meshdir="shapes"', "shapes/m.obj", "m.obj"),
     ],
 )
 def test_a_mesh_is_found_where_mujoco_reads_it(tmp_path, compiler, name, mesh):
-    compiler = compiler.format(folder=tmp_path, name=tmp_path.name)
-    file = place(tmp_path, "sub/m.obj" if mesh.startswith("sub") else name, CORNERS)
+    file = place(tmp_path, name, CORNERS)
     asset = f'<compiler {compiler}/><asset><mesh name="m" file="{mesh}"/></asset>'
     scene = place(tmp_path, "scene.xml", mjcf(asset))
     mujoco.MjModel.from_xml_path(str(scene))
@@ -44,7 +43,7 @@ def test_nested_includes_and_attached_models_are_found(tmp_path):
         place(tmp_path, "dirs.xml", mjcf('<compiler meshdir="shapes"/>')),
         place(tmp_path, "shapes/m.obj", CORNERS),
         place(tmp_path, "other.xml", mjcf("")),
-        place(tmp_path, "sky/right.png", b""),
+        place(tmp_path, "sky/right.png", ""),
     ]
     sky = '<texture name="t" type="cube" fileright="right.png"/>'
     inner = f'<compiler texturedir="sky"/><asset><model name="o" file="other.xml"/>{sky}</asset>'

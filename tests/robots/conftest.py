@@ -5,6 +5,7 @@ import pytest
 from cloudrc.config.robot import find_robot
 
 CONTROLLER = find_robot("pelican").onboard.name
+HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
 
 
 @pytest.fixture

@@ -34,6 +34,15 @@ def drive(own_robot):
     return go
 
 
+def changed(changes):
+    """Return the text of the rover's model with other words."""
+    model = TEXT
+    for old, new in changes.items():
+        assert old in model
+        model = model.replace(old, new)
+    return model
+
+
 def heading(simulator):
     return atan2(simulator.readings.axes[1], simulator.readings.axes[0])
 
@@ -79,10 +88,7 @@ def test_no_wheel_is_faster_than_its_limit_and_turning_comes_first():
     ids=["gear", "radius", "track"],
 )
 def test_directions_gears_radius_and_track_of_the_wheels_come_from_the_model(drive, changes):
-    model = TEXT
-    for old, new in changes.items():
-        assert old in model
-        model = model.replace(old, new)
+    model = changed(changes)
     driven = drive((0.8, 0.0, 0.0, 0.0), model=model).readings
     assert driven.velocity == pytest.approx((0.8, 0.0, 0.0), abs=0.03)
     turned = drive((0.0, 0.0, 0.0, 0.5), model=model).readings
@@ -114,11 +120,7 @@ def test_a_robot_with_four_driven_wheels_drives(drive):
     ],
 )
 def test_a_model_without_such_wheels_is_refused_in_one_line(own_robot, changes, message):
-    model = TEXT
-    for old, new in changes.items():
-        assert old in model
-        model = model.replace(old, new)
-    folder = own_robot("onboard: diff_drive\nplanar: true", model)
+    folder = own_robot("onboard: diff_drive\nplanar: true", changed(changes))
     with pytest.raises(BadInputError) as error:
         check_robot(World(robot=str(folder), scene="empty"))
     assert message in str(error.value)

@@ -6,8 +6,8 @@ import cloudrc
 from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState
+from tests.robots.conftest import HOVER
 
-HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
 FAILS = """
 from cloudrc.robots.onboard.multirotor import build as general
 

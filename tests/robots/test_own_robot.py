@@ -5,9 +5,8 @@ import pytest
 import cloudrc
 from cloudrc.config.robot import find_robot
 from cloudrc.errors import BadInputError
-from tests.robots.conftest import CONTROLLER
+from tests.robots.conftest import CONTROLLER, HOVER
 
-HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
 SENSORS = "sensors: {contact_force: {unit: N, sensor: tip}}"
 CLIMBS = """
 from cloudrc.robots.pelican.onboard import actuators, build as published

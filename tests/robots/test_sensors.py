@@ -8,14 +8,9 @@ from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
 from cloudrc.robots.build import check_robot
-from tests.robots.conftest import CONTROLLER
+from tests.robots.conftest import CONTROLLER, HOVER
 
 PELICAN = find_robot("pelican").model.read_text()
-HOVER = {
-    "mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]},
-    "world.scene": "empty",
-    "link.profile": "ideal",
-}
 EYE = '<site name="eye" pos="0 0 -.1001" zaxis="0 0 -1"/><geom name="base" type="box"'
 SENSORS = """
     <touch name="tip" site="tip"/>

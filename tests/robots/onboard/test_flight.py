@@ -9,9 +9,9 @@ from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.robots.build import build_robot
 from cloudrc.robots.onboard._drag import RotorDrag
+from tests.robots.conftest import HOVER
 from tests.robots.onboard.conftest import nano, robot, x_layout
 
-HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
 MODEL = nano().replace('pos="0 0 2"', "")
 WEAK = robot(x_layout(0.14, 0.17, 0.02, 6.0), 1.3, ".03 .025 .05").replace('pos="0 0 2"', "")
 """Its thrust is 1.9 times its weight."""
@@ -24,18 +24,10 @@ def test_the_drag_of_robot_yaml_reaches_the_rotors(own_robot):
     assert isinstance(robot.simulator.actuators, RotorDrag)
 
 
-@pytest.mark.parametrize(
-    ("text", "settings", "message"),
-    [
-        ("onboard: Multirotor", {}, "robot.yaml: onboard: no onboard named 'Multirotor'"),
-    ],
-)
-def test_a_wrong_onboard_controller_is_refused_where_it_is_chosen(
-    own_robot, text, settings, message
-):
-    mine = own_robot(text, MODEL)
-    with pytest.raises(BadInputError, match=message):
-        cloudrc.fly("hover", HOVER | {"world.robot": str(mine)} | settings)
+def test_a_wrong_onboard_controller_is_refused_where_it_is_chosen(own_robot):
+    mine = own_robot("onboard: Multirotor", MODEL)
+    with pytest.raises(BadInputError, match=r"robot.yaml: onboard: no onboard named 'Multirotor'"):
+        cloudrc.fly("hover", HOVER | {"world.robot": str(mine)})
 
 
 @pytest.mark.parametrize(("braking", "error"), [(3, None), (10, BadInputError)])

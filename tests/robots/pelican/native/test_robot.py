@@ -173,11 +173,9 @@ def test_where_c_looks_for_no_contact_there_is_none(kind):
     assert 300 < free < 2900
 
 
-@pytest.mark.parametrize("setting", [{"density": 1.2}])
-def test_in_air_that_acts_on_geoms_c_uses_the_whole_model(setting):
+def test_in_air_that_acts_on_geoms_c_uses_the_whole_model():
     parts = simulate("pelican", "empty"), LowLevel(), Guard(LIMITS, FENCE)
-    for name, value in setting.items():
-        setattr(parts[0].model.opt, name, value)
+    parts[0].model.opt.density = 1.2
     assert NativeRobot(*parts)._flight.robot_radius == inf
 
 
