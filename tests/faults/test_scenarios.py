@@ -6,10 +6,10 @@ from cloudrc.faults.scenarios import SCENARIOS
 from cloudrc.faults.search import run_fault
 from tests.conftest import nightly
 
-QUICK = "cloud-killed", "world-restarted"
+QUICK = "world-restarted"
 
 
-@pytest.mark.parametrize("name", [*QUICK, *nightly(*sorted(SCENARIOS.keys() - set(QUICK)))])
+@pytest.mark.parametrize("name", [QUICK, *nightly(*sorted(SCENARIOS.keys() - {QUICK}))])
 def test_a_fault_passes_its_checks(name):
     outcome = run_fault(name, 2)
     assert [check.show() for check in outcome.checks if not check.passed] == []
@@ -19,21 +19,12 @@ def test_a_fault_passes_its_checks(name):
 @pytest.mark.parametrize(
     ("name", "broken", "value", "said"),
     [
-        (
-            "cloud-killed",
-            "cloudrc.world.guard.state.SETTLE_NS",
-            3 * 10**9,
-            "TRACK again after its start",
-        ),
-        (
-            "swizzle-clog",
-            "cloudrc.world.endpoint.REAL_TIME_FACTOR_MIN",
-            0.0,
-            "times that world reports",
-        ),
+        ("cloud-killed", "guard.state.SETTLE_NS", 3 * 10**9, "TRACK again after its start"),
+        ("swizzle-clog", "endpoint.REAL_TIME_FACTOR_MIN", 0.0, "times that world reports: late"),
     ],
 )
-def test_a_check_fails_if_its_promise_is_broken(name, broken, value, said, monkeypatch):
-    monkeypatch.setattr(broken, value)
+def test_only_the_checks_of_a_broken_promise_fail(name, broken, value, said, monkeypatch):
+    monkeypatch.setattr(f"cloudrc.world.{broken}", value)
     failed = [check.text for check in run_fault(name, 1).checks if not check.passed]
-    assert any(said in text for text in failed)
+    assert failed[-1] == said
+    assert set(failed) <= {said, "the new process commands after"}

@@ -55,10 +55,10 @@ def test_a_hostile_cloud_causes_no_breach(robot, policy):
 HELD = Schedule(
     3,
     events=(
-        *(FaultEvent("blackout", at, lasts) for at, lasts in ((6.0, 0.4), (6.8, 0.3), (9.5, 1.5))),
-        *(FaultEvent("stopped", 12.0), FaultEvent("blackout", 15.0, 3.0)),
+        *(FaultEvent("blackout", at, lasts) for at, lasts in ((3.0, 0.4), (3.8, 0.3), (6.0, 1.0))),
+        *(FaultEvent("stopped", 8.0), FaultEvent("blackout", 11.0, 2.6)),
     ),
-    duration=30.0,
+    duration=24.0,
     hold_max=2.0,
 )
 """Several HOLDs, a stop, and a LAND."""
@@ -80,7 +80,7 @@ def applies_late_commands(patch):
     ("breaks", "kind", "schedule"),
     [
         (lambda patch: None, "", HELD),
-        (ignores(limits, "ramp_ns", lambda *_: 0), "cap", replace(HELD, duration=9.0)),
+        (ignores(limits, "ramp_ns", lambda *_: 0), "cap", replace(HELD, duration=6.0)),
         (ignores(Guard, "_alone_max_ns", 3_600_000 * MS), "hold", HELD),
         (applies_late_commands, "order", Schedule(1, reorder=0.5, duration=4.0)),
         (ignores(EmergencyStopRepeater, "sound"), "obeyed", HELD),

@@ -39,7 +39,7 @@ def refusals(*positions, start="spawn", scene="pipes", **more):
     return "\n".join(map(str, problems))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(*[st.tuples(st.floats(-2.8, 9), st.floats(-8.3, 5.3), st.floats(0.4, 2.2))] * 2)
 def test_a_way_touches_a_wall_if_one_of_its_points_does(start, end):
     """Compare with the clearance of the metrics at points on the way, 1 cm apart."""

@@ -22,7 +22,7 @@ def build(robot, predictor, **keys):
 
 @pytest.mark.parametrize("robot", ["nano", *nightly("rover")])
 def test_a_predictor_with_the_robots_model_predicts_far_better_than_none(robot):
-    keys = {"world.robot": robot, "link.profile": "paper-p3", "mission.steps.count": 3}
+    keys = {"world.robot": robot, "link.profile": "paper-p3", "mission.steps.count": 2}
     if robot == "rover":
         keys |= {"mission": GROUND}
         del keys["mission.steps.count"]
@@ -76,7 +76,7 @@ def test_a_model_of_ones_own_may_lie_in_the_folder_and_gets_the_parameters(own_r
 def test_identify_writes_a_response_for_a_robot_on_the_ground(call, tmp_path, monkeypatch, no_page):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ground.yaml").write_text(json.dumps({
-        "mission": GROUND | {"steps": GROUND["steps"] | {"count": 12}},
+        "mission": GROUND | {"steps": GROUND["steps"] | {"count": 10}},
         "world": {"scene": "empty", "robot": "rover"}, "link": {"profile": "ideal"},
         "criteria": {"settle_m": None},
     }))  # fmt: skip

@@ -79,7 +79,7 @@ def test_full_speed_at_a_face_stops_before_it(flight, velocity):
 
 @pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize(
-    "seeds", [range(3), pytest.param(range(3, 203), marks=NIGHTLY)], ids=("3", "200")
+    "seeds", [range(1), pytest.param(range(1, 203), marks=NIGHTLY)], ids=("1", "202")
 )
 def test_a_hostile_cloud_does_not_get_it_out_of_the_fence(simulator, seeds):
     for seed in seeds:

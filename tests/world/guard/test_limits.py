@@ -78,7 +78,7 @@ VECTORS = st.tuples(ANY, ANY, ANY)
 PLACES = st.tuples(st.floats(-4, 10), st.floats(-9, 6), st.floats(-0.2, 3))
 SPEEDS = st.tuples(*[st.floats(-8, 8)] * 3)
 LOW, HIGH = FENCE.inner_low, FENCE.inner_high
-MANY = settings(max_examples=1000, deadline=None)
+MANY = settings(max_examples=400, deadline=None)
 
 
 def fenced(velocity, position, low=LOW):

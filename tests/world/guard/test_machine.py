@@ -195,4 +195,4 @@ class GuardMachine(RuleBasedStateMachine):
 
 
 TestGuardMachine = GuardMachine.TestCase
-TestGuardMachine.settings = settings(max_examples=200, stateful_step_count=25, deadline=None)
+TestGuardMachine.settings = settings(max_examples=100, stateful_step_count=25, deadline=None)

@@ -182,13 +182,14 @@ def test_in_air_that_acts_on_geoms_c_uses_the_whole_model():
 @pytest.mark.parametrize(
     ("name", "settings"),
     [
-        ("paper", ()),
-        ("steps", ("world.onboard.integral_limit_xy=0.3", "guard.speed_max_mps=0.5")),
+        ("steps", ("world.onboard.integral_limit_xy=0.3", "guard.speed_max_mps=0.5",
+                   "mission.steps.count=2")),
         ("fast", ("link.profile=lossy", "criteria.time_limit_s=5")),
-        pytest.param("paper-verbatim", (), marks=pytest.mark.full),
-        ("hover", ("link.uplink.blackouts=[{start_s: 8, duration_s: 3}]",)),
+        *(pytest.param(name, (), marks=pytest.mark.full) for name in ("paper", "paper-verbatim")),
+        ("hover", ("link.uplink.blackouts=[{start_s: 3, duration_s: 2}]",
+                   "mission.waypoints.0.dwell_s=3")),
     ],
-)
+)  # fmt: skip
 def test_an_experiment_has_the_same_records_in_c(name, settings, monkeypatch):
     experiment, identity = load_experiment(name, settings), Identity(CLOCK, bytes(16), ring())
     assert isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
