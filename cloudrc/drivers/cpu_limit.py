@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from cloudrc.drivers.machine import CGROUP, CGROUPS
+from cloudrc.drivers.machine import CGROUPS, control_groups
 
 QUOTA_PERIOD_US = 100_000
 """Time of which a limit gives a share [us].
@@ -48,15 +48,12 @@ def _groups(quota_us: int) -> Iterator[tuple[Path, Path, Mapping[str, str]]]:
     In version 2 a group with processes has no groups with limits in it, so the new one may have to
     be in a group above.
     """
-    lines = CGROUP.read_text().splitlines() if CGROUP.exists() else []
-    for names, path in (line.split(":", 2)[1:] for line in lines):
+    for names, home in control_groups():
         if not names:
-            home = CGROUPS / path.strip("/")
             for parent in (home, *home.parents):
                 if parent.is_relative_to(CGROUPS) and (parent / "cgroup.procs").exists():
                     yield home, parent, {"cpu.max": f"{quota_us} {QUOTA_PERIOD_US}"}
         elif "cpu" in names.split(","):
-            home = CGROUPS / names / path.strip("/")
             files = {"cpu.cfs_period_us": QUOTA_PERIOD_US, "cpu.cfs_quota_us": quota_us}
             yield home, home, {name: str(value) for name, value in files.items()}
 

@@ -42,14 +42,22 @@ def usable_cores() -> int:
     """
     affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1
-    lines = CGROUP.read_text().splitlines() if CGROUP.exists() else []
-    groups = [CGROUPS / line[3:].strip("/") for line in lines if line.startswith("0::")]
-    for group in groups:
-        for file in (folder / "cpu.max" for folder in (group, *group.parents)):
+    for names, group in control_groups():
+        for file in (folder / "cpu.max" for folder in (group, *group.parents) if not names):
             quota, period = file.read_text().split() if file.exists() else ("max", "")
             if quota != "max":
                 cores = min(cores, max(1, ceil(int(quota) / int(period))))
     return cores
+
+
+def control_groups() -> list[tuple[str, Path]]:
+    """Return the control groups of this process: names of their controllers, and folder.
+
+    That of version 2 has no names.
+    """
+    lines = CGROUP.read_text().splitlines() if CGROUP.exists() else []
+    parts = (line.split(":", 2)[1:] for line in lines)
+    return [(names, CGROUPS / names / path.strip("/")) for names, path in parts]
 
 
 def interpreter(*words: str) -> list[str]:

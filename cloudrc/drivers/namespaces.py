@@ -78,8 +78,8 @@ class ProgramEnd:
             stack.callback(self.close)
             hello, (self.device,) = self._read_answer(1)
             stack.pop_all()
-        self.way, self.has_ipv6 = str(hello["way"]), bool(hello["ipv6"])
-        self._namespace = str(hello["namespace"])
+        self.way, self.has_ipv6 = hello["way"], hello["ipv6"]
+        self._namespace = hello["namespace"]
 
     @property
     def outputs(self) -> tuple[IO[bytes], IO[bytes]]:
@@ -96,7 +96,7 @@ class ProgramEnd:
     def state(self) -> ProgramState:
         """Return the state of the program and its namespace."""
         answer, _ = self._ask()
-        listens = [(str(host), int(port)) for host, port in answer["listens"]]
+        listens = [(host, port) for host, port in answer["listens"]]
         code = answer["code"]
         if code is not None and code < 0:  # as the shell tells a signal
             code = SIGNALLED - code

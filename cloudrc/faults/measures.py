@@ -74,11 +74,6 @@ class Outcome:
     error: str = ""  # the exception that ended it, if any
     seed: int = 1  # of all its flights
 
-    def flown(self, sha256: str) -> None:
-        """Add the hash of one flight's records."""
-        both = f"{self.sha256} {sha256}".encode()
-        self.sha256 = hashlib.sha256(both).hexdigest() if self.sha256 else sha256
-
     def most(self, text: str, measured: float, limit: float, unit: str = "") -> None:
         """Check `measured` <= `limit`, both in `unit` [any unit]; `text` says what is measured."""
         self.checks.append(Requirement(text, measured, "<=", limit, unit))
@@ -121,7 +116,9 @@ class Outcome:
         self.same("breaches of an invariant", flight.watch.counts.total(), 0)
         for breach in flight.watch.breaches:
             self.true(f"{breach.kind} at {breach.time:.3f} s: {breach.text}", False)
-        self.flown(flight.sha256())
+        new = flight.sha256()
+        both = f"{self.sha256} {new}".encode()
+        self.sha256 = hashlib.sha256(both).hexdigest() if self.sha256 else new
 
     def done(self, flight: FaultRun) -> None:
         """Check that the mission was completed, with each waypoint reached once and in order."""

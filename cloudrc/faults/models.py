@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from operator import itemgetter
-from typing import TypeAlias, TypeVar
+from typing import TypeAlias
 
 from cloudrc.drivers.teleop import PERIOD_NS, RemoteTeleop, TeleopLoop, UnixPeer
 from cloudrc.drivers.virtual import Clock
@@ -20,7 +20,6 @@ from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import MissionRecord, MissionStore, Order, connect
 from cloudrc.teleop.wire import ALARM, Message
 
-T = TypeVar("T")
 FAR_NS = 1 << 62
 CFS_PERIOD = 0.1  # period of the kernel's CPU quota [s]
 SOCKET_MAX = 256
@@ -152,7 +151,8 @@ class _Peer(UnixPeer):
         self.waiting: list[Message | None] = []
 
     def receive(self) -> list[Message | None]:
-        return _take_all(self.waiting)
+        waiting, self.waiting = self.waiting, []
+        return waiting
 
     def send(self, message: Message | None) -> bool:
         """Implement `UnixPeer.send`; return False if the other socket is closed or full."""
@@ -273,12 +273,6 @@ class TeleopModel:
 
 
 def _make(service: MissionService, calls: list[Call], now_ns: int) -> None:
-    for call in _take_all(calls):
+    while calls:
         with suppress(ConflictError, UnavailableError):
-            call(service, now_ns)
-
-
-def _take_all(waiting: list[T]) -> list[T]:
-    taken = waiting[:]
-    waiting.clear()
-    return taken
+            calls.pop(0)(service, now_ns)

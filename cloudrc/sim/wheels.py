@@ -41,10 +41,10 @@ def read_wheels(model: Any, radius: float | None) -> list[Wheel]:
         turns = model.actuator_trntype[number] == TRANSMISSION.mjTRN_JOINT
         joint = int(model.actuator_trnid[number, 0]) if turns else 0  # joint 0 is no hinge
         size = radius or _radius(model, joint)
-        if wrong := _what_is_wrong(model, number, joint, data.xaxis[joint] @ frame, size):
+        axis = data.xaxis[joint] @ frame
+        if wrong := _what_is_wrong(model, number, joint, axis, size):
             name = model.actuator(number).name.removeprefix(ROBOT_PREFIX) or number
             raise ValueError(f"actuator '{name}': {wrong}")
-        axis = data.xaxis[joint] @ frame
         gear = float(model.actuator_gear[number, 0] * np.sign(axis[1]))
         most = model.actuator_ctrlrange[number] if model.actuator_ctrllimited[number] else [inf]
         speed_max = float(np.abs(most).min()) * size / abs(gear)
