@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
@@ -173,7 +173,7 @@ def _reach(model: Any, data: Any, geom: int, base: Array) -> float:
     if kind == GEOM.mjGEOM_CAPSULE:
         points, round_off = np.outer((-size[1], size[1]), (0.0, 0.0, 1.0)), size[0]
     elif kind == GEOM.mjGEOM_BOX:
-        points, round_off = np.stack(np.meshgrid(*[(-1, 1)] * 3), -1).reshape(-1, 3) * size, 0.0
+        points, round_off = np.array([*product((-1, 1), repeat=3)]) * size, 0.0
     elif kind == GEOM.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]
         first, number = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]

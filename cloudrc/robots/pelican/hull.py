@@ -8,6 +8,7 @@ Source: docs/reference/plant.md, "Robot", "Key points for clearance".
 
 from __future__ import annotations
 
+from itertools import product
 from typing import TypeAlias
 
 import numpy as np
@@ -30,7 +31,7 @@ def few() -> Array:
     for x, y in ((ROTOR_ARM, 0), (0, ROTOR_ARM), (-ROTOR_ARM, 0), (0, -ROTOR_ARM)):
         for side in (-ROTOR_HALF_THICKNESS, ROTOR_HALF_THICKNESS):
             parts.append(_ring(x, y, ROTOR_HEIGHT + side, ROTOR_RADIUS, 24))
-    corners = np.stack(np.meshgrid(*[(-1, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    corners = np.array([*product((-1, 1), repeat=3)])
     parts += [corners * BASE_HALF, *(_ring(0, 0, z, ROD_RADIUS, 8) for z in (ROD_BOTTOM, ROD_TOP))]
     positions = np.concatenate(parts)
     radii = np.where(np.arange(len(positions)) < ARM_COUNT, ARM_RADIUS, 0.0)
