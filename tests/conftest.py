@@ -243,6 +243,19 @@ def browse(chromium):
 
 
 @pytest.fixture
+def scene_with(tmp_path):
+    """Return a function that writes the scene `empty` with more bodies, and what follows them."""
+
+    def write(bodies, after=""):
+        path = tmp_path / "mine.xml"
+        text = file_of("empty").read_text()
+        path.write_text(text.replace("</worldbody>", f"{bodies}</worldbody>{after}"))
+        return str(path)
+
+    return write
+
+
+@pytest.fixture
 def scene_at(tmp_path):
     """Return a function that writes a shipped scene with its spawn at (x, y, z) [m]."""
 

@@ -5,7 +5,6 @@ import sys
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.config.shipped import file_of
 from cloudrc.report.write import assess
 from cloudrc.runs.flight import fly_in_memory
 
@@ -14,16 +13,15 @@ TRACK = "time_s,x_m,y_m,z_m\n0,0,0,1\n1.5,0,0,1\n2.5,1.5,0,1\n4,1.5,0,1\n"
 
 
 @pytest.fixture
-def flown_into(tmp_path):
+def flown_into(tmp_path, scene_with):
     """Return a function that flies into a body 0.8 m ahead, and returns the assessment."""
 
     def fly(body, *settings):
-        text = file_of("empty").read_text()
-        scene, track = tmp_path / "mine.xml", tmp_path / "track.csv"
-        scene.write_text(text.replace("</worldbody>", f"{body}</worldbody>"))
+        track = tmp_path / "track.csv"
         track.write_text(TRACK)
-        keys = f"world.scene={scene}", f"mission.setpoints={track}", "criteria.settle_m=null"
-        return fly_in_memory(load_experiment("hover", [*keys, *settings]))
+        keys = f"world.scene={scene_with(body)}", f"mission.setpoints={track}"
+        keys = [*keys, "criteria.settle_m=null", *settings]
+        return fly_in_memory(load_experiment("hover", keys))
 
     return fly
 

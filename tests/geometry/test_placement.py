@@ -17,7 +17,7 @@ from cloudrc.geometry.placement import (
     find_crossed,
     find_overlapped,
 )
-from cloudrc.geometry.scene import SCENES, load_scene
+from cloudrc.geometry.scene import load_scene
 
 KNOWN = obstacles(load_scene("pipes"), touch="board")
 FEW = hull_of("pelican")
@@ -84,16 +84,9 @@ GROUND = '<geom type="plane" size="5 5 .1"/>'
 
 
 @pytest.fixture
-def own_scene(tmp_path):
-    """Return a function that writes a scene with some bodies."""
-
-    def write(bodies):
-        path = tmp_path / "mine.xml"
-        text = (SCENES / "empty.xml").read_text()
-        path.write_text(text.replace("</worldbody>", f"{bodies}</worldbody>"))
-        return World(scene=str(path))
-
-    return write
+def own_scene(scene_with):
+    """Return a function that writes a scene with some bodies, and reads it."""
+    return lambda bodies: scene_of(World(scene=scene_with(bodies)))
 
 
 @pytest.mark.parametrize(

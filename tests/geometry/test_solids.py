@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cloudrc.geometry import solids
-from cloudrc.geometry.scene import SCENES, load_scene
+from cloudrc.geometry.scene import load_scene
 from cloudrc.geometry.solids import Solid
 from cloudrc.sim.bodies import complete
 from cloudrc.sim.engine import mujoco
@@ -22,15 +22,10 @@ PLACE = 'pos="1 2 1.5" euler="20 30 40"'
 CUBE = " ".join(f"{x} {y} {z}" for x in (-0.2, 0.2) for y in (-0.3, 0.3) for z in (-0.4, 0.4))
 
 
-def read_bodies(path):
-    return complete(load_scene(str(path)))
-
-
-def scene(folder, bodies, more=""):
-    text = (SCENES / "empty.xml").read_text().replace("<worldbody>", f"{MESH}<worldbody>")
-    path = folder / "mine.xml"
-    path.write_text(text.replace("</worldbody>", f"{bodies}</worldbody>{more}"))
-    return path
+@pytest.fixture
+def read(scene_with):
+    """Return a function that writes a scene with some bodies and assets, and reads its bodies."""
+    return lambda bodies, more="": complete(load_scene(scene_with(bodies, MESH + more)))
 
 
 def true_distances(geom, points):
@@ -50,8 +45,8 @@ def true_distances(geom, points):
 
 
 @pytest.mark.parametrize("shape", GEOMS)
-def test_a_solid_is_as_far_away_as_its_geom(shape, tmp_path):
-    (solid,) = read_bodies(scene(tmp_path, f'<body name="it" {PLACE}>{GEOMS[shape]}</body>')).solids
+def test_a_solid_is_as_far_away_as_its_geom(shape, read):
+    (solid,) = read(f'<body name="it" {PLACE}>{GEOMS[shape]}</body>').solids
     assert (solid.name, solid.shape) == ("it", shape)
     points = np.random.default_rng(1).uniform((0, 1, 0.5), (2, 3, 2.5), (200, 3))
     found, true = solid.distance(points), true_distances(GEOMS[shape], points)
@@ -71,12 +66,11 @@ def solid_of(shape, size, faces=None):
     return Solid("it", shape, np.zeros(3), np.eye(3), np.array(size), faces)
 
 
-def test_a_box_of_a_mesh_is_as_far_away_as_a_box(tmp_path, monkeypatch):
+def test_a_box_of_a_mesh_is_as_far_away_as_a_box(read, monkeypatch):
     monkeypatch.setattr(solids, "_CELLS_MAX", 1000)  # many parts
     geom = '<geom type="mesh" mesh="cube" euler="0 0 45"/>'
     cube = f'<asset><mesh name="cube" vertex="{CUBE}"/></asset>'
-    path = scene(tmp_path, f'<body name="it" pos="1 2 3">{geom}</body>', cube)
-    (mesh,) = read_bodies(path).solids
+    (mesh,) = read(f'<body name="it" pos="1 2 3">{geom}</body>', cube).solids
     size = (0.2, 0.3, 0.4)
     points = near(size)
     turned = np.array(((1, -1, 0), (1, 1, 0), (0, 0, 2**0.5))) / 2**0.5
@@ -85,16 +79,14 @@ def test_a_box_of_a_mesh_is_as_far_away_as_a_box(tmp_path, monkeypatch):
     assert mesh.distance(np.ones((4, 2, 3))).shape == (4, 2)
 
 
-def test_only_what_the_robot_can_touch_is_a_solid(tmp_path):
-    path = scene(
-        tmp_path,
+def test_only_what_the_robot_can_touch_is_a_solid(read):
+    bodies = read(
         '<body name="ghost"><geom size=".1" contype="0" conaffinity="0"/></body>'
         '<body name="other"><geom size=".1" contype="2" conaffinity="4"/></body>'
         '<body name="half"><geom size=".1" contype="2" conaffinity="1"/></body>'
         '<body name="hills"><geom type="hfield" hfield="h"/></body>',
         '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 .5 .1" elevation="0 0 1 1"/></asset>',
     )
-    bodies = read_bodies(path)
     assert bodies.bodies == ("floor", "ghost", "other", "half", "hills")
     assert [(solid.name, solid.shape) for solid in bodies.solids] == [
         ("half", "sphere"),

@@ -82,17 +82,16 @@ BODIES = """
   <body name="a/b" pos="7 0 1"><geom type="capsule" size=".1 .1"/></body>
   <body name="mocap" mocap="true" pos="8 0 1"><geom type="cylinder" size=".1 .1"/></body>
   <body name="seen" pos="9 0 1"><geom type="ellipsoid" size=".1 .1 .1" contype="0" conaffinity="0"/></body>
-</worldbody><contact><exclude body1="a/b" body2="mocap"/></contact>"""  # noqa: E501
+"""  # noqa: E501
+EXCLUDE = '<contact><exclude body1="a/b" body2="mocap"/></contact>'
 
 
-def test_each_geom_has_the_name_of_its_body_and_the_robot_none(tmp_path):
+def test_each_geom_has_the_name_of_its_body_and_the_robot_none(tmp_path, scene_with):
     """MuJoCo fuses static bodies, but not those that `exclude` or mocap names."""
-    scene, robot = tmp_path / "scene.xml", tmp_path / "robot.xml"
-    text = file_of("empty").read_text()
-    scene.write_text(text.replace("</worldbody>", BODIES))
+    robot = tmp_path / "robot.xml"
     text = FILES["robot"].read_text()
     robot.write_text(text.replace("<worldbody>", '<worldbody><geom size=".1" pos="0 0 2"/>'))
-    names = bodies_of_geoms(model_of(str(robot), str(scene)))
+    names = bodies_of_geoms(model_of(str(robot), scene_with(BODIES, EXCLUDE)))
     assert sorted(filter(None, names)) == [
         *("a/b", "floor", "in", "in", "mocap", "robot", "seen"),
         *("unnamed body 1", "unnamed body 2", "world", "world"),
@@ -137,20 +136,19 @@ POLE = '<body name="pole" pos="9 0 1"><geom size=".1" contype="{}" conaffinity="
     ],
 )
 def test_a_robot_meets_what_the_path_check_says_or_is_refused(
-    tmp_path, robot_bits, pole_bits, message
+    tmp_path, scene_with, robot_bits, pole_bits, message
 ):
     """Otherwise it flies through a pole without a word, or hits a body that is no obstacle."""
-    robot, scene = tmp_path / "robot.xml", tmp_path / "scene.xml"
+    robot = tmp_path / "robot.xml"
     contype, conaffinity = robot_bits
     text = find_robot("x2").model.read_text()
     bits = f'<default><geom contype="{contype}" conaffinity="{conaffinity}"/>'
     robot.write_text(text.replace("<default>", bits, 1))
     assert bits in robot.read_text()
-    pole = POLE.format(*pole_bits)
-    scene.write_text(FILES["scene"].read_text().replace("</worldbody>", f"{pole}</worldbody>"))
+    scene = scene_with(POLE.format(*pole_bits))
     expected = pytest.raises(InvalidValueError, match=message) if message else nullcontext()
     with expected:
-        model_of(str(robot), str(scene))
+        model_of(str(robot), scene)
 
 
 FLIES = """

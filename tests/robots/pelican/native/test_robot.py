@@ -10,7 +10,6 @@ import pytest
 from cloudrc import assembly
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.config.shipped import file_of
 from cloudrc.messages import Command, GuardState
 from cloudrc.robots.pelican.low_level import LowLevel
 from cloudrc.robots.pelican.native import robot as native
@@ -131,18 +130,15 @@ def test_plans_fly_the_same_in_c(seed):
     assert count.steps > 1000
 
 
-def test_c_finds_the_contacts_with_a_body_that_mujoco_does_not_fuse(tmp_path):
+def test_c_finds_the_contacts_with_a_body_that_mujoco_does_not_fuse(scene_with):
     """`exclude` names the pillar, so that the pillar stays a body of its own."""
-    text = file_of("empty").read_text()
     pillar = '<body name="pillar" pos="1.2 0 1"><geom type="capsule" size=".1 1"/></body>'
-    exclude = '</worldbody><contact><exclude body1="pillar" body2="floor"/></contact>'
-    path = tmp_path / "scene.xml"
-    path.write_text(text.replace("</worldbody>", pillar + exclude))
+    scene = scene_with(pillar, '<contact><exclude body1="pillar" body2="floor"/></contact>')
 
     def into_the_pillar(pilot):
         return UP if pilot.now_ns < SECOND else (0.8, 0.0, 0.0)
 
-    pilots = [Pilot(robot).fly(2.5, into_the_pillar) for robot in both(str(path))]
+    pilots = [Pilot(robot).fly(2.5, into_the_pillar) for robot in both(scene)]
     assert pilots[0].seen == pilots[1].seen
     touches = [touch for each in pilots[1].seen[7::8] for touch in each]
     assert touches[0].body == "pillar"
