@@ -50,7 +50,7 @@ def warn_if_exposed(listen: Address) -> None:
 
 
 def repeat(action: Callable[[], None], shortest: float, longest: float) -> None:
-    """Repeat an action on a thread, with random pauses between two lengths [s]."""
+    """Repeat an action on a thread, with random pauses from `shortest` to `longest` [s]."""
 
     def work() -> None:
         while True:
