@@ -251,7 +251,7 @@ def link_monitor(experiment: ResolvedExperiment, *, uplink: bool, trusted: bool)
     """Make the monitor that compares the received datagrams with the link profile.
 
     `uplink` is True in cloud, False in world. If the link is not `trusted`, as in a pod, the
-    monitor refuses trace files that are larger than TRACE_MAX. It does not know how long packets
+    monitor reads no trace files larger than TRACE_MAX. It does not know how long packets
     wait in a cell, so it does not judge a link behind one.
     """
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
