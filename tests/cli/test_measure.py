@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from cloudrc.drivers import cpu_limit
+from cloudrc.drivers import cpu_limit, machine
 from tests.cli.conftest import FLY
 
 TIMES = ["--report", "none", "--set", "link.profile=paper-p1", "--set"]
@@ -29,7 +29,7 @@ def test_the_times_of_a_measured_flight_are_flown_again(folder, call):
 
 
 def test_a_controller_is_measured_without_a_limit_where_none_is_allowed(folder, call, monkeypatch):
-    monkeypatch.setattr(cpu_limit, "CGROUP", folder / "none")
+    monkeypatch.setattr(machine, "CGROUP", folder / "none")
     monkeypatch.setattr(cpu_limit.time, "sleep", lambda seconds: None)
     out, err = call("measure compute pid --cpus 0.5 --seconds 1")
     assert out.startswith("pid, 100 Hz: ")
