@@ -43,7 +43,7 @@ def bare_robot():
     simulator.read_sensors.return_value = ()
     simulator.take_contact_force.return_value = None
     run = lambda tick_ns, stop_ns: stop_ns  # noqa: E731
-    return Mock(guard=guard, simulator=simulator, observers=[], run=run)
+    return Mock(guard=guard, simulator=simulator, observers=[], advance=run)
 
 
 def bare_world(ring, nonce=b"w", start_ns=0):
