@@ -180,8 +180,8 @@ def test_in_air_that_acts_on_geoms_c_uses_the_whole_model():
     [
         ("steps", ("world.onboard.integral_limit_xy=0.3", "guard.speed_max_mps=0.5",
                    "mission.steps.count=2")),
-        ("fast", ("link.profile=lossy", "criteria.time_limit_s=5")),
-        *(pytest.param(name, (), marks=pytest.mark.full) for name in ("paper", "paper-verbatim")),
+        *(pytest.param(name, (), marks=pytest.mark.full)
+          for name in ("paper", "paper-verbatim", "fast")),
         ("hover", ("link.uplink.blackouts=[{start_s: 3, duration_s: 2}]",
                    "mission.waypoints.0.dwell_s=3")),
     ],
