@@ -33,7 +33,7 @@ from cloudrc.records import (
     SessionOpened,
     TelemetrySent,
 )
-from tests.exposition.test_live import told as sample
+from tests.support.told import told as sample
 
 
 def test_it_ends_if_it_is_not_the_child_of_who_has_started_it(monkeypatch):
@@ -77,18 +77,18 @@ def test_events_are_all_told_and_samples_ten_times_a_second(pipe):
     alive = feed.alive_while(lambda: True)
     assert [alive(), alive()] == [True, True], "a sign of life, not more often than it says"
     for k in range(20):
-        feed.tell([sample(k * PERIOD_NS * 0.25e-9), EVENT])
+        feed.tell([sample(k * PERIOD_NS // 4), EVENT])
     ready, *lines = os.read(pipe[0], 1 << 20).decode().splitlines()
     told = [from_line(line) for line in lines]
     assert ready == "ready"
-    assert repr(told[:2]) == repr([sample(0.0), EVENT])  # with the types of all values
+    assert repr(told[:2]) == repr([sample(0), EVENT])  # with the types of all values
     assert [type(record) for record in told].count(TelemetrySent) == 5
     assert told.count(EVENT) == 20
 
 
 def test_where_nobody_watches_events_are_said_in_words(pipe):
     feed = Feed(pipe[1], watched=False)
-    feed.tell([sample(0.0), EVENT, EVENT._replace(text="caf\udce9")])
+    feed.tell([sample(0), EVENT, EVENT._replace(text="caf\udce9")])
     assert feed.alive_while(lambda: True)()
     assert os.read(pipe[0], 1 << 20) == f"{EVENT.text}\ncaf\\udce9\n".encode()
 

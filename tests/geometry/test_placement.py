@@ -85,8 +85,8 @@ GROUND = '<geom type="plane" size="5 5 .1"/>'
 
 @pytest.fixture
 def own_scene(scene_with):
-    """Return a function that writes a scene with some bodies, and reads it."""
-    return lambda bodies: scene_of(World(scene=scene_with(bodies)))
+    """Return a function that writes a scene with some bodies."""
+    return lambda bodies: World(scene=scene_with(bodies))
 
 
 @pytest.mark.parametrize(

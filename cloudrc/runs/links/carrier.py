@@ -129,13 +129,8 @@ class LiveLink:
         for way in DIRECTIONS:
             self._publish(way, time.monotonic_ns())
             take, state = partial(self._take, way), partial(self.states.get, way)
-            self._servers.append(ControlServer(link_socket(self.url, way), take, state))
-
-    def close(self) -> None:
-        """Take no more changes, and remove the states."""
-        for server in self._servers:
-            server.close()
-        shutil.rmtree(self.folder, ignore_errors=True)
+            server = ControlServer(link_socket(self.url, way), take, state)
+            self._stack.callback(server.close)
 
     def status_page(self) -> str:
         """Return the states of both directions as JSON. Any thread may call this method."""
