@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from cloudrc.cli.parser import Options, Parser, flags, settings_from, whole_number
-from cloudrc.cli.processes import read_address, read_size, status_arguments
+from cloudrc.cli.parser import Options, Parser, flags, read_size, settings_from, whole_number
+from cloudrc.cli.processes import read_address, status_arguments
 from cloudrc.drivers.process import StopSignal
 
 EPILOG = """\

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from math import inf
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -22,7 +23,15 @@ from cloudrc.cli.output import (
     print_result,
     tell,
 )
-from cloudrc.cli.parser import Options, Parser, add_verbs, flags, number, whole_number
+from cloudrc.cli.parser import (
+    Options,
+    Parser,
+    add_verbs,
+    flags,
+    number,
+    read_size,
+    whole_number,
+)
 from cloudrc.cli.where import (
     find_local_run,
     given_token,
@@ -145,6 +154,7 @@ def _keep_arguments(fly: Parser) -> None:
     add("--keep", "N", "largest number of reports (default: 100)", 100, whole_number(1, 10**6))
     about = "largest age of a report in days (default: 30)"
     add("--keep-days", "DAYS", about, 30.0, number(1e-3, 1e5, "days"))
+    add("--keep-size", "SIZE", "largest size of all reports, such as 1Gi", inf, read_size)
 
 
 def execute(options: Options) -> int | None:
@@ -207,13 +217,14 @@ def _fly(options: Options, api: Api) -> int:
 
 def _keep_report(options: Options, order: Json, view: Json) -> None:
     """Keep a report of a mission; without one, say why: the verdict counts."""
-    from cloudrc.runs.kept import keep_report
+    from cloudrc.runs.kept import Retention, keep_report
 
     if not (options.config and options.profile):
         raise BadInputError("--report needs --config and --profile")
-    files, most = (options.config, options.profile), (options.keep, options.keep_days)
+    most = Retention(options.keep, options.keep_days, options.keep_size)
+    files = options.config, options.profile
     try:
-        folder = keep_report(options.report, files, order, view, keep=most[0], days=most[1])
+        folder = keep_report(options.report, files, order, view, most)
         print_line(f"report: {folder.name}")
     except (CloudrcError, OSError) as error:
         print_line(f"no report is kept: {error}")

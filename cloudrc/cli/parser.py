@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import re
 import sys
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, fields
@@ -149,6 +150,16 @@ read_count, read_seed = whole_number(1, COUNT_MAX), whole_number(0, 2**53 - 1)
 def number(low: float, high: float, unit: str) -> NumberFlag:
     """Return a type for argparse: a number from `low` to `high` [`unit`], such as "seconds"."""
     return NumberFlag(Quantity(unit, low, high))
+
+
+def read_size(text: str) -> float:
+    """Parse a size in the notation of Kubernetes, such as 500M, for argparse; return bytes."""
+    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([kKMGT]?)(i?)", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a size such as 500M or 1Gi")
+    number, unit, binary = found.groups()
+    power = " KMGT".index(unit.upper() or " ")
+    return float(number) * (1024.0 if binary else 1000.0) ** power
 
 
 def flags(parser: argparse._ActionsContainer) -> Add:

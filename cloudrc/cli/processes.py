@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import re
 import socket
 from types import SimpleNamespace
 
-from cloudrc.cli.parser import Options, Parser, flags, settings_from, whole_number
+from cloudrc.cli.parser import Options, Parser, flags, read_size, settings_from, whole_number
 from cloudrc.drivers.process import StopSignal
 from cloudrc.drivers.realtime import Address, split_address
 
@@ -39,7 +38,7 @@ def _end_arguments(parser: Parser) -> None:
     file = "MCAP file to record to; an existing one becomes NAME.before.mcap"
     add("--record", "FILE", file, required=True)
     add("--record-flights", "", "no periodic records while the robot does not fly")
-    size = "limit of both recordings, such as 500M or 1Gi; at 90 %% the recording ends"
+    size = "limit of both files, such as 500M or 1Gi; at 45 %% the recording begins anew"
     add("--record-max", "SIZE", size, read=read_size)
     add("--listen", "HOST:PORT", "address to receive at", read=read_address, required=True)
     add("--key", "FILE", "the tunnel's key ('cloudrc key new FILE')", required=True)
@@ -75,16 +74,6 @@ def _has_ipv6() -> bool:
     except OSError:
         return False
     return True
-
-
-def read_size(text: str) -> float:
-    """Parse a size in the notation of Kubernetes, such as 500M, for argparse; return bytes."""
-    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([kKMGT]?)(i?)", text)
-    if found is None:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a size such as 500M or 1Gi")
-    number, unit, binary = found.groups()
-    power = " KMGT".index(unit.upper() or " ")
-    return float(number) * (1024.0 if binary else 1000.0) ** power
 
 
 def _run_world(options: Options) -> None:

@@ -333,7 +333,6 @@ def fetch_all(
         if cut_to_last_mission(mission, being_written=True, number=number) or not want_end:
             break
     for component in COMPONENTS:
-        _fetch_previous(release, component, folder / f"{component}.before.mcap", tell)
         try:
             logs = pods.fetch_logs(release, component)
         except CloudrcError as error:
@@ -342,18 +341,6 @@ def fetch_all(
         for container, text in logs.items():
             (folder / f"{component}-{container}.log").write_text(text, encoding="utf-8")
     return mission
-
-
-def _fetch_previous(release: Release, component: str, path: Path, tell: Tell) -> None:
-    """If a container was restarted, fetch the recording that it made before the last restart."""
-    try:
-        statuses = pods.container_statuses(pods.find_pod(release, component))
-        if any(each.name == component and each.restart_count for each in statuses):
-            pods.fetch_recording(release, component, path, previous=True)
-            tell(f"{component} was restarted; its earlier recording is in {path}")
-    except CloudrcError as error:
-        path.unlink(missing_ok=True)
-        tell(f"{component} was restarted; no earlier recording: {error}")
 
 
 def report_flight(

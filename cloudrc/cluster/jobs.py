@@ -29,13 +29,13 @@ from cloudrc.cluster.pods import (
     pod_failure,
     pod_log,
 )
+from cloudrc.cluster.releases import COMPONENT as LABEL
 from cloudrc.errors import TimedOutError, to_one_line
 
 COMPONENT = "mission"
 """Label `component` of the Jobs, pods and ConfigMaps of missions, and name of their container."""
 FILE = "mission.yaml"
 """Key in the ConfigMap under which the mission is stored."""
-COMPONENT_LABEL = "app.kubernetes.io/component"
 KILLED_WATCHER = (137, 143)
 """Exit codes of a watcher that was killed: by SIGKILL, or by SIGTERM."""
 UID_LABEL = "batch.kubernetes.io/controller-uid"
@@ -328,7 +328,7 @@ class JobReader:
 
     @property
     def _container(self) -> str:
-        return str(self.job.metadata.labels[COMPONENT_LABEL])
+        return str(self.job.metadata.labels[LABEL])
 
     def _read_log(self, pod: Any, last: int | None) -> Iterator[str]:
         """Yield the new lines of the last `last` [s] of a pod's log; None: of the whole log."""

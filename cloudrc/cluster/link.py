@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, run
 from cloudrc.cluster.pods import INDEX
-from cloudrc.cluster.releases import INSTANCE, no_release, several_releases
+from cloudrc.cluster.releases import CLOUDRC, COMPONENT, INSTANCE, no_release, several_releases
 from cloudrc.config.link_edit import Edit, edit_profile
 from cloudrc.config.load import load_link
 from cloudrc.config.profile import DIRECTIONS, FILE_READERS
@@ -58,8 +58,7 @@ def read_link(release: Release) -> LinkParts:
     BadInputError if there are several, a ClusterError if the release has no link, or if a pod does
     not run.
     """
-    selector = "app.kubernetes.io/name=cloudrc"
-    selector += f",{INSTANCE}={release.name}" if release.name else ""
+    selector = f"{CLOUDRC},{INSTANCE}={release.name}" if release.name else CLOUDRC
     words = [*release.flags, "get", "configmaps,pods", f"--selector={selector}", "--output=json"]
     found = json.loads(run("kubectl", words))["items"]
     maps = [each for each in found if PROFILE in each.get("data", {})]
@@ -92,8 +91,7 @@ def _running_pods(found: list[Any]) -> dict[str, str]:
     ]
     # The newest pod comes last, and replaces older pods in the dictionary.
     pods.sort(key=lambda pod: str(pod["metadata"]["creationTimestamp"]))
-    label = "app.kubernetes.io/component"
-    return {pod["metadata"]["labels"].get(label): pod["metadata"]["name"] for pod in pods}
+    return {pod["metadata"]["labels"].get(COMPONENT): pod["metadata"]["name"] for pod in pods}
 
 
 CARRIER = """\

@@ -30,8 +30,9 @@ from cloudrc.cluster.client import (
     program,
     run,
 )
-from cloudrc.cluster.releases import COMPONENT, INSTANCE, no_release
+from cloudrc.cluster.releases import CLOUDRC, COMPONENT, INSTANCE, no_release
 from cloudrc.errors import BadInputError, TimedOutError, to_one_line
+from cloudrc.record import part_before
 
 NO_IMAGE = ("ErrImagePull", "ImagePullBackOff", "ErrImageNeverPull", "InvalidImageName")
 NOT_MADE = ("CreateContainerConfigError", "CreateContainerError", "RunContainerError")
@@ -150,7 +151,7 @@ def workloads(release: Release) -> dict[str, Any]:
 
     Raise a ClusterError if the release does not exist.
     """
-    selector = f"app.kubernetes.io/name=cloudrc,{INSTANCE}={release.name}"
+    selector = f"{CLOUDRC},{INSTANCE}={release.name}"
     for kind in ("deployments", "statefulsets"):
         if found := release.request("list", kind, label_selector=selector):
             return {each.metadata.labels[COMPONENT]: each for each in found}
@@ -321,27 +322,22 @@ def follow_page(release: Release, port: int, tell: Callable[[str], None]) -> Ite
                 end_process(process)
 
 
-def fetch_recording(
-    release: Release, component: str, target: Path, *, previous: bool = False
-) -> None:
-    """Copy the recording of "world" or "cloud" from its pod to a file.
+def fetch_recording(release: Release, component: str, target: Path) -> None:
+    """Copy the recording of "world" or "cloud" from its pod to a file, the part before beside it.
 
-    Args:
-        release: The release.
-        component: "world" or "cloud", the name of both pod and container.
-        target: File to write.
-        previous: Whether to copy the recording from before the container's last restart.
+    `component` is also the name of the container.
     """
     pod = find_pod(release, component).metadata.name
-    path = f"{DATA}/{component}{'.before' if previous else ''}.mcap"
-    copy_file(release, pod, component, path, target)
-
-
-def copy_file(release: Release, pod: str, container: str, path: str, target: Path) -> None:
-    """Copy the file at `path` in a container of a pod to a file of this machine."""
-    words = [*release.flags, "exec", pod, f"--container={container}", "--", "cat", path]
+    inside = [*release.flags, "exec", pod, f"--container={component}", "--"]
+    path = Path(DATA, f"{component}.mcap")
     with target.open("wb") as file:
-        run("kubectl", words, stdout=file)
+        run("kubectl", [*inside, "cat", str(path)], stdout=file)
+    before = part_before(target)
+    with before.open("wb") as file:
+        look = f"cat {part_before(path)} 2>/dev/null || true"
+        run("kubectl", [*inside, "sh", "-c", look], stdout=file)
+    if not before.stat().st_size:
+        before.unlink()
 
 
 def fetch_logs(release: Release, component: str) -> dict[str, str]:

@@ -22,8 +22,6 @@ INSTANCE = "app.kubernetes.io/instance"
 """Label with the name of the release."""
 COMPONENT = "app.kubernetes.io/component"
 CLOUDRC = "app.kubernetes.io/name=cloudrc"
-SELECTOR = "app.kubernetes.io/name=cloudrc,app.kubernetes.io/component=world"
-"""Selects the one Deployment, or in a fleet StatefulSet, that each release has for its worlds."""
 
 
 class Place(NamedTuple):
@@ -136,11 +134,10 @@ def only_release(release: Release) -> Release:
         BadInputError: If the namespace has several releases.
         ClusterError: If the namespace does not exist, or has no release.
     """
-    kinds = "deployments", "statefulsets"
     names = [
         _place(each).name
-        for kind in kinds
-        for each in release.request("list", kind, label_selector=SELECTOR)
+        for kind in ("deployments", "statefulsets")
+        for each in release.request("list", kind, label_selector=f"{CLOUDRC},{COMPONENT}=world")
     ]
     if len(names) > 1:
         raise several_releases(release, names)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.errors import DISK_FULL
+from cloudrc.record import part_before
 from cloudrc.record.holes import Hole
 from cloudrc.records import (
     Arrival,
@@ -89,7 +90,8 @@ class Recorder:
     ) -> None:
         """Create the queue of records; after `start`, a thread opens the file.
 
-        When the file reaches `size_max` [bytes], recording ends; None means no limit.
+        When the file reaches `size_max` [bytes], it becomes NAME.before.mcap, in place of an
+        earlier one, and a new file begins; None means no limit.
         """
         self.error = ""  # why records are missing from the file, in words
         self._path = path
@@ -185,7 +187,10 @@ class Recorder:
         return taken
 
     def _flush(self) -> None:
-        """Pass data to the operating system; close the file if it is full or a sync has failed."""
+        """Pass data to the operating system; close the file if it is full or a sync has failed.
+
+        After a full file, the next record begins a new one.
+        """
         if self._sink and not self._ended:
             try:
                 self._note_losses(self._sink)
@@ -193,7 +198,9 @@ class Recorder:
                 if self._sync_error is not None:
                     raise self._sync_error
                 if self._size_max is not None and self._path.stat().st_size >= self._size_max:
-                    raise OSError(errno.EFBIG, "the file has reached its size limit")
+                    full, self._sink = self._sink, None
+                    full.close()
+                    self._path.replace(part_before(self._path))
             except OSError as error:
                 self._end(error)
 
@@ -205,7 +212,7 @@ class Recorder:
                 sink.sync()
                 self._safe_since = began
             except OSError as error:  # the next flush, in the other thread, ends the file
-                self._sync_error = error
+                self._sync_error = error if sink is self._sink else None
             except ValueError:  # the file was closed in the meantime
                 pass
 

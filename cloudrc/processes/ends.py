@@ -31,7 +31,8 @@ from cloudrc.link.traces import SIZE_MAX, link_profile
 from cloudrc.link.verify.judge import Flow
 from cloudrc.messages import GuardState, plan_length
 from cloudrc.outside.code import apart
-from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, repeat, warn
+from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, warn
+from cloudrc.record import part_before
 from cloudrc.records import Fault
 from cloudrc.runs.requirements import require
 from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES, Kind
@@ -47,6 +48,10 @@ not trust this process. In a cluster, traces come from a ConfigMap, which holds 
 FORWARD_LIMIT_NS = 800_000_000
 """Longest time for which cloud, when asked to end, still forwards teleop's request to hold [ns]. A
 process has 1.5 s to end."""
+
+SHARE = 0.45
+"""Size at which a recording begins anew, as a share of the limit of both files [1]: an open chunk
+comes on top."""
 
 
 @dataclass(frozen=True)
@@ -215,20 +220,17 @@ def open_recorder(
     """Make the recorder of world or cloud, which writes to `path`.
 
     The recording of a previous process is kept as NAME.before.mcap, because it may show why that
-    process ended. `limit` is the largest size of both recordings together [bytes]. `clock` is
-    "world" or "cloud", the clock of the stamps; `clock_id` identifies this machine's monotonic
-    clock. `attached` are files to attach: name -> content.
+    process ended; so is a file that reaches its share of `limit`, the largest size of both
+    together [bytes]. `clock` is "world" or "cloud", the clock of the stamps; `clock_id` identifies
+    this machine's monotonic clock. `attached` are files to attach: name -> content.
     """
     require("a recording", ("record",))
     from cloudrc.drivers.recording import Recorder
     from cloudrc.record.writer import McapWriter
 
-    kept, size_max = 0, None
-    if path.is_file() and (kept := path.stat().st_size):
-        path.replace(path.with_name(f"{path.stem}.before{path.suffix}"))
-    if limit:
-        room = round(0.9 * limit)
-        size_max = max(room - kept, room // 10)
+    if path.is_file() and path.stat().st_size:
+        path.replace(part_before(path))
+    size_max = round(SHARE * limit) if limit else None
     offset_ns = time.time_ns() - time.monotonic_ns()
 
     def open_file(file: Path) -> McapWriter:

@@ -7,10 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 WALL_OFFSET = "wall_clock_offset_ns"
 """Metadata key, only in real time: wall time minus the stamps' clock at the opening of the file
 [ns]."""
+
+
+def part_before(path: Path) -> Path:
+    """Return the file of what was recorded before the recording `path` was begun."""
+    return path.with_name(f"{path.stem}.before{path.suffix}")
 
 
 def wall_time(metadata: Mapping[str, str], stamp_ns: int) -> datetime | None:

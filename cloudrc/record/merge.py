@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.errors import CloudrcError
+from cloudrc.record import part_before
 from cloudrc.record.columns import Recording, Table, datagrams, join
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole, union
 from cloudrc.record.topics import TOPICS
@@ -122,7 +123,8 @@ def _lag_ns(
 def merge(world: Path, cloud: Path, last_ns: int | None = None) -> Recording:
     """Merge the files of world and cloud, complete or torn, into one mission on world's clock.
 
-    With `last_ns`, read the messages of the last time [ns] at least.
+    With `last_ns`, read the messages of the last time [ns] at least. What was recorded before a
+    file was begun is read, too.
 
     If one file cannot be read, the result contains only the other file, on that file's own clock,
     and a note. It is an error if neither file can be read.
@@ -131,7 +133,7 @@ def merge(world: Path, cloud: Path, last_ns: int | None = None) -> Recording:
     failures = []
     for end, path in (("world", world), ("cloud", cloud)):
         try:
-            found[end] = Recording.read(path, last_ns=last_ns)
+            found[end] = _read(path, last_ns)
         except CloudrcError as error:
             failures.append(error)
     if not found:
@@ -146,6 +148,27 @@ def merge(world: Path, cloud: Path, last_ns: int | None = None) -> Recording:
     if failures:
         mission.holes = (SOMEWHERE,)
     return mission
+
+
+def _read(path: Path, last_ns: int | None) -> Recording:
+    """Read a recording, and the complete part before it, if both have stamps of one clock."""
+    recording, earlier = Recording.read(path, last_ns=last_ns), part_before(path)
+    until_ns = recording.messages[-1][1] - (last_ns or END_NS)
+    if recording.messages[0][1] < until_ns or not earlier.is_file():
+        return recording
+    try:
+        before = Recording.read(earlier, last_ns=last_ns)
+    except CloudrcError:  # of a process that was killed at once
+        return recording
+    # Whoever copied the files while a recorder began anew may have the same part twice.
+    follows = before.messages[0][1] < recording.messages[0][1]
+    same_clock = before.metadata.get("clock_id") == recording.metadata.get("clock_id")
+    if follows and same_clock and not before.lacking:
+        messages = [*before.messages, *recording.messages]
+        recording.messages = sorted(messages, key=itemgetter(1))
+        recording.holes = union([*before.holes, *recording.holes])
+        recording.told = "; ".join(filter(None, [before.told, recording.told]))
+    return recording
 
 
 def _join(world: Recording, cloud: Recording) -> Recording:

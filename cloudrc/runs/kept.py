@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 from cloudrc.cluster.client import Release, run
 from cloudrc.cluster.flight import FETCHES, FLUSH, fetch_all, report_flight
@@ -44,14 +44,20 @@ DAY = 86_400.0
 """A day [s]."""
 
 
+class Retention(NamedTuple):
+    """The reports that a volume keeps; the oldest go first."""
+
+    number: int  # largest number of reports
+    days: float  # largest age of a report [days]
+    size: float  # largest size of the reports before the newest [bytes]
+
+
 def keep_report(
     data: Path,
     files: tuple[Path, Path],
     order: Mapping[str, Any],
     view: Mapping[str, Any],
-    *,
-    keep: int,
-    days: float,
+    most: Retention,
 ) -> Path:
     """Write the report of the mission that has just ended, and remove old ones; return its folder.
 
@@ -60,11 +66,10 @@ def keep_report(
         files: The release's experiment and the profile of its link.
         order: The mission as it was posted.
         view: The mission as the API shows it.
-        keep: Largest number of reports in the volume.
-        days: Largest age of a report [days].
+        most: The reports that remain.
     """
     experiment = _experiment(*files, order)
-    _remove_old(data / REPORTS, keep - 1, days)
+    _remove_old(data / REPORTS, most)
     seconds = max((event["time_s"] for event in view["events"]), default=0.0) + 2 * BEFORE
     for _ in range(FETCHES):
         time.sleep(FLUSH)
@@ -100,10 +105,12 @@ def _experiment(
         return read_experiment(config, robot_settings(robot), flown=True)
 
 
-def _remove_old(reports: Path, keep: int, days: float) -> None:
-    """Remove all but the newest `keep` reports, and those that are older than `days` [days]."""
-    for place, folder in enumerate(sorted(reports.glob("*-*/"), reverse=True)):
-        if place >= keep or folder.stat().st_mtime < time.time() - days * DAY:
+def _remove_old(reports: Path, most: Retention) -> None:
+    """Remove the oldest reports, so that a new one is within `most`."""
+    size, oldest = 0, time.time() - most.days * DAY
+    for count, folder in enumerate(sorted(reports.glob("*-*"), reverse=True), start=1):
+        size += sum(file.stat().st_size for file in folder.iterdir())
+        if count >= most.number or size > most.size or folder.stat().st_mtime < oldest:
             shutil.rmtree(folder)
 
 
@@ -164,6 +171,14 @@ def _report_of_pods(
 
 def _has(recording: Recording, record: MissionRecord) -> bool:
     return record.number in recording["/telemetry"]["mission_id"]
+
+
+def _check_seen(recording: Recording, record: MissionRecord) -> None:
+    if not _has(recording, record):
+        raise InvalidRunError(
+            f"the pods' recordings lack mission {record.id}: a pod has been replaced since, or "
+            "newer flights took its place; keep reports by recordings.storage of the chart"
+        )
 
 
 def _missions(release: Release) -> dict[str, MissionRecord]:

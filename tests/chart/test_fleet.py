@@ -38,7 +38,8 @@ def test_one_robot_without_a_cell_renders_byte_by_byte_as_before_fleets(tmp_path
     values = {**ALL, "console": ON, "cloud": {"backgroundLoad": ON, "ros": ON}}
     path.write_text(json.dumps(values))
     before = manifests(BEFORE, path)
-    assert len(before) > 25
+    del before["PrometheusRule", "demo-cloudrc"]  # the text of an alert has changed
+    assert len(before) > 24
     path.write_text(json.dumps({**values, "robots": 1}))
     assert manifests(CHART, path).items() >= before.items()
 

@@ -65,7 +65,7 @@ def ready(running, teleop, pretend, tmp_path, monkeypatch):
     )
     pretend(
         "kubectl",
-        f'case "$*" in *exec*before*) cat {tmp_path}/left ;;'
+        f'case "$*" in *exec*world.before*) cat {tmp_path}/left || true ;; *before*) ;;'
         f" *patch*) echo $* >> {tmp_path}/patched ;;"
         f" *exec*world*) cat {tmp_path}/world.mcap ;;"
         f" *exec*cloud*) cat {tmp_path}/cloud.mcap ;; *) {teleop.forwards()} ;; esac",
@@ -136,12 +136,10 @@ def test_a_refused_mission_leaves_no_run(ready, tmp_path, call):
 
 @pytest.mark.parametrize("left", ["", "before\n"])
 def test_the_recording_from_before_a_restart_is_copied(ready, tmp_path, call, left):
-    (key,) = [key for key in ready.objects if key[0] == "pods" and "world" in key[1]]
-    ready.objects[key]["status"]["containerStatuses"][0]["restartCount"] = 1
     ends(ready)
     if left:
         (tmp_path / "left").write_text(left)
-    assert "world was restarted" in call(LINE, code=6).err
+    call(LINE, code=6)
     found = (tmp_path / "runs" / "latest").glob("*.before.mcap")
     wanted = {"world.before.mcap": left} if left else {}
     assert {path.name: path.read_text() for path in found} == wanted

@@ -14,10 +14,11 @@ import pytest
 from cloudrc.drivers.recording import AFTERWARDS_NS, FlightsOnly, Recorder
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState
+from cloudrc.record import part_before
 from cloudrc.record.columns import Recording
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import GuardChange, Lateness
-from tests.record.conftest import Shelf, counted, open_mcap, world_records
+from tests.record.conftest import MS, Shelf, counted, open_mcap, world_records
 
 
 class Disk(io.BytesIO):
@@ -105,13 +106,17 @@ def test_disk_errors_are_reported_and_never_raised(step):
     assert recorder.dropped == (0 if step == "close" else 2)
 
 
-def test_a_recording_at_its_size_limit_ends_complete(tmp_path):
+def test_a_recording_at_its_size_limit_begins_anew(tmp_path):
     recorder = Recorder(path := tmp_path / "w.mcap", open_mcap, size_max=20_000)
-    record_all(recorder, world_records(1000), 200)
-    assert (said := "recording stopped: the file has reached its size limit") in recorder.error
-    assert recorder.dropped > 0
-    assert 20_000 <= path.stat().st_size < 100_000
-    assert Recording.read(path).note == said
+    record_all(recorder, world_records(1000), 100)
+    assert (recorder.error, recorder.dropped) == ("", 0)
+    parts = [part_before(path), path]
+    before, last = map(Recording.read, parts)
+    assert sorted(tmp_path.iterdir()) == sorted(parts), "older parts are gone"
+    assert 20_000 <= parts[0].stat().st_size < 60_000
+    assert (before.note, last.note) == ("", "")
+    stamps_ns = [*before["/odometry"]["stamp_ns"], *last["/odometry"]["stamp_ns"]]
+    assert stamps_ns == [*range(stamps_ns[0], 10_000 * MS, 10 * MS)]
 
 
 def test_a_pod_records_flights_whole_and_events_between_them():

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from cloudrc import records as rec
 from cloudrc.errors import BadInputError
+from cloudrc.record import part_before
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import (
     clock_offset,
@@ -105,6 +106,20 @@ def test_the_same_clock_is_left_as_it_is(tmp_path):
     assert_equal(merged, Recording.from_records(*ends.values()))
     texts = {"world.txt": b"world", "cloud.txt": b"cloud", "config.yaml": b"world"}
     assert merged.attachments == texts | {"report.json": b"{}"}
+
+
+@pytest.mark.parametrize(("clock", "torn", "rows"), [("a", 1, 80), ("b", 1, 50), ("a", 2, 50)])
+def test_a_complete_part_before_on_the_same_clock_belongs_to_a_recording(
+    tmp_path, clock, torn, rows
+):
+    world, cloud = files(tmp_path, world_records(50, SECOND), cloud_records(50, SECOND), ("a", "a"))
+    part = write(part_before(world), world_records(30), "world", clock)
+    part.write_bytes(part.read_bytes()[: part.stat().st_size // torn])
+    mission = merge(world, cloud)
+    assert (len(mission["/odometry"]), mission.note) == (rows, "")
+    assert len(merge(world, cloud, last_ns=400 * MS)["/odometry"]) == 50
+    part.write_bytes(world.read_bytes())  # copied while a recorder began anew
+    assert len(merge(world, cloud)["/odometry"]) == 50
 
 
 def test_unrelated_clocks_begin_together_also_in_a_torn_file(tmp_path):

@@ -2,13 +2,17 @@
 
 import os
 import time
+from collections import Counter
+from unittest.mock import Mock
 
 import pytest
 
+from cloudrc.cluster.client import Release
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.report.folder import read_run
 from cloudrc.runs import kept
+from cloudrc.teleop.store import MissionRecord
 from tests.cluster.test_flight import flown, record
 from tests.record.conftest import later
 
@@ -28,11 +32,11 @@ def data(tmp_path, monkeypatch):
     return tmp_path
 
 
-def keep(data, mission, keep=9, days=1.0):
+def keep(data, mission, count=9, days=1.0, size=1e9):
     files = data / "experiment.yaml", data / "profile.yaml"
     order = {"name": "x", "time_limit_s": 77.0, "waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
     view = {"id": mission, "events": [{"time_s": 5.0}]}
-    return kept.keep_report(data, files, order, view, keep=keep, days=days)
+    return kept.keep_report(data, files, order, view, kept.Retention(count, days, size))
 
 
 def test_a_kept_report_is_a_run_of_the_last_mission_and_of_the_links_profile(data):
@@ -44,15 +48,39 @@ def test_a_kept_report_is_a_run_of_the_last_mission_and_of_the_links_profile(dat
     assert recording["/mission"]["stamp_ns"][0] > HOUR
 
 
-def test_the_oldest_reports_go(data, monkeypatch):
-    monkeypatch.setattr(kept, "report_flight", lambda *given, **wanted: None)
-    names = [keep(data, f"m{number}", keep=2).name for number in range(3)]
+def test_a_report_of_another_install_is_told_by_the_missions_number(data, tmp_path, monkeypatch):
+    """An earlier install, whose volume this is, has flown a mission of the same id."""
+    there = keep(data, "m1")
+    number = int(Recording.read(there / "mission.mcap")["/telemetry"]["mission_id"][-1])
+    known = MissionRecord("m1", Mock(), number, state="done", happened=Counter(started=1))
+    pods = Mock()
+    monkeypatch.setattr(kept, "_missions", lambda release: {"m1": known})
+    monkeypatch.setattr(kept, "_report_of_pods", pods)
+    monkeypatch.setattr(kept, "find_pod", Mock())
+
+    def kubectl(name, words, stdout=None):
+        if stdout:
+            stdout.write((there / words[-1].rpartition("/")[2]).read_bytes())
+        return there.name
+
+    monkeypatch.setattr(kept, "run", kubectl)
+    release = Release(None, "lab", "cloudrc")
+    for folder in ("own", "foreign"):
+        (found := tmp_path / folder).mkdir()
+        kept.fetch_mission(release, "m1", found, print)
+        assert (pods.called, bool([*found.iterdir()])) == (folder == "foreign", folder == "own")
+        known.number += 1
+
+
+def test_the_oldest_reports_go(data):
+    names = [keep(data, f"m{number}", count=2).name for number in range(3)]
     kept_now = sorted(each.name for each in (data / "missions").iterdir())
     assert kept_now == names[1:]
     old = time.time() - 2 * kept.DAY
     os.utime(data / "missions" / names[1], (old, old))
-    keep(data, "m9")
+    keep(data, "m8")
     assert not (data / "missions" / names[1]).exists()
+    assert [keep(data, "m9", size=0.0)] == [*(data / "missions").iterdir()]
 
 
 def test_the_end_of_a_long_recording_is_read_in_little_memory(data, monkeypatch):

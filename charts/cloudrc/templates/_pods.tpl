@@ -157,6 +157,29 @@ affinity:
 {{- .Values.recordings.existingClaim | default $made -}}
 {{- end }}
 
+{{/* A quantity such as 1Gi as a number [bytes]. */}}
+{{- define "cloudrc.bytes" -}}
+{{- $unit := toString . | regexFind "[kKMGT]i?$" -}}
+{{- $decimal := dict "" 1 "k" 1e3 "M" 1e6 "G" 1e9 "T" 1e12 -}}
+{{- $binary := dict "Ki" 1024 "Mi" 1048576 "Gi" 1073741824 "Ti" 1099511627776 -}}
+{{- mulf (toString . | trimSuffix $unit | float64) (get (merge $decimal $binary) $unit) | int64 -}}
+{{- end }}
+
+{{/* What each of world, cloud and the kept reports of a robot may take of recordings.storage, a quarter
+     [bytes]: the last one is for a report that is written. "" without this value. */}}
+{{- define "cloudrc.recordingShare" -}}
+{{- with .Values.recordings.storage -}}
+{{- div (include "cloudrc.bytes" .) (mul 4 (include "cloudrc.robots" $)) -}}
+{{- end -}}
+{{- end }}
+
+{{/* Limit of the recordings of a component. Argument: (dict "root" $ "component" NAME). */}}
+{{- define "cloudrc.recordMax" -}}
+{{- $own := (index .root.Values .component).recordingSizeLimit -}}
+{{- $share := include "cloudrc.recordingShare" .root | default $own -}}
+{{- lt (include "cloudrc.bytes" $share | int64) (include "cloudrc.bytes" $own | int64) | ternary $share $own -}}
+{{- end }}
+
 {{/* Mount of this volume; several releases, and the robots of a fleet, may share a claim. */}}
 {{- define "cloudrc.dataMount" -}}
 {{- $folder := printf "subPath: %s" (include "cloudrc.fullname" .) -}}

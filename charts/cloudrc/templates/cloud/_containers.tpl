@@ -21,7 +21,7 @@
     - --key=/etc/cloudrc-secret/key
     - --record=/var/lib/cloudrc/cloud.mcap
     - --record-flights
-    - --record-max={{ .Values.cloud.recordingSizeLimit }}
+    - --record-max={{ include "cloudrc.recordMax" (dict "root" . "component" "cloud") }}
     - "--metrics=[::]:{{ $metrics }}"
   ports:
     {{- if not $onboard }}

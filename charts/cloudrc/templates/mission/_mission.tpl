@@ -58,6 +58,9 @@
     - --profile=/etc/cloudrc-link/profile.yaml
     - --keep={{ .root.Values.recordings.keepMissions }}
     - --keep-days={{ .root.Values.recordings.keepDays }}
+    {{- with include "cloudrc.recordingShare" .root }}
+    - --keep-size={{ . }}
+    {{- end }}
     {{- end }}
   env:
     # Posting twice under one key flies once.
