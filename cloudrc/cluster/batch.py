@@ -40,6 +40,10 @@ OUT_OF_MEMORY = (
 """How a pod has ended whose flight needs too much memory."""
 FAILED_SHARE = 10
 """The Job ends early once more than one shard of so many has failed: then all would."""
+LEVELS = ("V1JobSpec", "V1PodSpec", "V1Container")
+"""Kinds of what has the fields of a Job."""
+OF_CONTAINER = ("resources", "securityContext")
+"""Fields of both a pod and its container that apply to the container if it can have them."""
 STORE = "/rows"
 """Folder in which the pods mount the claim."""
 
@@ -66,19 +70,35 @@ class PodSettings(NamedTuple):
 
 def check_changes(changes: Mapping[KeyPath, Any]) -> None:
     """Raise a BadInputError if the Job has no field of this name."""
-    fields = [name for kind in _kinds() for name in kind.attribute_map.values()]
+    from kubernetes import client
+
     for path in changes:
-        if path[0] not in fields:
+        if not _level_of(path):
+            fields = [
+                name for kind in LEVELS for name in getattr(client, kind).attribute_map.values()
+            ]
             text = "neither a Job nor its pod or container has this field"
             hint = suggest_name(path[0], fields)
             raise BadInputError(f"--set-job {'.'.join(path)}: {text}{hint}")
 
 
-def _kinds() -> tuple[Any, Any, Any]:
-    """Return the kinds of what has the fields of a Job: its spec, the pod's, the container."""
+def _level_of(path: KeyPath) -> str:
+    """Return which of `LEVELS` has the field of this path; "" if none has it."""
     from kubernetes import client
 
-    return client.V1JobSpec, client.V1PodSpec, client.V1Container
+    def has_field(level: str) -> bool:
+        kind: Any = getattr(client, level)
+        for part in path:
+            names = {name: attribute for attribute, name in kind.attribute_map.items()}
+            if part not in names:
+                return False
+            kind = getattr(client, kind.openapi_types[names[part]], None)
+            if kind is None:  # a number, list or mapping
+                break
+        return True
+
+    order = reversed(LEVELS) if path[0] in OF_CONTAINER else LEVELS
+    return next(filter(has_field, order), "")
 
 
 def start(
@@ -111,8 +131,7 @@ def start(
         mount = {"name": "flights", "mountPath": own, "subPath": key, "readOnly": True}
         container["volumeMounts"].append(mount)
     for path, value in settings.changes.items():
-        kinds = zip(_kinds(), (job["spec"], pod, container), strict=True)
-        node = next(node for kind, node in kinds if path[0] in kind.attribute_map.values())
+        node = dict(zip(LEVELS, (job["spec"], pod, container), strict=True))[_level_of(path)]
         for part in path[:-1]:
             node = node.setdefault(part, {})
         node[path[-1]] = value

@@ -63,6 +63,8 @@ def test_the_job_flies_each_index_with_its_flights(started, api, release):
 def test_the_flags_of_the_job_reach_it(api, release, tmp_path):
     (tmp_path / "p.py").write_text("# mine")
     changes = {("nodeSelector", "disk"): "ssd", ("ttlSecondsAfterFinished",): 60, ("env",): []}
+    changes |= {("resources", "limits", "gpu"): "1", ("securityContext", "privileged"): False}
+    changes |= {("securityContext", "fsGroup"): 7, ("restartPolicy",): "OnFailure"}
     asked = {"parallelism": 2, "cpu_limit": "2", "memory": "1Gi", "claim": "rows"}
     pods = PODS._replace(**asked, changes=changes)
     batch.start(release, "sweep-1", b"flights", pods, [str(tmp_path / "p.py")])
@@ -73,7 +75,9 @@ def test_the_flags_of_the_job_reach_it(api, release, tmp_path):
     assert pod["nodeSelector"] == {"disk": "ssd"}
     assert container["env"] == []
     assert container["args"] == ["4", "--out=/rows/sweep-1"]
-    assert container["resources"]["limits"] == {"cpu": "2", "memory": "1Gi"}
+    assert container["resources"]["limits"] == {"cpu": "2", "memory": "1Gi", "gpu": "1"}
+    assert container["securityContext"]["privileged"] is False
+    assert (pod["securityContext"]["fsGroup"], pod["restartPolicy"]) == (7, "OnFailure")
     assert {"name": "rows", "mountPath": "/rows"} in container["volumeMounts"]
     assert pod["volumes"][-1]["persistentVolumeClaim"] == {"claimName": "rows"}
     own = container["volumeMounts"][-1]
@@ -84,6 +88,8 @@ def test_the_flags_of_the_job_reach_it(api, release, tmp_path):
     assert container["args"] == ["4", "--out=s3://lab/x/sweep-2"]
     with pytest.raises(BadInputError, match=r"--set-job toleration\.x: .* did you mean tolera"):
         batch.check_changes({("toleration", "x"): 1})
+    with pytest.raises(BadInputError, match=r"--set-job securityContext\.root: neither a Job"):
+        batch.check_changes({("securityContext", "root"): 1})
 
 
 def test_a_running_job_is_kept_and_a_failed_job_is_replaced(started, api, release):
