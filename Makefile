@@ -45,7 +45,7 @@ DRAWING := glfw pyopengl mujoco-studio
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-cell results docs site dist images kind-load lock clean
+.PHONY: help demo test process process-shared process-alone e2e e2e-full test-tun smoke-tun ros2-test ros2-smoke moonshot test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-cell results docs site dist owner images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -247,6 +247,11 @@ dist: $(VENV)/dev ## build wheel, sdist and chart into dist/; needs helm
 	rm -rf dist
 	SOURCE_DATE_EPOCH=$(EPOCH) $(bin)/python -m hatchling build -d dist -t wheel -t sdist
 	$(bin)/python -m tools.pack_chart dist $(EPOCH)
+
+# The account that publishes; docs/install.md says where it stands.
+owner: ## write the account that publishes into pages, notebooks and badges: make owner OWNER=me
+	@test '$(OWNER)' || { echo "name the account: make owner OWNER=me" >&2; exit 2; }
+	grep -rlw OWNER docs charts/cloudrc/README.md | xargs sed -i 's/\bOWNER\b/$(OWNER)/g'
 
 images: ## build the container images; needs Docker
 	@command -v docker >/dev/null || { \
