@@ -176,7 +176,7 @@ def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iter
     """
     failures = list[str]()
 
-    def describe_end(state: Any) -> str:
+    def describe_end(pod: Any, state: Any) -> str:
         words = to_one_line(state.message) or state.reason
         if state.exit_code == BadInputError.exit_code:  # the other pods refuse them, too
             delete_job(release, name)

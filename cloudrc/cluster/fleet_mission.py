@@ -9,19 +9,17 @@ from __future__ import annotations
 import csv
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from http.client import HTTPConnection
 from typing import Any
 
 from cloudrc.cluster.client import ClusterError, Release, explain_errors, run
-from cloudrc.cluster.jobs import AT, COMPONENT, KILLED_WATCHER, Ended, failure_of, why_waiting
+from cloudrc.cluster.jobs import AT, KILLED_WATCHER, Ended, JobReader
 from cloudrc.cluster.pods import (
     CELL,
     DATA,
     INDEX,
     METRICS,
-    PodWatch,
-    container_statuses,
     find_pod,
     list_pods,
 )
@@ -29,8 +27,6 @@ from cloudrc.errors import CloudrcError, to_one_line
 
 ROBOT = "batch.kubernetes.io/job-completion-index"
 """Annotation of a Job's pod: the robot that it flies."""
-JOB = "batch.kubernetes.io/job-name"
-"""Label of a Job's pods."""
 PAUSE = 0.2
 """Time between the requests for the metrics of two robots [s]: 5 requests a second."""
 COUNTERS = {
@@ -62,9 +58,16 @@ def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> En
         robot: Ended(ClusterError.exit_code, "INTERRUPTED: no_verdict")
         for robot in range(job.spec.completions)
     }
-    for robot, end in _ends(release, name, tell):
-        ended[robot] = end
-        tell(f"robot {robot}: {end.message}")
+
+    def see_end(pod: Any, state: Any) -> str:
+        if state.exit_code in KILLED_WATCHER:  # a new pod follows the mission
+            return ""
+        robot = int(pod.metadata.annotations[ROBOT])
+        ended[robot] = Ended(state.exit_code, to_one_line(state.message) or state.reason)
+        return f"robot {robot}: {ended[robot].message}"
+
+    for _ in JobReader(release, name, tell, see_end, logs=False).read():
+        pass
     record, after = _read_cell(release), _read_robots(release)
     rows = [
         {"robot": robot, **_verdict(end), **_flown(before.get(robot), after.get(robot))}
@@ -73,31 +76,6 @@ def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> En
     for line in ["", *summarize_fleet(_document(rows, record, start)).splitlines()]:
         tell(line)
     return Ended(max(end.exit_code for end in ended.values()), "")
-
-
-def _ends(release: Release, name: str, tell: Callable[[str], None]) -> Iterator[tuple[int, Ended]]:
-    """Yield robot and end of each mission, until all robots or the Job have ended."""
-    seen, robots, told = set[str](), set[int](), set[str]()
-    watch = PodWatch(release, f"{JOB}={name}")
-    while True:
-        job = release.request("get", "jobs", name=name)
-        is_over = failure_of(job) is not None
-        watch.look()
-        waits = "" if is_over else why_waiting(release, job, [*watch.pods.values()])
-        if waits and waits not in told:
-            told.add(waits)
-            tell(waits)
-        for uid, pod in watch.pods.items():
-            own = (each for each in container_statuses(pod) if each.name == COMPONENT)
-            end = next((each.state.terminated for each in own), None)
-            if end is None or uid in seen:
-                continue
-            seen.add(uid)
-            if end.exit_code not in KILLED_WATCHER:  # else a new pod follows the mission
-                robots.add(number := int(pod.metadata.annotations[ROBOT]))
-                yield number, Ended(end.exit_code, to_one_line(end.message) or end.reason)
-        if is_over or len(robots) == job.spec.completions:
-            return
 
 
 def _verdict(end: Ended) -> dict[str, str]:

@@ -219,10 +219,10 @@ def follow(release: Release, name: str, write: Callable[[str], None]) -> Ended:
     """
     states, watch = list[Any](), ReleaseWatch(release)
 
-    def see_end(state: Any) -> str | None:
+    def see_end(pod: Any, state: Any) -> str:
         states.append(state)
         killed = state.reason == "OOMKilled"
-        return f"the Job's pod {describe_end(COMPONENT, state)}" if killed else None
+        return f"the Job's pod {describe_end(COMPONENT, state)}" if killed else ""
 
     reader = JobReader(release, name, write, see_end, watch.look)
     for line in reader.read():
@@ -241,18 +241,20 @@ class JobReader:
         release: Release,
         name: str,
         tell: Callable[[str], None],
-        see_end: Callable[[Any], str | None],
+        see_end: Callable[[Any, Any], str],
         look: Callable[[], Iterable[str]] = tuple,
+        *,
+        logs: bool = True,
     ) -> None:
         """Read the Job `name`.
 
-        `see_end` receives the final state of the container of each pod that ends; it may return a
-        sentence about it. `tell` receives this sentence, and others if a pod waits for a node,
-        or if the log of an ended pod cannot be read. `tell` also receives the sentences
-        that `look` returns.
+        `see_end` receives each pod that ends and the final state of its container; it returns a
+        sentence about it, or "". `tell` receives this sentence, and others if a pod waits for a
+        node, or if the log of an ended pod cannot be read. `tell` also receives the sentences that
+        `look` returns. Without `logs`, no log is read.
         """
         self._release, self._name, self._tell = release, name, tell
-        self._see_end, self._look = see_end, look
+        self._see_end, self._look, self._logs = see_end, look, logs
         self._told, self._read = set[str](), set[str]()  # sentences; UIDs of pods
         self._read_at = dict[str, float]()  # UID of a running pod -> time of its last read [s]
         self._seen = set[int]()  # hashes of lines
@@ -311,7 +313,7 @@ class JobReader:
                 running.append(pod)
                 continue
             self._read.add(pod.metadata.uid)
-            self._tell_once(self._see_end(ended) if ended else "")
+            self._tell_once(self._see_end(pod, ended) if ended else "")
             yield from self._read_log(pod, None)
         if running:
             pod = min(running, key=lambda each: self._read_at.get(each.metadata.uid, 0.0))
@@ -332,6 +334,8 @@ class JobReader:
 
     def _read_log(self, pod: Any, last: int | None) -> Iterator[str]:
         """Yield the new lines of the last `last` [s] of a pod's log; None: of the whole log."""
+        if not self._logs:
+            return
         try:
             log = pod_log(self._release, pod.metadata.name, self._container, last)
         except ClusterError as error:  # the pod may be gone
@@ -342,7 +346,7 @@ class JobReader:
                 self._seen.add(hash(line))
                 yield line
 
-    def _tell_once(self, text: str | None) -> None:
+    def _tell_once(self, text: str) -> None:
         if text and text not in self._told:
             self._told.add(text)
             self._tell(text)

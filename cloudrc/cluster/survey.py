@@ -146,7 +146,7 @@ def admission(release: Release, component: str, spec: dict[str, Any]) -> Finding
         fix = f"make the namespace: kubectl create namespace {release.namespace}"
         return Finding(name, "missing", to_one_line(str(error)), fix)
     except ClusterError as error:
-        fix = "set other values, such as link.mode=relay, which Pod Security 'restricted' admits"
+        fix = "set other values: link.mode=relay for Pod Security, smaller resources for a quota"
         return Finding(name, "missing", to_one_line(str(error)), fix)
     return Finding(name, "ok", "is admitted: Pod Security, LimitRanges and quota agree")
 

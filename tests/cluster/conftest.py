@@ -153,7 +153,7 @@ class FakeApi:
 
     def end_robot(self, job, robot, code, message):
         """Create the ended pod of a fleet's Job that flies a robot."""
-        name, own = f"{job}-{robot}", {"batch.kubernetes.io/job-name": job}
+        name, own = f"{job}-{robot}", {UID_LABEL: self.get("jobs", job)["metadata"]["uid"]}
         body = pod(name, "mission", labels=own, state=terminated(code, message))
         body["metadata"]["annotations"] = {ROBOT: str(robot)}
         self.put("pods", body)

@@ -150,7 +150,7 @@ def test_a_minute_takes_few_requests_even_if_all_pods_end_in_it(started, api, re
         add_pod(api, f"pod-{number}", "Running")
     before = len(api.seen)
     api.hooks.append(end_some)
-    found = [*batch.JobReader(release, "sweep-1", print, lambda state: "").read()]
+    found = [*batch.JobReader(release, "sweep-1", print, lambda pod, state: "").read()]
     assert {*found} == {f"row {number}" for number in range(pods)}
     assert len(found) == pods
     assert len(api.seen) - before <= pods + 200
@@ -172,7 +172,7 @@ def test_running_pods_are_read_in_turn_and_a_forgotten_watch_begins_again(starte
     found = []
     api.at_look(4, forget)
     api.at_look(8, end)
-    for line in batch.JobReader(release, "sweep-1", print, lambda state: "").read():
+    for line in batch.JobReader(release, "sweep-1", print, lambda pod, state: "").read():
         found.append(line)
     assert found == ["row a", "row b", "row c"]
 

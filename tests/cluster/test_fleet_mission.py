@@ -39,6 +39,7 @@ cloudrc_guard_held_seconds_total {age / 10}
             code = int(robot == 1)
             message = "FAILURE: timed_out: too late; also not_settled: 1 m" if code else "SUCCESS"
             api.end_robot(name, robot, code, message)
+        api.end(name, "Complete")
         api.seen.clear()
         return lines, follow_fleet(release, name, lines.append), list(api.seen)
 
