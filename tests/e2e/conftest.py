@@ -93,6 +93,15 @@ def in_release(*words, timeout=240.0):
     return done.stdout
 
 
+def report(folder, release, *mission):
+    """Run `cloudrc mission report`; return the report."""
+    line = ["mission", "report", release, *mission, "-n", NAMESPACE, "--out", folder, "-o", "json"]
+    done = cloudrc(*map(str, line))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (folder / "report.html").is_file()
+    return json.loads(done.stdout)
+
+
 def set_link(*words):
     """Run `cloudrc link set` for the release; return its report of the new link."""
     return dict(json.loads(in_release("link", "set", *words, "-o", "json")))

@@ -9,6 +9,7 @@ import pytest
 
 from tests.e2e.conftest import (
     EXAMPLES,
+    NAME,
     TIMES,
     eventually,
     job_end,
@@ -16,6 +17,7 @@ from tests.e2e.conftest import (
     kubectl,
     metrics,
     pod,
+    report,
     scrapes,
     value,
 )
@@ -73,6 +75,12 @@ def test_the_papers_mission_ends_complete(first, note):
     assert "touched" in said or "success" in said.lower()
     described = kubectl("describe", f"--selector=batch.kubernetes.io/job-name={MISSION}", "pod")
     assert said in " ".join(described.split())
+
+
+def test_the_last_mission_of_a_release_without_a_volume_has_a_report(first, tmp_path):
+    found = report(tmp_path / "last", NAME)
+    assert (found["verdict"], found["complete"]) == ("success", True)
+    assert found["numbers"]["waypoints_reached"]["value"] == 7
 
 
 def test_a_stranger_reaches_neither_tunnel_nor_metrics_nor_api(first):

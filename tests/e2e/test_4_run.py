@@ -6,9 +6,19 @@ import pytest
 
 from cloudrc import __version__
 from cloudrc.cluster.client import connect
+from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow
 from cloudrc.config.load import load_experiment
-from tests.e2e.conftest import CHART, NAMESPACE, cloudrc, command, helm, in_release, read
+from tests.e2e.conftest import (
+    CHART,
+    NAMESPACE,
+    cloudrc,
+    command,
+    helm,
+    in_release,
+    kubectl,
+    report,
+)
 from tests.flights.conftest import fly, numbers
 
 TIME_TOLERANCE = 0.05
@@ -18,7 +28,7 @@ DELAY_TOLERANCE = 0.002
 SIZES = {"world": 420, "cloud": 320}
 """Role -> largest size of its image, uncompressed [MB]."""
 ROVER = "rover"
-"""Release of another robot."""
+"""Release of another robot, whose recordings are in a volume."""
 LOOK = """\
 import json, os, shutil
 from importlib.util import find_spec
@@ -32,17 +42,21 @@ print(json.dumps(found))
 
 @pytest.fixture(scope="module", autouse=True)
 def rover(installed):
-    """A release of its own whose Job drives the rover beside the first tests of this module.
+    """A release of its own; beside the first tests of this module, the Job `by-hand` drives it.
 
     Later than `installed`, which deletes the Jobs of an earlier session.
     """
     world = "experiment.world.robot=rover,experiment.world.scene=pillars"
-    given = f"--set=link.mode=relay,mission.enabled=true,experiment.mission=pillars,{world}"
+    given = (
+        f"experiment.mission=pillars,mission.cronJob.enabled=true,recordings.storage=100Mi,{world}"
+    )
     try:
-        helm("install", ROVER, str(CHART), given)
-        yield
+        helm("install", ROVER, str(CHART), f"--set=link.mode=relay,{given}")
+        kubectl("create", "job", "by-hand", f"--from=cronjob/{ROVER}-cloudrc-mission")
+        yield connect(None, NAMESPACE, ROVER)
     finally:
         helm("uninstall", ROVER)
+        kubectl("delete", "pvc", f"{ROVER}-cloudrc-recordings", "--wait=false")
 
 
 @pytest.mark.parametrize(("role", "holds"), [("world", ["mujoco"]), ("cloud", [])])
@@ -55,6 +69,7 @@ def test_an_image_is_small_and_holds_no_more_than_its_role_needs(cluster, note, 
     assert json.loads(command(*look)) == holds
 
 
+@pytest.mark.full
 def test_an_image_that_is_not_loaded_is_named(cluster):
     helm("install", "no-image", str(CHART), "--set=image.tag=0.0.0-missing")
     line = ["run", "hover", "--mode", "cluster", "-n", NAMESPACE, "--release", "no-image"]
@@ -83,14 +98,14 @@ def test_a_run_in_a_cluster_is_that_of_virtual_time(
     done = cloudrc("doctor", "--mode", "cluster", "-o", "json")
     found = {check["name"]: check["state"] for check in json.loads(done.stdout)["checks"]}
     assert (done.returncode, found["kubeconfig"], found["cluster"]) == (0, "ok", "ok")
-    report = tmp_path / name
+    run = tmp_path / name
     line = ["run", name, "--set", setting, "--mode", "cluster", "--figures"]
-    said = in_release(*line, "--out", str(report))
-    assert said.splitlines()[-1] == str(report / "report.html")
+    said = in_release(*line, "--out", str(run))
+    assert said.splitlines()[-1] == str(run / "report.html")
     wanted = ["report.html", "report.json", "mission.mcap", "config.yaml", "environment.json"]
     wanted += [f"figures/{name}.png" for name in ("delay", "odom", "error")]
-    assert [name for name in wanted if not (report / name).is_file()] == []
-    document = json.loads((report / "report.json").read_text())
+    assert [name for name in wanted if not (run / name).is_file()] == []
+    document = json.loads((run / "report.json").read_text())
     assert (document["verdict"], document["mode"]) == ("success", "cluster")
     assert (document["shaper"], document["complete"]) == ("relay", True)
     real = {name: entry["value"] for name, entry in document["numbers"].items()}
@@ -99,13 +114,19 @@ def test_a_run_in_a_cluster_is_that_of_virtual_time(
     assert real[instant] == pytest.approx(virtual[instant], rel=TIME_TOLERANCE)
     for mean in ("uplink_delay_mean", "downlink_delay_mean"):
         assert real[mean] == pytest.approx(virtual[mean], abs=DELAY_TOLERANCE)
-    assert load_experiment(report / "config.yaml").name == name
+    assert load_experiment(run / "config.yaml").name == name
 
 
 @pytest.mark.real_time
-def test_a_job_drives_another_robot_through_its_mission(rover):
-    (job,) = read("jobs", f"--selector=app.kubernetes.io/instance={ROVER}")["items"]
+def test_kubectl_alone_drives_another_robot_whose_report_is_kept_when_its_pods_are_gone(
+    rover, tmp_path
+):
     lines: list[str] = []
-    end = follow(connect(None, NAMESPACE, ROVER), job["metadata"]["name"], lines.append)
+    end = follow(rover, "by-hand", lines.append)
     assert end.exit_code == 0, (end, lines)
     assert "waypoint 4 of 4 reached" in "\n".join(lines)
+    (name,) = (line.split()[-1] for line in lines if line.startswith("report: "))
+    kubectl("delete", "pods", f"--selector=app.kubernetes.io/instance={ROVER}")
+    wait_ready(rover, timeout=120.0)
+    found = report(tmp_path / "kept", ROVER, name)
+    assert (found["verdict"], found["complete"]) == ("success", True)
