@@ -328,16 +328,20 @@ def fetch_recording(release: Release, component: str, target: Path) -> None:
     `component` is also the name of the container.
     """
     pod = find_pod(release, component).metadata.name
-    inside = [*release.flags, "exec", pod, f"--container={component}", "--"]
     path = Path(DATA, f"{component}.mcap")
-    with target.open("wb") as file:
-        run("kubectl", [*inside, "cat", str(path)], stdout=file)
+    copy_file(release, pod, component, str(path), target)
     before = part_before(target)
-    with before.open("wb") as file:
-        look = f"cat {part_before(path)} 2>/dev/null || true"
-        run("kubectl", [*inside, "sh", "-c", look], stdout=file)
-    if not before.stat().st_size:
+    try:
+        copy_file(release, pod, component, str(part_before(path)), before)
+    except ClusterError:  # there is none
         before.unlink()
+
+
+def copy_file(release: Release, pod: str, container: str, path: str, target: Path) -> None:
+    """Copy the file at `path` in a container of a pod to a file of this machine."""
+    words = [*release.flags, "exec", pod, f"--container={container}", "--", "cat", path]
+    with target.open("wb") as file:
+        run("kubectl", words, stdout=file)
 
 
 def fetch_logs(release: Release, component: str) -> dict[str, str]:

@@ -31,7 +31,7 @@ from cloudrc.link.traces import SIZE_MAX, link_profile
 from cloudrc.link.verify.judge import Flow
 from cloudrc.messages import GuardState, plan_length
 from cloudrc.outside.code import apart
-from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, warn
+from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, repeat, warn
 from cloudrc.record import part_before
 from cloudrc.records import Fault
 from cloudrc.runs.requirements import require

@@ -18,9 +18,12 @@ from cloudrc.cluster.client import Release, run
 from cloudrc.cluster.flight import FETCHES, FLUSH, fetch_all, report_flight
 from cloudrc.cluster.link import EXPERIMENT
 from cloudrc.cluster.pods import DATA, copy_file, find_pod
+from cloudrc.config.ground import put_on_ground
+from cloudrc.config.heading import without_held_yaws
 from cloudrc.config.load import load_link, read_experiment, robot_settings
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.config.resolved import ResolvedExperiment, dump
+from cloudrc.config.robot import known_robot
 from cloudrc.config.schema import MissionConfig
 from cloudrc.errors import InvalidRunError
 from cloudrc.link.follow import PROFILE
@@ -102,13 +105,17 @@ def _experiment(
     with TemporaryDirectory() as name:
         config = Path(name) / "config.yaml"
         config.write_text(write_yaml(tree), encoding="utf-8")
-        return read_experiment(config, robot_settings(robot), flown=True)
+        found = read_experiment(config, robot_settings(robot), flown=True)
+    # As teleop does with an order, which may have waypoints of two numbers.
+    mission = put_on_ground(found.mission, found.world)
+    mission = without_held_yaws(mission, known_robot(found.world.robot).heading)
+    return found.model_copy(update={"mission": mission})
 
 
 def _remove_old(reports: Path, most: Retention) -> None:
     """Remove the oldest reports, so that a new one is within `most`."""
     size, oldest = 0, time.time() - most.days * DAY
-    for count, folder in enumerate(sorted(reports.glob("*-*"), reverse=True), start=1):
+    for count, folder in enumerate(sorted(reports.glob("*-*/"), reverse=True), start=1):
         size += sum(file.stat().st_size for file in folder.iterdir())
         if count >= most.number or size > most.size or folder.stat().st_mtime < oldest:
             shutil.rmtree(folder)
@@ -162,8 +169,8 @@ def _report_of_pods(
         recording = fetch_all(release, folder, tell, want_end=True, number=record.number)
     if not _has(recording, record):
         raise InvalidRunError(
-            f"the pods' recordings lack mission {record.id}: a pod has been replaced since, or its "
-            "volume was full; keep recordings by the value recordings.storage of the chart"
+            f"the pods' recordings lack mission {record.id}: a pod has been replaced since, or "
+            "newer flights took its place; keep reports by recordings.storage of the chart"
         )
     (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
     report_flight(experiment, folder, recording, False, page=False, figures=False)
@@ -171,14 +178,6 @@ def _report_of_pods(
 
 def _has(recording: Recording, record: MissionRecord) -> bool:
     return record.number in recording["/telemetry"]["mission_id"]
-
-
-def _check_seen(recording: Recording, record: MissionRecord) -> None:
-    if not _has(recording, record):
-        raise InvalidRunError(
-            f"the pods' recordings lack mission {record.id}: a pod has been replaced since, or "
-            "newer flights took its place; keep reports by recordings.storage of the chart"
-        )
 
 
 def _missions(release: Release) -> dict[str, MissionRecord]:

@@ -48,6 +48,13 @@ def test_a_kept_report_is_a_run_of_the_last_mission_and_of_the_links_profile(dat
     assert recording["/mission"]["stamp_ns"][0] > HOUR
 
 
+def test_the_waypoints_of_a_robot_on_the_ground_have_its_height(data):
+    (data / "experiment.yaml").write_text("world: {robot: rover, scene: pillars}\n")
+    order = {"waypoints": [{"position_m": [1.5, 1.2]}]}
+    found = kept._experiment(data / "experiment.yaml", data / "profile.yaml", order)
+    assert found.mission.waypoints[0].position_m == (1.5, 1.2, 0.1)
+
+
 def test_a_report_of_another_install_is_told_by_the_missions_number(data, tmp_path, monkeypatch):
     """An earlier install, whose volume this is, has flown a mission of the same id."""
     there = keep(data, "m1")
@@ -57,13 +64,12 @@ def test_a_report_of_another_install_is_told_by_the_missions_number(data, tmp_pa
     monkeypatch.setattr(kept, "_missions", lambda release: {"m1": known})
     monkeypatch.setattr(kept, "_report_of_pods", pods)
     monkeypatch.setattr(kept, "find_pod", Mock())
+    monkeypatch.setattr(kept, "run", lambda name, words: there.name)
 
-    def kubectl(name, words, stdout=None):
-        if stdout:
-            stdout.write((there / words[-1].rpartition("/")[2]).read_bytes())
-        return there.name
+    def copy(release, pod, container, path, target):
+        target.write_bytes((there / target.name).read_bytes())
 
-    monkeypatch.setattr(kept, "run", kubectl)
+    monkeypatch.setattr(kept, "copy_file", copy)
     release = Release(None, "lab", "cloudrc")
     for folder in ("own", "foreign"):
         (found := tmp_path / folder).mkdir()
@@ -72,7 +78,8 @@ def test_a_report_of_another_install_is_told_by_the_missions_number(data, tmp_pa
         known.number += 1
 
 
-def test_the_oldest_reports_go(data):
+def test_the_oldest_reports_go(data, monkeypatch):
+    monkeypatch.setattr(kept, "report_flight", lambda *given, **wanted: None)
     names = [keep(data, f"m{number}", count=2).name for number in range(3)]
     kept_now = sorted(each.name for each in (data / "missions").iterdir())
     assert kept_now == names[1:]
