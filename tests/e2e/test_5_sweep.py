@@ -166,8 +166,9 @@ KINDS = {
         ),
     },
 }
-"""API version -> kind -> its scope, and fields of its spec. A field that is not here is refused.
-Source: the API references of Kueue 0.15 and JobSet 0.10."""
+"""API version -> kind -> its scope, and fields of its spec: those of the examples and some beside
+them. A field that is not here is refused. Their names are those of the API references of Kueue
+(v1beta2) and JobSet (v1alpha2)."""
 
 
 def schema(form):

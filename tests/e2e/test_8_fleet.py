@@ -1,4 +1,4 @@
-"""A fleet behind one cell, scaled to three: one Job, a verdict each, and the cell's numbers."""
+"""A fleet of three behind one cell: one Job, a verdict each, and the cell as in virtual time."""
 
 import json
 import re
@@ -30,8 +30,8 @@ MISSION = {"start": "spawn", "waypoints": [POINT]}
 SETS = [f"statefulset/{NAME}-cloudrc-{component}" for component in ("world", "cloud")]
 
 
-def install(rate_kbit, robots):
-    given = {"robots": robots, "experiment": {"mission": MISSION, "cell": {"rate_kbit": rate_kbit}}}
+def install(rate_kbit):
+    given = {"robots": 3, "experiment": {"mission": MISSION, "cell": {"rate_kbit": rate_kbit}}}
     values = [f"--set-json={key}={json.dumps(each)}" for key, each in given.items()]
     helm("upgrade", "--install", NAME, str(CHART), *values)
     wait_ready(replace(place(), name=NAME), timeout=120.0)
@@ -42,7 +42,7 @@ def mission(cluster, tmp_path_factory):
     """The file of the mission; the fleet is there as long as this module needs it."""
     path = tmp_path_factory.mktemp("fleet") / "point.yaml"
     path.write_text(yaml.safe_dump({**MISSION, "time_limit_s": 20.0}))
-    install(800, 2)
+    install(800)
     yield path
     helm("uninstall", NAME)
     selector = f"app.kubernetes.io/instance={NAME}"
@@ -77,16 +77,6 @@ def real_time_factor():
     return min(value(samples(page), "cloudrc_real_time_factor") for page in pages)
 
 
-def test_kubectl_scale_changes_the_fleet(mission):
-    kubectl("scale", "--replicas=3", *SETS)
-
-    def robots():
-        found = json.loads(cloudrc("list", "releases", "-n", NAMESPACE, "-o", "json").stdout)
-        return next((r["robot"], r["state"]) for r in found["releases"] if r["name"] == NAME)
-
-    eventually(lambda: robots() == ("3 pelican", "ready"), "3 robots", 60.0)
-
-
 def test_a_fleet_flies_by_one_job_and_loads_the_cell_as_in_virtual_time(mission, note, tmp_path):
     job, done = fly(mission)
     factor = real_time_factor()
@@ -107,9 +97,19 @@ def test_a_fleet_flies_by_one_job_and_loads_the_cell_as_in_virtual_time(mission,
     assert age == pytest.approx(wanted[1], rel=0.1)
 
 
+def test_kubectl_scale_changes_the_fleet(mission):
+    def robots():
+        found = json.loads(cloudrc("list", "releases", "-n", NAMESPACE, "-o", "json").stdout)
+        return next((r["robot"], r["state"]) for r in found["releases"] if r["name"] == NAME)
+
+    for count in (4, 3):
+        kubectl("scale", f"--replicas={count}", *SETS)
+        eventually(lambda: robots() == (f"{count} pelican", "ready"), f"{count} robots", 60.0)  # noqa: B023
+
+
 @pytest.mark.full
 def test_an_overloaded_cell_is_named(mission):
-    install(500, 3)
+    install(500)
     _, done = fly(mission)
     assert done.returncode != 0
     assert "cell overloaded: uplink" in done.stdout
