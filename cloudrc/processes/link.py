@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import json
 import time
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal
+from typing import Any, Literal
 
 from cloudrc.config.load import load_link, read_experiment, robot_settings
 from cloudrc.config.resolved import ResolvedExperiment
@@ -71,15 +72,15 @@ def run_link(settings: LinkSettings, stop: StopSignal) -> None:
     load = make_profile_loader(settings.direction, settings.config.absolute())
     profiles = Profiles(settings.profile, load, log)
     profile, peer = profiles.first(), PeerName(settings.peer, ipv4_addresses, log)
-    with TemporaryDirectory(prefix="tc-", dir=settings.route.parent) as tables:
-        programs, clock, wait = Programs(tables), time.monotonic_ns, time.sleep
-        netem = partial(Netem, programs, clock=clock, wait=wait, tables=Path(tables), log=log)
+    with (
+        TemporaryDirectory(prefix="tc-", dir=settings.route.parent) as tables,
+        closing(Programs(tables)) as programs,
+    ):
+        machine: dict[str, Any] = {"clock": time.monotonic_ns, "wait": time.sleep, "log": log}
         sidecar = Sidecar(
             relay=_relay_maker(settings, experiment),
-            netem=netem,
-            clock=clock,
-            wait=wait,
-            log=log,
+            netem=partial(Netem, programs, tables=Path(tables), **machine),
+            **machine,
             profile=profile,
             mode=settings.mode,
             direction=settings.direction,
@@ -106,14 +107,11 @@ def run_link(settings: LinkSettings, stop: StopSignal) -> None:
             exporter.link.tell = lambda: status_page(sidecar)
         if settings.control:
             ControlServer(settings.control, change, lambda: sidecar.state)
-        try:
-            repeat(poll_profile, PROFILE_PERIOD, PROFILE_PERIOD)
-            repeat(resolve_peer, *PEER_PAUSE)
-            repeat(sidecar.publish_released, RELEASED_PERIOD, RELEASED_PERIOD)
-            alive = feed.alive_while(stop)
-            sidecar.run(lambda: alive() if sidecar.state else stop())
-        finally:
-            programs.close()
+        repeat(poll_profile, PROFILE_PERIOD, PROFILE_PERIOD)
+        repeat(resolve_peer, *PEER_PAUSE)
+        repeat(sidecar.publish_released, RELEASED_PERIOD, RELEASED_PERIOD)
+        alive = feed.alive_while(stop)
+        sidecar.run(lambda: alive() if sidecar.state else stop())
 
 
 def make_profile_loader(direction: str, experiment: Path) -> Load:
