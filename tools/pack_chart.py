@@ -3,7 +3,8 @@
 `helm package` stamps each file with the present time, before Helm 4 always. This tool takes its
 archive and sets owner, rights and times to fixed values.
 
-    python -m tools.pack_chart FOLDER EPOCH
+    python -m tools.pack_chart FOLDER EPOCH            the chart of the working tree
+    python -m tools.pack_chart FILE.tgz --of COMMIT    that of a commit, for the tests of upgrades
 """
 
 from __future__ import annotations
@@ -31,6 +32,18 @@ def pack(chart: Path, folder: Path, epoch: int) -> Path:
     return target
 
 
+def pack_commit(commit: str, file: Path) -> None:
+    """Pack the chart of a commit into `file`; its time is the time of all files."""
+    show = ["git", "-C", str(ROOT), "show", "--no-patch", "--format=%ct", commit]
+    epoch = int(subprocess.run(show, check=True, capture_output=True).stdout)
+    archive = ["git", "-C", str(ROOT), "archive", commit, "charts/cloudrc"]
+    files = subprocess.run(archive, check=True, capture_output=True).stdout
+    with tempfile.TemporaryDirectory() as scratch:
+        subprocess.run(["tar", "-x", "-C", scratch], input=files, check=True)
+        made = pack(Path(scratch, "charts", "cloudrc"), Path(scratch, "packed"), epoch)
+        file.write_bytes(made.read_bytes())
+
+
 def _same_bytes(archive: Path, epoch: int) -> bytes:
     """Return the archive's content, sorted by name, with fixed owner, rights and times."""
     packed = io.BytesIO()
@@ -49,4 +62,7 @@ def _same_bytes(archive: Path, epoch: int) -> bytes:
 
 
 if __name__ == "__main__":
-    print(pack(ROOT / "charts" / "cloudrc", Path(sys.argv[1]), int(sys.argv[2])))
+    if sys.argv[2:3] == ["--of"]:
+        pack_commit(sys.argv[3], Path(sys.argv[1]))
+    else:
+        print(pack(ROOT / "charts" / "cloudrc", Path(sys.argv[1]), int(sys.argv[2])))

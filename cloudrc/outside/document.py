@@ -167,8 +167,10 @@ class Document:
         for key, source in self.sources.items():
             if source.is_setting and key[: len(path)] == path:
                 return source
-        above = (self.sources.get(path[:length]) for length in range(len(path), -1, -1))
-        return next(filter(None, above), Source("default", Path()))
+        for length in range(len(path), -1, -1):
+            if found := self.sources.get(path[:length]):
+                return found
+        return Source("default", Path())
 
     def get(self, *path: str) -> Any:
         """Return the value at `path`, or None if there is no such value."""
