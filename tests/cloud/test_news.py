@@ -115,15 +115,22 @@ def test_a_loop_freezes_for_want_of_an_echo_only_if_a_command_waits_for_one():
 
 
 FAR = ["link.profile=ideal", *both_ways(delay_ms=200, loss=0.1)]
+SENT_ON_DELTA = {
+    "plan 0.4 s": ("cloud.send_delta_mps=0.05",),
+    "plan 0.8 s": ("cloud.send_delta_mps=0.05", "cloud.plan_s=0.8"),
+}
 SHORT = ["mission=steps", "world.scene=empty", "mission.touch=null", "mission.steps.count=1"]
 
 
-def test_sent_on_delta_a_mission_needs_a_fraction_of_the_bytes():
-    """With all commands, and with those that are news."""
-    more = [], ["cloud.send_delta_mps=0.05"]
-    flown = [fly("fast", *FAR, *SHORT, *each) for each in more]
+def compare(name, *settings):
+    """Fly with all commands, and with those that are news; return numbers of both."""
+    flown = [fly("fast", *FAR, *settings, *more) for more in ((), SENT_ON_DELTA[name])]
     assert [flight.verdict.failures for flight in flown] == [(), ()]
-    every, news = map(numbers, flown)
+    return [numbers(flight) for flight in flown]
+
+
+def test_sent_on_delta_a_mission_needs_a_fraction_of_the_bytes():
+    every, news = compare("plan 0.4 s", *SHORT)
     assert news["bytes_sent_downlink"] < every["bytes_sent_downlink"] / 3
     assert news["hold_count"] == 0
     assert "commands_withheld" not in every
@@ -133,3 +140,13 @@ def test_sent_on_delta_a_mission_needs_a_fraction_of_the_bytes():
     )
     assert news["loss_downlink"] == pytest.approx(0.1, abs=0.08)
     assert news["tracking_rms_estimated"] < every["tracking_rms_estimated"] + 0.007
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", range(1, 11))
+@pytest.mark.parametrize("name", SENT_ON_DELTA)
+def test_sent_on_delta_the_contact_comes_in_time_for_an_eighth_of_the_bytes(name, seed):
+    every, news = compare(name, f"seed={seed}")
+    assert news["bytes_sent_downlink"] <= every["bytes_sent_downlink"] / 8
+    assert news["contact_time"] == pytest.approx(every["contact_time"], rel=0.01)
+    assert news["hold_count"] == 0

@@ -11,6 +11,12 @@ HALF = sqrt(0.5)
 SAMPLE = Odometry(1_000_000_000, (1.0, 2.0, 3.0), UPRIGHT, (0.5, -1.0, 2.0), (0.0, 0.0, pi / 2))
 
 
+def test_constant_velocity_is_equation_3():
+    stamp_ns, position, _, *rates = constant_velocity.build().predict(SAMPLE, 0.1)
+    assert (stamp_ns, position) == (1_100_000_000, pytest.approx((1.05, 1.9, 3.2)))
+    assert rates == [SAMPLE.velocity, SAMPLE.angular_velocity_body]
+
+
 @pytest.mark.parametrize("module", [constant_velocity, commanded_velocity, constant_acceleration])
 @pytest.mark.parametrize(
     ("before", "after"),

@@ -12,13 +12,27 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from cloudrc.config.profile import load_profile
+from cloudrc.config.shipped import names
 from cloudrc.drivers.programs import Programs
 from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.link.model import LinkDirection
 from cloudrc.link.netem import STRETCH, Netem, table
 from cloudrc.link.profile import Trace
+from cloudrc.link.streams import numbers, sample
+from cloudrc.link.traces import link_profile
 from cloudrc.runs.links.under_test import DEVICE, HOSTS, _namespaces, inside
+from cloudrc.tunnel.codec import Kind
 from tests.link.profiles import blackout, changed, in_bursts, profile_of
 
+MINUTES = [
+    (name, way)
+    for name in names("profile")
+    for way in ("uplink", "downlink")
+    if name != "lossy"  # netem refuses that one
+    and (way == "uplink" or load_profile(name).downlink != load_profile(name).uplink)
+]
+"""Directions of the shipped profiles; one direction if both are equal."""
 pytestmark = pytest.mark.netem
 
 
@@ -74,12 +88,12 @@ class Flow:
             meanwhile()
             time.sleep(max(0.0, begin + (index + 1) * period - time.monotonic()))
 
-    def settle(self):
+    def settle(self, quiet=0.5):
         """Wait until nothing arrives any more, then close."""
         count = -1
         while count != len(self.arrived):
             count = len(self.arrived)
-            time.sleep(0.5)
+            time.sleep(quiet)
         self._open = False
         self._thread.join()
         self._out.close()
@@ -190,6 +204,44 @@ def test_losses_are_as_many_as_asked_and_counted(shaped, asked, share, burst):
     assert (counts["forwarded"], counts["lost"]) == (len(arrived), len(lost))
     assert len(lost) / 2000 == pytest.approx(share, abs=0.07)
     assert mean == pytest.approx(burst, rel=0.5)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("name", "way"), MINUTES)
+def test_a_shipped_profile_for_a_minute(shaped, name, way, figure):
+    """Mean, loss and order are those that the model draws for the same instants of sending."""
+    profile = link_profile(getattr(load_profile(name), way))
+    found, drawn = [], []
+
+    def off():
+        tunnel, stranger = Flow(), Flow(port=7402)
+        sending = (6000, 0.01, lambda: stranger.send(1, 0.0))
+        sender = threading.Thread(target=tunnel.send, args=sending)
+        shaped.follow_profile(profile, restart=True)
+        sender.start()
+        while sender.is_alive():
+            shaped.step(0.1)  # as a link's process does, whether there is a time line or not
+        found[:] = [tunnel.settle()]
+        drawn[:] = [drawn_for(tunnel, profile, seed) for seed in range(20)]
+        beside, mean = stranger.settle().delays().mean(), tunnel.delays().mean()
+        asked = float(np.mean([each.mean for each in drawn]))
+        return float(abs(mean - beside - asked))
+
+    error = least(off, WITHIN)
+    figure("netem, a minute of a profile: mean off by", 1e3 * error, "<=", 1e3 * WITHIN, "ms")
+    assert error <= WITHIN
+    order = np.array(found[0].numbers())
+    loss = 1 - len(set(found[0].numbers())) / 6000
+    overtaken = float(np.sum(np.maximum.accumulate(order)[:-1] > order[1:])) / len(order)
+    for what, measured in (("loss", loss), ("overtaken", overtaken)):
+        values = np.array([getattr(each, what) for each in drawn])
+        assert abs(measured - values.mean()) <= 5 * values.std() + 0.003, what
+
+
+def drawn_for(flow, profile, seed):
+    """Return the model's statistics for packets with the times of sending of a flow."""
+    sent_ns = [at_ns - flow.sent_ns[0] for at_ns in flow.sent_ns]
+    return numbers(sample(LinkDirection(profile, seed, True), Kind.TELEMETRY, sent_ns, SIZE))
 
 
 def test_a_change_in_flight_loses_nothing(shaped):
