@@ -272,8 +272,10 @@ def last_words(stderr: bytes) -> str:
     text = stderr.decode(errors="replace")
     lines = [" ".join(line.split()) for line in text.splitlines() if line.strip()]
     first = next((i for i, line in enumerate(lines) if line.lower().startswith("error")), -1)
-    message = " ".join(lines[first:])
-    return message.removeprefix("Error: ").removeprefix("error: ") or "no error message"
+    message = " ".join(lines[first:]).removeprefix("Error: ").removeprefix("error: ")
+    if "error dialing backend" in message:  # the API server reaches no kubelet
+        message += "; the pod's node does not answer, see: kubectl get nodes"
+    return message or "no error message"
 
 
 def end_process(process: subprocess.Popen[Any]) -> None:

@@ -51,6 +51,11 @@ def test_only_a_short_outage_is_waited_for(running, release):
     [
         ("exec sleep 60", TimedOutError, r"'helm list' took more than 0\.3 s"),
         ("echo 'W1120 06:00 beware\nError: UPGRADE FAILED: no\n  - way'", ClusterError, "no - way"),
+        (
+            "echo 'error: error dialing backend: dial tcp 172.18.0.2:10250: connection refused'",
+            ClusterError,
+            "the pod's node does not answer, see: kubectl get nodes",
+        ),
     ],
 )
 def test_the_error_of_a_program_becomes_one_line(pretend, monkeypatch, script, kind, expected):
