@@ -25,7 +25,8 @@ TRACK, ESTOP = GuardState.TRACK, GuardState.ESTOP  # looking up a member of an e
 class Robot:
     """Runs physics, guard and onboard controller step by step, and informs `observers`.
 
-    An observer has the methods of `faults.invariants.RobotInvariants`.
+    An observer has the methods see_step, see_command, see_request and see_session, as that of the
+    faults' invariants.
 
     Onboard controller and actuators may be code of a user. If it fails in flight, the guard stops
     the robot.
