@@ -86,6 +86,7 @@ class WorldEndpoint(TunnelEnd):
         counts = robot.guard.counts
         super().__init__(identity, Direction.UPLINK, counts, newest_wins=newest_wins)
         self.robot, self._sensors = robot, sensors
+        self._run_robot = robot.advance if robot.name else robot.run  # only a user's code may fail
         self._tick_ns, self._slip_ns = start_ns, 0  # world's clock and its lag
         self._command_age_max_ns = age_max_ns = robot.guard.command_age_max_ns
         self._door = ServerHandshake(self._session, identity.nonce, identity.clock_id, age_max_ns)
@@ -181,7 +182,7 @@ class WorldEndpoint(TunnelEnd):
                 self._sample(tick_ns)
             sample_ns = self._sample_ns
             stop_ns = sample_ns if sample_ns < until_ns else until_ns
-            tick_ns = self._tick_ns = self.robot.advance(tick_ns, stop_ns)
+            tick_ns = self._tick_ns = self._run_robot(tick_ns, stop_ns)
         if samples and tick_ns == self._sample_ns:
             self._sample(tick_ns)
 

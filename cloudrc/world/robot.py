@@ -67,20 +67,17 @@ class Robot:
         return RESULT.row(commands, self._size, "result") if self.name else commands
 
     def advance(self, tick_ns: int, until_ns: int) -> int:
-        """Run steps as `run` does; if the user's code that runs them fails, Python runs them.
+        """Run steps of a robot with a user's code as `run` does; if it fails, Python runs them.
 
         Then the guard has stopped the robot.
         """
         try:
             ended_ns = self.run(tick_ns, until_ns)
-            if self.name:
-                RESULT.array(self.simulator.data.qvel, "velocity")
-            return ended_ns
+            RESULT.array(self.simulator.data.qvel, "velocity")
         except FAILURES as error:
-            if not self.name:
-                raise
             self._fail(error, tick_ns)
             return Robot.run(self, tick_ns, until_ns)
+        return ended_ns
 
     def run(self, tick_ns: int, until_ns: int) -> int:
         """Run steps from `tick_ns` up to `until_ns`; return the time of the next step [ns]."""
