@@ -56,6 +56,9 @@ def without_collections() -> Iterator[None]:
         yield
     finally:
         if was_on:
+            # The flight's records become old objects at once; else a collection visits them now.
+            gc.freeze()
+            gc.unfreeze()
             gc.enable()
 
 
