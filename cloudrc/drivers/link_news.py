@@ -60,4 +60,7 @@ def _differences(before: dict[str, Any], after: dict[str, Any]) -> Iterator[str]
 def _show(value: Any) -> str:
     if value is None:
         return "not set"
-    return f"{value:g}" if isinstance(value, float) else to_one_line(json.dumps(value))[:VALUE_MAX]
+    if isinstance(value, float):
+        return f"{value:g}"
+    text = to_one_line(json.dumps(value))
+    return text if len(text) <= VALUE_MAX else f"{text[: VALUE_MAX - 3]}..."
