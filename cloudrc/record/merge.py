@@ -153,19 +153,20 @@ def merge(world: Path, cloud: Path, last_ns: int | None = None) -> Recording:
 def _read(path: Path, last_ns: int | None) -> Recording:
     """Read a recording, and the complete part before it, if both have stamps of one clock."""
     recording, earlier = Recording.read(path, last_ns=last_ns), part_before(path)
-    until_ns = recording.messages[-1][1] - (last_ns or END_NS)
-    if recording.messages[0][1] < until_ns or not earlier.is_file():
+    newer = recording.messages
+    is_enough = bool(newer) and newer[0][1] < newer[-1][1] - (last_ns or END_NS)
+    if is_enough or not earlier.is_file():
         return recording
     try:
         before = Recording.read(earlier, last_ns=last_ns)
     except CloudrcError:  # of a process that was killed at once
         return recording
     # Whoever copied the files while a recorder began anew may have the same part twice.
-    follows = before.messages[0][1] < recording.messages[0][1]
+    older = before.messages
+    follows = bool(older) and (not newer or older[0][1] < newer[0][1])
     same_clock = before.metadata.get("clock_id") == recording.metadata.get("clock_id")
     if follows and same_clock and not before.lacking:
-        messages = [*before.messages, *recording.messages]
-        recording.messages = sorted(messages, key=itemgetter(1))
+        recording.messages = sorted([*older, *newer], key=itemgetter(1))
         recording.holes = union([*before.holes, *recording.holes])
         recording.told = "; ".join(filter(None, [before.told, recording.told]))
     return recording

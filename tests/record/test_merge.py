@@ -122,6 +122,14 @@ def test_a_complete_part_before_on_the_same_clock_belongs_to_a_recording(
     assert len(merge(world, cloud)["/odometry"]) == 50
 
 
+def test_a_part_that_has_just_begun_hides_nothing_of_the_part_before(tmp_path):
+    world, cloud = files(tmp_path, [], cloud_records(50, SECOND), ("a", "a"))
+    write(part_before(world), world_records(50, SECOND), "world", "a")
+    assert len(merge(world, cloud)["/odometry"]) == 50
+    write(part_before(world), [], "world", "a")
+    assert len(merge(world, cloud)["/odometry"]) == 0
+
+
 def test_unrelated_clocks_begin_together_also_in_a_torn_file(tmp_path):
     cloud = [one for one in cloud_records(150, SECOND) if not isinstance(one, rec.Arrival)]
     ends = files(tmp_path, world_records(150, 7 * SECOND), cloud, ("a", "b"))
