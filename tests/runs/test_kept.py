@@ -8,6 +8,7 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.cluster.client import Release
+from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.report.folder import read_run
@@ -76,6 +77,9 @@ def test_a_report_of_another_install_is_told_by_the_missions_number(data, tmp_pa
         kept.fetch_mission(release, "m1", found, print)
         assert (pods.called, bool([*found.iterdir()])) == (folder == "foreign", folder == "own")
         known.number += 1
+    known.state = "flying"
+    with pytest.raises(BadInputError, match="mission m1 has not ended; wait for its end"):
+        kept.fetch_mission(release, "m1", found, print)
 
 
 def test_the_oldest_reports_go(data, monkeypatch):
