@@ -205,5 +205,6 @@ def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write plain values as JSON, as `write_atomically` does."""
-    write_atomically(path, f"{json.dumps(document, indent=2, ensure_ascii=False)}\n".encode())
+    """Write plain values as JSON, as `write_atomically` does; a number must be finite."""
+    text = json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False)
+    write_atomically(path, f"{text}\n".encode())

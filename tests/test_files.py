@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from cloudrc import files
-from cloudrc.files import make_own_folder, who_may_write
+from cloudrc.files import make_own_folder, who_may_write, write_json
 
 OTHER = os.geteuid() + 1
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
@@ -82,3 +82,9 @@ def test_new_folders_are_for_this_user_alone(tmp_path, umask):
     finally:
         os.umask(before)
     assert [path.stat().st_mode & 0o777 for path in (folder, folder.parent)] == [0o700, 0o700]
+
+
+def test_json_with_a_number_that_is_not_finite_is_not_written(tmp_path):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "report.json", {"rms": float("nan")})
+    assert not [*tmp_path.iterdir()]
