@@ -19,12 +19,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
-from importlib.metadata import (
-    EntryPoint,
-    entry_points,
-    packages_distributions,
-    version,
-)
+from importlib.metadata import EntryPoint, entry_points, packages_distributions, version
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType

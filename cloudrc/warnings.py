@@ -27,8 +27,10 @@ from cloudrc.tunnel.codec import COMMAND_SIZES, TELEMETRY_SIZES
 GUARD_STEP = 0.002
 """Time between two looks of the guard at the age of a command [s]."""
 WITHOUT_MODEL = (
-    *("last_sample", "commanded_velocity"),
-    *("constant_velocity", "constant_acceleration"),
+    "last_sample",
+    "commanded_velocity",
+    "constant_velocity",
+    "constant_acceleration",
 )
 """Predictors of cloudrc that know no model of the robot."""
 

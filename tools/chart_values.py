@@ -69,12 +69,21 @@ SECRET = {**OBJECT, "properties": {"name": NAME}, "additionalProperties": False}
 PULL_SECRETS = {"type": "array", "items": _either(STRING, {**SECRET, "required": ["name"]})}
 HOST = _text(r"^$|^([a-z0-9]([-a-z0-9]*[a-z0-9])?\.)*[a-z0-9]([-a-z0-9]*[a-z0-9])?$")
 PORT = {"type": "integer", "minimum": 1, "maximum": 65_535}
-NAMES = """
-queueName schedulerName configMap priorityClassName runtimeClassName existingClaim tlsSecret
-className existingSecret name
-"""
+NAMES = (
+    "queueName",
+    "schedulerName",
+    "configMap",
+    "priorityClassName",
+    "runtimeClassName",
+    "existingClaim",
+    "tlsSecret",
+    "className",
+    "existingSecret",
+    "name",
+)
+"""Values that are names of Kubernetes."""
 RULES = {
-    **dict.fromkeys(NAMES.split(), NAME),
+    **dict.fromkeys(NAMES, NAME),
     "fullnameOverride": _text(r"^$|^[a-z]([-a-z0-9]*[a-z0-9])?$"),
     "tag": _text(r"^$|^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$"),
     "digest": _text(r"^$|^sha256:[0-9a-f]{64}$"),

@@ -24,6 +24,7 @@ from cloudrc.cluster.client import (
     run,
 )
 from cloudrc.cluster.pods import pod_failure
+from cloudrc.cluster.releases import COMPONENT
 from cloudrc.errors import to_one_line
 
 NEEDED = {
@@ -120,7 +121,7 @@ def render_chart(release: Release, values: Sequence[str]) -> list[Any]:
 def _specs(rendered: list[Any]) -> dict[str, Any]:
     """Return component -> spec of its Deployment or StatefulSet, of the chart's objects."""
     return {
-        thing["metadata"]["labels"]["app.kubernetes.io/component"]: thing["spec"]
+        thing["metadata"]["labels"][COMPONENT]: thing["spec"]
         for thing in rendered
         if thing["kind"] in ("Deployment", "StatefulSet")
     }

@@ -23,9 +23,24 @@ ENDS = (WORLD, CLOUD)
 AXES = ("x", "y", "z")
 TERMS = ("proportional", "integral", "derivative")
 DIRECTIONS = ("uplink", "downlink")
-OUTCOMES = tuple(
-    "sent used late stale repeated old_epoch range vertical future malformed version direction "
-    "accept_ignored tag hello busy unanswered".split()
+OUTCOMES = (
+    "sent",
+    "used",
+    "late",
+    "stale",
+    "repeated",
+    "old_epoch",
+    "range",
+    "vertical",
+    "future",
+    "malformed",
+    "version",
+    "direction",
+    "accept_ignored",
+    "tag",
+    "hello",
+    "busy",
+    "unanswered",
 )
 """Outcomes of a datagram. The sender counts "sent", the receiver counts all other outcomes."""
 ONLY_WORLD = {"stale", "range", "vertical", "future", "hello", "unanswered"}

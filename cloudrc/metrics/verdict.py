@@ -61,7 +61,11 @@ NOT_STARTED = (
     " guard.command_age_max_ms"
 )
 PROVEN_BY_ALL = (
-    "not_recorded not_started mission_not_ended waypoint_not_reached not_touched".split()
+    "not_recorded",
+    "not_started",
+    "mission_not_ended",
+    "waypoint_not_reached",
+    "not_touched",
 )
 """Codes of failures that only a recording without holes proves: something never happened in it."""
 ADVICE = "close other programs or give the run more cores"

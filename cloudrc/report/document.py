@@ -24,7 +24,17 @@ ENVIRONMENT_FILE, FILES = "environment.json", "files"
 """Name of the file about the machine of a flight, and its key for the hashes of files."""
 INCOMPLETE = "The recording is incomplete"
 """Beginning of the note on what a recording has lost."""
-PACKAGES = "cloudrc mujoco numpy pydantic pyyaml cryptography mcap rosbags matplotlib".split()
+PACKAGES = (
+    "cloudrc",
+    "mujoco",
+    "numpy",
+    "pydantic",
+    "pyyaml",
+    "cryptography",
+    "mcap",
+    "rosbags",
+    "matplotlib",
+)
 """Packages whose versions can change the results of a run or a report."""
 
 
