@@ -217,12 +217,12 @@ class Flight:
 def _joined(recording: Recording, source: type[Record]) -> Columns:
     """Return the columns of all topics in whose rows the records of a class are."""
     tables = [recording[topic.name].columns for topic in BY_SOURCE[source]]
+    times_ns = [table["stamp_ns"] for table in tables]
     # In the last period of a torn recording some topics may be missing.
-    stamps = reduce(np.intersect1d, [table["stamp_ns"] for table in tables])
-    columns: Columns = {}
-    for table in tables:
-        columns |= select(table, np.searchsorted(table["stamp_ns"], stamps))
-    return columns
+    if not all(np.array_equal(times_ns[0], each) for each in times_ns):
+        stamps = reduce(np.intersect1d, times_ns)
+        tables = [select(table, np.searchsorted(table["stamp_ns"], stamps)) for table in tables]
+    return {name: column for table in tables for name, column in table.items()}
 
 
 def _flown(flight: Flight, columns: Columns) -> Columns:
