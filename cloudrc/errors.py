@@ -35,6 +35,14 @@ class NothingFlownError(BadInputError):
     """Nothing was flown that could be shown, reported or compared."""
 
 
+class StateError(BadInputError):
+    """What is there does not allow it now; the text says what to do first."""
+
+
+class RejectedError(BadInputError):
+    """The process that was asked has judged the input, and does not take it; the text is its."""
+
+
 class MissingPrerequisiteError(CloudrcError):
     """A package, program or permission is missing."""
 

@@ -24,7 +24,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "mujoco": ("sim/",),
     "yaml": ("outside/", "config/", "record/", "report/", "cli/", "cluster/"),
     "pydantic": (
-        *("config/", "link/", "cli/", "teleop/", "trials/plan", "report/folder"),
+        *("config/", "link/", "cli/", "teleop/", "report/folder"),
         *("drivers/process", "faults/schedule", "exercise/task"),
     ),
     "matplotlib": ("report/",),

@@ -13,6 +13,7 @@ from cloudrc.cli.progress import Progress, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.cli.where import release_from_flags
 from cloudrc.config.overrides import parse_settings
+from cloudrc.config.sweep import draft_of
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.files import read_json, write_atomically, write_json
 from cloudrc.metrics.verdict import EXIT_CODES
@@ -25,7 +26,7 @@ from cloudrc.studies.pods import fly_in_pods
 from cloudrc.text import escape
 from cloudrc.trials import summary as summaries
 from cloudrc.trials.bucket import open_rows
-from cloudrc.trials.plan import PlannedFlight, SweepPlan, check, draft_of, read_draft, unpack
+from cloudrc.trials.plan import PlannedFlight, SweepPlan, check, read_draft, unpack
 from cloudrc.trials.play import keep
 from cloudrc.trials.play import run as play_missing
 from cloudrc.trials.rows import Row

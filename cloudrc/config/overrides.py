@@ -16,8 +16,8 @@ from __future__ import annotations
 import copy
 import inspect
 import json
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from functools import lru_cache, reduce
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -62,13 +62,12 @@ class Setting(NamedTuple):
 
 Settings: TypeAlias = dict[KeyPath, Setting]
 """Path -> setting, keys with fewer parts first."""
+Given: TypeAlias = tuple[str, Any, Source]
+"""A setting as it is given: its key, such as `link.both.delay_ms`, its value and its source."""
 
 
-def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
-    """Make settings from triples of a key, such as `link.both.delay_ms`, its value and its source.
-
-    Raise a BadInputError if a key has an empty part or is set twice.
-    """
+def collect_settings(given: Iterable[Given]) -> Settings:
+    """Make settings; raise a BadInputError if a key has an empty part or is set twice."""
     found: Settings = {}
     for key, value, source in given:
         path = tuple(part.strip() for part in key.split("."))
@@ -92,18 +91,49 @@ def _directions(path: KeyPath) -> list[KeyPath]:
 def parse_settings(
     texts: Iterable[str], label: str = "--set", example: str = "link.both.delay_ms=40"
 ) -> Settings:
-    """Parse texts `key=value`; a relative path in a value starts at the working folder.
+    """Parse texts `key=value`, as `split_settings` does."""
+    return collect_settings(split_settings(texts, label, example))
+
+
+def split_settings(
+    texts: Iterable[str], label: str = "--set", example: str = "link.both.delay_ms=40"
+) -> list[Given]:
+    """Split texts `key=value`; a relative path in a value starts at the working folder.
 
     Raise a BadInputError for a text of another form; its message begins with `label` and
     ends with an `example` of the right form.
     """
-    given, source = list[tuple[str, Any, Source]](), Source(label, Path.cwd())
+    given, source = list[Given](), Source(label, Path.cwd())
     for text in texts:
         key, equals, value = text.partition("=")
         if not equals:
             raise BadInputError(f"{label} {text}: must be key=value; for example {example}")
         given.append((key, parse_value(value, f"{label} {key}"), source))
-    return collect_settings(given)
+    return given
+
+
+def check_no_seed(settings: Settings) -> None:
+    """Check that no setting is the seed: work with several seeds sets that of each flight."""
+    if (seed := settings.get(("seed",))) is not None:
+        text = "each flight has its own seed; give their number with --seeds or the key 'seeds'"
+        raise BadInputError(f"{seed.source.label}: seed: {text}")
+
+
+@contextmanager
+def naming_settings(settings: Settings) -> Iterator[None]:
+    """Let a ProblemsError of the block name the settings that caused its problems."""
+    try:
+        yield
+    except ProblemsError as error:
+        lines = [f"{_label(settings, each.path)}{each}" for each in error.problems]
+        raise BadInputError("; ".join(lines)) from error
+
+
+def _label(settings: Settings, path: KeyPath) -> str:
+    """Return the place of the setting that caused a problem, as "FILE:LINE: "; "" if none did."""
+    paths = [path[:length] for length in range(len(path), 0, -1)]
+    paths += [key for key in settings if key[: len(path)] == path]  # of a part of the value
+    return next((f"{settings[key].source.label}: " for key in paths if key in settings), "")
 
 
 def apply_overrides(document: Document, settings: Settings, *, build: bool = False) -> None:

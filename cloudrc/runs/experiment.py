@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from cloudrc.config.compute import check_unshared
 from cloudrc.config.load import load_experiment
-from cloudrc.config.overrides import OUTSIDE, ROS2, parse_settings
+from cloudrc.config.overrides import OUTSIDE, ROS2, Settings
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.scene import has_mujoco
@@ -27,27 +27,23 @@ WARNINGS_MAX = 3
 
 
 def load(
-    name: str, overrides: Iterable[str], seed: int | None = None, *, fleets: bool = False
+    name: str,
+    overrides: Iterable[str] | Settings,
+    seed: int | None = None,
+    *,
+    fleets: bool = False,
 ) -> ResolvedExperiment:
     """Load an experiment by name or path with `overrides` (KEY=VALUE); check `report.metrics`.
 
     Without `fleets`, it must be the flight of one robot.
     """
-    seeds = [] if seed is None else [f"seed={seed}"]
-    experiment = load_experiment(name, [*overrides, *seeds])
+    changes = overrides if seed is None else [*overrides, f"seed={seed}"]
+    experiment = load_experiment(name, changes)
     if not fleets:
         check_alone(experiment)
-    measure.check(experiment.report.metrics)
+    own = experiment.report.metrics
+    reuse(("metrics", own), lambda: measure.check(own))
     return experiment
-
-
-def check_no_seed(texts: Iterable[str]) -> None:
-    """Check that none of the settings `texts` (KEY=VALUE) sets the seed.
-
-    Work with several seeds replaces the seed in every flight.
-    """
-    if ("seed",) in parse_settings(texts):
-        raise problem_at("seed", "each flight has its own seed; give their number with --seeds")
 
 
 def robots_of(

@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cloudrc.config.sweep import draft_of
 from cloudrc.errors import CloudrcError, NothingFlownError
 from cloudrc.metrics.measure import SHIPPED
 from cloudrc.outside.refusal import check_names, naming
 from cloudrc.outside.values import InvalidValueError
 from cloudrc.runs.flight import counts
 from cloudrc.studies.sweep import read_flights
-from cloudrc.trials.plan import SweepPlan, check, draft_of
+from cloudrc.trials.plan import SweepPlan, check
 from cloudrc.trials.play import run
 from cloudrc.trials.rows import Row, Rows
 from cloudrc.trials.summary import (
