@@ -25,7 +25,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "yaml": ("outside/", "config/", "record/", "report/", "cli/", "cluster/"),
     "pydantic": (
         *("config/", "link/", "cli/", "teleop/", "report/folder"),
-        *("drivers/process", "faults/schedule", "exercise/task"),
+        *("drivers/process", "faults/schedule"),
     ),
     "matplotlib": ("report/",),
     "viser": ("console/", "report/replay"),

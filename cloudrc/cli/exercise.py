@@ -19,7 +19,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.outside.paths import check_there
 
 if TYPE_CHECKING:
-    from cloudrc.exercise.task import Task
+    from cloudrc.config.task import Task
 
 VERBS = {"new": "write the files that students fill in", "check": "score students' files"}
 EPILOG = """\
@@ -67,8 +67,7 @@ def execute(options: Options) -> None:
 
 
 def _new(task: str | None, folder: Path) -> None:
-    from cloudrc.exercise.files import write_files
-    from cloudrc.exercise.task import SHIPPED
+    from cloudrc.exercise.files import SHIPPED, write_files
 
     if task is None and folder.suffix in (".yaml", ".yml"):
         task, folder = str(folder), Path(folder.stem)
@@ -81,7 +80,8 @@ def _new(task: str | None, folder: Path) -> None:
 
 def _read(source: Path) -> Task:
     """Read a task, and check the flights of a lecturer's own."""
-    from cloudrc.exercise.task import SHIPPED, read_task
+    from cloudrc.config.task import read_task
+    from cloudrc.exercise.files import SHIPPED
 
     task = read_task(source)
     if source != SHIPPED:
@@ -95,8 +95,8 @@ def _check(options: Options, folder: Path) -> None:
     """Score a hand-in, and show each test as it ends."""
     from cloudrc.cli.progress import Progress
     from cloudrc.exercise import score
+    from cloudrc.exercise.files import task_of
     from cloudrc.exercise.scoring import check
-    from cloudrc.exercise.task import task_of
 
     source = task_of(folder, options.task)
     task = _read(source)

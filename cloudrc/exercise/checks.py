@@ -21,8 +21,8 @@ from cloudrc import plugins
 from cloudrc.cloud.estimators import DelaySample
 from cloudrc.config.load import load_experiment
 from cloudrc.config.resolved import ResolvedExperiment
+from cloudrc.config.task import FormulaName, Task, TestConfig
 from cloudrc.errors import CloudrcError, PlacedError, describe_error
-from cloudrc.exercise.task import FormulaName, Task, TestConfig
 from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
 from cloudrc.metrics import measure
 from cloudrc.outside import code
@@ -111,7 +111,7 @@ def compare(formula: FormulaName, part: str, file: Path) -> tuple[float, str]:
 
 
 def check_flights(task: Task, beside: Path) -> None:
-    """Raise a BadInputError if an experiment of a task, a key or a number is none."""
+    """Check the experiments of a task's flights, their keys and their numbers."""
     files = {task.key(part): beside / name for part, name in task.files.items()}
     there = {key: file for key, file in files.items() if file.is_file()}
     for part in task.parts.values():

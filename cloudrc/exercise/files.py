@@ -6,9 +6,20 @@ from collections.abc import Collection
 from difflib import get_close_matches
 from pathlib import Path
 
-from cloudrc.exercise.task import COPY, SHIPPED, read_task
+from cloudrc.config.task import read_task
 from cloudrc.files import write_atomically
 from cloudrc.outside.paths import check_new, check_there
+
+SHIPPED = Path(__file__).with_name("task.yaml")
+"""The exercise of docs/exercise.md."""
+COPY = "task.yaml"
+"""Name of a task in a student's folder."""
+
+
+def task_of(folder: Path, given: Path | None = None) -> Path:
+    """Return the path of a hand-in's task: the given one, the copy in its folder, the exercise."""
+    copy = folder / COPY
+    return given or (copy if copy.is_file() else SHIPPED)
 
 
 def write_files(folder: Path, source: Path = SHIPPED) -> list[str]:

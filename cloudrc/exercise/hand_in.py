@@ -36,8 +36,8 @@ def score(part: str, folder: Path, source: Path) -> None:
     nowhere = os.open(os.devnull, os.O_RDWR)
     for standard in (0, 1, 2):
         os.dup2(nowhere, standard)
+    from cloudrc.config.task import read_task
     from cloudrc.exercise import checks
-    from cloudrc.exercise.task import read_task
 
     task = read_task(source)
     os.chdir(folder)  # a file may open one beside it by its name

@@ -14,12 +14,12 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
+from cloudrc.config.task import read_task
 from cloudrc.drivers.machine import interpreter, signal_group
 from cloudrc.errors import to_one_line
 from cloudrc.exercise import hand_in
-from cloudrc.exercise.files import describe_missing
+from cloudrc.exercise.files import SHIPPED, describe_missing, task_of
 from cloudrc.exercise.score import sum_up
-from cloudrc.exercise.task import SHIPPED, read_task, task_of
 
 TIME_LIMIT = 60
 """Limit of each part [s] of processor time; the solution needs 5 s."""

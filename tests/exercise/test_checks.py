@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from cloudrc import exercise
+from cloudrc.config.task import read_task
 from cloudrc.exercise import checks, scoring
-from cloudrc.exercise.task import SHIPPED, read_task
+from cloudrc.exercise.files import SHIPPED
 from tests.conftest import nightly, wait_until
 
 SOLUTION = Path(__file__).with_name("solution")

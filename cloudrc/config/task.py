@@ -1,7 +1,7 @@
 """Define a task for a class: its files, and the tests and points of each part.
 
-The exercise of docs/exercise.md is the task in `task.yaml` beside this file. A lecturer's own task
-has tests by flights alone; formulas are those of the exercise.
+A lecturer's own task has tests by flights alone; formulas are those of the exercise of
+docs/exercise.md.
 """
 
 from __future__ import annotations
@@ -15,10 +15,6 @@ from cloudrc.config.problems import validate
 from cloudrc.config.section import Section
 from cloudrc.outside.document import read_document
 
-SHIPPED = Path(__file__).with_name("task.yaml")
-"""The exercise."""
-COPY = "task.yaml"
-"""Name of a task in a student's folder."""
 FormulaName = Literal[
     "mean", "hold time", "position", "orientation", "velocity, stamp", "P", "I", "D", "limit"
 ]
@@ -94,9 +90,3 @@ class Task(Section):
 def read_task(path: Path) -> Task:
     """Read a task; raise a BadInputError that lists all problems."""
     return validate(read_document(path, str(path)), Task, str(path))
-
-
-def task_of(folder: Path, given: Path | None = None) -> Path:
-    """Return the path of a hand-in's task: the given one, the copy in its folder, the exercise."""
-    copy = folder / COPY
-    return given or (copy if copy.is_file() else SHIPPED)
