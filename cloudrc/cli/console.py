@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.cli.output import open_page, print_line, tell
 from cloudrc.cli.parser import Options, Parser, flags, whole_number
 from cloudrc.cli.where import (
+    api_arguments,
     flown_release,
     given_token,
     need_run_here,
     release_arguments,
-    token_argument,
 )
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 from cloudrc.teleop.client import Api
@@ -54,8 +54,7 @@ def arguments(parser: Parser) -> None:
     add = flags(pod)
     add("--config", "FILE", "experiment file")
     add("--profile", "FILE", "file of the link profile")
-    add("--api", "URL", "the API of teleop")
-    token_argument(pod)
+    api_arguments(pod, "the API of teleop")
 
 
 def _origin(text: str) -> str:

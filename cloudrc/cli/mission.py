@@ -33,13 +33,13 @@ from cloudrc.cli.parser import (
     whole_number,
 )
 from cloudrc.cli.where import (
+    api_arguments,
     find_local_run,
     given_token,
     need_release,
     release_arguments,
     run_argument,
     timeout_argument,
-    token_argument,
 )
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.runs.missions import Json, MissionFollower, read_mission
@@ -102,8 +102,7 @@ def arguments(parser: Parser) -> None:
     _report_arguments(verbs.pop("report"))
     for name, verb in verbs.items():
         url = "http://HOST:PORT[/PATH] or unix:PATH of a run or release"
-        flags(verb)("--api", "URL", url, required=name == "fly")
-        token_argument(verb)
+        api_arguments(verb, url, required=name == "fly")
         if name != "fly":
             run_argument(verb)
             release_arguments(verb)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from cloudrc.cli.output import print_line, tell
 from cloudrc.cli.parser import Options, Parser, add_verbs, flags
 from cloudrc.cli.processes import number_argument
-from cloudrc.cli.where import given_token, need_run_here, token_argument
+from cloudrc.cli.where import api_arguments, given_token, need_run_here
 from cloudrc.errors import BadInputError
 from cloudrc.teleop.client import Api
 
@@ -45,8 +45,7 @@ def arguments(parser: Parser) -> None:
     add("--config", "FILE", "experiment file")
     number_argument(pod)
     add("--records", "DIR", "folder of 'cloudrc cloud --records DIR'")
-    add("--api", "URL", "the API of teleop; without a token, nodes cannot steer")
-    token_argument(pod)
+    api_arguments(pod, "the API of teleop; without a token, nodes cannot steer")
 
 
 class _Flight(NamedTuple):

@@ -20,6 +20,7 @@ from cloudrc.cluster.client import DEFAULT_RELEASE as DEFAULT_RELEASE
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.files import warn_if_readable
 from cloudrc.outside.paths import TOKEN_VARIABLE, read_token
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
@@ -124,10 +125,21 @@ def need_release(options: Options) -> Release:
         raise MissingPrerequisiteError(f"{text}; and {error}") from None
 
 
-def token_argument(parser: argparse._ActionsContainer) -> None:
-    """Declare the argument --token-file."""
-    text = f"file with the API's token (default: from {TOKEN_VARIABLE}, or the release's Secret)"
-    flags(parser)("--token-file", "FILE", text)
+def api_arguments(parser: argparse._ActionsContainer, text: str, *, required: bool = False) -> None:
+    """Declare --api, the address of teleop's API, and --token-file."""
+    add = flags(parser)
+    add("--api", "URL", text, read=_api, required=required)
+    about = f"file with the API's token (default: from {TOKEN_VARIABLE}, or the release's Secret)"
+    add("--token-file", "FILE", about)
+
+
+def _api(text: str) -> str:
+    from cloudrc.teleop.client import Api
+
+    try:
+        return Api(text).url
+    except InvalidValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def given_token(options: Options) -> Callable[[], str] | None:

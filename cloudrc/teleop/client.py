@@ -14,8 +14,9 @@ from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
 
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import CloudrcError, RejectedError
 from cloudrc.outside.paths import TOKEN_VARIABLE
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.text import escape
 
 if TYPE_CHECKING:
@@ -39,10 +40,12 @@ FOREIGN = (
 ALL_MET = "every waypoint reached, every criterion met"
 """Says what a robot has done in a mission of waypoints that succeeded."""
 UNIX = "unix:"
+FORMS = "http://HOST:PORT[/PATH] or unix:PATH"
+"""What an address of the API looks like."""
 
 
 class ApiError(CloudrcError):
-    """Report that the API refuses a request."""
+    """Report that the API answers a request with an error."""
 
     exit_code = 5
 
@@ -55,7 +58,9 @@ class Api:
     """Call teleop's API at one address."""
 
     def __init__(self, url: str, token: Callable[[], str] = lambda: "", place: str = "") -> None:
-        """Check and store the address, "http://HOST:PORT[/PATH]" or "unix:PATH".
+        """Store the address, "http://HOST:PORT[/PATH]" or "unix:PATH".
+
+        Raise an InvalidValueError for another one.
 
         `token` is called for each request; it returns the current token, or "" for none. `place`
         is the name of the run or release for messages; "" if the user gave the address.
@@ -65,7 +70,7 @@ class Api:
         try:
             self._connection(REQUEST_TIMEOUT)
         except (ValueError, KeyError, http.client.InvalidURL):
-            raise BadInputError(f"--api {url}: give http://HOST:PORT[/PATH] or unix:PATH") from None
+            raise InvalidValueError(f"'{url}' is not {FORMS}") from None
 
     def get(self, path: str) -> Any:
         """Send a GET request; result and errors are those of `post`."""
@@ -76,8 +81,8 @@ class Api:
 
         Raises:
             UnreachableError: If there is no answer, or if teleop is busy or not ready yet.
-            BadInputError: If a value is invalid.
-            ApiError: If the API refuses the request for another reason.
+            RejectedError: If a value is invalid.
+            ApiError: If the API answers with another error.
         """
         return self._ask("POST", path, b"" if body is None else json.dumps(body).encode())
 
@@ -112,7 +117,7 @@ class Api:
                 answer = connection.getresponse()
                 is_page = answer.headers.get_content_type() == "text/html"
                 if is_page or not 200 <= answer.status < 300:
-                    raise _refusal(answer, self.place, with_token=bool(token))
+                    raise _error_of(answer, self.place, with_token=bool(token))
                 yield answer
             except (OSError, ValueError, http.client.HTTPException) as error:
                 why = getattr(error, "strerror", None) or error
@@ -157,7 +162,7 @@ def mission_path(mission_id: str) -> str:
     return f"/v1/missions/{quote(mission_id, safe='', errors='surrogateescape')}"
 
 
-def _refusal(answer: http.client.HTTPResponse, place: str, *, with_token: bool) -> CloudrcError:
+def _error_of(answer: http.client.HTTPResponse, place: str, *, with_token: bool) -> CloudrcError:
     """Return the error for an answer of the API that is no success."""
     detail = _detail(answer)
     if answer.status == 401:
@@ -165,12 +170,12 @@ def _refusal(answer: http.client.HTTPResponse, place: str, *, with_token: bool) 
         detail = f"the API {which}; name its file: --token-file FILE or {TOKEN_VARIABLE}"
     detail = f"{place}: {detail}" if place else detail
     if answer.status in (400, 413, 422):
-        return BadInputError(detail)
+        return RejectedError(detail)
     return UnreachableError(detail) if answer.status in RETRY_STATUSES else ApiError(detail)
 
 
 def _detail(answer: http.client.HTTPResponse) -> str:
-    """Return the reason that the API gives for a refusal; a line for each of several problems."""
+    """Return the reason that the API gives for an error; a line for each of several problems."""
     status = f"the API answered {answer.status} {answer.reason}"
     try:
         body = json.loads(answer.read())

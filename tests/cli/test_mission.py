@@ -210,3 +210,9 @@ def test_fly_waits_until_the_robots_of_its_fleet_begin_together(api, mission, mo
     mission("fly --mission two.yaml --at 112.5", 130)
     clock.sleep.assert_called_once_with(12.5)
     assert api.get("/v1/missions")["missions"] == []
+
+
+@pytest.mark.parametrize("url", ["ftp://there", "http://", "http://there:99999", "unix:", "there"])
+def test_an_address_of_the_api_is_judged_before_the_command(call, url):
+    said = call(f"mission status --api {url}", code=2).err
+    assert f"argument --api: '{url}' is not http://HOST:PORT[/PATH] or unix:PATH" in said
