@@ -179,10 +179,12 @@ def figure(options: Options) -> None:
 def _pods(options: Options) -> PodSettings:
     """Return the pods that the flags ask for."""
     require("a cluster", ("kube",))
-    from cloudrc.cluster.batch import PodSettings, check_changes
+    from cloudrc.cluster.batch import PodSettings, unknown_field
 
     settings = parse_settings(options.set_job, "--set-job", "priorityClassName=low")
-    check_changes(changes := {path: each.value for path, each in settings.items()})
+    changes = {path: each.value for path, each in settings.items()}
+    if text := unknown_field(changes):
+        raise BadInputError(f"--set-job {text}")
     given = {name: getattr(options, name) for name in PodSettings._fields if name in POD_FLAGS}
     return PodSettings(**given, changes=changes)
 

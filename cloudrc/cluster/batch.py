@@ -21,7 +21,7 @@ from cloudrc.cluster.jobs import (
     find_job,
     read_example,
 )
-from cloudrc.errors import BadInputError, to_one_line
+from cloudrc.errors import RejectedError, to_one_line
 from cloudrc.outside.document import KeyPath
 from cloudrc.text import suggest_name
 
@@ -68,8 +68,8 @@ class PodSettings(NamedTuple):
         return f"{above.rstrip('/')}/{name}" if above else None
 
 
-def check_changes(changes: Mapping[KeyPath, Any]) -> None:
-    """Raise a BadInputError if the Job has no field of this name."""
+def unknown_field(changes: Iterable[KeyPath]) -> str:
+    """Say which of the paths is no field of the Job, and a similar field; "" if each is one."""
     from kubernetes import client
 
     for path in changes:
@@ -79,7 +79,8 @@ def check_changes(changes: Mapping[KeyPath, Any]) -> None:
             ]
             text = "neither a Job nor its pod or container has this field"
             hint = suggest_name(path[0], fields)
-            raise BadInputError(f"--set-job {'.'.join(path)}: {text}{hint}")
+            return f"{'.'.join(path)}: {text}{hint}"
+    return ""
 
 
 def _level_of(path: KeyPath) -> str:
@@ -114,7 +115,7 @@ def start(
     belongs to no Helm release. The pods have `own_files` at the same paths as this machine.
 
     Raises:
-        ClusterError: If the cluster refuses the Job, for example because the sweep is too large.
+        ClusterError: If the cluster rejects the Job, for example because the sweep is too large.
     """
     if (earlier := find_job(release, name)) is not None:
         if not failure_of(earlier):  # flies, or is complete
@@ -167,20 +168,20 @@ def _set_up(job: Any, name: str, settings: PodSettings) -> None:
 def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iterator[str]:
     """Yield the lines of a Job's logs until the Job is complete; then delete the Job.
 
-    `tell` receives sentences for the user. A failed Job is not deleted, unless its pods refuse the
+    `tell` receives sentences for the user. A failed Job is not deleted, unless its pods reject the
     flights.
 
     Raises:
-        BadInputError: If a pod refuses the flights, for example because its image has other code.
+        RejectedError: If a pod rejects the flights, for example because its image has other code.
         ClusterError: If the Job fails, or if a pod will never run.
     """
     failures = list[str]()
 
     def describe_end(pod: Any, state: Any) -> str:
         words = to_one_line(state.message) or state.reason
-        if state.exit_code == BadInputError.exit_code:  # the other pods refuse them, too
+        if state.exit_code == RejectedError.exit_code:  # the other pods would, too
             delete_job(release, name)
-            raise BadInputError(f"the pods refuse the flights: {words}")
+            raise RejectedError(f"the pods reject the flights: {words}")
         if not state.exit_code:
             return ""
         words = OUT_OF_MEMORY if state.reason == "OOMKilled" else words

@@ -2,9 +2,9 @@
 
 First, `send` sends the new profile to the link containers of both pods, by the same request as in a
 local run (`link.control`); they apply it within a second. Then `keep` writes it into the ConfigMap,
-which restarted containers read. If a container refuses the profile, the ConfigMap stays unchanged.
-If a step fails, the error message lists the places where the change is in force. The files of
-traces are sent and stored with the profile.
+which restarted containers read. If a container does not take the profile, the ConfigMap stays
+unchanged. If a step fails, the error message lists the places where the change is in force. The
+files of traces are sent and stored with the profile.
 
 This module uses kubectl, which starts in 0.1 s; the Python client takes 0.5 s.
 """
@@ -25,8 +25,9 @@ from cloudrc.cluster.pods import INDEX
 from cloudrc.cluster.releases import CLOUDRC, COMPONENT, INSTANCE, no_release, several_releases
 from cloudrc.config.link_edit import Edit, edit_profile
 from cloudrc.config.load import load_link
+from cloudrc.config.problems import problem_at
 from cloudrc.config.profile import DIRECTIONS, FILE_READERS
-from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
+from cloudrc.errors import CloudrcError, RejectedError, TimedOutError
 from cloudrc.link.control import APPLY_LIMIT, SOCKET, put_request, read_answer
 from cloudrc.link.follow import PROFILE
 from cloudrc.link.state import CHANGE_FILE, ChangeFacts, LinkState, write_change
@@ -55,8 +56,8 @@ def read_link(release: Release) -> LinkParts:
     """Read a release's link with one kubectl command.
 
     If the name of `release` is "", read the link of the only release in the namespace. Raise a
-    BadInputError if there are several, a ClusterError if the release has no link, or if a pod does
-    not run.
+    StateError if there are several, a ClusterError if the release has no link, or if a pod does not
+    run.
     """
     selector = f"{CLOUDRC},{INSTANCE}={release.name}" if release.name else CLOUDRC
     words = [*release.flags, "get", "configmaps,pods", f"--selector={selector}", "--output=json"]
@@ -112,7 +113,7 @@ while data := link.recv(65536):
 def ask(release: Release, pod: str, request: bytes) -> LinkState:
     """Send a request to the link container of a pod; return the state of its direction.
 
-    Raise a ValueError or a BadInputError as `read_answer`, a ClusterError if kubectl fails.
+    Raise a ValueError or a RejectedError as `read_answer`, a ClusterError if kubectl fails.
     """
     words = ["python", "-I", "-S", "-c", CARRIER, f"{FOLDER}/{SOCKET}"]
     command = [*release.flags, "exec", "--stdin", pod, "--container=link", "--", *words]
@@ -134,8 +135,7 @@ def send(
     """Change the profile in both link containers, and wait until both have applied the change.
 
     `profile` and `settings` are those of `cloudrc.config.load.edit_profile`. `number` identifies
-    the change. Raise a BadInputError if the request is not valid, or if a container refuses the
-    change.
+    the change. Raise a RejectedError if a container does not take it.
     """
     edit, files = with_files(link.files, profile, settings)
     files[CHANGE_FILE] = write_change(ChangeFacts(number, edit.cause, edit.restart))
@@ -145,12 +145,12 @@ def send(
         answers = list(pool.map(lambda pod: _answer_of(release, pod, request, number), at))
     failed = [answer for answer in answers if isinstance(answer, CloudrcError)]
     states = [answer for answer in answers if isinstance(answer, LinkState)]
-    refused = [state for state in states if state.refused == number]
-    if refused:
-        said = [f"the {each.direction} is unchanged: {each.refusal}" for each in refused]
-        said += [f"the {each.direction} has the change" for each in states if each not in refused]
+    taken = [state for state in states if not state.objection(number)]
+    if len(taken) < len(states):
+        said = [state.objection(number) for state in states if state not in taken]
+        said += [f"the {state.direction} has the change" for state in taken]
         said += [*map(str, failed), "the ConfigMap is unchanged"]
-        raise BadInputError("; ".join(said))
+        raise RejectedError("; ".join(said))
     return Sent(edit, files, states, failed)
 
 
@@ -162,7 +162,7 @@ def _answer_of(release: Release, pod: str, request: bytes, number: str) -> LinkS
         return error
     except ValueError as error:
         return ClusterError(f"a link container has another version: {error}; upgrade it")
-    if number in (state.change, state.refused):
+    if state.has_decided(number):
         return state
     return TimedOutError(
         f"the {state.direction} did not apply the change within {APPLY_LIMIT:g} s; see the log "
@@ -201,9 +201,6 @@ def with_files(
 
     `files` maps file names to texts. If `profile` is given, this profile replaces the one in
     `files`. `settings` are texts `key=value`.
-
-    Raises:
-        BadInputError: If the request is not valid, or if the files are too large for a ConfigMap.
     """
     new: dict[str, str] = {}
     with TemporaryDirectory(prefix="cloudrc-") as name:
@@ -225,8 +222,6 @@ def with_files(
                     new[values[key]] = path.read_text(encoding="utf-8-sig")
     size = sum(len(text) for name, text in {**files, **new}.items() if name != EXPERIMENT)
     if size > SIZE_MAX:
-        raise BadInputError(
-            f"traces and profile have {size} bytes, a ConfigMap takes {SIZE_MAX}; use a trace "
-            "with fewer rows, for example one per 20 ms"
-        )
+        text = f"traces and profile have {size} bytes, a ConfigMap takes {SIZE_MAX}; use a trace"
+        raise problem_at("link", f"{text} with fewer rows, for example one per 20 ms")
     return edited, {PROFILE: write_yaml(edited.values), **new}

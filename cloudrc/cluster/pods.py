@@ -31,7 +31,7 @@ from cloudrc.cluster.client import (
     run,
 )
 from cloudrc.cluster.releases import CLOUDRC, COMPONENT, INSTANCE, no_release
-from cloudrc.errors import BadInputError, TimedOutError, to_one_line
+from cloudrc.errors import StateError, TimedOutError, to_one_line
 from cloudrc.record import part_before
 
 NO_IMAGE = ("ErrImagePull", "ImagePullBackOff", "ErrImageNeverPull", "InvalidImageName")
@@ -134,7 +134,7 @@ def find_pod(release: Release, component: str) -> Any:
     """Find the newest running pod of a component; else raise a ClusterError with the cause."""
     pods = list_pods(release, component)
     if (robots := len({pod.metadata.labels.get(INDEX) for pod in pods})) > 1:
-        raise BadInputError(f"{release} has {robots} robots; name one: --robot K")
+        raise StateError(f"{release} has {robots} robots; name one: --robot K")
     for pod in pods:
         if pod.status.phase == "Running":
             return pod

@@ -16,7 +16,7 @@ from cloudrc.cluster.client import (
     Release,
     connect,
 )
-from cloudrc.errors import BadInputError
+from cloudrc.errors import CloudrcError, StateError
 
 INSTANCE = "app.kubernetes.io/instance"
 """Label with the name of the release."""
@@ -112,7 +112,7 @@ def _link(files: dict[str, str]) -> str:
             (folder / key).write_text(text, encoding="utf-8")
         try:
             link = load_link(folder / "profile.yaml", folder / "experiment.yaml")
-        except BadInputError:
+        except CloudrcError:
             return "invalid"
     values = link.model_dump(mode="json", exclude_defaults=True)
     texts = [_way(values.get(way, {})) for way in DIRECTIONS]
@@ -131,7 +131,7 @@ def only_release(release: Release) -> Release:
     """Return the only release in the namespace of `release`; its name does not matter.
 
     Raises:
-        BadInputError: If the namespace has several releases.
+        StateError: If the namespace has several releases.
         ClusterError: If the namespace does not exist, or has no release.
     """
     names = [
@@ -153,16 +153,16 @@ def choose_release(
 
     Raises:
         MissingPrerequisiteError: If there is no valid kubeconfig.
-        BadInputError: If the namespace has several releases.
+        StateError: If the namespace has several releases.
         ClusterError: If it has none.
     """
     release = connect(context, namespace, name or DEFAULT_RELEASE)
     return release if name else only_release(release)
 
 
-def several_releases(release: Release, names: list[str]) -> BadInputError:
+def several_releases(release: Release, names: list[str]) -> StateError:
     """Return the error that a namespace has several releases."""
-    return BadInputError(
+    return StateError(
         f"several releases {release.where}: {', '.join(sorted(names))}; name one: --release NAME"
     )
 

@@ -54,7 +54,7 @@ class _Handler(HttpHandler):
             self.answer(REFUSED, str(error))
             return
         until = time.monotonic() + APPLY_LIMIT
-        while (state := self.server.state()) is None or number not in (state.change, state.refused):
+        while (state := self.server.state()) is None or not state.has_decided(number):
             if time.monotonic() > until:
                 break
             time.sleep(LOOK_PERIOD)

@@ -8,13 +8,13 @@ JSON object, file name -> text: `follow.PROFILE`, the traces that the profile na
 
 from __future__ import annotations
 
-from cloudrc.errors import BadInputError
+from cloudrc.errors import RejectedError
 from cloudrc.link.state import LinkState, from_text
 
 SOCKET = "link.sock"
 """Name of the socket in a pod, in the folder of the route file."""
 APPLY_LIMIT = 5.0
-"""Time limit for a direction to apply or to refuse a change [s]; usually it takes 0.1 s."""
+"""Time limit for a direction to decide about a change [s]; usually it takes 0.1 s."""
 OK, REFUSED = 200, 422
 """HTTP statuses of the answers: the state, or why the body is no change."""
 
@@ -28,13 +28,13 @@ def put_request(document: str) -> bytes:
 def read_answer(answer: bytes) -> LinkState:
     """Return the state of the direction; raise a ValueError if the answer has none.
 
-    Raise a BadInputError with the reason if the change was refused as invalid.
+    Raise a RejectedError with the reason if the direction has found the change invalid.
     """
     head, _, body = answer.partition(b"\r\n\r\n")
     words = head.split()
     status = int(words[1]) if words[1:] and words[1].isdigit() else 0
     if status == REFUSED:
-        raise BadInputError(body.decode(errors="replace").strip())
+        raise RejectedError(body.decode(errors="replace").strip())
     if status != OK:
         raise ValueError(f"answered with status {status}")
     return from_text(body)

@@ -59,6 +59,14 @@ class LinkState:
     refused: str = ""  # number of the last refused change; "" if no change was refused
     refusal: str = ""  # why the last refused change was refused, in words
 
+    def has_decided(self, number: str) -> bool:
+        """Return whether the direction has taken or refused the change `number`."""
+        return number in (self.change, self.refused)
+
+    def objection(self, number: str) -> str:
+        """Say why the change `number` was refused; "" if it was not."""
+        return f"the {self.direction} is unchanged: {self.refusal}" * (self.refused == number)
+
 
 def to_text(state: LinkState) -> str:
     """Format a state as JSON."""

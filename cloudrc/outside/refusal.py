@@ -23,6 +23,18 @@ def naming(place: str, wanted: str = "") -> Iterator[None]:
         raise BadInputError(f"{place}: {error}{hint}") from None
 
 
+@contextmanager
+def reading(place: object, text: str) -> Iterator[None]:
+    """Turn an error of the block, which reads a file of ours, into a BadInputError about its place.
+
+    Another program has cut or changed the file, or an early version of cloudrc has written it.
+    """
+    try:
+        yield
+    except (OSError, EOFError, ValueError, LookupError, TypeError) as error:
+        raise BadInputError(f"{place}: {text} ({error})") from error
+
+
 def check_names(what: str, names: Iterable[str], known: Iterable[str], place: str = "") -> None:
     """Raise a BadInputError if one of the `names` is none of the `known`; it suggests the nearest.
 

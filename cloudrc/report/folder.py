@@ -1,4 +1,4 @@
-"""Read the folder of a run to write a new report; refuse a recording that is not sufficient.
+"""Read the folder of a run to write a new report.
 
 The source of the report is `mission.mcap`. If another program has filtered, cut or replaced this
 file, cloudrc writes no report, and the old report stays unchanged.
@@ -17,11 +17,12 @@ from pydantic import TypeAdapter
 from cloudrc.config.load import read_experiment
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.drivers.local import JOURNAL_FILE, under_way
-from cloudrc.errors import BadInputError
+from cloudrc.errors import StateError
 from cloudrc.files import read, read_json
 from cloudrc.link.cell import CellLog
 from cloudrc.outside.document import parse_yaml
 from cloudrc.outside.paths import check_there
+from cloudrc.outside.refusal import reading
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
 from cloudrc.record.reader import NothingReadableError
@@ -42,8 +43,8 @@ JUDGEMENT = ("criteria", "description", "name", "report")
 def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     """Read the folder of a run; return arguments for `write_report`.
 
-    If the recordings of world and cloud are not merged yet, merge them. Raise a BadInputError if
-    the folder has no experiment, or no recording that is sufficient for a report.
+    If the recordings of world and cloud are not merged yet, merge them. Raise a StateError
+    if the recording is not sufficient for a report.
     """
     config, merged = folder / "config.yaml", folder / "mission.mcap"
     check_there(config, "name the folder of a run")
@@ -52,7 +53,7 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     recording = before or merge(folder / "world.mcap", folder / "cloud.mcap")
     whole = read_json(folder / "report.json", REPORT_BYTES_MAX).get("complete") is True
     for lack in _lacking(recording, config, whole=whole):
-        raise BadInputError(f"{merged}: {lack}; no report is written")
+        raise StateError(f"{merged}: {lack}; no report is written")
     run = _read_facts(recording)
     if before is None:
         run = replace(run, interrupted=True)  # the command was killed before it wrote mission.mcap
@@ -63,12 +64,12 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
 
 
 def check_ended(folder: Path) -> None:
-    """Raise a BadInputError if the flight whose files are in a folder has not ended."""
+    """Raise a StateError if the flight whose files are in a folder has not ended."""
     if folder.resolve() not in under_way() and not is_open(folder / "mission.mcap"):
         return
     if (folder / JOURNAL_FILE).is_file():
-        raise BadInputError(f"{folder}: the session has not ended; end it: cloudrc down")
-    raise BadInputError(f"{folder}: the flight has not ended; wait for its end")
+        raise StateError(f"{folder}: the session has not ended; end it: cloudrc down")
+    raise StateError(f"{folder}: the flight has not ended; wait for its end")
 
 
 def open_recording(run: Path) -> tuple[Path, Recording]:
@@ -92,11 +93,8 @@ def read_cell(path: Path) -> CellLog:
     """Read cell.csv, what the cell of a fleet did; without this file there was no cell."""
     if not path.exists():
         return CellLog(())
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            return CellLog.read(csv.DictReader(file))
-    except (ValueError, KeyError, TypeError) as error:
-        raise BadInputError(f"{path}: is not the record of a cell: {error}") from error
+    with reading(path, "is no record of a cell"), path.open(encoding="utf-8", newline="") as file:
+        return CellLog.read(csv.DictReader(file))
 
 
 def _read_merged(folder: Path) -> Recording | None:
@@ -105,7 +103,7 @@ def _read_merged(folder: Path) -> Recording | None:
     if not (folder / "mission.mcap").exists():
         if not any(ends) and (robots := robots_in(folder)):
             names = list_some([robot.name for robot in robots], 5)
-            raise BadInputError(f"{folder}: is a fleet; name one of its robots: {names}")
+            raise StateError(f"{folder}: is a fleet; name one of its robots: {names}")
         if not any(ends):
             check_there(folder / "mission.mcap", "name the folder of a run")
         return None

@@ -15,10 +15,10 @@ import numpy as np
 
 from cloudrc.config.hull import doubts, hull_of
 from cloudrc.config.overrides import onboard_values
+from cloudrc.config.problems import ConfigProblem, collect
 from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import RobotFiles, find_robot
 from cloudrc.config.schema import World
-from cloudrc.errors import BadInputError
 from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Vector
 from cloudrc.outside.code import calling
@@ -57,9 +57,6 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
 
     Args:
         name: Name of a shipped robot, or absolute path of a folder or an .xml file.
-
-    Raises:
-        BadInputError: If the robot does not compile or does not hold the contract.
     """
     world = World.model_validate({"robot": name, "scene": SCENE})
     robot = find_robot(name)
@@ -67,13 +64,17 @@ def check(name: str) -> tuple[dict[str, Any], list[str]]:
     advise(world, ZERO)
     body = build_robot(world, ResolvedGuard.model_validate({}))
     facts = _read_facts(world, robot, body.simulator.model)
-    changes = [*doubts(name), *_judge_tunings(robot, world)]
-    try:
-        with calling(f"the onboard controller of {name} failed", keep=BadInputError):
-            motion, rest = _move(body, robot)
-    except BadInputError as error:
-        return facts, [*changes, str(error)]
+    changes, failures = [*doubts(name)], list[ConfigProblem]()
+    for tuning in robot.tunings:  # an experiment may choose it
+        with collect(failures, ()):
+            check_robot(world.model_copy(update={"tuning": tuning}))
+    motion, rest = dict[str, float](), 0.0
+    with collect(failures, ()), calling(f"the onboard controller of {name} failed"):
+        motion, rest = _move(body, robot)
     facts |= motion
+    changes += map(str, failures)
+    if not motion:
+        return facts, changes
     if body.simulator.bad_values():
         return facts, [*changes, "the simulation diverged: check masses and inertias of the model"]
     return facts, [*changes, *_judge(robot, facts, rest)]
@@ -101,15 +102,6 @@ def _read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
         "has_response": robot.response is not None,
         "sensors": {name: each.unit for name, each in robot.sensors.items()},
     }
-
-
-def _judge_tunings(robot: RobotFiles, world: World) -> Iterator[str]:
-    """Yield what must change in the tunings, which an experiment may choose."""
-    for name in robot.tunings:
-        try:
-            check_robot(world.model_copy(update={"tuning": name}))
-        except BadInputError as error:
-            yield str(error)
 
 
 def _move(body: Robot, robot: RobotFiles) -> tuple[dict[str, float], float]:
@@ -172,7 +164,7 @@ def _follow(
         goal, brakes = reference or wanted, reference is None
         simulator.step(body.steer(simulator.readings, goal, yaw_rate, brakes=brakes))
         if simulator.readings.axes[8] < UPRIGHT_MIN:
-            raise BadInputError("the robot turns over: check the onboard controller's gains")
+            raise ValueError("the robot turns over: check its gains")
     return reference
 
 

@@ -25,7 +25,7 @@ from cloudrc.config.profile import DIRECTIONS
 from cloudrc.config.resolved import ResolvedExperiment, dump
 from cloudrc.config.robot import known_robot
 from cloudrc.config.schema import MissionConfig
-from cloudrc.errors import BadInputError, InvalidRunError
+from cloudrc.errors import InvalidRunError, StateError
 from cloudrc.link.follow import PROFILE
 from cloudrc.outside.document import parse_yaml, write_yaml
 from cloudrc.outside.refusal import check_names
@@ -130,7 +130,7 @@ def fetch_mission(
     gets a line about logs that cannot be fetched.
 
     Raises:
-        BadInputError: If there is no such mission, or if it has not ended.
+        StateError: If the mission has not ended.
         InvalidRunError: If the recordings of the pods begin after the mission.
     """
     known = _missions(release)
@@ -151,7 +151,7 @@ def fetch_mission(
             (folder / name).unlink()
     check_names("mission", [wanted], flown, f"{release}: ")
     if not known[wanted].ended:
-        raise BadInputError(f"mission {wanted} has not ended; wait for its end")
+        raise StateError(f"mission {wanted} has not ended; wait for its end")
     _report_of_pods(release, known[wanted], folder, tell)
 
 

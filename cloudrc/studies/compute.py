@@ -11,7 +11,7 @@ import numpy as np
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import ComputeTime
 from cloudrc.drivers.cpu_limit import PacedClock, cpu_limit
-from cloudrc.errors import BadInputError
+from cloudrc.errors import NothingFlownError
 from cloudrc.messages import plan_length
 from cloudrc.outside.code import apart
 from cloudrc.report.folder import read_run
@@ -75,7 +75,7 @@ def of_run(folder: Path) -> MeasuredTimes:
     link, arrived = assembly.build_links(experiment)[1], recording["/downlink_delay"]
     if not experiment.cloud.compute_measured or link.only is None or experiment.is_fleet:
         text = "needs a flight in real time, or one with cloud.compute_measured and a link without"
-        raise BadInputError(f"{folder}: {text} a rate, keep_order and a time line")
+        raise NothingFlownError(f"{folder}: {text} a rate, keep_order and a time line")
     size = COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
     times_ms = list[float]()
     for epoch, counter, delay in zip(*(arrived[name].tolist() for name in ARRIVAL), strict=True):

@@ -17,7 +17,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cloudrc import source
-from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, to_one_line
+from cloudrc.errors import (
+    CloudrcError,
+    InvalidRunError,
+    NothingFlownError,
+    StateError,
+    to_one_line,
+)
 from cloudrc.files import read_json, write_atomically, write_json
 from cloudrc.outside.document import read_document, write_yaml
 from cloudrc.outside.paths import LOCK, lock_folder
@@ -64,12 +70,12 @@ def flights_of(plan: SweepPlan, shard: Shard = None) -> list[PlannedFlight]:
 def begin(folder: Path, plan: SweepPlan, shard: Shard = None) -> Rows:
     """Write the file and the summary of a sweep into `folder`, which is locked; return its rows.
 
-    Raise a BadInputError if the folder has rows of another sweep or of other code.
+    Raise a StateError if the folder has rows of another sweep or of other code.
     """
     rows = Rows(folder, shard and shard[0])
     points = {key: flight.point for key, flight in plan.flights.items()}
     if any(points.get(key) != row["point"] for key, row in rows.kept.items()):
-        raise BadInputError(f"--out {folder}: {_why_others(folder, plan, rows)}; name a new folder")
+        raise StateError(f"--out {folder}: {_why_others(folder, plan, rows)}; name a new folder")
     path = folder / FILE
     if not path.exists() or read_document(path, str(path)).tree != plan.draft.file:
         write_atomically(path, write_yaml(plan.draft.file).encode())
@@ -124,10 +130,10 @@ def _write_summary(folder: Path, plan: SweepPlan, rows: Rows) -> None:
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
-    """Read the description of a sweep; raise a BadInputError if `folder` is not that of a sweep."""
+    """Read the description of the sweep in a folder."""
     found = read_json(folder / SUMMARY, SIZE_MAX)
     if not found.keys() >= {"axes", "flights", "units", "files"}:
-        raise BadInputError(f"{folder}: is not a folder of 'cloudrc sweep run'; name one")
+        raise NothingFlownError(f"{folder}: is not a folder of 'cloudrc sweep run'; name one")
     return found
 
 
@@ -195,20 +201,20 @@ def find_row(folder: Path, begin: str) -> tuple[Row, PlannedFlight]:
     """Return the row of a sweep whose key begins like this, and the flight that repeats it.
 
     Raises:
-        BadInputError: If no row, or more than one, has such a key; or if the flight would be
-            another one, because code or files have changed.
+        StateError: If no row, or more than one, has such a key; or if the flight would be another
+            one, because code or files have changed.
     """
     rows = Rows(folder)
     found = [row for key, row in rows.kept.items() if key.startswith(begin)]
     if len(found) != 1:
         text = f"{len(found)} rows have a key that begins like this; give one key"
-        raise BadInputError(f"{folder}: {begin}: {text}")
+        raise StateError(f"{folder}: {begin}: {text}")
     (row,) = found
     plan = read_plan(folder / FILE)
     flight = plan.flights.get(row["key"])
     if flight is None:
         why = _why_others(folder, plan, rows)
-        raise BadInputError(f"{row['key']}: {why}; fly the sweep again")
+        raise StateError(f"{row['key']}: {why}; fly the sweep again")
     return row, flight
 
 
@@ -240,7 +246,7 @@ class Flown(NamedTuple):
 def read_sweep(folder: Path) -> Flown:
     """Read the rows of a sweep in the order of its grid.
 
-    Raise a BadInputError if a row has another point than those of the sweep. Warn if the rows are
+    Raise a StateError if a row has another point than those of the sweep. Warn if the rows are
     of more than one code, whose difference may be what the rows show.
     """
     summary, rows = read_summary(folder), read_rows(folder)
@@ -259,7 +265,7 @@ def read_sweep(folder: Path) -> Flown:
         ordered = sorted(rows.values(), key=place)
     except (KeyError, ValueError):
         text = f"has rows of another grid than that in {SUMMARY}; name the folder of one sweep"
-        raise BadInputError(f"{folder}: {text}") from None
+        raise StateError(f"{folder}: {text}") from None
     unknown = dict.fromkeys((name for row in ordered for name in row["numbers"]), "")
     count = len(baselines) or summary["flights"]
     return Flown(ordered, {**unknown, **summary["units"]}, axes, count)
@@ -269,7 +275,7 @@ def read_flights(folder: Path) -> Flown:
     """Read a sweep that has rows; values of axes that are neither numbers nor text become text."""
     found = read_sweep(folder)
     if not found.rows:
-        raise BadInputError(f"{folder}: has no rows; run the sweep again with this --out")
+        raise NothingFlownError(f"{folder}: has no rows; run the sweep again with this --out")
     for row in found.rows:
         row["point"] = {
             axis: value if type(value) in (str, int, float) else json.dumps(value)

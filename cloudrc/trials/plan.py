@@ -18,6 +18,7 @@ from cloudrc.config.schema import Link
 from cloudrc.config.sweep import Draft
 from cloudrc.errors import StateError
 from cloudrc.metrics import measure
+from cloudrc.outside.refusal import reading
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.runs import flight
 from cloudrc.runs.experiment import check_world, load
@@ -151,23 +152,19 @@ def pack(flights: Iterable[PlannedFlight]) -> bytes:
 
 
 def unpack(path: Path) -> list[PlannedFlight]:
-    """Read the flights from a file made by `pack`; raise a StateError if it is unusable.
+    """Read the flights from a file made by `pack`.
 
-    It is also unusable if other code or plug-ins have packed it: the rows would be others.
+    Raise a StateError if other code or plug-ins have packed it: the rows would be others.
     """
-    text, flights = "is not a file of flights of this version of cloudrc", list[PlannedFlight]()
-    try:
-        points = json.loads(gzip.decompress(files.read(path)))
-        with reuse_results():
-            for told, point, values, seeds in points:
-                resolved = ResolvedExperiment.model_validate_json(json.dumps(values))
-                flights += [PlannedFlight(told, point, seed, resolved) for seed in seeds]
-                if told != fingerprint(experiment_facts(resolved)):
-                    text = "the flights come from other code or plug-ins than those of this image"
-                    raise ValueError(f"code {source.code_hash()}")
-    except (OSError, EOFError, ValueError, LookupError, TypeError) as error:
-        raise StateError(
-            f"{path}: {text} ({error}); build the image from the code that runs this command, and "
-            "install the same packages in both"
-        ) from error
+    flights = list[PlannedFlight]()
+    with reading(path, "is no file of flights of this version of cloudrc"), reuse_results():
+        for told, point, values, seeds in json.loads(gzip.decompress(files.read(path))):
+            resolved = ResolvedExperiment.model_validate_json(json.dumps(values))
+            flights += [PlannedFlight(told, point, seed, resolved) for seed in seeds]
+            if told != fingerprint(experiment_facts(resolved)):
+                text = "the flights come from other code or plug-ins than those of this image, code"
+                raise StateError(
+                    f"{path}: {text} {source.code_hash()}; build the image from the code that runs "
+                    "this command, and install the same packages in both"
+                )
     return flights

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc import files
-from cloudrc.errors import BadInputError
+from cloudrc.errors import StateError
 
 Row = dict[str, Any]
 """Result of a trial: `key`, `point` (axis -> value), `seed`, `verdict`, `failures` (codes), `text`
@@ -56,7 +56,7 @@ def line_of(row: Row) -> bytes:
 def read_rows(folder: Path) -> dict[str, Row]:
     """Read the rows of all files of a folder: key -> row; ignore an unfinished last line.
 
-    Raise a BadInputError if a line is not a row.
+    Raise a StateError if a line is not a row.
     """
     found: dict[str, Row] = {}
     for path in sorted(folder.glob("rows*.jsonl")):
@@ -71,7 +71,7 @@ def take_lines(data: bytes, place: object, found: dict[str, Row]) -> None:
         row = parse_row(line)
         if row is None:
             text = "is not a row; delete this line to play its trial again"
-            raise BadInputError(f"{place}:{number}: {text}")
+            raise StateError(f"{place}:{number}: {text}")
         found.setdefault(row["key"], row)
 
 

@@ -11,7 +11,7 @@ from cloudrc.config.link_edit import Edit, edit_profile
 from cloudrc.config.profile import DIRECTIONS
 from cloudrc.drivers.link_control import ask
 from cloudrc.drivers.local import link_socket
-from cloudrc.errors import BadInputError, TimedOutError
+from cloudrc.errors import RejectedError, StateError, TimedOutError
 from cloudrc.link.control import APPLY_LIMIT, put_request
 from cloudrc.link.follow import PROFILE
 from cloudrc.link.state import (
@@ -47,12 +47,13 @@ def set_here(
     "uplink.delay_ms=120". `number` identifies the change.
 
     Raises:
-        BadInputError: If there is no link yet, or if a value cannot be used.
+        StateError: If there is no link yet.
+        RejectedError: If a direction does not take the change.
         TimedOutError: If a direction does not apply the change.
     """
     states = read_states(folder)
     if not states:
-        raise BadInputError(
+        raise StateError(
             f"{folder.parent}: no link is up there: the flight has not begun or has ended"
         )
     edit = edit_profile(Document(states[0].profile), profile, settings)
@@ -68,8 +69,8 @@ def _change(folder: Path, way: str, url: str, request: bytes, number: str) -> Li
         state = ask(link_socket(url, way), request)
     except (OSError, ValueError) as error:
         raise TimedOutError(f"the {way} does not answer ({error}); see {log}") from None
-    if state.refused == number:
-        raise BadInputError(f"the {way} is unchanged: {state.refusal}")
+    if why := state.objection(number):
+        raise RejectedError(why)
     if state.change != number:
         text = f"the {way} did not apply the change within {APPLY_LIMIT:g} s"
         raise TimedOutError(f"{text}; see {log}")

@@ -22,10 +22,10 @@ from cloudrc.drivers.local import ROUTE_FILE, link_words, start_process
 from cloudrc.drivers.programs import run_tool
 from cloudrc.drivers.realtime import bind, free_ports, show_address, split_address
 from cloudrc.errors import (
-    BadInputError,
     CloudrcError,
     InvalidRunError,
     MissingPrerequisiteError,
+    RejectedError,
     TimedOutError,
 )
 from cloudrc.link.follow import make_folder
@@ -116,7 +116,7 @@ def _start(name: str, way: Way, shaper: str) -> subprocess.Popen[bytes]:
 def _ended(name: str, code: int, log: str) -> CloudrcError:
     last = (log.strip().splitlines() or ["it left no message"])[-1]
     text = f"the {name} is not shaped: {last.removeprefix('cloudrc: error: ')}"
-    known = {one.exit_code: one for one in (BadInputError, MissingPrerequisiteError, TimedOutError)}
+    known = {one.exit_code: one for one in (RejectedError, MissingPrerequisiteError, TimedOutError)}
     if code in known:
         return known[code](text)
     return InvalidRunError(f"{text} (exit code {code})")
