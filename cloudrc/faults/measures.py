@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import pairwise
-from math import dist, hypot, nan
+from math import dist, hypot, isfinite, nan
 from typing import Any, Literal, TypeAlias
 
 from cloudrc.faults.adversary import Lie
@@ -52,8 +52,8 @@ class Requirement:
 
     @property
     def passed(self) -> bool:
-        """Whether `measured` complies with `limit`; False if `measured` is NaN (not measured)."""
-        return bool(_COMPARE[self.relation](self.measured, self.limit))
+        """Whether `measured` complies with `limit`; False if it is not finite (not measured)."""
+        return isfinite(self.measured) and bool(_COMPARE[self.relation](self.measured, self.limit))
 
     def show(self) -> str:
         """Format the check on one line: its text, the measured value and the limit."""

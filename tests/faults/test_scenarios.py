@@ -2,6 +2,7 @@
 
 import pytest
 
+from cloudrc.faults.measures import Requirement
 from cloudrc.faults.scenarios import SCENARIOS
 from cloudrc.faults.search import run_fault
 from tests.conftest import nightly
@@ -28,3 +29,8 @@ def test_only_the_checks_of_a_broken_promise_fail(name, broken, value, said, mon
     failed = [check.text for check in run_fault(name, 1).checks if not check.passed]
     assert failed[-1] == said
     assert set(failed) <= {said, "the new process commands after"}
+
+
+@pytest.mark.parametrize("measured", [float("inf"), float("nan")])
+def test_what_was_not_measured_passes_no_check(measured):
+    assert not Requirement("late", measured, ">=", 1.0).passed
