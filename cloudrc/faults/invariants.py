@@ -37,7 +37,7 @@ from cloudrc.faults.watch import FLOWN, LAND, TRACK, Watch
 from cloudrc.messages import Command, OperatorRequest, Request, Start
 from cloudrc.sim.onboard import Commands
 from cloudrc.sim.readings import Readings
-from cloudrc.world.robot import STEP_NS, Robot
+from cloudrc.world.robot import STEP_NS, Observer, Robot
 
 
 class RobotInvariants:
@@ -52,7 +52,8 @@ class RobotInvariants:
         self._orders, self._motion = OrderChecks(watch), MotionChecks(watch)
         self._contacts = ContactChecks(watch, robot.simulator, honest=honest)
         watch.starts_ns.append(start_ns)
-        robot.observers.append(self)
+        tells = self.see_step, self.see_command, self.see_request, self.see_session
+        robot.observers.append(Observer(*tells))
 
     def see_step(self, now_ns: int, readings: Readings, commands: Commands) -> None:
         """Check all invariants in a step that begins at `now_ns` [ns]."""

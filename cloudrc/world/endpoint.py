@@ -349,7 +349,7 @@ class WorldEndpoint(TunnelEnd):
                 guard.acknowledge(tick_ns)
             case Request.START:
                 if request.start is Start.SPAWN:
-                    self.robot.put_on_ground(tick_ns, "mission starts from spawn")
+                    self.robot.start_again(tick_ns, "mission starts from spawn")
                     self._queue(self._door.begin_next_epoch(now_ns))
                     self._begin_epoch("mission starts from spawn")
                 guard.start_mission(tick_ns)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import NamedTuple
 
 from cloudrc.errors import describe_error
-from cloudrc.messages import GuardState, Vector
+from cloudrc.messages import Command, GuardState, OperatorRequest, Vector
 from cloudrc.outside.code import FAILURES, check_failure, locate, stack_of
 from cloudrc.outside.values import RESULT, InvalidValueError
 from cloudrc.records import Fault
@@ -22,11 +23,21 @@ STEP = STEP_NS * 1e-9
 TRACK, ESTOP = GuardState.TRACK, GuardState.ESTOP  # looking up a member of an enum is slow
 
 
+class Observer(NamedTuple):
+    """Functions that learn what a robot does; times are on world's clock [ns]."""
+
+    see_step: Callable[[int, Readings, Commands], None]
+    """Gets the time of a step, and readings and commands in it"""
+    see_command: Callable[[Command, str | None, int], None]
+    """Gets a command, why the guard has rejected it (None: it has not), and when it has come"""
+    see_request: Callable[[OperatorRequest, int], None]
+    """Gets a request that the robot has carried out, and when"""
+    see_session: Callable[[int], None]
+    """Gets the time at which a session has begun"""
+
+
 class Robot:
     """Runs physics, guard and onboard controller step by step, and informs `observers`.
-
-    An observer has the methods see_step, see_command, see_request and see_session, as that of the
-    faults' invariants.
 
     Onboard controller and actuators may be code of a user. If it fails in flight, the guard stops
     the robot.
@@ -39,19 +50,23 @@ class Robot:
 
     def __init__(self, simulator: Simulator, onboard: Onboard, guard: Guard) -> None:
         self.simulator, self.onboard, self.guard = simulator, onboard, guard
-        self.observers = list[Any]()
+        self.observers = list[Observer]()
         self.failure: Fault | None = None
         self.name, self._size = "", len(onboard.stopped)
         self._update, self._brake = onboard.update, onboard.brake
 
+    def start_again(self, now_ns: int, cause: str) -> None:
+        """Reset the robot as `put_on_ground` does; if a user's code fails, the guard stops it."""
+        try:
+            self.put_on_ground(now_ns, cause)
+        except FAILURES as error:
+            self._fail(error, now_ns)
+
     def put_on_ground(self, now_ns: int, cause: str) -> None:
         """Reset the robot to its spawn, stopped, and record the reason `cause`."""
         self.guard.put_on_ground(now_ns, cause)
-        try:
-            self.simulator.reset()
-            self.onboard.reset()
-        except FAILURES as error:
-            self._fail(error, now_ns)
+        self.simulator.reset()
+        self.onboard.reset()
 
     def steer(
         self, readings: Readings, velocity: Vector, yaw_rate: float, *, brakes: bool = False

@@ -3,6 +3,7 @@
 import logging
 from functools import cache, partial
 from math import inf
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -205,7 +206,7 @@ def test_what_c_cannot_simulate_is_flown_in_python(setting):
 def test_observers_and_a_tape_see_every_step():
     robot = robot_of(NativeRobot)
     count, seen = Count(robot), []
-    robot.observers.append(type("Seen", (), {"see_step": lambda self, *step: seen.append(step)})())
+    robot.observers.append(Mock(see_step=lambda *step: seen.append(step)))
     Pilot(robot).fly(1.0, lambda pilot: (0.0, 0.0, 1.0))
     assert len(seen) == 500
     robot.observers.clear()
