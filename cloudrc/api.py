@@ -244,12 +244,7 @@ def sweep(
     from cloudrc.trials.play import run
 
     jobs = _count(jobs, "jobs")
-    if isinstance(grid, Mapping):
-        with naming("the grid"):
-            plain = to_plain(grid)
-        plan = read_plan(plain)
-    else:
-        plan = read_plan(Path(grid))
+    plan = read_plan(grid if isinstance(grid, Mapping) else Path(grid))
     _warn(*plan.points)
     with (
         TemporaryDirectory(prefix="cloudrc-sweep-") as temporary,

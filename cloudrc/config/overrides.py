@@ -91,14 +91,7 @@ def _directions(path: KeyPath) -> list[KeyPath]:
 def parse_settings(
     texts: Iterable[str], label: str = "--set", example: str = "link.both.delay_ms=40"
 ) -> Settings:
-    """Parse texts `key=value`, as `split_settings` does."""
-    return collect_settings(split_settings(texts, label, example))
-
-
-def split_settings(
-    texts: Iterable[str], label: str = "--set", example: str = "link.both.delay_ms=40"
-) -> list[Given]:
-    """Split texts `key=value`; a relative path in a value starts at the working folder.
+    """Parse texts `key=value`; a relative path in a value starts at the working folder.
 
     Raise a BadInputError for a text of another form; its message begins with `label` and
     ends with an `example` of the right form.
@@ -109,7 +102,7 @@ def split_settings(
         if not equals:
             raise BadInputError(f"{label} {text}: must be key=value; for example {example}")
         given.append((key, parse_value(value, f"{label} {key}"), source))
-    return given
+    return collect_settings(given)
 
 
 def check_no_seed(settings: Settings) -> None:

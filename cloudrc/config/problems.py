@@ -141,11 +141,12 @@ def in_words(value: Any) -> str:
     return words.get(repr(value), shorten(value))
 
 
-_WITHOUT_VALUE = ("extra_forbidden", "missing", "value_error", "too_long")
+_WITHOUT_VALUE = ("extra_forbidden", "missing", "value_error", "too_long", "too_short")
 """Types of pydantic's errors whose message does not show the value."""
 _REASONS: Mapping[str, str] = {
     "value_error": "{error}",
     "too_long": "must have at most {max_length} entries",
+    "too_short": "must have at least {min_length} of them",
     "string_pattern_mismatch": "must be text without slashes",
     "missing": "is missing",
     "needs_python_object": "must be an object of a class, which YAML cannot contain",

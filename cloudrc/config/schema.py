@@ -65,6 +65,7 @@ DeadTimes = tuple[_DeadTime, _DeadTime, _DeadTime]
 milliseconds."""
 Gain = Annotated[float, Field(gt=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
+Seed = Annotated[int, Field(ge=0, lt=2**53)]
 # Every limit of the guard has a smallest and a largest value, so that nobody can switch it off.
 SPEED_MPS = 0.01, 10.0
 """Smallest and largest value of guard.speed_max_mps [m/s]."""
@@ -459,7 +460,7 @@ class Experiment(Section):
     """Name in reports and folders, without slashes; empty: the file's name"""
     description: str = ""
     """One line about the experiment, for lists and reports"""
-    seed: Annotated[int, Field(ge=0, lt=2**53)] = 1
+    seed: Seed = 1
     """Seed of all random numbers: link, sensor noise, wind, compute time and random steps"""
     mission: NameOr[MissionConfig] = "pipes"
     """Name of a shipped mission, a path, or the mission itself"""

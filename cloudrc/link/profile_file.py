@@ -15,9 +15,8 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import DIRECTIONS, DirectionKeys, DirectionProfile, ProfileKeys
-from cloudrc.outside.document import Document, KeyPath, Source, read_document
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import InvalidValueError, to_plain
+from cloudrc.outside.document import Document, KeyPath, plain_document, read_document
+from cloudrc.outside.values import InvalidValueError
 from cloudrc.text import unknown_name_text
 
 FOLDER = Path(__file__).with_name("profiles")
@@ -57,8 +56,7 @@ def with_files(direction: DirectionKeys) -> DirectionProfile:
 
 def _document(profile: str | Path | Mapping[str, Any]) -> Document:
     if isinstance(profile, Mapping):
-        with naming("profile"):
-            return Document(to_plain(profile), {(): Source("profile", Path())})
+        return plain_document(profile, "profile")
     if not isinstance(profile, str | Path):
         raise BadInputError(
             f"a link is the name or path of a profile, or a mapping; not {type(profile).__name__}"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -18,6 +19,8 @@ import yaml
 
 from cloudrc import files
 from cloudrc.errors import BadInputError
+from cloudrc.outside.refusal import naming
+from cloudrc.outside.values import to_plain
 
 KeyPath = tuple[str, ...]
 """The keys that lead from the top of a document to a value. The index of a list entry is text."""
@@ -197,6 +200,15 @@ def child(node: Any, key: str) -> Any:
     if isinstance(node, list) and key.isdecimal() and int(key) < len(node):
         return node[int(key)]
     return None
+
+
+def plain_document(given: Mapping[str, Any], name: str) -> Document:
+    """Return what a program gives in place of a file; `name` is its name in error messages.
+
+    Relative paths in it start at the working folder.
+    """
+    with naming(name):
+        return Document(to_plain(given), {(): Source(name, Path())})
 
 
 def read_document(path: Path, name: str) -> Document:

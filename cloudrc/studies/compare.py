@@ -66,7 +66,7 @@ def plan_sides(
 
     With `cost`, also plan those without a network.
     """
-    plan = check(draft_of(experiment, common, seeds, {"A": a, "B": b})._replace(cost=cost))
+    plan = check(draft_of(experiment, common, seeds, {"A": a, "B": b}, cost=cost))
     _check_numbers(names, plan.units)
     return plan
 

@@ -16,7 +16,7 @@ from tests.support.sweeps import SHORT
 
 def test_every_point_is_flown_with_every_seed(write_sweep):
     sweep = read_plan(write_sweep(seeds=[7, 3]))
-    assert (len(sweep.points), len(sweep.flights), sweep.draft.seeds) == (4, 8, (7, 3))
+    assert (len(sweep.points), len(sweep.flights), sweep.draft.seeds) == (4, 8, [7, 3])
     flights = list(sweep.flights.values())
     assert [(*each.point.values(), each.seed) for each in flights[:3]] == [
         ("last_sample", 40, 7), ("last_sample", 40, 3), ("last_sample", 0, 7)
@@ -24,7 +24,7 @@ def test_every_point_is_flown_with_every_seed(write_sweep):
     last = flights[-1].experiment
     assert (last.seed, last.cloud.predictor.name) == (3, "constant_velocity")
     assert last.uplink.delay_ms == last.downlink.delay_ms == 0 < last.uplink.jitter_ms
-    assert read_plan(write_sweep(seeds=2)).draft.seeds == (1, 2)
+    assert read_plan(write_sweep(seeds=2)).draft.seeds == [1, 2]
 
 
 def test_points_that_differ_in_the_network_share_their_flights_without_one(write_sweep):
@@ -116,6 +116,9 @@ def test_relative_paths_start_at_the_file(write_sweep, tmp_path, monkeypatch):
         ({"grid": {"link.both.delayms": [1]}}, "link.uplink.delayms: unknown key; did you mean"),
         ({"grid": {"world.plant.payload_kg": [0, 9]}}, "world.plant: the thrust-to-weight ratio"),
         ({"set": {"seed": 1}}, "seed: each flight has its own seed"),
+        ({"seeds": 0}, "seeds: must have at least 1"),
+        ({"seeds": [3, -1]}, "seeds.1: -1: must be >= 0"),
+        ({"seeds": [3, 3]}, "seeds: repeats a seed"),
     ],
 )
 def test_a_problem_is_refused_at_its_place(write_sweep, keys, reason):
