@@ -8,16 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import Spheres
 from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.obstacles import fence_of
 from cloudrc.geometry.scene import Plate, Scene, Tube
 from cloudrc.geometry.solids import Solid
+from cloudrc.outside.refusal import reading
 
 FLOWN_FILE = "geometry.json"
 """Name of the attachment of a recording."""
-_UNREADABLE = ValueError, TypeError, KeyError, AttributeError, RecursionError
 
 
 @dataclass(frozen=True)
@@ -43,14 +42,12 @@ class FlownWorld:
     @staticmethod
     def from_bytes(data: bytes) -> FlownWorld:
         """Read the content of a file; raise a BadInputError if it is not readable."""
-        try:
+        with reading(FLOWN_FILE, "is not readable"):
             tree = _frozen(json.loads(data))
             hull = tree["hull"] and Spheres(
                 **{key: np.array(each) for key, each in tree["hull"].items()}
             )
             return FlownWorld(_scene(tree["scene"]), hull, tree["planar"])
-        except _UNREADABLE as error:
-            raise BadInputError(f"{FLOWN_FILE} is not readable") from error
 
 
 def _frozen(value: Any) -> Any:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cloudrc.errors import BadInputError
-from cloudrc.files import read, version
+from cloudrc.files import version
 from cloudrc.link.profile import (
     Blackout,
     Change,
@@ -24,6 +24,7 @@ from cloudrc.link.profile import (
     GilbertElliott,
     Trace,
 )
+from cloudrc.outside.paths import read_file
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import ANY, Quantity
 from cloudrc.rounding import differences
@@ -76,11 +77,7 @@ def _plain(value: Any) -> Any:
 
 def read_lines(path: Path, name: str, remedy: str, size_max: int = SIZE_MAX) -> list[str]:
     """Read the lines of a text file; if that fails, raise a BadInputError with a remedy."""
-    try:
-        return read(path, size_max).decode("utf-8-sig", "replace").splitlines()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error).removeprefix(f"{path}: ")
-    raise BadInputError(f"{name}: {reason}; {remedy}")
+    return read_file(path, name, remedy, size_max).decode("utf-8-sig", "replace").splitlines()
 
 
 def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from cloudrc import files
 from cloudrc.errors import BadInputError
+from cloudrc.outside.paths import read_file
 from cloudrc.outside.refusal import naming
 from cloudrc.outside.values import to_plain
 
@@ -216,13 +216,11 @@ def read_document(path: Path, name: str) -> Document:
 
     Raise a BadInputError if the file cannot be read or has another content.
     """
+    data = read_file(path, name, "name a YAML file", SIZE_MAX)
     try:
-        text = files.read(path, SIZE_MAX).decode("utf-8")
+        text = data.decode("utf-8")
     except UnicodeDecodeError as error:
         raise BadInputError(f"{name}: is not UTF-8 text; save it as UTF-8") from error
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error).removeprefix(f"{path}: ")
-        raise BadInputError(f"{name}: cannot be read: {reason}; name a YAML file") from error
     parsed, lines = _parse_once(text, name)
     tree = copy.deepcopy(parsed)
     if not isinstance(tree, dict):

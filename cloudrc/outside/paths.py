@@ -97,20 +97,31 @@ def check_there(path: Path, remedy: str) -> None:
         raise BadInputError(f"{path}: no such file or folder; {remedy}")
 
 
+def read_file(path: Path, named: str, remedy: str, size_max: int = SIZE_MAX) -> bytes:
+    """Read a file of the user's; never block, even if it is a pipe.
+
+    If that fails, raise a BadInputError with `named`, what the file is, the reason and a `remedy`.
+    """
+    try:
+        return read(path, size_max)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error).removeprefix(f"{path}: ")
+        raise BadInputError(f"{named}: {reason}; {remedy}") from None
+
+
 def read_secret(
     path: Path, named: str, parse: Callable[[bytes], _Secret], make: str, size_max: int = SIZE_MAX
 ) -> _Secret:
-    """Read a file with a secret; never block, even if the file is a pipe.
+    """Read a file with a secret.
 
     If `parse` raises a ValueError about its content, raise a BadInputError that contains no part of
     the file: `named` and the reason. `make` is the command that makes such a file.
     """
+    data = read_file(path, named, f"make one: {make}", size_max)
     try:
-        return parse(read(path, size_max))
-    except OSError as error:
-        reason = error.strerror or str(error)
+        return parse(data)
     except ValueError as error:
-        reason = str(error).removeprefix(f"{path}: ")
+        reason = str(error)
     raise BadInputError(f"{named}: {reason}; make one: {make}")
 
 

@@ -9,6 +9,11 @@ from cloudrc.errors import BadInputError
 from cloudrc.outside.values import InvalidValueError
 from cloudrc.text import unknown_name_text
 
+_UNREADABLE = (
+    *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, RecursionError),
+)
+"""What reading a file of an unknown content may raise."""
+
 
 @contextmanager
 def naming(place: str, wanted: str = "") -> Iterator[None]:
@@ -31,7 +36,7 @@ def reading(place: object, text: str) -> Iterator[None]:
     """
     try:
         yield
-    except (OSError, EOFError, ValueError, LookupError, TypeError) as error:
+    except _UNREADABLE as error:
         raise BadInputError(f"{place}: {text} ({error})") from error
 
 

@@ -74,7 +74,7 @@ def test_a_new_file_is_read_once_and_refused_until_fixed(pod):
     assert pod.poll() is pod.poll() is None
     assert len(pod.log) == 4
     assert all(line.startswith("the new profile is refused, the old one stays") for line in pod.log)
-    with pytest.raises(BadInputError, match=r"profile\.yaml: cannot be read"):
+    with pytest.raises(BadInputError, match=r"profile\.yaml: No such file"):
         pod.profiles.first()
     pod.put(50.0, "")
     assert pod.poll() == (50.0, "")
