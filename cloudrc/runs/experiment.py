@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from cloudrc.config import overrides
 from cloudrc.config.compute import check_unshared
 from cloudrc.config.load import load_experiment
-from cloudrc.config.overrides import OUTSIDE, ROS2, Settings
+from cloudrc.config.overrides import OUTSIDE, ROS2, Settings, naming_settings, parse_settings
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.config.scene import has_mujoco
@@ -28,22 +29,30 @@ WARNINGS_MAX = 3
 
 def load(
     name: str,
-    overrides: Iterable[str] | Settings,
+    settings: Iterable[str] | Settings,
     seed: int | None = None,
     *,
     fleets: bool = False,
 ) -> ResolvedExperiment:
-    """Load an experiment by name or path with `overrides` (KEY=VALUE); check `report.metrics`.
+    """Load an experiment by name or path with `settings` (KEY=VALUE); check what it names.
 
-    Without `fleets`, it must be the flight of one robot.
+    That are its metrics and its robot. Without `fleets`, it must be the flight of one robot.
     """
-    changes = overrides if seed is None else [*overrides, f"seed={seed}"]
-    experiment = load_experiment(name, changes)
-    if not fleets:
-        check_alone(experiment)
+    if not isinstance(settings, dict):
+        settings = parse_settings([*settings, *([] if seed is None else [f"seed={seed}"])])
+    with naming_settings(settings):
+        experiment = load_experiment(name, settings)
+        if not fleets:
+            check_alone(experiment)
+        check_world(experiment.world, turns=experiment.mission.turns)
     own = experiment.report.metrics
     reuse(("metrics", own), lambda: measure.check(own))
     return experiment
+
+
+def check_no_seed(texts: Iterable[str]) -> None:
+    """Check that none of the settings `texts` (KEY=VALUE) is the seed."""
+    overrides.check_no_seed(parse_settings(texts))
 
 
 def robots_of(
@@ -102,8 +111,6 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
 
             packages = "nav_msgs, geometry_msgs and sensor_msgs"
             require_ros("cloud.controller ros2", "node", packages)
-    if mode != "cluster":
-        check_world(experiment.world, turns=experiment.mission.turns)
 
 
 def check_world(world: World, *, turns: bool = False) -> None:

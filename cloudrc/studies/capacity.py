@@ -14,13 +14,12 @@ from statistics import fmean, median_low
 from typing import Any
 
 from cloudrc.config.compute import compute_times
-from cloudrc.config.overrides import check_no_seed, parse_settings
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import NothingFlownError
 from cloudrc.link.model import HEADER_BYTES
 from cloudrc.link.waiting import nddd1
-from cloudrc.runs.experiment import check_world, load, robots_of
+from cloudrc.runs.experiment import check_no_seed, check_world, load, robots_of
 from cloudrc.runs.flight import ERROR
 from cloudrc.statistics import exact_interval, median_interval
 from cloudrc.trials.fingerprint import experiment_facts, fingerprint
@@ -95,7 +94,7 @@ class Condition:
             "cloud.controller": controller,
         }
         settings = [*asked.set, *(f"{key}={value}" for key, value in given.items() if value)]
-        check_no_seed(parse_settings(settings))
+        check_no_seed(settings)
         own = self._load(asked.experiment, settings, 1)
         kinds = len(own.fleet.vary) or 1
         self.fleet = self._load(asked.experiment, settings, kinds)

@@ -9,14 +9,14 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from cloudrc.ages import simulate_ages
-from cloudrc.config.overrides import check_no_seed, onboard_values, parse_settings
+from cloudrc.config.overrides import onboard_values
 from cloudrc.config.problems import problem_at
 from cloudrc.config.profile import COMMAND_AGE_MS
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import CloudrcError
 from cloudrc.outside.document import child
 from cloudrc.runs import flight
-from cloudrc.runs.experiment import check_world, load
+from cloudrc.runs.experiment import check_no_seed, load
 from cloudrc.studies import stability
 from cloudrc.studies.search import ValueRange, bisect, search
 from cloudrc.studies.stability import LARGE
@@ -69,7 +69,7 @@ class Margin:
     def __init__(self, asked: Asked) -> None:
         """Read the present value and the range of the search."""
         self.asked = asked
-        check_no_seed(parse_settings([*asked.settings, f"{asked.key}=0"]))
+        check_no_seed([*asked.settings, f"{asked.key}=0"])
         now = present_value(load(asked.experiment, asked.settings), asked.key)
         first = asked.max if now is None else now
         if first is None:
@@ -123,7 +123,6 @@ class Margin:
         settings = [*asked.settings, f"{asked.key}={self.value(number):.12g}"]
         try:
             experiment = load(asked.experiment, settings)
-            check_world(experiment.world, turns=experiment.mission.turns)
         except CloudrcError as error:
             return None, str(error)
         given = [text.partition("=")[0].strip() for text in settings]

@@ -14,10 +14,10 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
-from cloudrc.config.overrides import OUTSIDE, check_no_seed, parse_settings
+from cloudrc.config.overrides import OUTSIDE, parse_settings
 from cloudrc.config.problems import problem_at
 from cloudrc.outside.reuse import reuse_results
-from cloudrc.runs.experiment import check_world, load, robots_of
+from cloudrc.runs.experiment import check_no_seed, check_world, load, robots_of
 from cloudrc.text import cells, escape, table
 from cloudrc.trials.fingerprint import experiment_facts, fingerprint
 from cloudrc.trials.fleet import FleetTrial
@@ -90,7 +90,7 @@ class PlaceStudy:
 
     def plan(self) -> list[FleetTrial]:
         """Check all flights; return them in the order of the table."""
-        check_no_seed(parse_settings(self.set))
+        check_no_seed(self.set)
         disturbed = [f"{key}={value}" for key, value in self.disturbances.items()]
         trials = list[FleetTrial]()
         with reuse_results():

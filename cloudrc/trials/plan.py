@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 from cloudrc import files, source
 from cloudrc.config import sweep
-from cloudrc.config.overrides import Settings, naming_settings
 from cloudrc.config.resolved import ResolvedExperiment, local_files
 from cloudrc.config.schema import Link
 from cloudrc.config.sweep import Draft
@@ -21,7 +20,7 @@ from cloudrc.metrics import measure
 from cloudrc.outside.refusal import reading
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.runs import flight
-from cloudrc.runs.experiment import check_world, load
+from cloudrc.runs.experiment import load
 from cloudrc.trials.fingerprint import experiment_facts, fingerprint, key_of
 from cloudrc.trials.rows import Row
 from cloudrc.trials.summary import RATIO
@@ -103,7 +102,7 @@ def check(draft: Draft) -> SweepPlan:
     own_files = dict[str, str]()
     with reuse_results():
         for point, settings in draft.points():
-            points.append(_resolve(draft.experiment, settings))
+            points.append(load(draft.experiment, settings))
             facts = experiment_facts(points[-1])
             own_files |= facts[-1]
             first = PlannedFlight(fingerprint(facts), point, draft.seeds[0], points[-1])
@@ -121,14 +120,6 @@ def check(draft: Draft) -> SweepPlan:
     units = flight.units(own_metrics) | ({RATIO: "1"} if draft.cost else {})
     keys = {key: each.key for key, each in baselines.items()}
     return SweepPlan(draft, points, flights, keys, units, own_files)
-
-
-def _resolve(name: str, settings: Settings) -> ResolvedExperiment:
-    """Return the checked experiment of a point."""
-    with naming_settings(settings):
-        experiment = load(name, settings)
-        check_world(experiment.world, turns=experiment.mission.turns)
-    return experiment
 
 
 def _without_network(flown: PlannedFlight) -> PlannedFlight:

@@ -7,6 +7,7 @@ from gymnasium.utils.env_checker import check_env
 
 import cloudrc
 import cloudrc.gym
+from cloudrc.errors import BadInputError
 from cloudrc.gym import Networked
 from cloudrc.record.columns import Recording
 
@@ -42,6 +43,11 @@ def test_the_same_actions_fly_the_true_path_of_a_flight(name, options, experimen
     assert count > len(truth["stamp_ns"]) - 20  # a flight goes on for up to 100 ms
     for column in ("position", "orientation_wxyz", "velocity", "angular_velocity_body"):
         assert truth[column][:count].tobytes() == flown[column].tobytes()
+
+
+def test_a_robot_that_cannot_lift_off_is_judged_when_it_is_loaded():
+    with pytest.raises(BadInputError, match=r"^--set: world\.plant: the thrust-to-weight ratio"):
+        gymnasium.make("cloudrc/Steps-v0", settings={"world.plant.payload_kg": 9})
 
 
 def test_network_and_cloud_of_an_experiment_are_left_out(tmp_path):
