@@ -65,7 +65,9 @@ _NAMES: dict[KeyPath, Any] = {
 """Key path of a name -> value in place of null."""
 _SECTIONS = ("world", "guard", "link", "cloud", "report")
 """Sections that may be null, and get values."""
-_PROFILE_KEYS = {("link",), ("link", "profile"), ("cloud", "place")}
+_PLACE, _PROFILE = ("cloud", "place"), ("link", "profile")
+"""Keys of the names of files; the kind of file is called as its key."""
+_PROFILE_KEYS = {("link",), _PROFILE, _PLACE}
 """If a setting gives one of these keys, it replaces the whole link profile."""
 _OF_ALL = "fleet", "cell", "cloud.cores", "cloud.sharing", "cloud.place"
 """Beginnings of keys that are the same for all robots of a fleet."""
@@ -299,9 +301,9 @@ def _inline_mission(document: Document) -> None:
 
 def _inline_link(document: Document, found: list[ConfigProblem]) -> None:
     """Replace the names of place and link profile by what they give; add problems to `found`."""
-    with problems.collect(found, ("cloud", "place")):
+    with problems.collect(found, _PLACE):
         _take_place(document)
-    with problems.collect(found, ("link", "profile")):
+    with problems.collect(found, _PROFILE):
         _inline_profile(document)
 
 
@@ -319,27 +321,24 @@ def _take_contact(document: Document) -> None:
 
 def _take_place(document: Document) -> None:
     """Fill in link and computer of the place where cloud runs; keys that are given win."""
-    name = document.get("cloud", "place")
-    if not isinstance(name, str):
+    if not isinstance(document.get(*_PLACE), str):
         return
-    file, place = _read_named(document, "place", ("cloud", "place"), PlaceFile)
-    source = document.source(("cloud", "place"))
+    file, place = _read_named(document, _PLACE, PlaceFile)
+    source = document.source(_PLACE)
     for key in _COMPUTER:
         if key not in document.tree["cloud"]:
             document.set_value(("cloud", key), getattr(place, key), source)
-    if _has_all_values(document) or document.source(("link", "profile")).is_setting:
+    if _has_all_values(document) or document.source(_PROFILE).is_setting:
         return
-    document.set_value(("link", "profile"), place.profile, file.source(("profile",)))
+    document.set_value(_PROFILE, place.profile, file.source(("profile",)))
     for way in DIRECTIONS:
         _inline_direction(document, way, file)
 
 
-def _read_named(
-    document: Document, kind: str, path: KeyPath, model: type[_Named]
-) -> tuple[Document, _Named]:
+def _read_named(document: Document, path: KeyPath, model: type[_Named]) -> tuple[Document, _Named]:
     """Read the file that the key `path` names, and check it; make its path in the key absolute."""
     name, source = document.get(*path), document.source(path)
-    file = shipped.read(kind, name, source.folder)
+    file = shipped.read(path[-1], name, source.folder)
     content = problems.validate(file, model, name)
     if shipped.is_path(name):
         document.set_value(path, str(source.absolute(name)), source)
@@ -348,13 +347,12 @@ def _read_named(
 
 def _inline_profile(document: Document) -> None:
     """Fill in the values of the link that the experiment omits, from the link profile."""
-    _default(document, ("link", "profile"), Experiment().link.profile)
-    name = document.get("link", "profile")
-    if not isinstance(name, str):
+    _default(document, _PROFILE, Experiment().link.profile)
+    if not isinstance(document.get(*_PROFILE), str):
         return
-    profile = _present_profile(document)
+    profile = _present(document, _PROFILE, Profile)
     if not _has_all_values(document):
-        file, profile = _read_named(document, "profile", ("link", "profile"), Profile)
+        file, profile = _read_named(document, _PROFILE, Profile)
         for way in DIRECTIONS:
             _inline_direction(document, way, file)
     for path, value in _implied(profile).items():
@@ -366,22 +364,25 @@ def _inline_direction(document: Document, way: str, profile: Document) -> None:
     own = document.get("link", way)
     if not isinstance(own, dict | None):
         return
-    own = own or {}
-    kept = {("link", way, key): document.source(("link", way, key)) for key in own}
+    own, sources = own or {}, document.sources
     document.tree["link"][way] = (profile.get(way) or {}) | own
-    inserted = {
-        ("link", *key): place
-        for key, place in profile.sources.items()
-        if key[:1] == (way,) and not (key[1:2] and key[1] in own)
-    }
-    document.sources = inserted | kept | document.sources
+    for key in own:
+        sources.setdefault(("link", way, key), document.source(("link", way, key)))
+    for key, place in profile.sources.items():
+        if key[:1] == (way,) and own.keys().isdisjoint(key[1:2]):
+            sources.setdefault(("link", *key), place)
 
 
-def _present_profile(document: Document) -> Profile:
-    """Return the profile of a resolved experiment; an empty one if its file no longer exists."""
+def _present(document: Document, path: KeyPath, model: type[_Named]) -> _Named:
+    """Return what the key `path` of a resolved experiment names.
+
+    Return an empty one if the key is null, or if its file no longer exists.
+    """
     with suppress(BadInputError):
-        return load_profile(str(document.get("link", "profile")))
-    return Profile()
+        if name := document.get(*path):
+            file = shipped.read(path[-1], str(name), Path())
+            return problems.validate(file, model, str(name))
+    return model()
 
 
 def _implied(profile: Profile) -> dict[KeyPath, float]:
@@ -423,7 +424,7 @@ def _remove_derived(document: Document, name: str, *, new_profile: bool) -> None
         age_max = guard.command_age_max_ms or COMMAND_AGE_MAX_MS
         derived["guard", "speed_max_mps"] = speed_cap(age_max, guard.plan_max_s or 0.0, bounds)
     if new_profile:
-        derived |= _implied(_present_profile(document)) | _computer(document)
+        derived |= _implied(_present(document, _PROFILE, Profile)) | _computer(document)
         for way in DIRECTIONS:
             del document.tree["link"][way]
     for (section, key), value in derived.items():
@@ -433,10 +434,7 @@ def _remove_derived(document: Document, name: str, *, new_profile: bool) -> None
 
 def _computer(document: Document) -> dict[KeyPath, Any]:
     """Return the values of the place of a resolved experiment, or the defaults without one."""
-    present = PlaceFile()
-    if name := document.get("cloud", "place"):
-        with suppress(BadInputError):
-            present = problems.validate(shipped.read("place", name, Path()), PlaceFile, name)
+    present = _present(document, _PLACE, PlaceFile)
     return {("cloud", key): getattr(present, key) for key in _COMPUTER}
 
 
