@@ -40,7 +40,7 @@ class StateError(BadInputError):
 
 
 class RejectedError(BadInputError):
-    """The process that was asked has judged the input, and does not take it; the text is its."""
+    """Another process, or netem, has judged the input, and does not take it; the text is its."""
 
 
 class MissingPrerequisiteError(CloudrcError):

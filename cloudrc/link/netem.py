@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
+from cloudrc.errors import CloudrcError, MissingPrerequisiteError, RejectedError
 from cloudrc.link.carry.udp import Address
 from cloudrc.link.draws import PARETO_CUT, Floats
 from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline
@@ -163,9 +163,9 @@ def write_table(folder: Path, profile: DirectionProfile) -> None:
 
 
 def check(profile: DirectionProfile) -> None:
-    """Raise a BadInputError with the reason if netem cannot realise a profile."""
+    """Raise a RejectedError with the reason if netem cannot realise a profile."""
     pieces = Timeline(profile).pieces
-    refused = {
+    beyond = {
         "a trace with loop": profile.rows is not None and profile.loop,
         "loss.delay_bad_ms (more delay while a burst of losses lasts)": any(
             isinstance(piece.loss, GilbertElliott) and piece.loss.delay_bad_ms for piece in pieces
@@ -179,9 +179,9 @@ def check(profile: DirectionProfile) -> None:
             one.duration_s * 1e9 < STEP_NS for one in profile.blackouts
         ),
     }
-    for what, holds in refused.items():
+    for what, holds in beyond.items():
         if holds:
-            raise BadInputError(f"netem cannot do {what}; {USE_RELAY}, which can, or leave it out")
+            raise RejectedError(f"netem cannot do {what}; {USE_RELAY}, which can, or leave it out")
 
 
 def options(profile: DirectionProfile, conditions: Conditions, room: int) -> list[str]:

@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 from pydantic import TypeAdapter
 
 from cloudrc.config.schema import Touch
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import CloudrcError, StateError
 from cloudrc.metrics.verdict import Observations
 from cloudrc.teleop.refusals import UnavailableError, UnknownMissionError
 from cloudrc.teleop.wire import ENDED, QUEUED, STATES, Plan
@@ -128,7 +128,7 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
 
     Raises:
         StoreLockedError: If another process has locked the file.
-        BadInputError: If the file does not contain missions, or cannot be read or made.
+        StateError: If the file does not contain missions, or cannot be read or made.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch(0o600)
@@ -140,7 +140,7 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
     if code == sqlite3.SQLITE_BUSY:
         raise StoreLockedError(f"{path}: another teleop has this journal open; waiting for its end")
     if code not in (0, sqlite3.SQLITE_CORRUPT):  # no database, or a disk that fails
-        raise BadInputError(f"--journal {path}: {reason}; repair or move it, or name another file")
+        raise StateError(f"journal {path}: {reason}; repair or move it, or name another file")
     aside = path.with_name(f"{path.name}.damaged")
     for ending in ("", "-wal"):  # the files of one database
         if (part := Path(f"{path}{ending}")).exists():

@@ -114,7 +114,7 @@ def test_a_damaged_file_is_set_aside_and_named(path, damage):
 def test_anything_else_is_refused_and_left_alone(path, make, said):
     path.parent.mkdir()
     make(path)
-    with pytest.raises(BadInputError, match=f"--journal {path}: .*{said}.*another"):
+    with pytest.raises(BadInputError, match=f"journal {path}: .*{said}.*another"):
         open_store(path, b"")
     assert {"missions", "missions-wal"} >= set(os.listdir(path.parent))
 
