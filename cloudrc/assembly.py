@@ -24,7 +24,7 @@ from cloudrc.cloud.operator import Operator
 from cloudrc.cloud.planar import Planar
 from cloudrc.config import schema
 from cloudrc.config.compute import compute_times
-from cloudrc.config.overrides import build_for, build_plugin
+from cloudrc.config.overrides import build_plugin
 from cloudrc.config.resolved import ResolvedExperiment, ResolvedGuard
 from cloudrc.config.robot import RobotFacts, facts, is_planar
 from cloudrc.config.scene import steered_in
@@ -257,7 +257,7 @@ def build_cloud(
     news = None if delta is None else SendOnDelta(delta, beat)
     loop = make_loop(
         lambda: build_plugin("estimators", cloud.estimator),
-        build_for("predictors", cloud.predictor, _facts_of(experiment)),
+        build_plugin("predictors", cloud.predictor, robot=_facts_of(experiment)),
         controller,
         horizon_max=cloud.horizon_max_s,
         freeze_after=cloud.freeze_after_s + (beat if news else 0.0),
@@ -292,7 +292,7 @@ def build_compute_time(
 def build_controller(experiment: ResolvedExperiment) -> Controller:
     """Build the controller of an experiment."""
     choice = experiment.cloud.controller
-    controller: Controller = build_for("controllers", choice, _facts_of(experiment))
+    controller: Controller = build_plugin("controllers", choice, robot=_facts_of(experiment))
     return controller
 
 

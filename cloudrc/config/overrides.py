@@ -238,11 +238,6 @@ def complete_plugins(document: Document, cloud: Cloud, robot: RobotFacts) -> lis
     return found
 
 
-def _takes_robot(kind: str, name: str) -> bool:
-    """Return whether a plug-in's `build` has the argument `robot`, and gets it."""
-    return (kind, "robot") in GIVEN and "robot" in plugins.signature(kind, name).parameters
-
-
 def _complete(
     document: Document,
     path: KeyPath,
@@ -274,8 +269,7 @@ def _try(
     checked = _check(kind, name, given)
     with code.calling(f"{plugins.one(kind)} {name!r} has a default that YAML cannot contain"):
         values: dict[str, Any] = checked.model_dump(mode="json")
-    more = {"robot": robot} if _takes_robot(kind, name) else {}
-    plugin = plugins.load(kind, name, **dict(checked), **more)
+    plugin = _build(kind, name, checked, {"robot": robot})
     if plans and name in OUTSIDE:
         raise BadInputError(f"'{name}' cannot plan ahead; set cloud.plan_s to 0")
     if plans and kind == "predictors":
@@ -290,21 +284,20 @@ def _try(
     return values
 
 
-def build_plugin(kind: str, choice: PlugIn, /, **given: Any) -> Any:
+def build_plugin(kind: str, choice: PlugIn, /, **offered: Any) -> Any:
     """Build a plug-in of a resolved experiment; convert its parameters to the declared types.
 
-    `kind` is a key of `cloudrc.plugins.PACKAGES`, such as "controllers". `given` are arguments of
-    its `build` that are no parameters of the user. Raise a BadInputError that names the wrong
-    parameters.
+    `kind` is a key of `cloudrc.plugins.PACKAGES`, such as "controllers". Its `build` gets those
+    arguments of `offered`, which are no parameters of the user, that it has. Raise a BadInputError
+    that names the wrong parameters.
     """
-    checked = _check(kind, choice.name, choice.model_extra or {})
-    return plugins.load(kind, choice.name, **given, **dict(checked))
+    return _build(kind, choice.name, _check(kind, choice.name, choice.model_extra or {}), offered)
 
 
-def build_for(kind: str, choice: PlugIn, robot: RobotFacts) -> Any:
-    """Build a plug-in as `build_plugin` does; if its `build` takes `robot`, it gets it."""
-    more = {"robot": robot} if _takes_robot(kind, choice.name) else {}
-    return build_plugin(kind, choice, **more)
+def _build(kind: str, name: str, checked: BaseModel, offered: dict[str, Any]) -> Any:
+    takes = plugins.signature(kind, name).parameters if offered else {}
+    given = {key: offered[key] for key in offered if (kind, key) in GIVEN and key in takes}
+    return plugins.load(kind, name, **given, **dict(checked))
 
 
 def default_parameters(kind: str, name: str) -> dict[str, Any]:

@@ -138,13 +138,12 @@ def describe_steps(world: World) -> str:
 
 def _build_onboard(world: World, robot: RobotFiles, model: Any) -> Onboard:
     """Build the onboard controller for a compiled `MjModel`."""
-    name, more = robot.onboard.name, {}
+    name = robot.onboard.name
     choice = PlugIn.model_validate({**parameters(robot, world), "name": name})
     with at_key("world.robot", f"{robot.model} in {file_of(world.scene)}: "):
         try:
-            if BRAKING in plugins.signature(KIND, name).parameters:
-                more = {BRAKING: robot.guard.braking_mps2}
-            return build_plugin(KIND, choice, model=model, **more)  # type: ignore[no-any-return]
+            offered = {"model": model, BRAKING: robot.guard.braking_mps2}
+            return build_plugin(KIND, choice, **offered)  # type: ignore[no-any-return]
         except ProblemsError as error:  # about its parameters
             first = error.problems[0]
             raise _problem(world, first.path, f"{first._replace(path=())} ({name})") from error

@@ -5,7 +5,7 @@ import json
 import pytest
 
 import cloudrc
-from cloudrc.config.overrides import build_for, onboard_values
+from cloudrc.config.overrides import build_plugin, onboard_values
 from cloudrc.config.robot import facts, known_robot
 from cloudrc.config.schema import PlugIn, World
 from cloudrc.errors import BadInputError
@@ -17,7 +17,7 @@ MODELS = ("command_history", "kalman", "model_based")
 
 def build(robot, predictor, **keys):
     world = World.model_validate_json(json.dumps({"robot": robot, **keys}))
-    return build_for("predictors", PlugIn.model_validate(predictor), facts(world, 7.0))
+    return build_plugin("predictors", PlugIn.model_validate(predictor), robot=facts(world, 7.0))
 
 
 @pytest.mark.parametrize("robot", ["nano", *nightly("rover")])
