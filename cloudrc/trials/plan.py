@@ -148,14 +148,12 @@ def unpack(path: Path) -> list[PlannedFlight]:
     Raise a StateError if other code or plug-ins have packed it: the rows would be others.
     """
     flights = list[PlannedFlight]()
-    with reading(path, "is no file of flights of this version of cloudrc"), reuse_results():
+    build = "build the image from the code that runs this command, with the same packages"
+    with reading(path, f"holds no flights of this version of cloudrc; {build}"), reuse_results():
         for told, point, values, seeds in json.loads(gzip.decompress(files.read(path))):
             resolved = ResolvedExperiment.model_validate_json(json.dumps(values))
             flights += [PlannedFlight(told, point, seed, resolved) for seed in seeds]
             if told != fingerprint(experiment_facts(resolved)):
-                text = "the flights come from other code or plug-ins than those of this image, code"
-                raise StateError(
-                    f"{path}: {text} {source.code_hash()}; build the image from the code that runs "
-                    "this command, and install the same packages in both"
-                )
+                text = f"its flights are of other code or plug-ins than code {source.code_hash()}"
+                raise StateError(f"{path}: {text}; {build}")
     return flights

@@ -34,7 +34,7 @@ the stamp of a basis in the future, or if the robot cannot move that way.
   no time limit: the robot waits for the next mission.
 
 A robot whose robot.yaml says `stop: brake` does not descend in LAND: it brakes and, at rest, stops.
-A planar robot stays on the ground: the guard ignores its height, and refuses commands with a
+A planar robot stays on the ground: the guard ignores its height, and rejects commands with a
 vertical velocity as impossible. Its HOLD ends as that of a robot in the air.
 
 A robot that touches nothing never turns over: no command tilts it as far as OVERTURNED_COSINE.
