@@ -34,9 +34,10 @@ def load(
     *,
     fleets: bool = False,
 ) -> ResolvedExperiment:
-    """Load an experiment by name or path with `settings` (KEY=VALUE); check what it names.
+    """Load an experiment by name or path with `settings` (KEY=VALUE).
 
-    That are its metrics and its robot. Without `fleets`, it must be the flight of one robot.
+    Check its metrics, and that its robot can move in its scene. Without `fleets`, it must be the
+    flight of one robot.
     """
     if not isinstance(settings, dict):
         settings = parse_settings([*settings, *([] if seed is None else [f"seed={seed}"])])
