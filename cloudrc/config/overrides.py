@@ -123,10 +123,15 @@ def naming_settings(settings: Settings) -> Iterator[None]:
 
 
 def _label(settings: Settings, path: KeyPath) -> str:
-    """Return the place of the setting that caused a problem, as "FILE:LINE: "; "" if none did."""
-    paths = [path[:length] for length in range(len(path), 0, -1)]
-    paths += [key for key in settings if key[: len(path)] == path]  # of a part of the value
-    return next((f"{settings[key].source.label}: " for key in paths if key in settings), "")
+    """Return the place of the setting that caused a problem, as "FILE:LINE: "; "" if none did.
+
+    It is the most exact one that gives the value at `path`, a part of it, or what it is a part of.
+    """
+    for key, each in reversed(settings.items()):
+        size = min(len(key), len(path))
+        if key[:size] == path[:size]:
+            return f"{each.source.label}: "
+    return ""
 
 
 def apply_overrides(document: Document, settings: Settings, *, build: bool = False) -> None:
