@@ -143,7 +143,7 @@ def status(options: Options) -> None:
     """Print how many flights of a sweep are done, and how many succeeded per value of an axis."""
     with Progress(f"reads {options.folder}"):
         found = sweep.read_sweep(options.folder)
-        values = sweep.count_successes(found)
+        values = sweep.count_by_value(found)
     document = {"flights": found.flights, "rows": len(found.rows), "axes": values}
     print_result(options.output, document, sweep.status_text(found, values))
 

@@ -32,7 +32,7 @@ from cloudrc.runs.folder import new_folder
 from cloudrc.text import csv_table, table
 from cloudrc.trials.plan import COLUMNS, PlannedFlight, SweepPlan, read_plan
 from cloudrc.trials.rows import SIZE_MAX, Row, Rows, read_rows
-from cloudrc.trials.summary import count_verdicts, normalise
+from cloudrc.trials.summary import count_successes, count_verdicts, normalise
 from cloudrc.trials.workers import map_in_order, take_each
 from cloudrc.version import __version__
 
@@ -284,19 +284,21 @@ def read_flights(folder: Path) -> Flown:
     return found
 
 
-def count_successes(found: Flown) -> list[dict[str, Any]]:
+def count_by_value(found: Flown) -> list[dict[str, Any]]:
     """Return the flights and successes per value of an axis."""
-    counts: list[dict[str, Any]] = []
-    for axis, choices in found.axes.items():
-        for value in choices:
-            own = [row for row in found.rows if row["point"][axis] == value]
-            done = sum(row["verdict"] == "success" for row in own)
-            counts.append({"axis": axis, "value": value, "flights": len(own), "success": done})
-    return counts
+    of_value = [
+        (axis, value, [row for row in found.rows if row["point"][axis] == value])
+        for axis, choices in found.axes.items()
+        for value in choices
+    ]
+    return [
+        {"axis": axis, "value": value, "flights": len(own), "success": count_successes(own)}
+        for axis, value, own in of_value
+    ]
 
 
 def status_text(found: Flown, counts: Sequence[Mapping[str, Any]]) -> str:
-    """Format the state of a sweep for people; `counts` are those of `count_successes`."""
+    """Format the state of a sweep for people; `counts` are those of `count_by_value`."""
     verdicts = count_verdicts(found.rows)
     text = f"{len(found.rows)} of {found.flights} flights are done: {verdicts}"
     if not counts:
