@@ -152,16 +152,16 @@ def find(kind: str, name: str, *, look: bool = True) -> Found:
 
     With `look`, the caller only looks at what the file defines; it neither builds nor measures.
     """
-    own, what = _own_module(kind, name), f"{one(kind)} {name!r}"
-    if not own and not is_path(name):
+    own, what, in_file = _own_module(kind, name), f"{one(kind)} {name!r}", is_path(name)
+    if not own and not in_file:
         check_names(one(kind), [name], names(kind))
-    if is_path(name) and not Path(name).is_file():
+    if in_file and not Path(name).is_file():
         with naming(what):
             raise InvalidValueError("there is no such file")
     with calling(f"{what} cannot be imported"):
         if own:
             return Found(importlib.import_module(own))
-        if is_path(name):
+        if in_file:
             return Found(load_file(Path(name), look=look))
         # Last, because the search of all installed packages takes milliseconds.
         with telling_if_slow(f"{name} is still being imported"):

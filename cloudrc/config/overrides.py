@@ -300,8 +300,9 @@ def build_plugin(kind: str, choice: PlugIn, /, **offered: Any) -> Any:
 
 
 def _build(kind: str, name: str, checked: BaseModel, offered: dict[str, Any]) -> Any:
-    takes = plugins.signature(kind, name).parameters if offered else {}
-    given = {key: offered[key] for key in offered if (kind, key) in GIVEN and key in takes}
+    known = [key for key in offered if (kind, key) in GIVEN]
+    takes = plugins.signature(kind, name).parameters if known else {}
+    given = {key: offered[key] for key in known if key in takes}
     return plugins.load(kind, name, **given, **dict(checked))
 
 
