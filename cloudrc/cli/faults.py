@@ -131,7 +131,7 @@ def run_file(options: Options) -> int:
         raise BadInputError("--seed belongs to named faults, not to a schedule's file")
     with Progress(f"flies {options.name}"):
         try:
-            finding = fly(load(options.name), keep=True)
+            finding = fly(load(options.name), hashed=True)
         except ValueError as error:
             raise BadInputError(f"{options.name}: {error}") from error
     breaches = [breach._asdict() for breach in finding.breaches]

@@ -24,10 +24,11 @@ from cloudrc.drivers.virtual import Clock, VirtualRun
 from cloudrc.endpoint import Endpoint
 from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, dishonesty
 from cloudrc.faults.inject import BUGS, SECRET, bugs, inject, shaped
-from cloudrc.faults.invariants import RobotInvariants
+from cloudrc.faults.invariants import Steps, check_order
 from cloudrc.faults.models import RestartableEndpoint, TeleopModel
+from cloudrc.faults.observer import RobotObserver
+from cloudrc.faults.rules import Breach, Rules
 from cloudrc.faults.schedule import OFFSET_MAX, Schedule, generator
-from cloudrc.faults.watch import Watch
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
 from cloudrc.messages import GuardState
@@ -57,7 +58,6 @@ class FaultRun:
         schedule: Schedule,  # faults of the flight, and the link's profile
         *settings: str,  # settings of the robot's experiment, as for `--set`
         honest: bool = True,  # whether a contact is a breach; not if `schedule` has a policy
-        keep: bool = True,  # whether all records are kept; sha256() needs them
         start: bool = True,  # whether the experiment's mission is ordered at once
         life: int = 1,  # makes the nonces differ from those of another flight
         lies: Sequence[Lie] = (),  # change cloud's commands after those of the schedule
@@ -82,14 +82,13 @@ class FaultRun:
         policy, self._words = dishonesty(schedule, self._fence)
         mistakes = [bugs(schedule, self._clock)] if schedule.of(*BUGS) else []
         self._lies = [*policy, *mistakes, *lies]
-        self._honest, self._keep, self._life = honest and not schedule.policy, keep, life
+        self._rules = Rules(self.experiment, honest=honest and not schedule.policy)
+        self._life, self._observers = life, list[RobotObserver]()
         self._rival_at = min((event.at for event in schedule.of("second_cloud")), default=None)
         self.secrets, self.rings = {"world": SECRET, "cloud": SECRET}, dict[str, KeyRing]()
         self.generations = {"world": 0, "cloud": 0}
         self.of_world, self.of_cloud = list[Record](), list[Record]()
-        self.changes = list[GuardChange]()
-        self.watch = Watch(self.experiment)
-        self.listeners: list[Callable[[list[Record], int], None]] = [self.watch.see]
+        self.listeners = list[Callable[[list[Record], int], None]]()
         phase_ns = int(generator(self.experiment.seed, 45).integers(WAKE_NS))
         self.teleop = TeleopModel(self._fence, phase_ns)
         if start:
@@ -151,8 +150,25 @@ class FaultRun:
         self._rival_at = None
 
     def sha256(self) -> str:
-        """Return the hash of all records so far; the flight must have been made with `keep`."""
+        """Return the hash of all records so far."""
         return Recording.from_records(self.of_world, self.of_cloud).sha256
+
+    def steps(self) -> list[Steps]:
+        """Return the steps of the robot so far, in a list for each process of world."""
+        return [Steps(each) for each in self._observers]
+
+    def breaches(self) -> list[Breach]:
+        """Return the breaches of invariants so far, in the order of time."""
+        starts_ns = [each.start_ns for each in self._observers]
+        found = [*check_order(self.of_world, starts_ns)]
+        for observer, steps in zip(self._observers, self.steps(), strict=True):
+            found += [*observer.breaches, *steps.breaches()]
+        return sorted(found, key=lambda breach: breach.time)
+
+    @property
+    def changes(self) -> list[GuardChange]:
+        """The changes of the guard's state so far."""
+        return self.of(GuardChange)
 
     def of(self, kind: type[_Kind]) -> list[_Kind]:
         """Return world's records of a class."""
@@ -178,7 +194,7 @@ class FaultRun:
     def _build_world(self, start_ns: int) -> list[Endpoint]:
         identity = self._begin("world", SHARED)
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
-        RobotInvariants(world.robot, self.watch, start_ns, self._honest)
+        self._observers.append(RobotObserver(world.robot, self._rules, start_ns))
         return [world]
 
     def _build_cloud(self, start_ns: int) -> list[Endpoint]:
@@ -210,10 +226,8 @@ class FaultRun:
         return Identity(clock_id, nonce, self.rings[end])
 
     def _sink(self, of_world: list[Record], of_cloud: list[Record]) -> None:
-        if self._keep:
-            self.of_world += of_world
-            self.of_cloud += of_cloud
-        self.changes += [record for record in of_world if isinstance(record, GuardChange)]
+        self.of_world += of_world
+        self.of_cloud += of_cloud
         for listen in self.listeners:
             listen(of_world, self.run.now_ns)
 

@@ -1,4 +1,4 @@
-"""Safety invariants, checked after every 2 ms step, independently of the guard.
+"""Safety invariants, checked in every 2 ms step of a flight, independently of the guard.
 
 fence      The robot's base stays inside the fence while its actuators are on. After a collision or
            an emergency stop the robot may leave the fence by at most `FALL_MAX`. A robot that is
@@ -24,87 +24,238 @@ tick       The guard runs once in each step of the physics.
 
 All limits come from configuration, robot and docs/, not from the guard: from "Stop rule" and
 "Leaving HOLD" in reference/plant.md, F5 and F23 in reference/faults.md, and "The guard" in
-safety.md. `motion_checks` looks at fence, cap, stop and rest, `contact_checks` at collision and at
-what is switched off, `order_checks` at stale, latch and hold.
+safety.md. `order_checks` looks at stale, latch and hold during the flight. This module looks at the
+others after it, in the rows that `observer` has kept.
 """
 
 from __future__ import annotations
 
-from cloudrc.faults.contact_checks import ContactChecks
-from cloudrc.faults.motion_checks import MotionChecks
-from cloudrc.faults.order_checks import OrderChecks
-from cloudrc.faults.watch import FLOWN, LAND, TRACK, Watch
-from cloudrc.messages import Command, OperatorRequest, Request, Start
-from cloudrc.sim.onboard import Commands
-from cloudrc.sim.readings import Readings
-from cloudrc.world.robot import STEP_NS, Observer, Robot
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cloudrc.faults.observer import ROW, RobotObserver
+from cloudrc.faults.rules import ESTOP, FLOWN, HOLD, LAND, TRACK, Breach, Rules
+from cloudrc.messages import GuardState
+from cloudrc.records import CommandApplied, Record, SessionOpened
+from cloudrc.text import describe_point
+from cloudrc.world.robot import STEP, STEP_NS
+
+SLACK = 1e-9  # tolerance for rounding [m/s]
+STILL = 0.12
+"""Largest speed of a robot at rest [m/s]: the guard's limit, 0.1, plus one step of free fall."""
+REST = 0.5
+"""Tolerance of the stopping distance after TRACK [m]; it includes a swing of up to 0.2 m."""
+REACTION = 0.2  # time until the robot brakes as hard as it can [s]
+MARGIN = 0.1  # distance from a face of the fence at which the robot has to stop [m]
+FALL_MAX = 1.5  # largest distance that a falling robot may leave the fence [m]
+THROWN_NS = 3_000_000_000  # time after a collision in which the robot may leave the fence [ns]
+REELS_NS = 1_000_000_000  # time after a collision in which it explains the robot's motion [ns]
+STANDS = 0.2  # speed per axis up to which a robot stands when it is switched off [m/s]
+FALL = 1.0
+"""Downward speed that proves a fall while switched off [m/s]; a drop of 2 cm ends at only 0.7."""
+BRAKE_NS = 200_000_000  # time to stop a descent that the operator has acknowledged [ns]
+FLOOR = "floor"  # body on which a robot may always stand
+NEVER_NS = 1 << 60
+SHOWN = "position", "velocity", "reference"  # columns that the text of a breach shows
+REPORTED = 5  # number of breaches of each kind that are told
+
+Array: TypeAlias = NDArray[Any]
+Broken: TypeAlias = Iterator[tuple[str, Array, str]]
+"""Name of an invariant, in which steps it is broken, and what happens in them."""
 
 
-class RobotInvariants:
-    """Checks one robot after every step of its physics; times are on world's clock [ns]."""
+class Steps:
+    """The steps of a robot as arrays with one entry per step.
 
-    def __init__(self, robot: Robot, watch: Watch, start_ns: int, honest: bool) -> None:
-        """Check a robot from `start_ns` [ns] on; check its contacts only if cloud is `honest`."""
-        self._guard, self._simulator, self._watch = robot.guard, robot.simulator, watch
-        self._stopped = robot.onboard.stopped
-        self._was = self._state = robot.guard.state  # after the last step; after the last event
-        self._next_ns, self._steps = start_ns, 0
-        self._orders, self._motion = OrderChecks(watch), MotionChecks(watch)
-        self._contacts = ContactChecks(watch, robot.simulator, honest=honest)
-        watch.starts_ns.append(start_ns)
-        tells = self.see_step, self.see_command, self.see_request, self.see_session
-        robot.observers.append(Observer(*tells))
+    Attributes:
+        rows: The rows of the robot's observer.
+        flown: Whether the guard is in a state in which the robot flies.
+        was: State of the guard in the step before.
+        before: The reference in the step before [m/s].
+        touches: The contacts, without those of wheels with the floor; each with its step.
+        touched_ns: Time since the last contact began [ns].
+        margin: Distance of the base to the nearest wall or the ceiling [m]; below 0 outside.
+        falls: Whether the robot was stopped or hit in the air, and has not flown since.
+        thrown: Whether the robot is outside the fence, or has just been, because of a contact.
+    """
 
-    def see_step(self, now_ns: int, readings: Readings, commands: Commands) -> None:
-        """Check all invariants in a step that begins at `now_ns` [ns]."""
-        steps, was, state = self._simulator.steps, self._was, self._guard.state
-        motion, contacts, orders, watch = self._motion, self._contacts, self._orders, self._watch
-        watch.now_ns = now_ns
-        if now_ns != self._next_ns or steps != self._steps + 1:
-            watch.note("tick", "a step of the physics without a tick of the guard")
-        self._next_ns, self._steps = now_ns + STEP_NS, steps
-        if state is not was:
-            orders.check_change(was, state)
-            contacts.check_hit(state)
-        orders.check_wait(state)
-        # Hard braking may command actuators of a robot to 0, too: only the object itself counts.
-        is_on = commands is not self._stopped
-        contacts.check_actuators(state, readings.velocity, is_on)
-        motion.check_fence(was, state, readings)
-        if was is TRACK and state is not TRACK:
-            motion.leave_track(readings)
-        if state in FLOWN:
-            contacts.comes_down = state is LAND
-            motion.check_reference(self._guard, readings.position, orders.is_ramped)
-            if state is TRACK:
-                orders.check_track()
-            elif is_on:
-                motion.check_rest(readings.position)
-        elif is_on:
-            watch.note("latch", f"actuators on in {state.name}")
-        if contacts.check_touches(state):
-            motion.touch()
-        motion.before = self._guard.reference
-        self._was = self._state = state
+    def __init__(self, observer: RobotObserver) -> None:
+        self.rules, rules = observer.rules, observer.rules
+        rows = self.rows = np.array(observer.rows, ROW).view(np.recarray)
+        self.was, self.before = _before(rows.state), _before(rows.reference)
+        self.flown = np.isin(rows.state, FLOWN)
+        rolls_on = FLOOR if rules.planar else ""
+        self.touches = [each for each in observer.touches if each[1].body != rolls_on]
+        touched = np.isin(np.arange(len(rows)), [step for step, _ in self.touches])
+        self.touched_ns = self.since(touched)
+        below, above = rows.position - rules.low, rules.high - rows.position
+        self.margin = np.hstack((below[:, :2], above)).min(axis=1)
+        hit = _before(self.flown) & (rows.state == ESTOP)
+        self.falls = self.since(hit | rows.downed) < self.since(self.flown)
+        back = (self.margin >= 0.0) & (self.touched_ns >= THROWN_NS)
+        self.thrown = self.touched_ns < self.since(back)
 
-    def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """Check an accepted command's age, count invalid ones; `rejection` is None if accepted."""
-        self._watch.now_ns = now_ns
-        self._orders.see_command(command, rejection, self._state)
-        self._state = self._guard.state
+    def since(self, event: Array) -> Array:
+        """Return the time [ns] since the last step in which `event` was true, this one included."""
+        now_ns: Array = self.rows.now_ns
+        return now_ns - np.maximum.accumulate(np.where(event, now_ns, -NEVER_NS))
 
-    def see_request(self, request: OperatorRequest, now_ns: int) -> None:
-        """Store what a request allows the robot to do, which it has carried out at `now_ns`."""
-        self._watch.now_ns = now_ns
-        if request.request is Request.START and request.start is Start.SPAWN:
-            self._steps, self._contacts.is_asked = 0, True
-        elif request.request is Request.ESTOP:
-            self._contacts.is_asked = True
-            if self._state in FLOWN:
-                self._motion.falls = self._contacts.comes_down = True
-        self._orders.see_request(request, self._state)
-        self._state = self._guard.state
+    @property
+    def smallest_margin(self) -> float:
+        """Smallest distance of the base to walls and ceiling [m], unless it falls; 9 at most."""
+        counts = ~self.falls & ((self.margin >= 0.0) | ~self.thrown)
+        return float(self.margin[counts].min(initial=9.0))
 
-    def see_session(self, now_ns: int) -> None:
-        """Forget the commands of the old session: the guard has forgotten them, too."""
-        self._orders.forget_commands()
+    @property
+    def top_speed(self) -> float:
+        """Largest reference [m/s]."""
+        return float(np.fmax.reduce(_norm(self.rows.reference[self.flown]), initial=0.0))
+
+    def breaches(self) -> Iterator[Breach]:
+        """Yield each breach of an invariant."""
+        for check in (_ticks, _fence, _reference, _rest, _contacts):
+            for kind, broken, what in check(self):
+                for row in self.rows[broken]:
+                    motion = [f"{name} {describe_point(row[name])}" for name in SHOWN]
+                    text = f"{what} in {GuardState(row.state).name}, {', '.join(motion)}"
+                    yield Breach(row.now_ns * 1e-9, kind, text)
+
+
+def _before(values: Array) -> Array:
+    """Return the values in the step before; 0 in the first step."""
+    shifted = np.roll(values, 1, axis=0)
+    shifted[:1] = 0
+    return shifted
+
+
+def _norm(vectors: Array) -> Array:
+    norms: Array = np.sqrt((vectors * vectors).sum(axis=1))
+    return norms
+
+
+def _ticks(steps: Steps) -> Broken:
+    now_ns, count = steps.rows.now_ns, steps.rows.steps
+    skips = (np.diff(count, prepend=0) != 1) & (count != 1)
+    late = np.diff(now_ns, prepend=now_ns[:1] - STEP_NS) != STEP_NS
+    yield "tick", skips | late, "a step of the physics without a tick of the guard"
+
+
+def _fence(steps: Steps) -> Broken:
+    rows, floor = steps.rows, steps.rules.low[2]
+    low = rows.position[:, 2] < floor
+    yield "fence", low, "below the floor"
+    may_leave = steps.falls | steps.thrown
+    out = steps.margin < np.where(may_leave, -FALL_MAX, 0.0)
+    yield "fence", out, "outside"
+    starts = steps.flown & (_before(steps.falls) | rows.downed)
+    rests = (_norm(rows.velocity) <= STILL) & (steps.margin >= 0.0) & ~low
+    yield "fence", starts & ~rests, "took off after a stop, not at rest inside the fence"
+
+
+def _stop_distance(speed: Array, rules: Rules) -> Array:
+    """Return the way from `speed` [m/s] to rest [m].
+
+    Source: docs/reference/plant.md, "Stop rule".
+    """
+    distance: Array = speed * (REACTION + speed / (2.0 * rules.braking))
+    return distance
+
+
+def _reference(steps: Steps) -> Broken:
+    rows, rules, v = steps.rows, steps.rules, steps.rows.reference
+    room = np.where(v > 0.0, rules.high - rows.position, rows.position - rules.low)
+    stops = (v == 0.0) | (_stop_distance(abs(v), rules) <= room - MARGIN + SLACK)
+    stops[:, 2] |= (rows.state == LAND) & (v[:, 2] < 0.0)
+    yield "stop", steps.flown & ~stops.all(axis=1), "too fast to stop before the fence"
+    # The negated comparisons find NaN, too.
+    turns = ~(abs(rows.yaw_rate) <= rules.limits.yaw_rate_max_radps)
+    yield "cap", steps.flown & turns, "the reference turns too fast"
+    fast = ~(_norm(v) <= rules.limits.speed_max_mps + SLACK)
+    yield "cap", steps.flown & fast, "the reference is too fast"
+    yield "cap", steps.flown & rules.planar & (v[:, 2] != 0.0), "the reference leaves the ground"
+    most = np.where(rows.ramped, rules.braking, rules.limits.acceleration_max_mps2)
+    grows = ~(_norm(growth(steps.before, v)) <= most * STEP + SLACK)
+    # Braking is not limited: at the fence, or after a collision.
+    yield "cap", (rows.state == TRACK) & grows, "the reference grows too fast"
+
+
+def growth(before: Array, after: Array) -> Array:
+    """Return how much velocities grow per axis from `before` to `after` [m/s], shape (n, 3).
+
+    It is 0 if the speed falls. If the direction reverses, all of the new speed is growth.
+    """
+    grown = np.maximum(abs(after) - abs(before), 0.0)
+    turned: Array = np.where(before * after < 0.0, abs(after), grown)
+    return turned
+
+
+def _rest(steps: Steps) -> Broken:
+    rows, rules = steps.rows, steps.rules
+    yield "latch", rows.is_on & ~steps.flown, "actuators on"
+    left = (steps.was == TRACK) & (rows.state != TRACK)
+    left_ns = steps.since(left)
+    last = np.maximum.accumulate(np.where(left, np.arange(len(rows)), 0))
+    speed = np.fmax(_norm(rows.velocity), _norm(steps.before))[last]
+    way = _norm((rows.position - rows.position[last])[:, :2])
+    far = (way > _stop_distance(speed, rules) + REST) & (steps.touched_ns >= left_ns + REELS_NS)
+    waits = steps.flown & (rows.state != TRACK) & rows.is_on & (left_ns < NEVER_NS)
+    yield "rest", waits & far, "far from where the last command ended"
+    excused = rows.asked | (rows.touch_age <= REELS_NS * 1e-9)
+    goes_off = _before(rows.is_on) & ~rows.is_on
+    alone = goes_off & ~rows.asked & (rows.state != ESTOP)
+    moves = ~(abs(rows.velocity) <= STANDS).all(axis=1)
+    yield "rest", alone & moves, "switched off in motion"
+    halted = steps.since(alone) < steps.since(rows.is_on | rows.asked | (goes_off & ~alone))
+    falls = halted & ~alone & ~excused & (rows.velocity[:, 2] < -FALL)
+    yield "rest", falls, "falls, switched off in the air"
+
+
+def _contacts(steps: Steps) -> Broken:
+    rows, rules = steps.rows, steps.rules
+    if not rules.honest:
+        return
+    hit = (steps.was != ESTOP) & (rows.state == ESTOP) & ~rows.asked
+    yield "collision", hit & (rows.touch_age > REELS_NS * 1e-9), "stopped although nothing touches"
+    lands = rows.state == LAND
+    # A landing that is acknowledged just above an obstacle cannot stop in time.
+    lands |= (rows.state == HOLD) & (steps.since(lands) <= BRAKE_NS)
+    in_air = steps.flown & (rows.state != LAND)
+    comes_down = steps.since(rows.downed | (rows.state == LAND)) < steps.since(in_air)
+    for step, touch in steps.touches:
+        is_named = touch.by_probe and touch.body == rules.touched
+        lies = not steps.flown[step] and (comes_down[step] or touch.body == FLOOR)
+        if not (is_named or lands[step] or lies):
+            yield "collision", np.array([step]), f"touched {touch.body}"
+
+
+def first_of_each(breaches: Iterable[Breach]) -> tuple[Breach, ...]:
+    """Return the first `REPORTED` breaches of each kind."""
+    counts, kept = Counter[str](), list[Breach]()
+    for breach in breaches:
+        counts[breach.kind] += 1
+        if counts[breach.kind] <= REPORTED:
+            kept.append(breach)
+    return tuple(kept)
+
+
+def check_order(records: Iterable[Record], starts_ns: Sequence[int]) -> Iterator[Breach]:
+    """Check in world's records that each command was applied once and in order.
+
+    The order of commands is that of epochs and, within an epoch, of counters. It begins anew with
+    each process of world, from `starts_ns` [ns] on: if cloud knows no epoch, a restarted world
+    begins at the first.
+    """
+    newest = (0, 0, -1)  # process of world, epoch and counter
+    for record in records:
+        if isinstance(record, CommandApplied | SessionOpened):
+            counter = record.counter if isinstance(record, CommandApplied) else -1
+            process = bisect_right(starts_ns, record.stamp_ns)
+            if (this := (process, record.epoch, counter)) <= newest:
+                text = f"command {counter} of epoch {record.epoch} after {newest[1:]}"
+                yield Breach(record.stamp_ns * 1e-9, "order", text)
+            newest = max(newest, this)

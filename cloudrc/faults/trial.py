@@ -6,14 +6,16 @@ last part of the flight has no faults: the robot must then fly again, otherwise 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from cloudrc.errors import describe_error
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.inject import order
+from cloudrc.faults.invariants import first_of_each
 from cloudrc.faults.measures import events_of_missions, held
+from cloudrc.faults.rules import LATCHED, Breach
 from cloudrc.faults.schedule import Schedule
-from cloudrc.faults.watch import LATCHED, Breach
 from cloudrc.messages import GuardState
 from cloudrc.records import GuardChange, Record
 from cloudrc.teleop.service import MissionService
@@ -67,32 +69,29 @@ class TrialResult:
         return "\n".join([*lines, f"{word}  records {self.sha256[:16]}"])
 
 
-def fly(schedule: Schedule, *, keep: bool = False) -> TrialResult:
-    """Fly with a schedule of faults.
-
-    With `keep` the records are kept and hashed, which doubles the time.
+def fly(schedule: Schedule, *, hashed: bool = False) -> TrialResult:
+    """Fly with a schedule of faults; `hashed` asks for the hash of all records.
 
     Raises:
         CloudrcError: If the schedule names an unknown link profile or policy.
         ValueError: If its faults do not fit the profile.
     """
-    flight = FaultRun(schedule, keep=keep)
-    watch, operator = flight.watch, TrialOperator(flight)
+    flight = FaultRun(schedule)
+    operator, found = TrialOperator(flight), list[Breach]()
     try:
         flight.fly(schedule.duration)
     except Exception as error:  # world and cloud must survive every fault
-        watch.note("error", describe_error(error))
-    wanted = checked_in(schedule)
-    if "waypoint" in wanted:
-        _check_waypoints(flight)
-    if "stuck" in wanted:
-        operator.check_stuck()
-    if "obeyed" in wanted:
-        operator.check_stops()
-    if "alarm" in wanted:
-        _check_alarms(flight)
-    sha256, done = flight.sha256() if keep else "", len(flight.events("done"))
-    return TrialResult(schedule, tuple(watch.breaches), sha256, watch.margin, watch.speed, done)
+        found.append(Breach(flight.now, "error", describe_error(error)))
+    found += [*flight.breaches(), *operator.breaches(), *_waypoints(flight), *_alarms(flight)]
+    wanted, steps = checked_in(schedule), flight.steps()
+    return TrialResult(
+        schedule,
+        first_of_each(breach for breach in sorted(found) if breach.kind in wanted),
+        flight.sha256() if hashed else "",
+        margin=min(each.smallest_margin for each in steps),
+        speed=max(each.top_speed for each in steps),
+        missions=len(flight.events("done")),
+    )
 
 
 def checked_in(schedule: Schedule) -> frozenset[str]:
@@ -119,20 +118,17 @@ class TrialOperator:
         self._unmet_ns = [round(event.at * 1e9) for event in flight.schedule.of("stopped")]
         flight.listeners.append(self._look)
 
-    def check_stuck(self) -> None:
-        """Report a breach if the guard was never in TRACK in the last `BACK` [s] (no faults)."""
-        flight, now_ns = self._flight, self._flight.run.now_ns
-        if now_ns - self._tracked_ns > BACK * 1e9:
+    def breaches(self) -> Iterator[Breach]:
+        """Yield that the guard was not in TRACK for `BACK` [s], and stops without effect."""
+        flight, now = self._flight, self._flight.now
+        if now - self._tracked_ns * 1e-9 > BACK:
             state, cause = flight.guard_now()
             mission = flight.mission.state if flight.teleop.missions else "none"
             text = f"not flown in {BACK:g} s of calm: guard {state.name} ({cause}), mission"
-            flight.watch.note("stuck", f"{text} {mission}")
-
-    def check_stops(self) -> None:
-        """Check that each emergency stop of the operator led to ESTOP."""
+            yield Breach(now, "stuck", f"{text} {mission}")
         for at_ns in self._unmet_ns:
             text = f"the operator's stop at {at_ns * 1e-9:.2f} s has stopped nothing"
-            self._flight.watch.note("obeyed", text)
+            yield Breach(now, "obeyed", text)
 
     def _look(self, records: list[Record], now_ns: int) -> None:
         """Note what the guard did in the last 100 ms, then act as an operator would."""
@@ -161,18 +157,18 @@ class TrialOperator:
             order(flight)
 
 
-def _check_waypoints(flight: FaultRun) -> None:
+def _waypoints(flight: FaultRun) -> Iterator[Breach]:
     reached: dict[str, list[int]] = {}
     for event in events_of_missions(flight, "reached"):
         reached.setdefault(event["mission"], []).append(event["waypoint"])
     for mission, waypoints in reached.items():
         if waypoints != list(range(len(waypoints))):
             text = f"{mission} reached its waypoints as {waypoints}"
-            flight.watch.note("waypoint", text)
+            yield Breach(flight.now, "waypoint", text)
 
 
-def _check_alarms(flight: FaultRun) -> None:
+def _alarms(flight: FaultRun) -> Iterator[Breach]:
     latched = [change for change in flight.changes if change.state in LATCHED]
     for change in (*held(flight), *latched):
         text = f"{change.state.name} in a flight without faults: {change.cause}"
-        flight.watch.note("alarm", text, change.stamp_ns)
+        yield Breach(change.stamp_ns * 1e-9, "alarm", text)

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from cloudrc.faults.measures import Outcome
+from cloudrc.faults.rules import Breach
 from cloudrc.faults.scenarios import SCENARIOS
 from cloudrc.faults.schedule import FaultEvent, Schedule, dump, load
 from cloudrc.faults.search import run_fault
 from cloudrc.faults.trial import TrialResult
-from cloudrc.faults.watch import Breach
 from cloudrc.trials.workers import WorkerDiedError
 
 KILLED = WorkerDiedError("a worker was killed")

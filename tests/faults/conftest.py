@@ -4,8 +4,9 @@ from functools import cache
 from types import SimpleNamespace
 
 from cloudrc.config.load import load_experiment
-from cloudrc.faults.invariants import RobotInvariants
-from cloudrc.faults.watch import FLOWN, TRACK, Watch
+from cloudrc.faults.invariants import Steps
+from cloudrc.faults.observer import RobotObserver
+from cloudrc.faults.rules import FLOWN, TRACK, Rules
 from cloudrc.messages import ZERO, Command, OperatorRequest, Request, Start
 from cloudrc.records import Contact
 from cloudrc.robots.pelican.rotors import STOPPED
@@ -31,9 +32,13 @@ class FakeRobot:
         self.observers = []
         self.position, self.velocity = (1.0, 1.0, 1.0), ZERO
         self.now_ns = 0
-        self.watch = Watch(experiment(robot))
-        self.observer = RobotInvariants(self, self.watch, 0, honest)
+        self.observer = RobotObserver(self, Rules(experiment(robot), honest=honest), 0)
         self.request(Request.START)
+
+    def broken(self):
+        """Return the kinds of breaches."""
+        found = *self.observer.breaches, *Steps(self.observer).breaches()
+        return {breach.kind for breach in found}
 
     def request(self, *requests):
         """Carry out operator requests; the guard's state stays what a test says."""

@@ -5,7 +5,7 @@ from operator import methodcaller
 
 import pytest
 
-from cloudrc.faults.watch import ESTOP, GROUND, HOLD, LAND, TRACK
+from cloudrc.faults.rules import ESTOP, GROUND, HOLD, LAND, TRACK
 from cloudrc.messages import ZERO, Request
 from tests.faults.conftest import FakeRobot
 
@@ -26,7 +26,7 @@ def play(*story, **options):
     robot = FakeRobot(**options)
     for deed in story:
         deed(robot)
-    return set(robot.watch.counts)
+    return robot.broken()
 
 
 def fly(*references):

@@ -157,5 +157,5 @@ def test_a_stop_gets_through_thirty_percent_loss(count, figure):
         (stop,) = [change for change in flight.changes if change.state is ESTOP]
         took.append(stop.stamp_ns * 1e-9 - at)
         assert flight.changes[-1].state is GROUND
-        assert not flight.watch.breaches
+        assert not flight.breaches()
     figure("stop under 30 % loss", max(took), "<=", drive.rtt + 0.1, "s", count=count)
