@@ -13,7 +13,7 @@ import numpy as np
 
 from cloudrc.drivers.virtual import Clock
 from cloudrc.faults.adversary import Lie
-from cloudrc.faults.models import Action, Call, RestartableEndpoint, Tamper
+from cloudrc.faults.models import Tamper
 from cloudrc.faults.schedule import FaultEvent, Schedule, generator
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
 from cloudrc.messages import Command
@@ -82,62 +82,77 @@ def inject(flight: FaultRun) -> None:
     """Schedule the faults of processes, keys, datagrams, teleop and the operator in a flight."""
     schedule = flight.schedule
     for event in schedule.events:
-        process = flight.world if event.kind.startswith("world") else flight.cloud
-        if event.kind.endswith("throttled"):
-            process.throttle(event.at, event.duration, event.value)
-        for time, action in _actions(flight, process, event).get(event.kind, ()):
-            process.at(time, action)
+        _disturb_processes(flight, event)
+        _use_keys_and_api(flight, event)
     intrusions, rng = schedule.of("corruption", "garbage", "replay"), generator(schedule.seed, 41)
     for way, process in (("down", flight.world), ("up", flight.cloud)):
         if mine := [event for event in intrusions if event.way in ("both", way)]:
             process.tamper = _tamper(mine, rng)
 
 
-def order(flight: FaultRun, now_ns: int = 0) -> None:
-    """Order the experiment's mission; teleop may not take the order. `now_ns` is not used."""
+def order(flight: FaultRun, now_ns: int) -> None:
+    """Order the experiment's mission at `now_ns` [ns]; teleop may not take the order."""
     mission = flight.make_order()
-    flight.teleop.ask(lambda service, now_ns: service.create(mission, now_ns))
+    flight.teleop.ask(now_ns, lambda service, now_ns: service.create(mission, now_ns))
 
 
-def _actions(
-    flight: FaultRun, process: RestartableEndpoint, event: FaultEvent
-) -> dict[str, tuple[tuple[float, Action], ...]]:
-    """Return how to inject `event`: kind of fault -> pairs of time [s] and action.
-
-    The mapping is the same for all kinds of event; the caller selects the entry of the event's
-    kind. `process`, world or cloud, is the one that the event kills or freezes.
-    """
+def _disturb_processes(flight: FaultRun, event: FaultEvent) -> None:
+    """Schedule when a fault kills, stops or throttles processes, and when they run again."""
+    process = flight.world if event.kind.startswith("world") else flight.cloud
     at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
     gone = at + event.value * lasts  # end of teleop after it was asked to end
 
-    def ask(call: Call) -> Action:
-        return lambda now_ns: teleop.ask(call)
-
-    def read(end: str, keys: KeySet | None = None) -> Action:
-        return lambda now_ns: flight.replace_key(end, keys or flight.secrets["world"])
-
     def restart_pod(now_ns: int, down: float) -> None:
         teleop.kill(now_ns)
-        flight.cloud.restart(now_ns, down)
-        flight.cloud.at(now_ns * 1e-9 + down, teleop.start)
+        process.restart(now_ns, down)
+        process.at(now_ns * 1e-9 + down, teleop.start)
 
-    restart, freeze = partial(process.restart, down=lasts), partial(process.freeze, duration=lasts)
-    pause = ask(MissionService.pause)
-    return {
-        **dict.fromkeys(("cloud_killed", "world_killed"), ((at, restart),)),
-        **dict.fromkeys(("cloud_paused", "world_paused"), ((at, freeze),)),
-        "pod_killed": ((at, partial(restart_pod, down=lasts)),),
-        "pod_shut_down": ((at, pause), (gone, partial(restart_pod, down=end - gone))),
-        "teleop_killed": ((at, teleop.kill), (end, teleop.start)),
-        "teleop_shut_down": ((at, pause), (gone, teleop.kill), (end, teleop.start)),
-        "teleop_paused": ((at, partial(teleop.freeze, duration=lasts)),),
-        "second_cloud": ((end, lambda now_ns: flight.end_rival()),),
-        "key_rotated": ((at, read("world", NEXT_KEY)), (end, read("cloud", NEXT_KEY))),
-        "key_wrong": ((at, read("cloud", WRONG_KEY)), (end, read("cloud"))),
-        "second_order": ((at, partial(order, flight)),),
-        "stopped": ((at, teleop.switch_off),),
-        "held": ((at, ask(MissionService.hold)), (end, ask(MissionService.resume))),
-    }
+    match event.kind:
+        case "cloud_killed" | "world_killed":
+            process.at(at, process.restart, lasts)
+        case "cloud_paused" | "world_paused":
+            process.at(at, process.freeze, lasts)
+        case "cloud_throttled" | "world_throttled":
+            process.throttle(at, lasts, event.value)
+        case "pod_killed":
+            process.at(at, restart_pod, lasts)
+        case "pod_shut_down":
+            process.at(at, teleop.ask, MissionService.pause)
+            process.at(gone, restart_pod, end - gone)
+        case "teleop_killed":
+            process.at(at, teleop.kill)
+            process.at(end, teleop.start)
+        case "teleop_shut_down":
+            process.at(at, teleop.ask, MissionService.pause)
+            process.at(gone, teleop.kill)
+            process.at(end, teleop.start)
+        case "teleop_paused":
+            process.at(at, teleop.freeze, lasts)
+
+
+def _use_keys_and_api(flight: FaultRun, event: FaultEvent) -> None:
+    """Schedule when ends read keys, the second cloud leaves, and the operator calls teleop."""
+    cloud, teleop, at, end = flight.cloud, flight.teleop, event.at, event.end
+
+    def read(now_ns: int, end: str, keys: KeySet | None = None) -> None:
+        flight.replace_key(end, keys or flight.secrets["world"])
+
+    match event.kind:
+        case "second_cloud":
+            cloud.at(end, flight.end_rival)
+        case "key_rotated":
+            cloud.at(at, read, "world", NEXT_KEY)
+            cloud.at(end, read, "cloud", NEXT_KEY)
+        case "key_wrong":
+            cloud.at(at, read, "cloud", WRONG_KEY)
+            cloud.at(end, read, "cloud")
+        case "second_order":
+            cloud.at(at, partial(order, flight))
+        case "stopped":
+            cloud.at(at, teleop.switch_off)
+        case "held":
+            cloud.at(at, teleop.ask, MissionService.hold)
+            cloud.at(end, teleop.ask, MissionService.resume)
 
 
 def _tamper(events: list[FaultEvent], rng: np.random.Generator) -> Tamper:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from operator import itemgetter
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from cloudrc.drivers.teleop import PERIOD_NS, RemoteTeleop, TeleopLoop, UnixPeer
 from cloudrc.drivers.virtual import Clock
@@ -27,8 +27,8 @@ SOCKET_MAX = 256
 UNIX_SOCKET_MAX = 11
 """Number of datagrams that a Unix socket can hold: net.unix.max_dgram_qlen, which is 10, plus 1."""
 
-Action: TypeAlias = Callable[[int], None]
-"""Function that is called at a virtual time [ns] to begin or end a fault."""
+Action: TypeAlias = Callable[..., None]
+"""Function that begins or ends a fault; takes the virtual time [ns], and further arguments."""
 Tamper: TypeAlias = Callable[[bytes, int], list[bytes]]
 """Function that replaces an arriving datagram by others, at a virtual time [ns]."""
 Call: TypeAlias = Callable[[MissionService, int], object]
@@ -52,7 +52,7 @@ class RestartableEndpoint:
         self._frozen_until_ns = -1
         self._waiting: list[bytes] = []
         self._left: list[Record] = []
-        self._actions: list[tuple[int, Action]] = []
+        self._actions = list[tuple[int, Action, tuple[Any, ...]]]()
         self.members, self.others = build(clock.at(0)), list[Record]()
 
     @property
@@ -60,9 +60,9 @@ class RestartableEndpoint:
         """World or the first cloud; None while there is no process."""
         return self.members[0] if self.members else None
 
-    def at(self, seconds: float, action: Action) -> None:
-        """Schedule an action at the virtual time `seconds` [s]."""
-        insort(self._actions, (round(seconds * 1e9), action), key=itemgetter(0))
+    def at(self, seconds: float, action: Action, *args: Any) -> None:
+        """Schedule an action at the virtual time `seconds` [s]; `args` are further arguments."""
+        insort(self._actions, (round(seconds * 1e9), action, args), key=itemgetter(0))
 
     def kill(self, now_ns: int) -> None:
         """Kill the process as with SIGKILL; its records so far are kept."""
@@ -89,7 +89,7 @@ class RestartableEndpoint:
         """
         stall = (1.0 - share) * CFS_PERIOD
         for n in range(int(duration / CFS_PERIOD)):
-            self.at(start + n * CFS_PERIOD, lambda now_ns: self.freeze(now_ns, stall))
+            self.at(start + n * CFS_PERIOD, self.freeze, stall)
 
     def receive_now(self, data: bytes, now_ns: int) -> None:
         """Pass a datagram to the process unchanged; keep it while the process is frozen."""
@@ -115,7 +115,8 @@ class RestartableEndpoint:
     def handle_deadline(self, now_ns: int) -> None:
         """Implement `Endpoint.handle_deadline`: inject due faults, then run the process."""
         while self._actions and self._actions[0][0] <= now_ns:
-            self._actions.pop(0)[1](now_ns)
+            _, act, args = self._actions.pop(0)
+            act(now_ns, *args)
         if 0 <= self._frozen_until_ns <= now_ns:
             self._frozen_until_ns = -1
             waiting, self._waiting = self._waiting, []
@@ -238,8 +239,11 @@ class TeleopModel:
         assert self.service is not None, "teleop is down"
         self.service.create(order, now_ns)
 
-    def ask(self, call: Call) -> None:
-        """Call teleop's API; teleop handles the call when it wakes next. A refusal is ignored."""
+    def ask(self, now_ns: int, call: Call) -> None:
+        """Call teleop's API; teleop handles the call when it wakes next. A refusal is ignored.
+
+        `now_ns` is ignored, too.
+        """
         self._calls.append(call)
 
     def switch_off(self, now_ns: int) -> None:

@@ -152,9 +152,9 @@ class TrialOperator:
             return
         self._next_ns = now_ns + PATIENCE_NS
         if seen["guard"] in [each.name for each in LATCHED]:
-            flight.teleop.ask(MissionService.acknowledge)
+            flight.teleop.ask(now_ns, MissionService.acknowledge)
         elif is_over:
-            order(flight)
+            order(flight, now_ns)
 
 
 def _waypoints(flight: FaultRun) -> Iterator[Breach]:

@@ -33,7 +33,7 @@ class Drive:
             self.press(1.5, 0.1, ZERO)
 
     def at(self, time, call):
-        self.flight.cloud.at(time, lambda now_ns: self.flight.teleop.ask(call))
+        self.flight.cloud.at(time, self.flight.teleop.ask, call)
 
     def press(self, time, lasts, velocity, turn=None):
         """Repeat a request at 10 Hz; return the time of the last request [s]."""
@@ -151,7 +151,7 @@ def test_a_stop_gets_through_thirty_percent_loss(count, figure):
         drive = Drive(seed=seed, link=["link.both.loss=0.3"])
         flight, at = drive.flight, 2.0 + drive.random(0.0, 0.1)
         drive.press(1.6, 2.0, EAST)  # the operator who drives does not let go
-        flight.cloud.at(at, lambda now_ns, flight=flight: flight.teleop.switch_off(now_ns))
+        flight.cloud.at(at, flight.teleop.switch_off)
         drive.at(at + 1.0, MissionService.acknowledge)
         flight.fly(at + 2.0)
         (stop,) = [change for change in flight.changes if change.state is ESTOP]
