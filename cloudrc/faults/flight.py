@@ -57,7 +57,6 @@ class FaultRun:
         self,
         schedule: Schedule,  # faults of the flight, and the link's profile
         *settings: str,  # settings of the robot's experiment, as for `--set`
-        honest: bool = True,  # whether a contact is a breach; not if `schedule` has a policy
         start: bool = True,  # whether the experiment's mission is ordered at once
         life: int = 1,  # makes the nonces differ from those of another flight
         lies: Sequence[Lie] = (),  # change cloud's commands after those of the schedule
@@ -82,7 +81,7 @@ class FaultRun:
         policy, self._words = dishonesty(schedule, self._fence)
         mistakes = [bugs(schedule, self._clock)] if schedule.of(*BUGS) else []
         self._lies = [*policy, *mistakes, *lies]
-        self._rules = Rules(self.experiment, honest=honest and not schedule.policy)
+        self._rules = Rules(self.experiment)
         self._life, self._observers = life, list[RobotObserver]()
         self._rival_at = min((event.at for event in schedule.of("second_cloud")), default=None)
         self.secrets, self.rings = {"world": SECRET, "cloud": SECRET}, dict[str, KeyRing]()

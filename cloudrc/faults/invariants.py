@@ -31,14 +31,13 @@ others after it, in the rows that `observer` has kept.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.faults.observer import ROW, RobotObserver
+from cloudrc.faults.observer import REPORTED, ROW, RobotObserver
 from cloudrc.faults.rules import ESTOP, FLOWN, HOLD, LAND, TRACK, Breach, Rules
 from cloudrc.messages import GuardState
 from cloudrc.records import CommandApplied, Record, SessionOpened
@@ -62,7 +61,6 @@ BRAKE_NS = 200_000_000  # time to stop a descent that the operator has acknowled
 FLOOR = "floor"  # body on which a robot may always stand
 NEVER_NS = 1 << 60
 SHOWN = "position", "velocity", "reference"  # columns that the text of a breach shows
-REPORTED = 5  # number of breaches of each kind that are told
 
 Array: TypeAlias = NDArray[Any]
 Broken: TypeAlias = Iterator[tuple[str, Array, str]]
@@ -120,7 +118,7 @@ class Steps:
         """Yield each breach of an invariant."""
         for check in (_ticks, _fence, _reference, _rest, _contacts):
             for kind, broken, what in check(self):
-                for row in self.rows[broken]:
+                for row in self.rows[broken][:REPORTED]:
                     motion = [f"{name} {describe_point(row[name])}" for name in SHOWN]
                     text = f"{what} in {GuardState(row.state).name}, {', '.join(motion)}"
                     yield Breach(row.now_ns * 1e-9, kind, text)
@@ -217,8 +215,6 @@ def _rest(steps: Steps) -> Broken:
 
 def _contacts(steps: Steps) -> Broken:
     rows, rules = steps.rows, steps.rules
-    if not rules.honest:
-        return
     hit = (steps.was != ESTOP) & (rows.state == ESTOP) & ~rows.asked
     yield "collision", hit & (rows.touch_age > REELS_NS * 1e-9), "stopped although nothing touches"
     lands = rows.state == LAND
@@ -231,16 +227,6 @@ def _contacts(steps: Steps) -> Broken:
         lies = not steps.flown[step] and (comes_down[step] or touch.body == FLOOR)
         if not (is_named or lands[step] or lies):
             yield "collision", np.array([step]), f"touched {touch.body}"
-
-
-def first_of_each(breaches: Iterable[Breach]) -> tuple[Breach, ...]:
-    """Return the first `REPORTED` breaches of each kind."""
-    counts, kept = Counter[str](), list[Breach]()
-    for breach in breaches:
-        counts[breach.kind] += 1
-        if counts[breach.kind] <= REPORTED:
-            kept.append(breach)
-    return tuple(kept)
 
 
 def check_order(records: Iterable[Record], starts_ns: Sequence[int]) -> Iterator[Breach]:

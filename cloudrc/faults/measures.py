@@ -13,7 +13,6 @@ from typing import Any, Literal, TypeAlias
 
 from cloudrc.faults.adversary import Lie
 from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.invariants import first_of_each
 from cloudrc.faults.schedule import Schedule, generator
 from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
@@ -95,11 +94,9 @@ class Outcome:
         """Choose a time from `first` to `last` [s]; by default, the robot is among the tubes."""
         return generator(self.seed, 77).uniform(first, last)
 
-    def prepare(
-        self, *settings: str, lies: Sequence[Lie] = (), honest: bool = True, **faults: Any
-    ) -> FaultRun:
+    def prepare(self, *settings: str, lies: Sequence[Lie] = (), **faults: Any) -> FaultRun:
         """Prepare a flight with `faults`, the values of a `Schedule`; the rest is as there."""
-        return FaultRun(Schedule(self.seed, **faults), *settings, honest=honest, lies=lies)
+        return FaultRun(Schedule(self.seed, **faults), *settings, lies=lies)
 
     def fly(self, *settings: str, limit: float = 120.0, **faults: Any) -> FaultRun:
         """Fly the mission, at most until `limit` [s]; check that it was safe and was completed."""
@@ -112,11 +109,11 @@ class Outcome:
         self.done(flight)
         return flight
 
-    def safe(self, flight: FaultRun) -> None:
-        """Add whether the flight broke an invariant, and the hash of its records."""
-        breaches = flight.breaches()
+    def safe(self, flight: FaultRun, excused: str = "") -> None:
+        """Add whether the flight broke an invariant but `excused`, and the hash of its records."""
+        breaches = [breach for breach in flight.breaches() if breach.kind != excused]
         self.same("breaches of an invariant", len(breaches), 0)
-        for breach in first_of_each(breaches):
+        for breach in breaches:
             self.true(f"{breach.kind} at {breach.time:.3f} s: {breach.text}", False)
         new = flight.sha256()
         both = f"{self.sha256} {new}".encode()

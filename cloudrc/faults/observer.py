@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from math import inf
 from typing import Any
 
@@ -23,6 +23,7 @@ INVALID_COMMANDS, INVALID_NS = 5, 1_000_000_000
 INVALID = ("range", "vertical", "future")  # why the guard rejects impossible commands
 GROUND_NS = 10_000_000_000
 """Shortest time that a robot on the ground waits for a mission's first command [ns]."""
+REPORTED = 5  # number of times that a breach is told
 RAMP_MIN = 1.0
 """Shortest time of slow growth of the velocity reference after a HOLD [s]."""
 ROW = np.dtype([
@@ -57,7 +58,7 @@ class RobotObserver:
         """Observe a robot whose first step begins at `start_ns` [ns]."""
         self.rules, self.start_ns, limits = rules, start_ns, rules.limits
         self.rows, self.touches = list[tuple[Any, ...]](), list[tuple[int, Contact]]()
-        self.breaches = list[Breach]()
+        self.breaches, self._counts = list[Breach](), Counter[str]()
         self._robot = robot
         self._list, self._seen = robot.simulator.touches, 0  # how many of the list were seen
         self._was = self._state = robot.guard.state  # after the last step; after the last event
@@ -96,7 +97,9 @@ class RobotObserver:
         self._was, self._state, self._asked, self._downed = state, state, False, False
 
     def _note(self, now_ns: int, kind: str, text: str) -> None:
-        self.breaches.append(Breach(now_ns * 1e-9, kind, text))
+        self._counts[kind] += 1
+        if self._counts[kind] <= REPORTED:
+            self.breaches.append(Breach(now_ns * 1e-9, kind, text))
 
     def see_session(self, now_ns: int) -> None:
         """Forget the commands of the old session: the guard has forgotten them, too."""

@@ -34,11 +34,9 @@ class Rules:
         braking: Deceleration of the robot [m/s^2].
         planar: Whether the robot stays on the ground.
         touched: Body that the mission has to touch.
-        honest: Whether the cloud is honest, so that any other contact is a breach.
     """
 
-    def __init__(self, experiment: ResolvedExperiment, *, honest: bool) -> None:
-        self.honest = honest
+    def __init__(self, experiment: ResolvedExperiment) -> None:
         robot, fence = find_robot(experiment.world.robot), fence_of(scene_of(experiment.world))
         self.limits, self.touched = experiment.guard, experiment.mission.touched
         self.planar, self.braking = robot.planar, robot.guard.braking_mps2

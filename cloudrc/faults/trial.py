@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from cloudrc.errors import describe_error
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.inject import order
-from cloudrc.faults.invariants import first_of_each
 from cloudrc.faults.measures import events_of_missions, held
 from cloudrc.faults.rules import LATCHED, Breach
 from cloudrc.faults.schedule import Schedule
@@ -86,7 +85,7 @@ def fly(schedule: Schedule, *, hashed: bool = False) -> TrialResult:
     wanted, steps = checked_in(schedule), flight.steps()
     return TrialResult(
         schedule,
-        first_of_each(breach for breach in sorted(found) if breach.kind in wanted),
+        tuple(breach for breach in sorted(found) if breach.kind in wanted),
         flight.sha256() if hashed else "",
         margin=min(each.smallest_margin for each in steps),
         speed=max(each.top_speed for each in steps),

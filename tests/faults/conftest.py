@@ -25,14 +25,14 @@ def experiment(robot="pelican"):
 class FakeRobot:
     """A robot in a mission; it is in whatever state and place a test puts it."""
 
-    def __init__(self, *, yaw_rate=0.0, honest=False, robot="pelican"):
+    def __init__(self, *, yaw_rate=0.0, robot="pelican"):
         self.guard = SimpleNamespace(state=TRACK, reference=ZERO, yaw_rate=yaw_rate)
         self.simulator = SimpleNamespace(steps=0, touch_age=float("inf"), touches=[])
         self.onboard = SimpleNamespace(stopped=STOPPED)
         self.observers = []
         self.position, self.velocity = (1.0, 1.0, 1.0), ZERO
         self.now_ns = 0
-        self.observer = RobotObserver(self, Rules(experiment(robot), honest=honest), 0)
+        self.observer = RobotObserver(self, Rules(experiment(robot)), 0)
         self.request(Request.START)
 
     def broken(self):
