@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, RootModel
 
+from cloudrc.config.problems import validate
 from cloudrc.config.schema import World
 from cloudrc.outside.document import read_document, write_yaml
+from cloudrc.text import unknown_name_text
 
 
 def generator(seed: int, use: int) -> np.random.Generator:
@@ -92,7 +94,7 @@ class FaultEvent:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise ValueError(f"no fault '{self.kind}'; there are: {', '.join(KINDS)}")
+            raise ValueError(unknown_name_text("fault", self.kind, [*KINDS]))
         if self.kind in SHARES and self.value > 1.0:
             raise ValueError(f"the value {self.value:g} is not between 0 and 1")
 
@@ -130,24 +132,19 @@ class Schedule:
         return sorted((e for e in self.events if e.kind in kinds), key=lambda e: e.at)
 
 
-_SCHEDULE = TypeAdapter(Schedule)
+_File = RootModel[Schedule]
 
 
 def dump(schedule: Schedule, note: str = "") -> str:
     """Format a schedule as YAML, with `note` as a comment at the top."""
-    document = _SCHEDULE.dump_python(schedule, mode="json", exclude_defaults=True)
+    document = _File(schedule).model_dump(mode="json", exclude_defaults=True)
     head = "".join(f"# {line}\n" for line in note.splitlines())
     return head + write_yaml(document)
 
 
 def load(path: Path) -> Schedule:
-    """Read a schedule from a file; raise a ValueError if it is no valid schedule."""
-    try:
-        schedule = _SCHEDULE.validate_python(read_document(path, str(path)).tree)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(map(str, first["loc"]))
-        raise ValueError(f"is no schedule of faults: {place}: {first['msg']}") from error
+    """Read a schedule from a file; raise a BadInputError if it is no valid schedule."""
+    schedule = validate(read_document(path, str(path)), _File, str(path)).root
     for each in schedule.events:
         if each.at >= schedule.duration:
             late = f"the fault {each.kind} at {each.at:g} s never begins"
