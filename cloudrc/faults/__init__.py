@@ -5,6 +5,7 @@ measures               checks, their result, and measurements in a flight for th
 schedule, inject       random faults of one flight, and how they are injected
 adversary              dishonest clouds
 models, flight         models of processes, clocks and teleop; a whole flight
-invariants             safety rules, checked after every step of the physics
+observer, rules        what a robot does in every step, and the limits of robot and scene
+invariants             safety rules: predicates over the steps of a flight
 trial                  fly one schedule of faults
 """

@@ -42,7 +42,6 @@ from cloudrc.world.endpoint import WorldEndpoint
 from cloudrc.world.robot import Robot
 
 _Kind = TypeVar("_Kind")
-SHARED, OTHER = b"one clock for all".ljust(16)[:16], b"another clock..."
 
 
 class FaultRun:
@@ -73,10 +72,10 @@ class FaultRun:
         robot = shipped.model_path("robot", schedule.robot, Path())
         settings = (f"world.robot={robot}", *plans, *faults, *settings, f"seed={schedule.seed}")
         self.experiment = load_experiment(_experiment_of(robot), list(settings))
-        has_own_clock = bool(schedule.cloud_offset or schedule.cloud_drift)
         offset = schedule.cloud_offset % OFFSET_MAX  # no clock shows a negative time
         self._clock = Clock(round(offset * 1e9), schedule.cloud_drift)
-        self._clock_id = OTHER if has_own_clock else SHARED
+        is_shared = self._clock == Clock()
+        self._clock_id = assembly.VIRTUAL_CLOCK if is_shared else assembly.CLOUD_CLOCK
         self._fence = steered_in(self.experiment.world)
         policy, self._words = dishonesty(schedule, self._fence)
         mistakes = [bugs(schedule, self._clock)] if schedule.of(*BUGS) else []
@@ -191,7 +190,7 @@ class FaultRun:
         return self.robot.guard.state, self.robot.guard.cause.words
 
     def _build_world(self, start_ns: int) -> list[Endpoint]:
-        identity = self._begin("world", SHARED)
+        identity = self._begin("world", assembly.VIRTUAL_CLOCK)
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
         self._observers.append(RobotObserver(world.robot, self._rules, start_ns))
         return [world]
@@ -214,7 +213,7 @@ class FaultRun:
         """Build a second cloud with the same key; it has its own teleop and the same mission."""
         teleop = Teleop(self._fence)
         teleop.start(start_ns, MissionRecord("rival", self.make_order(), 0))
-        identity = Identity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
+        identity = Identity(assembly.VIRTUAL_CLOCK, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, teleop, lambda: start_ns)
 
     def _begin(self, end: str, clock_id: bytes) -> Identity:

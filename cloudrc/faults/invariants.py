@@ -24,7 +24,7 @@ tick       The guard runs once in each step of the physics.
 
 All limits come from configuration, robot and docs/, not from the guard: from "Stop rule" and
 "Leaving HOLD" in reference/plant.md, F5 and F23 in reference/faults.md, and "The guard" in
-safety.md. `order_checks` looks at stale, latch and hold during the flight. This module looks at the
+safety.md. `observer` looks at stale, latch and hold during the flight. This module looks at the
 others after it, in the rows that `observer` has kept.
 """
 

@@ -184,7 +184,7 @@ class TeleopModel:
         """
         self._fence = fence
         self._phase_ns, self._starts = phase_ns, 0
-        self._disk = b""  # the bytes of its database
+        self._disk = connect()  # each change of the store is one transaction
         self.events: list[MissionEvent] = []
         self._peer = _Peer(lambda: self.service is not None)
         self._clouds = _Peer(lambda: self._host.inner is not None)
@@ -194,12 +194,8 @@ class TeleopModel:
     def start(self, now_ns: int = 0) -> None:
         """Start a new process, which knows only what is on the disk; `now_ns` is ignored."""
         self._starts += 1
-        self._database = connect()
-        if self._disk:
-            self._database.deserialize(self._disk)
         salt = b"desk %d" % self._starts  # random in production
-        store = MissionStore(self._database, salt)
-        service = MissionService(store, self._fence)
+        service = MissionService(MissionStore(self._disk, salt), self._fence)
         self.service: MissionService | None = service
         self._peer.waiting.clear()
         self._calls, self._stops = list[Call](), list[Call]()
@@ -214,9 +210,6 @@ class TeleopModel:
 
     def kill(self, now_ns: int = 0) -> None:
         """Kill the process; only the disk remains. `now_ns` is ignored."""
-        if self.service is not None:
-            self._disk = self._database.serialize()
-            self._database.close()
         self.service = None
 
     def run_on(self, host: RestartableEndpoint) -> None:
