@@ -12,10 +12,9 @@ from cloudrc import files
 from cloudrc.config.load import read_experiment
 from cloudrc.config.profile import load_profile
 from cloudrc.errors import BadInputError
-from cloudrc.files import atomic_file, write_atomically, write_json
+from cloudrc.files import atomic_file, write_atomically
 from cloudrc.link.traces import read_trace
 from cloudrc.record.columns import Recording
-from cloudrc.record.merge import merge
 from cloudrc.report.figures import FIGURES
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
@@ -80,15 +79,9 @@ def theirs(tmp_path):
     return folder
 
 
-def records(path, name="theirs.mcap"):
-    return write(path.with_name(name), world_records(20))
-
-
 WRITERS = [
     lambda path: write_atomically(path, b"new"),
-    lambda path: write_json(path, {}),
-    lambda path: Recording.read(records(path)).write(path),
-    lambda path: merge(records(path), records(path, "other.mcap")).write(path),
+    lambda path: Recording.from_records(world_records(20), []).write(path),
 ]
 
 
