@@ -37,7 +37,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.faults.observer import REPORTED, ROW, RobotObserver
+from cloudrc.faults.observer import ROW, RobotObserver
 from cloudrc.faults.rules import ESTOP, FLOWN, HOLD, LAND, TRACK, Breach, Rules
 from cloudrc.messages import GuardState
 from cloudrc.records import CommandApplied, Record, SessionOpened
@@ -115,10 +115,10 @@ class Steps:
         return float(np.fmax.reduce(_norm(self.rows.reference[self.flown]), initial=0.0))
 
     def breaches(self) -> Iterator[Breach]:
-        """Yield each breach of an invariant."""
+        """Yield each breach of an invariant, in the step in which it begins."""
         for check in (_ticks, _fence, _reference, _rest, _contacts):
             for kind, broken, what in check(self):
-                for row in self.rows[broken][:REPORTED]:
+                for row in self.rows[broken & ~_before(broken)]:
                     motion = [f"{name} {describe_point(row[name])}" for name in SHOWN]
                     text = f"{what} in {GuardState(row.state).name}, {', '.join(motion)}"
                     yield Breach(row.now_ns * 1e-9, kind, text)
@@ -226,7 +226,7 @@ def _contacts(steps: Steps) -> Broken:
         is_named = touch.by_probe and touch.body == rules.touched
         lies = not steps.flown[step] and (comes_down[step] or touch.body == FLOOR)
         if not (is_named or lands[step] or lies):
-            yield "collision", np.array([step]), f"touched {touch.body}"
+            yield "collision", np.arange(len(rows)) == step, f"touched {touch.body}"
 
 
 def check_order(records: Iterable[Record], starts_ns: Sequence[int]) -> Iterator[Breach]:
