@@ -24,8 +24,8 @@ tick       The guard runs once in each step of the physics.
 
 All limits come from configuration, robot and docs/, not from the guard: from "Stop rule" and
 "Leaving HOLD" in reference/plant.md, F5 and F23 in reference/faults.md, and "The guard" in
-safety.md. `observer` looks at stale, latch and hold during the flight. This module looks at the
-others after it, in the rows that `observer` has kept.
+safety.md. `observer` checks, during the flight, commands that world accepts and changes of the
+guard's state (stale, latch and hold). This module checks all else in the rows that it has kept.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.faults.observer import ROW, RobotObserver
+from cloudrc.faults.observer import NEVER_NS, ROW, RobotObserver
 from cloudrc.faults.rules import ESTOP, FLOWN, HOLD, LAND, TRACK, Breach, Rules
 from cloudrc.messages import GuardState
 from cloudrc.records import CommandApplied, Record, SessionOpened
@@ -59,7 +59,6 @@ FALL = 1.0
 """Downward speed that proves a fall while switched off [m/s]; a drop of 2 cm ends at only 0.7."""
 BRAKE_NS = 200_000_000  # time to stop a descent that the operator has acknowledged [ns]
 FLOOR = "floor"  # body on which a robot may always stand
-NEVER_NS = 1 << 60
 SHOWN = "position", "velocity", "reference"  # columns that the text of a breach shows
 
 Array: TypeAlias = NDArray[Any]
@@ -116,7 +115,7 @@ class Steps:
 
     def breaches(self) -> Iterator[Breach]:
         """Yield each breach of an invariant, in the step in which it begins."""
-        for check in (_ticks, _fence, _reference, _rest, _contacts):
+        for check in (_steps, _fence, _reference, _rest, _contacts):
             for kind, broken, what in check(self):
                 for row in self.rows[broken & ~_before(broken)]:
                     motion = [f"{name} {describe_point(row[name])}" for name in SHOWN]
@@ -136,11 +135,15 @@ def _norm(vectors: Array) -> Array:
     return norms
 
 
-def _ticks(steps: Steps) -> Broken:
-    now_ns, count = steps.rows.now_ns, steps.rows.steps
-    skips = (np.diff(count, prepend=0) != 1) & (count != 1)
+def _steps(steps: Steps) -> Broken:
+    rows, now_ns = steps.rows, steps.rows.now_ns
+    skips = (np.diff(rows.steps, prepend=0) != 1) & (rows.steps != 1)
     late = np.diff(now_ns, prepend=now_ns[:1] - STEP_NS) != STEP_NS
     yield "tick", skips | late, "a step of the physics without a tick of the guard"
+    tracks = rows.state == TRACK
+    yield "latch", tracks & ~rows.armed, "without the operator's start"
+    yield "stale", tracks & (now_ns > rows.fresh_until_ns), "without a fresh command"
+    yield "hold", rows.armed & (now_ns > rows.waits_until_ns + STEP_NS), "alone for too long"
 
 
 def _fence(steps: Steps) -> Broken:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from math import inf
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from cloudrc.messages import PLAN_STEP_NS, Command, GuardState, OperatorRequest,
 from cloudrc.records import Contact
 from cloudrc.sim.onboard import Commands
 from cloudrc.sim.readings import Readings
-from cloudrc.world.robot import STEP_NS, Robot
+from cloudrc.world.robot import Robot
 
 RESUME_COMMANDS, RESUME_NS = 10, 500_000_000
 """Number of fresh commands that end a HOLD, and the time within which they must arrive [ns]."""
@@ -23,7 +22,7 @@ INVALID_COMMANDS, INVALID_NS = 5, 1_000_000_000
 INVALID = ("range", "vertical", "future")  # why the guard rejects impossible commands
 GROUND_NS = 10_000_000_000
 """Shortest time that a robot on the ground waits for a mission's first command [ns]."""
-REPORTED = 5  # number of times that a breach is told
+NEVER_NS = 1 << 60
 RAMP_MIN = 1.0
 """Shortest time of slow growth of the velocity reference after a HOLD [s]."""
 ROW = np.dtype([
@@ -37,6 +36,9 @@ ROW = np.dtype([
     ("is_on", "?"),  # whether the actuators are on
     ("touch_age", "f8"),  # time since the last contact [s]
     ("ramped", "?"),  # whether the reference must grow slowly, because a HOLD has just ended
+    ("armed", "?"),  # whether a mission is on
+    ("fresh_until_ns", "i8"),  # when the newest command or its plan gets too old [ns]
+    ("waits_until_ns", "i8"),  # how long the robot may wait for commands in this state [ns]
     ("asked", "?"),  # whether the operator has stopped or reset the robot since the last step
     ("downed", "?"),  # whether the operator has stopped it in the air since the last step
 ])  # fmt: skip
@@ -58,7 +60,7 @@ class RobotObserver:
         """Observe a robot whose first step begins at `start_ns` [ns]."""
         self.rules, self.start_ns, limits = rules, start_ns, rules.limits
         self.rows, self.touches = list[tuple[Any, ...]](), list[tuple[int, Contact]]()
-        self.breaches, self._counts = list[Breach](), Counter[str]()
+        self.breaches = list[Breach]()
         self._robot = robot
         self._list, self._seen = robot.simulator.touches, 0  # how many of the list were seen
         self._was = self._state = robot.guard.state  # after the last step; after the last event
@@ -83,7 +85,8 @@ class RobotObserver:
         was, state = self._was, guard.state
         if state is not was:
             self._check_change(was, state, now_ns)
-        self._check_state(state, now_ns)
+        if state is not TRACK:
+            self._impossible = False
         touches = simulator.touches
         new = touches[self._seen if touches is self._list else 0 :]
         self._list, self._seen = touches, len(touches)
@@ -92,14 +95,13 @@ class RobotObserver:
         is_on = commands is not self._robot.onboard.stopped
         motion = readings.position, readings.velocity, guard.reference, guard.yaw_rate
         others = is_on, simulator.touch_age, now_ns < self._ramp_until_ns
-        requests = self._asked, self._downed
-        self.rows.append((now_ns, simulator.steps, state, *motion, *others, *requests))
+        waits_until_ns = self._alone_ns + self._waits_ns.get(state, NEVER_NS)
+        mission = self._armed, self._fresh_until_ns, waits_until_ns, self._asked, self._downed
+        self.rows.append((now_ns, simulator.steps, state, *motion, *others, *mission))
         self._was, self._state, self._asked, self._downed = state, state, False, False
 
     def _note(self, now_ns: int, kind: str, text: str) -> None:
-        self._counts[kind] += 1
-        if self._counts[kind] <= REPORTED:
-            self.breaches.append(Breach(now_ns * 1e-9, kind, text))
+        self.breaches.append(Breach(now_ns * 1e-9, kind, text))
 
     def see_session(self, now_ns: int) -> None:
         """Forget the commands of the old session: the guard has forgotten them, too."""
@@ -152,21 +154,6 @@ class RobotObserver:
             case Request.ACKNOWLEDGE:
                 self._released.add(state)
 
-    def _check_state(self, state: GuardState, now_ns: int) -> None:
-        """Check that TRACK has a mission and fresh commands, and that no mission waits too long."""
-        if state is TRACK:
-            if not self._armed:
-                self._note(now_ns, "latch", "TRACK without the operator's start")
-            if now_ns > self._fresh_until_ns:
-                late = (now_ns - self._fresh_until_ns) * 1e-9
-                self._note(now_ns, "stale", f"TRACK, {late:.3f} s after the last fresh command")
-            return
-        self._impossible = False
-        alone_ns = now_ns - self._alone_ns
-        if self._armed and alone_ns > self._waits_ns.get(state, inf) + STEP_NS:
-            self._note(now_ns, "hold", f"{state.name} for {alone_ns * 1e-9:.3f} s of a mission")
-            self._alone_ns = now_ns
-
     def _check_change(self, was: GuardState, state: GuardState, now_ns: int) -> None:
         if was in LATCHED and self._released.isdisjoint(LATCHED) and state is not ESTOP:
             text = f"{was.name} left for {state.name} without the operator"
@@ -181,7 +168,7 @@ class RobotObserver:
             self._alone_ns = now_ns
         elif state is LAND and not self._impossible:
             alone_ns = now_ns - self._alone_ns
-            if alone_ns <= self._waits_ns.get(was, inf):
+            if alone_ns <= self._waits_ns.get(was, NEVER_NS):
                 text = f"LAND out of {was.name} after {alone_ns * 1e-9:.3f} s alone"
                 self._note(now_ns, "hold", text)
         if state is not HOLD:
