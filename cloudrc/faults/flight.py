@@ -48,8 +48,7 @@ class FaultRun:
     """One flight of world, cloud, teleop and link.
 
     `secrets` maps "world" and "cloud" to the keys in their key files; `rings` maps them to the keys
-    that their running processes use. Every 100 ms, each of `listeners` is called with world's new
-    records and the virtual time [ns].
+    that their running processes use.
     """
 
     def __init__(
@@ -86,7 +85,6 @@ class FaultRun:
         self.secrets, self.rings = {"world": SECRET, "cloud": SECRET}, dict[str, KeyRing]()
         self.generations = {"world": 0, "cloud": 0}
         self.of_world, self.of_cloud = list[Record](), list[Record]()
-        self.listeners = list[Callable[[list[Record], int], None]]()
         phase_ns = int(generator(self.experiment.seed, 45).integers(WAKE_NS))
         self.teleop = TeleopModel(self._fence, phase_ns)
         if start:
@@ -128,9 +126,12 @@ class FaultRun:
         plan = assembly.build_plan(self.experiment)
         return Order(plan, touch=self.experiment.mission.touch)
 
-    def fly(self, until: float, is_over: Callable[[], bool] = lambda: False) -> FaultRun:
-        """Fly on until the virtual time `until` [s], or until `is_over()` is True; return self."""
-        self.run.fly(is_over, round(until * 1e9), self._sink)
+    def fly(self, until: float, look: Callable[[], bool | None] = lambda: False) -> FaultRun:
+        """Fly on until the virtual time `until` [s], or until `look()` is True; return self.
+
+        `look` is called every 100 ms.
+        """
+        self.run.fly(lambda: bool(look()), round(until * 1e9), self._sink)
         return self
 
     def fly_mission(self, limit: float = 120.0) -> FaultRun:
@@ -226,8 +227,6 @@ class FaultRun:
     def _sink(self, of_world: list[Record], of_cloud: list[Record]) -> None:
         self.of_world += of_world
         self.of_cloud += of_cloud
-        for listen in self.listeners:
-            listen(of_world, self.run.now_ns)
 
 
 def _experiment_of(robot: str) -> str:

@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
 from cloudrc.errors import describe_error
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.inject import order
+from cloudrc.faults.invariants import Steps
 from cloudrc.faults.measures import events_of_missions, held
-from cloudrc.faults.rules import LATCHED, Breach
+from cloudrc.faults.rules import ESTOP, LATCHED, TRACK, Breach
 from cloudrc.faults.schedule import Schedule
-from cloudrc.messages import GuardState
-from cloudrc.records import GuardChange, Record
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.wire import QUEUED
 from cloudrc.text import escape
@@ -75,14 +76,14 @@ def fly(schedule: Schedule, *, hashed: bool = False) -> TrialResult:
         CloudrcError: If the schedule names an unknown link profile or policy.
         ValueError: If its faults do not fit the profile.
     """
-    flight = FaultRun(schedule)
-    operator, found = TrialOperator(flight), list[Breach]()
+    flight, found = FaultRun(schedule), list[Breach]()
     try:
-        flight.fly(schedule.duration)
+        flight.fly(schedule.duration, TrialOperator(flight).act)
     except Exception as error:  # world and cloud must survive every fault
         found.append(Breach(flight.now, "error", describe_error(error)))
-    found += [*flight.breaches(), *operator.breaches(), *_waypoints(flight), *_alarms(flight)]
     wanted, steps = checked_in(schedule), flight.steps()
+    found += [*flight.breaches(), *_unanswered(flight, steps)]
+    found += [*_waypoints(flight), *_alarms(flight)]
     return TrialResult(
         schedule,
         tuple(breach for breach in sorted(found) if breach.kind in wanted),
@@ -112,36 +113,12 @@ class TrialOperator:
     """Orders one mission after another, and acknowledges each landing and emergency stop."""
 
     def __init__(self, flight: FaultRun) -> None:
-        self._flight = flight
-        self._next_ns, self._tracked_ns = 0, -1
-        self._unmet_ns = [round(event.at * 1e9) for event in flight.schedule.of("stopped")]
-        flight.listeners.append(self._look)
+        self._flight, self._next_ns = flight, 0
 
-    def breaches(self) -> Iterator[Breach]:
-        """Yield that the guard was not in TRACK for `BACK` [s], and stops without effect."""
-        flight, now = self._flight, self._flight.now
-        if now - self._tracked_ns * 1e-9 > BACK:
-            state, cause = flight.guard_now()
-            mission = flight.mission.state if flight.teleop.missions else "none"
-            text = f"not flown in {BACK:g} s of calm: guard {state.name} ({cause}), mission"
-            yield Breach(now, "stuck", f"{text} {mission}")
-        for at_ns in self._unmet_ns:
-            text = f"the operator's stop at {at_ns * 1e-9:.2f} s has stopped nothing"
-            yield Breach(now, "obeyed", text)
-
-    def _look(self, records: list[Record], now_ns: int) -> None:
-        """Note what the guard did in the last 100 ms, then act as an operator would."""
-        state, _ = self._flight.guard_now()
-        if state is GuardState.TRACK:
-            self._tracked_ns = now_ns
-        changes = [record.state for record in records if isinstance(record, GuardChange)]
-        if GuardState.ESTOP in (state, *changes):
-            self._unmet_ns = [at_ns for at_ns in self._unmet_ns if at_ns > now_ns]
-        self._operate(now_ns)
-
-    def _operate(self, now_ns: int) -> None:
+    def act(self) -> None:
         """Acknowledge a landing or a stop, or order the next mission."""
         flight, service = self._flight, self._flight.teleop.service
+        now_ns = flight.run.now_ns
         if service is None or now_ns < self._next_ns or flight.cloud.inner is None:
             return
         # A restarted world is in GROUND without a change of state, so ask for the state.
@@ -154,6 +131,21 @@ class TrialOperator:
             flight.teleop.ask(now_ns, MissionService.acknowledge)
         elif is_over:
             order(flight, now_ns)
+
+
+def _unanswered(flight: FaultRun, steps: list[Steps]) -> Iterator[Breach]:
+    """Yield that the guard was not in TRACK for `BACK` [s], and stops without effect."""
+    states = np.concatenate([each.rows.state for each in steps])
+    times = np.concatenate([each.rows.now_ns for each in steps]) * 1e-9
+    if TRACK not in states[times >= flight.now - BACK]:
+        state, cause = flight.guard_now()
+        mission = flight.mission.state if flight.teleop.missions else "none"
+        text = f"not flown in {BACK:g} s of calm: guard {state.name} ({cause}), mission"
+        yield Breach(flight.now, "stuck", f"{text} {mission}")
+    for event in flight.schedule.of("stopped"):
+        if ESTOP not in states[times >= event.at]:
+            text = f"the operator's stop at {event.at:.2f} s has stopped nothing"
+            yield Breach(flight.now, "obeyed", text)
 
 
 def _waypoints(flight: FaultRun) -> Iterator[Breach]:
