@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TypeVar
 
@@ -159,10 +160,8 @@ class FaultRun:
     def breaches(self) -> list[Breach]:
         """Return the breaches of invariants so far, in the order of time."""
         starts_ns = [each.start_ns for each in self._observers]
-        found = [*check_order(self.of_world, starts_ns)]
-        for observer, steps in zip(self._observers, self.steps(), strict=True):
-            found += [*observer.breaches, *steps.breaches()]
-        return sorted(found, key=lambda breach: breach.time)
+        found = [each.breaches() for each in self.steps()]
+        return sorted(chain(check_order(self.of_world, starts_ns), *found))
 
     @property
     def changes(self) -> list[GuardChange]:

@@ -82,7 +82,7 @@ class Steps:
     """
 
     def __init__(self, observer: RobotObserver) -> None:
-        self.rules, rules = observer.rules, observer.rules
+        self._observer, self.rules, rules = observer, observer.rules, observer.rules
         rows = self.rows = np.array(observer.rows, ROW).view(np.recarray)
         self.was, self.before = _before(rows.state), _before(rows.reference)
         self.flown = np.isin(rows.state, FLOWN)
@@ -115,6 +115,7 @@ class Steps:
 
     def breaches(self) -> Iterator[Breach]:
         """Yield each breach of an invariant, in the step in which it begins."""
+        yield from self._observer.breaches
         for check in (_steps, _fence, _reference, _rest, _contacts):
             for kind, broken, what in check(self):
                 for row in self.rows[broken & ~_before(broken)]:
