@@ -144,8 +144,8 @@ class FaultRun:
         """Replace the keys of `end` (world or cloud), in its key file and its running process."""
         self.secrets[end] = self.rings[end].keys = keys
 
-    def end_rival(self, now_ns: int) -> None:
-        """Stop the second cloud, so that the first can control the robot; `now_ns` is ignored."""
+    def end_rival(self) -> None:
+        """Stop the second cloud, so that the first cloud can control the robot again."""
         self.cloud.members = self.cloud.members[:1]
         self._rival_at = None
 

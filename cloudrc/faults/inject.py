@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from functools import partial
 from itertools import islice
 from math import inf, nan
 from typing import TYPE_CHECKING
@@ -90,10 +89,10 @@ def inject(flight: FaultRun) -> None:
             process.tamper = _tamper(mine, rng)
 
 
-def order(flight: FaultRun, now_ns: int) -> None:
-    """Order the experiment's mission at `now_ns` [ns]; teleop may not take the order."""
+def order(flight: FaultRun) -> None:
+    """Order the experiment's mission; teleop may not take the order."""
     mission = flight.make_order()
-    flight.teleop.ask(now_ns, lambda service, now_ns: service.create(mission, now_ns))
+    flight.teleop.ask(lambda service, now_ns: service.create(mission, now_ns))
 
 
 def _disturb_processes(flight: FaultRun, event: FaultEvent) -> None:
@@ -102,10 +101,10 @@ def _disturb_processes(flight: FaultRun, event: FaultEvent) -> None:
     at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
     gone = at + event.value * lasts  # end of teleop after it was asked to end
 
-    def restart_pod(now_ns: int, down: float) -> None:
-        teleop.kill(now_ns)
-        process.restart(now_ns, down)
-        process.at(now_ns * 1e-9 + down, teleop.start)
+    def restart_pod(down: float) -> None:
+        teleop.kill()
+        process.restart(down)
+        process.at(process.now_ns * 1e-9 + down, teleop.start)
 
     match event.kind:
         case "cloud_killed" | "world_killed":
@@ -134,7 +133,7 @@ def _use_keys_and_api(flight: FaultRun, event: FaultEvent) -> None:
     """Schedule when ends read keys, the second cloud leaves, and the operator calls teleop."""
     cloud, teleop, at, end = flight.cloud, flight.teleop, event.at, event.end
 
-    def read(now_ns: int, end: str, keys: KeySet | None = None) -> None:
+    def read(end: str, keys: KeySet | None = None) -> None:
         flight.replace_key(end, keys or flight.secrets["world"])
 
     match event.kind:
@@ -147,7 +146,7 @@ def _use_keys_and_api(flight: FaultRun, event: FaultEvent) -> None:
             cloud.at(at, read, "cloud", WRONG_KEY)
             cloud.at(end, read, "cloud")
         case "second_order":
-            cloud.at(at, partial(order, flight))
+            cloud.at(at, order, flight)
         case "stopped":
             cloud.at(at, teleop.switch_off)
         case "held":

@@ -28,7 +28,7 @@ UNIX_SOCKET_MAX = 11
 """Number of datagrams that a Unix socket can hold: net.unix.max_dgram_qlen, which is 10, plus 1."""
 
 Action: TypeAlias = Callable[..., None]
-"""Function that begins or ends a fault; takes the virtual time [ns], and further arguments."""
+"""Function that begins or ends a fault."""
 Tamper: TypeAlias = Callable[[bytes, int], list[bytes]]
 """Function that replaces an arriving datagram by others, at a virtual time [ns]."""
 Call: TypeAlias = Callable[[MissionService, int], object]
@@ -41,19 +41,21 @@ class RestartableEndpoint:
     A second cloud runs in the process of the first one; each of them receives all datagrams.
 
     Attributes:
+        now_ns: Virtual time of the last event [ns].
         members: World, the cloud, or both clouds; empty while there is no process.
         others: Records of the second cloud, oldest first.
     """
 
     def __init__(self, build: Callable[[int], list[Endpoint]], clock: Clock) -> None:
         """Start a process; `build` makes its members, given the time on `clock` [ns]."""
-        self._build, self.clock = build, clock
+        self._build, self.clock, self.now_ns = build, clock, 0
         self.tamper: Tamper | None = None  # changes the datagrams that arrive
         self._frozen_until_ns = -1
         self._waiting: list[bytes] = []
         self._left: list[Record] = []
         self._actions = list[tuple[int, Action, tuple[Any, ...]]]()
-        self.members, self.others = build(clock.at(0)), list[Record]()
+        self.members, self.others = list[Endpoint](), list[Record]()
+        self.start()
 
     @property
     def inner(self) -> Endpoint | None:
@@ -61,26 +63,27 @@ class RestartableEndpoint:
         return self.members[0] if self.members else None
 
     def at(self, seconds: float, action: Action, *args: Any) -> None:
-        """Schedule an action at the virtual time `seconds` [s]; `args` are further arguments."""
+        """Schedule an action with `args` at the virtual time `seconds` [s]."""
         insort(self._actions, (round(seconds * 1e9), action, args), key=itemgetter(0))
 
-    def kill(self, now_ns: int) -> None:
+    def kill(self) -> None:
         """Kill the process as with SIGKILL; its records so far are kept."""
         self._left = self.take_records()
         self.members, self._waiting, self._frozen_until_ns = [], [], -1
 
-    def start(self, now_ns: int) -> None:
-        """Start a new process of world or cloud at `now_ns` [ns, virtual time]."""
-        self.members = self._build(self.clock.at(now_ns))
+    def start(self) -> None:
+        """Start a new process of world or cloud."""
+        self.members = self._build(self.clock.at(self.now_ns))
 
-    def restart(self, now_ns: int, down: float) -> None:
-        """Kill the process at `now_ns` [ns]; start a new one after `down` [s]."""
-        self.kill(now_ns)
-        self.at(now_ns * 1e-9 + down, self.start)
+    def restart(self, down: float) -> None:
+        """Kill the process; start a new one after `down` [s]."""
+        self.kill()
+        self.at(self.now_ns * 1e-9 + down, self.start)
 
-    def freeze(self, now_ns: int, duration: float) -> None:
-        """Stop the process as with SIGSTOP, from `now_ns` [ns] for `duration` [s]."""
-        self._frozen_until_ns = max(self._frozen_until_ns, now_ns + round(duration * 1e9))
+    def freeze(self, duration: float) -> None:
+        """Stop the process as with SIGSTOP for `duration` [s]."""
+        until_ns = self.now_ns + round(duration * 1e9)
+        self._frozen_until_ns = max(self._frozen_until_ns, until_ns)
 
     def throttle(self, start: float, duration: float, share: float) -> None:
         """Throttle the process: it runs for a `share` [1] of each CFS period, then it is stopped.
@@ -114,9 +117,10 @@ class RestartableEndpoint:
 
     def handle_deadline(self, now_ns: int) -> None:
         """Implement `Endpoint.handle_deadline`: inject due faults, then run the process."""
+        self.now_ns = now_ns
         while self._actions and self._actions[0][0] <= now_ns:
             _, act, args = self._actions.pop(0)
-            act(now_ns, *args)
+            act(*args)
         if 0 <= self._frozen_until_ns <= now_ns:
             self._frozen_until_ns = -1
             waiting, self._waiting = self._waiting, []
@@ -191,8 +195,8 @@ class TeleopModel:
         self._peer.other, self._clouds.other = self._clouds, self._peer
         self.start()
 
-    def start(self, now_ns: int = 0) -> None:
-        """Start a new process, which knows only what is on the disk; `now_ns` is ignored."""
+    def start(self) -> None:
+        """Start a new process, which knows only what is on the disk."""
         self._starts += 1
         salt = b"desk %d" % self._starts  # random in production
         service = MissionService(MissionStore(self._disk, salt), self._fence)
@@ -208,8 +212,8 @@ class TeleopModel:
         )
         self._free_ns, self._turn_ns = 0, NEVER_NS
 
-    def kill(self, now_ns: int = 0) -> None:
-        """Kill the process; only the disk remains. `now_ns` is ignored."""
+    def kill(self) -> None:
+        """Kill the process; only the disk remains."""
         self.service = None
 
     def run_on(self, host: RestartableEndpoint) -> None:
@@ -232,15 +236,12 @@ class TeleopModel:
         assert self.service is not None, "teleop is down"
         self.service.create(order, now_ns)
 
-    def ask(self, now_ns: int, call: Call) -> None:
-        """Call teleop's API; teleop handles the call when it wakes next. A refusal is ignored.
-
-        `now_ns` is ignored, too.
-        """
+    def ask(self, call: Call) -> None:
+        """Call teleop's API; teleop handles the call when it wakes next. A refusal is ignored."""
         self._calls.append(call)
 
-    def switch_off(self, now_ns: int) -> None:
-        """Make an emergency stop: teleop sends `ALARM` to cloud at once; `now_ns` is ignored.
+    def switch_off(self) -> None:
+        """Make an emergency stop: teleop sends `ALARM` to cloud at once.
 
         When teleop's process wakes next, it also stores the stop on the disk.
         """
@@ -248,20 +249,21 @@ class TeleopModel:
             self._stops.append(MissionService.switch_off)
             self._peer.send(ALARM)
 
-    def freeze(self, now_ns: int, duration: float) -> None:
-        """Freeze the process as with SIGSTOP, from `now_ns` [ns] for `duration` [s]."""
+    def freeze(self, duration: float) -> None:
+        """Freeze the process as with SIGSTOP for `duration` [s]."""
         if self.service is not None:
-            self._free_ns = max(self._free_ns, now_ns + round(duration * 1e9))
+            self._free_ns = max(self._free_ns, self._host.now_ns + round(duration * 1e9))
             self._host.at(self._free_ns * 1e-9, self._turn)  # a late process wakes at once
 
     def _take(self, news: list[MissionEvent | Fault]) -> None:
         self.events += [each for each in news if isinstance(each, MissionEvent)]
 
-    def _wake(self, now_ns: int) -> None:
-        self._turn(now_ns)
-        self._host.at((now_ns + PERIOD_NS) * 1e-9, self._wake)
+    def _wake(self) -> None:
+        self._turn()
+        self._host.at((self._host.now_ns + PERIOD_NS) * 1e-9, self._wake)
 
-    def _turn(self, now_ns: int) -> None:
+    def _turn(self) -> None:
+        now_ns = self._host.now_ns
         if self.service is None or now_ns < self._free_ns:
             return
         late_ns = max(0, now_ns - self._turn_ns - PERIOD_NS) if self._turn_ns >= 0 else 0

@@ -128,9 +128,9 @@ class TrialOperator:
             return
         self._next_ns = now_ns + PATIENCE_NS
         if seen["guard"] in [each.name for each in LATCHED]:
-            flight.teleop.ask(now_ns, MissionService.acknowledge)
+            flight.teleop.ask(MissionService.acknowledge)
         elif is_over:
-            order(flight, now_ns)
+            order(flight)
 
 
 def _unanswered(flight: FaultRun, steps: list[Steps]) -> Iterator[Breach]:
