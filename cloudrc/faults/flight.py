@@ -25,7 +25,7 @@ from cloudrc.drivers.virtual import Clock, VirtualRun
 from cloudrc.endpoint import Endpoint
 from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, dishonesty
 from cloudrc.faults.inject import BUGS, SECRET, bugs, inject, shaped
-from cloudrc.faults.invariants import Steps, check_order
+from cloudrc.faults.invariants import FlightSteps, check_order
 from cloudrc.faults.models import RestartableEndpoint, TeleopModel
 from cloudrc.faults.observer import RobotObserver
 from cloudrc.faults.rules import Breach, Rules
@@ -153,9 +153,9 @@ class FaultRun:
         """Return the hash of all records so far."""
         return Recording.from_records(self.of_world, self.of_cloud).sha256
 
-    def steps(self) -> list[Steps]:
+    def steps(self) -> list[FlightSteps]:
         """Return the steps of the robot so far, in a list for each process of world."""
-        return [Steps(each) for each in self._observers]
+        return [FlightSteps(each) for each in self._observers]
 
     def breaches(self) -> list[Breach]:
         """Return the breaches of invariants so far, in the order of time."""

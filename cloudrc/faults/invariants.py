@@ -66,7 +66,7 @@ Broken: TypeAlias = Iterator[tuple[str, Array, str]]
 """Name of an invariant, in which steps it is broken, and what happens in them."""
 
 
-class Steps:
+class FlightSteps:
     """The steps of a robot as arrays with one entry per step.
 
     Attributes:
@@ -136,7 +136,7 @@ def _norm(vectors: Array) -> Array:
     return norms
 
 
-def _steps(steps: Steps) -> Broken:
+def _steps(steps: FlightSteps) -> Broken:
     rows, now_ns = steps.rows, steps.rows.now_ns
     skips = (np.diff(rows.steps, prepend=0) != 1) & (rows.steps != 1)
     late = np.diff(now_ns, prepend=now_ns[:1] - STEP_NS) != STEP_NS
@@ -147,7 +147,7 @@ def _steps(steps: Steps) -> Broken:
     yield "hold", rows.armed & (now_ns > rows.waits_until_ns + STEP_NS), "alone for too long"
 
 
-def _fence(steps: Steps) -> Broken:
+def _fence(steps: FlightSteps) -> Broken:
     rows, floor = steps.rows, steps.rules.low[2]
     low = rows.position[:, 2] < floor
     yield "fence", low, "below the floor"
@@ -168,7 +168,7 @@ def _stop_distance(speed: Array, rules: Rules) -> Array:
     return distance
 
 
-def _reference(steps: Steps) -> Broken:
+def _reference(steps: FlightSteps) -> Broken:
     rows, rules, v = steps.rows, steps.rules, steps.rows.reference
     room = np.where(v > 0.0, rules.high - rows.position, rows.position - rules.low)
     stops = (v == 0.0) | (_stop_distance(abs(v), rules) <= room - MARGIN + SLACK)
@@ -196,7 +196,7 @@ def growth(before: Array, after: Array) -> Array:
     return turned
 
 
-def _rest(steps: Steps) -> Broken:
+def _rest(steps: FlightSteps) -> Broken:
     rows, rules = steps.rows, steps.rules
     yield "latch", rows.is_on & ~steps.flown, "actuators on"
     left = (steps.was == TRACK) & (rows.state != TRACK)
@@ -217,7 +217,7 @@ def _rest(steps: Steps) -> Broken:
     yield "rest", falls, "falls, switched off in the air"
 
 
-def _contacts(steps: Steps) -> Broken:
+def _contacts(steps: FlightSteps) -> Broken:
     rows, rules = steps.rows, steps.rules
     hit = (steps.was != ESTOP) & (rows.state == ESTOP) & ~rows.asked
     yield "collision", hit & (rows.touch_age > REELS_NS * 1e-9), "stopped although nothing touches"

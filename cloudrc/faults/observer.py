@@ -12,7 +12,7 @@ from cloudrc.messages import PLAN_STEP_NS, Command, GuardState, OperatorRequest,
 from cloudrc.records import Contact
 from cloudrc.sim.onboard import Commands
 from cloudrc.sim.readings import Readings
-from cloudrc.world.robot import Robot
+from cloudrc.world.robot import Observer, Robot
 
 RESUME_COMMANDS, RESUME_NS = 10, 500_000_000
 """Number of fresh commands that end a HOLD, and the time within which they must arrive [ns]."""
@@ -77,7 +77,8 @@ class RobotObserver:
         self._is_reset = self._impossible = False
         self._fresh_ns = deque[int](maxlen=RESUME_COMMANDS)
         self._invalid_ns = deque[int](maxlen=INVALID_COMMANDS)
-        robot.observers.append(self)
+        tells = self.see_step, self.see_command, self.see_request, self.see_session
+        robot.observers.append(Observer(*tells))
 
     def see_step(self, now_ns: int, readings: Readings, commands: Commands) -> None:
         """Keep and check a step that begins at `now_ns` [ns]."""

@@ -14,7 +14,7 @@ import numpy as np
 from cloudrc.errors import describe_error
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.inject import order
-from cloudrc.faults.invariants import Steps
+from cloudrc.faults.invariants import FlightSteps
 from cloudrc.faults.measures import events_of_missions, held
 from cloudrc.faults.rules import ESTOP, LATCHED, TRACK, Breach
 from cloudrc.faults.schedule import Schedule
@@ -133,7 +133,7 @@ class TrialOperator:
             order(flight)
 
 
-def _unanswered(flight: FaultRun, steps: list[Steps]) -> Iterator[Breach]:
+def _unanswered(flight: FaultRun, steps: list[FlightSteps]) -> Iterator[Breach]:
     """Yield that the guard was not in TRACK for `BACK` [s], and stops without effect."""
     states = np.concatenate([each.rows.state for each in steps])
     times = np.concatenate([each.rows.now_ns for each in steps]) * 1e-9

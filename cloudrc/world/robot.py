@@ -39,9 +39,6 @@ class Observer(NamedTuple):
 class Robot:
     """Runs physics, guard and onboard controller step by step, and informs `observers`.
 
-    An observer has the methods see_step, see_command, see_request and see_session, as that of
-    `cloudrc.faults`.
-
     Onboard controller and actuators may be code of a user. If it fails in flight, the guard stops
     the robot.
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.faults.invariants import Steps
+from cloudrc.faults.invariants import FlightSteps
 from cloudrc.faults.observer import RobotObserver
 from cloudrc.faults.rules import ESTOP, FLOWN, GROUND, HOLD, LAND, TRACK, Rules
 from cloudrc.messages import ZERO, Command, OperatorRequest, Request, Start
@@ -40,7 +40,7 @@ class FakeRobot:
 
     def broken(self):
         """Return the kinds of breaches."""
-        return {breach.kind for breach in Steps(self.observer).breaches()}
+        return {breach.kind for breach in FlightSteps(self.observer).breaches()}
 
     def request(self, *requests):
         """Carry out operator requests; the guard's state stays what a test says."""
