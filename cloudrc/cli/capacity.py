@@ -62,7 +62,7 @@ def execute(options: Options) -> None:
     from cloudrc.report.figures.style import Look
     from cloudrc.runs.folder import new_folder
     from cloudrc.runs.requirements import MODES, require
-    from cloudrc.studies.capacity import Capacity, Sought, describe
+    from cloudrc.studies.capacity import Sought, describe, fly
     from cloudrc.studies.capacity_text import (
         CAPTION,
         COLUMNS,
@@ -75,20 +75,20 @@ def execute(options: Options) -> None:
 
     require("a capacity", MODES["virtual"])
     asked = settings_from(options, Sought)
-    found = Capacity(asked)
-    warn(*(each.fleet for each in found.conditions))
+    conditions = asked.conditions()
+    warn(*(each.fleet for each in conditions))
     folder = options.out
     if folder is None or not (folder / "capacity.json").exists():
-        folder = new_folder(folder, f"capacity-{found.conditions[0].fleet.name}", "latest-capacity")
+        folder = new_folder(folder, f"capacity-{conditions[0].fleet.name}", "latest-capacity")
     with lock_folder(folder), Progress("flies") as view:
         write_json(folder / "capacity.json", {"schemaVersion": 1, **asdict(asked)})
         view.say(f"{options.experiment}: how many robots? seeds 1 to {options.seeds}")
         try:
-            found.fly(Rows(folder), lambda row: view.say(in_words(row)))
+            fly(conditions, Rows(folder), lambda row: view.say(in_words(row)))
         except CloudrcError:
             tell(f"the finished fleets are kept; the same call with --out {folder} goes on")
             raise
-        document = describe(found, asked)
+        document = describe(asked, conditions)
         write_json(folder / "capacity.json", {"schemaVersion": 1, **document})
         for kind, content in draw_capacity(document, Look(width=3.5)).items():
             write_atomically(folder / f"capacity.{kind}", content)

@@ -57,8 +57,8 @@ def execute(options: Options) -> int:
     study = settings_from(options, PlaceStudy)
     with Progress("checks the flights"):
         trials = study.plan()
-    warn(*(trial.fleet for trial in trials))
-    name, folder = trials[0].fleet.name, options.out
+    warn(*(trial.flight.resolved for trial in trials))
+    name, folder = trials[0].flight.resolved.name, options.out
     if folder is None or not any(folder.glob("rows*.jsonl")):
         folder = new_folder(folder, f"place-{name}", "latest-place")
     with lock_folder(folder):

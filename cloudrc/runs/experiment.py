@@ -62,8 +62,9 @@ def robots_of(
     """Load the experiment of each robot of a fleet; the other arguments are those of `load`."""
     if experiment.fleet.only is not None:
         return [experiment]
+    others = [each for each in overrides if not each.startswith("fleet.only=")]
     numbers = range(experiment.fleet.robots)
-    return [load(name, [*overrides, f"fleet.only={n}"], seed, fleets=True) for n in numbers]
+    return [load(name, [*others, f"fleet.only={n}"], seed, fleets=True) for n in numbers]
 
 
 def check_alone(experiment: ResolvedExperiment) -> None:

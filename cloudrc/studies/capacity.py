@@ -7,25 +7,26 @@ seed, and then the sizes around it fly with all seeds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
+from operator import itemgetter
 from statistics import fmean, median_low
 from typing import Any
 
 from cloudrc.config.compute import compute_times
 from cloudrc.config.problems import problem_at
-from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.errors import NothingFlownError
 from cloudrc.link.model import HEADER_BYTES
+from cloudrc.link.profile import DIRECTIONS
 from cloudrc.link.waiting import nddd1
-from cloudrc.runs.experiment import check_no_seed, check_world, load, robots_of
 from cloudrc.runs.flight import ERROR
 from cloudrc.statistics import exact_interval, median_interval
 from cloudrc.trials.fingerprint import experiment_facts, fingerprint
-from cloudrc.trials.fleet import FleetTrial, alone
+from cloudrc.trials.fleet import FleetTrial, alone, load_trial
 from cloudrc.trials.plan import PlannedFlight
-from cloudrc.trials.play import run
+from cloudrc.trials.play import Trial, run
 from cloudrc.trials.rows import Row, Rows
 
 SLACK = 1.4
@@ -56,20 +57,28 @@ class Sought:
     seeds: int  # the fleets have the seeds 1 to `seeds`
     max: int  # largest fleet to try
 
+    def conditions(self) -> list[Condition]:
+        """Load the experiment under all conditions."""
+        pairs = product(self.queue or [""], self.controllers or [""])
+        return [Condition(self, queue, controller) for queue, controller in pairs]
 
-def search(start: int, top: int) -> Generator[int, bool, int]:
-    """Yield sizes of fleets to try, up to `top`, and get whether each succeeds.
 
-    Return the largest size that succeeds next to one that fails; 0 if none does.
+def next_size(known: Mapping[int, bool], start: int, top: int) -> int | None:
+    """Return the size of the next fleet to try, from `start` on and up to `top`.
+
+    `known` are size -> whether the fleet succeeds. None if the largest size that succeeds is known.
     """
-    yes, no, size = 0, top + 1, min(start, top)
-    while no - yes > 1:
-        if (yield size):
-            yes = size
-        else:
-            no = size
-        size = min(top, max(yes + 1, yes * GROWTH)) if no > top else (yes + no) // 2
-    return yes
+    if not known:
+        return min(start, top)
+    yes, no = largest(known), min((size for size, ok in known.items() if not ok), default=top + 1)
+    if no - yes <= 1:
+        return None
+    return min(top, max(yes + 1, yes * GROWTH)) if no > top else (yes + no) // 2
+
+
+def largest(known: Mapping[int, bool]) -> int:
+    """Return the largest size of a fleet that succeeds; 0 if none does."""
+    return max((size for size, ok in known.items() if ok), default=0)
 
 
 class Condition:
@@ -82,6 +91,7 @@ class Condition:
         theory: The same by queueing theory: the largest number that gets commands in time.
         traffic: What a robot sends in the cell, per direction.
         time_limit: Time limit of the mission [s].
+        fleets: The rows of the fleets that have flown: number of robots -> seed -> row.
     """
 
     def __init__(self, asked: Sought, queue: str, controller: str) -> None:
@@ -93,66 +103,67 @@ class Condition:
             "cell.queue_packets": packets,
             "cloud.controller": controller,
         }
-        settings = [*asked.set, *(f"{key}={value}" for key, value in given.items() if value)]
-        check_no_seed(settings)
-        own = self._load(asked.experiment, settings, 1)
-        kinds = len(own.fleet.vary) or 1
-        self.fleet = self._load(asked.experiment, settings, kinds)
-        self._kinds = robots_of(self.fleet, asked.experiment, [*settings, f"fleet.robots={kinds}"])
-        for robot in self._kinds:
-            check_world(robot.world, turns=robot.mission.turns)
+        own = [f"{key}={value}" for key, value in given.items() if value]
+        self._asked, self._settings = asked, [*asked.set, *own, "fleet.only=null"]
+        self._trials, self.point = dict[int, FleetTrial](), dict[str, Any]()
+        self.fleet = self._load(BASES).flight.resolved
         cell, cloud = self.fleet.cell, self.fleet.cloud
         if cell.rate_kbit is None and not (cloud.cores and cloud.compute_ms):
             text = "the robots share nothing; give a rate [kbit/s], or --set cloud.cores=1 with"
             raise problem_at("--cell", f"{text} --set cloud.compute_ms=2")
         shown = cell.queue if cell.queue == "newest" else f"{cell.queue} {cell.queue_packets}"
         shown = shown if cell.rate_kbit else "no cell"
-        self.point = {"queue": shown, "controller": cloud.controller.name}
+        self.point |= {"queue": shown, "controller": cloud.controller.name}
         self.bases = list[PlannedFlight]()
-        first = FleetTrial("", {}, 1, self.fleet, self._kinds)
-        for number in range(max(BASES, kinds)):
-            robot = alone(first.robot(number))
+        kinds = max(BASES, len(self.fleet.fleet.vary))
+        for robot in map(alone, self._load(kinds).robots):
             facts = fingerprint(experiment_facts(robot))
-            self.bases.append(PlannedFlight(facts, {"robot": number}, 1, robot))
+            self.bases.append(PlannedFlight(facts, {"robot": robot.fleet.only}, 1, robot))
         self.arithmetic, self.theory = dict[str, float](), dict[str, int]()
         self.traffic = dict[str, dict[str, float]]()
-        self.time_limit: float | None = self.fleet.criteria.time_limit_s
+        self.time_limit = self.fleet.criteria.time_limit_s
+        self.fleets = defaultdict[int, dict[int, Row]](dict)
 
-    @staticmethod
-    def _load(name: str, settings: Sequence[str], robots: int) -> ResolvedExperiment:
-        more = f"fleet.robots={robots}", "fleet.only=null"
-        return load(name, [*settings, *more], fleets=True)
+    def _load(self, robots: int) -> FleetTrial:
+        settings, point = [*self._settings, f"fleet.robots={robots}"], {"robots": robots}
+        experiment = self._asked.experiment
+        return load_trial(experiment, settings, self.point | point, until_failure=True)
 
-    def set_base(self, rows: Sequence[Row], top: int) -> None:
-        """Take the flights alone: time limit, arithmetic and theory, up to `top` robots."""
+    def set_base(self, rows: Sequence[Row]) -> None:
+        """Take the flights alone: time limit, arithmetic and theory."""
         numbers = [row["numbers"] for row in rows if row["verdict"] == "success"]
         if not numbers:
             raise NothingFlownError(f"the first robots fail alone, too: {rows[0]['text']}")
         if self.time_limit is None:
             self.time_limit = math.ceil(SLACK * max(each["duration"] for each in numbers))
-        cell, cloud, first = self.fleet.cell, self.fleet.cloud, numbers[0]
-        spare = self.age_max - first["age_at_actuator_p99"]
-        if cell.rate_kbit is not None and "packets_sent_uplink" in first:  # a long mission has it
-            for way in ("uplink", "downlink"):
-                packets = first[f"packets_sent_{way}"]
-                size = first[f"bytes_sent_{way}"] / packets + HEADER_BYTES
-                rate = packets / first["duration"]
-                service = size * 8e-3 / cell.rate_kbit + cell.airtime_us * 1e-6
-                self.traffic[way] = {"rate_hz": rate, "bytes": size, "service_s": service}
-            loads = [each["rate_hz"] * each["service_s"] for each in self.traffic.values()]
-            self.arithmetic["cell"] = 1.0 / (sum(loads) if cell.shared else max(loads))
-            if not (cell.shared or cell.traffic):
-                busiest = max(self.traffic.values(), key=lambda way: way["bytes"])
-                fits = (
-                    nddd1(n, 1 / busiest["rate_hz"], busiest["service_s"]) < spare
-                    for n in range(1, top + 1)
-                )
-                self.theory["N.D/D/1"] = next((n for n, fit in enumerate(fits) if not fit), top)
+            self._settings.append(f"criteria.time_limit_s={self.time_limit}")
+        cloud, first = self.fleet.cloud, numbers[0]
+        if self.fleet.cell.rate_kbit and "packets_sent_uplink" in first:  # a long mission has it
+            self._set_cell(first)
         if cloud.cores and cloud.compute_ms:
             mean_ms = fmean(compute_times(cloud.compute_ms))
             whole = cloud.cores * cloud.speed / (mean_ms * 1e-3)  # commands a second for all
             self.arithmetic["cloud"] = whole / cloud.command_rate_hz
             self.theory["closed queue"] = int(whole / RESUME_HZ)
+
+    def _set_cell(self, numbers: Mapping[str, float]) -> None:
+        """Set arithmetic and theory of the cell, from the numbers of a robot alone."""
+        cell, age = self.fleet.cell, numbers["age_at_actuator_p99"]
+        assert cell.rate_kbit is not None, "there is a cell"
+        for way in DIRECTIONS:
+            packets = numbers[f"packets_sent_{way}"]
+            size = numbers[f"bytes_sent_{way}"] / packets + HEADER_BYTES
+            rate = packets / numbers["duration"]
+            service = size * 8e-3 / cell.rate_kbit + cell.airtime_us * 1e-6
+            self.traffic[way] = {"rate_hz": rate, "bytes": size, "service_s": service}
+        loads = [each["rate_hz"] * each["service_s"] for each in self.traffic.values()]
+        self.arithmetic["cell"] = 1.0 / (sum(loads) if cell.shared else max(loads))
+        if not (cell.shared or cell.traffic):
+            busiest = max(self.traffic.values(), key=itemgetter("bytes"))
+            period, service = 1.0 / busiest["rate_hz"], busiest["service_s"]
+            sizes = range(1, self._asked.max + 1)
+            late = (n for n in sizes if age + nddd1(n, period, service) >= self.age_max)
+            self.theory["N.D/D/1"] = next(late, sizes[-1] + 1) - 1
 
     @property
     def age_max(self) -> float:
@@ -171,71 +182,65 @@ class Condition:
 
     def trial(self, robots: int, seed: int) -> FleetTrial:
         """Return the flight of a fleet; not before `set_base`."""
-        judged = self.fleet.criteria.model_copy(update={"time_limit_s": self.time_limit})
-        own = self.fleet.fleet.model_copy(update={"robots": robots})
-        fleet = self.fleet.model_copy(update={"criteria": judged, "fleet": own})
-        kinds = [each.model_copy(update={"criteria": judged}) for each in self._kinds]
-        facts = [experiment_facts(each) for each in (fleet, *kinds)]
-        point = self.point | {"robots": robots}
-        return FleetTrial(fingerprint(facts), point, seed, fleet, kinds, until_failure=True)
+        if robots not in self._trials:
+            self._trials[robots] = self._load(robots)
+        return self._trials[robots].with_seed(seed)
+
+    @property
+    def known(self) -> dict[int, bool]:
+        """Number of robots -> whether the fleet with seed 1 succeeds."""
+        return {size: succeeded(rows[1]) for size, rows in self.fleets.items() if 1 in rows}
+
+    def next_size(self) -> int | None:
+        """Return the size that the search tries next, with seed 1; None if it has ended."""
+        start = int(min(self.arithmetic.values(), default=1)) or 1
+        return next_size(self.known, start, self._asked.max)
+
+    def around(self) -> list[int]:
+        """Return the sizes that fly with all seeds: the one found, one less and one more."""
+        found = largest(self.known)
+        return [*range(max(1, found - 1), min(self._asked.max, found + 1) + 1)]
+
+    def missing(self) -> list[tuple[int, int]]:
+        """Return size and seed of those that have not flown."""
+        every = product(self.around(), range(1, self._asked.seeds + 1))
+        return [(size, seed) for size, seed in every if seed not in self.fleets[size]]
 
 
-class Capacity:
-    """Finds the capacity of each condition.
+def fly(
+    conditions: Sequence[Condition], rows: Rows, see: Callable[[Row], None] = lambda row: None
+) -> None:
+    """Fly what has no row in `rows`; raise the reason if that ends early.
 
-    Attributes:
-        found: Number of each condition -> largest fleet that succeeds with seed 1.
-        rows: The rows of all fleets that have flown.
+    Call `see` with the row of each fleet that has flown.
     """
+    bases = {each.key: each for one in conditions for each in one.bases}
+    _play([*bases.values()], rows)
+    for each in conditions:
+        each.set_base([rows.kept[base.key] for base in each.bases])
+    while fleets := _next(conditions):
+        trials = [condition.trial(size, seed) for condition, size, seed in fleets]
+        _play(trials, rows, see)
+        for (condition, size, seed), trial in zip(fleets, trials, strict=True):
+            condition.fleets[size][seed] = rows.kept[trial.key]
 
-    def __init__(self, asked: Sought) -> None:
-        """Load the experiment under all conditions."""
-        self._asked = asked
-        pairs = product(asked.queue or [""], asked.controllers or [""])
-        self.conditions = [Condition(asked, *pair) for pair in pairs]
-        self.found = dict[int, int]()
-        self.rows = dict[str, Row]()
 
-    def fly(self, rows: Rows, see: Callable[[Row], None] = lambda row: None) -> None:
-        """Fly what has no row in `rows`; raise the reason if that ends early.
+def _next(conditions: Sequence[Condition]) -> list[tuple[Condition, int, int]]:
+    """Return condition, size and seed of the fleets that fly next: those of all searches.
 
-        Call `see` with the row of each fleet that has flown.
-        """
-        self._rows, self._see = rows, see
-        bases = {each.key: each for one in self.conditions for each in one.bases}
-        self._play(bases.values(), lambda row: None)
-        for each in self.conditions:
-            each.set_base([self._rows.kept[base.key] for base in each.bases], self._asked.max)
-        starts = [int(min(each.arithmetic.values(), default=1)) or 1 for each in self.conditions]
-        searches = [search(start, self._asked.max) for start in starts]
-        asked, wanted = {n: next(each) for n, each in enumerate(searches)}, list[FleetTrial]()
-        while asked:
-            trials = {n: self.conditions[n].trial(size, 1) for n, size in asked.items()}
-            self._fly([*trials.values(), *wanted[:FILL]])
-            del wanted[:FILL]
-            for n, trial in trials.items():
-                try:
-                    asked[n] = searches[n].send(succeeded(self.rows[trial.key]))
-                except StopIteration as end:
-                    self.found[n] = end.value
-                    wanted += self._around(self.conditions[n], end.value)
-                    del asked[n]
-        self._fly(sorted(wanted, key=lambda each: -each.fleet.fleet.robots))
+    Fleets of the searches that have ended fly beside them.
+    """
+    sizes = [(each, each.next_size()) for each in conditions]
+    searched = [(each, size, 1) for each, size in sizes if size is not None]
+    others = [(each, *fleet) for each, size in sizes if size is None for fleet in each.missing()]
+    return searched + others[: FILL if searched else None]
 
-    def _around(self, condition: Condition, largest: int) -> Iterator[FleetTrial]:
-        for size in range(max(1, largest - 1), min(self._asked.max, largest + 1) + 1):
-            for seed in range(1, self._asked.seeds + 1):
-                yield condition.trial(size, seed)
 
-    def _fly(self, trials: Iterable[FleetTrial]) -> None:
-        trials = [*trials]
-        self._play(trials, self._see)
-        self.rows |= {each.key: self._rows.kept[each.key] for each in trials}
-
-    def _play(self, trials: Iterable[Any], see: Callable[[Row], None]) -> None:
-        trials = [*trials]
-        if stopped := run(trials, self._rows, len(trials), see, in_order=False):
-            raise stopped
+def _play(
+    trials: Sequence[Trial], rows: Rows, see: Callable[[Row], None] = lambda row: None
+) -> None:
+    if stopped := run(trials, rows, len(trials), see, in_order=False):
+        raise stopped
 
 
 def succeeded(row: Row) -> bool:
@@ -248,19 +253,15 @@ def succeeded(row: Row) -> bool:
 def capacity_of(fleets: Mapping[int, Mapping[int, bool]], top: int) -> dict[str, Any]:
     """Return the capacity over seeds: its median, and the interval of this median.
 
-    `fleets` are seed -> number of robots -> whether the fleet succeeded. The capacity of a seed is
-    the largest flown size up to which all succeed. If the smallest one fails, it is lower; if the
-    largest one succeeds, it may be higher, up to `top`.
+    `fleets` are number of robots -> seed -> whether the fleet succeeded; the numbers follow each
+    other. The capacity of a seed is the largest one up to which all succeed. If the smallest one
+    fails, it is lower; if the largest one succeeds, it may be higher, up to `top`.
     """
-    sizes = sorted({size for each in fleets.values() for size in each})
+    sizes = sorted(fleets)
     values = list[int]()
-    for each in fleets.values():
-        last = sizes[0] - 1
-        for size in sizes:
-            if not each[size]:
-                break
-            last = size
-        values.append(last)
+    for seed in fleets[sizes[0]]:
+        failed = (size for size in sizes if not fleets[size][seed])
+        values.append(next(failed, sizes[-1] + 1) - 1)
     interval = median_interval(values)
     low, high = interval or (min(values), max(values))
     return {
@@ -273,31 +274,18 @@ def capacity_of(fleets: Mapping[int, Mapping[int, bool]], top: int) -> dict[str,
     }
 
 
-def describe(found: Capacity, asked: Sought) -> dict[str, Any]:
+def describe(asked: Sought, conditions: Sequence[Condition]) -> dict[str, Any]:
     """Return the result as values for JSON."""
-    return {
-        **asdict(asked),
-        "conditions": [
-            _describe(each, found.found[number], [*found.rows.values()], asked)
-            for number, each in enumerate(found.conditions)
-        ],
+    return {**asdict(asked), "conditions": [_describe(each, asked.max) for each in conditions]}
+
+
+def _describe(condition: Condition, top: int) -> dict[str, Any]:
+    decisive = {
+        size: {seed: succeeded(row) for seed, row in sorted(condition.fleets[size].items())}
+        for size in condition.around()
     }
-
-
-def _describe(
-    condition: Condition, largest: int, rows: Sequence[Row], asked: Sought
-) -> dict[str, Any]:
-    groups = dict[int, list[Row]]()
-    for row in sorted(rows, key=lambda row: row["point"]["robots"]):
-        if condition.point.items() <= row["point"].items():
-            groups.setdefault(row["point"]["robots"], []).append(row)
-    seeds = {seed: dict[int, bool]() for seed in range(1, asked.seeds + 1)}
-    for size, each in groups.items():
-        if abs(size - largest) <= 1:
-            for row in each:
-                seeds[row["seed"]][size] = succeeded(row)
-    capacity = capacity_of(seeds, asked.max)
-    fleets = [_summary(size, each) for size, each in groups.items()]
+    capacity = capacity_of(decisive, top)
+    fleets = [_summary(size, [*rows.values()]) for size, rows in sorted(condition.fleets.items())]
     failed = [each for each in fleets if each["robots"] > capacity["capacity"] and each["failures"]]
     return {
         **condition.point,

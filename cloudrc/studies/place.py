@@ -14,13 +14,10 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
-from cloudrc.config.overrides import OUTSIDE, parse_settings
-from cloudrc.config.problems import problem_at
+from cloudrc.config.overrides import parse_settings
 from cloudrc.outside.reuse import reuse_results
-from cloudrc.runs.experiment import check_no_seed, check_world, load, robots_of
 from cloudrc.text import cells, escape, table
-from cloudrc.trials.fingerprint import experiment_facts, fingerprint
-from cloudrc.trials.fleet import FleetTrial
+from cloudrc.trials.fleet import FleetTrial, load_trial
 from cloudrc.trials.rows import Row
 
 DISTURBANCES = {
@@ -90,29 +87,22 @@ class PlaceStudy:
 
     def plan(self) -> list[FleetTrial]:
         """Check all flights; return them in the order of the table."""
-        check_no_seed(self.set)
         disturbed = [f"{key}={value}" for key, value in self.disturbances.items()]
         trials = list[FleetTrial]()
         with reuse_results():
             for values in product(self.compute, self.robots, self.places):
-                point = dict(zip(AXES, values, strict=True))
                 own = (f"{key}={value}" for key, value in zip(AXES.values(), values, strict=True))
-                settings = [*self.set, *disturbed, *own]
-                fleet = load(self.experiment, settings, fleets=True)
-                robots = tuple(robots_of(fleet, self.experiment, settings))
-                if fleet.cloud.controller.name in OUTSIDE:
-                    raise problem_at("cloud.controller", "flies with `cloudrc run` only")
-                for robot in robots:
-                    check_world(robot.world, turns=robot.mission.turns)
-                known = fingerprint(experiment_facts(fleet), *map(experiment_facts, robots))
-                trial = FleetTrial(known, point, 1, fleet, robots)
-                trials += [trial._replace(seed=1 + n) for n in range(self.seeds)]
+                settings, point = [*self.set, *disturbed, *own], zip(AXES, values, strict=True)
+                trial = load_trial(self.experiment, settings, dict(point), until_failure=False)
+                trials += [trial.with_seed(1 + n) for n in range(self.seeds)]
         return trials
 
 
 def describe(trials: Iterable[FleetTrial], rows: Mapping[str, Row]) -> dict[str, Any]:
     """Return a row for each point that has flown, and which place wins, as values for JSON."""
-    points = ([*of_point] for _, of_point in groupby(trials, lambda trial: trial.fingerprint))
+    points = (
+        [*of_point] for _, of_point in groupby(trials, lambda trial: trial.flight.fingerprint)
+    )
     shown = [
         _describe_point(each[0], [rows[trial.key] for trial in each])
         for each in points
@@ -129,17 +119,17 @@ def describe(trials: Iterable[FleetTrial], rows: Mapping[str, Row]) -> dict[str,
 def _describe_point(trial: FleetTrial, rows: Sequence[Row]) -> dict[str, Any]:
     numbers = [row["numbers"] for row in rows]
     row = {
-        **trial.point,
-        "name": Path(trial.point["place"]).stem,
+        **trial.flight.point,
+        "name": Path(trial.flight.point["place"]).stem,
         "succeeded": sum(each.get("succeeded", 0) for each in numbers),
-        "flown": trial.fleet.fleet.robots * len(rows),
+        "flown": trial.flight.resolved.fleet.robots * len(rows),
     }
     row["by_seed"] = {name: [each.get(f"{name}_median") for each in numbers] for name in SHOWN}
     for name, values in row["by_seed"].items():
         if known := [value for value in values if value is not None]:
             row[name] = median(known)
     sent = [each["sent_kbit_median"] for each in numbers if "sent_kbit_median" in each]
-    onboard = not trial.fleet.link_values  # nothing leaves the robot
+    onboard = not trial.flight.resolved.link_values  # nothing leaves the robot
     row["rate_kbit"] = 0.0 if onboard else mean(sent) if sent else None
     if codes := sorted({code for each in rows for code in each["failures"]}):
         row["why"] = ", ".join(codes)

@@ -7,15 +7,17 @@ succeeds if all other robots do.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from hashlib import sha256
 from itertools import accumulate
 from statistics import median
 from typing import Any, NamedTuple
 
-from cloudrc import assembly, source
+from cloudrc import assembly
 from cloudrc.config.fleet import CellConfig
+from cloudrc.config.overrides import OUTSIDE
+from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.link.cell import CellLog
 from cloudrc.outside.code import apart
@@ -26,9 +28,11 @@ from cloudrc.report.document import Assessment, Run
 from cloudrc.report.fleet import FleetFlown, cloud_numbers, fleet_document
 from cloudrc.report.write import assess
 from cloudrc.runs import flight
+from cloudrc.runs.experiment import check_no_seed, check_world, load, robots_of
 from cloudrc.runs.fleet import assemble_fleet
 from cloudrc.runs.interrupts import raise_if_interrupted
-from cloudrc.trials.fingerprint import experiment_facts, fingerprint, key_of
+from cloudrc.trials.fingerprint import experiment_facts, fingerprint
+from cloudrc.trials.plan import PlannedFlight
 from cloudrc.trials.rows import Row
 
 LATE_NS = 1_000_000_000
@@ -39,28 +43,22 @@ end the stay at a waypoint a little early."""
 class FleetTrial(NamedTuple):
     """The flight of a fleet under one condition, with one seed."""
 
-    fingerprint: str  # of the condition and the size of the fleet
-    point: dict[str, Any]  # axis -> value
-    seed: int
-    fleet: ResolvedExperiment  # its seed is not used
-    kinds: Sequence[ResolvedExperiment]  # robot k is as number k modulo their count
+    flight: PlannedFlight  # of the fleet
+    robots: Sequence[ResolvedExperiment]  # their seeds are not used
     until_failure: bool = False
 
     @property
     def key(self) -> str:
         """16 hexadecimal digits; equal keys mean equal flights."""
-        return key_of(self.fingerprint, self.seed)
+        return self.flight.key
 
-    def robot(self, number: int) -> ResolvedExperiment:
-        """Return the experiment of a robot in the fleet."""
-        kind = self.kinds[number % len(self.kinds)]
-        own = kind.fleet.model_copy(update={"robots": self.fleet.fleet.robots, "only": number})
-        return kind.model_copy(update={"seed": self.seed, "fleet": own})
+    def with_seed(self, seed: int) -> FleetTrial:
+        """Return the flight of the same fleet with another seed."""
+        return self._replace(flight=self.flight._replace(seed=seed))
 
     def play(self) -> Row:
         """Fly, judge and measure; return the row."""
-        of = {"key": self.key, "point": self.point, "seed": self.seed}
-        return {**of, **flight.or_error(self._fly), "code": source.code_hash()}
+        return self.flight.row(flight.or_error(self._fly))
 
     @apart()
     @reuse_results()
@@ -68,6 +66,24 @@ class FleetTrial(NamedTuple):
         flown = _Flight(self)
         flown.run.fly(flown.look)
         return flown.row()
+
+
+def load_trial(
+    experiment: str, settings: Sequence[str], point: Mapping[str, Any], *, until_failure: bool
+) -> FleetTrial:
+    """Load and check a fleet and each of its robots, for a flight with seed 1.
+
+    `point` are axis -> value.
+    """
+    check_no_seed(settings)
+    fleet = load(experiment, settings, fleets=True)
+    if fleet.cloud.controller.name in OUTSIDE:
+        raise problem_at("cloud.controller", "flies with `cloudrc run` only")
+    robots = robots_of(fleet, experiment, settings)
+    for robot in robots:
+        check_world(robot.world, turns=robot.mission.turns)
+    known = fingerprint(*map(experiment_facts, (fleet, *robots)))
+    return FleetTrial(PlannedFlight(known, {**point}, 1, fleet), robots, until_failure)
 
 
 def alone(robot: ResolvedExperiment) -> ResolvedExperiment:
@@ -81,17 +97,17 @@ class _Flight:
     """A fleet in flight."""
 
     def __init__(self, trial: FleetTrial) -> None:
-        self._experiment = trial.fleet.model_copy(update={"seed": trial.seed})
+        self._experiment, seed = trial.flight.experiment, trial.flight.seed
         self._until_failure = trial.until_failure
-        numbers = range(trial.fleet.fleet.robots)
-        self._robots = [trial.robot(number) for number in numbers]
-        self._stores = [RecordStore() for _ in numbers]
-        self._legs = [0 for _ in numbers]  # waypoint to which each flies
+        self._robots = [robot.model_copy(update={"seed": seed}) for robot in trial.robots]
+        self._stores = [RecordStore() for _ in self._robots]
+        self._legs = [0 for _ in self._robots]  # waypoint to which each flies
         self._latest_ns = [_latest_ns(robot) for robot in self._robots]
         self._judged = dict[int, Assessment]()
-        self._excused = set[int]()  # numbers of robots that fail alone
+        self._flying = {*range(len(self._robots))}  # numbers of those that may still fail
+        self._fail_alone = 0
         self._failures, self._text = list[str](), ""
-        sinks = [partial(self._take, number) for number in numbers]
+        sinks = [partial(self._take, number) for number in self._flying]
         self.run = assemble_fleet(self._experiment, self._robots, sinks)
         self._log = CellLog(self.run.cells)
 
@@ -105,27 +121,24 @@ class _Flight:
     def look(self, now_ns: int) -> bool:
         """Return whether the flight is over before its end; `now_ns` is the time [ns]."""
         self._log.take(now_ns)
-        return self._until_failure and any(
-            self._has_failed(number, now_ns) for number in range(len(self._robots))
-        )
+        return self._until_failure and any(self._fails(each, now_ns) for each in [*self._flying])
 
-    def _has_failed(self, number: int, now_ns: int) -> bool:
-        if number in self._judged or number in self._excused:
-            return False
+    def _fails(self, number: int, now_ns: int) -> bool:
+        """Return whether a robot that succeeds alone has failed, or can no longer end in time."""
         member, leg = self.run.members[number], self._legs[number]
         if member.over() or now_ns >= member.limit_ns:
-            verdict = self._judge(number).verdict
-            if verdict.outcome == "success":
-                return False
-            codes = [each.code for each in verdict.failures]
-            text = verdict.failures[0].text
+            failures = self._judge(number).verdict.failures
+            codes, text = [each.code for each in failures], failures[0].text if failures else ""
         elif now_ns > self._latest_ns[number][leg]:
             codes = ["timed_out"]
             text = f"at waypoint {leg + 1} after {now_ns / 1e9:.0f} s: the time limit is too near"
         else:
             return False
-        if not _succeeds(alone(self._robots[number])):
-            self._excused.add(number)
+        self._flying.remove(number)
+        if not codes:
+            return False
+        if flight.fly_in_memory(alone(self._robots[number])).verdict.outcome != "success":
+            self._fail_alone += 1
             return False
         self._failures, self._text = codes, f"robot {number}: {text}"
         return True
@@ -174,22 +187,11 @@ class _Flight:
                 **{name: busiest[name] for name in names if busiest.get(name) is not None},
                 **({"cloud_hz": document["cloud"]["rate_hz"]} if document["cloud"] else {}),
                 "succeeded": document["succeeded"],
-                "fail_alone": len(self._excused),
+                "fail_alone": self._fail_alone,
                 "flown_s": self.run.now_ns * 1e-9,
             },
             "records_sha256": sha256(hashes.encode()).hexdigest(),
         }
-
-
-_ALONE = dict[str, bool]()  # of this process: fleets of one seed have the same robots
-
-
-def _succeeds(robot: ResolvedExperiment) -> bool:
-    """Return whether a robot alone succeeds."""
-    key = fingerprint(experiment_facts(robot), robot.seed)
-    if key not in _ALONE:
-        _ALONE[key] = flight.fly_in_memory(robot).verdict.outcome == "success"
-    return _ALONE[key]
 
 
 def _latest_ns(robot: ResolvedExperiment) -> list[int]:

@@ -6,7 +6,8 @@ from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 from cloudrc.runs.fleet import assemble_fleet
-from cloudrc.studies.capacity import Condition, Sought, capacity_of, search
+from cloudrc.studies.capacity import Condition, Sought, capacity_of, next_size
+from cloudrc.studies.capacity import largest as largest_of
 
 SHORT = (
     *("mission.steps.count=8", "mission.steps.period_s=0.5"),
@@ -21,32 +22,34 @@ def trial(robots, *settings, seed=1):
 
 
 def find(largest, start):
-    """Search for a largest size; return it and the tried ones."""
-    sizes, tries, answer = search(start, 64), [], None
-    try:
-        while True:
-            tries.append(sizes.send(answer))
-            answer = tries[-1] <= largest
-    except StopIteration as end:
-        return end.value, tries
+    """Search for a largest size; return what is known at the end."""
+    known = {}
+    while size := next_size(known, start, 64):
+        assert size not in known
+        known[size] = size <= largest
+    return known
 
 
 @pytest.mark.parametrize("start", [1, 5, 40, 100])
 @pytest.mark.parametrize("largest", [0, 1, 5, 13, 63, 64])
 def test_the_search_finds_where_success_ends_within_a_few_fleets(start, largest):
-    found, tries = find(largest, start)
-    assert found == largest
-    assert len(tries) == len({*tries}) <= 12
+    known = find(largest, start)
+    assert largest_of(known) == largest
+    assert len(known) <= 12
 
 
 def test_the_seeds_decide_the_capacity_and_one_beyond_the_flown_sizes_is_a_bound():
-    good = {12: True, 13: True, 14: False}
-    bad, odd = {12: False, 13: True, 14: True}, {12: True, 13: True, 14: True}
-    found = capacity_of(dict(enumerate([good] * 6 + [bad, odd])), top=64)
+    seeds = range(8)  # six fail at 14, one at 12, one never
+    fleets = {
+        12: {seed: seed != 6 for seed in seeds},
+        13: dict.fromkeys(seeds, True),
+        14: {seed: seed > 5 for seed in seeds},
+    }
+    found = capacity_of(fleets, top=64)
     assert found["capacity"] == 13
     assert found["interval"] == [11, 14]
     assert (found["at_most"], found["at_least"]) == (11, 14)
-    few = capacity_of({1: {1: True, 2: True}}, top=2)
+    few = capacity_of({1: {1: True}, 2: {1: True}}, top=2)
     assert (few["capacity"], few["at_most"], few["at_least"]) == (2, None, None)
     assert few["interval_is"] == "range"
 
@@ -61,9 +64,9 @@ def test_a_robot_that_fails_alone_does_not_count():
 def test_a_fleet_that_is_stopped_has_the_verdict_of_a_whole_flight(robots):
     asked = trial(robots)
     row = asked.play()
-    members, fleet = [asked.robot(number) for number in range(robots)], asked.fleet
+    members = [each.model_copy(update={"seed": 1}) for each in asked.robots]
     stores = [RecordStore() for _ in members]
-    whole = assemble_fleet(fleet.model_copy(update={"seed": 1}), members, [s.add for s in stores])
+    whole = assemble_fleet(asked.flight.experiment, members, [s.add for s in stores])
     whole.fly()
     verdicts = [
         assess(Recording(records=store), robot, Run("virtual", "virtual")).verdict
