@@ -5,7 +5,7 @@ World and cloud do not import each other. Drivers use them only through `cloudrc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import replace
 from math import degrees, dist, inf, pi, radians
@@ -33,6 +33,7 @@ from cloudrc.errors import ControllerLostError
 from cloudrc.geometry.fence import Fence
 from cloudrc.link.cell import FRAME_NS, Bulk, Cell, Video
 from cloudrc.link.model import LinkDirection
+from cloudrc.link.profile import DIRECTIONS
 from cloudrc.link.queue import PacketQueue
 from cloudrc.link.traces import link_profile
 from cloudrc.messages import Start
@@ -82,13 +83,14 @@ def assemble(
     make_loop: Callable[..., ControlLoop] = ControlLoop,
     channel: ControllerChannel | None = None,
     *,
-    queue: Callable[[LinkDirection], PacketQueue] | None = None,
+    queue: Callable[[Sequence[LinkDirection]], PacketQueue] | None = None,
     compute: ComputeTime | None = None,
 ) -> tuple[WorldEndpoint, CloudEndpoint, Teleop, VirtualRun]:
     """Build world, cloud and teleop, and connect them for a flight in virtual time.
 
     The mission starts with the flight; `Teleop.over` tells when it is over. `make_loop`, `channel`
-    and `compute` are those of `build_cloud`. `queue` makes the queue of the packets in flight.
+    and `compute` are those of `build_cloud`. `queue` makes the queue of the packets in
+    flight on the links.
     """
     from cloudrc.drivers.virtual import CPU_CLOCK, Clock, VirtualRun
 
@@ -110,7 +112,7 @@ def assemble(
         channel=channel,
         compute=compute,
     )
-    in_flight = queue(links[1]) if queue else None
+    in_flight = queue(links) if queue else None
     run = VirtualRun(world, cloud, *links, cloud_clock=own, in_flight=in_flight)
     return world, cloud, teleop, run
 
@@ -324,7 +326,8 @@ def build_cells(experiment: ResolvedExperiment, origin_ns: int = 0) -> list[Cell
     if given.rate_kbit is None:
         return []
     limits = given.queue, given.queue_packets, round(given.airtime_us * 1e3)
-    cells = [Cell(given.rate_kbit * 1e3, *limits) for _ in range(1 if given.shared else 2)]
+    ways = ["both"] if given.shared else DIRECTIONS
+    cells = [Cell(given.rate_kbit * 1e3, *limits, way) for way in ways]
     for flow, each in enumerate(given.traffic, start=-len(given.traffic)):
         start_ns = int(generator(experiment.seed, f"traffic {flow}").integers(FRAME_NS))
         video = Video(flow, each.rate_kbit * 1e3, origin_ns + start_ns)

@@ -15,20 +15,20 @@ class SharedCompute(ComputeTime):
 
     Attributes:
         shortest_ns: Duration of the next computation on a core of its own [ns].
-        ask: Is called with the duration of a computation that begins, on a core of its own [ns].
     """
 
-    ask: Callable[[int], None]
+    def __init__(self, own: ComputeTime, begins: Callable[[int], None]) -> None:
+        """Draw the durations from `own`, in the same order as without sharing.
 
-    def __init__(self, own: ComputeTime) -> None:
-        """Draw the durations from `own`, in the same order as without sharing."""
-        self._own, self.shortest_ns = own, own.end(0)
+        `begins` gets the duration of a computation that begins, on a core of its own [ns].
+        """
+        self._own, self._begins, self.shortest_ns = own, begins, own.end(0)
 
     def begin(self) -> None:
         """Nothing is measured."""
 
     def end(self, began_ns: int) -> int:
         """Ask for a core; return `FOREVER_NS`. `began_ns` is not used."""
-        self.ask(self.shortest_ns)
+        self._begins(self.shortest_ns)
         self.shortest_ns = self._own.end(0)
         return FOREVER_NS

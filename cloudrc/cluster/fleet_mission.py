@@ -10,8 +10,9 @@ import csv
 import re
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from http.client import HTTPConnection
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.cluster.client import ClusterError, Release, explain_errors, run
 from cloudrc.cluster.jobs import AT, KILLED_WATCHER, Ended, JobReader
@@ -24,6 +25,9 @@ from cloudrc.cluster.pods import (
     list_pods,
 )
 from cloudrc.errors import CloudrcError, to_one_line
+
+if TYPE_CHECKING:
+    from cloudrc.link.cell import Usage
 
 ROBOT = "batch.kubernetes.io/job-completion-index"
 """Annotation of a Job's pod: the robot that it flies."""
@@ -53,7 +57,7 @@ def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> En
     if left > 0:
         tell(f"{job.spec.completions} robots begin together in {left:.0f} s")
         time.sleep(left)
-    start = max((float(row["time_s"]) for row in _read_cell(release)), default=0.0)
+    start = max((each.time_s for each in _read_cell(release)), default=0.0)
     ended = {
         robot: Ended(ClusterError.exit_code, "INTERRUPTED: no_verdict")
         for robot in range(job.spec.completions)
@@ -97,27 +101,26 @@ def _flown(before: Numbers | None, after: Numbers | None) -> Numbers:
     return {"hold_s": new["hold_s"], **age}
 
 
-def _document(rows: list[dict[str, Any]], record: list[dict[str, str]], start: float) -> Any:
+def _document(rows: list[dict[str, Any]], record: list[Usage], start: float) -> Any:
     """Return what the summary of a fleet needs.
 
-    The cell's rows after `start` [s] are its flight: all rows, if the cell has a new pod.
+    What the cell did after `start` [s] is its flight: all of it, if the cell has a new pod.
     """
-    from cloudrc.link.cell import CellLog
     from cloudrc.report.fleet import cell_rows, judge_robots
 
-    if record and float(record[-1]["time_s"]) < start:
+    if record and record[-1].time_s < start:
         start = 0.0
-    log = CellLog.read([row for row in record if float(row["time_s"]) > start])
-    for row in log.rows:
-        row["time_s"] -= start
-    for row in rows if log.rows else ():
-        row["dropped"] = sum(log.dropped[way, row["robot"]] for way in log.ways)
+    log = [replace(each, time_s=each.time_s - start) for each in record if each.time_s > start]
+    for row in rows if log else ():
+        row["dropped"] = sum(each.dropped.get(row["robot"], 0) for each in log)
     cell = cell_rows(log, len(rows), alone=False)  # others may send, too
     return {**judge_robots(rows), "cell": cell, "cloud": None, "separation_min_m": None}
 
 
-def _read_cell(release: Release) -> list[dict[str, str]]:
+def _read_cell(release: Release) -> list[Usage]:
     """Read what the cell has recorded so far; [] without a cell, or if it does not answer."""
+    from cloudrc.link.cell import Usage
+
     if not release.find("statefulsets", CELL):
         return []
     try:
@@ -126,7 +129,8 @@ def _read_cell(release: Release) -> list[dict[str, str]]:
         text = run("kubectl", [*release.flags, *words])
     except CloudrcError:  # the verdicts count
         return []
-    return [*csv.DictReader(text.splitlines()[: text.count("\n")])]  # the last line may be cut
+    lines = text.splitlines()[: text.count("\n")]  # the last line may be cut
+    return [*map(Usage.read, csv.DictReader(lines))]
 
 
 def _read_robots(release: Release) -> dict[int, Numbers]:

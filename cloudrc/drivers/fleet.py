@@ -18,7 +18,7 @@ from heapq import heapreplace
 from typing import Literal, NamedTuple, Protocol
 
 from cloudrc.drivers.virtual import PERIOD_NS, Sink, VirtualRun, without_collections
-from cloudrc.link.cell import Cell
+from cloudrc.link.cell import Cell, Usage
 from cloudrc.link.queue import NOTHING_NS
 
 
@@ -124,12 +124,12 @@ class FleetRun:
         self._next_ns = [member.run.next_ns for member in members]
         self.now_ns = 0
 
-    def fly(self, look: Callable[[int], object] = lambda now_ns: None) -> None:
+    def fly(self, log: list[Usage], is_over: Callable[[int], bool] = lambda now_ns: False) -> None:
         """Fly until the missions of all robots are over, or until the limit of each.
 
         Every 100 ms of virtual time, call the sinks of the robots whose flight is not over. If the
-        robots share something, the others go on, and `look` is called with the time [ns]; if its
-        answer is true, the flight of all is over.
+        robots share something, the others go on; `log` gets what the cells have done, and the
+        flight of all is over once `is_over`, which gets the time [ns], says so.
         """
         if not self._media:
             for each in self.members:  # nobody acts on the others
@@ -146,7 +146,8 @@ class FleetRun:
                 flying = [
                     each for each in flying if self.now_ns < each.limit_ns and not each.over()
                 ]
-                if look(self.now_ns):
+                log += (cell.end_period(self.now_ns) for cell in self.cells)
+                if is_over(self.now_ns):
                     return
 
     def _advance(self, end_ns: int) -> None:

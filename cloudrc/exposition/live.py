@@ -7,14 +7,15 @@ clock: they are computed from differences between stamps of one clock.
 from __future__ import annotations
 
 import json
-from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterable, Sequence
 from math import nan
 from typing import Any, TypeAlias, get_args
 
 from cloudrc.exposition import table
 from cloudrc.exposition.parts import Histogram, Readings, samples
 from cloudrc.exposition.table import LiveMetric, MetricKind, of_role
+from cloudrc.link.cell import Usage
 from cloudrc.link.verify import verdict_of
 from cloudrc.messages import NEVER_NS, Cause, GuardState
 from cloudrc.metrics.definitions import (
@@ -312,21 +313,24 @@ class CellMetrics:
     """Metrics of the radio cell of a fleet."""
 
     def __init__(self, values: Values) -> None:
-        self._values = values
+        self._values, self._robots = values, 0
+        self._dropped = Counter[tuple[int, str]]()
 
-    def take(
-        self, rows: Sequence[Mapping[str, Any]], dropped: Mapping[tuple[str, int], int]
-    ) -> None:
-        """Take the newest rows of a `CellLog`, each of a tenth of a second, and its `dropped`."""
-        lost = defaultdict[str, dict[str, int]](dict)
-        for (way, robot), count in sorted(dropped.items()):
-            if robot >= 0:
-                lost[str(robot)][way] = count
+    def expect(self, robots: int) -> None:
+        """Set the number of robots, which have counters from the start."""
+        self._robots = robots
+
+    def take(self, done: Sequence[Usage]) -> None:
+        """Take what the cells have done in the newest tenth of a second."""
         busy, queued, waits = Values(), Values(), Values()
-        for row in rows:
-            way, packets = row["direction"], row["packets"]
-            busy[way], queued[way] = row["busy_ns"] * 1e-8, row["most"]
-            waits[way] = row["waited_ns"] * 1e-9 / packets if packets else nan
+        lost = {str(robot): Values() for robot in range(self._robots)}
+        for each in done:
+            way = each.direction
+            busy[way], queued[way] = each.busy_ns * 1e-8, each.most
+            waits[way] = each.waited_ns * 1e-9 / each.packets if each.packets else nan
+            self._dropped.update({(robot, way): n for robot, n in each.dropped.items()})
+            for robot in range(self._robots):
+                lost[str(robot)][way] = self._dropped[robot, way]
         self._values |= {  # new dictionaries: another thread may read the old ones
             "cloudrc_cell_dropped_total": lost,
             "cloudrc_cell_utilisation": busy,

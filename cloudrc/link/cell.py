@@ -7,11 +7,10 @@ packets sent before an instant, and tells which leave until this instant.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from functools import partial
-from heapq import heappop, heappush
 from math import inf
 from typing import Any, Literal, NamedTuple
 
@@ -42,15 +41,31 @@ class CellPacket(NamedTuple):
 
 @dataclass(slots=True)
 class Usage:
-    """What a cell has done within a time."""
+    """What a cell has done within a period: a row of cell.csv."""
 
+    direction: str  # "uplink" or "downlink"; "both" if they share the medium
+    time_s: float = 0.0  # end of the period
     packets: int = 0  # that began to leave
     size: int = 0  # of these [bytes]
     busy_ns: int = 0
     waited_ns: int = 0  # sum over all packets
     longest_ns: int = 0  # longest wait [ns]
     most: int = 0  # largest number of waiting packets
-    dropped: dict[int, int] = field(default_factory=dict)  # flow -> packets
+    dropped: dict[int, int] = field(default_factory=dict)  # robot, below 0: others -> packets
+
+    def row(self) -> dict[str, Any]:
+        """Return the row; its `dropped_by` has a pair ROBOT:PACKETS for each robot."""
+        by = " ".join(f"{flow}:{count}" for flow, count in sorted(self.dropped.items()))
+        row = {"time_s": self.time_s, **asdict(self)}
+        return row | {"dropped": sum(self.dropped.values()), "dropped_by": by}
+
+    @classmethod
+    def read(cls, row: Mapping[str, str]) -> Usage:
+        """Return what `row` has returned; raise a ValueError or KeyError for another row."""
+        pairs = (pair.split(":") for pair in row["dropped_by"].split())
+        counts: dict[str, Any] = {each.name: int(row[each.name]) for each in fields(cls)[2:-1]}
+        dropped = {int(flow): int(count) for flow, count in pairs}
+        return cls(row["direction"], float(row["time_s"]), **counts, dropped=dropped)
 
 
 class Cell:
@@ -60,7 +75,7 @@ class Cell:
         inbox: Packets that are sent, in any order, for the next `advance`.
         delay_ns: Shortest delay of a robot's packet behind the cell [ns].
         done_ns: When the packet in service leaves [ns]; `NOTHING_NS` if there is none.
-        usage: Sums since the start, or since somebody has replaced them.
+        usage: Sums since the last `end_period`.
     """
 
     def __init__(
@@ -69,10 +84,12 @@ class Cell:
         queue: Literal["fifo", "drr", "priority", "newest"] = "fifo",
         packets_max: int = 1000,
         airtime_ns: int = 0,
+        direction: str = "both",
     ) -> None:
         """Create an idle cell of `rate` [bit/s]; `airtime_ns` is what each packet costs more [ns].
 
-        `packets_max` is the size of a queue, with the packet in service.
+        `packets_max` is the size of a queue, with the packet in service. `direction` is that of
+        its `Usage`.
         """
         self._rate, self._queue, self._packets_max = rate, queue, packets_max
         self._airtime_ns = airtime_ns
@@ -82,8 +99,14 @@ class Cell:
         self._waiting = 0
         self.traffic: dict[int, Video | Bulk] = {}  # flow -> source
         self.inbox: list[CellPacket] = []
-        self.delay_ns, self.done_ns = 0, NOTHING_NS
-        self.usage = Usage()
+        self.delay_ns = self.done_ns = NOTHING_NS
+        self.usage = Usage(direction)
+
+    def end_period(self, now_ns: int) -> Usage:
+        """Return what it has done since the last call; `now_ns` is the time [ns]."""
+        done, self.usage = self.usage, Usage(self.usage.direction)
+        done.time_s = now_ns / 1e9
+        return done
 
     def service_ns(self, size: int) -> int:
         """Return how long the cell serves a packet of `size` [bytes], with headers."""
@@ -239,13 +262,13 @@ class Bulk:
         """Set the time of the first packet [ns]."""
         self._flow, self._sent, self.next_ns = flow, 0, start_ns
         self._window, self._flying, self._threshold, self._halved_ns = 10.0, 0, inf, -1
-        self._confirmed: list[int] = []
+        self._confirmed = deque[int]()
 
     def fire(self, cell: Cell) -> None:
         """Take the confirmations that are due, and send as many packets as the window allows."""
         now_ns = self.next_ns
         while self._confirmed and self._confirmed[0] <= now_ns:
-            heappop(self._confirmed)
+            self._confirmed.popleft()
             self._flying -= 1
             growth = 1.0 if self._window < self._threshold else 1.0 / self._window
             self._window = min(WINDOW_MAX, self._window + growth)
@@ -261,7 +284,7 @@ class Bulk:
 
     def leave(self, now_ns: int) -> None:
         """Expect the confirmation of a packet that has left at `now_ns` [ns]."""
-        heappush(self._confirmed, now_ns + ROUND_TRIP_NS)
+        self._confirmed.append(now_ns + ROUND_TRIP_NS)
         self.next_ns = min(self.next_ns, self._confirmed[0])
 
 
@@ -269,13 +292,24 @@ class CellQueue(PacketQueue):
     """The packets of a robot in flight behind a cell; new ones are sent through the cell."""
 
     def __init__(
-        self, robot: int, cells: Sequence[Cell], orders: Sequence[bool], downlink: LinkDirection
+        self,
+        robot: int,
+        cells: Sequence[Cell],
+        orders: Sequence[bool],
+        links: Sequence[LinkDirection],
+        onward: Callable[[LinkDirection, Sequence[int], Any], None] | None = None,
     ) -> None:
-        """Set the robot's number, the cells of both ways, and which ways keep the order."""
+        """Set the robot's number; the cells of uplink and downlink, or the one of both.
+
+        `orders` tells which of the `links` keep the order. `onward` gets what leaves the cell, as
+        `put` does by default.
+        """
         super().__init__()
-        self._robot, self._cells, self._orders = robot, cells, orders
-        self._downlink = downlink
+        self._robot, self._cells, self._orders = robot, (*cells, *cells)[:2], orders
+        self._downlink, self._onward = links[1], onward or self.put
         self._last_ns, self._numbers = [0, 0], 0
+        for cell, link in zip(self._cells, links, strict=True):
+            cell.delay_ns = min(cell.delay_ns, link.shortest_ns)
 
     def send(
         self, link: LinkDirection, header: tuple[int, int, int], size: int, data: Any, now_ns: int
@@ -297,46 +331,4 @@ class CellQueue(PacketQueue):
         arrival_ns = now_ns + delay_ns
         if self._orders[way]:
             arrival_ns = self._last_ns[way] = max(arrival_ns, self._last_ns[way])
-        self.put(link, (arrival_ns,), data)
-
-
-class CellLog:
-    """What the cells of a fleet do, in each tenth of a second.
-
-    Attributes:
-        ways: Directions: "uplink" and "downlink", or "both".
-        rows: The rows of a CSV file; `dropped_by` has a pair ROBOT:PACKETS for each robot.
-        dropped: Direction and robot, below 0 others, -> number of packets that were dropped.
-    """
-
-    def __init__(self, served: Sequence[Cell]) -> None:
-        """Take the cells of uplink and downlink, or the one that both share."""
-        self.ways: tuple[str, ...] = {0: (), 1: ("both",), 2: ("uplink", "downlink")}[len(served)]
-        self._cells, self.rows = served, list[dict[str, Any]]()
-        self.dropped = Counter[tuple[str, int]]()
-
-    @classmethod
-    def read(cls, rows: Iterable[Mapping[str, str]]) -> CellLog:
-        """Return the log whose rows a CSV file has; raise a ValueError or KeyError for others."""
-        log = cls(())
-        for row in rows:
-            way, by, numbers = row["direction"], row["dropped_by"], dict(row)
-            del numbers["direction"], numbers["dropped_by"]
-            time_s = float(numbers.pop("time_s"))
-            counts = {name: int(value) for name, value in numbers.items()}
-            log.rows.append({"time_s": time_s, "direction": way, **counts, "dropped_by": by})
-            for pair in by.split():
-                flow, _, count = pair.partition(":")
-                log.dropped[way, int(flow)] += int(count)
-        log.ways = tuple(dict.fromkeys(row["direction"] for row in log.rows))
-        return log
-
-    def take(self, now_ns: int) -> None:
-        """End a period at `now_ns` [ns]."""
-        for way, cell in zip(self.ways, self._cells, strict=True):
-            values, cell.usage = asdict(cell.usage), Usage()
-            dropped = values.pop("dropped")
-            self.dropped.update({(way, flow): count for flow, count in dropped.items()})
-            row = {"time_s": now_ns / 1e9, "direction": way, **values}
-            by = " ".join(f"{flow}:{count}" for flow, count in sorted(dropped.items()))
-            self.rows.append(row | {"dropped": sum(dropped.values()), "dropped_by": by})
+        self._onward(link, (arrival_ns,), data)

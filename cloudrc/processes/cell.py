@@ -7,16 +7,14 @@ what the cell does, as the file cell.csv of a fleet in virtual time.
 from __future__ import annotations
 
 import json
-import random
 import socket
-import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from ipaddress import ip_address
-from itertools import product
+from itertools import cycle
 from math import inf
 from pathlib import Path
 from typing import TextIO, TypeAlias
@@ -32,10 +30,10 @@ from cloudrc.link.carry.engine import LinkWay
 from cloudrc.link.carry.log import PacketLog
 from cloudrc.link.carry.punctual import ask_for_fifo, settle
 from cloudrc.link.carry.udp import Entrance, Exit
-from cloudrc.link.cell import Cell, CellLog
+from cloudrc.link.cell import Cell
 from cloudrc.link.follow import PEER_PAUSE, PeerName
-from cloudrc.link.queue import NOTHING_NS
-from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, warn
+from cloudrc.link.profile import DIRECTIONS
+from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, repeat, warn
 from cloudrc.runs.experiment import check_cell
 from cloudrc.text import csv_table
 from cloudrc.tunnel.codec import peek
@@ -82,10 +80,10 @@ def run_cell(settings: CellSettings, stop: StopSignal) -> None:
         settle()
         if ask_for_fifo():
             log("the cell runs under SCHED_FIFO")
-        done = CellLog(cells)
-        done.dropped.update(dict.fromkeys(product(done.ways, range(count)), 0))
+        if exporter:
+            exporter.cell.expect(count)
         limit = settings.record_max or inf
-        _carry(engine, done, feed.alive_while(stop), file, exporter, limit)
+        _carry(engine, cells, feed.alive_while(stop), file, exporter, limit)
         log(json.dumps(engine.counts() | engine.errors.in_ns()))
 
 
@@ -110,31 +108,29 @@ def _open(
     outside = opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
     outside.setblocking(False)
     port = EntrancePort()
-    engine, exits, shortest_ns = CellEngine(port, cells), list[WayOut](), NOTHING_NS
+    engine, exits = CellEngine(port, cells), list[WayOut]()
     for robot in range(count):
         own = read_experiment(str(settings.config), robot_settings(robot))
         ways = list[LinkWay]()
         for name, to, link in zip(
-            ("uplink", "downlink"),
+            DIRECTIONS,
             (settings.clouds, settings.worlds),
             assembly.build_links(own, origin_ns),
             strict=True,
         ):
             host, first = getattr(settings, name)
-            exits.append((address_of(to, robot), Exit(outside), ways))
-            ways.append(LinkWay(link, exits[-1][1], PacketLog(0)))
+            leave = Exit(outside)
+            exits.append((address_of(to, robot), leave, ways))
+            ways.append(LinkWay(link, leave, PacketLog(0)))
             with listening(f"--{name}", (host, first + robot)):
                 one = opened.enter_context(bind((host, first + robot)))
             port.add(one, Entrance(one, ways[-1], peek))
-            shortest_ns = min(shortest_ns, link.shortest_ns)
         engine.join(robot, (ways[0], ways[1]), (own.uplink.keep_order, own.downlink.keep_order))
-    for cell in cells:
-        cell.delay_ns = shortest_ns
     return engine, cells, exits
 
 
 def _follow(exits: Sequence[WayOut]) -> None:
-    """Resolve the names of all peers again and again, on a thread of its own.
+    """Resolve the names of all peers again and again, one after the other.
 
     A robot that has sent nothing may not exist: it takes seconds to learn that a name is unknown.
     """
@@ -144,17 +140,15 @@ def _follow(exits: Sequence[WayOut]) -> None:
             leave.peer = address
         else:
             names.append((PeerName(address, ipv4_addresses, log), leave, ways))
+    turns = cycle(names)
 
-    def work() -> None:
-        while True:
-            used = [one for one in names if any(way.received for way in one[2])]
-            for name, leave, _ in used:
-                leave.peer = name.poll() or leave.peer
-                time.sleep(random.uniform(*PEER_PAUSE) / min(len(used), AT_ONCE))
-            time.sleep(PEER_PAUSE[0] / AT_ONCE)
+    def resolve_next() -> None:
+        name, leave, ways = next(turns)
+        if any(way.received for way in ways):
+            leave.peer = name.poll() or leave.peer
 
     if names:
-        threading.Thread(target=work, daemon=True).start()
+        repeat(resolve_next, *(pause / AT_ONCE for pause in PEER_PAUSE))
 
 
 def _is_number(host: str) -> bool:
@@ -167,7 +161,7 @@ def _is_number(host: str) -> bool:
 
 def _carry(
     engine: CellEngine,
-    cells: CellLog,
+    cells: Sequence[Cell],
     stop: Callable[[], bool],
     file: TextIO,
     exporter: Exporter | None,
@@ -184,15 +178,14 @@ def _carry(
             engine.step(rest_ns * 1e-9)
         if not start_ns and engine.counts()["received"]:
             start_ns = until_ns - PERIOD_NS
-        cells.rows.clear()
-        cells.take(until_ns - start_ns)
-        if any(row["packets"] for row in cells.rows):
+        done = [cell.end_period(until_ns - start_ns) for cell in cells]
+        if any(each.packets for each in done):
             if file.tell() > record_max:
                 file.seek(0)
                 file.truncate()
-            lines = csv_table(cells.rows).split("\n", 1)
+            lines = csv_table([each.row() for each in done]).split("\n", 1)
             file.write(f"{lines[0]}\n" * (not file.tell()) + f"{lines[1]}\n")
             file.flush()
         if exporter:
-            exporter.cell.take(cells.rows, cells.dropped)
+            exporter.cell.take(done)
             exporter.ready(True)

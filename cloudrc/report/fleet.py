@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from math import inf
+from operator import attrgetter
 from statistics import median
 from typing import Any
 
@@ -16,7 +18,7 @@ from cloudrc import source
 from cloudrc.config.resolved import ResolvedExperiment, fingerprint
 from cloudrc.config.scene import scene_of
 from cloudrc.drivers.fleet import FleetRun
-from cloudrc.link.cell import CellLog
+from cloudrc.link.cell import Usage
 from cloudrc.link.waiting import md1, nddd1
 from cloudrc.record.columns import Recording
 from cloudrc.report.document import SCHEMA_VERSION
@@ -76,9 +78,9 @@ class FleetFlown:
     """A fleet that has flown."""
 
     experiment: ResolvedExperiment
-    log: CellLog
-    cloud: Mapping[str, float] | None  # numbers of the shared cores
     mode: str = "virtual"
+    log: list[Usage] = field(default_factory=list)  # what the cell has done
+    cloud: Mapping[str, float] | None = None  # numbers of the shared cores
     robots: list[dict[str, Any]] = field(default_factory=list)  # what the report says of each
     # Of each robot, world frame [m], a row per `GRID_NS`, shape (n, 3).
     paths: list[NDArray[np.float64]] = field(default_factory=list)
@@ -98,8 +100,8 @@ class FleetFlown:
             uplink, downlink, duration = (known[name]["value"] for name in SENT)
             if duration:
                 row["sent_kbit"] = (uplink + downlink) / duration * 8e-3
-        if self.log.ways:
-            row["dropped"] = sum(self.log.dropped[way, number] for way in self.log.ways)
+        if self.log:
+            row["dropped"] = sum(each.dropped.get(number, 0) for each in self.log)
         self.robots.append(row | {"records_sha256": document["records_sha256"]})
         truth = recording["/ground_truth"]
         if len(truth):
@@ -145,21 +147,29 @@ def judge_robots(robots: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def cell_rows(log: CellLog, senders: int, *, alone: bool) -> list[dict[str, Any]]:
+def by_direction(log: Iterable[Usage]) -> dict[str, list[Usage]]:
+    """Return direction -> what its cell has done."""
+    found = defaultdict[str, list[Usage]](list)
+    for each in log:
+        found[each.direction].append(each)
+    return found
+
+
+def cell_rows(log: Iterable[Usage], senders: int, *, alone: bool) -> list[dict[str, Any]]:
     """Return `cell_numbers` of each direction in which packets have left."""
-    used = {row["direction"] for row in log.rows if row["packets"]}
-    return [cell_numbers(log, way, senders, alone=alone) for way in log.ways if way in used]
+    ways = by_direction(log).values()
+    return [cell_numbers(way, senders, alone=alone) for way in ways if any(u.packets for u in way)]
 
 
-def cell_numbers(log: CellLog, way: str, senders: int, *, alone: bool) -> dict[str, Any]:
-    """Return the numbers of a cell; a wait without end is None.
+def cell_numbers(done: Sequence[Usage], senders: int, *, alone: bool) -> dict[str, Any]:
+    """Return the numbers of the cell of a direction; a wait without end is None.
 
     `senders` is the number of robots, which are `alone` if there is no other traffic.
     """
-    rows = [row for row in log.rows if row["direction"] == way]
-    names = "packets", "dropped", "busy_ns", "waited_ns"
-    packets, dropped, busy_ns, waited_ns = (sum(row[name] for row in rows) for name in names)
-    duration = rows[-1]["time_s"]
+    way, duration = done[-1].direction, done[-1].time_s
+    names = "packets", "busy_ns", "waited_ns"
+    packets, busy_ns, waited_ns = (sum(map(attrgetter(name), done)) for name in names)
+    dropped = sum(sum(each.dropped.values()) for each in done)
     service, rate = busy_ns * 1e-9 / packets, (packets + dropped) / duration  # [s], offered [1/s]
     expected = dict[str, float]()
     if way != "both" and alone:
@@ -171,8 +181,8 @@ def cell_numbers(log: CellLog, way: str, senders: int, *, alone: bool) -> dict[s
         "utilisation": busy_ns * 1e-9 / duration,
         "wait_mean_ms": waited_ns * 1e-6 / packets,
         **{name: wait * 1e3 if wait < inf else None for name, wait in expected.items()},
-        "wait_max_ms": max(row["longest_ns"] for row in rows) * 1e-6,
-        "waiting_max": max(row["most"] for row in rows),
+        "wait_max_ms": max(each.longest_ns for each in done) * 1e-6,
+        "waiting_max": max(each.most for each in done),
         "packets": packets,
         "dropped": dropped,
     }

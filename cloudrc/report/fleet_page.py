@@ -28,7 +28,7 @@ from cloudrc.report.figures.style import (
     new_figure,
     panel,
 )
-from cloudrc.report.fleet import FleetFlown, remarks, tables
+from cloudrc.report.fleet import FleetFlown, by_direction, remarks, tables
 from cloudrc.report.page import HEADLINES
 from cloudrc.version import __version__
 
@@ -81,7 +81,7 @@ def write_fleet_page(folder: Path, flown: FleetFlown, document: Mapping[str, Any
         headline=f"{document['succeeded']} of {count} robots succeeded.",
         notes="".join(f"<p>{escape(note[0].upper() + note[1:])}.</p>" for note in notes),
         figure=b64encode(_draw(flown, document)).decode(),
-        caption=escape(CAPTION + WAITS * bool(flown.log.ways)),
+        caption=escape(CAPTION + WAITS * bool(flown.log)),
         tables="\n".join(map(_table, tables(document))),
         first=flown.robots[0]["robot"],
         mode=flown.mode,
@@ -105,7 +105,7 @@ def _draw(flown: FleetFlown, document: Mapping[str, Any]) -> bytes:
     """Draw the ages of all robots and, if there is a cell, its waits over time, as SVG."""
     look = Look()
     with own_settings(look):
-        if flown.log.ways:
+        if flown.log:
             figure, (ages, waits) = look.two_panels()
             _draw_waits(waits, flown)
         else:
@@ -125,10 +125,8 @@ def _draw(flown: FleetFlown, document: Mapping[str, Any]) -> bytes:
 
 
 def _draw_waits(axes: Axes, flown: FleetFlown) -> None:
-    for way in flown.log.ways:
-        rows = [row for row in flown.log.rows if row["direction"] == way]
-        waits = [row["longest_ns"] * 1e-6 for row in rows]
-        times = [row["time_s"] for row in rows]
+    for way, done in by_direction(flown.log).items():
+        waits, times = [each.longest_ns * 1e-6 for each in done], [each.time_s for each in done]
         axes.plot(times, waits, color=COLOURS[way], label=way, linewidth=0.8)
     axes.set(xlabel="time [s]", ylabel="longest wait [ms]", ylim=(0, None))
     panel(axes, "b")

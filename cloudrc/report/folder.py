@@ -19,7 +19,7 @@ from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.drivers.local import JOURNAL_FILE, under_way
 from cloudrc.errors import StateError
 from cloudrc.files import read, read_json
-from cloudrc.link.cell import CellLog
+from cloudrc.link.cell import Usage
 from cloudrc.outside.document import parse_yaml
 from cloudrc.outside.paths import check_there
 from cloudrc.outside.refusal import reading
@@ -89,12 +89,15 @@ def robots_in(folder: Path) -> list[Path]:
     return [found[number] for number in sorted(filter(str.isdecimal, found), key=int)]
 
 
-def read_cell(path: Path) -> CellLog:
+def read_cell(path: Path) -> list[Usage]:
     """Read cell.csv, what the cell of a fleet did; without this file there was no cell."""
     if not path.exists():
-        return CellLog(())
-    with reading(path, "is no record of a cell"), path.open(encoding="utf-8", newline="") as file:
-        return CellLog.read(csv.DictReader(file))
+        return []
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return [*map(Usage.read, csv.DictReader(file))]
+    except (ValueError, KeyError, TypeError) as error:
+        raise BadInputError(f"{path}: is not the record of a cell: {error}") from error
 
 
 def _read_merged(folder: Path) -> Recording | None:

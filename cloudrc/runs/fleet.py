@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from cloudrc import assembly
 from cloudrc.cloud.sharing import SharedCompute
@@ -23,7 +23,7 @@ from cloudrc.drivers.local_fleet import CELL_FILE, LocalFleet
 from cloudrc.drivers.virtual import Sink
 from cloudrc.errors import CloudrcError
 from cloudrc.files import read_json, write_json
-from cloudrc.link.cell import CellLog, CellQueue
+from cloudrc.link.cell import Cell, CellQueue
 from cloudrc.link.follow import make_folder
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import cut_to_last_mission, merge
@@ -32,13 +32,21 @@ from cloudrc.report.document import ENVIRONMENT_FILE, Run, environment_document
 from cloudrc.report.fleet import FleetFlown, cloud_numbers, fleet_document
 from cloudrc.report.folder import ROBOT, read_cell, robots_in
 from cloudrc.report.write import write_report
-from cloudrc.runs.fly import VirtualRecorder, end_of, explaining, naming_files, write_merged
+from cloudrc.runs.fly import Report, VirtualRecorder, end_of, explaining, naming_files, write_merged
 from cloudrc.runs.interrupts import raise_if_interrupted
 from cloudrc.runs.own_files import hash_files
 from cloudrc.text import csv_table
 
 AFTER_NS = 200_000_000
 """Time after its mission for which a robot is recorded [ns]; it flies on until all are over."""
+
+
+class _Robot(NamedTuple):
+    """A robot of a fleet, its folder, and what writes its report there."""
+
+    experiment: ResolvedExperiment
+    folder: Path
+    report: Report
 
 
 def fly_fleet(
@@ -54,19 +62,37 @@ def fly_fleet(
 
     Return the fleet's report. `page` and `landed` are those of `runs.fly.fly`.
     """
+    flown, members = FleetFlown(experiment, mode), list[_Robot]()
     with naming_files(folder):
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
         for robot in robots:
-            _folder(folder, robot).mkdir()
-            (_folder(folder, robot) / "config.yaml").write_text(dump(robot), encoding="utf-8")
-        files = [*map(hash_files, robots)]  # now: the user may edit them during the flight
+            own = folder / f"{ROBOT}{robot.fleet.only}"
+            own.mkdir()
+            (own / "config.yaml").write_text(dump(robot), encoding="utf-8")
+            # The hashes now: the user may edit the files during the flight.
+            members.append(_Robot(robot, own, partial(_report, flown, own, hash_files(robot))))
         environment = environment_document(files=hash_files(experiment))
         write_json(folder / ENVIRONMENT_FILE, environment)
         fly = _fly_virtual if mode == "virtual" else _fly_local
-        flown, broken = fly(experiment, robots, folder, files, landed)
+        broken = fly(flown, members, folder, landed)
         document = write_fleet(folder, flown, page=page)
     if broken:
         raise broken
+    return document
+
+
+def _report(
+    flown: FleetFlown,
+    folder: Path,
+    files: dict[str, str],
+    recording: Recording,
+    robot: ResolvedExperiment,
+    run: Run,
+) -> dict[str, Any]:
+    """Write the report of a robot into `folder`, and add what the fleet's needs to `flown`."""
+    run, own = replace(run, files=files), robot.report.metrics
+    document = write_report(folder, recording, robot, run, own=own, page=False)
+    flown.add(recording, robot, document)
     return document
 
 
@@ -89,10 +115,9 @@ def write_again(
     `write` writes the report of a robot, whose folder it gets; it returns the robot's recording,
     experiment and report.
     """
-    cloud = read_json(folder / "report.json").get("cloud")  # it is recorded nowhere else
-    flown = FleetFlown(
-        read_experiment(folder / "config.yaml", flown=True), read_cell(folder / CELL_FILE), cloud
-    )
+    flown = FleetFlown(read_experiment(folder / "config.yaml", flown=True))
+    flown.log = read_cell(folder / CELL_FILE)
+    flown.cloud = read_json(folder / "report.json").get("cloud")  # it is recorded nowhere else
     for robot in robots_in(folder):
         recording, experiment, document = write(robot)
         flown.mode = document["mode"]
@@ -100,85 +125,52 @@ def write_again(
     return write_fleet(folder, flown, page=True)
 
 
-def _folder(folder: Path, robot: ResolvedExperiment) -> Path:
-    return folder / f"{ROBOT}{robot.fleet.only}"
-
-
 def _fly_virtual(
-    experiment: ResolvedExperiment,
-    robots: Sequence[ResolvedExperiment],
-    folder: Path,
-    files: Sequence[dict[str, str]],
-    landed: Callable[[], None],
-) -> tuple[FleetFlown, None]:
-    """Fly in virtual time; write recording and report of each robot."""
-
-    def see(records: list[Record]) -> None:
-        raise_if_interrupted()
-
+    flown: FleetFlown, robots: Sequence[_Robot], folder: Path, landed: Callable[[], None]
+) -> CloudrcError | None:
+    """Fly in virtual time; write recordings and reports; return why the flight ended early."""
     with ExitStack() as stack:
         recorders = [
-            stack.enter_context(VirtualRecorder(robot, _folder(folder, robot), see))
+            stack.enter_context(VirtualRecorder(robot.experiment, robot.folder, _look))
             for robot in robots
         ]
-        fleet = assemble_fleet(experiment, robots, [each.sink for each in recorders])
-        log, interrupted = CellLog(fleet.cells), False
-        try:
-            fleet.fly(log.take)
-        except KeyboardInterrupt:
-            interrupted = True
+        sinks = [each.sink for each in recorders]
+        fleet = assemble_fleet(flown.experiment, [each.experiment for each in robots], sinks)
+        broken, interrupted = end_of(lambda: fleet.fly(flown.log))
         landed()
-        if log.rows:
-            (folder / CELL_FILE).write_text(csv_table(log.rows), encoding="utf-8")
-        cloud = cloud_numbers(fleet, experiment.cloud.command_rate_hz)
-        flown = FleetFlown(experiment, log, cloud)
-        for recorder, hashes in zip(recorders, files, strict=True):
-            report = partial(_report, flown, recorder.folder, hashes)
-            recorder.finish(report, interrupted=interrupted)
-    return flown, None
+        if flown.log:
+            rows = [each.row() for each in flown.log]
+            (folder / CELL_FILE).write_text(csv_table(rows), encoding="utf-8")
+        flown.cloud = cloud_numbers(fleet, flown.experiment.cloud.command_rate_hz)
+        for robot, recorder in zip(robots, recorders, strict=True):
+            recorder.finish(robot.report, interrupted=interrupted)
+    return broken
+
+
+def _look(records: list[Record]) -> None:
+    raise_if_interrupted()
 
 
 def _fly_local(
-    experiment: ResolvedExperiment,
-    robots: Sequence[ResolvedExperiment],
-    folder: Path,
-    files: Sequence[dict[str, str]],
-    landed: Callable[[], None],
-) -> tuple[FleetFlown, CloudrcError | None]:
-    """Fly in real time, as `_fly_virtual`; also return why the flight ended early."""
-    folders = {robot.fleet.only or 0: _folder(folder, robot) for robot in robots}
-    for robot, own in zip(robots, folders.values(), strict=True):
-        make_folder(own / LINK_FOLDER, robot.link_values)
-    has_cell = experiment.cell.rate_kbit is not None
-    local = LocalFleet(folder, folders, lambda records: raise_if_interrupted(), cell=has_cell)
-    limit = max(map(assembly.flight_limit, robots))
+    flown: FleetFlown, robots: Sequence[_Robot], folder: Path, landed: Callable[[], None]
+) -> CloudrcError | None:
+    """Fly in real time, as `_fly_virtual`."""
+    for robot in robots:
+        make_folder(robot.folder / LINK_FOLDER, robot.experiment.link_values)
+    folders = {each.experiment.fleet.only or 0: each.folder for each in robots}
+    has_cell = flown.experiment.cell.rate_kbit is not None
+    local = LocalFleet(folder, folders, _look, cell=has_cell)
+    limit = max(assembly.flight_limit(robot.experiment) for robot in robots)
     broken, interrupted = end_of(lambda: local.fly(limit))
     landed()
-    flown = FleetFlown(experiment, read_cell(folder / CELL_FILE), None, "local")
-    for robot, own, hashes in zip(robots, folders.values(), files, strict=True):
+    flown.log = read_cell(folder / CELL_FILE)
+    for experiment, own, report in robots:
         with explaining(broken, interrupted=interrupted):
             mission = merge(own / "world.mcap", own / "cloud.mcap")
         cut_to_last_mission(mission, after_ns=AFTER_NS)
-        report = partial(_report, flown, own, hashes)
-        write_merged(
-            own, mission, robot, report, local.notes, interrupted=interrupted, broken=broken
-        )
-    return flown, broken
-
-
-def _report(
-    flown: FleetFlown,
-    folder: Path,
-    files: dict[str, str],
-    recording: Recording,
-    robot: ResolvedExperiment,
-    run: Run,
-) -> dict[str, Any]:
-    """Write the report of a robot into `folder`, and add what the fleet's needs to `flown`."""
-    run, own = replace(run, files=files), robot.report.metrics
-    document = write_report(folder, recording, robot, run, own=own, page=False)
-    flown.add(recording, robot, document)
-    return document
+        facts = own, mission, experiment, report, local.notes
+        write_merged(*facts, interrupted=interrupted, broken=broken)
+    return broken
 
 
 def assemble_fleet(
@@ -188,14 +180,10 @@ def assemble_fleet(
     cells, cloud = assembly.build_cells(experiment), experiment.cloud
     computes = any(robot.cloud.compute_ms for robot in robots)
     cores = SharedCores(cloud.cores, cloud.sharing) if cloud.cores and computes else None
-    members = list[Member]()
-    for number, (robot, sink) in enumerate(zip(robots, sinks, strict=True)):
-        orders = robot.uplink.keep_order, robot.downlink.keep_order
-        queue = partial(CellQueue, number, (*cells, *cells)[:2], orders) if cells else None
-        members.append(_build(number, robot, sink, queue, cores))
-    links = [link for robot in robots for link in assembly.build_links(robot)]
-    for cell in cells:
-        cell.delay_ns = min(link.shortest_ns for link in links)
+    members = [
+        _build(number, robot, sink, cells, cores)
+        for number, (robot, sink) in enumerate(zip(robots, sinks, strict=True))
+    ]
     return FleetRun(members, cells, cores)
 
 
@@ -203,16 +191,21 @@ def _build(
     number: int,
     robot: ResolvedExperiment,
     sink: Sink,
-    queue: Callable[..., CellQueue] | None,
+    cells: Sequence[Cell],
     cores: SharedCores | None,
 ) -> Member:
+    """Connect a robot to the cells and cores that it shares."""
+    orders = robot.uplink.keep_order, robot.downlink.keep_order
+    queue = partial(CellQueue, number, cells, orders) if cells else None
     compute, own = None, assembly.build_compute_time(robot)
-    if cores is not None and own is not None:
-        compute = SharedCompute(own)
-        cores.clouds.append(compute)
-        compute.ask = lambda duration_ns: cores.inbox.append(
-            Computation(run.now_ns, number, duration_ns, finish)
+    if cores and own:
+        compute = SharedCompute(
+            own,
+            lambda duration_ns: cores.inbox.append(
+                Computation(run.now_ns, number, duration_ns, finish)
+            ),
         )
+        cores.clouds.append(compute)
     _, cloud, teleop, run = assembly.assemble(robot, queue=queue, compute=compute)
 
     def finish(now_ns: int) -> None:

@@ -19,7 +19,6 @@ from cloudrc.config.fleet import CellConfig
 from cloudrc.config.overrides import OUTSIDE
 from cloudrc.config.problems import problem_at
 from cloudrc.config.resolved import ResolvedExperiment
-from cloudrc.link.cell import CellLog
 from cloudrc.outside.code import apart
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.record.columns import Recording, RecordStore
@@ -63,9 +62,9 @@ class FleetTrial(NamedTuple):
     @apart()
     @reuse_results()
     def _fly(self) -> Row:
-        flown = _Flight(self)
-        flown.run.fly(flown.look)
-        return flown.row()
+        fleet = _Flight(self)
+        fleet.run.fly(fleet.flown.log, fleet.is_over)
+        return fleet.row()
 
 
 def load_trial(
@@ -97,7 +96,7 @@ class _Flight:
     """A fleet in flight."""
 
     def __init__(self, trial: FleetTrial) -> None:
-        self._experiment, seed = trial.flight.experiment, trial.flight.seed
+        self.flown, seed = FleetFlown(trial.flight.experiment), trial.flight.seed
         self._until_failure = trial.until_failure
         self._robots = [robot.model_copy(update={"seed": seed}) for robot in trial.robots]
         self._stores = [RecordStore() for _ in self._robots]
@@ -108,8 +107,7 @@ class _Flight:
         self._fail_alone = 0
         self._failures, self._text = list[str](), ""
         sinks = [partial(self._take, number) for number in self._flying]
-        self.run = assemble_fleet(self._experiment, self._robots, sinks)
-        self._log = CellLog(self.run.cells)
+        self.run = assemble_fleet(self.flown.experiment, self._robots, sinks)
 
     def _take(self, number: int, from_world: list[Record], from_cloud: list[Record]) -> None:
         raise_if_interrupted()
@@ -118,9 +116,8 @@ class _Flight:
             if type(record) is Control and record.waypoint >= 0:
                 self._legs[number] = record.waypoint
 
-    def look(self, now_ns: int) -> bool:
+    def is_over(self, now_ns: int) -> bool:
         """Return whether the flight is over before its end; `now_ns` is the time [ns]."""
-        self._log.take(now_ns)
         return self._until_failure and any(self._fails(each, now_ns) for each in [*self._flying])
 
     def _fails(self, number: int, now_ns: int) -> bool:
@@ -152,8 +149,8 @@ class _Flight:
 
     def row(self) -> Row:
         """Measure all robots up to now; return the row."""
-        rate = self._experiment.cloud.command_rate_hz
-        flown = FleetFlown(self._experiment, self._log, cloud_numbers(self.run, rate))
+        flown = self.flown
+        flown.cloud = cloud_numbers(self.run, flown.experiment.cloud.command_rate_hz)
         rates = list[float]()  # of commands that reached the robot's controller [1/s]
         for number, robot in enumerate(self._robots):
             found = self._judge(number)

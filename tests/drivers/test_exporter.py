@@ -20,6 +20,7 @@ from cloudrc.exposition.table import (
     of_role,
 )
 from cloudrc.link.carry.log import ReleaseErrors
+from cloudrc.link.cell import Usage
 from cloudrc.messages import ZERO
 from cloudrc.records import (
     Contact,
@@ -65,8 +66,8 @@ def exporter(role, flight):
         made.link.shaped("netem", "uplink", "auto", 0.045)
         made.link.shaped("relay", "uplink", "auto", 0.045)  # takes the place of netem
     if role == "cell":
-        row = {"direction": "both", "busy_ns": 5e7, "most": 3, "waited_ns": 4e6, "packets": 2}
-        made.cell.take([row], {("both", 7): 1, ("both", -1): 9})
+        made.cell.expect(8)
+        made.cell.take([Usage("both", 0.1, 2, 250, 50_000_000, 4_000_000, dropped={7: 1, -1: 9})])
     return made
 
 

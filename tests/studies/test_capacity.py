@@ -67,7 +67,7 @@ def test_a_fleet_that_is_stopped_has_the_verdict_of_a_whole_flight(robots):
     members = [each.model_copy(update={"seed": 1}) for each in asked.robots]
     stores = [RecordStore() for _ in members]
     whole = assemble_fleet(asked.flight.experiment, members, [s.add for s in stores])
-    whole.fly()
+    whole.fly([])
     verdicts = [
         assess(Recording(records=store), robot, Run("virtual", "virtual")).verdict
         for store, robot in zip(stores, members, strict=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import select
 import selectors
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from socket import socket
 from typing import Any
 
@@ -55,14 +55,13 @@ class CellEngine(Engine):
 
     def join(self, robot: int, ways: tuple[LinkWay, LinkWay], orders: Sequence[bool]) -> None:
         """Add uplink and downlink of a robot; `orders` tells which of them keep the order."""
+        links = [way.link for way in ways]
+
+        def onward(link: LinkDirection, arrivals: Sequence[int], data: Any) -> None:
+            self.queue.put(self._leave, arrivals, (ways[links.index(link)], 0, data))
+
         self._ways = (*self._ways, *ways)
-        cells = (*self._cells, *self._cells)[:2]
-        queue = _Behind(robot, cells, orders, ways[1].link)
-
-        def put(link: LinkDirection, arrivals: Sequence[int], data: Any) -> None:
-            self.queue.put(self._leave, arrivals, (ways[link is ways[1].link], 0, data))
-
-        queue.onward = put
+        queue = CellQueue(robot, self._cells, orders, links, onward)
         self._queues |= dict.fromkeys(ways, queue)
 
     def step(self, timeout: float) -> None:
@@ -91,15 +90,6 @@ class CellEngine(Engine):
             for at_ns, _, leave in cell.advance(now_ns):
                 leave(at_ns)
             cell.inbox = later
-
-
-class _Behind(CellQueue):
-    """Hands on what has left the cell."""
-
-    onward: Callable[..., None]
-
-    def put(self, link: Any, arrivals: Sequence[int], data: Any) -> None:
-        self.onward(link, arrivals, data)
 
 
 def _soonest_ns(cell: Cell) -> int:
