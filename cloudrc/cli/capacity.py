@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 from cloudrc.cli.output import TABLES, output_argument, print_result, tell, warn
 from cloudrc.cli.parser import (
     Options,
@@ -58,9 +56,8 @@ def execute(options: Options) -> None:
     """Find the capacity of each queue and controller; write and print it, and draw the figure."""
     from cloudrc.cli.progress import Progress
     from cloudrc.files import write_atomically, write_json
-    from cloudrc.outside.paths import lock_folder
     from cloudrc.report.figures.style import Look
-    from cloudrc.runs.folder import new_folder
+    from cloudrc.runs.folder import results_folder
     from cloudrc.runs.requirements import MODES, require
     from cloudrc.studies.capacity import Sought, describe, fly
     from cloudrc.studies.capacity_text import (
@@ -77,11 +74,8 @@ def execute(options: Options) -> None:
     asked = settings_from(options, Sought)
     conditions = asked.conditions()
     warn(*(each.fleet for each in conditions))
-    folder = options.out
-    if folder is None or not (folder / "capacity.json").exists():
-        folder = new_folder(folder, f"capacity-{conditions[0].fleet.name}", "latest-capacity")
-    with lock_folder(folder), Progress("flies") as view:
-        write_json(folder / "capacity.json", {"schemaVersion": 1, **asdict(asked)})
+    name = conditions[0].fleet.name
+    with results_folder(options.out, "capacity", name) as folder, Progress("flies") as view:
         view.say(f"{options.experiment}: how many robots? seeds 1 to {options.seeds}")
         try:
             fly(conditions, Rows(folder), lambda row: view.say(in_words(row)))

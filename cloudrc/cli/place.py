@@ -7,8 +7,7 @@ from typing import Any
 
 from cloudrc.cli.output import TABLE, output_argument, print_result, tell, warn
 from cloudrc.cli.parser import COUNT_MAX, Options, Parser, flags, number, read_count, settings_from
-from cloudrc.outside.paths import lock_folder
-from cloudrc.runs.folder import new_folder
+from cloudrc.runs.folder import results_folder
 from cloudrc.text import escape
 
 EPILOG = """\
@@ -56,18 +55,15 @@ def execute(options: Options) -> int:
 
     study = settings_from(options, PlaceStudy)
     with Progress("checks the flights"):
-        trials = study.plan()
-    warn(*(trial.flight.resolved for trial in trials))
-    name, folder = trials[0].flight.resolved.name, options.out
-    if folder is None or not any(folder.glob("rows*.jsonl")):
-        folder = new_folder(folder, f"place-{name}", "latest-place")
-    with lock_folder(folder):
+        points = study.plan()
+    warn(*(trials[0].resolved for trials in points))
+    name = points[0][0].resolved.name
+    with results_folder(options.out, "place", name) as folder:
         rows = Rows(folder)
-        missing = [trial for trial in trials if trial.key not in rows.kept]
-        settings = [*options.set, *(f"{key}={each}" for key, each in study.disturbances.items())]
+        missing = [trial for trials in points for trial in trials if trial.key not in rows.kept]
         air = "calm" if study.calm else "in wind, with a payload (--calm: without)"
         head = f"{name} {air}, seeds 1 to {study.seeds}, {len(missing)} flights"
-        head = ": ".join(filter(None, (head, ", ".join(settings))))
+        head = ": ".join(filter(None, (head, ", ".join(study.settings))))
         with SweepView(head, len(missing), on_stdout=options.output == TABLE) as view:
             stopped = run(missing, rows, options.jobs, view.see, in_order=False)
     if stopped:
@@ -75,7 +71,7 @@ def execute(options: Options) -> int:
     document = {
         **{"experiment": name, "overrides": options.set, "disturbances": study.disturbances},
         **{"seeds": study.seeds, "interrupted": bool(stopped)},
-        **describe(trials, rows.kept),
+        **describe(points, rows.kept),
     }
     print_result(options.output, document, f"\n{as_text(document)}\n\n{escape(str(folder))}")
     return stopped.exit_code if stopped else 0

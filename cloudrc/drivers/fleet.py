@@ -134,6 +134,7 @@ class FleetRun:
         if not self._media:
             for each in self.members:  # nobody acts on the others
                 each.run.fly(each.over, each.limit_ns, each.sink)
+                self.now_ns = max(self.now_ns, each.run.now_ns)
             return
         flying = [*self.members]
         with without_collections():

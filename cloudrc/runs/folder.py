@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import itertools
 import logging
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.outside.paths import make_folder
+from cloudrc.outside.paths import lock_folder, make_folder
 
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
@@ -50,6 +51,15 @@ def new_folder(
     if link:
         point_to(folder, link)
     return folder
+
+
+@contextlib.contextmanager
+def results_folder(out: Path | None, study: str, name: str) -> Iterator[Path]:
+    """Lock the folder of a study's rows: `out` if it has some, else a new one, as `new_folder`."""
+    if out is None or not any(out.glob("rows*.jsonl")):
+        out = new_folder(out, f"{study}-{name}", f"latest-{study}")
+    with lock_folder(out):
+        yield out
 
 
 def point_to(folder: Path, link: str) -> None:

@@ -21,10 +21,11 @@ from cloudrc.errors import NothingFlownError
 from cloudrc.link.model import HEADER_BYTES
 from cloudrc.link.profile import DIRECTIONS
 from cloudrc.link.waiting import nddd1
+from cloudrc.runs.experiment import load, robots_of
 from cloudrc.runs.flight import ERROR
 from cloudrc.statistics import exact_interval, median_interval
 from cloudrc.trials.fingerprint import experiment_facts, fingerprint
-from cloudrc.trials.fleet import FleetTrial, alone, load_trial
+from cloudrc.trials.fleet import alone, plan_fleet
 from cloudrc.trials.plan import PlannedFlight
 from cloudrc.trials.play import Trial, run
 from cloudrc.trials.rows import Row, Rows
@@ -105,8 +106,8 @@ class Condition:
         }
         own = [f"{key}={value}" for key, value in given.items() if value]
         self._asked, self._settings = asked, [*asked.set, *own, "fleet.only=null"]
-        self._trials, self.point = dict[int, FleetTrial](), dict[str, Any]()
-        self.fleet = self._load(BASES).flight.resolved
+        self._trials, self.point = dict[int, PlannedFlight](), dict[str, Any]()
+        self.fleet = self._load(BASES).resolved
         cell, cloud = self.fleet.cell, self.fleet.cloud
         if cell.rate_kbit is None and not (cloud.cores and cloud.compute_ms):
             text = "the robots share nothing; give a rate [kbit/s], or --set cloud.cores=1 with"
@@ -116,7 +117,9 @@ class Condition:
         self.point |= {"queue": shown, "controller": cloud.controller.name}
         self.bases = list[PlannedFlight]()
         kinds = max(BASES, len(self.fleet.fleet.vary))
-        for robot in map(alone, self._load(kinds).robots):
+        settings = [*self._settings, f"fleet.robots={kinds}"]
+        fleet = load(asked.experiment, settings, fleets=True)
+        for robot in map(alone, robots_of(fleet, asked.experiment, settings)):
             facts = fingerprint(experiment_facts(robot))
             self.bases.append(PlannedFlight(facts, {"robot": robot.fleet.only}, 1, robot))
         self.arithmetic, self.theory = dict[str, float](), dict[str, int]()
@@ -124,10 +127,10 @@ class Condition:
         self.time_limit = self.fleet.criteria.time_limit_s
         self.fleets = defaultdict[int, dict[int, Row]](dict)
 
-    def _load(self, robots: int) -> FleetTrial:
+    def _load(self, robots: int) -> PlannedFlight:
         settings, point = [*self._settings, f"fleet.robots={robots}"], {"robots": robots}
         experiment = self._asked.experiment
-        return load_trial(experiment, settings, self.point | point, until_failure=True)
+        return plan_fleet(experiment, settings, self.point | point, until_failure=True)
 
     def set_base(self, rows: Sequence[Row]) -> None:
         """Take the flights alone: time limit, arithmetic and theory."""
@@ -180,11 +183,11 @@ class Condition:
         }
         return [name for name, is_near in near.items() if is_near]
 
-    def trial(self, robots: int, seed: int) -> FleetTrial:
+    def trial(self, robots: int, seed: int) -> PlannedFlight:
         """Return the flight of a fleet; not before `set_base`."""
         if robots not in self._trials:
             self._trials[robots] = self._load(robots)
-        return self._trials[robots].with_seed(seed)
+        return self._trials[robots]._replace(seed=seed)
 
     @property
     def known(self) -> dict[int, bool]:

@@ -17,7 +17,8 @@ from typing import Any
 from cloudrc.config.overrides import parse_settings
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.text import cells, escape, table
-from cloudrc.trials.fleet import FleetTrial, load_trial
+from cloudrc.trials.fleet import plan_fleet
+from cloudrc.trials.plan import PlannedFlight
 from cloudrc.trials.rows import Row
 
 DISTURBANCES = {
@@ -85,55 +86,55 @@ class PlaceStudy:
             if not self.calm and not any(f"{key}.".startswith(f"{own}.") for own in given)
         }
 
-    def plan(self) -> list[FleetTrial]:
-        """Check all flights; return them in the order of the table."""
-        disturbed = [f"{key}={value}" for key, value in self.disturbances.items()]
-        trials = list[FleetTrial]()
+    @property
+    def settings(self) -> list[str]:
+        """All settings of the flights, as KEY=VALUE, but those of the axes."""
+        return [*self.set, *(f"{key}={value}" for key, value in self.disturbances.items())]
+
+    def plan(self) -> list[list[PlannedFlight]]:
+        """Check all flights; return those of each point, in the order of the table."""
+        points = list[list[PlannedFlight]]()
         with reuse_results():
             for values in product(self.compute, self.robots, self.places):
                 own = (f"{key}={value}" for key, value in zip(AXES.values(), values, strict=True))
-                settings, point = [*self.set, *disturbed, *own], zip(AXES, values, strict=True)
-                trial = load_trial(self.experiment, settings, dict(point), until_failure=False)
-                trials += [trial.with_seed(1 + n) for n in range(self.seeds)]
-        return trials
+                settings, point = [*self.settings, *own], dict(zip(AXES, values, strict=True))
+                first = plan_fleet(self.experiment, settings, point, until_failure=False)
+                points.append([first._replace(seed=1 + n) for n in range(self.seeds)])
+        return points
 
 
-def describe(trials: Iterable[FleetTrial], rows: Mapping[str, Row]) -> dict[str, Any]:
+def describe(points: Iterable[Sequence[PlannedFlight]], rows: Mapping[str, Row]) -> dict[str, Any]:
     """Return a row for each point that has flown, and which place wins, as values for JSON."""
-    points = (
-        [*of_point] for _, of_point in groupby(trials, lambda trial: trial.flight.fingerprint)
-    )
     shown = [
-        _describe_point(each[0], [rows[trial.key] for trial in each])
-        for each in points
-        if all(trial.key in rows for trial in each)
+        _describe_point(trials[0], [rows[trial.key] for trial in trials])
+        for trials in points
+        if all(trial.key in rows for trial in trials)
     ]
-    groups = groupby(shown, itemgetter("compute_ms", "robots"))
-    best = [
-        {"compute_ms": compute, "robots": robots, **judge([*group])}
-        for (compute, robots), group in groups
-    ]
+    axes = "compute_ms", "robots"
+    groups = groupby(shown, itemgetter(*axes))
+    best = [{**dict(zip(axes, values, strict=True)), **judge([*own])} for values, own in groups]
     return {"points": shown, "best": best}
 
 
-def _describe_point(trial: FleetTrial, rows: Sequence[Row]) -> dict[str, Any]:
-    numbers = [row["numbers"] for row in rows]
-    row = {
-        **trial.flight.point,
-        "name": Path(trial.flight.point["place"]).stem,
-        "succeeded": sum(each.get("succeeded", 0) for each in numbers),
-        "flown": trial.flight.resolved.fleet.robots * len(rows),
-    }
-    row["by_seed"] = {name: [each.get(f"{name}_median") for each in numbers] for name in SHOWN}
-    for name, values in row["by_seed"].items():
-        if known := [value for value in values if value is not None]:
-            row[name] = median(known)
+def _describe_point(trial: PlannedFlight, rows: Sequence[Row]) -> dict[str, Any]:
+    numbers, point, fleet = [row["numbers"] for row in rows], trial.point, trial.resolved
     sent = [each["sent_kbit_median"] for each in numbers if "sent_kbit_median" in each]
-    onboard = not trial.flight.resolved.link_values  # nothing leaves the robot
-    row["rate_kbit"] = 0.0 if onboard else mean(sent) if sent else None
+    found = {
+        **point,
+        "name": Path(point["place"]).stem,
+        "succeeded": sum(each.get("succeeded", 0) for each in numbers),
+        "flown": fleet.fleet.robots * len(rows),
+        "by_seed": {name: [each.get(f"{name}_median") for each in numbers] for name in SHOWN},
+        "rate_kbit": mean(sent) if sent else None,
+    }
+    for name, values in found["by_seed"].items():
+        if known := [value for value in values if value is not None]:
+            found[name] = median(known)
+    if not fleet.link_values:  # on board, nothing leaves the robot
+        found["rate_kbit"] = 0.0
     if codes := sorted({code for each in rows for code in each["failures"]}):
-        row["why"] = ", ".join(codes)
-    return row
+        found["why"] = ", ".join(codes)
+    return found
 
 
 def judge(places: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -142,14 +143,14 @@ def judge(places: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     First decides how many robots succeed, then the numbers in `JUDGED`: a place loses if it is
     worse with every seed. All have the same wind with a seed.
     """
-    share = max(each["succeeded"] / each["flown"] for each in places)
-    if share == 0:
+    most = max(each["succeeded"] for each in places)  # of equally many
+    if most == 0:
         return {"places": [], "by": "no robot succeeds anywhere"}
-    best = [each for each in places if each["succeeded"] / each["flown"] == share]
-    by, lost = list[str](), [each for each in places if each not in best]
+    best = [each for each in places if each["succeeded"] == most]
+    by, lost = list[str](), [each for each in places if each["succeeded"] < most]
     if lost:
         shares = (f"{each['succeeded']}/{each['flown']} ({each['name']})" for each in lost)
-        by.append(f"{best[0]['succeeded']}/{best[0]['flown']} succeed, not {', '.join(shares)}")
+        by.append(f"{most}/{best[0]['flown']} succeed, not {', '.join(shares)}")
     for name, (words, form, same) in JUDGED.items():
         if not all(name in each for each in best):
             continue

@@ -11,8 +11,9 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from hashlib import sha256
 from itertools import accumulate
+from operator import itemgetter
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 
 from cloudrc import assembly
 from cloudrc.config.fleet import CellConfig
@@ -39,41 +40,10 @@ LATE_NS = 1_000_000_000
 end the stay at a waypoint a little early."""
 
 
-class FleetTrial(NamedTuple):
-    """The flight of a fleet under one condition, with one seed."""
-
-    flight: PlannedFlight  # of the fleet
-    robots: Sequence[ResolvedExperiment]  # their seeds are not used
-    until_failure: bool = False
-
-    @property
-    def key(self) -> str:
-        """16 hexadecimal digits; equal keys mean equal flights."""
-        return self.flight.key
-
-    def with_seed(self, seed: int) -> FleetTrial:
-        """Return the flight of the same fleet with another seed."""
-        return self._replace(flight=self.flight._replace(seed=seed))
-
-    def play(self) -> Row:
-        """Fly, judge and measure; return the row."""
-        return self.flight.row(flight.or_error(self._fly))
-
-    @apart()
-    @reuse_results()
-    def _fly(self) -> Row:
-        fleet = _Flight(self)
-        fleet.run.fly(fleet.flown.log, fleet.is_over)
-        return fleet.row()
-
-
-def load_trial(
+def plan_fleet(
     experiment: str, settings: Sequence[str], point: Mapping[str, Any], *, until_failure: bool
-) -> FleetTrial:
-    """Load and check a fleet and each of its robots, for a flight with seed 1.
-
-    `point` are axis -> value.
-    """
+) -> PlannedFlight:
+    """Load and check a fleet and each of its robots; return its flight with seed 1."""
     check_no_seed(settings)
     fleet = load(experiment, settings, fleets=True)
     if fleet.cloud.controller.name in OUTSIDE:
@@ -82,7 +52,23 @@ def load_trial(
     for robot in robots:
         check_world(robot.world, turns=robot.mission.turns)
     known = fingerprint(*map(experiment_facts, (fleet, *robots)))
-    return FleetTrial(PlannedFlight(known, {**point}, 1, fleet), robots, until_failure)
+    fly = partial(fly_fleet, robots, until_failure)
+    return PlannedFlight(known, {**point}, 1, fleet, fly)
+
+
+def fly_fleet(
+    robots: Sequence[ResolvedExperiment], until_failure: bool, fleet: ResolvedExperiment
+) -> Row:
+    """Fly, judge and measure a fleet; its robots get its seed. Return the results of the row."""
+
+    @apart()
+    @reuse_results()
+    def fly() -> Row:
+        seed = {"seed": fleet.seed}
+        flown = FleetFlight(fleet, [each.model_copy(update=seed) for each in robots])
+        return flown.fly(until_failure=until_failure)
+
+    return flight.or_error(fly)
 
 
 def alone(robot: ResolvedExperiment) -> ResolvedExperiment:
@@ -92,22 +78,38 @@ def alone(robot: ResolvedExperiment) -> ResolvedExperiment:
     return robot.model_copy(update={"cell": CellConfig(), "cloud": cloud, "fleet": own})
 
 
-class _Flight:
+class FleetFlight:
     """A fleet in flight."""
 
-    def __init__(self, trial: FleetTrial) -> None:
-        self.flown, seed = FleetFlown(trial.flight.experiment), trial.flight.seed
-        self._until_failure = trial.until_failure
-        self._robots = [robot.model_copy(update={"seed": seed}) for robot in trial.robots]
-        self._stores = [RecordStore() for _ in self._robots]
-        self._legs = [0 for _ in self._robots]  # waypoint to which each flies
-        self._latest_ns = [_latest_ns(robot) for robot in self._robots]
+    def __init__(self, fleet: ResolvedExperiment, robots: Sequence[ResolvedExperiment]) -> None:
+        """Build the robots, and what they share."""
+        self._flown, self._robots = FleetFlown(fleet), robots
+        self._stores = [RecordStore() for _ in robots]
+        self._legs = [0 for _ in robots]  # waypoint to which each flies
+        self._latest_ns = [_latest_ns(robot) for robot in robots]
         self._judged = dict[int, Assessment]()
-        self._flying = {*range(len(self._robots))}  # numbers of those that may still fail
+        self._flying = {*range(len(robots))}  # numbers of those that may still fail
         self._fail_alone = 0
         self._failures, self._text = list[str](), ""
         sinks = [partial(self._take, number) for number in self._flying]
-        self.run = assemble_fleet(self.flown.experiment, self._robots, sinks)
+        self._run = assemble_fleet(fleet, robots, sinks)
+
+    def fly(self, *, until_failure: bool) -> Row:
+        """Fly to the end, or until a robot has failed that succeeds alone; return the results."""
+        self._run.fly(self._flown.log, self._has_failed if until_failure else lambda now_ns: False)
+        document = self._measure()
+        if not until_failure and document["failures"]:
+            verdicts = [found.verdict for found in self._judged.values()]
+            self._failures = sorted({each.code for own in verdicts for each in own.failures})
+            self._text = document["failures"][0]["text"]
+        hashes = "".join(robot["records_sha256"] for robot in document["robots"])
+        return {
+            "verdict": "failure" if self._failures else "success",
+            "failures": self._failures,
+            "text": self._text,
+            "numbers": self._numbers(document),
+            "records_sha256": sha256(hashes.encode()).hexdigest(),
+        }
 
     def _take(self, number: int, from_world: list[Record], from_cloud: list[Record]) -> None:
         raise_if_interrupted()
@@ -116,13 +118,12 @@ class _Flight:
             if type(record) is Control and record.waypoint >= 0:
                 self._legs[number] = record.waypoint
 
-    def is_over(self, now_ns: int) -> bool:
-        """Return whether the flight is over before its end; `now_ns` is the time [ns]."""
-        return self._until_failure and any(self._fails(each, now_ns) for each in [*self._flying])
+    def _has_failed(self, now_ns: int) -> bool:
+        return any(self._fails(number, now_ns) for number in [*self._flying])
 
     def _fails(self, number: int, now_ns: int) -> bool:
         """Return whether a robot that succeeds alone has failed, or can no longer end in time."""
-        member, leg = self.run.members[number], self._legs[number]
+        member, leg = self._run.members[number], self._legs[number]
         if member.over() or now_ns >= member.limit_ns:
             failures = self._judge(number).verdict.failures
             codes, text = [each.code for each in failures], failures[0].text if failures else ""
@@ -147,48 +148,32 @@ class _Flight:
             self._judged[number] = assess(recording, robot, run, robot.report.metrics)
         return self._judged[number]
 
-    def row(self) -> Row:
-        """Measure all robots up to now; return the row."""
-        flown = self.flown
-        flown.cloud = cloud_numbers(self.run, flown.experiment.cloud.command_rate_hz)
-        rates = list[float]()  # of commands that reached the robot's controller [1/s]
+    def _measure(self) -> dict[str, Any]:
+        """Return the report of the fleet, from all robots up to now."""
+        flown = self._flown
+        flown.cloud = cloud_numbers(self._run, flown.experiment.cloud.command_rate_hz)
         for number, robot in enumerate(self._robots):
             found = self._judge(number)
             flown.add(found.flight.recording, robot, found.document)
-            duration = found.numbers.get("duration")
-            time = duration.value if duration else self.run.now_ns * 1e-9
-            applied = found.numbers.get("commands_applied")
-            rates.append(applied.value / time if applied and time else 0.0)
-        document = fleet_document(flown)
-        if not self._until_failure:
-            failed = [found for found in self._judged.values() if found.verdict.failures]
-            codes = {each.code for found in failed for each in found.verdict.failures}
-            self._failures = sorted(codes)
-            self._text = failed[0].verdict.failures[0].text if failed else ""
+        return fleet_document(flown)
+
+    def _numbers(self, document: Mapping[str, Any]) -> dict[str, float]:
+        """Return the numbers of the row; `document` is the fleet's report."""
+        end_s, rates = self._run.now_ns * 1e-9, list[float]()  # that reached each controller [1/s]
+        for found in self._judged.values():
+            known = {name: each.value for name, each in found.numbers.items()}
+            rates.append(known.get("commands_applied", 0.0) / (known.get("duration") or end_s))
+        busiest = max(document["cell"], key=itemgetter("load"), default=dict[str, float]())
         numbers = {
-            f"{name}_{which}": value
-            for which in ("median", "worst")
-            for name, value in document[which].items()
+            **{f"{name}_median": value for name, value in document["median"].items()},
+            **{f"{name}_worst": value for name, value in document["worst"].items()},
+            **{"rate_hz_median": median(rates), "rate_hz_worst": min(rates)},
+            **{name: busiest.get(name) for name in ("load", "wait_mean_ms", "nddd1_ms")},
+            "cloud_hz": (document["cloud"] or {}).get("rate_hz"),
+            **{"succeeded": document["succeeded"], "fail_alone": self._fail_alone},
+            "flown_s": end_s,
         }
-        ways: list[Row] = document["cell"]
-        busiest = max(ways, key=lambda way: way["load"], default={})
-        names = "load", "wait_mean_ms", "nddd1_ms"
-        hashes = "".join(robot["records_sha256"] for robot in document["robots"])
-        return {
-            "verdict": "failure" if self._failures else "success",
-            "failures": self._failures,
-            "text": self._text,
-            "numbers": {
-                **numbers,
-                **{"rate_hz_median": median(rates), "rate_hz_worst": min(rates)},
-                **{name: busiest[name] for name in names if busiest.get(name) is not None},
-                **({"cloud_hz": document["cloud"]["rate_hz"]} if document["cloud"] else {}),
-                "succeeded": document["succeeded"],
-                "fail_alone": self._fail_alone,
-                "flown_s": self.run.now_ns * 1e-9,
-            },
-            "records_sha256": sha256(hashes.encode()).hexdigest(),
-        }
+        return {name: value for name, value in numbers.items() if value is not None}
 
 
 def _latest_ns(robot: ResolvedExperiment) -> list[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -36,6 +36,7 @@ class PlannedFlight(NamedTuple):
     point: dict[str, Any]  # axis -> value or name
     seed: int
     resolved: ResolvedExperiment  # experiment of the point; its seed is not used
+    fly: Callable[[ResolvedExperiment], Row] = flight.fly_point
 
     @property
     def key(self) -> str:
@@ -49,7 +50,7 @@ class PlannedFlight(NamedTuple):
 
     def play(self) -> Row:
         """Fly; return the row."""
-        return self.row(flight.fly_point(self.experiment))
+        return self.row(self.fly(self.experiment))
 
     def row(self, flown: Row) -> Row:
         """Return the flight's row; `flown` has the results, such as the verdict."""

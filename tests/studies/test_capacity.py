@@ -64,9 +64,9 @@ def test_a_robot_that_fails_alone_does_not_count():
 def test_a_fleet_that_is_stopped_has_the_verdict_of_a_whole_flight(robots):
     asked = trial(robots)
     row = asked.play()
-    members = [each.model_copy(update={"seed": 1}) for each in asked.robots]
+    members = [each.model_copy(update={"seed": 1}) for each in asked.fly.args[0]]
     stores = [RecordStore() for _ in members]
-    whole = assemble_fleet(asked.flight.experiment, members, [s.add for s in stores])
+    whole = assemble_fleet(asked.experiment, members, [s.add for s in stores])
     whole.fly([])
     verdicts = [
         assess(Recording(records=store), robot, Run("virtual", "virtual")).verdict
