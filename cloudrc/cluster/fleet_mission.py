@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import re
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
 from http.client import HTTPConnection
@@ -16,14 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cluster.client import ClusterError, Release, explain_errors, run
 from cloudrc.cluster.jobs import AT, KILLED_WATCHER, Ended, JobReader
-from cloudrc.cluster.pods import (
-    CELL,
-    DATA,
-    INDEX,
-    METRICS,
-    find_pod,
-    list_pods,
-)
+from cloudrc.cluster.pods import CELL, DATA, INDEX, METRICS, find_pod, list_pods
 from cloudrc.errors import CloudrcError, to_one_line
 
 if TYPE_CHECKING:
@@ -33,13 +27,13 @@ ROBOT = "batch.kubernetes.io/job-completion-index"
 """Annotation of a Job's pod: the robot that it flies."""
 PAUSE = 0.2
 """Time between the requests for the metrics of two robots [s]: 5 requests a second."""
-COUNTERS = {
-    "age_s": "cloudrc_command_age_seconds_sum",
-    "ages": "cloudrc_command_age_seconds_count",
-    "hold_s": "cloudrc_guard_held_seconds_total",
-}
-"""Name of a number -> counter in the metrics of world."""
-Numbers = dict[str, float]
+COUNTERS = (
+    "cloudrc_command_age_seconds_sum",
+    "cloudrc_command_age_seconds_count",
+    "cloudrc_guard_held_seconds_total",
+)
+"""Counters of world: ages of all commands [s], number of commands, time in HOLD [s]."""
+Metrics = dict[str, float]
 
 
 def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> Ended:
@@ -74,7 +68,7 @@ def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> En
         pass
     record, after = _read_cell(release), _read_robots(release)
     rows = [
-        {"robot": robot, **_verdict(end), **_flown(before.get(robot), after.get(robot))}
+        {"robot": robot, **_verdict(end), **_flown(before[robot], after[robot])}
         for robot, end in ended.items()
     ]
     for line in ["", *summarize_fleet(_document(rows, record, start)).splitlines()]:
@@ -92,13 +86,12 @@ def _verdict(end: Ended) -> dict[str, str]:
     return {"verdict": named.get(end.exit_code, "interrupted"), **why}
 
 
-def _flown(before: Numbers | None, after: Numbers | None) -> Numbers:
+def _flown(before: Metrics, after: Metrics) -> dict[str, float]:
     """Return the numbers of a robot's mission from its counters before and after it."""
-    if before is None or after is None:
+    if not (before and after):
         return {}
-    new = {name: after[name] - before[name] for name in COUNTERS}
-    age = {"age_ms": new["age_s"] / new["ages"] * 1e3} if new["ages"] > 0 else {}
-    return {"hold_s": new["hold_s"], **age}
+    ages, count, held = (after.get(name, 0.0) - before.get(name, 0.0) for name in COUNTERS)
+    return {"hold_s": held, **({"age_ms": ages / count * 1e3} if count > 0 else {})}
 
 
 def _document(rows: list[dict[str, Any]], record: list[Usage], start: float) -> Any:
@@ -133,9 +126,9 @@ def _read_cell(release: Release) -> list[Usage]:
     return [*map(Usage.read, csv.DictReader(lines))]
 
 
-def _read_robots(release: Release) -> dict[int, Numbers]:
-    """Read the counters of each robot's world; leave out a robot that does not answer."""
-    found = dict[int, Numbers]()
+def _read_robots(release: Release) -> dict[int, Metrics]:
+    """Read the metrics of each robot's world; those of a robot that does not answer are {}."""
+    found = defaultdict[int, Metrics](dict)
     for pod in list_pods(release, "world"):
         time.sleep(PAUSE)
         try:
@@ -144,8 +137,7 @@ def _read_robots(release: Release) -> dict[int, Numbers]:
             continue
         lines = (line.rpartition(" ") for line in text.splitlines() if not line.startswith("#"))
         values = {name: float(value) for name, _, value in lines}
-        number = int(pod.metadata.labels[INDEX])
-        found[number] = {name: values.get(metric, 0.0) for name, metric in COUNTERS.items()}
+        found[int(pod.metadata.labels[INDEX])] = values
     return found
 
 
