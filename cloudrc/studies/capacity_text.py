@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from math import nan
 from typing import Any
 
@@ -38,6 +39,8 @@ LIMITS = {
     "cloud_rate": "the cloud computes {cloud_hz:.0f} commands a second for a robot",
 }
 """Limit that a fleet has come near to -> how."""
+Values = tuple[float, float, float]
+"""A value and its band."""
 CAPTION = (
     "Success: share of fleets in which all robots succeed that succeed alone, and Clopper and "
     "Pearson's 95 % interval. Age and commands: the worst robot of a fleet, median over the "
@@ -50,17 +53,17 @@ def _name(condition: Mapping[str, Any]) -> str:
     return f"{condition['queue']}, {condition['controller']}"
 
 
-def rows_of(document: Mapping[str, Any]) -> list[dict[str, Any]]:
+def rows_of(document: Mapping[str, Any]) -> list[Row]:
     """Return a flat row for each condition and size of a fleet."""
+    names = "queue", "controller", "robots", "fleets", "success"
+    rows = ({**each, **fleet} for each in document["conditions"] for fleet in each["fleets"])
     return [
         {
-            **{name: each[name] for name in ("queue", "controller")},
-            **{name: fleet[name] for name in ("robots", "fleets", "success")},
-            **dict(zip(("low", "high"), fleet["interval"], strict=True)),
-            **fleet["numbers"],
+            **{name: row[name] for name in names},
+            **dict(zip(("low", "high"), row["interval"], strict=True)),
+            **row["numbers"],
         }
-        for each in document["conditions"]
-        for fleet in each["fleets"]
+        for row in rows
     ]
 
 
@@ -122,41 +125,35 @@ def _binding(each: Mapping[str, Any]) -> Iterator[str]:
 
 def draw_capacity(document: Mapping[str, Any], look: Look) -> dict[str, bytes]:
     """Draw success, age and rate over the number of robots; return the figure by suffix."""
-    conditions = {_name(each): each for each in document["conditions"]}
-    first = document["conditions"][0]
+    conditions, first = document["conditions"], document["conditions"][0]
     marks = {f"arithmetic, {name}": value for name, value in first["arithmetic"].items()}
     marks |= {f"theory, {name}": value for name, value in first["theory"].items()}
 
-    def lines(name: str) -> dict[str, Sequence[Point]]:
+    def lines(values: Callable[[Row], Values]) -> dict[str, Sequence[Point]]:
         return {
-            key: [_point(fleet, name) for fleet in each["fleets"]]
-            for key, each in conditions.items()
+            _name(each): [
+                Point(fleet["robots"], *values(fleet), fleet["success"] < fleet["fleets"])
+                for fleet in each["fleets"]
+            ]
+            for each in conditions
         }
 
-    success = {
-        key: [
-            Point(each["robots"], *_share(each), each["success"] < each["fleets"])
-            for each in own["fleets"]
-        ]
-        for key, own in conditions.items()
-    }
-    limit = first["age_max_ms"]
+    limit, age = first["age_max_ms"], "age of the command, p99; dashed: the guard's limit"
     panels = [
-        Panel("fleets that succeed", "%", success, marks=marks),
-        Panel(
-            "age of the command, p99; dashed: the guard's limit", "ms", lines("age_p99_ms"), limit
-        ),
-        Panel("commands", "Hz", lines("rate_hz")),
+        Panel("fleets that succeed", "%", lines(_share), marks=marks),
+        Panel(age, "ms", lines(partial(_worst, "age_p99_ms")), limit),
+        Panel("commands", "Hz", lines(partial(_worst, "rate_hz"))),
     ]
     return draw(panels, "robots", [], "queue, controller", look=look)
 
 
-def _share(fleet: Mapping[str, Any]) -> tuple[float, float, float]:
+def _share(fleet: Row) -> Values:
+    """Return the share of successes and its interval [%]."""
     low, high = fleet["interval"] if fleet["fleets"] > 1 else (nan, nan)
     return 100 * fleet["success"] / fleet["fleets"], 100 * low, 100 * high
 
 
-def _point(fleet: Mapping[str, Any], name: str) -> Point:
-    worst, middle = (fleet["numbers"].get(f"{name}_{which}", nan) for which in ("worst", "median"))
-    ends = min(worst, middle), max(worst, middle)
-    return Point(fleet["robots"], worst, *ends, fleet["success"] < fleet["fleets"])
+def _worst(name: str, fleet: Row) -> Values:
+    """Return a number of the worst robot, and the band from it to the median robot."""
+    both = [fleet["numbers"].get(f"{name}_{which}", nan) for which in ("worst", "median")]
+    return both[0], min(both), max(both)
