@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import product
+from itertools import islice, product
 from operator import itemgetter
 from statistics import fmean, median_low
 from typing import Any
@@ -27,7 +27,7 @@ from cloudrc.statistics import exact_interval, median_interval
 from cloudrc.trials.fingerprint import experiment_facts, fingerprint
 from cloudrc.trials.fleet import alone, plan_fleet
 from cloudrc.trials.plan import PlannedFlight
-from cloudrc.trials.play import Trial, run
+from cloudrc.trials.play import run
 from cloudrc.trials.rows import Row, Rows
 
 SLACK = 1.4
@@ -37,8 +37,6 @@ BASES = 4
 """Smallest number of robots that fly alone first; one may fail by itself."""
 GROWTH = 2
 """Growth of the fleet from one size to the next, until one fails [1]."""
-FILL = 4
-"""Number of fleets that fly beside those of a search, so that no core waits for it."""
 RESUME_HZ = 20.0
 """Rate of commands below which a HOLD does not end [1/s].
 Source: docs/reference/plant.md, "Leaving HOLD": 10 commands within 500 ms."""
@@ -64,22 +62,19 @@ class Sought:
         return [Condition(self, queue, controller) for queue, controller in pairs]
 
 
-def next_size(known: Mapping[int, bool], start: int, top: int) -> int | None:
-    """Return the size of the next fleet to try, from `start` on and up to `top`.
+def search(start: int, top: int, succeeds: Callable[[int], bool]) -> Iterator[int]:
+    """Yield sizes of fleets to try, up to `top`; after each, `succeeds` tells whether it does.
 
-    `known` are size -> whether the fleet succeeds. None if the largest size that succeeds is known.
+    It ends at a size that succeeds next to one that fails.
     """
-    if not known:
-        return min(start, top)
-    yes, no = largest(known), min((size for size, ok in known.items() if not ok), default=top + 1)
-    if no - yes <= 1:
-        return None
-    return min(top, max(yes + 1, yes * GROWTH)) if no > top else (yes + no) // 2
-
-
-def largest(known: Mapping[int, bool]) -> int:
-    """Return the largest size of a fleet that succeeds; 0 if none does."""
-    return max((size for size, ok in known.items() if ok), default=0)
+    yes, no, size = 0, top + 1, min(start, top)
+    while no - yes > 1:
+        yield size
+        if succeeds(size):
+            yes = size
+        else:
+            no = size
+        size = min(top, max(yes + 1, yes * GROWTH)) if no > top else (yes + no) // 2
 
 
 class Condition:
@@ -106,8 +101,8 @@ class Condition:
         }
         own = [f"{key}={value}" for key, value in given.items() if value]
         self._asked, self._settings = asked, [*asked.set, *own, "fleet.only=null"]
-        self._trials, self.point = dict[int, PlannedFlight](), dict[str, Any]()
-        self.fleet = self._load(BASES).resolved
+        self.point = dict[str, Any]()
+        self.fleet = self.flight(BASES).resolved
         cell, cloud = self.fleet.cell, self.fleet.cloud
         if cell.rate_kbit is None and not (cloud.cores and cloud.compute_ms):
             text = "the robots share nothing; give a rate [kbit/s], or --set cloud.cores=1 with"
@@ -127,7 +122,8 @@ class Condition:
         self.time_limit = self.fleet.criteria.time_limit_s
         self.fleets = defaultdict[int, dict[int, Row]](dict)
 
-    def _load(self, robots: int) -> PlannedFlight:
+    def flight(self, robots: int) -> PlannedFlight:
+        """Load a fleet; return its flight with seed 1, until a failure."""
         settings, point = [*self._settings, f"fleet.robots={robots}"], {"robots": robots}
         experiment = self._asked.experiment
         return plan_fleet(experiment, settings, self.point | point, until_failure=True)
@@ -183,67 +179,48 @@ class Condition:
         }
         return [name for name, is_near in near.items() if is_near]
 
-    def trial(self, robots: int, seed: int) -> PlannedFlight:
-        """Return the flight of a fleet; not before `set_base`."""
-        if robots not in self._trials:
-            self._trials[robots] = self._load(robots)
-        return self._trials[robots]._replace(seed=seed)
+    def search(self) -> Iterator[PlannedFlight]:
+        """Yield flights with seed 1, each once the one before is in `fleets`."""
+        start = int(min(self.arithmetic.values(), default=1)) or 1
+        for size in search(start, self._asked.max, lambda size: succeeded(self.fleets[size][1])):
+            yield self.flight(size)
 
     @property
-    def known(self) -> dict[int, bool]:
-        """Number of robots -> whether the fleet with seed 1 succeeds."""
-        return {size: succeeded(rows[1]) for size, rows in self.fleets.items() if 1 in rows}
-
-    def next_size(self) -> int | None:
-        """Return the size that the search tries next, with seed 1; None if it has ended."""
-        start = int(min(self.arithmetic.values(), default=1)) or 1
-        return next_size(self.known, start, self._asked.max)
-
     def around(self) -> list[int]:
-        """Return the sizes that fly with all seeds: the one found, one less and one more."""
-        found = largest(self.known)
+        """The sizes that decide: the largest one that succeeds, one less and one more."""
+        found = max((n for n, rows in self.fleets.items() if succeeded(rows[1])), default=0)
         return [*range(max(1, found - 1), min(self._asked.max, found + 1) + 1)]
 
-    def missing(self) -> list[tuple[int, int]]:
-        """Return size and seed of those that have not flown."""
-        every = product(self.around(), range(1, self._asked.seeds + 1))
-        return [(size, seed) for size, seed in every if seed not in self.fleets[size]]
+    def decisive(self) -> Iterator[PlannedFlight]:
+        """Yield the flights of these sizes with all seeds."""
+        for flight in map(self.flight, self.around):
+            yield from (flight._replace(seed=1 + n) for n in range(self._asked.seeds))
 
 
-def fly(
-    conditions: Sequence[Condition], rows: Rows, see: Callable[[Row], None] = lambda row: None
-) -> None:
+def fly(conditions: Sequence[Condition], rows: Rows, see: Callable[[Row], None]) -> None:
     """Fly what has no row in `rows`; raise the reason if that ends early.
 
     Call `see` with the row of each fleet that has flown.
     """
-    bases = {each.key: each for one in conditions for each in one.bases}
-    _play([*bases.values()], rows)
+    bases = {base.key: base for each in conditions for base in each.bases}
+    if stopped := run(bases.values(), rows, len(bases), in_order=False):
+        raise stopped
     for each in conditions:
         each.set_base([rows.kept[base.key] for base in each.bases])
-    while fleets := _next(conditions):
-        trials = [condition.trial(size, seed) for condition, size, seed in fleets]
-        _play(trials, rows, see)
-        for (condition, size, seed), trial in zip(fleets, trials, strict=True):
-            condition.fleets[size][seed] = rows.kept[trial.key]
+    searches = [(each, each.search()) for each in conditions]
+    while tried := [(each, flight) for each, own in searches for flight in islice(own, 1)]:
+        _fly(tried, rows, see)
+    _fly([(each, flight) for each in conditions for flight in each.decisive()], rows, see)
 
 
-def _next(conditions: Sequence[Condition]) -> list[tuple[Condition, int, int]]:
-    """Return condition, size and seed of the fleets that fly next: those of all searches.
-
-    Fleets of the searches that have ended fly beside them.
-    """
-    sizes = [(each, each.next_size()) for each in conditions]
-    searched = [(each, size, 1) for each, size in sizes if size is not None]
-    others = [(each, *fleet) for each, size in sizes if size is None for fleet in each.missing()]
-    return searched + others[: FILL if searched else None]
-
-
-def _play(
-    trials: Sequence[Trial], rows: Rows, see: Callable[[Row], None] = lambda row: None
+def _fly(
+    fleets: Sequence[tuple[Condition, PlannedFlight]], rows: Rows, see: Callable[[Row], None]
 ) -> None:
-    if stopped := run(trials, rows, len(trials), see, in_order=False):
+    """Fly fleets, and give each condition the rows of its own."""
+    if stopped := run((flight for _, flight in fleets), rows, len(fleets), see, in_order=False):
         raise stopped
+    for condition, flight in fleets:
+        condition.fleets[flight.point["robots"]][flight.seed] = rows.kept[flight.key]
 
 
 def succeeded(row: Row) -> bool:
@@ -285,7 +262,7 @@ def describe(asked: Sought, conditions: Sequence[Condition]) -> dict[str, Any]:
 def _describe(condition: Condition, top: int) -> dict[str, Any]:
     decisive = {
         size: {seed: succeeded(row) for seed, row in sorted(condition.fleets[size].items())}
-        for size in condition.around()
+        for size in condition.around
     }
     capacity = capacity_of(decisive, top)
     fleets = [_summary(size, [*rows.values()]) for size, rows in sorted(condition.fleets.items())]

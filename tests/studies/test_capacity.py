@@ -6,8 +6,7 @@ from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 from cloudrc.runs.fleet import assemble_fleet
-from cloudrc.studies.capacity import Condition, Sought, capacity_of, next_size
-from cloudrc.studies.capacity import largest as largest_of
+from cloudrc.studies.capacity import Condition, Sought, capacity_of, search
 
 SHORT = (
     *("mission.steps.count=8", "mission.steps.period_s=0.5"),
@@ -16,26 +15,17 @@ SHORT = (
 DEAF = "fleet.vary=[{world.odometry_rate_hz: 100}, {link.both.loss: 1}]"
 
 
-def trial(robots, *settings, seed=1):
+def flight(robots, *settings):
     asked = Sought("steps", (*SHORT, *settings), 300, ["fifo:20"], [], 1, 4)
-    return Condition(asked, "fifo:20", "").trial(robots, seed)
-
-
-def find(largest, start):
-    """Search for a largest size; return what is known at the end."""
-    known = {}
-    while size := next_size(known, start, 64):
-        assert size not in known
-        known[size] = size <= largest
-    return known
+    return Condition(asked, "fifo:20", "").flight(robots)
 
 
 @pytest.mark.parametrize("start", [1, 5, 40, 100])
 @pytest.mark.parametrize("largest", [0, 1, 5, 13, 63, 64])
 def test_the_search_finds_where_success_ends_within_a_few_fleets(start, largest):
-    known = find(largest, start)
-    assert largest_of(known) == largest
-    assert len(known) <= 12
+    tries = [*search(start, 64, lambda size: size <= largest)]
+    assert max((size for size in tries if size <= largest), default=0) == largest
+    assert len(tries) == len({*tries}) <= 12
 
 
 def test_the_seeds_decide_the_capacity_and_one_beyond_the_flown_sizes_is_a_bound():
@@ -55,14 +45,14 @@ def test_the_seeds_decide_the_capacity_and_one_beyond_the_flown_sizes_is_a_bound
 
 
 def test_a_robot_that_fails_alone_does_not_count():
-    row = trial(2, DEAF).play()
+    row = flight(2, DEAF).play()
     assert row["verdict"] == "success"
     assert row["numbers"]["fail_alone"] == 1
 
 
 @pytest.mark.parametrize("robots", [1, 2])
 def test_a_fleet_that_is_stopped_has_the_verdict_of_a_whole_flight(robots):
-    asked = trial(robots)
+    asked = flight(robots)
     row = asked.play()
     members = [each.model_copy(update={"seed": 1}) for each in asked.fly.args[0]]
     stores = [RecordStore() for _ in members]
