@@ -137,18 +137,18 @@ class Cell:
                 ((source.next_ns, -flow) for flow, source in self.traffic.items()),
                 default=(NOTHING_NS, 0),
             )
-            if self.done_ns <= min(sent_ns, other_ns):
-                if self.done_ns > until_ns:
-                    return
+            new_ns = min(sent_ns, other_ns)
+            if self.done_ns <= min(new_ns, until_ns):
                 now_ns, packet = self.done_ns, self._leave()
                 if packet.flow >= 0:
                     yield now_ns, packet.flow, packet.leave
+            elif new_ns >= until_ns:
+                break
             elif sent_ns <= other_ns:
                 self.put(inbox.pop())
-            elif other_ns < until_ns:
-                self.traffic[-others].fire(self)
             else:
-                return
+                self.traffic[-others].fire(self)
+        self.inbox += inbox  # what is sent later
 
     def put(self, packet: CellPacket) -> bool:
         """Let a packet wait; return False if it is dropped, because the queue is full."""

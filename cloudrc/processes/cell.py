@@ -25,7 +25,7 @@ from cloudrc.config.resolved import ResolvedExperiment
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.drivers.process import Feed, StopSignal
 from cloudrc.drivers.realtime import Address, bind
-from cloudrc.link.carry.cell import CellEngine, EntrancePort
+from cloudrc.link.carry.cell import CellEngine, CellPort
 from cloudrc.link.carry.engine import LinkWay
 from cloudrc.link.carry.log import PacketLog
 from cloudrc.link.carry.punctual import ask_for_fifo, settle
@@ -107,7 +107,7 @@ def _open(
     cells = assembly.build_cells(experiment, origin_ns)
     outside = opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
     outside.setblocking(False)
-    port = EntrancePort()
+    port = CellPort(cells)
     engine, exits = CellEngine(port, cells), list[WayOut]()
     for robot in range(count):
         own = read_experiment(str(settings.config), robot_settings(robot))

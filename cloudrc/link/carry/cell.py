@@ -21,22 +21,27 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.queue import NOTHING_NS
 
 
-class EntrancePort:
-    """Takes in at many sockets."""
+class CellPort:
+    """Takes in at many sockets, and wakes when the cell has to go on."""
 
-    def __init__(self) -> None:
-        """Create a port without sockets."""
-        self._selector = selectors.DefaultSelector()
+    def __init__(self, cells: Sequence[Cell]) -> None:
+        """Create a port without sockets for the cells of both ways, or the one of both."""
+        self._cells, self._selector = cells, selectors.DefaultSelector()
 
     def add(self, one: socket, entrance: Entrance) -> None:
         """Take in at a socket, too, which `entrance` reads."""
         self._selector.register(one, selectors.EVENT_READ, entrance)
 
     def wait(self, until_ns: int) -> bool:
-        """Wait until datagrams have come, or until a time [ns]; return whether some have come."""
-        timeout = max(0.0, (until_ns - time.monotonic_ns()) * 1e-9)
+        """Wait until datagrams have come or packets leave the cell, or until a time [ns].
+
+        Return whether the engine has to take in.
+        """
+        cell_ns = min(map(_soonest_ns, self._cells))
+        timeout = max(0.0, (min(until_ns, cell_ns) - time.monotonic_ns()) * 1e-9)
         # The selector itself waits for whole milliseconds.
-        return bool(select.select([self._selector], (), (), timeout)[0])
+        has_come = bool(select.select([self._selector], (), (), timeout)[0])
+        return has_come or cell_ns <= time.monotonic_ns()
 
     def take(self) -> Iterator[Packet]:
         """Read up to `BATCH` datagrams from each socket."""
@@ -64,19 +69,6 @@ class CellEngine(Engine):
         queue = CellQueue(robot, self._cells, orders, links, onward)
         self._queues |= dict.fromkeys(ways, queue)
 
-    def step(self, timeout: float) -> None:
-        """Wait at most `timeout` [s] until packets come, leave the cell or are due; handle them."""
-        cell_ns, due_ns = min(map(_soonest_ns, self._cells)), self.queue.next_ns
-        until_ns = min(time.monotonic_ns() + round(timeout * 1e9), due_ns - SPIN_NS, cell_ns)
-        has_come = self._port.wait(until_ns)
-        if due_ns - time.monotonic_ns() <= SPIN_NS:
-            while time.monotonic_ns() < due_ns:
-                pass
-            self._release()
-        if has_come or cell_ns <= time.monotonic_ns():
-            self.take_in()
-            self._release()
-
     def take_in(self) -> None:
         """Take packets from the port; put those on their links that have left the cell."""
         now_ns = time.monotonic_ns()
@@ -85,11 +77,8 @@ class CellEngine(Engine):
             self._queues[way].send(way.link, header, size, data, max(sent_ns, self._known_ns))
         self._known_ns = now_ns
         for cell in self._cells:
-            later = [packet for packet in cell.inbox if packet.sent_ns >= now_ns]
-            cell.inbox = [packet for packet in cell.inbox if packet.sent_ns < now_ns]
             for at_ns, _, leave in cell.advance(now_ns):
                 leave(at_ns)
-            cell.inbox = later
 
 
 def _soonest_ns(cell: Cell) -> int:

@@ -20,7 +20,7 @@ class Given:
     packets: list[Packet] = field(default_factory=list)
 
     def wait(self, until_ns: int) -> bool:
-        return bool(self.packets)
+        return True
 
     def take(self) -> Iterator[Packet]:
         given, self.packets = self.packets, []
