@@ -138,7 +138,7 @@ class Cell:
                 default=(NOTHING_NS, 0),
             )
             new_ns = min(sent_ns, other_ns)
-            if self.done_ns <= min(new_ns, until_ns):
+            if self.done_ns <= new_ns and self.done_ns <= until_ns:
                 now_ns, packet = self.done_ns, self._leave()
                 if packet.flow >= 0:
                     yield now_ns, packet.flow, packet.leave
