@@ -20,6 +20,7 @@ from cloudrc.config.scene import scene_of
 from cloudrc.drivers.fleet import FleetRun
 from cloudrc.link.cell import Usage
 from cloudrc.link.waiting import md1, nddd1
+from cloudrc.metrics.verdict import EXIT_CODES
 from cloudrc.record.columns import Recording
 from cloudrc.report.document import SCHEMA_VERSION
 from cloudrc.report.summary import COLOURS
@@ -40,8 +41,6 @@ NUMBERS = {
     "loss_downlink": ("loss_downlink", 1.0),
 }
 """Number of a robot in the fleet's report -> number in its own report, factor from the SI unit."""
-SENT = "bytes_sent_uplink", "bytes_sent_downlink", "duration"
-"""Numbers in a robot's own report: payload of all datagrams [byte], and their time [s]."""
 ROBOTS = {
     "robot": "{robot}",
     "age [ms]": "{age_ms:.0f}",
@@ -69,8 +68,6 @@ CELL = {
 """Head -> cell of the table of cells."""
 SHOWN = 10
 """Largest fleet of which the terminal shows each robot."""
-ORDER = "interrupted", "invalid", "failure", "success"
-"""Verdicts; that of a fleet is the first one that a robot has."""
 
 
 @dataclass(slots=True)
@@ -89,17 +86,17 @@ class FleetFlown:
         self, recording: Recording, robot: ResolvedExperiment, document: Mapping[str, Any]
     ) -> None:
         """Take what is needed from the recording and the report of a robot."""
-        number, known = robot.fleet.only or 0, document["numbers"]
+        number = robot.fleet.only or 0
+        known = {name: each["value"] for name, each in document["numbers"].items()}
         row = {"robot": number, "verdict": document["verdict"]}
         if codes := [failure["code"] for failure in document["failures"]]:
             row["why"] = ", ".join(codes)
         for name, (own, factor) in NUMBERS.items():
             if own in known:
-                row[name] = known[own]["value"] * factor
-        if known.keys() >= {*SENT}:
-            uplink, downlink, duration = (known[name]["value"] for name in SENT)
-            if duration:
-                row["sent_kbit"] = (uplink + downlink) / duration * 8e-3
+                row[name] = known[own] * factor
+        if known.get("duration") and "bytes_sent_uplink" in known:
+            sent = known["bytes_sent_uplink"] + known["bytes_sent_downlink"]
+            row["sent_kbit"] = sent / known["duration"] * 8e-3
         if self.log:
             row["dropped"] = sum(each.dropped.get(number, 0) for each in self.log)
         self.robots.append(row | {"records_sha256": document["records_sha256"]})
@@ -138,7 +135,7 @@ def judge_robots(robots: Sequence[dict[str, Any]]) -> dict[str, Any]:
     values = {name: [robot[name] for robot in robots if name in robot] for name in numbers}
     return {
         "schemaVersion": SCHEMA_VERSION,
-        "verdict": min((robot["verdict"] for robot in robots), key=ORDER.index),
+        "verdict": max((robot["verdict"] for robot in robots), key=EXIT_CODES.__getitem__),
         "failures": [{"code": "robots_failed", "text": text}] if failed else [],
         "succeeded": len(robots) - len(failed),
         "robots": [*robots],

@@ -2,22 +2,20 @@
 
 import pytest
 
-from cloudrc.record.columns import Recording, RecordStore
-from cloudrc.report.document import Run
-from cloudrc.report.write import assess
-from cloudrc.runs.fleet import assemble_fleet
-from cloudrc.studies.capacity import Condition, Sought, capacity_of, search
+from cloudrc.studies.capacity import capacity_of, search
+from cloudrc.trials.fleet import plan_fleet
 
 SHORT = (
     *("mission.steps.count=8", "mission.steps.period_s=0.5"),
     *("criteria.settle_m=10", "criteria.time_limit_s=6"),
+    *("cell.rate_kbit=300", "cell.queue_packets=20"),
 )
 DEAF = "fleet.vary=[{world.odometry_rate_hz: 100}, {link.both.loss: 1}]"
 
 
-def flight(robots, *settings):
-    asked = Sought("steps", (*SHORT, *settings), 300, ["fifo:20"], [], 1, 4)
-    return Condition(asked, "fifo:20", "").flight(robots)
+def fly(robots, *settings, until_failure=True):
+    settings = *SHORT, *settings, f"fleet.robots={robots}"
+    return plan_fleet("steps", settings, {}, until_failure=until_failure).play()
 
 
 @pytest.mark.parametrize("start", [1, 5, 40, 100])
@@ -45,23 +43,14 @@ def test_the_seeds_decide_the_capacity_and_one_beyond_the_flown_sizes_is_a_bound
 
 
 def test_a_robot_that_fails_alone_does_not_count():
-    row = flight(2, DEAF).play()
+    row = fly(2, DEAF)
     assert row["verdict"] == "success"
     assert row["numbers"]["fail_alone"] == 1
 
 
-@pytest.mark.parametrize("robots", [1, 2])
-def test_a_fleet_that_is_stopped_has_the_verdict_of_a_whole_flight(robots):
-    asked = flight(robots)
-    row = asked.play()
-    members = [each.model_copy(update={"seed": 1}) for each in asked.fly.args[0]]
-    stores = [RecordStore() for _ in members]
-    whole = assemble_fleet(asked.experiment, members, [s.add for s in stores])
-    whole.fly([])
-    verdicts = [
-        assess(Recording(records=store), robot, Run("virtual", "virtual")).verdict
-        for store, robot in zip(stores, members, strict=True)
-    ]
-    succeeds = all(each.outcome == "success" for each in verdicts)
-    assert (row["verdict"] == "success") is succeeds is (robots == 1)
-    assert (row["numbers"]["flown_s"] < 0.7 * whole.now_ns * 1e-9) is not succeeds
+@pytest.mark.parametrize(("robots", "verdict"), [(1, "success"), (2, "failure")])
+def test_a_fleet_that_is_stopped_has_the_verdict_of_a_whole_flight(robots, verdict):
+    stopped, whole = fly(robots), fly(robots, until_failure=False)
+    assert stopped["verdict"] == whole["verdict"] == verdict
+    saved = stopped["numbers"]["flown_s"] / whole["numbers"]["flown_s"]
+    assert (saved < 0.7) is (verdict == "failure")

@@ -1,7 +1,5 @@
 """A cell in real time: it serves the packets of all robots one after another."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 from time import monotonic_ns
 
 from cloudrc.link.carry.cell import CellEngine
@@ -13,41 +11,37 @@ from cloudrc.link.profile import DirectionProfile
 SERVICE_NS = 1_000_000
 
 
-@dataclass
-class Given:
+class Given(list):
     """A port at which packets have come already."""
 
-    packets: list[Packet] = field(default_factory=list)
-
-    def wait(self, until_ns: int) -> bool:
+    def wait(self, until_ns):
         return True
 
-    def take(self) -> Iterator[Packet]:
-        given, self.packets = self.packets, []
-        return iter(given)
+    def take(self):
+        while self:
+            yield self.pop(0)
 
 
-def carry(cells: list[Cell], packets: int, **profile: float) -> list[tuple[int, int, bytes]]:
+def carry(cells, packets, **profile):
     """Send packets of 1 ms on each way of two robots at once; return robot, times, data."""
-    port, left = Given(), list[tuple[int, int, bytes]]()
+    port, left = Given(), []
     engine, begin_ns = CellEngine(port, cells), monotonic_ns()
+
+    def give(data):
+        left.append((data[0], monotonic_ns() - begin_ns, data[1]))
+        return True
+
     for robot in range(2):
-        links = [
-            LinkDirection(DirectionProfile(**profile), 1, uplink, stream=str(robot))
-            for uplink in (True, False)
-        ]
-
-        def give(data: bytes, robot: int = robot) -> bool:
-            left.append((robot, monotonic_ns() - begin_ns, data))
-            return True
-
-        ways = LinkWay(links[0], give), LinkWay(links[1], give)
+        ways = []
+        for uplink, name in ((True, "up"), (False, "down")):
+            link = LinkDirection(DirectionProfile(**profile), 1, uplink, stream=str(robot))
+            way = LinkWay(link, give)
+            ways.append(way)
+            port += [
+                Packet(way, (5, 1, number), 125 - HEADER_BYTES, (robot, name), begin_ns)
+                for number in range(packets)
+            ]
         engine.join(robot, ways, (True, True))
-        port.packets += [
-            Packet(way, (5, 1, number), 125 - HEADER_BYTES, name, begin_ns)
-            for way, name in zip(ways, (b"up", b"down"), strict=True)
-            for number in range(packets)
-        ]
     waited = sum(cell.service_ns(125) for cell in cells) * 4 * packets
     while len(left) < 4 * packets and monotonic_ns() < begin_ns + waited + 200_000_000:
         engine.step(0.001)
@@ -55,25 +49,25 @@ def carry(cells: list[Cell], packets: int, **profile: float) -> list[tuple[int, 
     return left
 
 
-def test_two_robots_share_each_direction() -> None:
+def test_two_robots_share_each_direction():
     left = carry([Cell(1e6), Cell(1e6)], 2)
-    times = [at_ns for _, at_ns, data in left if data == b"up"]
+    times = [at_ns for _, at_ns, data in left if data == "up"]
     assert all(at_ns >= (n + 1) * SERVICE_NS for n, at_ns in enumerate(times))
-    assert [robot for robot, _, data in left if data == b"down"] == [0, 0, 1, 1]
+    assert [robot for robot, _, data in left if data == "down"] == [0, 0, 1, 1]
 
 
-def test_one_medium_serves_both_directions() -> None:
+def test_one_medium_serves_both_directions():
     left = carry([Cell(1e6)], 1)
-    assert [data for _, _, data in left] == [b"up", b"up", b"down", b"down"]
+    assert [data for _, _, data in left] == ["up", "up", "down", "down"]
     assert left[-1][1] >= 4 * SERVICE_NS
 
 
-def test_the_links_delay_follows_the_cell() -> None:
+def test_the_links_delay_follows_the_cell():
     left = carry([Cell(1e6), Cell(1e6)], 1, delay_ms=20)
     assert min(at_ns for _, at_ns, _ in left) >= 20_000_000 + SERVICE_NS
 
 
-def test_what_a_link_loses_takes_no_place_in_the_cell() -> None:
+def test_what_a_link_loses_takes_no_place_in_the_cell():
     cells = [Cell(1e6), Cell(1e6)]
     assert not carry(cells, 1, loss=1.0)
     assert cells[0].usage.packets == 0
