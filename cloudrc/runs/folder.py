@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.outside.paths import lock_folder, make_folder
+from cloudrc.outside.paths import LOCK, lock_folder, make_folder
 
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
@@ -55,8 +55,8 @@ def new_folder(
 
 @contextlib.contextmanager
 def results_folder(out: Path | None, study: str, name: str) -> Iterator[Path]:
-    """Lock the folder of a study's rows: `out` if it has some, else a new one, as `new_folder`."""
-    if out is None or not any(out.glob("rows*.jsonl")):
+    """Lock the folder of a study's rows: `out` of an earlier call, else one of `new_folder`."""
+    if out is None or not (out / LOCK).exists():
         out = new_folder(out, f"{study}-{name}", f"latest-{study}")
     with lock_folder(out):
         yield out
