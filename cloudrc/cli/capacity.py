@@ -9,6 +9,7 @@ from cloudrc.cli.parser import (
     flags,
     number,
     read_count,
+    read_list,
     settings_from,
     whole_number,
 )
@@ -38,18 +39,14 @@ def arguments(parser: Parser) -> None:
     about = (
         "compare these queues of the cell: fifo, drr, priority or newest, with :PACKETS if wanted"
     )
-    add("--queue", "NAME,...", about, [], read=_split)
-    add("--controllers", "NAME,...", "compare these controllers", [], read=_split)
+    add("--queue", "NAME,...", about, [], read=read_list(str))
+    add("--controllers", "NAME,...", "compare these controllers", [], read=read_list(str))
     add("--seeds", "N", "fly seeds 1 to N (default: 5)", 5, read_count)
     add("--max", "N", "largest fleet to try (default: 64)", 64, whole_number(1, 1000))
     add("--set", "KEY=VALUE", "change one key of the experiment; repeatable")
     about = "folder of the results; with those of an earlier call, fly what is missing"
     add("--out", "DIR", f"{about} (default: runs/capacity-...)")
     output_argument(parser, forms=TABLES)
-
-
-def _split(text: str) -> list[str]:
-    return text.split(",")
 
 
 def execute(options: Options) -> None:

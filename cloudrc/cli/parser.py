@@ -152,6 +152,11 @@ def number(low: float, high: float, unit: str) -> NumberFlag:
     return NumberFlag(Quantity(unit, low, high))
 
 
+def read_list(read: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
+    """Return a function that reads different values between commas, each by `read`."""
+    return lambda text: tuple(dict.fromkeys(read(each.strip()) for each in text.split(",")))
+
+
 def read_size(text: str) -> float:
     """Parse a size in the notation of Kubernetes, such as 500M, for argparse; return bytes."""
     found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([kKMGT]?)(i?)", text)

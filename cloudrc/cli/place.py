@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 from cloudrc.cli.output import TABLE, output_argument, print_result, tell, warn
-from cloudrc.cli.parser import COUNT_MAX, Options, Parser, flags, number, read_count, settings_from
+from cloudrc.cli.parser import (
+    COUNT_MAX,
+    Options,
+    Parser,
+    flags,
+    number,
+    read_count,
+    read_list,
+    settings_from,
+)
 from cloudrc.runs.folder import results_folder
 from cloudrc.text import escape
 
@@ -30,20 +36,16 @@ def arguments(parser: Parser) -> None:
     about = "a shipped name or a YAML file (default: fast)"
     add("experiment", "EXPERIMENT", about, "fast", nargs="?")
     about = "computing times of a command in ms (default: 0,5,20,60)"
-    add("--compute", "MS,...", about, "0,5,20,60", _list_of(number(0, 1000, "ms")))
-    add("--robots", "N,...", "numbers of robots (default: 1)", "1", _list_of(read_count))
+    add("--compute", "MS,...", about, "0,5,20,60", read_list(number(0, 1000, "ms")))
+    add("--robots", "N,...", "numbers of robots (default: 1)", "1", read_list(read_count))
     about = "shipped places or YAML files (default: onboard,edge,cloud)"
-    add("--places", "PLACE,...", about, "onboard,edge,cloud", _list_of(str))
+    add("--places", "PLACE,...", about, "onboard,edge,cloud", read_list(str))
     add("--set", "KEY=VALUE", "change one key of the experiment; repeatable")
     add("--seeds", "N", "fly seeds 1 to N (default: 3)", 3, read_count)
     add("--calm", "", "fly without wind and without a payload")
     add("--jobs", "N", "parallel processes (default: one per core)", COUNT_MAX, read_count)
     add("--out", "DIR", "folder (default: a new one in runs/); if it has rows, fly the others")
     output_argument(parser)
-
-
-def _list_of(read: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
-    return lambda text: tuple(dict.fromkeys(read(each.strip()) for each in text.split(",")))
 
 
 def execute(options: Options) -> int:

@@ -10,12 +10,11 @@ import json
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from math import nan
-from typing import Any, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, TypeAlias, get_args
 
 from cloudrc.exposition import table
 from cloudrc.exposition.parts import Histogram, Readings, samples
 from cloudrc.exposition.table import LiveMetric, MetricKind, of_role
-from cloudrc.link.cell import Usage
 from cloudrc.link.verify import verdict_of
 from cloudrc.messages import NEVER_NS, Cause, GuardState
 from cloudrc.metrics.definitions import (
@@ -48,6 +47,9 @@ from cloudrc.records import (
     SessionOpened,
     TelemetrySent,
 )
+
+if TYPE_CHECKING:
+    from cloudrc.link.cell import Usage
 
 Values: TypeAlias = dict[str, Any]
 """Name of a metric -> its current value, of a kind that `samples` converts, or its histogram."""

@@ -44,7 +44,7 @@ class Usage:
     """What a cell has done within a period: a row of cell.csv."""
 
     direction: str  # "uplink" or "downlink"; "both" if they share the medium
-    time_s: float = 0.0  # end of the period
+    time_s: float = 0.0  # end of the period [s]
     packets: int = 0  # that began to leave
     size: int = 0  # of these [bytes]
     busy_ns: int = 0

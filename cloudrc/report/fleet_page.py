@@ -29,7 +29,7 @@ from cloudrc.report.figures.style import (
     panel,
 )
 from cloudrc.report.fleet import FleetFlown, by_direction, remarks, tables
-from cloudrc.report.page import HEADLINES
+from cloudrc.report.page import HEADLINES, REPEAT
 from cloudrc.version import __version__
 
 CAPTION = (
@@ -37,10 +37,6 @@ CAPTION = (
     "percentile; red: the robot failed. Above the dashed line the guard holds a robot. "
 )
 WAITS = "Right: the longest wait of a packet in the cell, in each tenth of a second."
-RECORDS = {
-    "virtual": "the records will be identical",
-    "real": "in real time, no two flights have identical records",
-}
 COLOURS = {"uplink": UPLINK, "downlink": DOWNLINK, "both": BLACK}
 BODY = Template("""<body>
 <header>
@@ -53,10 +49,10 @@ $notes
 <figcaption><b>Fig. 1.</b> $caption</figcaption></figure>
 $tables
 <h2>Repeat this run</h2>
-<p>Run this in the folder of the report; $records. The first command flies the
-fleet, the second one its first robot alone, and the third one writes the page of this robot:</p>
-<pre>cloudrc run config.yaml --mode $mode
-cloudrc run config.yaml --mode $mode --set fleet.only=$first --set cell.rate_kbit=null
+<p>$repeat</p>
+<pre>cloudrc run config.yaml --mode $mode</pre>
+<p>The first robot alone, and its page in the folder of this run:</p>
+<pre>cloudrc run config.yaml --mode $mode --set fleet.only=$first --set cell.rate_kbit=null
 cloudrc report robot-$first</pre>
 <details><summary>Complete experiment (<code>config.yaml</code>)</summary>
 <pre>$config</pre></details>
@@ -85,7 +81,7 @@ def write_fleet_page(folder: Path, flown: FleetFlown, document: Mapping[str, Any
         tables="\n".join(map(_table, tables(document))),
         first=flown.robots[0]["robot"],
         mode=flown.mode,
-        records=RECORDS["virtual" if flown.mode == "virtual" else "real"],
+        repeat=escape(REPEAT[flown.mode == "virtual"]),
         config=escape(dump(experiment)),
     )
     text = Template(page.partition("<body>")[0]).substitute(facts) + body
