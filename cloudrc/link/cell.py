@@ -94,7 +94,7 @@ class Cell:
         self._rate, self._queue, self._packets_max = rate, queue, packets_max
         self._airtime_ns = airtime_ns
         self._lanes: dict[int, dict[Any, CellPacket]] = {}  # lane -> place -> packet, oldest first
-        self._turn, self._deficits = deque[int](), dict[int, int]()  # of drr
+        self._turns: dict[int, int] = {}  # of drr: lane -> what it may still send, first one first
         self._serving: CellPacket | None = None
         self._waiting = 0
         self.traffic: dict[int, Video | Bulk] = {}  # flow -> source
@@ -166,9 +166,8 @@ class Cell:
         waiting[place] = packet
         self._waiting += 1
         self.usage.most = max(self.usage.most, self._waiting)
-        if self._queue == "drr" and lane not in self._deficits:
-            self._turn.append(lane)
-            self._deficits[lane] = QUANTUM
+        if self._queue == "drr":
+            self._turns.setdefault(lane, QUANTUM)
         if self._serving is None:
             self._serve(packet.sent_ns)
         return True
@@ -216,19 +215,15 @@ class Cell:
         """Return the queue from which the next packet leaves; None if nothing waits."""
         if self._queue != "drr":
             return next((lane for lane in sorted(self._lanes) if self._lanes[lane]), None)
-        while self._turn:
-            lane = self._turn[0]
+        while self._turns:
+            lane, rest = next(iter(self._turns.items()))
             waiting = self._lanes[lane]
-            if not waiting:
-                self._turn.popleft()
-                del self._deficits[lane]
-                continue
-            size = next(iter(waiting.values())).size
-            if size <= self._deficits[lane]:
-                self._deficits[lane] -= size
+            if waiting and (size := next(iter(waiting.values())).size) <= rest:
+                self._turns[lane] -= size
                 return lane
-            self._deficits[lane] += QUANTUM
-            self._turn.rotate(-1)
+            del self._turns[lane]
+            if waiting:  # its next turn comes after those of all others
+                self._turns[lane] = rest + QUANTUM
         return None
 
 
