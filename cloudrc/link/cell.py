@@ -153,18 +153,17 @@ class Cell:
     def put(self, packet: CellPacket) -> bool:
         """Let a packet wait; return False if it is dropped, because the queue is full."""
         flow, lane = packet.flow, self._lane(packet)
-        waiting = self._lanes.setdefault(lane, {})
-        place: tuple[int, ...] = (flow, packet.number)
-        if self._queue == "newest" and flow >= 0:
-            place = flow, packet.kind, packet.way
-            if place in waiting:
-                self._drop(flow)
-                self._waiting -= 1
-        elif len(waiting) + self._is_serving(lane) >= self._packets_max:
-            self._drop(flow)
+        waiting, dropped = self._lanes.setdefault(lane, {}), self.usage.dropped
+        is_newest = self._queue == "newest" and flow >= 0
+        place = (flow, packet.kind, packet.way) if is_newest else (flow, packet.number)
+        takes_place = place in waiting  # of an older packet
+        is_full = not is_newest and len(waiting) + self._is_serving(lane) >= self._packets_max
+        if takes_place or is_full:
+            dropped[flow] = dropped.get(flow, 0) + 1
+        if is_full:
             return False
         waiting[place] = packet
-        self._waiting += 1
+        self._waiting += not takes_place
         self.usage.most = max(self.usage.most, self._waiting)
         if self._queue == "drr":
             self._turns.setdefault(lane, QUANTUM)
@@ -181,10 +180,6 @@ class Cell:
     def _is_serving(self, lane: int) -> bool:
         return self._serving is not None and self._lane(self._serving) == lane
 
-    def _drop(self, flow: int) -> None:
-        dropped = self.usage.dropped
-        dropped[flow] = dropped.get(flow, 0) + 1
-
     def _leave(self) -> CellPacket:
         """Return the packet in service, which leaves, and serve the next one."""
         packet, now_ns = self._serving, self.done_ns
@@ -192,7 +187,7 @@ class Cell:
         self._serving, self.done_ns = None, NOTHING_NS
         self._serve(now_ns)
         if packet.flow < 0:
-            self.traffic[packet.flow].leave(now_ns)
+            packet.leave(now_ns)
         return packet
 
     def _serve(self, now_ns: int) -> None:
@@ -242,9 +237,6 @@ class Video:
             cell.put(CellPacket(self.next_ns, 2, self._flow, self._sent, 0, VIDEO_BYTES))
         self.next_ns += FRAME_NS
 
-    def leave(self, now_ns: int) -> None:
-        """Nothing depends on it."""
-
 
 class Bulk:
     """A flow that fills the queue: its window grows until a drop, and then becomes half as large.
@@ -270,14 +262,15 @@ class Bulk:
         self.next_ns = self._confirmed[0] if self._confirmed else now_ns + ROUND_TRIP_NS
         while self._flying < int(self._window):
             self._sent += 1
-            if not cell.put(CellPacket(now_ns, 2, self._flow, self._sent, 0, BULK_BYTES)):
+            what = self._flow, self._sent, 0, BULK_BYTES, self._leave
+            if not cell.put(CellPacket(now_ns, 2, *what)):
                 if now_ns > self._halved_ns:
                     self._window = self._threshold = max(2.0, self._window / 2)
                     self._halved_ns = now_ns + ROUND_TRIP_NS
                 return
             self._flying += 1
 
-    def leave(self, now_ns: int) -> None:
+    def _leave(self, now_ns: int) -> None:
         """Expect the confirmation of a packet that has left at `now_ns` [ns]."""
         self._confirmed.append(now_ns + ROUND_TRIP_NS)
         self.next_ns = min(self.next_ns, self._confirmed[0])
