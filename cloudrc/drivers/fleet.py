@@ -113,7 +113,11 @@ class Member:
 
 
 class FleetRun:
-    """Runs the robots of a fleet, in virtual time that starts at 0."""
+    """Runs the robots of a fleet, in virtual time that starts at 0.
+
+    Attributes:
+        log: What the cells have done in each 100 ms.
+    """
 
     def __init__(
         self, members: Sequence[Member], cells: Sequence[Cell], cores: SharedCores | None
@@ -122,14 +126,14 @@ class FleetRun:
         self.members, self.cells, self.cores = members, cells, cores
         self._media: tuple[Cell | SharedCores, ...] = (*cells, *([cores] if cores else []))
         self._next_ns = [member.run.next_ns for member in members]
-        self.now_ns = 0
+        self.now_ns, self.log = 0, list[Usage]()
 
-    def fly(self, log: list[Usage], is_over: Callable[[int], bool] = lambda now_ns: False) -> None:
+    def fly(self, is_over: Callable[[int], bool] = lambda now_ns: False) -> None:
         """Fly until the missions of all robots are over, or until the limit of each.
 
         Every 100 ms of virtual time, call the sinks of the robots whose flight is not over. If the
-        robots share something, the others go on; `log` gets what the cells have done, and the
-        flight of all is over once `is_over`, which gets the time [ns], says so.
+        robots share something, the others go on, until `is_over`, which gets the time [ns], says
+        that the flight of all is over.
         """
         if not self._media:
             for each in self.members:  # nobody acts on the others
@@ -147,7 +151,7 @@ class FleetRun:
                 flying = [
                     each for each in flying if self.now_ns < each.limit_ns and not each.over()
                 ]
-                log += (cell.end_period(self.now_ns) for cell in self.cells)
+                self.log += (cell.end_period(self.now_ns) for cell in self.cells)
                 if is_over(self.now_ns):
                     return
 

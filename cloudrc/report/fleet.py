@@ -77,10 +77,23 @@ class FleetFlown:
     experiment: ResolvedExperiment
     mode: str = "virtual"
     log: list[Usage] = field(default_factory=list)  # what the cell has done
-    cloud: Mapping[str, float] | None = None  # numbers of the shared cores
+    cloud: Mapping[str, float] | None = None  # numbers of the shared cores, SI units
     robots: list[dict[str, Any]] = field(default_factory=list)  # what the report says of each
     # Of each robot, world frame [m], a row per `GRID_NS`, shape (n, 3).
     paths: list[NDArray[np.float64]] = field(default_factory=list)
+
+    def share(self, fleet: FleetRun) -> None:
+        """Take what the cell and the shared cores have done in virtual time."""
+        self.log, cores = fleet.log, fleet.cores
+        if cores is None or not cores.count:
+            return
+        duration, rate = fleet.now_ns * 1e-9, self.experiment.cloud.command_rate_hz
+        each, busy = cores.count / len(fleet.members), cores.busy_ns * 1e-9 / cores.cores
+        self.cloud = {
+            "utilisation": busy / duration,
+            "rate_hz": each / duration,
+            "rate_expected_hz": min(rate, each / busy),
+        }
 
     def add(
         self, recording: Recording, robot: ResolvedExperiment, document: Mapping[str, Any]
@@ -182,22 +195,6 @@ def cell_numbers(done: Sequence[Usage], senders: int, *, alone: bool) -> dict[st
         "waiting_max": max(each.most for each in done),
         "packets": packets,
         "dropped": dropped,
-    }
-
-
-def cloud_numbers(fleet: FleetRun, rate: float) -> dict[str, float] | None:
-    """Return the numbers of the shared cores in SI units; None without shared cores.
-
-    `rate` is that of commands [1/s].
-    """
-    cores, duration, robots = fleet.cores, fleet.now_ns * 1e-9, len(fleet.members)
-    if cores is None or not cores.count:
-        return None
-    busy = cores.busy_ns * 1e-9 / cores.cores
-    return {
-        "utilisation": busy / duration,
-        "rate_hz": cores.count / robots / duration,
-        "rate_expected_hz": min(rate, cores.count / robots / busy),
     }
 
 

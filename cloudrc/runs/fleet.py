@@ -29,7 +29,7 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.records import Record
 from cloudrc.report.document import ENVIRONMENT_FILE, Run, environment_document
-from cloudrc.report.fleet import FleetFlown, cloud_numbers, fleet_document
+from cloudrc.report.fleet import FleetFlown, fleet_document
 from cloudrc.report.folder import ROBOT, read_cell, robots_in
 from cloudrc.report.write import write_report
 from cloudrc.runs.fly import Report, VirtualRecorder, end_of, explaining, naming_files, write_merged
@@ -136,12 +136,12 @@ def _fly_virtual(
         ]
         sinks = [each.sink for each in recorders]
         fleet = assemble_fleet(flown.experiment, [each.experiment for each in robots], sinks)
-        broken, interrupted = end_of(lambda: fleet.fly(flown.log))
+        broken, interrupted = end_of(fleet.fly)
         landed()
+        flown.share(fleet)
         if flown.log:
             rows = [each.row() for each in flown.log]
             (folder / CELL_FILE).write_text(csv_table(rows), encoding="utf-8")
-        flown.cloud = cloud_numbers(fleet, flown.experiment.cloud.command_rate_hz)
         for robot, recorder in zip(robots, recorders, strict=True):
             recorder.finish(robot.report, interrupted=interrupted)
     return broken

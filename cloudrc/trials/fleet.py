@@ -25,7 +25,7 @@ from cloudrc.outside.reuse import reuse_results
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.records import Control, Record
 from cloudrc.report.document import Assessment, Run
-from cloudrc.report.fleet import FleetFlown, cloud_numbers, fleet_document
+from cloudrc.report.fleet import FleetFlown, fleet_document
 from cloudrc.report.write import assess
 from cloudrc.runs import flight
 from cloudrc.runs.experiment import check_no_seed, check_world, load, robots_of
@@ -96,7 +96,7 @@ class FleetFlight:
 
     def fly(self, *, until_failure: bool) -> Row:
         """Fly to the end, or until a robot has failed that succeeds alone; return the results."""
-        self._run.fly(self._flown.log, self._has_failed if until_failure else lambda now_ns: False)
+        self._run.fly(*([self._has_failed] if until_failure else []))
         document = self._measure()
         if not until_failure and document["failures"]:
             verdicts = [found.verdict for found in self._judged.values()]
@@ -151,7 +151,7 @@ class FleetFlight:
     def _measure(self) -> dict[str, Any]:
         """Return the report of the fleet, from all robots up to now."""
         flown = self._flown
-        flown.cloud = cloud_numbers(self._run, flown.experiment.cloud.command_rate_hz)
+        flown.share(self._run)
         for number, robot in enumerate(self._robots):
             found = self._judge(number)
             flown.add(found.flight.recording, robot, found.document)

@@ -79,7 +79,7 @@ def test_a_fleet_flies_by_run_alone_and_in_real_time_if_the_machine_carries_it(l
 
 
 def test_an_interrupted_fleet_has_a_report(folder, call, monkeypatch):
-    def interrupt(run, log):
+    def interrupt(run):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("cloudrc.drivers.fleet.FleetRun.fly", interrupt)

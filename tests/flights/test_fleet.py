@@ -31,7 +31,7 @@ def in_fleet(*settings):
     experiment = load_experiment("steps", (*SHORT, *settings))
     robots = robots_of(experiment, "steps", (*SHORT, *settings))
     stores = [RecordStore() for _ in robots]
-    assemble_fleet(experiment, robots, [store.add for store in stores]).fly([])
+    assemble_fleet(experiment, robots, [store.add for store in stores]).fly()
     return [Recording(records=store).sha256 for store in stores]
 
 
