@@ -93,11 +93,8 @@ def read_cell(path: Path) -> list[Usage]:
     """Read cell.csv, what the cell of a fleet did; without this file there was no cell."""
     if not path.exists():
         return []
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            return [*map(Usage.read, csv.DictReader(file))]
-    except (ValueError, KeyError, TypeError) as error:
-        raise BadInputError(f"{path}: is not the record of a cell: {error}") from error
+    with reading(path, "is no record of a cell"), path.open(encoding="utf-8", newline="") as file:
+        return [*map(Usage.read, csv.DictReader(file))]
 
 
 def _read_merged(folder: Path) -> Recording | None:
