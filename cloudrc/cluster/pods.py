@@ -330,11 +330,14 @@ def fetch_recording(release: Release, component: str, target: Path) -> None:
     pod = find_pod(release, component).metadata.name
     path = Path(DATA, f"{component}.mcap")
     copy_file(release, pod, component, str(path), target)
-    before = part_before(target)
-    try:
-        copy_file(release, pod, component, str(part_before(path)), before)
-    except ClusterError:  # there is none
-        before.unlink()
+    if list_files(release, pod, component, str(part_before(path))):
+        copy_file(release, pod, component, str(part_before(path)), part_before(target))
+
+
+def list_files(release: Release, pod: str, container: str, path: str) -> list[str]:
+    """List the files of a folder in a container, or the file `path` itself; [] if it is missing."""
+    words = ["exec", pod, f"--container={container}", "--", "sh", "-c", f"ls {path} || true"]
+    return run("kubectl", [*release.flags, *words]).split()
 
 
 def copy_file(release: Release, pod: str, container: str, path: str, target: Path) -> None:

@@ -14,10 +14,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from cloudrc.cluster.client import Release, run
+from cloudrc.cluster.client import Release
 from cloudrc.cluster.flight import FETCHES, FLUSH, fetch_all, report_flight
 from cloudrc.cluster.link import EXPERIMENT
-from cloudrc.cluster.pods import DATA, copy_file, find_pod
+from cloudrc.cluster.pods import DATA, copy_file, find_pod, list_files
 from cloudrc.config.ground import put_on_ground
 from cloudrc.config.heading import without_held_yaws
 from cloudrc.config.load import load_link, read_experiment, robot_settings
@@ -137,9 +137,8 @@ def fetch_mission(
     flown = [each.id for each in known.values() if "started" in each.happened]
     wanted = mission or (flown[-1] if flown else "")
     pod = find_pod(release, "cloud").metadata.name
-    words = ["exec", pod, "--container=cloud", "--", "sh", "-c", f"ls {DATA}/{REPORTS} || true"]
-    names = run("kubectl", [*release.flags, *words])
-    kept = [name for name in names.split() if name == wanted or name.endswith(f"-{wanted}")]
+    names = list_files(release, pod, "cloud", f"{DATA}/{REPORTS}")
+    kept = [name for name in names if name == wanted or name.endswith(f"-{wanted}")]
     if wanted and kept:
         for name in FILES:
             path = f"{DATA}/{REPORTS}/{kept[-1]}/{name}"

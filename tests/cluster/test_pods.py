@@ -62,6 +62,23 @@ def test_the_wait_for_a_release_ends_with_the_cause(running, release, body, erro
         wait_ready(release, timeout=0.03)
 
 
+def test_a_pod_that_loses_its_readiness_with_its_node_names_the_node(running, release):
+    lost = pod("world-1", "world")
+    lost["spec"] = {**lost["spec"], "nodeName": "worker-2"}
+    lost["status"]["conditions"][0]["status"] = "False"
+    running.put("pods", lost)
+    with pytest.raises(TimedOutError, match="its node 'worker-2' does not answer"):
+        wait_ready(release, timeout=0.0)
+
+
+def test_a_part_before_that_cannot_be_fetched_is_not_taken_for_missing(
+    running, release, pretend, tmp_path
+):
+    pretend("kubectl", 'case "$*" in *before*) echo error: node gone >&2; exit 1 ;; esac')
+    with pytest.raises(ClusterError, match="node gone"):
+        pods.fetch_recording(release, "world", tmp_path / "world.mcap")
+
+
 def test_a_secret_that_does_not_exist_is_named(running, release):
     running.put("pods", pod("cloud-1", "cloud", ready=False, phase="Pending"))
     about = {"involvedObject": {"uid": running.get("pods", "cloud-1")["metadata"]["uid"]}}

@@ -65,7 +65,7 @@ def test_a_report_of_another_install_is_told_by_the_missions_number(data, tmp_pa
     monkeypatch.setattr(kept, "_missions", lambda release: {"m1": known})
     monkeypatch.setattr(kept, "_report_of_pods", pods)
     monkeypatch.setattr(kept, "find_pod", Mock())
-    monkeypatch.setattr(kept, "run", lambda name, words: there.name)
+    monkeypatch.setattr(kept, "list_files", lambda *where: [there.name])
 
     def copy(release, pod, container, path, target):
         target.write_bytes((there / target.name).read_bytes())
