@@ -56,7 +56,7 @@ VERDICTS = {"off": "not believed", "open": "undecided", "ok": "believed"}
 """Worst verdict on any quantity of the link -> verdict on the whole link."""
 MEANINGS = {
     "not believed": ("red", "does not match its profile"),
-    "undecided": ("yellow", "needs more packets (--seconds): see above"),
+    "undecided": ("yellow", "needs more packets (--seconds)"),
     "believed": ("green", "matches its profile"),
 }
 """Verdict on a link -> its colour, and what it means."""
@@ -265,6 +265,10 @@ def as_text(report: Report, paint: Paint = plain) -> str:
     colour, text = MEANINGS[report["verdict"]]
     if report["verdict"] == "believed" and any(NOT_JUDGED in note for note in report["notes"]):
         text += f", except what is {NOT_JUDGED} (above)"
+    if report["verdict"] == "undecided":
+        rows = [(way, row) for way, one in report["directions"].items() for row in one["rows"]]
+        names = [f"{row['name']} of the {way}" for way, row in rows if row["verdict"] == "open"]
+        text += f" for {', '.join(names)}" * bool(names)
     return "\n".join([*lines, paint(f"{report['verdict'].upper()}: the link {text}", colour)])
 
 
