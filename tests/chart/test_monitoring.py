@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from cloudrc.exposition.table import METRICS, MetricKind
-from tests.chart.conftest import CHART, OPERATOR, of_kind, render
+from tests.chart.conftest import CHART, OPERATOR, notes, of_kind, render
 from tools.dashboards import expressions
 
 KINDS = {"PodMonitor", "PrometheusRule"}
@@ -26,7 +26,10 @@ RECORDED = {rule["record"] for rule in RULES if "record" in rule}
 def test_monitors_need_the_value_and_the_kind_or_force():
     def monitors(more, **where):
         values = {key: {"enabled": True, **more} for key in ("podMonitor", "prometheusRule")}
-        return {thing["kind"] for thing in render({"metrics": values}, **where)} & KINDS
+        made = {thing["kind"] for thing in render({"metrics": values}, **where)} & KINDS
+        is_missed = values["podMonitor"]["enabled"] and not made
+        assert ("no Prometheus operator" in notes({"metrics": values}, **where)) == is_missed
+        return made
 
     assert monitors({"enabled": False}, apis=[OPERATOR]) == set()
     assert monitors({}) == set()
