@@ -266,8 +266,8 @@ def as_text(report: Report, paint: Paint = plain) -> str:
     if report["verdict"] == "believed" and any(NOT_JUDGED in note for note in report["notes"]):
         text += f", except what is {NOT_JUDGED} (above)"
     if report["verdict"] == "undecided":
-        rows = [(way, row) for way, one in report["directions"].items() for row in one["rows"]]
-        names = [f"{row['name']} of the {way}" for way, row in rows if row["verdict"] == "open"]
+        judged = [(way, row) for way, one in report["directions"].items() for row in one["rows"]]
+        names = [f"{row['name']} of the {way}" for way, row in judged if row["verdict"] == "open"]
         text += f" for {', '.join(names)}" * bool(names)
     return "\n".join([*lines, paint(f"{report['verdict'].upper()}: the link {text}", colour)])
 
