@@ -279,7 +279,7 @@ def forwarded(
                 if time.monotonic() > until:
                     raise TimedOutError(
                         f"kubectl port-forward to pod '{pod}' has not started within "
-                        f"{START_LIMIT:g} s"
+                        f"{START_LIMIT:g} s; does its node answer? See: kubectl get nodes"
                     )
                 time.sleep(LOOK_PERIOD)
             yield found
