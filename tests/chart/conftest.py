@@ -85,8 +85,12 @@ def engine():
     return gotpl_helm.HelmTemplateEngine(SOURCES, lookup=lambda *words: cluster[-1](*words))
 
 
+def read_values(text):
+    return dict(yaml.load(text, Loader) or {})  # noqa: S506
+
+
 def values_of(path):
-    return dict(yaml.load(path.read_text(), Loader) or {})  # noqa: S506
+    return read_values(path.read_text())
 
 
 def render_texts(
@@ -97,32 +101,23 @@ def render_texts(
     lookup=nothing,
     apis=(),
     upgrade=False,
-    alias="cloudrc",
     reused=None,
 ):
     """Render every template: path -> text; raise if the schema refuses the values.
 
-    `alias` is the chart's name as a dependency of a larger chart. `reused` are all values of an
-    earlier install, in place of this chart's defaults, as with `helm upgrade --reuse-values`.
+    Values may be a text in YAML. `reused` are all values of an earlier install, in place of this
+    chart's defaults, as with `helm upgrade --reuse-values`.
     """
     import jsonschema
 
-    merged = laid_over(reused or values_of(CHART / "values.yaml"), values or {})
+    given = read_values(values) if isinstance(values, str) else values or {}
+    merged = laid_over(reused or values_of(CHART / "values.yaml"), given)
     jsonschema.Draft7Validator(SCHEMA).validate(merged)
+    about = {"Name": release, "Namespace": namespace, "Service": "Helm"}
     context = {
         "Values": copy.deepcopy(merged),
-        "Release": {
-            "Name": release,
-            "Namespace": namespace,
-            "Service": "Helm",
-            "IsInstall": not upgrade,
-            "IsUpgrade": upgrade,
-        },
-        "Chart": {
-            "Name": alias,
-            "Version": METADATA["version"],
-            "AppVersion": METADATA["appVersion"],
-        },
+        "Release": {**about, "IsInstall": not upgrade, "IsUpgrade": upgrade},
+        "Chart": {key[0].upper() + key[1:]: value for key, value in METADATA.items()},
         "Capabilities": {"APIVersions": Versions(apis)},
         "Files": Files(),
     }

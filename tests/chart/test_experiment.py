@@ -51,16 +51,15 @@ def test_the_configmap_loads_as_the_same_experiment(name, experiment, profile):
 
 
 def test_a_profile_replaces_the_experiments_link(profile):
-    loss = {"bad_start": 0.1, "bad_end": 0.5}
-    link = {"profile": "wifi", "uplink": {"delay_ms": 80, "loss": loss}}
-    made, wifi = profile({"experiment": {"link": link}}), load_profile("wifi")
+    link = "link: {profile: wifi, uplink: {delay_ms: 80, loss: {bad_start: 0.1, bad_end: 0.5}}}"
+    made, wifi = profile(f"experiment: {{{link}}}"), load_profile("wifi")
     assert (made.uplink.delay_ms, made.uplink.loss.bad_start) == (80, 0.1)
     assert made.uplink.jitter_ms == wifi.uplink.jitter_ms
     assert made.downlink == wifi.downlink
-    own = {"profile": {"downlink": {"delay_ms": 5}}}
-    made = profile({"experiment": {"link": link}, "link": own})
+    own = "link: {profile: {downlink: {delay_ms: 5}}}"
+    made = profile(f"{{experiment: {{{link}}}, {own}}}")
     assert (made.uplink.delay_ms, made.downlink.delay_ms) == (0, 5)
-    assert profile({"link": {"profile": "lossy"}}) == load_profile("lossy")
+    assert profile("link: {profile: lossy}") == load_profile("lossy")
 
 
 @pytest.mark.parametrize(("key", "way"), [("trace", {"trace": "drive.csv"}), ("table", TABLE)])
@@ -81,13 +80,13 @@ def test_a_change_restarts_only_what_it_must():
         found = (thing for thing in render(values) if thing["kind"] != "Secret")
         return {(thing["kind"], thing["metadata"]["name"]): thing for thing in found}
 
-    before, seeded = named({}), named({"experiment": {"seed": 2}})
+    before, seeded = named(""), named("experiment: {seed: 2}")
     for end in ("world", "cloud"):
         old, new = (
             each["Deployment", f"demo-cloudrc-{end}"]["spec"]["template"]["metadata"]["annotations"]
             for each in (before, seeded)
         )
         assert {key for key in new if old[key] != new[key]} == {"checksum/experiment"}
-    after = named({"link": {"profile": "lossy"}})
+    after = named("link: {profile: lossy}")
     differ = {key for key in before if before[key] != after[key]}
     assert differ == {("ConfigMap", "demo-cloudrc-link")}

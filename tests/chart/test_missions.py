@@ -13,7 +13,7 @@ EXAMPLES = {
     name: list(yaml.safe_load_all((CHART / "examples" / f"{name}.yaml").read_text()))
     for name in ("mission-job", "mission-paper")
 }
-ENABLED = {"mission": {"enabled": True}}
+ENABLED = "mission: {enabled: true}"
 
 
 def load(mission):
@@ -24,19 +24,16 @@ def jobs(values=None, **where):
     return list(of_kind(render(values, **where), "Job").values())
 
 
-POINT = {"position_m": [0.0, 0.0, 1.0], "dwell_s": 2.0}
-
-
 @pytest.mark.parametrize(
     ("values", "name"),
     [
-        ({"experiment": {"mission": "hover"}}, "hover"),
-        ({"mission": {"plan": "hover"}}, "hover"),
-        ({"mission": {"plan": {"start": "here", "waypoints": [POINT]}}}, None),
+        ("{mission: {enabled: true}, experiment: {mission: hover}}", "hover"),
+        ("mission: {enabled: true, plan: hover}", "hover"),
+        ("mission: {enabled: true, plan: {start: here, waypoints: [{position_m: [0, 0, 1]}]}}", ""),
     ],
 )
 def test_the_plan_defaults_to_the_experiments_mission(values, name, tmp_path):
-    objects = render({**values, "mission": {**values.get("mission", {}), "enabled": True}})
+    objects = render(values)
     (job,) = of_kind(objects, "Job").values()
     config = job["spec"]["template"]["spec"]["volumes"][0]["configMap"]["name"]
     (data,) = (t["data"] for t in objects if t["metadata"]["name"] == config and "data" in t)
@@ -47,8 +44,8 @@ def test_the_plan_defaults_to_the_experiments_mission(values, name, tmp_path):
 
 def test_only_another_mission_makes_another_job():
     """A Job is immutable: with the same name, an upgrade with a new plan would fail."""
-    other = {"mission": {"enabled": True, "plan": "hover"}}
-    given = (ENABLED, ENABLED, other, {**ENABLED, "image": {"tag": "9"}})
+    other = "mission: {enabled: true, plan: hover}"
+    given = (ENABLED, ENABLED, other, "{mission: {enabled: true}, image: {tag: '9'}}")
     names = [job["metadata"]["name"] for values in given for job in jobs(values)]
     assert names[0] == names[1]
     assert len(set(names)) == 3
@@ -69,8 +66,7 @@ def test_the_chart_makes_the_job_of_the_example():
 
 def test_a_suspended_cron_job_is_the_template_of_jobs():
     """`kubectl create job --from=cronjob/NAME-mission` copies labels and spec of the template."""
-    values = {"mission": {"cronJob": {"enabled": True}}}
-    objects = render(values, release="d" * 53)
+    objects = render("mission: {cronJob: {enabled: true}}", release="d" * 53)
     (cron,) = of_kind(objects, "CronJob").values()
     assert cron["spec"]["suspend"]
     assert len(cron["metadata"]["name"]) <= 52
@@ -80,13 +76,13 @@ def test_a_suspended_cron_job_is_the_template_of_jobs():
     configs = [thing["metadata"]["name"] for thing in objects if thing["kind"] == "ConfigMap"]
     assert volume["configMap"]["name"] == cron["metadata"]["name"]
     assert cron["metadata"]["name"] in configs
-    values["mission"]["cronJob"]["schedule"] = "0 3 * * *"
-    (cron,) = of_kind(render(values), "CronJob").values()
+    nightly = "mission: {cronJob: {enabled: true, schedule: 0 3 * * *}}"
+    (cron,) = of_kind(render(nightly), "CronJob").values()
     assert (cron["spec"]["suspend"], cron["spec"]["schedule"]) == (False, "0 3 * * *")
 
 
 def test_the_job_of_a_mission_keeps_its_report_in_the_claim():
-    given = {"recordings": {"storage": "1Gi", "keepMissions": 7}, **ENABLED}
+    given = "{recordings: {storage: 1Gi, keepMissions: 7}, mission: {enabled: true}}"
     (job,) = jobs(given)
     pod = job["spec"]["template"]["spec"]
     arguments = pod["containers"][0]["args"]

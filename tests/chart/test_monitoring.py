@@ -57,7 +57,7 @@ def test_the_rules_use_existing_metrics_of_the_release_and_say_what_to_do():
 
 def rendered_rules(release):
     """Render the rules of a release in the namespace `lab`."""
-    on = {"metrics": {"prometheusRule": {"enabled": True, "force": True}}}
+    on = "metrics: {prometheusRule: {enabled: true, force: true}}"
     (rule,) = of_kind(render(on, release=release), "PrometheusRule").values()
     return rule["spec"]
 

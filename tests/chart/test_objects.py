@@ -18,30 +18,29 @@ from tests.chart.conftest import (
 @pytest.mark.parametrize(
     ("release", "values", "name"),
     [
-        ("my-cloudrc", {}, "my-cloudrc-world"),
-        ("1rel", {"fullnameOverride": "robot"}, "robot-world"),
-        ("d" * 53, {}, "d" * 46 + "-world"),
+        ("my-cloudrc", "", "my-cloudrc-world"),
+        ("1rel", "fullnameOverride: robot", "robot-world"),
+        ("d" * 53, "", "d" * 46 + "-world"),
     ],
 )
 def test_names_follow_release_and_override(release, values, name):
-    objects = render({**values, "mission": {"enabled": True}}, release=release)
+    objects = render(f"{values}\nmission: {{enabled: true}}", release=release)
     assert name in {thing["metadata"]["name"] for thing in objects}
     assert max(len(thing["metadata"]["name"]) for thing in objects) <= 63
 
 
+EVERYTHING = """
+mission: {enabled: true, queue: true}
+console: {enabled: true}
+ros: {enabled: true, steer: true}
+cloud: {backgroundLoad: {enabled: true, workers: 3}}
+"""
+
+
 def test_the_command_line_accepts_every_containers_arguments():
-    load = {"backgroundLoad": {"enabled": True, "workers": 3}}
-    on = {"enabled": True}
-    more = {"mission": {**on, "queue": True}, "console": on, "ros": {**on, "steer": True}}
-    pods = pod_specs(render({**more, "cloud": load}))
-    assert list(containers(pods["cloud"])) == [
-        "link",
-        "cloud",
-        "teleop",
-        "bridge",
-        "console",
-        "load",
-    ]
+    pods = pod_specs(render(EVERYTHING))
+    parts = ["link", "cloud", "teleop", "bridge", "console", "load"]
+    assert list(containers(pods["cloud"])) == parts
     assert "seq 3" in containers(pods["cloud"])["load"]["command"][-1]
     parts = [part for pod in pods.values() for part in containers(pod).values() if "args" in part]
     assert len(parts) == 10
@@ -72,12 +71,12 @@ TOPICS = "topics of ROS 2, which know no token"
 @pytest.mark.parametrize(
     ("values", "words", "warns"),
     [
-        ({}, SLOW, False),
-        ({"link": {"profile": "satellite"}}, SLOW, True),
-        ({}, CLOSED, True),
-        ({}, KEEP, True),
-        ({"networkPolicy": {"enabled": False}}, TOPICS, False),
-        ({"networkPolicy": {"enabled": False}, "ros": {"enabled": True}}, TOPICS, True),
+        ("", SLOW, False),
+        ("link: {profile: satellite}", SLOW, True),
+        ("", CLOSED, True),
+        ("", KEEP, True),
+        ("networkPolicy: {enabled: false}", TOPICS, False),
+        ("{networkPolicy: {enabled: false}, ros: {enabled: true}}", TOPICS, True),
     ],
 )
 def test_the_notes_warn_of_what_will_not_work(values, words, warns):

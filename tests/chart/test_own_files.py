@@ -5,12 +5,11 @@ import yaml
 
 from tests.chart.conftest import a_namespace, notes, of_kind, render
 
-OWN = {"robot": {"configMap": "mine"}, "scene": {"configMap": "lab"}}
+OWN = "{robot: {configMap: mine}, scene: {configMap: lab}}"
 
 
 def files(name, *keys):
-    data = dict.fromkeys(keys, "text")
-    return {"kind": "ConfigMap", "metadata": {"name": name}, "data": data}
+    return {"kind": "ConfigMap", "metadata": {"name": name}, "data": dict.fromkeys(keys, "text")}
 
 
 PRESENT = [files("mine", "robot.yaml", "robot.xml"), files("lab", "scene.xml")]
@@ -40,8 +39,7 @@ def test_helm_test_and_notes_fly_the_mission_of_the_experiment():
     short = flown(None)
     assert len(short["waypoints"]) == 1
     assert flown("steps") == short, "the API flies no steps"
-    rover = {"world": {"robot": "rover", "scene": "pillars"}, "mission": "pillars"}
-    text = notes({"experiment": rover})
+    text = notes("experiment: {world: {robot: rover, scene: pillars}, mission: pillars}")
     assert "cloudrc mission run pillars" in text
     assert "Robot: rover, in the scene pillars" in text
     assert "Robot: mine, in the scene lab" in notes(OWN)

@@ -23,6 +23,7 @@ from tests.chart.conftest import (
     VALUES,
     a_namespace,
     containers,
+    nothing,
     pod_specs,
     render,
     values_of,
@@ -34,75 +35,8 @@ kubernetes_validate = pytest.importorskip("kubernetes_validate", reason="comes w
 RENDERED = Path(__file__).parent / "rendered"
 OLDEST = re.match(r">=(\d+\.\d+)\.0-0 ", METADATA["kubeVersion"])[1]
 NEWEST = ".".join(kubernetes_validate.latest_version().split(".")[:2])
-ON = {"enabled": True}
-MINE = {"prometheus.io/scrape": "false", "example.org/owner": "me"}
-INJECT = {"sidecar.istio.io/inject": "false"}
 CASES = {
-    "placed": {
-        "commonLabels": {"team": "robots", "site": "a"},
-        "world": {"podLabels": {"site": "b"}},
-        "cloud": {
-            "nodeSelector": {"disk": "fast"},
-            "tolerations": [{"key": "lab", "operator": "Exists"}],
-            "affinity": {"nodeAffinity": {}},
-            "podAnnotations": MINE,
-        },
-        "mission": {**ON, "queue": True, "podAnnotations": INJECT, "podLabels": INJECT},
-        "teleop": {"service": {"port": 80}, "journal": {"keep": True}},
-        "metrics": {"podMonitor": {**ON, "force": True, "labels": {"team": "ops"}}},
-    },
-    "ros": {"cloud": {"ros": {**ON, "image": {"repository": "lab/nodes"}}}, "mission": ON},
-    "bridge": {"ros": ON},
-    "steered": {
-        "ros": {**ON, "steer": True, "namespace": "drone1"},
-        "cloud": {"ros": {**ON, "launch": ["ros2", "gain:=0.5 # not YAML", "true"]}},
-    },
-    "console": {"console": ON},
-    "hosts": {
-        "global": {"imageRegistry": "mirror.lab", "imagePullSecrets": [{"name": "all"}]},
-        "image": {"pullSecrets": ["one", {"name": "two"}]},
-        "console": {
-            **ON,
-            "allowFrom": [{"namespaceSelector": {"matchLabels": {"name": "ingress"}}}],
-        },
-        "ingress": {
-            **{**ON, "className": "nginx", "annotations": {"a": "b"}, "tlsSecret": "lab-tls"},
-            **{"apiHost": "api.lab", "consoleHost": "console.lab"},
-        },
-        "gateway": {**ON, "apiHost": "api.lab", "parentRefs": [{"name": "lab", "namespace": "gw"}]},
-    },
-    "claim": {
-        "mission": ON,
-        "recordings": {"existingClaim": "lab-data", "storage": "1Gi", "keepMissions": 5},
-    },
-    "own": {
-        "robot": {"configMap": "mine"},
-        "scene": {"configMap": "lab"},
-        "experiment": {"seed": 4, "world": {"robot": "rover", "odometry_rate_hz": 50}},
-    },
-    "openshift": {
-        "podSecurityContext": None,
-        "containerSecurityContext": None,
-        "ipFamilyPolicy": None,
-        "metrics": {"annotations": False},
-        "serviceAccount": {"create": False, "name": "robots"},
-    },
-    "images": {
-        "image": {
-            "registry": "ghcr.io/me",
-            "tag": "9.9.9",
-            "world": {"digest": "sha256:" + "0" * 64},
-        }
-    },
-    "secrets": {
-        "secret": {"existingSecret": "lab-key"},
-        "teleop": {"tokens": {"existingSecret": "lab-tokens"}},
-        "podSecurityContext": {"runAsUser": 12_345},
-    },
-    "scraped": {
-        "metrics": {"allowFrom": [{"namespaceSelector": {"matchLabels": {"name": "monitoring"}}}]},
-        "teleop": {"allowFrom": [{"ipBlock": {"cidr": "10.0.0.0/8"}}]},
-    },
+    **values_of(Path(__file__).with_name("cases.yaml")),
     **{path.stem.replace("values", "").strip("-"): values_of(path) for path in VALUES[1:]},
 }
 """Name of a file in rendered/ -> values."""
@@ -115,7 +49,7 @@ class Dumper(yaml.SafeDumper):
 
 def shown(values):
     """Render what does not change by itself: without Secrets, hashes, versions and long texts."""
-    objects = render(values, lookup=a_namespace() if "netem" in str(values) else (lambda *_: {}))
+    objects = render(values, lookup=a_namespace() if "netem" in str(values) else nothing)
     text = json.dumps([thing for thing in objects if thing["kind"] != "Secret"])
     text = re.sub(r'("checksum/\w+": )"\w+"', r'\1"HASH"', text)
     text = re.sub(r"-mission-[0-9a-f]{8}", "-mission-HASH", text)

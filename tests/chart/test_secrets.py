@@ -6,12 +6,6 @@ import pytest
 
 from tests.chart.conftest import a_namespace, notes, of_kind, pod_specs, render
 
-OURS = {
-    "secret": {"existingSecret": "lab-key"},
-    "teleop": {"tokens": {"existingSecret": "lab-tokens"}},
-    "mission": {"enabled": True},
-}
-
 
 def test_key_and_tokens_are_made_once_and_kept():
     installed = render(lookup=a_namespace())
@@ -27,19 +21,20 @@ def test_key_and_tokens_are_made_once_and_kept():
 
 
 @pytest.mark.parametrize(
-    ("key", "said"),
+    ("values", "name", "made"),
     [
-        ("secret", "no Secret 'lab-key' in namespace 'lab'; make it: .* generic lab-key"),
-        ("teleop", "no Secret 'lab-tokens' in namespace 'lab'; make it: .* --from-file=operator"),
+        ("secret: {existingSecret: lab-key}", "lab-key", "generic lab-key"),
+        ("teleop: {tokens: {existingSecret: lab-tokens}}", "lab-tokens", "--from-file=operator"),
     ],
 )
-def test_a_missing_secret_is_refused_with_a_command(key, said):
+def test_a_missing_secret_is_refused_with_a_command(values, name, made):
+    said = f"no Secret '{name}' in namespace 'lab'; make it: .* {made}"
     with pytest.raises(Exception, match=said):
-        render({key: OURS[key]}, lookup=a_namespace())
+        render(values, lookup=a_namespace())
 
 
 def test_secrets_are_in_no_output_and_no_environment():
-    objects, printed = render({"mission": {"enabled": True}}), notes()
+    objects, printed = render("mission: {enabled: true}"), notes()
     assert not any("secretKeyRef" in str(pod) for pod in pod_specs(objects).values())
     for secret in of_kind(objects, "Secret").values():
         for text in secret["data"].values():

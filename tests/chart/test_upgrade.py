@@ -5,7 +5,7 @@ import tarfile
 import pytest
 import yaml
 
-from tests.chart.conftest import ROOT, notes, of_kind, render
+from tests.chart.conftest import ROOT, containers, notes, of_kind, pod_specs, render
 
 PACKED = sorted((ROOT / "tests" / "fixtures" / "charts").glob("*.tgz"))
 each_chart = pytest.mark.parametrize("path", PACKED, ids=lambda path: path.stem)
@@ -26,20 +26,24 @@ def test_reused_values_of_an_earlier_chart_give_todays_objects(path):
 
 
 def test_an_added_limit_that_is_taken_out_stays_out():
-    values = {"ros": {"enabled": True, "resources": {"limits": {"cpu": None}}}}
-    cloud = of_kind(render(values), "Deployment")["cloud"]["spec"]["template"]["spec"]
-    (bridge,) = (each for each in cloud["containers"] if each["name"] == "bridge")
+    objects = render("ros: {enabled: true, resources: {limits: {cpu: null}}}")
+    bridge = containers(pod_specs(objects)["cloud"])["bridge"]
     assert bridge["resources"]["limits"].keys() == {"memory"}
 
 
+GONE = """
+world: {epochs: {a: 1}}
+experiment:
+  world: {plant: {thrust_factor: 0.9, mass_factor: 1.1}}
+  criteria: {contact: true}
+"""
+
+
 def test_values_that_have_gone_are_named_and_reach_no_pod():
-    experiment = {"world": {"plant": {"thrust_factor": 0.9, "mass_factor": 1.1}}}
-    experiment["criteria"] = {"contact": True}
-    values = {"world": {"epochs": {"a": 1}}, "experiment": experiment}
-    said = notes(values, upgrade=True)
+    said = notes(GONE, upgrade=True)
     for path in ("world.epochs", "criteria.contact", "plant.thrust_factor"):
         assert f"{path}: " in said
-    data = of_kind(render(values), "ConfigMap")["experiment"]["data"]["experiment.yaml"]
+    data = of_kind(render(GONE), "ConfigMap")["experiment"]["data"]["experiment.yaml"]
     assert yaml.safe_load(data) == {"world": {"plant": {"mass_factor": 1.1}}, "criteria": {}}
     assert "no effect" not in notes({})
 

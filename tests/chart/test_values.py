@@ -33,18 +33,18 @@ def test_the_schema_is_closed_at_every_level():
 
 
 def test_the_defaults_are_valid_and_written_out():
-    assert render({"global": {"anything": {"goes": True}}}), "values of a parent chart"
+    assert render("global: {anything: {goes: true}}"), "values of a parent chart"
     assert DEFAULTS.keys() == SCHEMA["properties"].keys() - {"global", "enabled"}
 
 
 @pytest.mark.parametrize(
     ("values", "named"),
     [
-        ({"lnk": {}}, "lnk"),
-        ({"link": {"profile": {"uplink": {"delay": 40}}}}, "delay"),
-        ({"experiment": {"guard": {"command_age_max_ms": -1}}}, "-1"),
-        ({"experiment": {"seed": 2**53}}, "9007199254740992"),
-        ({"world": {"podLabels": {"app.kubernetes.io/name": "x"}}}, "app.kubernetes.io/name"),
+        ("lnk: {}", "lnk"),
+        ("link: {profile: {uplink: {delay: 40}}}", "delay"),
+        ("experiment: {guard: {command_age_max_ms: -1}}", "-1"),
+        ("experiment: {seed: 9007199254740992}", "9007199254740992"),
+        ("world: {podLabels: {app.kubernetes.io/name: x}}", "app.kubernetes.io/name"),
     ],
 )
 def test_a_wrong_value_is_refused_and_named(values, named):
