@@ -11,7 +11,6 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from cloudrc.cluster.client import connect
@@ -26,11 +25,16 @@ ROOT = Path(__file__).resolve().parents[2]
 CHART = ROOT / "charts" / "cloudrc"
 EXAMPLES = CHART / "examples"
 NAMESPACE = "cloudrc-e2e"
-NAMESPACES = (NAMESPACE, f"{NAMESPACE}-monitoring")
+MONITORING = f"{NAMESPACE}-monitoring"
+NAMESPACES = (NAMESPACE, MONITORING)
 """Namespaces that these tests create."""
 NAME = "cloudrc"
 ENDS = ("world", "cloud")
-RESTRICTED = {"pod-security.kubernetes.io/enforce": "restricted"}
+RESTRICTED = f"""
+apiVersion: v1
+kind: Namespace
+metadata: {{name: {NAMESPACE}, labels: {{pod-security.kubernetes.io/enforce: restricted}}}}
+"""
 SUMMARY: list[str] = []
 """Lines that pytest prints after the tests."""
 TIMES: dict[str, float] = {}
@@ -63,12 +67,9 @@ def read(*words):
     return json.loads(kubectl("get", *words, "--output=json"))
 
 
-def apply(*documents):
-    """Apply objects, in the namespace of the tests unless they name another."""
-    for document in documents:
-        if document["kind"] != "Namespace":
-            document["metadata"].setdefault("namespace", NAMESPACE)
-    command("kubectl", "apply", "--filename=-", given=yaml.safe_dump_all(documents))
+def apply(objects, namespace=NAMESPACE):
+    """Apply objects, a text in YAML."""
+    kubectl(f"--namespace={namespace}", "apply", "--filename=-", given=objects)
 
 
 def helm(*words, timeout=180.0):
@@ -86,9 +87,9 @@ def cloudrc(*words, timeout=240.0):
     )
 
 
-def in_release(*words, timeout=240.0):
-    """Run cloudrc for the release of the tests, and return its output."""
-    done = cloudrc(*words, "-n", NAMESPACE, "--release", NAME, timeout=timeout)
+def in_release(*words, release=NAME):
+    """Run cloudrc for a release, and return its output."""
+    done = cloudrc(*words, "-n", NAMESPACE, "--release", release)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -118,8 +119,12 @@ def eventually(look, what, timeout=30.0, every=0.5):
         time.sleep(every)
 
 
-def place():
-    return connect(None, NAMESPACE, NAME)
+def place(release=NAME):
+    return connect(None, NAMESPACE, release)
+
+
+def until_ready(release=NAME):
+    wait_ready(place(release), timeout=120.0)
 
 
 def pods(component):
@@ -200,10 +205,10 @@ def mean_delays(seconds):
     return found
 
 
-def job_end(name):
+def job_end(name, release=NAME):
     """Wait for the end of a Job; check that its state fits its end; return its end and its log."""
     lines: list[str] = []
-    end = follow(place(), name, lines.append)
+    end = follow(place(release), name, lines.append)
     assert read("job", name)["status"].get("succeeded", 0) == (end.exit_code == 0), end
     return end, "\n".join(lines)
 
@@ -215,10 +220,19 @@ def job_log(name):
     return kubectl("logs", runs[0]["metadata"]["name"]) if runs else ""
 
 
-def fly(name, waypoints, limit=60.0, **keys):
+def fly(name, waypoints, limit=60.0, release=NAME, **keys):
     """Start a Job that flies waypoints, as `cloudrc mission run` does; `keys` of the mission."""
     mission = {"name": name, "time_limit_s": limit, "waypoints": list(waypoints), **keys}
-    run_job(place(), mission, name=name)
+    run_job(place(release), mission, name=name)
+
+
+INTERRUPTED = 130
+"""Exit code of a mission that was cancelled."""
+LONG = [
+    {"position_m": [0.5, 0.0, 0.7]},
+    {"position_m": [0.5, 1.0, 0.7], "dwell_s": 200.0, "time_limit_s": 300.0},
+]
+"""Waypoints of a mission that waits at the second one for longer than any test takes."""
 
 
 def save(folder):
@@ -280,8 +294,7 @@ def cluster(request):
             os.environ["KUBECONFIG"] = str(BUILD / "kubeconfig")
             _create()
         load(IMAGES)
-        metadata = {"name": NAMESPACE, "labels": RESTRICTED}
-        apply({"apiVersion": "v1", "kind": "Namespace", "metadata": metadata})
+        apply(RESTRICTED)
         request.config.stash[UP] = True
         yield
     finally:
@@ -335,17 +348,20 @@ def pytest_terminal_summary(terminalreporter):
             terminalreporter.write_line(line)
 
 
+VALUES = f"""
+link: {{mode: relay}}
+dashboards: {{enabled: true}}
+metrics:
+  allowFrom:
+  - namespaceSelector: {{matchLabels: {{kubernetes.io/metadata.name: {MONITORING}}}}}
+"""
+
+
 @pytest.fixture(scope="session")
 def values(tmp_path_factory):
     """The file of values with which the tests install their release."""
-    prometheus = {"kubernetes.io/metadata.name": f"{NAMESPACE}-monitoring"}
-    given = {
-        "link": {"mode": "relay"},
-        "dashboards": {"enabled": True},
-        "metrics": {"allowFrom": [{"namespaceSelector": {"matchLabels": prometheus}}]},
-    }
     path = tmp_path_factory.mktemp("values") / "values.yaml"
-    path.write_text(yaml.safe_dump(given))
+    path.write_text(VALUES)
     return path
 
 
@@ -355,7 +371,7 @@ def installed(cluster, values):
     kubectl("delete", "jobs", "--all")  # of an earlier session, where the cluster was kept
     began = time.monotonic()
     helm("upgrade", "--install", NAME, str(CHART), f"--values={values}")
-    wait_ready(place(), timeout=120.0)
+    until_ready()
     SUMMARY.append(f"helm install until both pods are ready: {time.monotonic() - began:.0f} s")
 
 

@@ -6,9 +6,8 @@ from urllib.parse import urlencode
 
 from cloudrc.cluster.client import connect
 from cloudrc.cluster.pods import NO_PROXY, forwarded
-from tests.e2e.conftest import NAMESPACE, apply, command, kubectl, pod
+from tests.e2e.conftest import MONITORING, NAMESPACE, apply, command, kubectl, pod
 
-MONITORING = f"{NAMESPACE}-monitoring"
 TRY_PORTS = """\
 import json, socket, sys
 ports = json.loads(sys.argv[1])
@@ -29,27 +28,27 @@ print(json.dumps(answered))
 """
 
 
-def image():
-    """Return the image of the cloud pod, which has Python and is on the node."""
-    return str(pod("cloud")["spec"]["containers"][0]["image"])
-
-
 def stranger(name, ports):
-    """Try ports from a pod without the release's labels; return the TCP ports that answer."""
+    """Try ports from a pod without the release's labels; return the TCP ports that answer.
+
+    It runs the image of the cloud pod, which has Python and is on the node.
+    """
     cloud = pod("cloud")["spec"]
-    container = {
-        "name": "stranger",
-        "image": image(),
-        "command": ["python", "-c", TRY_PORTS, json.dumps(ports)],
-        "securityContext": cloud["containers"][0]["securityContext"],
-    }
-    spec = {
-        "restartPolicy": "Never",
-        "automountServiceAccountToken": False,
-        "securityContext": cloud["securityContext"],
-        "containers": [container],
-    }
-    apply({"apiVersion": "v1", "kind": "Pod", "metadata": {"name": name}, "spec": spec})
+    first = cloud["containers"][0]
+    apply(f"""
+apiVersion: v1
+kind: Pod
+metadata: {{name: {name}}}
+spec:
+  restartPolicy: Never
+  automountServiceAccountToken: false
+  securityContext: {json.dumps(cloud["securityContext"])}
+  containers:
+  - name: stranger
+    image: {first["image"]}
+    command: {json.dumps(["python", "-c", TRY_PORTS, json.dumps(ports)])}
+    securityContext: {json.dumps(first["securityContext"])}
+""")
     try:
         succeeded = "--for=jsonpath={.status.phase}=Succeeded"
         kubectl("wait", f"pod/{name}", succeeded, "--timeout=60s", timeout=70.0)
@@ -86,32 +85,31 @@ def targets():
 def install_prometheus():
     """Start a Prometheus in a namespace of its own, and wait until it is ready."""
     found = command("docker", "images", "--format={{.Repository}}:{{.Tag}}", "cloudrc/prometheus")
-    metadata = {"name": "prometheus", "namespace": MONITORING}
-    config = {"name": "config", "mountPath": "/etc/prometheus"}
-    prometheus = {
-        "name": "prometheus",
-        "image": found.split()[0],
-        "readinessProbe": {"httpGet": {"path": "/-/ready", "port": 9090}, "periodSeconds": 1},
-        "volumeMounts": [config],
-    }
-    volume = {"name": "config", "configMap": {"name": "prometheus"}}
     apply(
-        {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": MONITORING}},
-        {
-            "apiVersion": "v1",
-            "kind": "ConfigMap",
-            "metadata": metadata,
-            "data": {
-                "prometheus.yml": CONFIG,
-                "pods.json": targets(),
-            },
-        },
-        {
-            "apiVersion": "v1",
-            "kind": "Pod",
-            "metadata": metadata,
-            "spec": {"containers": [prometheus], "volumes": [volume]},
-        },
+        f"""
+apiVersion: v1
+kind: Namespace
+metadata: {{name: {MONITORING}}}
+---
+apiVersion: v1
+kind: ConfigMap
+metadata: {{name: prometheus}}
+data:
+  prometheus.yml: {json.dumps(CONFIG)}
+  pods.json: {json.dumps(targets())}
+---
+apiVersion: v1
+kind: Pod
+metadata: {{name: prometheus}}
+spec:
+  containers:
+  - name: prometheus
+    image: {found.split()[0]}
+    readinessProbe: {{httpGet: {{path: /-/ready, port: 9090}}, periodSeconds: 1}}
+    volumeMounts: [{{name: config, mountPath: /etc/prometheus}}]
+  volumes: [{{name: config, configMap: {{name: prometheus}}}}]
+""",
+        MONITORING,
     )
     ready = ["wait", "pod/prometheus", "--for=condition=Ready", "--timeout=60s"]
     kubectl(f"--namespace={MONITORING}", *ready)

@@ -9,6 +9,8 @@ import pytest
 
 from tests.e2e.conftest import (
     CHART,
+    INTERRUPTED,
+    LONG,
     NAME,
     eventually,
     fly,
@@ -52,13 +54,6 @@ PROFILES = [
 changes the mean by 0.3, 0.5 and 0.5 ms. The release starts with paper-p2."""
 SETTLE = 1.0
 """Time after a change until the datagrams sent before the change have arrived [s]."""
-INTERRUPTED = 130
-"""Exit code of a mission that was cancelled."""
-LONG = [
-    {"position_m": [0.5, 0.0, 0.7]},
-    {"position_m": [0.5, 1.0, 0.7], "dwell_s": 200.0, "time_limit_s": 300.0},
-]
-"""A mission that waits at its second point for longer than the tests of this module take."""
 SHOWN = 600
 """Time that the dashboards show [s]: the missions so far."""
 TRIES = 12

@@ -9,7 +9,6 @@ import time
 import pytest
 
 from cloudrc.cli.mission import LEASE
-from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.pods import fetch_recording
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState
@@ -27,6 +26,7 @@ from tests.e2e.conftest import (
     pod,
     pods,
     read,
+    until_ready,
     value,
 )
 
@@ -107,7 +107,7 @@ def test_a_deleted_world_ends_the_mission_as_failed(installed):
     end, _ = job_end("orphaned")
     assert end.exit_code == 1, end
     assert "world_restarted" in end.message
-    wait_ready(place(), timeout=60.0)
+    until_ready()
 
 
 def recording(component, folder):

@@ -5,9 +5,6 @@ import json
 import pytest
 
 from cloudrc import __version__
-from cloudrc.cluster.client import connect
-from cloudrc.cluster.flight import wait_ready
-from cloudrc.cluster.jobs import follow
 from cloudrc.config.load import load_experiment
 from tests.e2e.conftest import (
     CHART,
@@ -16,8 +13,10 @@ from tests.e2e.conftest import (
     command,
     helm,
     in_release,
+    job_end,
     kubectl,
     report,
+    until_ready,
 )
 from tests.flights.conftest import fly, numbers
 
@@ -53,7 +52,7 @@ def rover(installed):
     try:
         helm("install", ROVER, str(CHART), f"--set=link.mode=relay,{given}")
         kubectl("create", "job", "by-hand", f"--from=cronjob/{ROVER}-cloudrc-mission")
-        yield connect(None, NAMESPACE, ROVER)
+        yield
     finally:
         helm("uninstall", ROVER)
         kubectl("delete", "pvc", f"{ROVER}-cloudrc-recordings", "--wait=false")
@@ -118,15 +117,12 @@ def test_a_run_in_a_cluster_is_that_of_virtual_time(
 
 
 @pytest.mark.real_time
-def test_kubectl_alone_drives_another_robot_whose_report_is_kept_when_its_pods_are_gone(
-    rover, tmp_path
-):
-    lines: list[str] = []
-    end = follow(rover, "by-hand", lines.append)
-    assert end.exit_code == 0, (end, lines)
-    assert "waypoint 4 of 4 reached" in "\n".join(lines)
-    (name,) = (line.split()[-1] for line in lines if line.startswith("report: "))
+def test_kubectl_alone_drives_another_robot_whose_report_is_kept_when_its_pods_are_gone(tmp_path):
+    end, log = job_end("by-hand", ROVER)
+    assert end.exit_code == 0, (end, log)
+    assert "waypoint 4 of 4 reached" in log
+    (name,) = (line.split()[-1] for line in log.splitlines() if line.startswith("report: "))
     kubectl("delete", "pods", f"--selector=app.kubernetes.io/instance={ROVER}")
-    wait_ready(rover, timeout=120.0)
+    until_ready(ROVER)
     found = report(tmp_path / "kept", ROVER, name)
     assert (found["verdict"], found["complete"]) == ("success", True)

@@ -5,7 +5,6 @@ import json
 import pytest
 import yaml
 
-from cloudrc.cluster.flight import wait_ready
 from tests.e2e.conftest import (
     CHART,
     EXAMPLES,
@@ -15,7 +14,7 @@ from tests.e2e.conftest import (
     helm,
     metrics,
     pace,
-    place,
+    until_ready,
     value,
 )
 
@@ -41,7 +40,7 @@ def constrained(installed, values, tmp_path):
         assert (tmp_path / name / "report.json").is_file(), done.stdout + done.stderr
         return done.returncode, json.loads((tmp_path / name / "report.json").read_text())
 
-    wait_ready(place(), timeout=120.0)
+    until_ready()
     yield fly
     helm("upgrade", NAME, str(CHART), f"--values={values}")
 

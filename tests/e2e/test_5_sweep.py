@@ -5,6 +5,7 @@ import json
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import yaml
@@ -15,15 +16,12 @@ RUN = [sys.executable, "-m", "cloudrc", "sweep"]
 SWEEP = "--selector=app.kubernetes.io/component=sweep"
 FLOWN = (0, 1)
 """Exit codes of a sweep whose flights have all ended: 1 if one has failed its mission."""
-CLAIM = {
-    "apiVersion": "v1",
-    "kind": "PersistentVolumeClaim",
-    "metadata": {"name": "rows"},
-    "spec": {
-        "accessModes": ["ReadWriteOnce"],
-        "resources": {"requests": {"storage": "100Mi"}},
-    },
-}
+CLAIM = """
+apiVersion: v1
+kind: PersistentVolumeClaim
+metadata: {name: rows}
+spec: {accessModes: [ReadWriteOnce], resources: {requests: {storage: 100Mi}}}
+"""
 
 
 @pytest.fixture
@@ -32,13 +30,12 @@ def sweep(tmp_path):
 
     def write(flights, steps=5):
         file = tmp_path / "sweep.yaml"
-        document = {
-            "experiment": "steps",
-            "set": {"link.profile": "paper-p2", "mission.steps.count": steps},
-            "grid": {"cloud.predictor": ["last_sample", "./mine.py"]},
-            "seeds": flights // 2,
-        }
-        file.write_text(yaml.safe_dump(document))
+        file.write_text(f"""
+experiment: steps
+set: {{link.profile: paper-p2, mission.steps.count: {steps}}}
+grid: {{cloud.predictor: [last_sample, ./mine.py]}}
+seeds: {flights // 2}
+""")
         mine = "from cloudrc.cloud.predictors.constant_velocity import build as build\n"
         (tmp_path / "mine.py").write_text(mine)
         return file
@@ -99,7 +96,8 @@ def rows_of_claim():
     container["volumeMounts"] = [{"name": "rows", "mountPath": "/rows"}]
     container["resources"]["requests"]["cpu"] = "50m"
     spec["volumes"] = [{"name": "rows", "persistentVolumeClaim": {"claimName": "rows"}}]
-    apply({"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "rows"}, "spec": spec})
+    pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "rows"}, "spec": spec}
+    apply(yaml.safe_dump(pod))
     ended = "--for=jsonpath={.status.phase}=Succeeded"
     kubectl("wait", "pod/rows", ended, "--timeout=100s")
     return kubectl("logs", "rows")
@@ -140,72 +138,12 @@ def test_without_a_claim_the_rows_of_lost_pods_are_flown_again(cluster, sweep, s
     assert table(tmp_path / "pods") == here(file, tmp_path / "here")
 
 
-TEXT, COUNT = {"type": "string"}, {"type": "integer"}
-AMOUNT = {"x-kubernetes-int-or-string": True}
-ANY = {"type": "object", "x-kubernetes-preserve-unknown-fields": True}
-QUOTA = {"name": TEXT, "nominalQuota": AMOUNT, "borrowingLimit": AMOUNT, "lendingLimit": AMOUNT}
-GROUP = {"coveredResources": [TEXT], "flavors": [{"name": TEXT, "resources": [QUOTA]}]}
-JOBS = {"name": TEXT, "replicas": COUNT, "groupName": TEXT, "template": ANY}
-KINDS = {
-    "kueue.x-k8s.io/v1beta2": {
-        "ResourceFlavor": ("Cluster", {"nodeLabels": ANY, "topologyName": TEXT}),
-        "ClusterQueue": (
-            "Cluster",
-            {"cohortName": TEXT, "namespaceSelector": ANY, "resourceGroups": [GROUP]},
-        ),
-        "LocalQueue": ("Namespaced", {"clusterQueue": TEXT, "stopPolicy": TEXT}),
-    },
-    "jobset.x-k8s.io/v1alpha2": {
-        "JobSet": (
-            "Namespaced",
-            {
-                "failurePolicy": {"maxRestarts": COUNT},
-                "replicatedJobs": [JOBS],
-                "suspend": {"type": "boolean"},
-            },
-        ),
-    },
-}
-"""API version -> kind -> its scope, and fields of its spec: those of the examples and some beside
-them. A field that is not here is refused. Their names are those of the API references of Kueue
-(v1beta2) and JobSet (v1alpha2)."""
-
-
-def schema(form):
-    """Return the schema of a value: of a mapping's fields, of a list's items, or `form` itself."""
-    if isinstance(form, list):
-        return {"type": "array", "items": schema(form[0])}
-    if "type" in form or form is AMOUNT:
-        return form
-    fields = {name: schema(each) for name, each in form.items()}
-    return {"type": "object", "properties": fields}
-
-
-def definitions():
-    """Yield the definition of each kind that the examples need."""
-    for api, kinds in KINDS.items():
-        group, version = api.split("/")
-        for kind, (scope, spec) in kinds.items():
-            plural = f"{kind.lower()}s"
-            one = {"name": version, "served": True, "storage": True}
-            names = {"kind": kind, "plural": plural, "singular": kind.lower()}
-            note = {"api-approved.kubernetes.io": "unapproved, of a test"}
-            versions = [{**one, "schema": {"openAPIV3Schema": schema({"spec": spec})}}]
-            yield {
-                "apiVersion": "apiextensions.k8s.io/v1",
-                "kind": "CustomResourceDefinition",
-                "metadata": {"name": f"{plural}.{group}", "annotations": note},
-                "spec": {"group": group, "names": names, "scope": scope, "versions": versions},
-            }
-
-
 def test_the_examples_for_kueue_and_jobset_are_taken(cluster):
     """By the API server, with definitions of this test; the Job of the JobSet by its own rules."""
-    made = yaml.safe_dump_all(definitions())
-    command("kubectl", "create", "--filename=-", given=made)
+    kinds = f"--filename={Path(__file__).with_name('kinds.yaml')}"
+    command("kubectl", "create", kinds)
     try:
-        names = [f"crd/{each['metadata']['name']}" for each in definitions()]
-        command("kubectl", "wait", "--for=condition=Established", "--timeout=60s", *names)
+        command("kubectl", "wait", "--for=condition=Established", "--timeout=60s", kinds)
         take = ["create", "--dry-run=server", "--validate=strict", "--filename=-"]
         for name, field in (("kueue-queue", "nominalQuota"), ("sweep-jobset", "maxRestarts")):
             text = (EXAMPLES / f"{name}.yaml").read_text()
@@ -218,4 +156,4 @@ def test_the_examples_for_kueue_and_jobset_are_taken(cluster):
             text = yaml.safe_dump({**job, **each["template"]})
             kubectl(*take, given=text)
     finally:
-        command("kubectl", "delete", "--ignore-not-found", "--filename=-", given=made)
+        command("kubectl", "delete", "--ignore-not-found", kinds)

@@ -6,20 +6,18 @@ import re
 import pytest
 import yaml
 
-from cloudrc.cluster.flight import wait_ready
 from cloudrc.messages import GuardState
 from tests.e2e.conftest import (
     CHART,
     EXAMPLES,
     NAME,
-    NAMESPACE,
-    cloudrc,
     command,
     helm,
+    in_release,
     kubectl,
     load,
-    place,
     pod,
+    until_ready,
 )
 
 pytestmark = pytest.mark.full
@@ -64,16 +62,15 @@ def image(cluster, note):
 def upgrade(*files):
     """Give the release the values of these files alone."""
     helm("upgrade", NAME, str(CHART), *(f"--values={file}" for file in files))
-    wait_ready(place(), timeout=120.0)
+    until_ready()
 
 
 def contact_time():
     """Fly `pipes`; return the time at which the robot touches the board [s]."""
     times = []
     for _ in range(FLIGHTS):
-        done = cloudrc("mission", "run", "pipes", "-n", NAMESPACE, "--release", NAME)
-        assert done.returncode == 0, done.stdout + done.stderr
-        times.append(float(re.search(r"board touched at ([0-9.]+) s", done.stdout)[1]))
+        said = in_release("mission", "run", "pipes")
+        times.append(float(re.search(r"board touched at ([0-9.]+) s", said)[1]))
     return min(times)
 
 

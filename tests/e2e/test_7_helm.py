@@ -4,8 +4,7 @@ import shlex
 
 import pytest
 
-from cloudrc.cluster.flight import wait_ready
-from tests.e2e.conftest import NAME, cloudrc, command, helm, place
+from tests.e2e.conftest import NAME, cloudrc, command, helm, until_ready
 
 
 @pytest.mark.full
@@ -21,6 +20,6 @@ def test_the_commands_of_the_notes_work_as_printed(installed):
 
 @pytest.mark.real_time
 def test_helm_test_flies_and_passes(installed):
-    wait_ready(place(), timeout=120.0)
+    until_ready()
     said = helm("test", NAME, "--timeout=300s", timeout=500.0)
     assert "Phase:          Succeeded" in said

@@ -4,22 +4,25 @@ import subprocess
 
 import pytest
 
-from cloudrc.cluster.client import connect
-from cloudrc.cluster.flight import wait_ready
-from cloudrc.cluster.jobs import follow, run_job
-from tests.e2e.conftest import CHART, NAMESPACE, ROOT, cloudrc, eventually, helm, job_log, read
+from tests.e2e.conftest import (
+    CHART,
+    INTERRUPTED,
+    LONG,
+    ROOT,
+    eventually,
+    fly,
+    helm,
+    in_release,
+    job_end,
+    job_log,
+    read,
+    until_ready,
+)
 
 OLD = "cloudrc-old"
 """The release that is upgraded."""
 AUDIT = "--audit=/var/lib/cloudrc-journal/audit.jsonl"
 """An argument of earlier charts, for the images of that time."""
-POINTS = [
-    {"position_m": [0.5, 0.0, 0.7]},
-    {"position_m": [0.5, 1.0, 0.7], "dwell_s": 200.0, "time_limit_s": 300.0},
-]
-"""The second point takes longer than upgrade and rollback."""
-INTERRUPTED = 130
-"""Exit code of a mission that was cancelled."""
 
 
 @pytest.fixture
@@ -43,9 +46,8 @@ def ends():
 
 def changed(before, *command):
     """Run a command of helm; return the components whose pods are replaced by it."""
-    release = connect(None, NAMESPACE, OLD)
     helm(*command)
-    wait_ready(release, timeout=120.0)
+    until_ready(OLD)
     return {component for component, uid in ends().items() if before[component] != uid}
 
 
@@ -61,16 +63,15 @@ def changed(before, *command):
 def test_a_mission_goes_on_while_its_release_is_upgraded_and_rolled_back(
     installed, chart, before, keeps, restarts
 ):
-    release = connect(None, NAMESPACE, OLD)
     helm("install", OLD, str(chart), "--set=link.mode=relay")
-    wait_ready(release, timeout=120.0)
-    run_job(release, {"name": "old", "time_limit_s": 300.0, "waypoints": POINTS}, name="old")
+    until_ready(OLD)
+    fly("old", LONG, 300.0, OLD)
     eventually(lambda: "waypoint 1 of 2 reached" in job_log("old"), "the mission flies", 90.0)
     assert changed(ends(), "upgrade", OLD, str(CHART), keeps) == restarts
     assert changed(ends(), "rollback", OLD, "1") == restarts
-    said = cloudrc("mission", "cancel", "-n", NAMESPACE, "--release", OLD).stdout
+    said = in_release("mission", "cancel", release=OLD)
     assert "waypoint 2 of 2" in said, "it was under way"
-    end = follow(release, "old", lambda line: None)
+    end, _ = job_end("old", OLD)
     assert end.exit_code == INTERRUPTED, end
 
 
@@ -78,6 +79,6 @@ def test_a_mission_goes_on_while_its_release_is_upgraded_and_rolled_back(
 @pytest.mark.parametrize("before", ["before-guests"])
 def test_the_earliest_chart_is_upgraded_with_both_pods(installed, chart, before):
     helm("install", OLD, str(chart), "--set=link.mode=relay,world.epochs.a=b")
-    wait_ready(connect(None, NAMESPACE, OLD), timeout=120.0)
+    until_ready(OLD)
     assert changed(ends(), "upgrade", OLD, str(CHART), "--reuse-values") == {"world", "cloud"}
     assert "world.epochs" in helm("get", "notes", OLD)

@@ -5,17 +5,26 @@ import sys
 
 import pytest
 
-from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.link import FOLDER
 from cloudrc.link.state import STATE_FILE, from_text
-from tests.e2e.conftest import CHART, NAME, NAMESPACE, ROOT, eventually, helm, kubectl, place, pod
+from tests.e2e.conftest import (
+    CHART,
+    NAME,
+    NAMESPACE,
+    ROOT,
+    eventually,
+    helm,
+    kubectl,
+    pod,
+    until_ready,
+)
 
 
 @pytest.fixture(scope="module")
 def console(installed):
     """`cloudrc console --cluster`, on the release with a console."""
     helm("upgrade", NAME, str(CHART), "--reset-then-reuse-values", "--set", "console.enabled=true")
-    wait_ready(place(), timeout=120.0)
+    until_ready()
     words = ["console", "--cluster", "--no-open", "-n", NAMESPACE, "--release", NAME]
     command = [sys.executable, "-m", "cloudrc", *words]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
