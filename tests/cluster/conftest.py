@@ -1,16 +1,18 @@
 """A fake Kubernetes API server with objects in memory, a fake teleop, and fake programs."""
 
 import base64
-import functools
 import itertools
 import json
 import os
+import re
 import threading
 import uuid
+from functools import reduce
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
+import yaml
 
 from cloudrc.cluster import client, flight, jobs
 from cloudrc.cluster.client import connect
@@ -19,13 +21,18 @@ from cloudrc.cluster.jobs import UID_LABEL
 from cloudrc.cluster.pods import INDEX
 from tests.chart.conftest import render
 
+PATH = re.compile(r"/(?:api|apis/[^/]+)/v\w+(?:/namespaces/([^/]+))?/(\w+)(?:/([^/]+))?(?:/(\w+))?")
+"""Path of a request: namespace, plural, name, subresource."""
 
-def _terms(selector):
-    return dict(term.split("=") for term in selector.split(",") if term)
+
+def _has_labels(body, selector):
+    asked = dict(term.split("=") for term in selector.split(",") if term)
+    return asked.items() <= body["metadata"].get("labels", {}).items()
 
 
-def _value(body, path):
-    return functools.reduce(dict.__getitem__, path.split("."), body)
+def _has_fields(body, selector):
+    terms = (term.split("=") for term in selector.split(",") if term)
+    return all(reduce(dict.__getitem__, path.split("."), body) == value for path, value in terms)
 
 
 class FakeApi:
@@ -35,7 +42,6 @@ class FakeApi:
         self.objects = {}
         self.logs = {}
         self.refuse = {}
-        self.nodes = ["one"]
         self.forbidden = set()  # objects that the user may not create or delete
         self.seen = []
         self.hooks = []  # each gets the path that is read; what it returns is the reply
@@ -43,6 +49,7 @@ class FakeApi:
         self._clock = itertools.count()
         self.forgotten = 0  # a watch from an earlier resource version gets error 410
         self.changes = []  # (kind, plural, object) in the order of their resource versions
+        self.put("nodes", {"metadata": {"name": "one"}, "spec": {}})
         self.server = serve(lambda request, body: self.answer(request.command, request.path, body))
         self.url = f"http://127.0.0.1:{self.server.server_port}"
 
@@ -75,18 +82,11 @@ class FakeApi:
 
     def answer(self, method, path, body):
         address = urlsplit(path)
-        if address.path == "/api/v1/nodes":
-            return 200, {"items": [{"metadata": {"name": name}, "spec": {}} for name in self.nodes]}
-        if address.path.endswith("/selfsubjectaccessreviews"):
+        query = {key: values[0] for key, values in parse_qs(address.query).items()}
+        namespace, plural, name, subresource = PATH.match(address.path).groups(default="")
+        if plural == "selfsubjectaccessreviews":
             asked = body["spec"]["resourceAttributes"]["resource"]
             return 201, {"spec": {}, "status": {"allowed": asked not in self.forbidden}}
-        parts = address.path.strip("/").split("/")
-        in_namespace = parts[parts.index("namespaces") + 1 :] if "namespaces" in parts else []
-        if in_namespace[1:]:
-            _, plural, *rest = in_namespace
-        else:  # a namespace, or objects of all namespaces
-            plural, rest = ("namespaces", in_namespace) if in_namespace else (parts[-1], [])
-        name, subresource = (*rest, "", "")[:2]
         self.seen.append(f"{method} {plural}{'/' + name if name else ''}")
         if (method, plural) in self.refuse:
             code, message = self.refuse[method, plural]
@@ -95,47 +95,39 @@ class FakeApi:
             replies = [hook(path) for hook in self.hooks if method == "GET"]
             if refused := next(filter(None, replies), None):
                 return refused
-            if method == "POST" and "dryRun" in address.query:
-                return 201, body
             if method == "POST":
-                return 201, self.put(plural, body)
-            if "watch=" in address.query:
-                return 200, self._watch(plural, parse_qs(address.query))
+                return 201, body if "dryRun" in query else self.put(plural, body)
+            if "watch" in query:
+                return 200, self._watch(plural, query)
             if not name:
-                query = parse_qs(address.query)
-                labels = _terms(query.get("labelSelector", [""])[0])
-                fields = _terms(query.get("fieldSelector", [""])[0])
                 found = [
                     body
                     for (kind, _), body in self.objects.items()
                     if kind == plural
-                    and (not in_namespace or body["metadata"]["namespace"] == in_namespace[0])
-                    and labels.items() <= body["metadata"].get("labels", {}).items()
-                    and all(_value(body, path) == value for path, value in fields.items())
+                    and namespace in ("", body["metadata"]["namespace"])
+                    and _has_labels(body, query.get("labelSelector", ""))
+                    and _has_fields(body, query.get("fieldSelector", ""))
                 ]
                 return 200, {"items": found}
             if (plural, name) not in self.objects:
                 return 404, {"message": f'{plural} "{name}" not found', "code": 404}
             if subresource == "log":
                 log = self.logs.get(name, "")
-                return (
-                    (200, log) if log is not None else (403, {"message": "no right", "code": 403})
-                )
+                return (403, {"message": "no right", "code": 403}) if log is None else (200, log)
             if method == "DELETE":
                 return 200, self.drop(plural, name)
             return 200, self.objects[plural, name]
 
     def _watch(self, plural, query):
         """Return the changes since a version as lines; the real server waits for more."""
-        labels = _terms(query["labelSelector"][0])
-        since = int(query.get("resourceVersion", ["0"])[0])
+        since = int(query.get("resourceVersion", "0"))
         if 0 < since < self.forgotten:
             status = {"code": 410, "reason": "Expired", "message": "too old"}
             return json.dumps({"type": "ERROR", "object": status}) + "\n"
         return "".join(
             json.dumps({"type": kind, "object": body}) + "\n"
             for kind, changed, body in self.changes[since:]
-            if changed == plural and labels.items() <= body["metadata"].get("labels", {}).items()
+            if changed == plural and _has_labels(body, query["labelSelector"])
         )
 
     def jobs(self):
@@ -157,6 +149,11 @@ class FakeApi:
         body = pod(name, "mission", labels=own, state=terminated(code, message))
         body["metadata"]["annotations"] = {ROBOT: str(robot)}
         self.put("pods", body)
+
+    def tell_of(self, plural, name, **event):
+        """Put an event about an object."""
+        about = {"uid": self.get(plural, name)["metadata"]["uid"], "name": name}
+        self.put("events", {"metadata": {"name": "e"}, "involvedObject": about, **event})
 
     def at_look(self, number, action, plural="jobs"):
         """Call `action` at the n-th request for objects of a kind, by default Jobs."""
@@ -250,19 +247,17 @@ def labels(component):
     }
 
 
-SECURE = {"runAsUser": 10001}
-TELEOP = {
-    "name": "teleop",
-    "image": "cloudrc/cloud:0.1.0",
-    "securityContext": {"allowPrivilegeEscalation": False},
-}
-POD = {
-    "containers": [{"name": "cloud"}, TELEOP],
-    "volumes": [
-        {"name": "data", "emptyDir": {}},
-        {"name": "tokens", "secret": {"secretName": "cloudrc-tokens"}},
-    ],
-}
+POD = yaml.safe_load("""
+securityContext: {runAsUser: 10001}
+containers:
+- {name: cloud}
+- name: teleop
+  image: cloudrc/cloud:0.1.0
+  securityContext: {allowPrivilegeEscalation: false}
+volumes:
+- {name: data, emptyDir: {}}
+- {name: tokens, secret: {secretName: cloudrc-tokens}}
+""")
 """Pod of a component, as in its Deployment."""
 
 
@@ -293,7 +288,7 @@ def deployment(component, **status):
             "replicas": 1,
             "selector": {},
             "serviceName": "",
-            "template": {"spec": {**POD, "securityContext": SECURE}},
+            "template": {"spec": POD},
         },
         "status": {**settled, **status},
     }
@@ -339,19 +334,19 @@ def fleet(api, release):
                 one = pod(f"cloudrc-{component}-{number}", component, labels={INDEX: str(number)})
                 api.put("pods", one)
         values = {"robots": robots, "experiment": {"cell": {"rate_kbit": 500}}}
-        api.put("configmaps", job_template(values))
-        token = base64.b64encode(TOKEN.encode()).decode()
-        api.put("secrets", {"metadata": {"name": "cloudrc-tokens"}, "data": {"operator": token}})
+        put_template_and_token(api, values)
         return api
 
     return make
 
 
-def job_template(values=None):
-    """Make the ConfigMap with the Job of a mission, as the chart makes it from values."""
+def put_template_and_token(api, values=None):
+    """Put the ConfigMap with the Job of a mission, as the chart makes it, and the API's token."""
     objects = render(values, release="cloudrc")
-    (found,) = (each for each in objects if each["metadata"]["name"] == "cloudrc-mission-job")
-    return found
+    (job,) = (each for each in objects if each["metadata"]["name"] == "cloudrc-mission-job")
+    api.put("configmaps", job)
+    token = base64.b64encode(TOKEN.encode()).decode()
+    api.put("secrets", {"metadata": {"name": "cloudrc-tokens"}, "data": {"operator": token}})
 
 
 @pytest.fixture
@@ -363,9 +358,7 @@ def running(api, release):
     ports = [{"name": "api", "port": 8080, "targetPort": "api"}]
     metadata = {"name": "cloudrc-api", "labels": labels("cloud")}
     api.put("services", {"metadata": metadata, "spec": {"ports": ports}})
-    api.put("configmaps", job_template())
-    token = base64.b64encode(TOKEN.encode()).decode()
-    api.put("secrets", {"metadata": {"name": "cloudrc-tokens"}, "data": {"operator": token}})
+    put_template_and_token(api)
     return api
 
 
@@ -403,8 +396,12 @@ def missions_of(api):
 MISSION = {"name": "short", "start": "spawn", "waypoints": [{"position_m": [0, 0, 1]}]}
 
 
-def terminated(exit_code, message):
-    return {"terminated": {"exitCode": exit_code, "message": message}}
+def terminated(exit_code, message="", **more):
+    return {"terminated": {"exitCode": exit_code, "message": message, **more}}
 
 
-OUT_OF_MEMORY = {"terminated": {"exitCode": 137, "reason": "OOMKilled"}}
+def waiting(reason, message=""):
+    return {"waiting": {"reason": reason, "message": message}}
+
+
+OUT_OF_MEMORY = terminated(137, reason="OOMKilled")

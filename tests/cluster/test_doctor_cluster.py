@@ -6,7 +6,6 @@ import shutil
 import pytest
 
 from cloudrc.cli import doctor as checks
-from cloudrc.cli.main import main
 from cloudrc.cluster import client
 from tests.cluster.conftest import CONFIG_PLACE, kubeconfig
 
@@ -20,29 +19,34 @@ def programs(monkeypatch):
     return found
 
 
-def doctor(capsys, code, *more):
-    assert main(["doctor", "--mode", "cluster", "-o", "json", *more]) == code
-    report = json.loads(capsys.readouterr().out)
-    assert report["ready"] is (code == 0)
-    return {check["name"]: check for check in report["checks"]}
+@pytest.fixture
+def doctor(call):
+    """Return a function that runs the doctor; it returns the checks by their names."""
+
+    def run(code, *more):
+        report = json.loads(call("doctor --mode cluster -o json", *more, code=code).out)
+        assert report["ready"] is (code == 0)
+        return {check["name"]: check for check in report["checks"]}
+
+    return run
 
 
-def test_a_cluster_elsewhere_does_not_need_kind(api, programs, capsys):
-    found = doctor(capsys, 0)
+def test_a_cluster_elsewhere_does_not_need_kind(api, programs, doctor):
+    found = doctor(0)
     assert found["cluster"]["found"] == "the API server answers"
     assert found["kind"]["state"] == "warn"
     assert "to make a cluster here" in found["kind"]["fix"]
-    assert doctor(capsys, 3, "--context", "x")["kubeconfig"]["state"] == "missing"
+    assert doctor(3, "--context", "x")["kubeconfig"]["state"] == "missing"
     programs.remove("helm")
-    assert doctor(capsys, 3)["helm"]["state"] == "missing"
+    assert doctor(3)["helm"]["state"] == "missing"
 
 
-def test_a_cluster_that_cannot_be_reached_blocks_the_mode(tmp_path, capsys, monkeypatch):
+def test_a_cluster_that_cannot_be_reached_blocks_the_mode(tmp_path, doctor, monkeypatch):
     monkeypatch.setattr(CONFIG_PLACE, str(tmp_path / "config"))
     monkeypatch.setattr(client, "RETRIES", {"total": 0})
     (tmp_path / "config").touch()
-    assert "no cluster is configured" in doctor(capsys, 3)["kubeconfig"]["found"]
+    assert "no cluster is configured" in doctor(3)["kubeconfig"]["found"]
     (tmp_path / "config").write_text(kubeconfig("http://127.0.0.1:9"))
-    check = doctor(capsys, 3)["cluster"]
+    check = doctor(3)["cluster"]
     assert "does not answer" in check["found"]
     assert "kubectl cluster-info" in check["fix"]

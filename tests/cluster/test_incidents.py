@@ -4,12 +4,7 @@ import pytest
 
 from cloudrc.cluster.incidents import ReleaseWatch
 from cloudrc.cluster.jobs import JobGoneError, follow, run_job
-from tests.cluster.conftest import MISSION, pod, terminated
-
-
-def ended(exit_code, reason="Error", message="", at="2026-01-01T00:00:01Z"):
-    state = {"exitCode": exit_code, "reason": reason, "message": message, "finishedAt": at}
-    return {"terminated": state}
+from tests.cluster.conftest import MISSION, OUT_OF_MEMORY, pod, terminated
 
 
 @pytest.fixture
@@ -20,9 +15,9 @@ def watch(running, release):
 @pytest.mark.parametrize(
     ("state", "words"),
     [
-        (ended(137, "OOMKilled"), "container 'cloud' of the cloud pod was killed, because it used "
+        (OUT_OF_MEMORY, "container 'cloud' of the cloud pod was killed, because it used "
          "more memory than its limit: raise cloud.resources.limits.memory"),
-        (ended(3, message="starts\nport 9100 is taken\n"), "with exit code 3: port 9100 is taken"),
+        (terminated(3, "starts\nport 9100 is taken\n"), "with exit code 3: port 9100 is taken"),
     ],
 )  # fmt: skip
 def test_a_container_that_ends_in_flight_is_told_once_with_its_cause(running, watch, state, words):
@@ -31,7 +26,7 @@ def test_a_container_that_ends_in_flight_is_told_once_with_its_cause(running, wa
     (sentence,) = watch.look()
     assert words in sentence
     assert list(watch.look()) == []
-    again = ended(137, at="2026-01-01T00:09:00Z")
+    again = terminated(137, finishedAt="2026-01-01T00:09:00Z")
     running.put("pods", {**pod("cloud-1", "cloud", restarts=2, last=again), **kept(running)})
     assert len(list(watch.look())) == 1, "it was killed a second time"
 
@@ -49,9 +44,8 @@ def kept(api, name="cloud-1"):
     ],
 )
 def test_what_kubernetes_says_of_a_pod_in_flight_is_told_once(running, watch, kind, reason, told):
-    about = {"uid": running.get("pods", "world-1")["metadata"]["uid"], "name": "world-1"}
-    said = {"type": kind, "reason": reason, "message": "by\nsomebody", "involvedObject": about}
-    running.put("events", {"metadata": {"name": "e"}, **said})
+    said = {"type": kind, "reason": reason, "message": "by\nsomebody"}
+    running.tell_of("pods", "world-1", **said)
     assert list(watch.look()) == told
     assert list(watch.look()) == []
 
@@ -65,10 +59,6 @@ def gone(api, release):
 
 def delete(api):
     api.objects.pop(("jobs", "first"))
-
-
-def suspend(api):
-    api.get("jobs", "first")["spec"]["suspend"] = True
 
 
 def time_out(api):

@@ -6,7 +6,7 @@ import pytest
 
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import follow, run_job
-from tests.cluster.conftest import MISSION, TOKEN
+from tests.cluster.conftest import MISSION, TOKEN, waiting
 
 
 def pod_of(api, name):
@@ -34,12 +34,9 @@ def test_a_job_posts_the_mission_to_its_release(running, release):
 
 def test_follow_ends_when_the_pod_cannot_run(running, release):
     run_job(release, MISSION, name="first")
-    about = {"involvedObject": {"uid": running.get("jobs", "first")["metadata"]["uid"]}}
-    said = {"reason": "FailedCreate", "message": "violates PodSecurity"}
-    running.put("events", {"metadata": {"name": "first.1"}, **about, **said})
+    running.tell_of("jobs", "first", reason="FailedCreate", message="violates PodSecurity")
     with pytest.raises(ClusterError, match="violates PodSecurity"):
         follow(release, "first", print)
-    waits = {"state": {"waiting": {"reason": "ErrImagePull"}}, "ready": False}
-    running.start_pod("first", phase="Pending", **waits)
+    running.start_pod("first", phase="Pending", state=waiting("ErrImagePull"), ready=False)
     with pytest.raises(ClusterError, match=r"cannot start: the image.*make kind-load"):
         follow(release, "first", print)

@@ -13,45 +13,42 @@ from cloudrc.errors import BadInputError
 from tests.cluster.conftest import MISSION, deployment, labels
 
 
-def put(api, name, namespace="demo"):
-    body = deployment("world")
-    body["metadata"]["labels"]["app.kubernetes.io/instance"] = name
-    body["metadata"] |= {"name": f"{namespace}-{name}-world", "namespace": namespace}
-    api.put("deployments", body)
+def put_files(api, experiment, link, name="cloudrc", namespace="demo"):
+    """Put the ConfigMaps of a release: the files of its experiment and its link."""
+    files = {"experiment": {"experiment.yaml": experiment}, "link": {"profile.yaml": link}}
+    for kind, data in files.items():
+        about = {**labels(kind), "app.kubernetes.io/instance": name}
+        metadata = {"name": f"{namespace}-{name}-{kind}", "namespace": namespace, "labels": about}
+        api.put("configmaps", {"metadata": metadata, "data": data})
+
+
+def release_in(api, name, namespace="demo", *, ready=True, experiment="{}", link="profile: null"):
+    """Put the objects of a release that `cloudrc list releases` reads."""
+    for component in ("world", "cloud"):
+        available = int(ready or component == "world")
+        body = deployment(component, availableReplicas=available)
+        body["metadata"]["labels"]["app.kubernetes.io/instance"] = name
+        body["metadata"] |= {"name": f"{namespace}-{name}-{component}", "namespace": namespace}
+        api.put("deployments", body)
+    put_files(api, experiment, link, name, namespace)
 
 
 def test_the_only_release_is_used_whatever_its_name_and_of_several_none(api, release):
     with pytest.raises(ClusterError, match=r"^no release in namespace 'demo'; see all: helm"):
         only_release(release)
-    put(api, "alpha")
+    release_in(api, "alpha")
     assert only_release(release).name == "alpha"
-    put(api, "cloudrc")
+    release_in(api, "cloudrc")
     with pytest.raises(BadInputError, match=r"'demo': alpha, cloudrc; name one: --release NAME"):
         only_release(release)
-
-
-def release_in(api, name, namespace, *, ready, robot="", profile="uplink: {delay_ms: 40}"):
-    """Put the objects of a release that `cloudrc list releases` reads."""
-    for component in ("world", "cloud"):
-        available = 1 if ready or component == "world" else 0
-        body = deployment(component, availableReplicas=available)
-        body["metadata"]["labels"]["app.kubernetes.io/instance"] = name
-        body["metadata"] |= {"name": f"{namespace}-{name}-{component}", "namespace": namespace}
-        api.put("deployments", body)
-    experiment = f"world: {{robot: {robot}}}" if robot else "{}"
-    for kind, data in (("experiment", experiment), ("link", profile)):
-        file = {"experiment": "experiment.yaml", "link": "profile.yaml"}[kind]
-        about = {**labels(kind), "app.kubernetes.io/instance": name}
-        metadata = {"name": f"{namespace}-{name}-{kind}", "namespace": namespace, "labels": about}
-        api.put("configmaps", {"metadata": metadata, "data": {file: data}})
 
 
 JITTER = "{uplink: {delay_ms: 45, jitter_ms: 25}, downlink: {delay_ms: 45, jitter_ms: 25}}"
 
 
 def test_the_releases_of_all_namespaces_are_listed(api, call, monkeypatch):
-    release_in(api, "b", "lab", ready=False, robot="heavy", profile=JITTER)
-    release_in(api, "a", "demo", ready=True, profile="{uplink: {delay_ms: 40, loss: 0.1}}")
+    release_in(api, "b", "lab", ready=False, experiment="world: {robot: heavy}", link=JITTER)
+    release_in(api, "a", link="uplink: {delay_ms: 40, loss: 0.1}")
     flies = {"id": "m3", "state": "flying", "reached": [{}, {}], "waypoints": 7}
     missions = {"a": flies, "b": None}
 
@@ -72,11 +69,7 @@ def test_the_releases_of_all_namespaces_are_listed(api, call, monkeypatch):
 
 def test_a_fleet_is_one_line_with_its_robots_and_what_its_job_does(fleet, release, call):
     api = fleet(6)
-    for kind, text in (("experiment", "cell: {rate_kbit: 500}"), ("link", "profile: null")):
-        file = {"experiment": "experiment.yaml", "link": "profile.yaml"}[kind]
-        api.put(
-            "configmaps", {"metadata": {"name": kind, "labels": labels(kind)}, "data": {file: text}}
-        )
+    put_files(api, "cell: {rate_kbit: 500}", "profile: null")
     job = run_job(release, MISSION)
     api.get("jobs", job)["status"] = {"active": 4, "succeeded": 1, "failed": 1}
     api.get("statefulsets", "cloudrc-world")["status"]["availableReplicas"] = 5

@@ -3,6 +3,7 @@
 import pytest
 
 from cloudrc.cluster import survey
+from tests.cluster.conftest import pod, waiting
 
 CHART = """\
 apiVersion: apps/v1
@@ -50,7 +51,7 @@ def found(release):
 
 
 def test_a_cluster_that_is_fit_has_no_problem_and_keeps_no_pod(cluster, release):
-    cluster.nodes = ["one", "two"]
+    cluster.put("nodes", {"metadata": {"name": "two"}, "spec": {}})
     seen = found(release)
     checks = ["permissions", "world pod", "cloud pod", "node one", "node two"]
     assert list(seen) == checks
@@ -60,12 +61,11 @@ def test_a_cluster_that_is_fit_has_no_problem_and_keeps_no_pod(cluster, release)
 
 
 def test_a_node_without_an_image_is_told(cluster, release):
-    waits = {"waiting": {"reason": "ErrImagePull", "message": "no such image"}}
-    status = {"name": "world", "image": "i", "imageID": "", "ready": False, "restartCount": 0}
-    cluster.ended = {"phase": "Pending", "containerStatuses": [{**status, "state": waits}]}
+    waits = waiting("ErrImagePull", "no such image")
+    cluster.ended = pod("one", "world", state=waits, ready=False, phase="Pending")["status"]
     seen = found(release)["node one"]
     assert seen.state == "missing"
-    assert "the image i of container 'world' is not on the node" in seen.found
+    assert "the image cloudrc/cloud:0.1.0 of container 'world' is not on the node" in seen.found
 
 
 def test_missing_permissions_end_the_survey(cluster, release):
