@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import os
 import shutil
 import signal
@@ -180,6 +181,12 @@ def call(capsys):
 
 
 @pytest.fixture
+def as_json(call):
+    """Return a function that runs a command with `-o json`, and returns the document."""
+    return lambda line, *more, code=0: json.loads(call(f"{line} -o json", *more, code=code).out)
+
+
+@pytest.fixture
 def refused(call):
     """Return a function that runs a command and returns its only output: one line of error."""
 
@@ -189,6 +196,12 @@ def refused(call):
         return error
 
     return run
+
+
+@pytest.fixture
+def one_core(monkeypatch):
+    """Fly in this process, where a test may replace parts of a flight."""
+    monkeypatch.setattr("cloudrc.trials.workers.usable_cores", lambda: 1)
 
 
 @pytest.fixture

@@ -4,10 +4,7 @@ import importlib
 import json
 import os
 import pkgutil
-import re
 import runpy
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +12,8 @@ import pytest
 
 import cloudrc
 from cloudrc.errors import BadInputError
+from tests.support.commands import python
+from tests.support.pages import blocks
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = {"mission.steps.count": 1, "link.profile": "paper-p1"}
@@ -122,39 +121,28 @@ def test_a_script_flies_in_several_processes(tmp_path):
     grid = {"experiment": "steps", "set": SHORT, "seeds": 2}
     (tmp_path / "own.py").write_text(f"import cloudrc\nprint(len(cloudrc.sweep({grid}, jobs=2)))")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [sys.executable, "own.py"], cwd=tmp_path, env=environment, capture_output=True, text=True
-    )
+    done = python("own.py", cwd=tmp_path, env=environment)
     assert done.stdout == "2\n", done.stderr
 
 
 def test_importing_cloudrc_imports_only_the_version():
     heavy = "('cloudrc.', 'numpy')"
     code = f"import sys, cloudrc; print([m for m in sys.modules if m.startswith({heavy})])"
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
-    assert done.stdout == "['cloudrc.version']\n"
+    assert python("-c", code, cwd=ROOT).stdout == "['cloudrc.version']\n"
 
 
 def test_the_example_of_the_page_runs(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "page.py").write_text(examples()[0])
+    (tmp_path / "page.py").write_text(blocks("python", "python")[0])
     runpy.run_path("page.py")
     assert capsys.readouterr().out.startswith("success []\n")
-
-
-def examples():
-    page = (ROOT / "docs" / "python.md").read_text()
-    return re.findall("```python\n(.*?)```", page, re.DOTALL)
 
 
 @pytest.mark.process
 @pytest.mark.full
 def test_the_examples_with_many_flights_run(tmp_path):
-    (tmp_path / "page.py").write_text("import cloudrc\n" + examples()[1])
-    command = [sys.executable, "page.py"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    (tmp_path / "page.py").write_text("import cloudrc\n" + blocks("python", "python")[1])
+    done = python("page.py", cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)})
     assert (done.returncode, len(done.stdout.splitlines())) == (0, 5), done.stderr
 
 

@@ -2,12 +2,13 @@
 
 import ast
 import re
-import subprocess
 import sys
 import tomllib
 from collections import Counter
 from functools import cache
 from pathlib import Path
+
+from tests.support.commands import python
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "cloudrc"
@@ -89,7 +90,7 @@ def test_a_reserved_package_is_imported_only_in_its_places():
 def test_live_metrics_load_neither_recordings_nor_heavy_libraries():
     heavy = {"cloudrc.record", "cloudrc.config", "pydantic", "numpy"}
     program = f"import sys, cloudrc.exposition.live; print({heavy} & sys.modules.keys())"
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    found = python("-c", program)
     assert found.stdout == "set()\n", found.stderr
 
 

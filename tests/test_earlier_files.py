@@ -22,9 +22,9 @@ def old(tmp_path, monkeypatch):
     return tmp_path / "old"
 
 
-def test_an_old_recording_gives_the_numbers_and_failures_that_it_gave(old, call, no_page):
+def test_an_old_recording_gives_the_numbers_and_failures_that_it_gave(old, as_json, no_page):
     before = json.loads((OLD / "recording" / "report.json").read_bytes())
-    after = json.loads(call("report recording -o json", code=1).out)
+    after = as_json("report recording", code=1)
     codes, found = ([each["code"] for each in one["failures"]] for one in (before, after))
     assert "obstacle_touched" in found
     assert found == codes
@@ -42,9 +42,9 @@ def test_every_topic_of_an_old_recording_is_read():
     assert (speed > 0.1).any()
 
 
-def test_flights_of_an_old_sweep_are_compared_and_drawn(old, call):
-    command = "compare last_sample constant_velocity --in sweep --number obstacle_contacts -o json"
-    document = json.loads(call(command).out)
+def test_flights_of_an_old_sweep_are_compared_and_drawn(old, call, as_json):
+    command = "compare last_sample constant_velocity --in sweep --number obstacle_contacts"
+    document = as_json(command)
     assert [*document["numbers"]] == ["obstacle_contacts"]
     assert document["pairs"] == 2
     call("sweep figure sweep --x cloud.predictor --number obstacle_contacts")

@@ -15,6 +15,7 @@ import pytest
 
 import cloudrc
 from cloudrc.robots.pelican.native.library import built_file, compilers
+from tests.support.commands import python
 from tools.pack_chart import pack
 from tools.set_registry import set_registry
 
@@ -197,9 +198,7 @@ for call in (cloudrc.fly, lambda: cloudrc.sweep({}), lambda: cloudrc.identify("r
 
 
 def test_without_extras_numbers_are_listed_and_what_lacks_an_extra_names_it(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", BASE], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = python("-c", BASE, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "duration" in done.stdout
     lines = done.stderr.splitlines()

@@ -1,6 +1,5 @@
 """The commands and the files in README.md and in some pages of docs/ work."""
 
-import json
 import os
 import re
 import shlex
@@ -148,14 +147,14 @@ def test_the_tour_s_way_to_read_a_recording_works(folder, call):
 
 
 @pytest.mark.usefixtures("numbers_only")
-def test_the_predictor_and_the_metric_of_the_pages_work(call):
+def test_the_predictor_and_the_metric_of_the_pages_work(as_json):
     """Compare a share of 0.5 with a share of 1, which is the predictor `constant_velocity`."""
-    fly = "run steps --mode virtual -o json --set mission.steps.count=3"
+    fly = "run steps --mode virtual --set mission.steps.count=3"
     fly += " --set cloud.predictor=./my_predictor.py --set report.metrics=./overshoot.py"
-    report = "report runs/latest --metric ./overshoot.py -o json"
+    report = "report runs/latest --metric ./overshoot.py"
     found = []
     for line in (*(f"{fly} --set cloud.predictor.share={share}" for share in (0.5, 1.0)), report):
-        numbers = json.loads(call(line).out)["numbers"]
+        numbers = as_json(line)["numbers"]
         found.append({name: number["value"] for name, number in numbers.items()})
     half, whole, again = found
     assert half["fault_count"] == whole["fault_count"] == 0

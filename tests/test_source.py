@@ -1,14 +1,13 @@
 """The hash of the code depends on all sources that a flight can run, and on nothing else."""
 
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import cloudrc
 from cloudrc import source
+from tests.support.commands import python
 
 PACKAGE = Path(cloudrc.__file__).parent
 
@@ -60,7 +59,6 @@ def test_a_flight_runs_nothing_from_the_folders_that_do_not_count():
         "assert row['verdict'] == 'success', row\n"
         "print(*(name.split('.')[1] for name in sys.modules if name.startswith('cloudrc.')))"
     )
-    command = [sys.executable, "-c", program]
-    flown = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    flown = python("-c", program, check=True).stdout.split()
     assert {"world", "cloud", "metrics"} <= {*flown}
     assert source.NOT_FLOWN.isdisjoint(flown)

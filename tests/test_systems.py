@@ -1,10 +1,10 @@
 """cloudrc on macOS and Windows, as far as a Linux can show it."""
 
 import os
-import subprocess
-import sys
 
 import pytest
+
+from tests.support.commands import python
 
 LINUX_ALONE = {
     "os": "sched_getaffinity sched_setaffinity sched_setscheduler sched_getscheduler sched_param "
@@ -27,20 +27,15 @@ def test_a_flight_in_real_time_uses_nothing_that_macos_lacks(tmp_path):
     lines.append("    module = importlib.import_module(module)")
     lines.append("    [delattr(module, name) for name in names.split() if hasattr(module, name)]")
     (tmp_path / "sitecustomize.py").write_text("\n".join(lines))
-    words = "run hover --mode local --report none".split()
-    flown = subprocess.run(
-        [sys.executable, "-m", "cloudrc", *words],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        capture_output=True,
-        text=True,
-    )
+    line = "-m cloudrc run hover --mode local --report none"
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    flown = python(*line.split(), cwd=tmp_path, env=environment)
     assert "Error" not in flown.stderr, flown.stderr
     assert flown.stdout.endswith("report.json\n"), flown.stdout
 
 
 def test_windows_is_sent_to_wsl2():
     program = "import sys; sys.platform = 'win32'; import cloudrc.cli.main"
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    found = python("-c", program)
     assert (found.returncode, found.stderr.count("\n")) == (3, 1)
     assert "WSL2" in found.stderr

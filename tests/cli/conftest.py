@@ -16,7 +16,6 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def replace_flights(monkeypatch):
+def replace_flights(one_core, monkeypatch):
     """Return a function that replaces flights by `fly(experiment)`, in this process."""
-    monkeypatch.setattr("cloudrc.trials.workers.usable_cores", lambda: 1)
     return lambda fly: monkeypatch.setattr("cloudrc.runs.flight.fly_point", fly)

@@ -1,18 +1,17 @@
 """The cost of the closed loop."""
 
 import json
-import subprocess
-import sys
 
 import pytest
+
+from tests.support.commands import python
 
 
 @pytest.mark.process
 @pytest.mark.alone  # other processes would take its caches
 @pytest.mark.full
 def test_the_closed_loop_is_fast_enough_beside_raw_physics():
-    command = [sys.executable, "-m", "cloudrc", "bench", "-o", "json", "--repeats", "5"]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = python("-m", "cloudrc", "bench", "-o", "json", "--repeats", "5")
     assert done.returncode == 0, done.stderr
     figures = json.loads(done.stdout)
     is_fast = figures["physics_steps"].startswith("C (")

@@ -26,10 +26,9 @@ def fly_with(replace_flights):
     return use
 
 
-def test_short_flights_are_compared_for_real(call, monkeypatch):
-    monkeypatch.setattr("cloudrc.trials.workers.usable_cores", lambda: 1)
-    out = call(f"compare {A} {B},cloud.estimator=split --seeds 1 -o json", *SHORT).out
-    document = json.loads(out)
+@pytest.mark.usefixtures("one_core")
+def test_short_flights_are_compared_for_real(as_json):
+    document = as_json(f"compare {A} {B},cloud.estimator=split --seeds 1", *SHORT)
     sides = A, f"{B},cloud.estimator=split"
     assert (document["a"], document["b"], document["pairs"]) == (*sides, 1)
     number = document["numbers"]["prediction_error_rms"]
@@ -59,7 +58,7 @@ def test_the_last_lines_are_the_answer(seeds, measure, answer, fly_with, call):
     assert call(f"{COMPARE} --seeds {seeds}").out.endswith(answer)
 
 
-def test_numbers_of_flights_that_failed_are_marked(fly_with, call):
+def test_numbers_of_flights_that_failed_are_marked(fly_with, call, as_json):
     """A robot that hardly moves has a small error: the table must not show it as a gain."""
     fly_with(lambda is_a, n: ("failure", 5e-7) if is_a and n < 3 else ("success", 0.01))
     out = call(f"{COMPARE} --seeds 3").out
@@ -67,7 +66,7 @@ def test_numbers_of_flights_that_failed_are_marked(fly_with, call):
     a_median, b_median = row.split()[1:3]
     assert (a_median[-1], b_median[-1] == "*") == ("*", False)
     assert "\n* contains flights that failed" in out
-    number = json.loads(call(f"{COMPARE} --seeds 3 -o json").out)["numbers"]["prediction_error_rms"]
+    number = as_json(f"{COMPARE} --seeds 3")["numbers"]["prediction_error_rms"]
     assert (number["a_failed"], number["b_failed"]) == (2, 0)
 
 
@@ -84,9 +83,9 @@ def test_ctrl_c_compares_the_finished_pairs(fly_with, call):
 
 
 @pytest.mark.full
-def test_ten_pairs_decide_between_two_predictors(call, figure):
+def test_ten_pairs_decide_between_two_predictors(as_json, figure):
     sides = f"{B} cloud.predictor=constant_acceleration"
-    out = call(f"compare {sides} --set=link.profile=paper-p3 -o json").out
-    found = json.loads(out)["numbers"]["prediction_error_rms"]
+    document = as_json(f"compare {sides} --set=link.profile=paper-p3")
+    found = document["numbers"]["prediction_error_rms"]
     figure("p of 10 pairs", found["p_wilcoxon"], "<=", 0.01)
     figure("pairs in which eq. (3) predicts worse", found["lower"], "==", 10)

@@ -1,6 +1,5 @@
 """The doctor: every problem has a fix; only what the mode needs blocks it."""
 
-import json
 import tomllib
 from pathlib import Path
 
@@ -24,13 +23,12 @@ NO_PHYSICS = Check("physics", "missing", "aborted", "install mujoco", ("local", 
         ("virtual", [NO_PHYSICS], 3),
     ],
 )
-def test_only_a_needed_check_gives_exit_code_3(mode, found, code, monkeypatch, call):
+def test_only_a_needed_check_gives_exit_code_3(mode, found, code, monkeypatch, call, as_json):
     monkeypatch.setattr(work, "all_checks", lambda *given: iter(found))
     text = call(f"doctor --mode {mode}", code=code).out
     assert text.splitlines()[-1].startswith(f"Mode {mode} can")
     assert all(check.fix in text for check in found)
-    document = json.loads(call(f"doctor --mode {mode} -o json", code=code).out)
-    assert document["ready"] is (code == 0)
+    assert as_json(f"doctor --mode {mode}", code=code)["ready"] is (code == 0)
 
 
 def test_every_problem_says_how_to_fix_it(monkeypatch):

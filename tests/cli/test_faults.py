@@ -21,9 +21,9 @@ from cloudrc.trials.workers import WorkerDiedError
 KILLED = WorkerDiedError("a worker was killed")
 
 
-def test_the_command_prints_json(call):
+def test_the_command_prints_json(as_json):
     Path("F17").mkdir()  # a folder is no schedule
-    printed = json.loads(call("faults run F17 -o json").out)
+    printed = as_json("faults run F17")
     assert (printed["schemaVersion"], printed["faults"][0]["result"]) == (1, "passed")
     assert {check["unit"] for check in printed["faults"][0]["checks"]} == {"", "m", "m/s", "yes"}
     assert pickle.dumps(run_fault("F27", 1)), "a result comes back from another process"
@@ -110,8 +110,8 @@ def test_a_search_counts_stores_and_can_continue(find):
     assert [told["invariants"][name]["judged"] for name in ("collision", "fence")] == [0, 1]
 
 
-def test_a_schedule_is_flown_for_real(call):
+def test_a_schedule_is_flown_for_real(as_json):
     schedule = Schedule(1, events=(FaultEvent("blackout", 2.0, 0.5),), duration=3.0)
     Path("schedule.yaml").write_text(dump(schedule))
-    told = json.loads(call("faults run schedule.yaml -o json").out)
+    told = as_json("faults run schedule.yaml")
     assert (told["breaches"], len(told["records_sha256"])) == ([], 64)

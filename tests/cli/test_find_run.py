@@ -72,7 +72,7 @@ def test_no_command_steers_another_flight_after_yours_has_ended(tmp_path, elsewh
         assert said(0, "mission estop") == using
 
 
-def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
+def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call, as_json):
     with flying(elsewhere / "runs" / "latest") as served:
         api, far = Api(served.url), {"name": "far", "waypoints": [{"position_m": [0.5, -2.0, 1.0]}]}
         api.post("/v1/missions", far)
@@ -96,7 +96,7 @@ def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
             assert out.startswith(f"runs/latest: {does}"), words
         for words in ("status", "status m1", "list"):
             assert call(f"mission {words}").out.startswith("runs/latest: "), words
-        assert "missions" in json.loads(call("mission list -o json").out)
+        assert "missions" in as_json("mission list")
         for words, code, why in (("hold", 5, ""), ("goto 0 0 99", 2, "beyond the fence")):
             error = call(f"mission {words}", code=code).err
             assert error.startswith("cloudrc: error: runs/latest: "), error

@@ -1,6 +1,5 @@
 """`cloudrc identify`: known models are found, bad recordings are refused by name."""
 
-import json
 from itertools import accumulate
 from math import exp
 
@@ -96,7 +95,7 @@ def test_a_flight_whose_recording_is_still_written_is_not_read(tmp_path, call, r
     call("recover", mission)
 
 
-def test_the_command_writes_a_model_that_a_predictor_takes(tmp_path, call):
+def test_the_command_writes_a_model_that_a_predictor_takes(tmp_path, call, as_json):
     with McapWriter(tmp_path / "mission.mcap", clock="world") as writer:
         writer.write(records())
     shown = call("identify --out model.yaml", tmp_path).out
@@ -113,5 +112,4 @@ def test_the_command_writes_a_model_that_a_predictor_takes(tmp_path, call):
         assert predictor.model_extra[key] == str(tmp_path / "model.yaml")
     error = call("identify", tmp_path, code=2).err
     assert "model.yaml: already there; name another file with --out" in error
-    document = json.loads(call("identify --out second.yaml -o json", tmp_path).out)
-    assert document == {"schemaVersion": 1, **model}
+    assert as_json("identify --out second.yaml", tmp_path) == {"schemaVersion": 1, **model}

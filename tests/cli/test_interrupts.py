@@ -21,8 +21,7 @@ SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
 @pytest.fixture(autouse=True)
-def one_core_and_a_terminal(monkeypatch):
-    monkeypatch.setattr("cloudrc.trials.workers.usable_cores", lambda: 1)
+def a_terminal(one_core):
     for number in SIGNALS:  # tests/conftest.py restores them
         signal.signal(number, signal.SIG_DFL)
 

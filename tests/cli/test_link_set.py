@@ -1,6 +1,5 @@
 """`cloudrc link set`: settings become a profile, take effect, and are read back."""
 
-import json
 import os
 import stat
 from copy import deepcopy
@@ -96,13 +95,13 @@ def flight(tmp_path):
 
 
 @pytest.mark.usefixtures("flight")
-def test_a_run_here_is_found_changed_and_read_back(call):
+def test_a_run_here_is_found_changed_and_read_back(call, as_json):
     shown = call("link set downlink.delay_ms=120 uplink.loss=0.02").out.splitlines()
     assert shown[1].split()[:4] == ["uplink", "relay", "45", "ms"]
     assert shown[2].split()[:4] == ["downlink", "relay", "120", "ms"]
     out = call("link set --profile handover").out
     assert "2 blackouts" in out, "what has no column of its own"
-    downlink = json.loads(call("link set --profile paper-p1 -o json").out)["links"]["downlink"]
+    downlink = as_json("link set --profile paper-p1")["links"]["downlink"]
     assert downlink["profile"]["downlink"]["delay_ms"] == 20.0
     assert downlink["cause"] == "profile paper-p1"
     assert "link set: uplink.loss: 1.5" in call("link set uplink.loss=1.5", code=2).err

@@ -10,6 +10,7 @@ from cloudrc.cli.link import VERBS
 from cloudrc.cli.main import INTERNAL, main
 from cloudrc.cli.parser import COMMANDS
 from cloudrc.errors import BadInputError
+from tests.support.commands import python
 
 HEAVY = ("numpy", "mujoco", "matplotlib", "pydantic", "yaml", "kubernetes", "rosbags", "mcap")
 QUIET = f"""
@@ -25,13 +26,12 @@ print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
 
 
 def test_help_imports_nothing_heavy():
-    words = [sys.executable, "-c", QUIET, "--help", *(f"{name} --help" for name in COMMANDS)]
-    assert subprocess.run(words, capture_output=True, text=True).stderr.strip() == "[]"
+    lines = ["--help", *(f"{name} --help" for name in COMMANDS)]
+    assert python("-c", QUIET, *lines).stderr.strip() == "[]"
 
 
 def test_the_list_names_all_onboard_controllers_without_physics():
-    words = [sys.executable, "-c", QUIET, "list"]
-    done = subprocess.run(words, capture_output=True, text=True)
+    done = python("-c", QUIET, "list")
     assert "mujoco" not in done.stderr
     (section,) = [each for each in done.stdout.split("\n\n") if each.startswith("onboard\n")]
     names = [line.split()[0] for line in section.splitlines()[1:]]

@@ -1,7 +1,5 @@
 """`cloudrc margin KEY`: the values with which the loop is stable, and with which it settles."""
 
-import json
-
 import pytest
 
 KEY = "link.uplink.delay_ms"
@@ -53,7 +51,7 @@ def test_the_last_line_names_the_border(arguments, works, code, answer, fly_with
     assert call(f"margin {arguments}", code=code).out.splitlines()[-1].startswith(answer)
 
 
-def test_stability_and_settling_are_two_answers(fly_with, call):
+def test_stability_and_settling_are_two_answers(fly_with, call, as_json):
     fly_with(uplink(150), stable=uplink(400))
     lines = call(f"margin {KEY}").out.splitlines()[-3:]
     border = f"fails at 410 ms (RTT 480 ms): {UNSTABLE}"
@@ -61,14 +59,14 @@ def test_stability_and_settling_are_two_answers(fly_with, call):
     assert lines[1].startswith("with this value a step of 1 m per axis dies out, too;")
     assert lines[1].endswith("m/s shortens 25.0% of the commands")
     assert lines[2].startswith("settles up to 150 ms")
-    found = json.loads(call(f"margin {KEY} -o json").out)
+    found = as_json(f"margin {KEY}")
     assert (found["stable_up_to"], found["settles_up_to"]) == (400, 150)
     assert (found["large_step"]["stable"], found["large_step"]["speed_limited"]) == (True, 0.25)
 
 
-def test_an_island_above_a_failing_value_is_told(fly_with, call):
+def test_an_island_above_a_failing_value_is_told(fly_with, call, as_json):
     fly_with(uplink(9999), stable=lambda found: not 100 <= found.uplink.delay_ms < 500)
-    found = json.loads(call(f"margin {KEY} -o json").out)
+    found = as_json(f"margin {KEY}")
     assert (found["stable_up_to"], found["stable_fails_at"]) == (90, 100)
     assert found["stable_elsewhere"] == [[560, 2240]]
     stable = call(f"margin {KEY}").out.splitlines()[-3]
@@ -97,12 +95,12 @@ def test_the_limits_of_cloud_and_guard_follow_the_delay(fly_with, call):
         ("command_history", 3.0),
     ],
 )
-def test_predictors_differ_in_the_round_trip_at_which_the_loop_is_stable(predictor, limit, call):
+def test_predictors_differ_in_the_round_trip_at_which_the_loop_is_stable(predictor, limit, as_json):
     """With the published gains. Source of the limits [s]: docs/reference/control.md, linear model.
 
     A predictor that replays the commands has no limit up to 3 s, the largest round trip tried.
     """
-    command = "margin link.both.delay_ms -o json --seeds 1 --max 1500 --set link.profile=ideal"
-    found = json.loads(call(f"{command} --set cloud.predictor={predictor}").out)
+    command = "margin link.both.delay_ms --seeds 1 --max 1500 --set link.profile=ideal"
+    found = as_json(f"{command} --set cloud.predictor={predictor}")
     assert 2e-3 * found["stable_up_to"] == limit
     assert found["stable_elsewhere"] == []

@@ -2,8 +2,6 @@
 
 import io
 import json
-import subprocess
-import sys
 from contextlib import redirect_stderr
 
 import pytest
@@ -16,6 +14,7 @@ from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import Fault, GuardChange, MissionEvent, TelemetrySent
 from tests.cli.conftest import SHORT
 from tests.conftest import wait_until
+from tests.support.commands import python
 
 
 class Terminal(io.StringIO):
@@ -40,8 +39,8 @@ def test_colour_and_a_status_line_are_for_terminals(monkeypatch):
     assert not is_live(Terminal())
 
 
-def test_yaml_has_the_content_of_json(call):
-    document = json.loads(call("list -o json").out)
+def test_yaml_has_the_content_of_json(call, as_json):
+    document = as_json("list")
     assert yaml.safe_load(call("list -o yaml").out) == document
     assert document["schemaVersion"] == 1
 
@@ -107,8 +106,7 @@ from cloudrc.cloud.predictors.last_sample import LastSample as build
 
 def test_nothing_that_a_plugin_prints_gets_into_a_document(folder):
     (folder / "prints.py").write_text(PRINTS)
-    line = "run steps --seeds 1 --set cloud.predictor=./prints.py -o json"
-    command = [sys.executable, "-m", "cloudrc", *line.split(), *SHORT]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    line = "-m cloudrc run steps --seeds 1 --set cloud.predictor=./prints.py -o json"
+    done = python(*line.split(), *SHORT)
     assert json.loads(done.stdout)["schemaVersion"] == 1
     assert {"descriptor", "child"} <= set(done.stderr.splitlines())

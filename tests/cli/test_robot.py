@@ -1,20 +1,17 @@
 """`cloudrc new robot` and `cloudrc robot check`."""
 
-import json
 import runpy
 import shutil
 
 import pytest
 
-from cloudrc.cli.main import main
 from cloudrc.config.shipped import FOLDERS
 
 
 @pytest.fixture
-def mine(tmp_path, capsys):
+def mine(tmp_path, call):
     folder = tmp_path / "my_robot"
-    assert main(["new", "robot", str(folder)]) == 0
-    assert f"cloudrc robot check {folder}" in capsys.readouterr().out
+    assert f"cloudrc robot check {folder}" in call("new robot", folder).out
     return folder
 
 
@@ -39,11 +36,10 @@ def wheeled(tmp_path):
     ("onboard", "count"),
     [("turn_rate_max: 0.05", 1), ("turn_rate_max: 1", 0)],
 )
-def test_the_check_lets_a_robot_with_wheels_turn(wheeled, call, onboard, count):
+def test_the_check_lets_a_robot_with_wheels_turn(wheeled, as_json, onboard, count):
     given = f"onboard: {{name: diff_drive, {onboard}}}"
     replace(wheeled / "robot.yaml", "onboard: diff_drive", given)
-    out = call("robot check -o json", wheeled, code=2 * count).out
-    found = json.loads(out)["changes"]
+    found = as_json("robot check", wheeled, code=2 * count)["changes"]
     assert [("to its left" in text, "turn_rate_max" in text) for text in found] == [
         (True,) * 2
     ] * count
@@ -57,16 +53,14 @@ def test_a_planar_robot_that_does_not_rest_at_the_height_of_the_spawn_is_refused
         assert "rests at a height of 0.050" in refused(command)
 
 
-def test_a_folder_with_files_stays_as_it_is(mine, capsys):
+def test_a_folder_with_files_stays_as_it_is(mine, refused):
     before = (mine / "robot.yaml").read_text()
-    assert main(["new", "robot", str(mine)]) == 2
-    assert "already exists; name a new folder" in capsys.readouterr().err
+    assert "already exists; name a new folder" in refused("new robot", mine)
     assert (mine / "robot.yaml").read_text() == before
 
 
-def test_a_new_robot_needs_no_change(mine, capsys):
-    assert main(["robot", "check", str(mine), "-o", "json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+def test_a_new_robot_needs_no_change(mine, as_json):
+    found = as_json("robot check", mine)
     assert found["ok"]
     assert found["facts"]["mass_kg"] == pytest.approx(1.3)
     assert (mine / "check.png").read_bytes().startswith(b"\x89PNG")

@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 from unittest.mock import Mock
 
 import pytest
@@ -12,6 +10,7 @@ from cloudrc.cli.main import main
 from cloudrc.report.figures import FIGURES
 from cloudrc.runs import requirements
 from tests.cli.conftest import FLY, SHORT
+from tests.support.commands import python
 
 
 @pytest.mark.parametrize(
@@ -51,8 +50,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_a_run_without_a_page_leaves_recording_and_numbers_and_needs_no_matplotlib(folder):
-    command = [sys.executable, "-c", WITHOUT_MATPLOTLIB, *FLY, "--out", "a", "--report", "none"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = python("-c", WITHOUT_MATPLOTLIB, *FLY, "--out", "a", "--report", "none")
     assert done.stdout.splitlines()[-1] == "a/report.json"
     names = {path.name for path in (folder / "a").iterdir()}
     assert names == {"report.json", "mission.mcap", "config.yaml", "environment.json"}
@@ -69,11 +67,11 @@ def test_figures_are_files_if_they_are_asked_for(line, folder, monkeypatch, call
 
 
 @pytest.mark.usefixtures("no_page")
-def test_a_run_and_its_report_can_be_repeated(folder, call):
+def test_a_run_and_its_report_can_be_repeated(folder, call, as_json):
     only_the_report = call(*FLY, "--seed", "3", "--out", "a", "-o", "json")
     assert only_the_report.out == (folder / "a/report.json").read_text()
     first = json.loads(only_the_report.out)
-    again = json.loads(call("run a/config.yaml --mode virtual --out b -o json").out)
+    again = as_json("run a/config.yaml --mode virtual --out b")
     assert first["records_sha256"] == again["records_sha256"]
     for name in ("report.json", "report.html"):
         (folder / "a" / name).unlink()

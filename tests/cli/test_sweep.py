@@ -26,16 +26,14 @@ __all__ = ["write_sweep"]
 ONE = {"cloud.predictor": ["constant_velocity"]}
 
 
-@pytest.fixture(autouse=True)
-def one_core(monkeypatch):
-    monkeypatch.setattr("cloudrc.trials.workers.usable_cores", lambda: 1)
+pytestmark = pytest.mark.usefixtures("one_core")
 
 
 def rows(folder):
     return list(read_rows(Path(folder)).values())
 
 
-def test_shards_give_the_table_of_the_whole(write_sweep, call):
+def test_shards_give_the_table_of_the_whole(write_sweep, call, as_json):
     file = write_sweep()
     said = call("sweep run --out whole", file)
     assert said.err == "steps: 4 points x 1 seeds: 4 flights\n"
@@ -48,7 +46,7 @@ def test_shards_give_the_table_of_the_whole(write_sweep, call):
     head, _, _, *cells = call("sweep status parts").out.splitlines()
     assert head == "4 of 4 flights are done: 4 success"
     assert [line.split() for line in cells][1] == ["cloud.predictor", "constant_velocity", "2/2"]
-    assert json.loads(call("sweep status parts -o json").out)["rows"] == 4
+    assert as_json("sweep status parts")["rows"] == 4
 
 
 def test_a_sweep_goes_on_where_it_ended(write_sweep, monkeypatch, call):

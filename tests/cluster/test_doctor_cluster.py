@@ -1,6 +1,5 @@
 """`cloudrc doctor --mode cluster` says "can run" if and only if `cloudrc run` can."""
 
-import json
 import shutil
 
 import pytest
@@ -20,11 +19,11 @@ def programs(monkeypatch):
 
 
 @pytest.fixture
-def doctor(call):
+def doctor(as_json):
     """Return a function that runs the doctor; it returns the checks by their names."""
 
     def run(code, *more):
-        report = json.loads(call("doctor --mode cluster -o json", *more, code=code).out)
+        report = as_json("doctor --mode cluster", *more, code=code)
         assert report["ready"] is (code == 0)
         return {check["name"]: check for check in report["checks"]}
 

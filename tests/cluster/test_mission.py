@@ -52,8 +52,8 @@ def test_run_prints_the_log_of_its_job_and_ends_with_the_verdict(running, call, 
     assert lines == ["waypoint 1 of 1 reached", VERDICT[code]]
 
 
-def test_the_other_verbs_go_to_the_api_of_the_release(running, teleop, call, refused):
-    assert json.loads(call("mission list -o json").out)["missions"] == []
+def test_the_other_verbs_go_to_the_api_of_the_release(running, teleop, call, as_json, refused):
+    assert as_json("mission list")["missions"] == []
     said = call("mission acknowledge").out
     assert said.startswith("release 'cloudrc' in namespace 'demo': acknowledged")
     assert teleop.posted == ["/v1/acknowledge"]

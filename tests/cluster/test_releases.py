@@ -1,6 +1,5 @@
 """Which release a command means: the named one, or the only one of the namespace; never a guess."""
 
-import json
 from contextlib import contextmanager
 from unittest.mock import Mock
 
@@ -46,7 +45,7 @@ def test_the_only_release_is_used_whatever_its_name_and_of_several_none(api, rel
 JITTER = "{uplink: {delay_ms: 45, jitter_ms: 25}, downlink: {delay_ms: 45, jitter_ms: 25}}"
 
 
-def test_the_releases_of_all_namespaces_are_listed(api, call, monkeypatch):
+def test_the_releases_of_all_namespaces_are_listed(api, call, as_json, monkeypatch):
     release_in(api, "b", "lab", ready=False, experiment="world: {robot: heavy}", link=JITTER)
     release_in(api, "a", link="uplink: {delay_ms: 40, loss: 0.1}")
     flies = {"id": "m3", "state": "flying", "reached": [{}, {}], "waypoints": 7}
@@ -57,7 +56,7 @@ def test_the_releases_of_all_namespaces_are_listed(api, call, monkeypatch):
         yield Mock(get=lambda path: {"mission": missions[release.name]})
 
     monkeypatch.setattr("cloudrc.cluster.fleet.release_api", answers)
-    rows = json.loads(call("list releases -o json").out)["releases"]
+    rows = as_json("list releases")["releases"]
     assert [list(row.values()) for row in rows] == [
         ["a", "demo", "pelican", "40 ms, loss / 0 ms", "ready", "m3 flying 2/7"],
         ["b", "lab", "heavy", "45\u00b125 ms", "cloud not ready", "-"],
@@ -67,13 +66,13 @@ def test_the_releases_of_all_namespaces_are_listed(api, call, monkeypatch):
     ]  # fmt: skip
 
 
-def test_a_fleet_is_one_line_with_its_robots_and_what_its_job_does(fleet, release, call):
+def test_a_fleet_is_one_line_with_its_robots_and_what_its_job_does(fleet, release, as_json):
     api = fleet(6)
     put_files(api, "cell: {rate_kbit: 500}", "profile: null")
     job = run_job(release, MISSION)
     api.get("jobs", job)["status"] = {"active": 4, "succeeded": 1, "failed": 1}
     api.get("statefulsets", "cloudrc-world")["status"]["availableReplicas"] = 5
-    (row,) = json.loads(call("list releases -o json").out)["releases"]
+    (row,) = as_json("list releases")["releases"]
     assert row["robot"] == "6 pelican"
     assert row["link"] == "45\u00b125 ms, cell 500"
     assert row["state"] == "world 5/6 not ready"

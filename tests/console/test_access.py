@@ -50,30 +50,69 @@ def both_doors(page, lines, query=""):
     return ask(page, lines, target)[0], ask(page, lines, target, upgrade=True)[0]
 
 
-def names(page):
-    """Return the own host, and the line of the cookie with the token."""
-    return f"127.0.0.1:{page.port}", f"Cookie: {page._access.cookie}={TOKEN}"
+def filled(page, text):
+    """Return the header lines of a text that has | between them."""
+    own = f"127.0.0.1:{page.port}"
+    for word, value in (("OWN", own), ("PORT", str(page.port)), ("NAME", page._access.cookie)):
+        text = text.replace(word, value)
+    return text.replace("TOKEN", TOKEN).split(" | ")
 
 
-def foreign_origins(port):
-    own = f"http://127.0.0.1:{port}"
-    return [
-        *("https://example.org", "null", "", f"https://127.0.0.1:{port}", "http://127.0.0.1"),
-        *(f"{own}0", f"{own}/", f"{own},{own}", f"HTTP://127.0.0.1:{port}", f"{own}@example.org"),
-        *(f"http://127.0.0.1.example.org:{port}", f"http://[::1]:{port}"),
-        *(f"http://localhost:{port}", "http://hub.example.org", f"{PROXY}:443"),
-        *("https://x.hub.example.org", "https://hub.example.org.evil.example"),
-    ]
-
-
-def foreign_hosts(port):
-    return [
-        *("example.org", "", f"127.0.0.1.:{port}", f"LOCALHOST:{port}", f"0.0.0.0:{port}"),
-        *(f"127.0.0.1.example.org:{port}", f"127.0.0.1:{port}@example.org", "127.0.0.1:x"),
-        *(f"127.0.0.1:{port},example.org", "hub.example.org:8000", "x.hub.example.org"),
-    ]
-
-
+OWN_PAGE = """
+Host: OWN
+Host: OWN | Origin: http://OWN
+Host: localhost:8000 | Origin: http://localhost:8000
+Host: 127.0.0.1 | Origin: http://127.0.0.1
+Host: hub.example.org | Origin: https://hub.example.org
+Host: hub.example.org
+Host: OWN | Origin: https://hub.example.org
+"""
+"""Directly, through a tunnel, and behind a proxy, which may change the host."""
+FOREIGN = """
+Host: OWN | Cookie: NAME=TOKEN | Origin: https://example.org
+Host: OWN | Cookie: NAME=TOKEN | Origin: null
+Host: OWN | Cookie: NAME=TOKEN | Origin:
+Host: OWN | Cookie: NAME=TOKEN | Origin: https://OWN
+Host: OWN | Cookie: NAME=TOKEN | Origin: http://127.0.0.1
+Host: OWN | Cookie: NAME=TOKEN | Origin: http://OWN0
+Host: OWN | Cookie: NAME=TOKEN | Origin: http://OWN/
+Host: OWN | Cookie: NAME=TOKEN | Origin: http://OWN,http://OWN
+Host: OWN | Cookie: NAME=TOKEN | Origin: HTTP://OWN
+Host: OWN | Cookie: NAME=TOKEN | Origin: http://OWN@example.org
+Host: OWN | Cookie: NAME=TOKEN | Origin: http://127.0.0.1.example.org:PORT
+Host: OWN | Cookie: NAME=TOKEN | Origin: http://[::1]:PORT
+Host: OWN | Cookie: NAME=TOKEN | Origin: http://localhost:PORT
+Host: OWN | Cookie: NAME=TOKEN | Origin: http://hub.example.org
+Host: OWN | Cookie: NAME=TOKEN | Origin: https://hub.example.org:443
+Host: OWN | Cookie: NAME=TOKEN | Origin: https://x.hub.example.org
+Host: OWN | Cookie: NAME=TOKEN | Origin: https://hub.example.org.evil.example
+Host: OWN | Cookie: NAME=TOKEN | Origin: http://OWN | Origin: https://example.org
+Host: OWN | Cookie: NAME=TOKEN | Origin: https://example.org | Origin: http://OWN
+Host: OWN | Cookie: NAME=TOKEN | Origin: http://OWN |  https://example.org
+Host: example.org | Cookie: NAME=TOKEN
+Host: | Cookie: NAME=TOKEN
+Host: 127.0.0.1.:PORT | Cookie: NAME=TOKEN
+Host: LOCALHOST:PORT | Cookie: NAME=TOKEN
+Host: 0.0.0.0:PORT | Cookie: NAME=TOKEN
+Host: 127.0.0.1.example.org:PORT | Cookie: NAME=TOKEN
+Host: OWN@example.org | Cookie: NAME=TOKEN
+Host: 127.0.0.1:x | Cookie: NAME=TOKEN
+Host: OWN,example.org | Cookie: NAME=TOKEN
+Host: hub.example.org:8000 | Cookie: NAME=TOKEN
+Host: x.hub.example.org | Cookie: NAME=TOKEN
+Host: hub.example.org | Cookie: NAME=TOKEN | Origin: http://OWN
+Host: OWN | Cookie: NAME=TOKEN | Host: example.org
+Host: example.org | Cookie: NAME=TOKEN | Host: OWN
+Host: example.org | Cookie: NAME=TOKEN | X-Forwarded-Host: OWN | Forwarded: host=OWN
+Cookie: NAME=TOKEN | Origin: http://OWN
+Host: OWN | Origin: http://OWN
+Host: OWN | Origin: http://OWN | Cookie: cloudrc-000000000000=TOKEN
+Host: OWN | Origin: http://OWN | Cookie: NAME=TOKEN; NAME=x
+Host: OWN | Origin: http://OWN | Cookie: NAME=TOKEN | Cookie: NAME=x
+Host: OWN | Origin: http://OWN | Authorization: token TOKEN | X-Token: TOKEN
+"""
+"""Each has everything right but the origin, the host or the token. One has the cookie of another
+console; in one the origin is folded."""
 WRONG_TOKENS = [
     *("", "x", TOKEN[:-1], f"{TOKEN}0", TOKEN.upper(), "0" * 12_000, f" {TOKEN}", f"{TOKEN}%20"),
     *(f"%30{TOKEN[1:]}", f"{TOKEN};", f"x&token={TOKEN}", f"{TOKEN}/", f"\xe9{TOKEN}"),
@@ -82,70 +121,42 @@ WRONG_TOKENS = [
 
 def test_the_own_page_connects_with_the_token(served):
     page, _ = served
-    own, cookie = names(page)
-    for host, origin in (
-        (own, None),
-        (own, f"http://{own}"),
-        ("localhost:8000", "http://localhost:8000"),  # a tunnel
-        ("127.0.0.1", "http://127.0.0.1"),
-        ("hub.example.org", PROXY),
-        ("hub.example.org", None),
-        (own, PROXY),  # a proxy that changes the host
-    ):
-        lines = [f"Host: {host}", cookie, *([f"Origin: {origin}"] if origin else [])]
+    for text in OWN_PAGE.splitlines()[1:]:
+        lines = filled(page, f"{text} | Cookie: NAME=TOKEN")
         assert both_doors(page, lines) == (200, 101), lines
-        assert ask(page, lines[:1] + lines[2:], f"/?token={TOKEN}", upgrade=True)[0] == 101
-    cookies = f"Cookie: theme=dark; {cookie.removeprefix('Cookie: ')}; cloudrc-0123=x"
-    assert both_doors(page, [f"Host: {own}", cookies]) == (200, 101)
+        assert ask(page, lines[:-1], f"/?token={TOKEN}", upgrade=True)[0] == 101
+    cookies = "Host: OWN | Cookie: theme=dark; NAME=TOKEN; cloudrc-0123=x"
+    assert both_doors(page, filled(page, cookies)) == (200, 101)
 
 
 def test_no_foreign_origin_host_or_token_connects(served):
-    """Each shape has everything right but the one."""
     page, _ = served
-    own, cookie = names(page)
-    host, origin = f"Host: {own}", f"Origin: http://{own}"
-    shapes = [([host, cookie, f"Origin: {each}"], "") for each in foreign_origins(page.port)]
-    shapes += [([f"Host: {each}", cookie], "") for each in foreign_hosts(page.port)]
-    shapes += [([host, origin], f"?token={each}") for each in WRONG_TOKENS]
-    name = page._access.cookie
-    shapes += [
-        ([host, origin, f"Cookie: {name}={each}"], "") for each in WRONG_TOKENS if each[-1:] != ";"
-    ]
-    shapes += [
-        ([host, origin], ""),
-        ([host, origin, f"Cookie: cloudrc-000000000000={TOKEN}"], ""),  # of another console
-        ([host, origin, f"Cookie: token={TOKEN}; {name.upper()}={TOKEN}"], ""),
-        ([host, origin, f"Cookie: {name}={TOKEN}; {name}=x"], ""),
-        ([host, origin, f"Cookie: {name}={TOKEN}", f"Cookie: {name}=x"], ""),
-        ([host, origin, f"Authorization: token {TOKEN}", f"X-Token: {TOKEN}"], ""),
-        ([host, origin], f"?TOKEN={TOKEN}"),
-        ([cookie, origin], ""),  # no host
-        ([cookie, host, "Host: example.org"], ""),
-        ([cookie, "Host: example.org", host], ""),
-        ([cookie, host, origin, "Origin: https://example.org"], ""),
-        ([cookie, host, "Origin: https://example.org", origin], ""),
-        ([cookie, host, f"Origin: http://{own}", " https://example.org"], ""),  # folded
-        ([cookie, "Host: example.org", f"X-Forwarded-Host: {own}", f"Forwarded: host={own}"], ""),
-        ([cookie, "Host: hub.example.org", f"Origin: http://{own}"], ""),
-    ]
+    own, name = filled(page, "Host: OWN | Origin: http://OWN"), page._access.cookie
+    shapes = [(filled(page, text), "") for text in FOREIGN.splitlines()[1:]]
+    shapes += [(own, f"?token={each}") for each in WRONG_TOKENS]
+    cookies = [each for each in WRONG_TOKENS if each[-1:] != ";"]
+    shapes += [([*own, f"Cookie: {name}={each}"], "") for each in cookies]
+    shapes += [([*own, f"Cookie: token={TOKEN}; {name.upper()}={TOKEN}"], "")]
+    shapes += [(own, f"?TOKEN={TOKEN}")]
     accepted = [shape for shape in shapes if {*both_doors(page, *shape)} & {101, 200, 202, 303}]
     assert not accepted
 
 
 def test_a_foreign_page_cannot_stop_and_the_own_page_can(served):
     page, posted = served
-    own, cookie = names(page)
-    for lines in (
-        [f"Host: {own}", cookie, "Origin: https://example.org"],
-        [f"Host: {own}", f"Origin: http://{own}"],
-        ["Host: example.org", cookie],
+    for text in (
+        "Host: OWN | Cookie: NAME=TOKEN | Origin: https://example.org",
+        "Host: OWN | Origin: http://OWN",
+        "Host: example.org | Cookie: NAME=TOKEN",
     ):
+        lines = filled(page, text)
         assert ask(page, lines, "/stop", "POST")[0] == 403
         assert ask(page, lines, "/hold", "POST")[0] == 403
         assert ask(page, lines, "/state")[0] == 403
-    assert ask(page, [f"Host: {own}", cookie], "/stop")[0] == 404, "no link stops"
+    own = filled(page, "Host: OWN | Cookie: NAME=TOKEN | Origin: http://OWN")
+    assert ask(page, own[:2], "/stop")[0] == 404, "no link stops"
     assert not page.steering._stops.is_set()
-    assert ask(page, [f"Host: {own}", cookie, f"Origin: http://{own}"], "/stop", "POST")[0] == 202
+    assert ask(page, own, "/stop", "POST")[0] == 202
     assert page.steering._stops.is_set()
     assert posted == []  # the thread that asks the API does not run here
 

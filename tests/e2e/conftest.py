@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 import time
 from functools import cache
 from pathlib import Path
@@ -20,6 +19,7 @@ from cloudrc.cluster.pods import METRICS, fetch_recording, forwarded
 from cloudrc.errors import CloudrcError
 from cloudrc.runs.links.verify import fetch
 from tests.drivers.conftest import WORK, slower
+from tests.support.commands import python
 
 ROOT = Path(__file__).resolve().parents[2]
 CHART = ROOT / "charts" / "cloudrc"
@@ -78,13 +78,7 @@ def helm(*words, timeout=180.0):
 
 def cloudrc(*words, timeout=240.0):
     """Run cloudrc; any exit code is accepted."""
-    return subprocess.run(
-        [sys.executable, "-m", "cloudrc", *words],
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        cwd=ROOT,
-    )
+    return python("-m", "cloudrc", *words, timeout=timeout, cwd=ROOT)
 
 
 def in_release(*words, release=NAME):

@@ -2,8 +2,6 @@
 
 import os
 import re
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -17,6 +15,7 @@ from cloudrc.runs.flight import fly_in_memory
 from cloudrc.tunnel.codec import DecodeError
 from cloudrc.tunnel.end import Identity
 from tests.flights.conftest import both_ways, ring
+from tests.support.commands import python
 
 SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 1.0}]", "mission.touch=null")
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,9 +36,8 @@ def short(*settings):
 
 @pytest.mark.promise("one-seed-one-run")
 def test_the_same_seed_gives_the_same_records_in_any_process():
-    command = [sys.executable, "-c", PRINT]
     env = os.environ | {"PYTHONHASHSEED": "77", "PYTHONPATH": str(ROOT)}
-    printed = subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout
+    printed = python("-c", PRINT, env=env, check=True).stdout
     again, other = digest(short()), digest(short("seed=2"))
     assert printed.strip() == digest(short()) == again != other
 

@@ -73,7 +73,9 @@ def test_a_model_of_ones_own_may_lie_in_the_folder_and_gets_the_parameters(own_r
         build(str(mine), {"name": "model_based"})
 
 
-def test_identify_writes_a_response_for_a_robot_on_the_ground(call, tmp_path, monkeypatch, no_page):
+def test_identify_writes_a_response_for_a_robot_on_the_ground(
+    call, as_json, tmp_path, monkeypatch, no_page
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ground.yaml").write_text(json.dumps({
         "mission": GROUND | {"steps": GROUND["steps"] | {"count": 10}},
@@ -81,7 +83,7 @@ def test_identify_writes_a_response_for_a_robot_on_the_ground(call, tmp_path, mo
         "criteria": {"settle_m": None},
     }))  # fmt: skip
     call("run ground.yaml --mode virtual --out run")
-    found = json.loads(call("identify run -o json").out)
+    found = as_json("identify run")
     assert found["robot_yaml"] == "response"
     response = known_robot("rover").response
     assert found["gain"][2] == 0.0

@@ -12,9 +12,8 @@ from tests.cli.conftest import SHORT
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
+def here(tmp_path, one_core, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("cloudrc.trials.workers.usable_cores", lambda: 1)
 
 
 def place(name, succeeded=2, **numbers):

@@ -26,7 +26,6 @@ from cloudrc.teleop import store
 from cloudrc.teleop.api import STARTING, ApiServer, Bridge, create_app
 from cloudrc.teleop.auth import Gate, Tokens
 from cloudrc.teleop.carrot import setpoint_at
-from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.models import RequestReader
 from cloudrc.teleop.refusals import ConflictError, UnavailableError
 from cloudrc.teleop.service import MissionService
@@ -46,11 +45,33 @@ FROM_SPAWN = Plan(THREE.legs)
 PLAN = Plan((Leg(A, yaw=0.3, yaw_tolerance=1.0), Leg(B, tolerance=0.2, dwell=0.0), Leg(C)))
 
 
-class Flight:
-    """Teleop, its robot, and all outputs of teleop."""
+class KilledError(BaseException):
+    """The process is gone."""
 
-    def __init__(self):
-        self.teleop = Teleop(FENCE)
+
+class Disk(sqlite3.Connection):
+    """The database of a `ServiceFlight`, whose commits may fail, or be the last of the process."""
+
+    flight = None
+
+    def commit(self):
+        self.flight.commits += 1
+        if self.flight.killed_before == self.flight.commits:
+            raise KilledError
+        if self.flight.full:
+            raise sqlite3.OperationalError("database or disk is full")
+        super().commit()
+        self.flight.image = self.serialize()
+        if self.flight.killed_after == self.flight.commits:
+            raise KilledError
+
+
+class ServiceFlight:
+    """A mission service, which can be restarted, its robot, and all that the service says."""
+
+    def __init__(self, scene=None, **how):
+        self.scene, self.full, self.mark, self.how = scene, False, 0, how
+        self.image, self.commits = None, 0  # the disk after the last commit; attempts to commit
         self.now_ns, self.position = 0, (0.0, 0.0, 0.1)
         self.epoch, self.world, self.mission = 1, "world 1", 0
         self.onboard = (0, 0)  # mission's number and waypoints reached, as world keeps them
@@ -60,6 +81,41 @@ class Flight:
         self.uplink = self.downlink = True
         self.said = []
         self.stop = EmergencyStopRepeater()  # cloud's
+        self.restart_teleop()
+
+    def restart_teleop(self):
+        """Start a new service with the missions on the disk."""
+        self.killed_before = self.killed_after = None  # number of a commit
+        self.teleop = MissionService(self.stored(), FENCE, self.scene, PELICAN, UNITS, **self.how)
+
+    def stored(self):
+        """Return the store that a new process reads from the disk."""
+        disk = store.connect(None, Disk)
+        disk.flight = self
+        if self.image is not None:
+            disk.deserialize(self.image)
+        return MissionStore(disk, b"")
+
+    @property
+    def kept(self):
+        """Events that the disk has, oldest first."""
+        return self.stored().events_after(0)
+
+    def create(self, plan=FROM_SPAWN, **order):
+        mission, _ = self.teleop.create(Order(plan, **order), self.now_ns)
+        self.collect()
+        return mission.id
+
+    @property
+    def newest(self):
+        """The mission that was created last; None before the first."""
+        return next(reversed(self.teleop.book.missions.values()), None)
+
+    def view(self, mission_id):
+        return self.teleop.book.find(mission_id).as_json()
+
+    def names(self, mission_id):
+        return [event["event"] for event in self.view(mission_id)["events"]]
 
     def step(self, position=None, seconds=0.01):
         """Let time pass in periods of 10 ms, telemetry and deadline in each."""
@@ -71,7 +127,7 @@ class Flight:
                 self.stop.see(self.guard, self.mission)
                 self.see()
             self.teleop.handle_deadline(self.now_ns)
-            self._collect()
+            self.collect()
             stop = self.stop.due(self.mission, self.now_ns) if self.stop.sounds else None
             if stop is not None and self.downlink:
                 self._obey(stop)
@@ -88,21 +144,6 @@ class Flight:
     def see(self):
         self.teleop.see(self.seen, self.now_ns)
 
-    def operate(self, verb, *words, number=0):
-        if verb == "start":
-            words = [store.MissionRecord("m1", Order(*words), number)]
-        try:
-            if verb == "acknowledge":
-                self.teleop.acknowledge()
-            elif verb in ("start", "stop"):
-                getattr(self.teleop, verb)(self.now_ns, *words)
-            elif verb == "cancel":
-                self.teleop.flight.end(self.now_ns, "cancelled", "mission cancelled")
-            else:
-                getattr(self.teleop.flight, verb)(self.now_ns, *words)
-        finally:
-            self._collect()
-
     def restart(self):
         """World loses everything it knew."""
         self.epoch += 1
@@ -115,32 +156,26 @@ class Flight:
         self.mission, self.guard = 0, GuardState.HOLD
         self.stop = EmergencyStopRepeater()
 
-    @property
-    def state(self):
-        flight = self.teleop.flight
-        return flight.state.upper() if flight else "IDLE"
-
-    @property
-    def leg(self):
-        return self.teleop.flight.route.leg
-
-    @property
-    def outcome(self):
-        return self.teleop.flight and self.teleop.flight.outcome
+    def _of(self, kind):
+        return [said for said in self.said if isinstance(said, kind)]
 
     @property
     def requests(self):
-        return [said for said in self.said if isinstance(said, OperatorRequest)]
+        return self._of(OperatorRequest)
 
     @property
     def events(self):
-        return [said for said in self.said if isinstance(said, MissionEvent)]
+        return self._of(MissionEvent)
 
     @property
     def setpoints(self):
-        return [said for said in self.said if isinstance(said, Setpoint)]
+        return self._of(Setpoint)
 
-    def _collect(self):
+    @property
+    def faults(self):
+        return self._of(Fault)
+
+    def collect(self):
         for output in self.teleop.take_outputs():
             for_session = isinstance(output, Setpoint | OperatorRequest)
             said = output._replace(epoch=0) if for_session else output
@@ -183,90 +218,22 @@ class Flight:
             self.onboard = (number, max(reached, request.reached))
 
 
-def flying(plan=PLAN):
-    """A flight whose mission has just started."""
-    flight = Flight()
+def flying(plan=FROM_SPAWN, **order):
+    """A flight whose mission, m1, has just started."""
+    flight = ServiceFlight()
     flight.step()
-    flight.operate("start", plan)
-    flight.step(seconds=0.03)
-    assert flight.state == "FLYING"
+    flight.create(plan, **order)
+    flight.step(seconds=0.05)
+    assert flight.newest.state == "flying"
     return flight
 
 
-class KilledError(BaseException):
-    """The process is gone."""
-
-
-class Disk(sqlite3.Connection):
-    """The database of a `ServiceFlight`, whose commits may fail, or be the last of the process."""
-
-    flight = None
-
-    def commit(self):
-        self.flight.commits += 1
-        if self.flight.killed_before == self.flight.commits:
-            raise KilledError
-        if self.flight.full:
-            raise sqlite3.OperationalError("database or disk is full")
-        super().commit()
-        self.flight.image = self.serialize()
-        if self.flight.killed_after == self.flight.commits:
-            raise KilledError
-
-
-class ServiceFlight(Flight):
-    """Flight with a `MissionService` in place of `Teleop`; the service can be restarted."""
-
-    def __init__(self, scene=None, **how):
-        super().__init__()
-        self.scene, self.full, self.mark, self.how = scene, False, 0, how
-        self.image, self.commits = None, 0  # the disk after the last commit; attempts to commit
-        self.restart_teleop()
-
-    def restart_teleop(self):
-        """Start a new service with the missions on the disk."""
-        self.killed_before = self.killed_after = None  # number of a commit
-        self.teleop = MissionService(self.stored(), FENCE, self.scene, PELICAN, UNITS, **self.how)
-
-    def stored(self):
-        """Return the store that a new process reads from the disk."""
-        disk = store.connect(None, Disk)
-        disk.flight = self
-        if self.image is not None:
-            disk.deserialize(self.image)
-        return MissionStore(disk, b"")
-
-    @property
-    def kept(self):
-        """Events that the disk has, oldest first."""
-        return self.stored().events_after(0)
-
-    def create(self, plan=FROM_SPAWN, **order):
-        mission, _ = self.teleop.create(Order(plan, **order), self.now_ns)
-        self._collect()
-        return mission.id
-
-    def view(self, mission_id):
-        return self.teleop.book.find(mission_id).as_json()
-
-    def names(self, mission_id):
-        return [event["event"] for event in self.view(mission_id)["events"]]
-
-    @property
-    def faults(self):
-        return [said for said in self.said if isinstance(said, Fault)]
-
-
 def service_flying(**order):
-    """A flight on its way to the second waypoint."""
-    flight = ServiceFlight()
-    flight.step()
-    mission_id = flight.create(**order)
-    flight.step(seconds=0.05)
+    """A flight on its way to the second waypoint, and the id of its mission."""
+    flight = flying(**order)
     flight.step(position=A)
-    assert flight.view(mission_id)["state"] == "flying"
-    assert flight.view(mission_id)["waypoint"] == 1
-    return flight, mission_id
+    assert flight.newest.waypoint == 1
+    return flight, "m1"
 
 
 def reference(flight):
@@ -274,7 +241,8 @@ def reference(flight):
     return setpoint_at(flight.setpoints[-1], flight.now_ns)
 
 
-PLACES = {"A": A, "B": B, "C": C, "away": AWAY}
+PLACES = {"A": A, "B": B, "C": C, "away": AWAY, "near": (1.07, 0.07, 1.07)}
+PLANS = {"create": FROM_SPAWN, "queue": FROM_SPAWN, "here": THREE, "patient": PLAN}
 SWITCHES = {
     **{guard.name: {"guard": guard} for guard in GuardState},
     **{"full": {"full": True}, "free": {"full": False}, "foreign": {"onboard": (ID, 1)}},
@@ -299,8 +267,8 @@ def play(flight, script):
             flight.step(seconds=float(action))
         elif action in SWITCHES:
             vars(flight).update(SWITCHES[action])
-        elif action in ("create", "queue", "here"):
-            flight.create(THREE if action == "here" else FROM_SPAWN, queue=action == "queue")
+        elif action in PLANS:
+            flight.create(PLANS[action], queue=action == "queue")
         elif action in ("leased", "waiting"):
             flight.create(lease=10.0, queue=action == "waiting")
         elif action == "renew":
@@ -310,12 +278,17 @@ def play(flight, script):
         elif action == "goto":
             flight.teleop.go_to(Leg(AWAY), flight.now_ns)
         elif action.startswith("cancel"):
-            newest = next(reversed(flight.teleop.book.missions))
-            flight.teleop.cancel(action.removeprefix("cancel") or newest, flight.now_ns)
+            mission_id = action.removeprefix("cancel") or flight.newest.id
+            flight.teleop.cancel(mission_id, flight.now_ns)
         elif action in VERBS:
             getattr(flight.teleop, VERBS[action])(flight.now_ns)
         elif action == "mark":
             flight.mark = len(flight.said)
+        elif action == "guess":  # a predecessor's request had the same number by chance
+            flight.mission = flight.requests[-1].number
+        elif action == "stall":
+            flight.now_ns += 4_000_000_000
+            flight.see()
         else:
             do = {"cloud": "restart_cloud", "world": "restart", "restart": "restart_teleop"}
             getattr(flight, do.get(action, action))()

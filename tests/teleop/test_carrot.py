@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from cloudrc.messages import ZERO, GuardState, Motion, Setpoint, Start
 from cloudrc.teleop.carrot import arrival_ns, setpoint_at
 from cloudrc.teleop.wire import Leg, Plan
-from tests.teleop.conftest import PERIOD_NS, Flight, reference
+from tests.teleop.conftest import PERIOD_NS, ServiceFlight, reference
 
 SECOND = 1_000_000_000
 TRACK, HOLD = GuardState.TRACK, GuardState.HOLD
@@ -43,15 +43,13 @@ def test_the_carrot_keeps_its_limits(start, end, speed, acceleration, now_ns):
     assert setpoint_at(moving, arrival_ns(moving) + 1).position == end
 
 
-def led(position=START, guard=TRACK):
+def led():
     """Return a flight that has just begun, with the robot in the air."""
-    flight = Flight()
-    flight.position, flight.guard = position, GuardState.HOLD
+    flight = ServiceFlight()
+    flight.position, flight.guard = START, HOLD
     flight.step()
-    flight.operate("start", TWO)
+    flight.create(TWO)
     flight.step(seconds=0.1)
-    flight.guard = guard
-    flight.step()
     return flight
 
 
@@ -71,7 +69,7 @@ def test_it_waits_at_a_robot_that_holds_and_starts_from_there():
     flight.step()
     assert reference(flight).position == (1.4, 0.1, 1.0)
     follow(flight, 5.0)
-    assert flight.leg == 1
+    assert flight.newest.waypoint == 1
 
 
 def test_it_starts_again_from_the_robot_after_a_silence():

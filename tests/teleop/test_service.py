@@ -1,7 +1,7 @@
 """Missions as a service: keys, the queue, the operator's hand, restarts, and what is shown."""
 
 import re
-from math import inf, nan
+from math import dist, inf, nan
 
 import pytest
 
@@ -11,7 +11,17 @@ from cloudrc.teleop.refusals import ConflictError
 from cloudrc.teleop.store import Order
 from cloudrc.teleop.view import NO_CLOUD, NOT_HEARD
 from cloudrc.teleop.wire import Leg, Plan
-from tests.teleop.conftest import FROM_SPAWN, PLACES, A, ServiceFlight, play, service_flying
+from tests.teleop.conftest import (
+    AWAY,
+    FROM_SPAWN,
+    PLACES,
+    A,
+    B,
+    ServiceFlight,
+    flying,
+    play,
+    service_flying,
+)
 
 BOARD = Touch(body="board")
 QUICK = Plan((Leg(A, dwell=0.0),), Start.HERE)
@@ -42,10 +52,18 @@ a second mission waits: create 0.05 A !create queue queue B C A B C
 between two missions the robot is seen to hold: create 0.05 A queue mute B C 1.0
   -> states=done,starting waypoint=-1 asked=END,START
 world restarts: create 0.05 A world 0.05 -> failure=world_restarted waypoint=-1
+the old world confirms no start from the spawn: mute create 0.05 guess 0.15 -> states=starting
+the new world does: mute create 0.05 guess 0.15 link 0.15 -> states=flying
 nothing starts: mute create 60 -> failure=timed_out
 the guard holds: create 0.05 A HOLD 20 TRACK B -> states=flying reached=0,1
 a stop by somebody else is not undone: create 0.05 A mark ESTOP 0.3
   -> failure=guard_stopped guard=ESTOP asked=END
+
+# To stay at a waypoint for 0.5 s
+dwell starts again outside of the tolerance: patient 0.05 A 0.4 near A 0.4 -> last=started
+and then it counts: patient 0.05 A 0.4 near A 0.46 -> last=reached
+time in hold or unseen is no dwell: patient 0.05 HOLD A 2 TRACK 0.4 stall -> reached=
+and afterwards time counts: patient 0.05 HOLD A 2 TRACK 0.4 stall 0.6 -> reached=0
 
 # The first setpoint: an armed robot flies to it at once
 a start leads it away once it starts: mute create 0.05 cloud TRACK foreign away 0.3 link 0.3
@@ -104,6 +122,8 @@ a stop before telemetry stops any flight: create 0.05 A TRACK foreign restart st
   -> guard=ESTOP failure=emergency_stopped
 a stop after an acknowledgement counts: create 0.05 A stop 0.2 ack stop 0.3
   -> guard=ESTOP last=emergency_stopped
+the number of an acknowledgement does not confirm it: stop 0.3 ack 0.3 stop 0.3 mute ack 0.01 guess
+  0.01 link 0.3 -> guard=GROUND
 none while a stop is on its way: create 0.05 A mute stop !ack 0.2 !ack link 0.3 ack 0.2
   -> guard=GROUND
 
@@ -171,6 +191,28 @@ def test_what_follows_from_a_script(name, script, expected):
     for each in expected.split():
         key, _, value = each.partition("=")
         assert ",".join(found[key]) == value, key
+
+
+@pytest.mark.parametrize(("downlink", "after"), [(True, 0.02), (False, 5.02)])
+def test_a_mission_in_virtual_time_is_over_once_the_robot_knows_or_after_5_s(downlink, after):
+    flight = flying()
+    flight.downlink = downlink
+    flight.teleop.cancel("m1", flight.now_ns)
+    over = [(flight.step(), flight.teleop._teleop.over)[1] for _ in range(600)]
+    assert over.index(True) * 0.01 == pytest.approx(after, abs=0.02)
+
+
+@pytest.mark.parametrize("at", [B, AWAY])
+def test_setpoints_end_on_time_and_tell_the_distance_from_the_last_one(at):
+    track = ((0.0, A), (1.0, B), (2.0, B))
+    flight = flying(Plan((Leg(A, tolerance=inf, time_limit=inf),), track=track))
+    flight.step(position=B, seconds=1.8)
+    assert state(flight) == "flying"
+    flight.step(position=at, seconds=0.3)
+    assert flight.names("m1")[-1] == "done"
+    texts = " ".join(event.text for event in flight.events)
+    assert f"{dist(at, B):.2f} m from the last one" in texts
+    assert "waypoint" not in texts
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ def test_a_waypoint_with_a_yaw_is_reached_within_5_degrees(yaw, seen, reached, s
     flight = flying(Plan((Leg(A, radians(yaw), speed=speed), Leg(B)), Start.HERE))
     flight.orientation = facing(seen)
     flight.step(position=A, seconds=4.0)
-    assert (flight.leg == 1) is reached
+    assert (flight.newest.waypoint == 1) is reached
 
 
 def test_the_setpoint_turns_only_at_a_waypoint_with_a_yaw_and_keeps_the_last_one():
@@ -36,8 +36,9 @@ def test_the_setpoint_turns_only_at_a_waypoint_with_a_yaw_and_keeps_the_last_one
     flight.step(position=A)
     assert [(s.yaw, s.turns) for s in flight.setpoints[-2:]] == [(0.5, True), (0.5, False)]
     before = len(flight.setpoints)
-    flight.operate("hold")
-    flight.operate("go_to", Leg(A, -1.0))
-    flight.operate("go_to", Leg(B))
+    flight.teleop.hold(flight.now_ns)
+    for leg in (Leg(A, -1.0), Leg(B)):
+        flight.teleop.go_to(leg, flight.now_ns)
+    flight.step()
     turned = [(s.yaw, s.turns) for s in flight.setpoints[before:]]
     assert turned == [(0.5, False), (-1.0, True), (-1.0, False)]
