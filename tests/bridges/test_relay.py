@@ -1,7 +1,6 @@
 """`cloudrc relay ros` puts a link between two topics: `make ros2-test` runs these tests."""
 
 import json
-import os
 import subprocess
 import sys
 import time
@@ -11,12 +10,9 @@ from importlib.util import find_spec
 import pytest
 
 import cloudrc.link
+from tests.bridges.conftest import needs_ros
 
-pytestmark = [
-    pytest.mark.ros2,
-    pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # of ROS's own packages
-    pytest.mark.skipif(find_spec("rclpy") is None, reason="needs a sourced ROS 2: make ros2-test"),
-]
+pytestmark = needs_ros
 if find_spec("rclpy"):
     from geometry_msgs.msg import Point
     from rclpy.executors import SingleThreadedExecutor
@@ -29,13 +25,6 @@ if find_spec("rclpy"):
 WORDS = ["relay", "ros", "--from", "/odom", "--to", "/remote/odom"]
 PROFILE = {"uplink": {"delay_ms": 70, "jitter_ms": 40, "loss": 0.05, "duplicate": 0.05}}
 PERIOD = 0.005  # between two messages [s]
-
-
-@pytest.fixture(autouse=True)
-def own_domain(monkeypatch):
-    """Keep the tests apart from other nodes of this machine."""
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(101 + os.getpid() % 100))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
 class Robot:

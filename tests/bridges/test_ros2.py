@@ -1,9 +1,7 @@
 """A node of ROS 2 controls the robot: `make ros2-test` runs these tests in a real ROS 2."""
 
 import json
-import os
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +12,9 @@ from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.companion import companion
 from cloudrc.record.columns import Recording, RecordStore
+from tests.bridges.conftest import needs_ros
 
-pytestmark = [
-    pytest.mark.ros2,
-    pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # of ROS's own packages
-    pytest.mark.skipif(find_spec("rclpy") is None, reason="needs a sourced ROS 2: make ros2-test"),
-]
-if find_spec("rclpy"):
-    pass
+pytestmark = needs_ros
 ROOT = Path(__file__).parents[2]
 SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 0.5}]", "mission.touch=null")
 
@@ -38,39 +31,23 @@ def example(names="controller", namespace=""):
     return f"env {path} {sys.executable} -m cloudrc_nodes {names}{more}"
 
 
-@pytest.fixture(autouse=True)
-def own_domain(monkeypatch):
-    """Keep the tests apart from other nodes of this machine."""
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.chdir(ROOT)
-
-
-def flown(settings, command, folder):
-    """Fly in virtual time; return the recording."""
+def built_in(settings, **how):
+    """Fly in virtual time; return the true path."""
     store = RecordStore()
-    experiment = load_experiment("paper", settings)
-    with companion(command, folder) as gone:
-        assembly.fly(experiment, store.add, gone=gone)
-    return Recording(records=store)
-
-
-def built_in(settings):
-    store = RecordStore()
-    assembly.fly(load_experiment("paper", settings), store.add)
-    return Recording(records=store)
-
-
-def true_path(recording):
-    truth = recording["/ground_truth"]
+    assembly.fly(load_experiment("paper", settings), store.add, **how)
+    truth = Recording(records=store)["/ground_truth"]
     return np.column_stack((truth["stamp_ns"], truth["position"], truth["velocity"]))
+
+
+def with_nodes(settings, command, folder):
+    with companion(command, folder) as gone:
+        return built_in(settings, gone=gone)
 
 
 @pytest.mark.smoke
 def test_the_papers_controller_as_a_node_flies_the_path_of_the_built_in_one_bit_by_bit(tmp_path):
-    recording = flown(["cloud.controller=ros2"], example(), tmp_path)
-    path = true_path(recording)
-    assert np.array_equal(path, true_path(built_in([])))
+    path = with_nodes(["cloud.controller=ros2"], example(), tmp_path)
+    assert np.array_equal(path, built_in([]))
     assert len(path) > 1000
 
 
@@ -82,8 +59,8 @@ def test_moonshot_the_node_flies_the_built_in_path_over_a_long_and_lossy_link(de
         "guard.command_age_max_ms=1500", "cloud.freeze_after_s=1.2", "cloud.horizon_max_s=2",
         "cloud.predictor=model_based",
     ]  # fmt: skip
-    path = true_path(flown([*settings, "cloud.controller=ros2"], example(), tmp_path))
-    assert np.array_equal(path, true_path(built_in(settings)))
+    path = with_nodes([*settings, "cloud.controller=ros2"], example(), tmp_path)
+    assert np.array_equal(path, built_in(settings))
     assert first_touch(path) > 0
 
 
@@ -94,9 +71,9 @@ def first_touch(path):
 
 def test_estimator_predictor_teleoperation_and_controller_fly_as_nodes_and_repeat(tmp_path):
     settings = ["cloud.controller=ros2", "cloud.predictor=last_sample"]
-    path, again = (true_path(flown(settings, example(""), tmp_path)) for _ in range(2))
+    path, again = (with_nodes(settings, example(""), tmp_path) for _ in range(2))
     assert np.array_equal(path, again)
-    assert first_touch(path) == pytest.approx(first_touch(true_path(built_in([]))), rel=0.03)
+    assert first_touch(path) == pytest.approx(first_touch(built_in([])), rel=0.03)
 
 
 def run(tmp_path, kind, *words, mode="virtual"):
@@ -145,10 +122,8 @@ def test_two_nodes_cannot_command(tmp_path, capsys, mode, second):
 
 def test_a_robot_has_a_namespace(tmp_path):
     settings = [*SHORT, "cloud.controller={name: ros2, namespace: drone1}"]
-    assert np.array_equal(
-        true_path(flown(settings, example(namespace="drone1"), tmp_path)),
-        true_path(built_in(SHORT)),
-    )
+    path = with_nodes(settings, example(namespace="drone1"), tmp_path)
+    assert np.array_equal(path, built_in(SHORT))
 
 
 @pytest.mark.parametrize("kind", [example(), "unstamped"])

@@ -1,6 +1,5 @@
 """A plain node of ROS 2 sees a flight and steers it: `make ros2-test` runs this in a real ROS 2."""
 
-import os
 import subprocess
 import sys
 import threading
@@ -19,24 +18,14 @@ from cloudrc.geometry.shapes import Shapes
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import Lateness
 from cloudrc.report.markers import encode_markers, scene_shapes
+from tests.bridges.conftest import needs_ros
 from tests.console.conftest import FakeApi, control, start
 
-pytestmark = [
-    pytest.mark.ros2,
-    pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # of ROS's own packages
-    pytest.mark.skipif(find_spec("rclpy") is None, reason="needs a sourced ROS 2: make ros2-test"),
-]
+pytestmark = needs_ros
 SUCCEEDED, ABORTED = 4, 6
 """Status of an action that has ended, as in action_msgs/GoalStatus."""
 PERIOD = 0.01
 """Time between two telemetries of the tests' cloud [s]."""
-
-
-@pytest.fixture(autouse=True)
-def own_domain(monkeypatch):
-    """Keep the tests apart from other nodes of this machine."""
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(101 + os.getpid() % 100))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
 class Watcher:
