@@ -8,7 +8,6 @@ import re
 import threading
 import uuid
 from functools import reduce
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
@@ -20,6 +19,7 @@ from cloudrc.cluster.fleet_mission import ROBOT
 from cloudrc.cluster.jobs import UID_LABEL
 from cloudrc.cluster.pods import INDEX
 from tests.chart.conftest import render
+from tests.support.http import serve
 
 PATH = re.compile(r"/(?:api|apis/[^/]+)/v\w+(?:/namespaces/([^/]+))?/(\w+)(?:/([^/]+))?(?:/(\w+))?")
 """Path of a request: namespace, plural, name, subresource."""
@@ -51,7 +51,6 @@ class FakeApi:
         self.changes = []  # (kind, plural, object) in the order of their resource versions
         self.put("nodes", {"metadata": {"name": "one"}, "spec": {}})
         self.server = serve(lambda request, body: self.answer(request.command, request.path, body))
-        self.url = f"http://127.0.0.1:{self.server.server_port}"
 
     def close(self):
         self.server.shutdown()
@@ -172,35 +171,6 @@ class FakeApi:
         return left
 
 
-def serve(answer):
-    """Serve HTTP on a free port; `answer` gets the request and its JSON, and returns a reply."""
-
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-        disable_nagle_algorithm = True
-
-        def reply(self):
-            length = int(self.headers.get("Content-Length") or 0)
-            code, said = answer(self, json.loads(self.rfile.read(length)) if length else None)
-            is_text = isinstance(said, str)
-            data = said.encode() if is_text else json.dumps(said).encode()
-            self.send_response(code)
-            self.send_header("Content-Type", "text/plain" if is_text else "application/json")
-            self.send_header("Content-Length", str(len(data)))
-            self.end_headers()
-            self.wfile.write(data)
-
-        do_GET = do_POST = do_DELETE = reply  # noqa: N815
-
-        def log_message(self, *words):
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
-    return server
-
-
 class FakeTeleop:
     """The API of a cloud pod, with a record of its requests."""
 
@@ -304,7 +274,7 @@ def api(tmp_path, monkeypatch):
     server = FakeApi()
     server.put("namespaces", {"metadata": {"name": "demo"}})
     path = tmp_path / "kubeconfig"
-    path.write_text(kubeconfig(server.url))
+    path.write_text(kubeconfig(server.server.url))
     monkeypatch.setattr(CONFIG_PLACE, str(path))
     monkeypatch.setattr(jobs, "LOOK_PERIOD", 0.01)
     monkeypatch.setattr(client, "RETRIES", {**client.RETRIES, "backoff_factor": 0.01})

@@ -4,9 +4,8 @@ import json
 import socket
 import threading
 import time
-import urllib.error
-import urllib.request
 from contextlib import ExitStack
+from urllib.request import Request
 
 import pytest
 import viser
@@ -24,6 +23,7 @@ from cloudrc.console.steering import Steering
 from cloudrc.messages import ZERO
 from tests.conftest import wait_until
 from tests.console.conftest import LIMIT
+from tests.support.http import ask
 
 VERSION = f"viser-v{viser.__version__}"
 
@@ -42,12 +42,7 @@ def call(page, path, method="GET"):
     """Send a request with the token in the cookie; return status and body."""
     headers = {"Cookie": f"{page._access.cookie}={page._access.token()}"}
     url = f"http://127.0.0.1:{page.port}/{path}"
-    request = urllib.request.Request(url, method=method, headers=headers)
-    try:
-        with urllib.request.urlopen(request, timeout=10) as answer:
-            return answer.status, answer.read().decode()
-    except urllib.error.HTTPError as error:
-        return error.code, error.read().decode()
+    return ask(Request(url, method=method, headers=headers))
 
 
 def scene(page):

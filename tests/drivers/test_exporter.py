@@ -2,8 +2,6 @@
 
 import select
 import socket
-import urllib.error
-import urllib.request
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -32,6 +30,7 @@ from cloudrc.records import (
     TelemetrySent,
 )
 from tests.flights.conftest import records
+from tests.support.http import DIRECT, ask
 
 HOST = "127.0.0.1"
 
@@ -120,12 +119,7 @@ def served():
 
 
 def get(port, path):
-    try:
-        with urllib.request.urlopen(f"http://{HOST}:{port}{path}", timeout=10) as answer:
-            return answer.status, answer.read().decode()
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, error.read().decode()
+    return ask(f"http://{HOST}:{port}{path}")
 
 
 def test_metrics_and_probes_are_on_one_port(served):
@@ -136,7 +130,7 @@ def test_metrics_and_probes_are_on_one_port(served):
         exporter.ready(ready)
         assert get(port, "/readyz")[0] == status
         assert f"cloudrc_ready {ready:.1f}" in get(port, "/metrics?name=any")[1]
-    with urllib.request.urlopen(f"http://{HOST}:{port}/metrics", timeout=10) as answer:
+    with DIRECT.open(f"http://{HOST}:{port}/metrics", timeout=10) as answer:
         assert answer.headers["Content-Type"] == "text/plain; version=0.0.4; charset=utf-8"
     assert get(port, "/") == (404, "there are /metrics, /healthz, /readyz, /link.json\n")
 

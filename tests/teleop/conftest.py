@@ -5,12 +5,11 @@ import socket
 import sqlite3
 import threading
 import time
-import urllib.error
-import urllib.request
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from urllib.request import Request as HttpRequest
 
 import pytest
 
@@ -33,6 +32,7 @@ from cloudrc.teleop.store import MissionStore, Order
 from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
 from tests.conftest import wait_until
 from tests.fences import FENCE
+from tests.support.http import ask
 
 PERIOD_NS = 10_000_000
 PELICAN, PAPER = hull_of("pelican"), read_experiment("paper")
@@ -299,8 +299,6 @@ def asked(flight, since=0):
     return [r.request for r in flight.requests[since:] if r.request is not Request.PROGRESS]
 
 
-DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-"""Opener without a proxy: `urlopen` keeps the proxy that the environment named at first."""
 LIMIT = 5.0
 OPERATOR, READER = "operator-token-of-the-tests", "reader-token-of-the-tests"
 
@@ -374,7 +372,7 @@ class Running:
     def request(self, path, data=None, token=OPERATOR, method=None, headers=None):
         said = {"Authorization": f"Bearer {token}"} if token else {}
         headers = {**said, **(headers or {})}
-        return urllib.request.Request(self.url + path, data, headers, method=method)
+        return HttpRequest(self.url + path, data, headers, method=method)
 
     def post(self, path, body=b"", token=OPERATOR):
         """Return the status and the answer of a POST; `body` may be bytes."""
@@ -382,12 +380,8 @@ class Running:
         return self.send(self.request(path, data, token, "POST"))
 
     def send(self, request):
-        try:
-            answer = DIRECT.open(request, timeout=LIMIT)
-        except urllib.error.HTTPError as error:
-            answer = error
-        with answer:
-            return answer.status, json.loads(answer.read() or "null")
+        status, text = ask(request, LIMIT)
+        return status, json.loads(text or "null")
 
     def logged(self):
         """Stop the server, and return the lines of its log."""

@@ -17,9 +17,9 @@ from cloudrc.teleop import auth, models
 from cloudrc.teleop.api import ApiServer, Bridge
 from cloudrc.teleop.client import Api, UnreachableError
 from cloudrc.teleop.refusals import ConflictError
+from tests.support.http import DIRECT
 from tests.teleop.conftest import (
     A_MISSION,
-    DIRECT,
     OPERATOR,
     READER,
     A,
