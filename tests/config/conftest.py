@@ -15,6 +15,13 @@ def refused(name, *settings):
     return str(caught.value)
 
 
+def refused_line(name, *settings):
+    """Return the error message, which is one line."""
+    line = refused(name, *settings)
+    assert "\n" not in line
+    return line
+
+
 @pytest.fixture
 def files_are_read_once():
     """Let the loads of a test share what they read, as those of a sweep do: most of their time."""

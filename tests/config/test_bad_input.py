@@ -7,7 +7,7 @@ import pytest
 
 from cloudrc.config.profile import load_profile
 from cloudrc.errors import BadInputError
-from tests.config.conftest import refused
+from tests.config.conftest import refused, refused_line
 
 
 @pytest.fixture
@@ -70,9 +70,8 @@ def test_fifty_problems_at_most_are_listed(mine):
     ],
 )  # fmt: skip
 def test_an_invalid_file_is_one_line(mine, text, reason):
-    found = refused_text(mine, text)
-    assert reason in found
-    assert "\n" not in found
+    mine.write_text(text)
+    assert reason in refused_line(mine).replace(f"{mine.parent}/", "")
 
 
 @pytest.mark.parametrize(
@@ -92,10 +91,6 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
     ("text", "reason"),
     [
         ("mission.waypoints.9.dwell_s=1", "entries 0 to 6; use one of these, or 7 to append"),
-        (
-            "mission.waypoints.2.yaw_deg=90",
-            "yaw_deg: 90: the onboard controller of this robot holds",
-        ),
         (
             "cloud.plan_s=0.4",
             "cloud.predictor: 'constant_velocity' has no model of the robot, which cloud.plan_s",

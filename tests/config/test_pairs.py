@@ -29,23 +29,37 @@ NAMES = {
     **{"estimator": "ewma", "predictor": "kalman", "controller": "pid"},
 }
 """Last part of a key -> a name that fits it."""
-CHOSEN = [
-    *((key, None) for key in ("cloud", "link", "guard", "link.uplink", "cloud.horizon_max_s")),
-    *(("link.profile", name) for name in ("ideal", "satellite", "handover")),
-    *(("guard.command_age_max_ms", 2000), ("guard.speed_max_mps", 5), ("guard.plan_max_s", 0.8)),
-    *(("cloud.freeze_after_s", None), ("guard.command_age_max_ms", None), ("guard.plan_max_s", 0)),
-    *(("cloud.horizon_max_s", 2), ("cloud.plan_s", 0.4), ("cloud.controller.speed_max", 2)),
-    *(("cloud", {"controller": "pid"}), ("cloud.predictor", {"name": "last_sample"})),
-    *(("link", {"profile": "paper-p3"}), ("link.uplink", {"delay_ms": 30}), ("guard", {})),
-    *(("link.both.delay_ms", 300), ("link.uplink.loss", {"bad_start": 0.1, "bad_end": 0.3})),
-    ("link.uplink.changes", [{"at_s": 3, "delay_ms": 50}]),
-    ("link.downlink.blackouts", [{"start_s": 3, "duration_s": 0.4}]),
-    *(
-        ("mission", "steps"),
-        ("mission.carrot", {"speed_mps": 2}),
-        ("mission.touch", None),
-    ),
-]
+CHOSEN = """
+cloud=null
+cloud={"controller": "pid"}
+cloud.controller.speed_max=2
+cloud.freeze_after_s=null
+cloud.horizon_max_s=null
+cloud.horizon_max_s=2
+cloud.plan_s=0.4
+cloud.predictor={"name": "last_sample"}
+guard=null
+guard={}
+guard.command_age_max_ms=null
+guard.command_age_max_ms=2000
+guard.plan_max_s=0
+guard.plan_max_s=0.8
+guard.speed_max_mps=5
+link=null
+link={"profile": "paper-p3"}
+link.profile=ideal
+link.profile=satellite
+link.profile=handover
+link.both.delay_ms=300
+link.uplink=null
+link.uplink={"delay_ms": 30}
+link.uplink.changes=[{"at_s": 3, "delay_ms": 50}]
+link.uplink.loss={"bad_start": 0.1, "bad_end": 0.3}
+link.downlink.blackouts=[{"start_s": 3, "duration_s": 0.4}]
+mission=steps
+mission.carrot={"speed_mps": 2}
+mission.touch=null
+"""
 """Settings that depend on each other, or replace many values."""
 
 
@@ -57,8 +71,11 @@ def values(key):
 
 
 def load(file, *settings):
-    texts = [f"{key}={json.dumps(value)}" for key, value in settings]
-    return load_experiment(file, texts, build=False)
+    return load_experiment(file, settings, build=False)
+
+
+def key_of(setting):
+    return setting.partition("=")[0]
 
 
 def loads(file, *settings):
@@ -72,8 +89,8 @@ def loads(file, *settings):
 def valid_settings(file):
     """Return a setting for each key that has a value with which the experiment loads."""
     keys = [key for key in FORMS if "downlink" not in key]
-    tried = ((key, value) for key in keys for value in values(key))
-    return [*dict(one for one in tried if loads(file, one)).items()]
+    tried = (f"{key}={json.dumps(value)}" for key in keys for value in values(key))
+    return [*{key_of(one): one for one in tried if loads(file, one)}.values()]
 
 
 def blames_another_key(file, *settings):
@@ -82,7 +99,7 @@ def blames_another_key(file, *settings):
         load(file, *settings)
     except BadInputError as error:
         lines = str(error).splitlines()[1:] or [str(error)]
-        keys = {key.replace(".both", "") for key, _ in settings}
+        keys = {key_of(one).replace(".both", "") for one in settings}
         keys |= {key.rpartition(".")[2] for key in keys}
         if not all(any(key in line for key in keys) for line in lines):
             return f"{settings}: {error}"
@@ -102,12 +119,12 @@ def file(request, tmp_path):
 @pytest.mark.parametrize("step", [60, *nightly(1)])
 def test_every_pair_of_valid_settings_loads_or_names_one_of_them(file, step):
     """Of pairs that are not of two chosen settings, try one of `step`."""
-    single = valid_settings(file)
-    assert [one for one in CHOSEN if not loads(file, one)] == []
+    single, chosen = valid_settings(file), CHOSEN.split("\n")[1:-1]
+    assert [one for one in chosen if not loads(file, one)] == []
     assert len(single) > 60
-    others = [*product(CHOSEN, single), *combinations(single, 2)][::step]
-    pairs = (*combinations(CHOSEN, 2), *others)
-    apart = [(one, two) for one, two in pairs if one[0] != two[0]]
+    others = [*product(chosen, single), *combinations(single, 2)][::step]
+    pairs = (*combinations(chosen, 2), *others)
+    apart = [(one, two) for one, two in pairs if key_of(one) != key_of(two)]
     assert [text for pair in apart if (text := blames_another_key(file, *pair))] == []
 
 
@@ -115,5 +132,5 @@ def test_null_means_again_what_the_profile_gives(tmp_path):
     path = tmp_path / "resolved.yaml"
     path.write_text(dump(load_experiment("hover", ["link.profile=satellite"])))
     keys = ("cloud.horizon_max_s", "cloud.freeze_after_s", "guard.command_age_max_ms")
-    before, after = load(path), load(path, *((key, None) for key in keys))
+    before, after = load(path), load(path, *(f"{key}=null" for key in keys))
     assert (after.cloud, after.guard) == (before.cloud, before.guard)

@@ -9,7 +9,7 @@ from cloudrc import plugins
 from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.schema import PlugIn
-from tests.config.conftest import refused
+from tests.config.conftest import refused_line
 
 SOURCE = '''"""Looks ahead by a share of the horizon.
 
@@ -58,8 +58,8 @@ def test_a_plug_in_is_loaded_by_path(share):
     ],
 )
 def test_parameters_are_checked_against_build(share, setting, reason):
-    found = refused("paper", f"cloud.predictor={share}", f"cloud.predictor.{setting}")
-    assert reason in found
+    settings = f"cloud.predictor={share}", f"cloud.predictor.{setting}"
+    assert reason in refused_line("paper", *settings)
 
 
 @pytest.mark.parametrize(
@@ -73,9 +73,7 @@ def test_parameters_are_checked_against_build(share, setting, reason):
 )  # fmt: skip
 def test_a_broken_plug_in_is_one_line(share, text, reason):
     share.write_text(text)
-    found = refused("paper", f"cloud.predictor={share}")
-    assert reason in found
-    assert "\n" not in found.strip()
+    assert reason in refused_line("paper", f"cloud.predictor={share}")
     if "cannot be imported" in reason:
         assert plugins.describe("predictors", str(share)).startswith("(not usable")
 
@@ -85,9 +83,8 @@ def test_a_plug_in_that_lacks_a_method_is_refused_before_the_flight(share, kind)
     lacking, *others = plugins.METHODS[f"{kind}s"]
     lines = [f"    def {name}(self, *given): ..." for name in others]
     share.write_text("\n".join(["class Own:", *lines, "build = Own"]))
-    found = refused("paper", f"cloud.{kind}={share}")
-    assert f"build() returned Own, which has no method {lacking}()" in found
-    assert "\n" not in found.strip()
+    line = refused_line("paper", f"cloud.{kind}={share}")
+    assert f"build() returned Own, which has no method {lacking}()" in line
 
 
 def test_installed_packages_add_plug_ins(share, monkeypatch):
