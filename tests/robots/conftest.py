@@ -1,11 +1,28 @@
 """A robot of one's own in a folder."""
 
+import json
+
 import pytest
 
 from cloudrc.config.robot import find_robot
+from cloudrc.config.schema import World
+from cloudrc.errors import BadInputError
+from cloudrc.robots.build import check_robot
 
 CONTROLLER = find_robot("pelican").onboard.name
 HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
+
+
+def world(**keys):
+    return World.model_validate_json(json.dumps({"scene": "empty", **keys}))
+
+
+def refused(**keys):
+    """Return the line with which a robot in a world is refused."""
+    with pytest.raises(BadInputError) as error:
+        check_robot(world(**keys))
+    assert "\n" not in str(error.value)
+    return str(error.value)
 
 
 @pytest.fixture

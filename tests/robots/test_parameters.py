@@ -1,28 +1,14 @@
 """Parameters on board, a robot unlike its model, and wind, for every robot."""
 
-import json
-
 import pytest
 
 import cloudrc
 from cloudrc.config import shipped
 from cloudrc.config.robot import find_robot
-from cloudrc.config.schema import World
-from cloudrc.errors import BadInputError
 from cloudrc.metrics.velocity_loop import identify, series
 from cloudrc.robots.build import check_robot
 from tests.conftest import nightly
-
-
-def world(**keys):
-    return World.model_validate_json(json.dumps({"scene": "empty", **keys}))
-
-
-def refused(**keys):
-    with pytest.raises(BadInputError) as error:
-        check_robot(world(**keys))
-    assert "\n" not in str(error.value)
-    return str(error.value)
+from tests.robots.conftest import refused, world
 
 
 @pytest.mark.parametrize("robot", shipped.names("robot"))

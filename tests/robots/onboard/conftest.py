@@ -45,6 +45,10 @@ def big(**more):
     return robot(x_layout(0.14, 0.17, 0.02, 8.0), 1.3, ".03 .025 .05", **more)
 
 
+SKEW = big().replace('diaginertia=".03 .025 .05"', 'fullinertia=".03 .025 .05 .006 .005 -.004"')
+"""It has products of inertia."""
+
+
 def nano(**more):
     """A robot of 27 g whose four rotors lift 60 g.
 

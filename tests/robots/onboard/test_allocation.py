@@ -5,12 +5,9 @@ import pytest
 
 from cloudrc.robots.onboard._allocation import Allocation
 from cloudrc.sim.airframe import read_airframe
-from tests.robots.onboard.conftest import big, compiled, hexarotor, one_site
+from tests.robots.onboard.conftest import SKEW, big, compiled, hexarotor, one_site
 
 GRAVITY = 9.81
-
-
-SKEW = big().replace('diaginertia=".03 .025 .05"', 'fullinertia=".03 .025 .05 .006 .005 -.004"')
 
 
 @pytest.fixture(params=[big(), big(centre=".03 0 .02"), SKEW, hexarotor(), one_site()])
