@@ -37,7 +37,12 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 def nightly(*values: object) -> list[object]:
     """Mark values of a parametrized test as `full`: only `make nightly` tests them."""
-    return [pytest.param(value, marks=pytest.mark.full) for value in values]
+    return nightly_rows(*((value,) for value in values))
+
+
+def nightly_rows(*rows: tuple[object, ...]) -> list[object]:
+    """Mark rows of several values likewise."""
+    return [pytest.param(*row, marks=pytest.mark.full) for row in rows]
 
 
 def _has_ipv6() -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cloudrc.statistics import median_interval
-from tests.conftest import nightly
+from tests.conftest import nightly, nightly_rows
 from tests.flights.conftest import both_ways, fly, numbers
 from tools.results import PAGE, results
 from tools.results import fly as fly_sweep
@@ -56,17 +56,16 @@ def test_high_gains_without_a_predictor_are_unstable(seed):
 
 
 @pytest.mark.parametrize(
-    "case",
-    nightly(
+    ("experiment", "estimator", "link", "bias_max", "rms_max"),
+    nightly_rows(
         ("steps", "running_mean", ("link.profile=paper-p3",), 1.0, 21.0),
         ("steps", "split", ("link.profile=paper-p3",), 2.0, 15.25),
         ("steps", "split", STEPPED, 2.0, 9.4),
         ("paper-verbatim", "running_mean", ("link.profile=paper-p3",), 1.0, 34.0),
     ),
 )
-def test_the_delay_estimate_has_no_bias(case):
+def test_the_delay_estimate_has_no_bias(experiment, estimator, link, bias_max, rms_max):
     """Check mean and RMS of the estimate's error [ms], over seeds 1 to 3, after the first echo."""
-    experiment, estimator, link, bias_max, rms_max = case
     biases, squares = [], []
     for seed in (1, 2, 3):
         settings = (*link, f"cloud.estimator={estimator}", f"seed={seed}")

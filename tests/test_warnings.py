@@ -7,7 +7,7 @@ import pytest
 from cloudrc.config import shipped
 from cloudrc.config.load import load_experiment
 from cloudrc.warnings import advise
-from tests.conftest import nightly
+from tests.conftest import nightly_rows
 from tests.flights.conftest import both_ways, fly, numbers
 
 
@@ -111,15 +111,14 @@ def test_each_shipped_profile_is_flown_without_a_warning(profile):
 
 
 @pytest.mark.parametrize(
-    "conditions",
+    ("delay", "jitter", "others"),
     [
         (90, 50, {}),
-        *nightly((110, 20, {}), (70, 60, {}), (100, 40, {}), (100, 40, {"distribution": "pareto"})),
-        *nightly((70, 40, {"distribution": "normal"}), (120, 5, {}), (200, 150, {})),
+        *nightly_rows((110, 20, {}), (70, 60, {}), (100, 40, {}), (120, 5, {}), (200, 150, {})),
+        *nightly_rows((100, 40, {"distribution": "pareto"}), (70, 40, {"distribution": "normal"})),
     ],
 )
-def test_a_hold_is_announced_if_and_only_if_the_guard_holds(conditions):
-    delay, jitter, others = conditions
+def test_a_hold_is_announced_if_and_only_if_the_guard_holds(delay, jitter, others):
     settings = both(delay, jitter, **others)
     warned = any("guard" in text for text in advise(load_experiment("steps", settings)))
     assert warned == (numbers(fly("steps", *settings))["hold_count"] > 0)

@@ -13,6 +13,7 @@ from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import UID_LABEL
 from cloudrc.errors import BadInputError
 from tests.cluster.conftest import pod, terminated
+from tests.conftest import nightly
 
 PODS = PodSettings(4, "my/world:1", "1")
 
@@ -130,7 +131,7 @@ def test_the_first_pod_that_refuses_the_flights_ends_the_job(started, api, relea
     assert api.jobs() == []
 
 
-@pytest.mark.parametrize("pods", [100, pytest.param(1000, marks=pytest.mark.full)])
+@pytest.mark.parametrize("pods", [100, *nightly(1000)])
 def test_a_minute_takes_few_requests_even_if_all_pods_end_in_it(started, api, release, pods):
     """A look is once a second; before, it read the log of each pod: 60,000 requests."""
     looks = itertools.count(1)

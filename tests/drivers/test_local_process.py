@@ -14,7 +14,7 @@ import pytest
 
 from cloudrc.drivers import local
 from cloudrc.record.columns import Recording
-from tests.conftest import nightly, wait_until
+from tests.conftest import nightly, nightly_rows, wait_until
 from tests.drivers.conftest import COMMAND, start, wait_until_flying
 
 pytestmark = pytest.mark.process
@@ -64,11 +64,8 @@ HANGS, DIES = signal.SIGSTOP, signal.SIGKILL
     ("victim", "how"),
     [
         ("uplink", HANGS),
-        pytest.param("cloud", DIES, marks=pytest.mark.full),
-        *(
-            pytest.param(each, HANGS, marks=pytest.mark.full)
-            for each in ("cloud", "downlink", "teleop", "world")
-        ),
+        *nightly_rows(("cloud", DIES), ("cloud", HANGS), ("downlink", HANGS)),
+        *nightly_rows(("teleop", HANGS), ("world", HANGS)),
     ],
 )
 def test_a_supervisor_that_was_paused_sees_who_hangs_or_dies(tmp_path, victim, how):

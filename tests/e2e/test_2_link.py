@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import pytest
 
+from tests.conftest import nightly_rows
 from tests.e2e.conftest import (
     CHART,
     INTERRUPTED,
@@ -47,8 +48,7 @@ TOLERANCE = 0.002
 """Tolerance of a mean one-way delay [s]."""
 PROFILES = [
     ("paper-p1", 0.020, 4.0),
-    pytest.param("paper-p3", 0.070, 20.0, marks=pytest.mark.full),
-    pytest.param("paper-p2", 0.045, 10.0, marks=pytest.mark.full),
+    *nightly_rows(("paper-p3", 0.070, 20.0), ("paper-p2", 0.045, 10.0)),
 ]
 """Profile, mean delay of each direction [s], time of the measurement [s]. In this time jitter alone
 changes the mean by 0.3, 0.5 and 0.5 ms. The release starts with paper-p2."""

@@ -6,6 +6,7 @@ import pytest
 
 from cloudrc import __version__
 from cloudrc.config.load import load_experiment
+from tests.conftest import nightly_rows
 from tests.e2e.conftest import (
     CHART,
     NAMESPACE,
@@ -88,7 +89,7 @@ def test_an_image_that_is_not_loaded_is_named(cluster):
     ("name", "setting", "instant"),
     [
         ("hover", "mission.waypoints.0.dwell_s=6", "duration"),
-        pytest.param("paper", "seed=1", "contact_time", marks=pytest.mark.full),
+        *nightly_rows(("paper", "seed=1", "contact_time")),
     ],
 )
 def test_a_run_in_a_cluster_is_that_of_virtual_time(

@@ -5,6 +5,7 @@ import json
 import pytest
 import yaml
 
+from tests.conftest import nightly_rows
 from tests.e2e.conftest import (
     CHART,
     EXAMPLES,
@@ -64,7 +65,7 @@ def scaled(name, component):
 
 @pytest.mark.parametrize(
     ("name", "component"),
-    [("constrained-drone", "world"), pytest.param("loaded-cloud", "cloud", marks=pytest.mark.full)],
+    [("constrained-drone", "world"), *nightly_rows(("loaded-cloud", "cloud"))],
 )
 def test_a_constrained_part_is_throttled_yet_keeps_real_time(constrained, note, name, component):
     plain = throttled(component)

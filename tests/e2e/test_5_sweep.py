@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests.conftest import nightly_rows
 from tests.e2e.conftest import EXAMPLES, NAMESPACE, ROOT, apply, command, eventually, kubectl, read
 
 RUN = [sys.executable, "-m", "cloudrc", "sweep"]
@@ -105,7 +106,7 @@ def rows_of_claim():
 
 @pytest.mark.parametrize(
     ("flights", "shards", "kills", "steps"),
-    [(8, 2, 1, 10), pytest.param(200, 8, 4, 5, marks=pytest.mark.full)],
+    [(8, 2, 1, 10), *nightly_rows((200, 8, 4, 5))],
 )
 def test_every_row_is_flown_once_though_pods_and_client_are_killed(
     cluster, sweep, start, tmp_path, flights, shards, kills, steps

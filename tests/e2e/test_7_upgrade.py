@@ -4,6 +4,7 @@ import subprocess
 
 import pytest
 
+from tests.conftest import nightly_rows
 from tests.e2e.conftest import (
     CHART,
     INTERRUPTED,
@@ -56,8 +57,8 @@ def changed(before, *command):
     ("before", "keeps", "restarts"),
     [
         ("before-fleet", "--reuse-values", set()),
-        pytest.param("before-light", "--reset-then-reuse-values", set(), marks=pytest.mark.full),
-        pytest.param("before-right", "--reuse-values", {"cloud"}, marks=pytest.mark.full),
+        *nightly_rows(("before-light", "--reset-then-reuse-values", set())),
+        *nightly_rows(("before-right", "--reuse-values", {"cloud"})),
     ],
 )
 def test_a_mission_goes_on_while_its_release_is_upgraded_and_rolled_back(

@@ -10,16 +10,12 @@ from cloudrc.runs.experiment import check_mode, robots_of
 from cloudrc.runs.fleet import assemble_fleet
 from cloudrc.runs.flight import fly_in_memory
 from tests.config.conftest import refused
+from tests.conftest import nightly_rows
 
 SHORT = ("mission.steps.count=1", "mission.steps.period_s=0.5", "criteria.time_limit_s=1")
 VARIED = "fleet.vary=[{world.robot: x2, seed: 4}, {link.both.delay_ms: 60, link.both.loss: 0.02}]"
 CLOCK = "cloud.clock_offset_s=5"
 LATE = ("cloud.compute_ms=8", "cloud.compute_deviation_ms=4", "cloud.cores=1")
-
-
-def full(*values):
-    """Mark several values of a parametrized test as those of `make nightly`."""
-    return [pytest.param(*each, marks=pytest.mark.full) for each in values]
 
 
 def alone(*settings):
@@ -53,7 +49,7 @@ def test_a_cell_without_limits_is_no_cell():
 
 @pytest.mark.parametrize(
     ("queue", "rate", "packets"),
-    [("fifo", 200, 1000), *full(("fifo", 150, 20)), ("drr", 150, 20)],
+    [("fifo", 200, 1000), *nightly_rows(("fifo", 150, 20)), ("drr", 150, 20)],
 )
 def test_one_robot_in_a_cell_is_a_robot_behind_a_bottleneck(queue, rate, packets):
     odd = "link.both.keep_order=true", "link.both.duplicate=0.05", "link.both.corrupt=0.01"
@@ -89,7 +85,7 @@ def test_cores_that_robots_share_need_virtual_time(tmp_path):
 
 @pytest.mark.parametrize(
     ("queue", "sharing"),
-    [("newest", "ps"), *full(("fifo", "ps"), ("drr", "fifo"), ("priority", "fifo"))],
+    [("newest", "ps"), *nightly_rows(("fifo", "ps"), ("drr", "fifo"), ("priority", "fifo"))],
 )
 def test_a_fleet_with_contention_flies_twice_alike(queue, sharing):
     traffic = "cell.traffic=[{kind: bulk}, {kind: video, rate_kbit: 300, direction: downlink}]"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.conftest import nightly
+from tests.conftest import nightly_rows
 from tests.flights.conftest import both_ways, fly, numbers
 
 FAST = (
@@ -28,9 +28,11 @@ def test_a_replay_knows_where_the_robot_will_be(predictor, millimetres):
     assert n["prediction_error_rms"] < 12.5e-3
 
 
-@pytest.mark.parametrize("case", [("command_history", 500), (BOX, 500), *nightly((BOX, 1000))])
-def test_a_replay_is_stable_at_round_trips_of_seconds(case):
-    predictor, each_way_ms = case
+@pytest.mark.parametrize(
+    ("predictor", "each_way_ms"),
+    [("command_history", 500), (BOX, 500), *nightly_rows((BOX, 1000))],
+)
+def test_a_replay_is_stable_at_round_trips_of_seconds(predictor, each_way_ms):
     limits = (
         *both_ways(delay_ms=each_way_ms, jitter_ms=0),
         f"guard.command_age_max_ms={2 * each_way_ms + 150}",

@@ -5,7 +5,7 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.studies.stability import fly_step, judge
-from tests.conftest import nightly
+from tests.conftest import nightly, nightly_rows
 
 PUBLISHED = (0.8, 0.8, 1.5), (0.0, 0.0, 0.0)
 FAST = (2.5, 2.5, 3.0), (0.5, 0.5, 0.0)
@@ -91,9 +91,8 @@ def flown(*settings, rtt=0.0, gains=PUBLISHED, of="steps"):
     ("predictor", "gains"),
     [
         ("last_sample", FAST),
-        pytest.param("constant_velocity", FAST, marks=pytest.mark.full),
-        pytest.param("last_sample", PUBLISHED, marks=pytest.mark.full),
-        pytest.param("constant_velocity", PUBLISHED, marks=pytest.mark.full),
+        *nightly_rows(("constant_velocity", FAST), ("last_sample", PUBLISHED)),
+        *nightly_rows(("constant_velocity", PUBLISHED)),
     ],
 )
 def test_the_limit_of_stability_is_that_of_the_linear_model(predictor, gains):
@@ -109,8 +108,7 @@ def test_the_limit_of_stability_is_that_of_the_linear_model(predictor, gains):
     ("predictor", "rtt", "stable"),
     [
         ("command_history", 1.5, True),
-        pytest.param("command_history", 3.0, True, marks=pytest.mark.full),
-        pytest.param("last_sample", 3.0, False, marks=pytest.mark.full),
+        *nightly_rows(("command_history", 3.0, True), ("last_sample", 3.0, False)),
     ],
 )
 def test_a_predictor_that_replays_the_commands_is_stable_at_3_s(predictor, rtt, stable):

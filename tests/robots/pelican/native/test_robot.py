@@ -22,6 +22,7 @@ from cloudrc.sim.engine import mujoco
 from cloudrc.tunnel.end import Identity
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.robot import Robot
+from tests.conftest import nightly_rows
 from tests.fences import FENCE
 from tests.flights.conftest import CLOCK, ring
 from tests.world.conftest import simulate
@@ -30,13 +31,12 @@ from tests.world.guard.conftest import LIMITS, MS, SECOND, UP, Flight, hostile
 pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
 
 
-def robot_of(kind, scene="empty", limits=LIMITS, model="pelican"):
-    parts = simulate(model, scene), LowLevel(), Guard(limits, FENCE)
-    return kind(*parts)
+def parts(scene="empty", limits=LIMITS):
+    return simulate("pelican", scene), LowLevel(), Guard(limits, FENCE)
 
 
-def both(scene="empty", limits=LIMITS, model="pelican"):
-    return [robot_of(kind, scene, limits, model) for kind in (Robot, NativeRobot)]
+def both(scene="empty", limits=LIMITS):
+    return [kind(*parts(scene, limits)) for kind in (Robot, NativeRobot)]
 
 
 class Count:
@@ -155,11 +155,11 @@ def nearest(robot, position):
 
 @pytest.mark.parametrize("kind", ["margin", "gap"])
 def test_where_c_looks_for_no_contact_there_is_none(kind):
-    parts = simulate("pelican", "pipes"), LowLevel(), Guard(LIMITS, FENCE)
-    model, data = parts[0].model, parts[0].data
+    simulator, *others = parts("pipes")
+    model, data = simulator.model, simulator.data
     rng, free = np.random.default_rng(1), 0
     getattr(model, f"geom_{kind}")[:] = rng.choice([0.0, 0.1], model.ngeom)
-    robot = NativeRobot(*parts)
+    robot = NativeRobot(simulator, *others)
     for _ in range(3000):
         data.qpos[:3] = rng.uniform((-2.0, -7.0, 0.3), (9.0, 3.0, 1.6))
         data.qpos[3:] = rng.normal(size=4)
@@ -171,9 +171,9 @@ def test_where_c_looks_for_no_contact_there_is_none(kind):
 
 
 def test_in_air_that_acts_on_geoms_c_uses_the_whole_model():
-    parts = simulate("pelican", "empty"), LowLevel(), Guard(LIMITS, FENCE)
-    parts[0].model.opt.density = 1.2
-    assert NativeRobot(*parts)._flight.robot_radius == inf
+    simulator, *others = parts()
+    simulator.model.opt.density = 1.2
+    assert NativeRobot(simulator, *others)._flight.robot_radius == inf
 
 
 @pytest.mark.parametrize(
@@ -181,8 +181,7 @@ def test_in_air_that_acts_on_geoms_c_uses_the_whole_model():
     [
         ("steps", ("world.onboard.integral_limit_xy=0.3", "guard.speed_max_mps=0.5",
                    "mission.steps.count=2")),
-        *(pytest.param(name, (), marks=pytest.mark.full)
-          for name in ("paper", "paper-verbatim", "fast")),
+        *nightly_rows(("paper", ()), ("paper-verbatim", ()), ("fast", ())),
         ("hover", ("link.uplink.blackouts=[{start_s: 3, duration_s: 2}]",
                    "mission.waypoints.0.dwell_s=3")),
     ],
@@ -204,7 +203,7 @@ def test_what_c_cannot_simulate_is_flown_in_python(setting):
 
 
 def test_observers_and_a_tape_see_every_step():
-    robot = robot_of(NativeRobot)
+    robot = NativeRobot(*parts())
     count, seen = Count(robot), []
     robot.observers.append(Mock(see_step=lambda *step: seen.append(step)))
     Pilot(robot).fly(1.0, lambda pilot: (0.0, 0.0, 1.0))
