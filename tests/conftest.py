@@ -18,7 +18,9 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.config.shipped import file_of
+from cloudrc.outside.document import write_yaml
 from cloudrc.runs.interrupts import forget_interrupt
+from tests.support.sweeps import GRID, SHORT
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
@@ -283,5 +285,17 @@ def scene_at(tmp_path):
         path = tmp_path / f"{scene}_{x}_{y}_{z}.xml"
         path.write_text(text.replace(SPAWN, f'name="spawn" pos="{x} {y} {z}"'))
         return str(path)
+
+    return write
+
+
+@pytest.fixture
+def write_sweep(tmp_path):
+    """Return a function that writes the file of a sweep and returns its path."""
+
+    def write(grid=GRID, seeds=1, name="grid.yaml", **keys):
+        document = {"experiment": "steps", "set": SHORT, "grid": grid, "seeds": seeds, **keys}
+        (tmp_path / name).write_text(write_yaml(document))
+        return tmp_path / name
 
     return write

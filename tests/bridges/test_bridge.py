@@ -15,7 +15,7 @@ from cloudrc.bridges.ros2.requests import RosRequests
 from cloudrc.config.disturbances import SensorsConfig
 from cloudrc.console.steering import Steering
 from cloudrc.geometry.shapes import Shapes, Surface
-from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
+from cloudrc.messages import UPRIGHT, ZERO, GuardState
 from cloudrc.record.live import (
     ERROR,
     OK,
@@ -27,19 +27,14 @@ from cloudrc.record.live import (
     encode_text,
     encode_transforms,
 )
-from cloudrc.records import Arrival, TelemetrySent
+from cloudrc.records import Arrival
 from cloudrc.report.markers import encode_markers, path_shape, scene_shapes
 from tests.console.conftest import FakeApi
+from tests.support.told import told
 
 STORE = get_typestore(Stores.ROS2_KILTED)
 LEFT = (2**-0.5, 0.0, 0.0, 2**-0.5)
 """Orientation: turned by 90 degrees to the left."""
-
-
-def telemetry(stamp_ns=0, guard=GuardState.TRACK):
-    return Telemetry(
-        stamp_ns, Odometry(stamp_ns, ZERO, UPRIGHT, ZERO, ZERO), (), -1, 0, 0, 0, guard
-    )
 
 
 class Asking:
@@ -265,7 +260,7 @@ def health(*records, now_ns=1_000_000_000, dropped=0):
     [("GROUND", OK), ("TRACK", OK), ("HOLD", WARN), ("LAND", ERROR), ("ESTOP", ERROR)],
 )
 def test_the_robot_is_as_well_as_its_guard(guard, level):
-    sent = TelemetrySent(0, 1, 1, telemetry(900_000_000, GuardState[guard]))
+    sent = told(900_000_000, GuardState[guard])
     robot = health(sent)[0]
     assert (robot.level, robot.values["guard"]) == (level, guard)
     assert robot.values["telemetry age"] == "100.0 ms"

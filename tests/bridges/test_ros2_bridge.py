@@ -15,11 +15,12 @@ from cloudrc.bridges.ros2.requests import RosRequests
 from cloudrc.console.steering import Steering
 from cloudrc.drivers.readers import RecordReader, RecordSender
 from cloudrc.geometry.shapes import Shapes
-from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
+from cloudrc.messages import ZERO
 from cloudrc.records import Lateness
 from cloudrc.report.markers import encode_markers, scene_shapes
 from tests.bridges.conftest import needs_ros
 from tests.console.conftest import FakeApi, control, start
+from tests.support.told import told
 
 pytestmark = needs_ros
 SUCCEEDED, ABORTED = 4, 6
@@ -87,8 +88,7 @@ def fly(sender, ended):
     while not ended.wait(PERIOD):
         number += 1
         stamp_ns = time.monotonic_ns()
-        odometry = Odometry(stamp_ns, (1.0, 2.0, 3.0), UPRIGHT, ZERO, ZERO)
-        sender.see(1, number, Telemetry(stamp_ns, odometry, (), -1, 0, 0, 0, GuardState.TRACK))
+        sender.see(1, number, told(stamp_ns).telemetry)
         sender.put([control(stamp_ns * 1e-9), Lateness(stamp_ns, "cloud", 0.001, 0.0, 0)])
 
 

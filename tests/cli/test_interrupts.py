@@ -13,9 +13,7 @@ import pytest
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.trials.plan import PlannedFlight
 from cloudrc.trials.rows import read_rows
-from tests.support.sweeps import write_sweep
 
-__all__ = ["write_sweep"]
 pytestmark = pytest.mark.child
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 

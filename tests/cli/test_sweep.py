@@ -20,9 +20,8 @@ from cloudrc.trials.plan import PlannedFlight, read_plan, unpack
 from cloudrc.trials.rows import read_rows
 from tests.cli.conftest import SHORT
 from tests.conftest import wait_until
-from tests.support.sweeps import flown, write_sweep
+from tests.support.sweeps import flown
 
-__all__ = ["write_sweep"]
 ONE = {"cloud.predictor": ["constant_velocity"]}
 
 

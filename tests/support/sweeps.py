@@ -1,9 +1,5 @@
 """The file of a short sweep, and results of its flights."""
 
-import pytest
-
-from cloudrc.outside.document import write_yaml
-
 SHORT = {
     "mission.steps.count": 1,
     "mission.steps.period_s": 1.0,
@@ -19,15 +15,3 @@ def flown(verdict="success", *failures, **numbers):
     text = "" if verdict == "success" else "a reason"
     return {"verdict": verdict, "failures": [*failures], "text": text, "numbers": numbers,
             "records_sha256": "", "physics_steps": "Python"}  # fmt: skip
-
-
-@pytest.fixture
-def write_sweep(tmp_path):
-    """Return a function that writes the file of a sweep and returns its path."""
-
-    def write(grid=GRID, seeds=1, name="grid.yaml", **keys):
-        document = {"experiment": "steps", "set": SHORT, "grid": grid, "seeds": seeds, **keys}
-        (tmp_path / name).write_text(write_yaml(document))
-        return tmp_path / name
-
-    return write

@@ -8,9 +8,8 @@ from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.trials import bucket as module
 from cloudrc.trials.bucket import open_rows
 from cloudrc.trials.plan import PlannedFlight, pack, read_plan
-from tests.support.sweeps import flown, write_sweep
+from tests.support.sweeps import flown
 
-__all__ = ["write_sweep"]
 MADE = [{"key": f"k{n}", "point": {}, "seed": n, **flown(x=1.0)} for n in range(3)]
 
 
