@@ -1,4 +1,4 @@
-"""Fixtures of all tests: commands, a browser, scenes, numbers, signals as in a new process."""
+"""Fixtures of all tests: commands, a browser, scenes, sweeps, signals as in a new process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import socket
 import time
 import traceback
 import warnings
-from math import nan
 from pathlib import Path
 
 import pytest
@@ -60,7 +59,7 @@ def wait_until(condition, limit=120.0):
     """Wait until `condition()` is true, at most `limit` [s]; return how long it took [s]."""
     began = time.monotonic()
     while not condition():
-        assert time.monotonic() - began < limit, "not in time"
+        assert time.monotonic() - began < limit, f"not within {limit:g} s"
         time.sleep(0.01)
     return time.monotonic() - began
 
@@ -128,33 +127,6 @@ def flights_of_others_are_not_seen(request, tmp_path_factory, monkeypatch):
         return  # kind's containers may need XDG_RUNTIME_DIR
     base = tmp_path_factory.getbasetemp()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(base))
-
-
-ROUNDING = 1e-9
-"""Tolerance of "<=": nanoseconds that were converted to seconds."""
-
-
-@pytest.fixture
-def figure():
-    """Check a number: figure("HOLD after", 0.252, "<=", 0.252, "s", count=200).
-
-    `measured` is the worst of `count` cases; None (not measured) fails.
-    """
-
-    def check(
-        name: str,
-        measured: float | None,
-        relation: str,
-        asked: float,
-        unit: str = "",
-        count: int = 1,
-    ) -> None:
-        value, asked = nan if measured is None else float(measured), float(asked)
-        holds = {"<=": value <= asked + ROUNDING, ">=": value >= asked, "==": value == asked}
-        said = f"{value:g} {unit}, the worst of {count}, asked {relation} {asked:g} {unit}"
-        assert holds[relation], f"{name}: {said}"
-
-    return check
 
 
 @pytest.fixture(autouse=True)

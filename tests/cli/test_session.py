@@ -127,11 +127,11 @@ def test_a_session_proposes_what_fits_its_robot_and_scene(folder, settings, prop
 
 @pytest.mark.process
 @pytest.mark.alone
-def test_a_session_flies_missions_and_reports_the_last_one(folder, command, figure):
+def test_a_session_flies_missions_and_reports_the_last_one(folder, command):
     began = time.monotonic()
     with up(folder) as process:
         busy = max(1.0, os.getloadavg()[0] / usable_cores())  # tests may share the machine
-        figure("session: address after", (time.monotonic() - began) / busy, "<=", 5.0, "s")
+        assert time.monotonic() - began <= 5.0 * busy, "its address is told later"
         said = (folder / "said").read_text()
         ports = re.findall(r"(\w+) :(\d+)", said)
         assert [name for name, _ in ports] == ["world", "cloud", "teleop", "uplink", "downlink"]

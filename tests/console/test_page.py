@@ -42,13 +42,13 @@ def session(tmp_path_factory):
 def flight(session):
     """The session, whose robot is at the spawn and has no mission."""
     api = session[0]
-    if api.get("/v1/state")["seen"]["guard"] == "ESTOP":
+    if seen(api)["guard"] == "ESTOP":
         acknowledge(api)
-    elif mission := api.get("/v1/state")["mission"]:
+    elif mission := mission_of(api):
         api.post(f"/v1/missions/{mission['id']}/cancel")
-    wait_until(lambda: not api.get("/v1/state")["mission"] and answers(api)["guard"] != "ESTOP")
+    wait_until(lambda: not mission_of(api) and answers(api)["guard"] != "ESTOP")
     mission = api.post("/v1/missions", {"waypoints": [{"position_m": (0.0, 0.0, 0.6)}]})
-    wait_until(lambda: api.get("/v1/state")["mission"]["state"] == "flying")
+    wait_until(lambda: mission_of(api)["state"] == "flying")
     api.post(f"/v1/missions/{mission['id']}/cancel")
     return session
 
@@ -65,6 +65,14 @@ def filled(api):
             return page, feed, steering
 
         yield fill
+
+
+def seen(api):
+    return api.get("/v1/state")["seen"]
+
+
+def mission_of(api):
+    return api.get("/v1/state")["mission"]
 
 
 def button(page, name):
@@ -113,8 +121,8 @@ def test_drag_and_send_moves_the_setpoint(flight, page, monkeypatch):
     page.wait_for_timeout(1000)
     asked = target()
     button(page, "Send").click()
-    wait_until(lambda: api.get("/v1/state")["mission"])
-    mission = api.get("/v1/state")["mission"]
+    wait_until(lambda: mission_of(api))
+    mission = mission_of(api)
     assert api.get(f"/v1/missions/{mission['id']}")["route_m"] == [asked]
     api.post(f"/v1/missions/{mission['id']}/cancel")
     api.post("/v1/goto", {"position_m": (0.3, 0.2, 0.9)})
@@ -131,22 +139,22 @@ def test_drag_and_send_moves_the_setpoint(flight, page, monkeypatch):
 
 @pytest.mark.process
 @pytest.mark.alone
-def test_keys_drive_sliders_change_the_delay_and_buttons_steer(flight, page, figure):
+def test_keys_drive_sliders_change_the_delay_and_buttons_steer(flight, page):
     api, _, run = flight
     page.keyboard.down("KeyW")
-    wait_until(lambda: api.get("/v1/state")["seen"]["position_m"][2] > 0.5)
+    wait_until(lambda: seen(api)["position_m"][2] > 0.5)
     page.keyboard.up("KeyW")
-    mission = api.get("/v1/state")["mission"]
+    mission = mission_of(api)
     assert mission["name"] == "drive"
     page.get_by_role("tab", name="Link").click()
     page.get_by_role("textbox").first.fill("150")  # the uplink's delay
     pressed_ns = time.monotonic_ns()
     page.keyboard.press("Enter")
-    wait_until(lambda: api.get("/v1/state")["seen"]["rtt_s"] > 0.15)
+    wait_until(lambda: seen(api)["rtt_s"] > 0.15)
     uplink = read_states(run / LINK_FOLDER)[0]
     assert uplink.profile["uplink"]["delay_ms"] == 150
     # From the link's record: the browser draws with the processor, and delays all that flies here.
-    figure("slider to new delay", (uplink.since_ns - pressed_ns) * 1e-9, "<=", 2.0, "s")
+    assert uplink.since_ns - pressed_ns <= 2_000_000_000
     page.get_by_role("textbox").first.fill("9999")
     page.keyboard.press("Enter")
     wait_until(lambda: page.get_by_role("textbox").first.input_value() == "500")
@@ -154,18 +162,18 @@ def test_keys_drive_sliders_change_the_delay_and_buttons_steer(flight, page, fig
     page.keyboard.press("Enter")
     page.get_by_role("tab", name="Steer").click()
     button(page, "Start").click()  # it ends the drive first
-    wait_until(lambda: (api.get("/v1/state")["mission"] or mission)["name"] == "hover")
-    wait_until(lambda: api.get("/v1/state")["mission"]["state"] == "flying")
+    wait_until(lambda: (mission_of(api) or mission)["name"] == "hover")
+    wait_until(lambda: mission_of(api)["state"] == "flying")
     for name, state in (("Hold", "held"), ("Resume", "flying")):
         button(page, name).click()
-        wait_until(lambda state=state: api.get("/v1/state")["mission"]["state"] == state)
+        wait_until(lambda state=state: mission_of(api)["state"] == state)
     button(page, "Cancel").click()
-    wait_until(lambda: not api.get("/v1/state")["mission"])
+    wait_until(lambda: not mission_of(api))
 
 
 @pytest.mark.process
 @pytest.mark.alone
-def test_the_second_browser_reads_and_both_stop(browse, flight, page, figure):
+def test_the_second_browser_reads_and_both_stop(browse, flight, page):
     api, address, _ = flight
     api.post("/v1/goto", {"position_m": (0.0, 0.0, 0.8)})
     second = browse(f"{address}&fixedDpr=0.25")
@@ -177,21 +185,20 @@ def test_the_second_browser_reads_and_both_stop(browse, flight, page, figure):
             page.mouse.click(width - x, y)
             page.wait_for_timeout(300)
             button(page, "STOP").click(trial=True)
-    wait_until(lambda: api.get("/v1/state")["seen"]["guard"] != "GROUND")
+    wait_until(lambda: seen(api)["guard"] != "GROUND")
     button(page, "STOP").click()
-    took = wait_until(lambda: api.get("/v1/state")["seen"]["guard"] == "ESTOP")
-    figure("stop", took, "<=", 1.0, "s")
+    wait_until(lambda: seen(api)["guard"] == "ESTOP", 1.0)
 
     def acknowledged():
         for browser in (page, second):  # one that stalls loses the controls to the other one
             if button(browser, "Acknowledge").is_visible():
                 button(browser, "Acknowledge").click()  # refused while the stop is on its way
         page.wait_for_timeout(1000)
-        return api.get("/v1/state")["seen"]["guard"] != "ESTOP"
+        return seen(api)["guard"] != "ESTOP"
 
     wait_until(acknowledged)
     second.keyboard.press("Shift+X")
-    wait_until(lambda: api.get("/v1/state")["seen"]["guard"] == "ESTOP")
+    wait_until(lambda: seen(api)["guard"] == "ESTOP")
     page.close()
     button(second, "Hold").wait_for(timeout=LIMIT * 1e3)
 

@@ -58,7 +58,7 @@ def fly(folder):
 @pytest.mark.process
 @pytest.mark.alone
 @pytest.mark.promise("api-load-spares-the-loop")
-def test_a_flood_of_requests_does_not_disturb_the_loop(tmp_path, figure):
+def test_a_flood_of_requests_does_not_disturb_the_loop(tmp_path):
     """Other programs disturb calm and flooded windows alike; the medians leave out short bursts."""
     for number in range(TRIES):
         floods, errors = fly(tmp_path / str(number))
@@ -70,7 +70,6 @@ def test_a_flood_of_requests_does_not_disturb_the_loop(tmp_path, figure):
         grown = np.median(errors[1::2]) - np.median(errors[::2])
         if rate >= 0.9 * RATE and grown <= 2.0 and answered <= 1.0:
             break
-    kind = f"API flood of {PAIRS} times 1 s, best of {TRIES}"
-    figure(f"{kind}: requests", rate, ">=", 0.9 * RATE, "1/s", count=PAIRS)
-    figure(f"{kind}: control period error p99 grows by", grown, "<=", 2.0, "ms", count=PAIRS)
-    figure(f"{kind}: last answer after the last request", answered, "<=", 1.0, "s", count=PAIRS)
+    assert rate >= 0.9 * RATE, "requests [1/s]"
+    assert grown <= 2.0, "growth of the control period's error [ms]"
+    assert answered <= 1.0, "last answer after the last request [s]"

@@ -95,7 +95,7 @@ CAUSE = "downlink.delay_ms=120, downlink.jitter_ms=0"
 
 
 @pytest.mark.alone
-def test_an_operator_sets_the_link_of_a_run_and_cancels_it(tmp_path, figure):
+def test_an_operator_sets_the_link_of_a_run_and_cancels_it(tmp_path):
     folder, took = tmp_path / "run", []
     run = start(folder, dwell=30.0, report="page")
     wait_until_flying(run)
@@ -112,7 +112,7 @@ def test_an_operator_sets_the_link_of_a_run_and_cancels_it(tmp_path, figure):
     assert local.under_way() == {}
     assert f"link: downlink 120 ms ({CAUSE})" in output
     assert not (folder / "link").exists()
-    figure("link set, local: in force after", min(took), "<=", 1.0, "s")
+    assert min(took) <= 1.0
     assert max(took) < 2.0, "on a busy machine"
     check_delays(Recording.read(folder / "mission.mcap"))
     page = (folder / "report.html").read_text()

@@ -160,7 +160,7 @@ for n in range(10_000):
 @pytest.mark.promise("a-kill-loses-half-a-second")
 @pytest.mark.process
 @pytest.mark.parametrize(("after", "sync"), [(0.9, 0.0), (2.1, 0.4), (2.1, 60.0)])
-def test_sigkill_loses_at_most_half_a_second(tmp_path, after, sync, figure):
+def test_sigkill_loses_at_most_half_a_second(tmp_path, after, sync):
     """`after` is the time of the kill [s], `sync` the duration of one sync to a slow disk [s]."""
     path = tmp_path / "world.mcap"
     command = [sys.executable, "-c", FLIGHT, str(path), str(sync)]
@@ -177,4 +177,4 @@ def test_sigkill_loses_at_most_half_a_second(tmp_path, after, sync, figure):
     counts = recording["/count"]["total"]
     assert counts.tolist() == list(range(len(counts)))
     lost = (last_ns - recording["/count"]["stamp_ns"][-1]) * 1e-9
-    figure("recorder killed by SIGKILL: recording lost", lost, "<=", 0.5, "s")
+    assert lost <= 0.5

@@ -61,7 +61,7 @@ class Drive:
 
 
 @pytest.mark.parametrize("count", [20, *nightly(100)])
-def test_telemetry_shows_a_key_press_in_time(count, figure):
+def test_telemetry_shows_a_key_press_in_time(count):
     drive, time, pressed = Drive(), 2.5, []
     for n in range(count):
         pressed.append(time + drive.random(0.0, 0.1))
@@ -77,11 +77,11 @@ def test_telemetry_shows_a_key_press_in_time(count, figure):
         seen = (arrived[r.epoch, r.counter] for r in shown if (r.epoch, r.counter) in arrived)
         took.append(next(seen) * 1e-9 - press)
     assert len(took) == count
-    figure("key press to telemetry", max(took), "<=", drive.rtt + 0.1, "s", count=count)
+    assert max(took) <= drive.rtt + 0.1
 
 
 @pytest.mark.parametrize("count", [10, *nightly(50)])
-def test_the_robot_holds_when_the_operator_is_lost(count, figure):
+def test_the_robot_holds_when_the_operator_is_lost(count):
     drive, time, lost = Drive("paper-p2"), 2.5, []
     for n in range(count):
         lost.append(drive.press(time + drive.random(0.0, 0.1), 0.4, EAST if n % 2 else WEST))
@@ -93,10 +93,8 @@ def test_the_robot_holds_when_the_operator_is_lost(count, figure):
         command = drive.command_after(last + 0.3, brakes=True)
         later = range(command.counter, command.counter + 9)
         took.append(min(applied.get((command.epoch, k), 10**18) for k in later) * 1e-9 - last)
-    assert [event.event for event in drive.flight.events("operator_lost")] == [
-        "operator_lost"
-    ] * count
-    figure("operator lost: braking on board after", max(took), "<=", 0.6, "s", count=count)
+    assert len(drive.flight.events("operator_lost")) == count
+    assert max(took) <= 0.6, "braking on board"
 
 
 @pytest.mark.parametrize("robot", ["rover", "x2"])
@@ -145,7 +143,7 @@ def test_a_drive_can_be_flown_again(tmp_path):
 
 @pytest.mark.promise("emergency-stop-gets-through")
 @pytest.mark.parametrize("count", [10, *nightly(100)])
-def test_a_stop_gets_through_thirty_percent_loss(count, figure):
+def test_a_stop_gets_through_thirty_percent_loss(count):
     took = []
     for seed in range(1, count + 1):
         drive = Drive(seed=seed, link=["link.both.loss=0.3"])
@@ -157,5 +155,5 @@ def test_a_stop_gets_through_thirty_percent_loss(count, figure):
         (stop,) = [change for change in flight.changes if change.state is ESTOP]
         took.append(stop.stamp_ns * 1e-9 - at)
         assert flight.changes[-1].state is GROUND
-        assert not flight.breaches()
-    figure("stop under 30 % loss", max(took), "<=", drive.rtt + 0.1, "s", count=count)
+        assert not flight.watch.breaches
+    assert max(took) <= drive.rtt + 0.1

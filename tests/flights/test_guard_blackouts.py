@@ -20,6 +20,8 @@ LONG = "criteria.time_limit_s=200"
 PATIENCE = (LONG, *(f"mission.waypoints.{k}.time_limit_s=200" for k in range(7)))
 KILLED, SILENT = 3.0, 60.5
 """Time until a new process starts, or the link returns [s]."""
+ROUNDING = 1e-9
+"""Of nanoseconds that were converted to seconds [s]."""
 
 
 @cache
@@ -40,7 +42,7 @@ def mid_pipe(*settings):
     return [early[round(k)] for k in np.linspace(0, len(early) - 1, COUNT)]
 
 
-def interrupt(figure, kill, at, *settings, calm=1.0):
+def interrupt(kill, at, *settings, calm=1.0):
     """Kill cloud's process, of which the new one knows nothing; or silence the link."""
     back = at + (KILLED if kill else SILENT)
     event = FaultEvent("cloud_killed", at, KILLED) if kill else FaultEvent("blackout", at, SILENT)
@@ -52,33 +54,27 @@ def interrupt(figure, kill, at, *settings, calm=1.0):
     (hold,) = measures.held(flight)
     held, basis_age = hold.stamp_ns * 1e-9, measures.basis_age_at_hold(flight)
     tracked = measures.first_into(flight, GuardState.TRACK, back)
-    what = "cloud process killed" if kill else "cloud silent for a minute"
-    speed = "1.5 m/s" if settings else "uncapped"
-    for name, measured, asked, unit in (
-        ("HOLD after, age of the basis", basis_age, 0.252, "s"),
-        ("below 0.05 m/s after", measures.calm_after(flight, held, back), calm, "s"),
-        ("drift", measures.drift(flight, held + calm, back), 0.10, "m"),
-        ("in TRACK after its end", tracked - back, 1.0, "s"),
-        ("breaches", len(flight.breaches()), 0, ""),
-    ):
-        figure(f"{what}, {speed}: {name}", measured, "<=", asked, unit)
     assert at < held <= at + 0.252
-    assert 0.250 < basis_age
+    assert 0.250 < basis_age <= 0.252 + ROUNDING
+    assert measures.calm_after(flight, held, back) <= calm + ROUNDING, "below 0.05 m/s"
+    assert measures.drift(flight, held + calm, back) <= 0.10
+    assert tracked - back <= 1.0 + ROUNDING
+    assert flight.watch.counts.total() == 0
     assert flight.generations == {"world": 1, "cloud": 1 + kill}
 
 
 @pytest.mark.promise("brakes-without-commands")
 @pytest.mark.parametrize("kill", [False, True], ids=["silent", "killed"])
 @pytest.mark.parametrize("k", [173, *nightly(*sorted({*range(COUNT)} - {173}))])
-def test_without_its_cloud_the_robot_holds_in_a_pipe(k, kill, figure):
-    interrupt(figure, kill, mid_pipe()[k], calm=1.4)
+def test_without_its_cloud_the_robot_holds_in_a_pipe(k, kill):
+    interrupt(kill, mid_pipe()[k], calm=1.4)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("k", range(COUNT))
-def test_without_its_cloud_the_slow_robot_holds_in_a_pipe(k, figure):
+def test_without_its_cloud_the_slow_robot_holds_in_a_pipe(k):
     """With a cap on its speed it stops sooner."""
-    interrupt(figure, False, mid_pipe(*SLOW)[k], *SLOW)
+    interrupt(False, mid_pipe(*SLOW)[k], *SLOW)
 
 
 def test_a_flight_without_faults_never_meets_the_fence():

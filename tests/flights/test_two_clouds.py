@@ -90,10 +90,9 @@ BASIC = ["a", "b", "silence", "replay"]
 
 
 @pytest.mark.promise("one-cloud-flies")
-def test_no_short_interleaving_reverts_a_command(figure):
+def test_no_short_interleaving_reverts_a_command():
     explore(BASIC, 5)
     explore(list(ACTIONS), 3)
-    figure("two-cloud interleavings to depth 5: commands that go back", 0, "==", 0, count=4**5)
 
 
 @pytest.mark.full

@@ -208,7 +208,7 @@ def test_losses_are_as_many_as_asked_and_counted(shaped, asked, share, burst):
 
 @pytest.mark.full
 @pytest.mark.parametrize(("name", "way"), MINUTES)
-def test_a_shipped_profile_for_a_minute(shaped, name, way, figure):
+def test_a_shipped_profile_for_a_minute(shaped, name, way):
     """Mean, loss and order are those that the model draws for the same instants of sending."""
     profile = link_profile(getattr(load_profile(name), way))
     found, drawn = [], []
@@ -228,7 +228,6 @@ def test_a_shipped_profile_for_a_minute(shaped, name, way, figure):
         return float(abs(mean - beside - asked))
 
     error = least(off, WITHIN)
-    figure("netem, a minute of a profile: mean off by", 1e3 * error, "<=", 1e3 * WITHIN, "ms")
     assert error <= WITHIN
     order = np.array(found[0].numbers())
     loss = 1 - len(set(found[0].numbers())) / 6000

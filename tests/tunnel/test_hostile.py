@@ -35,7 +35,7 @@ def test_the_check_finds_accepted_hostile_datagrams():
     ("runs", "least"),  # the fuzzer also makes valid frames
     [(600_000, 500_000), pytest.param(11_500_000, 10_000_000, marks=pytest.mark.full)],
 )
-def test_coverage_guided_hostile_datagrams(runs, least, tmp_path, figure):
+def test_coverage_guided_hostile_datagrams(runs, least, tmp_path):
     if (sys.platform, platform.machine()) != ("linux", "x86_64"):
         pytest.skip("atheris has wheels for Linux on x86_64 alone")
     command = [sys.executable, str(Path(__file__).with_name("hostile.py"))]
@@ -47,5 +47,4 @@ def test_coverage_guided_hostile_datagrams(runs, least, tmp_path, figure):
     assert found, said[-3000:]
     tried, grown = int(found.group(1)), float(found.group(2))
     assert tried >= least
-    figure("hostile datagrams by coverage: accepted", 0, "==", 0, count=tried)
-    figure("hostile datagrams by coverage: memory grown", grown, "<=", 20.0, "MiB")
+    assert grown <= 20.0, "memory [MiB]"

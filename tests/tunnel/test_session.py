@@ -123,7 +123,7 @@ def datagrams(count):
 
 @pytest.mark.promise("forged-datagrams-do-nothing")
 @pytest.mark.parametrize("count", [50, *nightly(1000)])
-def test_no_bit_of_any_datagram_can_be_flipped(count, figure):
+def test_no_bit_of_any_datagram_can_be_flipped(count):
     """All kinds are among ten datagrams."""
     accepted = flips = 0
     for data, opener in datagrams(count // 2):
@@ -139,7 +139,7 @@ def test_no_bit_of_any_datagram_can_be_flipped(count, figure):
             except DecodeError:
                 pass
         assert state(opener) == before
-    figure(f"bit flips of {count:,} datagrams: accepted", accepted, "==", 0, count=flips)
+    assert accepted == 0
     assert flips > 500 * count
 
 

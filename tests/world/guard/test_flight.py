@@ -101,11 +101,10 @@ def stopped_by(simulator, seed, longest):
 
 
 @pytest.mark.parametrize("seeds", [range(5), pytest.param(range(5, 400), marks=NIGHTLY)])
-def test_a_stopped_robot_lies_within_the_documented_distance(simulator, seeds, figure):
+def test_a_stopped_robot_lies_within_the_documented_distance(simulator, seeds):
     """docs/safety.md names a distance that no fall has reached."""
     outside = max(-stopped_by(simulator, seed, (1.0, 12.0))[1].room for seed in seeds)
-    name = "stopped by a hostile cloud: outside the fence by"
-    figure(name, outside, "<=", 1.5, "m", count=len(seeds))
+    assert outside <= 1.5
 
 
 def scrape(simulator, seed, room):
@@ -129,8 +128,7 @@ def scrape(simulator, seed, room):
 
 @pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("seeds", [(48, 86, 90, 101), pytest.param(range(400), marks=NIGHTLY)])
-def test_a_take_off_scrapes_less_far_than_to_the_fence(simulator, seeds, figure):
+def test_a_take_off_scrapes_less_far_than_to_the_fence(simulator, seeds):
     """A tilted robot scrapes along the floor before it rises. The four have the longest ways."""
     nearest = min(scrape(simulator, seed, TAKE_OFF_MARGIN) for seed in seeds)
-    name = "taken off 0.5 m from the fence: nearest to it"
-    figure(name, nearest, ">=", 0.02, "m", count=len(seeds))
+    assert nearest >= 0.02
