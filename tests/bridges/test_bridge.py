@@ -52,25 +52,21 @@ class Asking:
         return self.steering.velocity(now)
 
 
-def test_a_goal_is_a_goto_with_its_yaw():
-    asking = Asking()
-    asking.requests.go_to("map", (1.0, 2.0, 1.5), LEFT)
-    assert asking.api.posted == [("/v1/goto", {"position_m": [1.0, 2.0, 1.5], "yaw_deg": 90.0})]
-    assert asking.said == ["going to (1, 2, 1.5)"]
-
-
 @pytest.mark.parametrize(
-    ("options", "height", "goal"),
+    ("options", "z", "goal", "said"),
     [
-        ({"heading": "velocity"}, 2.0, {"position_m": [1.0, 0.0, 2.0]}),
-        ({"heading": "velocity", "planar": True}, 0.1, {"position_m": [1.0, 0.0]}),
+        ({}, 1.5, {"position_m": [1.0, 2.0, 1.5], "yaw_deg": 90.0}, "(1, 2, 1.5)"),
+        ({"heading": "velocity"}, 0.0, {"position_m": [1.0, 2.0, 1.7]}, "(1, 2, 1.7)"),
+        ({"heading": "velocity", "planar": True}, 0.0, {"position_m": [1.0, 2.0]}, "(1, 2)"),
     ],
 )
-def test_a_goal_on_the_ground_as_rviz_sends_keeps_the_height(options, height, goal):
+def test_a_goal_is_a_goto_with_its_yaw_which_on_the_ground_keeps_the_height(options, z, goal, said):
+    """RViz sends goals on the ground."""
     asking = Asking(**options)
-    asking.requests.see((0.0, 0.0, height), UPRIGHT)
-    asking.requests.go_to("", (1.0, 0.0, 0.0), UPRIGHT)
+    asking.requests.see((0.0, 0.0, 1.7), UPRIGHT)
+    asking.requests.go_to("map", (1.0, 2.0, z), LEFT)
     assert asking.api.posted == [("/v1/goto", goal)]
+    assert asking.said == [f"going to {said}"]
 
 
 @pytest.mark.parametrize(
@@ -243,7 +239,7 @@ def test_an_odometry_says_how_exact_it_is():
     errors = SensorsConfig(position_noise_m=0.1, attitude_noise_deg=180 / pi, rate_noise_radps=0.2)
     data = encode_odometry(0, ZERO, UPRIGHT, ZERO, ZERO, "b", "odom", covariances(errors))
     odometry = STORE.deserialize_cdr(data, "nav_msgs/msg/Odometry")
-    assert odometry.header.frame_id == "odom"
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "b")
     found = [np.diag(each.covariance.reshape(6, 6)) for each in (odometry.pose, odometry.twist)]
     assert np.concatenate(found) == pytest.approx([0.01] * 3 + [1.0] * 3 + [0.0] * 3 + [0.04] * 3)
 
@@ -288,9 +284,6 @@ def test_ros_reads_health_guard_and_frames():
     (moved,) = STORE.deserialize_cdr(data, "tf2_msgs/msg/TFMessage").transforms
     assert (moved.header.frame_id, moved.child_frame_id) == ("world", "drone1/base_link")
     assert (moved.transform.translation.z, moved.transform.rotation.z) == (3.0, LEFT[3])
-    data = encode_odometry(0, ZERO, UPRIGHT, ZERO, ZERO, "drone1/base_link")
-    odometry = STORE.deserialize_cdr(data, "nav_msgs/msg/Odometry")
-    assert odometry.child_frame_id == "drone1/base_link"
 
 
 def test_markers_move_with_the_robots_frames_and_the_scene_stays():

@@ -11,7 +11,7 @@ import pytest
 from cloudrc.drivers import local
 from cloudrc.teleop.client import Api
 from tests.conftest import wait_until
-from tests.teleop.conftest import running
+from tests.teleop.conftest import FAR, running
 
 SET = "link set uplink.loss=0.1"
 
@@ -74,8 +74,8 @@ def test_no_command_steers_another_flight_after_yours_has_ended(tmp_path, elsewh
 
 def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call, as_json):
     with flying(elsewhere / "runs" / "latest") as served:
-        api, far = Api(served.url), {"name": "far", "waypoints": [{"position_m": [0.5, -2.0, 1.0]}]}
-        api.post("/v1/missions", far)
+        api = Api(served.url)
+        api.post("/v1/missions", FAR)
         served.until(lambda: api.get("/v1/state")["mission"]["state"] == "flying")
 
         def cancel_second():

@@ -84,23 +84,3 @@ def test_the_limits_of_cloud_and_guard_follow_the_delay(fly_with, call):
     assert 2200 <= limits.guard.command_age_max_ms <= 2400
     assert limits.cloud.freeze_after_s == 0.7
     assert seen[70].guard.command_age_max_ms == 400
-
-
-@pytest.mark.full
-@pytest.mark.parametrize(
-    ("predictor", "limit"),
-    [
-        ("last_sample", pytest.approx(0.93, rel=0.1)),
-        ("constant_velocity", pytest.approx(0.66, rel=0.1)),
-        ("command_history", 3.0),
-    ],
-)
-def test_predictors_differ_in_the_round_trip_at_which_the_loop_is_stable(predictor, limit, as_json):
-    """With the published gains. Source of the limits [s]: docs/reference/control.md, linear model.
-
-    A predictor that replays the commands has no limit up to 3 s, the largest round trip tried.
-    """
-    command = "margin link.both.delay_ms --seeds 1 --max 1500 --set link.profile=ideal"
-    found = as_json(f"{command} --set cloud.predictor={predictor}")
-    assert 2e-3 * found["stable_up_to"] == limit
-    assert found["stable_elsewhere"] == []

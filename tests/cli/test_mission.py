@@ -12,7 +12,7 @@ from cloudrc.cli import mission as command
 from cloudrc.outside.paths import read_token
 from cloudrc.teleop.client import Api
 from tests.conftest import wait_until
-from tests.teleop.conftest import A, B, running
+from tests.teleop.conftest import FAR, A, B, running
 
 FILE = """
 description: Two points
@@ -21,9 +21,6 @@ waypoints:
   - {position_m: [1.0, 0.0, 1.0], dwell_s: 0.0}
   - {position_m: [2.0, 0.0, 1.0], dwell_s: 0.0}
 """
-
-
-FAR = {"name": "far", "waypoints": [{"position_m": [0.5, -2.0, 1.0]}]}
 
 
 @pytest.fixture
@@ -49,14 +46,11 @@ def mission(api, monkeypatch, call):
 
 
 def pilot(api, *points):
-    """Move the robot to each point once the mission has reached the previous point."""
+    """Move the robot to the points of a mission that somebody will order."""
 
     def fly():
         api.until(lambda: api.get("/v1/state")["mission"])
-        api.until(lambda: api.state_of("m1") == "flying")
-        for count, point in enumerate(points, 1):
-            api.flight.position = point
-            api.until(lambda count=count: len(api.get("/v1/missions/m1")["reached"]) >= count)
+        api.visit("m1", *points)
 
     thread = threading.Thread(target=fly)
     thread.start()

@@ -75,12 +75,11 @@ def test_a_killed_session_whose_recording_lacks_the_last_mission_has_no_report(f
         for mission in (first, last):
             store.note(mission, "started", "")
     (folder / "config.yaml").write_text(dump(load_experiment("hover")))
-    world = [
-        record._replace(telemetry=record.telemetry._replace(mission_id=first.number))
-        if isinstance(record, TelemetrySent)
-        else record
-        for record in world_records(100)
-    ]
+    world = world_records(100)
+    for at, record in enumerate(world):
+        if isinstance(record, TelemetrySent):
+            telemetry = record.telemetry._replace(mission_id=first.number)
+            world[at] = record._replace(telemetry=telemetry)
     write(folder / "world.mcap", world, clock_id="a")
     write(folder / "cloud.mcap", cloud_records(100), "cloud", "a")
     shown = "".join(call(f"report {folder}", code=6))
@@ -95,6 +94,18 @@ def command(call, no_page):
     return lambda line, code=0: "".join(call(line, code=code))
 
 
+@pytest.fixture
+def said(folder):
+    """Return what the session has said so far."""
+    return (folder / "said").read_text
+
+
+@pytest.fixture
+def told(folder):
+    """Return the report of the session."""
+    return lambda: json.loads((folder / "s/report.json").read_text())
+
+
 @contextmanager
 def up(folder, *words):
     """Start a session in the folder `s`; yield its process once the robot waits for missions."""
@@ -105,7 +116,8 @@ def up(folder, *words):
             stderr=said,
         )
     try:
-        wait_until(lambda: "to end: Ctrl-C here, or cloudrc down" in (folder / "said").read_text())
+        text = (folder / "said").read_text
+        wait_until(lambda: "to end: Ctrl-C here, or cloudrc down" in text())
         yield process
     finally:
         process.kill()
@@ -127,13 +139,12 @@ def test_a_session_proposes_what_fits_its_robot_and_scene(folder, settings, prop
 
 @pytest.mark.process
 @pytest.mark.alone
-def test_a_session_flies_missions_and_reports_the_last_one(folder, command):
+def test_a_session_flies_missions_and_reports_the_last_one(folder, command, said, told):
     began = time.monotonic()
     with up(folder) as process:
         busy = max(1.0, os.getloadavg()[0] / usable_cores())  # tests may share the machine
         assert time.monotonic() - began <= 5.0 * busy, "its address is told later"
-        said = (folder / "said").read_text()
-        ports = re.findall(r"(\w+) :(\d+)", said)
+        ports = re.findall(r"(\w+) :(\d+)", said())
         assert [name for name, _ in ports] == ["world", "cloud", "teleop", "uplink", "downlink"]
         wait_until(lambda: "guard GROUND" in command("mission status --run s"))
         (folder / "m.yaml").write_text("waypoints: [{position_m: [0.2, 0, 0.6]}]")
@@ -141,14 +152,12 @@ def test_a_session_flies_missions_and_reports_the_last_one(folder, command):
         assert "s: on the way to (0.5, 0, 1.2); mission m2" in command("mission goto 0.5 0 1.2")
         wait_until(lambda: "done" in command("mission list --run s").splitlines()[-1])
         assert "s: in force after" in command("link set downlink.delay_ms=60")
-        wait_until(lambda: "link: downlink 60 " in (folder / "said").read_text())
+        wait_until(lambda: "link: downlink 60 " in said())
         assert command("down") == f"s/report.json\n{USING}"
         assert process.wait(10) == 0
-    said = (folder / "said").read_text()
-    assert said.splitlines()[-1] == "s/report.json"
-    document = json.loads((folder / "s/report.json").read_text())
-    assert document["verdict"] == "success"
-    assert document["numbers"]["waypoints_reached"]["value"] == 1
+    assert said().splitlines()[-1] == "s/report.json"
+    assert told()["verdict"] == "success"
+    assert told()["numbers"]["waypoints_reached"]["value"] == 1
     flown = read_experiment(folder / "s/config.yaml")
     assert flown.description == "Mission m2 (goto), the last one of a session"
     assert flown.mission.waypoints[0].position_m == (0.5, 0.0, 1.2)
@@ -179,21 +188,19 @@ def sees(port, wanted):
 
 
 @pytest.mark.process
-def test_foxglove_sees_the_flight(folder):
+def test_foxglove_sees_the_flight(folder, said):
     (port,) = free_ports(1)
-    words = ("--foxglove", str(port))
-    with up(folder, *words) as process:
-        wait_until(lambda: f"foxglove: ws://127.0.0.1:{port}" in (folder / "said").read_text())
-        wait_until(
-            lambda: sees(port, {"/tf", "/scene", "/guard", "/delay_estimate", "/uplink_delay"})
-        )
+    topics = {"/tf", "/scene", "/guard", "/delay_estimate", "/uplink_delay"}
+    with up(folder, "--foxglove", str(port)) as process:
+        wait_until(lambda: f"foxglove: ws://127.0.0.1:{port}" in said())
+        wait_until(lambda: sees(port, topics))
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0
 
 
 @pytest.mark.process
 @pytest.mark.parametrize("ended", [True, False])
-def test_a_session_that_ends_with_a_drive_has_its_report(folder, command, ended):
+def test_a_session_that_ends_with_a_drive_has_its_report(folder, command, told, ended):
     with up(folder) as process:
         api = Api(local.under_way()[folder / "s"])
         for velocity in [(0.0, 0.0, 0.5)] * 30 + [(0.0, 0.0, 0.0)]:
@@ -206,8 +213,7 @@ def test_a_session_that_ends_with_a_drive_has_its_report(folder, command, ended)
             wait_until(lambda: "SUCCESS" in command("mission list --run s"))
         assert command("down") == f"s/report.json\n{USING}"
         assert process.wait(10) == 0
-    document = json.loads((folder / "s/report.json").read_text())
-    assert document["verdict"] == ("success" if ended else "interrupted")
+    assert told()["verdict"] == ("success" if ended else "interrupted")
     assert (folder / "s/mission.mcap").exists()
     assert len((folder / "s/drive.csv").read_text().splitlines()) > 50
     command("report s", code=0 if ended else 130)
@@ -216,10 +222,10 @@ def test_a_session_that_ends_with_a_drive_has_its_report(folder, command, ended)
 
 @pytest.mark.process
 @pytest.mark.parametrize(("victim", "code"), [("cloud", 6), ("", -signal.SIGKILL)])
-def test_a_session_that_dies_in_flight_can_be_reported(folder, command, victim, code):
+def test_a_session_that_dies_in_flight_can_be_reported(folder, command, said, told, victim, code):
     with up(folder) as process:
         command("mission goto 0.5 0 1.2")
-        wait_until(lambda: "mission started" in (folder / "said").read_text())
+        wait_until(lambda: "mission started" in said())
         time.sleep(1.0)
         pids = processes_of(process)
         os.kill(pids[victim] if victim else process.pid, signal.SIGKILL)
@@ -227,10 +233,9 @@ def test_a_session_that_dies_in_flight_can_be_reported(folder, command, victim, 
         wait_until(lambda: local.under_way() == {}, 5.0)
         wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids.values()), 5.0)
     if victim:
-        assert "the cloud process died in flight (signal 9)" in (folder / "said").read_text()
+        assert "the cloud process died in flight (signal 9)" in said()
     command("report s", code=130)  # interrupted
-    document = json.loads((folder / "s/report.json").read_text())
-    numbers = document["numbers"]
+    numbers = told()["numbers"]
     assert numbers["rtt_mean"]["value"] > 0.04
     # Cloud's last messages died with it: what counts datagrams is left out.
     assert ("commands_applied" in numbers) == (not victim)

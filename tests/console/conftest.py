@@ -2,11 +2,13 @@
 
 import subprocess
 import sys
+from argparse import Namespace
 from contextlib import contextmanager, suppress
 from math import nan
 
 import pytest
 
+from cloudrc.cli import console
 from cloudrc.drivers.local import under_way
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import Scene
@@ -72,12 +74,18 @@ def session_with_console(tmp_path_factory, *flags):
         api = Api(url)
         wait_until(lambda: answers(api))
         patch.setenv("BROWSER", "echo opens %s")
-        console = start(folder, "console", run, *flags)
-    yield api, run, console
+        shown = start(folder, "console", run, *flags)
+    yield api, run, shown
     session.terminate()
-    said, _ = console.communicate(timeout=LIMIT)
-    assert console.returncode == 0, said
+    said, _ = shown.communicate(timeout=LIMIT)
+    assert shown.returncode == 0, said
     session.communicate(timeout=LIMIT)
+
+
+def in_pod(file, robot=None, token_file=None):
+    """Return what the console of a pod shows, whose experiment and profile are a file."""
+    about = {"config": file, "profile": file, "api": "http://127.0.0.1:1"}
+    return console._in_pod(Namespace(**about, robot=robot, token_file=token_file))
 
 
 def acknowledge(api):

@@ -5,12 +5,12 @@ import socket
 
 import pytest
 
-from cloudrc.cli import console
 from cloudrc.config.load import load_experiment
 from cloudrc.console.access import Access, page_token
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import Page
 from cloudrc.console.steering import Steering
+from tests.console.conftest import in_pod
 
 TOKEN = "0123456789abcdef" * 2
 PROXY = "https://hub.example.org"
@@ -177,6 +177,4 @@ def test_the_token_of_a_release_s_page_follows_from_that_of_its_api(tmp_path):
     secret.write_text("o" * 32)
     assert page_token("o" * 32) != page_token("p" * 32)
     assert "o" * 8 not in page_token("o" * 32)
-    flags = {"config": secret, "profile": secret, "api": "http://127.0.0.1:1", "robot": None}
-    options = type("Options", (), {**flags, "token_file": secret})
-    assert console._in_pod(options).token() == page_token("o" * 32)
+    assert in_pod(secret, token_file=secret).token() == page_token("o" * 32)

@@ -2,16 +2,13 @@
 
 import io
 import time
-from argparse import Namespace
 from contextlib import ExitStack
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from cloudrc.cli import console
 from cloudrc.config.load import load_experiment
-from cloudrc.console import in_pod
 from cloudrc.console.controls import KEYS, Controls
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import PANEL_WIDTH, Page
@@ -24,6 +21,7 @@ from tests.console.conftest import (
     acknowledge,
     answers,
     beside,
+    in_pod,
     session_with_console,
     start,
 )
@@ -244,19 +242,17 @@ def test_controls_have_heights_only_for_a_robot_that_flies(filled, name, axes):
 def test_in_a_pod_the_page_shows_its_own_robot_of_a_fleet(tmp_path):
     config = tmp_path / "experiment.yaml"
     config.write_text("{fleet: {vary: [{world.robot: pelican}, {world.robot: nano}]}}")
-    flags = {"config": config, "profile": config, "api": "http://127.0.0.1:1", "token_file": None}
-    shown = [console._in_pod(Namespace(**flags, robot=number)).experiment() for number in (0, 1)]
-    assert [each.world.robot for each in shown] == ["pelican", "nano"]
+    shown = [in_pod(config, robot).experiment().world.robot for robot in (0, 1)]
+    assert shown == ["pelican", "nano"]
 
 
 def test_in_a_pod_a_slider_requests_a_change_and_returns(monkeypatch, capsys, tmp_path):
     profile = tmp_path / "profile.yaml"
     profile.write_text("uplink: {delay_ms: 40}")
-    flags = {"config": profile, "profile": profile, "api": "http://127.0.0.1:1", "robot": None}
-    link = console._in_pod(Namespace(**flags, token_file=None)).link
+    link = in_pod(profile).link
     link.change(["uplink.delay_ms=120"])
     assert capsys.readouterr().out == "link set uplink.delay_ms=120\n"
     assert "requested; only 'cloudrc console --cluster' carries it out" in link.note
     assert link.read()["uplink"] == {"delay_ms": 120.0}
-    monkeypatch.setattr(in_pod, "OWN_S", 0.0)
+    monkeypatch.setattr("cloudrc.console.in_pod.OWN_S", 0.0)
     assert link.read()["uplink"] == {"delay_ms": 40}

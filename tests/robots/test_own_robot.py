@@ -40,6 +40,7 @@ def test_the_controller_may_lie_in_the_folder_and_takes_parameters(own_robot):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("onboard: Multirotor", "robot.yaml: onboard: no onboard named 'Multirotor'"),
         ("onbord: x", "robot.yaml:1: onbord: unknown key; did you mean onboard?"),
         (f"onboard: {CONTROLLER}", "a mass of 1.06 +- 0.1 kg, not 4 and 1.325 kg"),
     ],

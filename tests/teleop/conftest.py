@@ -242,7 +242,10 @@ def reference(flight):
 
 
 PLACES = {"A": A, "B": B, "C": C, "away": AWAY, "near": (1.07, 0.07, 1.07)}
-PLANS = {"create": FROM_SPAWN, "queue": FROM_SPAWN, "here": THREE, "patient": PLAN}
+ORDERS = {
+    **{"create": {}, "queue": {"queue": True}, "here": {"plan": THREE}, "patient": {"plan": PLAN}},
+    **{"leased": {"lease": 10.0}, "waiting": {"lease": 10.0, "queue": True}},
+}
 SWITCHES = {
     **{guard.name: {"guard": guard} for guard in GuardState},
     **{"full": {"full": True}, "free": {"full": False}, "foreign": {"onboard": (ID, 1)}},
@@ -267,10 +270,8 @@ def play(flight, script):
             flight.step(seconds=float(action))
         elif action in SWITCHES:
             vars(flight).update(SWITCHES[action])
-        elif action in PLANS:
-            flight.create(PLANS[action], queue=action == "queue")
-        elif action in ("leased", "waiting"):
-            flight.create(lease=10.0, queue=action == "waiting")
+        elif action in ORDERS:
+            flight.create(**ORDERS[action])
         elif action == "renew":
             flight.teleop.renew("m1", flight.now_ns)
         elif action == "change":
@@ -304,6 +305,7 @@ OPERATOR, READER = "operator-token-of-the-tests", "reader-token-of-the-tests"
 
 
 A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
+FAR = {"name": "far", "waypoints": [{"position_m": [0.5, -2.0, 1.0]}]}
 
 
 class Running:
@@ -397,6 +399,14 @@ class Running:
         _, view = self.post("/v1/missions", mission)
         self.until(lambda: self.state_of(view["id"]) == "flying")
         return view["id"]
+
+    def visit(self, mission_id, *points):
+        """Move the robot to each point, once the mission has reached the point before."""
+        self.until(lambda: self.state_of(mission_id) == "flying")  # from the spawn
+        for count, point in enumerate(points, 1):
+            self.flight.position = point
+            path = f"/v1/missions/{mission_id}"
+            self.until(lambda: len(self.get(path)["reached"]) >= count)  # noqa: B023
 
     def state_of(self, mission_id):
         return self.get(f"/v1/missions/{mission_id}")["state"]

@@ -37,11 +37,7 @@ emergency_stop = pytest.mark.promise("emergency-stop-gets-through")
 
 
 def finish(api, mission_id):
-    api.until(lambda: api.state_of(mission_id) == "flying")  # the start puts the robot on its spawn
-    for count, point in enumerate((A, B, C), 1):
-        api.flight.position = point
-        path = f"/v1/missions/{mission_id}"
-        api.until(lambda count=count, path=path: len(api.get(path)["reached"]) >= count)
+    api.visit(mission_id, A, B, C)
     api.until(lambda: api.state_of(mission_id) == "done")
 
 

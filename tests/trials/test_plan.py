@@ -36,11 +36,8 @@ def test_points_that_differ_in_the_network_share_their_flights_without_one(write
     grid["link"] = {"near": {"link.both.delay_ms": 20}, "far": {"link.both.delay_ms": 40}}
     path = write_sweep(grid, seeds=2, cost=True, set={**short, "guard.command_age_max_ms": 900})
     sweep = read_plan(path)
-    assert (len(sweep.baselines), len({*sweep.baselines.values()}), len(sweep.flights)) == (
-        8,
-        4,
-        12,
-    )
+    counts = len(sweep.baselines), len({*sweep.baselines.values()}), len(sweep.flights)
+    assert counts == (8, 4, 12)
     bare = sweep.flights[sweep.baselines[[*sweep.baselines][-1]]].experiment
     assert (bare.seed, bare.cloud.predictor.name, bare.link.profile) == (2, "kalman", "ideal")
     assert (bare.uplink.delay_ms, bare.guard.command_age_max_ms) == (0.0, 900.0)
@@ -66,22 +63,27 @@ def test_equal_flights_have_equal_keys_however_they_are_written(write_sweep):
     assert list(read_plan(write_sweep({"delay": delays}, seeds=2)).flights) == keys[:2]
 
 
+def keys_with(path, file, *texts):
+    """Return the keys of a sweep with each text in a file."""
+    found = []
+    for text in texts:
+        file.write_text(text)
+        found.append([*read_plan(path).flights])
+    return found
+
+
 @pytest.mark.parametrize("key", ["robot", "scene"])
 def test_a_key_depends_on_what_a_model_includes(write_sweep, tmp_path, key):
     """A resumed sweep had two scenes in one table."""
     shipped = {"robot": "robots/pelican/robot.xml", "scene": "world/scenes/empty.xml"}[key]
-    text = (
-        (SCENES.parents[1] / shipped)
-        .read_text()
-        .replace("<worldbody>", '<worldbody><include file="b.xml"/>')
-    )
-    (tmp_path / "mine.xml").write_text(text)
-    path, found = write_sweep({f"world.{key}": ["./mine.xml"]}), []
-    for radius in (".1", ".1", ".2"):
-        part = f'<mujoco><site name="one" pos="0 9 5" size="{radius}"/></mujoco>'
-        (tmp_path / "b.xml").write_text(part)
-        found.append([*read_plan(path).flights])
-    assert found[0] == found[1] != found[2]
+    text = (SCENES.parents[1] / shipped).read_text()
+    including = text.replace("<worldbody>", '<worldbody><include file="b.xml"/>')
+    (tmp_path / "mine.xml").write_text(including)
+    path = write_sweep({f"world.{key}": ["./mine.xml"]})
+    part = '<mujoco><site name="one" pos="0 9 5" size=".1"/></mujoco>'
+    other = part.replace(".1", ".2")
+    before, again, after = keys_with(path, tmp_path / "b.xml", part, part, other)
+    assert before == again != after
 
 
 @pytest.mark.parametrize("named", ["in the source", "in a parameter"])
@@ -92,11 +94,8 @@ def test_a_key_depends_on_the_data_of_a_plug_in(write_sweep, tmp_path, named):
     (tmp_path / "mine.py").write_text(base + build)
     settings = {} if named == "in the source" else {"cloud.predictor.file": "gains.json"}
     path = write_sweep({"cloud.predictor": ["./mine.py"]}, set={**SHORT, **settings})
-    found = []
-    for gains in ("1", "1", "2"):
-        (tmp_path / "gains.json").write_text(gains)
-        found.append([*read_plan(path).flights])
-    assert found[0] == found[1] != found[2]
+    before, again, after = keys_with(path, tmp_path / "gains.json", "1", "1", "2")
+    assert before == again != after
 
 
 def test_relative_paths_start_at_the_file(write_sweep, tmp_path, monkeypatch):

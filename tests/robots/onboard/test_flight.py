@@ -4,12 +4,10 @@ from contextlib import nullcontext
 
 import pytest
 
-import cloudrc
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.robots.build import build_robot
 from cloudrc.robots.onboard._drag import RotorDrag
-from tests.robots.conftest import HOVER
 from tests.robots.onboard.conftest import nano, robot, x_layout
 
 MODEL = nano().replace('pos="0 0 2"', "")
@@ -22,12 +20,6 @@ def test_the_drag_of_robot_yaml_reaches_the_rotors(own_robot):
     experiment = load_experiment("hover", ["world.scene=empty", f"world.robot={mine}"])
     robot = build_robot(experiment.world, experiment.guard)
     assert isinstance(robot.simulator.actuators, RotorDrag)
-
-
-def test_a_wrong_onboard_controller_is_refused_where_it_is_chosen(own_robot):
-    mine = own_robot("onboard: Multirotor", MODEL)
-    with pytest.raises(BadInputError, match=r"robot.yaml: onboard: no onboard named 'Multirotor'"):
-        cloudrc.fly("hover", HOVER | {"world.robot": str(mine)})
 
 
 @pytest.mark.parametrize(("braking", "error"), [(3, None), (10, BadInputError)])
