@@ -8,6 +8,8 @@ from collections import Counter
 from functools import cache
 from pathlib import Path
 
+from importlinter.cli import lint_imports
+
 from tests.support.commands import python
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -18,33 +20,7 @@ ROS = (
     *("rclpy", "diagnostic_msgs", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs"),
     *("std_msgs", "std_srvs", "nav2_msgs", "tf2_msgs", "visualization_msgs"),
 )
-# Packages of a sourced ROS 2, which no package registry is asked for.
-# Module from outside -> the places (path prefixes below cloudrc/) that may import it. Ruff checks
-# clocks, sockets, threads, signals, chance, and calls such as `eval` and `print` (pyproject.toml).
-RESERVED: dict[str, tuple[str, ...]] = {
-    "mujoco": ("sim/",),
-    "yaml": ("outside/", "config/", "record/", "report/", "cli/", "cluster/"),
-    "pydantic": (
-        *("config/", "link/", "cli/", "teleop/", "report/folder"),
-        *("drivers/process", "faults/schedule"),
-    ),
-    "matplotlib": ("report/",),
-    "viser": ("console/", "report/replay"),
-    "foxglove": ("processes/foxglove_live",),
-    "gymnasium": ("gym/", "eval/environment", "eval/episode"),
-    "mcap": ("record/",),
-    "rosbags": ("record/",),
-    "kubernetes": ("cluster/",),
-    "prometheus_client": ("drivers/",),
-    "argparse": ("cli/",),
-    # A compiler makes the machine code of the usual step.
-    "subprocess": (
-        *("drivers/", "cli/", "cluster/", "robots/pelican/native/library"),
-        *("exercise/scoring", "link/exec/holder", "runs/links/under_test"),
-    ),
-    **dict.fromkeys(ROS, ("bridges/ros2/",)),
-    **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),
-}
+"""Packages of a sourced ROS 2, which no package registry is asked for."""
 # Imported package -> its name in pyproject.toml.
 ASKED_AS = {
     "yaml": "pyyaml",
@@ -77,14 +53,10 @@ def imports(tree):
     return found
 
 
-def test_a_reserved_package_is_imported_only_in_its_places():
-    found = [
-        f"{place_of(path)} imports {name}"
-        for path, tree in trees().items()
-        for name in imports(tree)
-        if not place_of(path).startswith(RESERVED.get(name.partition(".")[0], ("",)))
-    ]
-    assert found == []
+def test_the_contracts_of_imports_hold(monkeypatch, capsys):
+    """Ruff checks clocks, sockets, threads, signals, chance, and calls such as `eval`."""
+    monkeypatch.chdir(ROOT)
+    assert lint_imports(no_cache=True) == 0, capsys.readouterr().out
 
 
 def test_live_metrics_load_neither_recordings_nor_heavy_libraries():
