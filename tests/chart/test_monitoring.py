@@ -55,16 +55,9 @@ def test_the_rules_use_existing_metrics_of_the_release_and_say_what_to_do():
         assert len(re.findall(r"[\w:]+\{\$pods[,}]", rule["expr"])) >= len(asked)
 
 
-def rendered_rules(release):
-    """Render the rules of a release in the namespace `lab`."""
-    on = "metrics: {prometheusRule: {enabled: true, force: true}}"
-    (rule,) = of_kind(render(on, release=release), "PrometheusRule").values()
-    return rule["spec"]
-
-
-def in_release(labels, release="demo"):
-    """Give the labels of alerts.yaml the namespace and the pod names of a release."""
-    pod = f"{release}-cloudrc-world-{labels.get('pod', 'x')}"
+def in_release(labels):
+    """Give the labels of alerts.yaml the namespace and the pod names of the release."""
+    pod = f"demo-cloudrc-world-{labels.get('pod', 'x')}"
     return {**labels, "namespace": "lab", "pod": pod}
 
 
@@ -72,10 +65,14 @@ def labels_text(labels):
     return "{" + ",".join(f'{key}="{value}"' for key, value in labels.items()) + "}"
 
 
-def series_in_release(series, release="demo"):
-    """Convert a series such as name{pod="world"} to one of a release."""
-    name, _, text = series.rstrip("}").partition("{")
-    return name + labels_text(in_release(dict(re.findall(r'(\w+)="(.*?)"', text)), release))
+def labels_of(text):
+    return dict(re.findall(r'(\w+)="(.*?)"', text))
+
+
+def series_in_release(series):
+    """Convert a series such as name{pod="world"} to one of the release."""
+    name, _, text = series.partition("{")
+    return name + labels_text(in_release(labels_of(text)))
 
 
 def promtool_test(case):
@@ -92,7 +89,7 @@ def promtool_test(case):
         alerts.append({"eval_time": time, "alertname": name, "exp_alerts": expected})
     samples = []
     for rule, (value, labels) in case.get("recorded", {}).items():
-        labels = in_release({"rule": rule, **dict(re.findall(r'(\w+)="(.*?)"', labels))})
+        labels = in_release({"rule": rule, **labels_of(labels)})
         samples.append({"labels": labels_text(labels), "value": value})
     round_all = 'round(label_replace({__name__=~"pod:.+"}, "rule", "$1", "__name__", "(.+)"), 0.01)'
     asked = {"expr": round_all, "eval_time": "2m", "exp_samples": samples}
@@ -112,33 +109,32 @@ def test_the_alerts_fire_when_they_should_and_only_then(tmp_path):
     rows = [row for case in cases for row in case.get("fires", ())]
     assert {name for _, name, *fired in rows if fired} == ALERTS.keys(), "each alert has a case"
     assert cases[-1]["recorded"].keys() == RECORDED
-    (tmp_path / "demo.yaml").write_text(yaml.safe_dump(rendered_rules("demo")))
-    promtool(tmp_path, ["demo.yaml"], list(map(promtool_test, cases)))
+    on = "metrics: {prometheusRule: {enabled: true, force: true}}"
+    (rules,) = of_kind(render(on), "PrometheusRule").values()
+    promtool(tmp_path, rules["spec"], *map(promtool_test, cases))
 
 
-def promtool(folder, rule_files, tests):
-    document = {"rule_files": rule_files, "evaluation_interval": "5s", "tests": tests}
-    (folder / "tests.yaml").write_text(yaml.safe_dump(document))
-    for words in (["check", "rules", *rule_files], ["test", "rules", "tests.yaml"]):
-        done = subprocess.run(["promtool", *words], capture_output=True, text=True, cwd=folder)
+def promtool(folder, rules, *tests):
+    """Check rules, and test them."""
+    (folder / "rules.yaml").write_text(yaml.safe_dump(rules))
+    about = {"rule_files": ["rules.yaml"], "evaluation_interval": "5s"}
+    (folder / "tests.yaml").write_text(yaml.safe_dump({**about, "tests": [*tests]}))
+    said = ""
+    for words in ("check rules rules.yaml", "test rules tests.yaml"):
+        command = ["promtool", *words.split()]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
         assert "SUCCESS" in done.stdout, done.stdout + done.stderr
+        said += done.stdout
+    return said
 
 
-def dashboards(values=None, **where):
-    """Render the ConfigMaps of dashboards, and the dashboards in them by name of the file."""
-    objects = render({"dashboards": {"enabled": True, **(values or {})}}, **where)
-    found = of_kind(objects, "ConfigMap").items()
-    maps = [one for name, one in found if "grafana-" in name]
-    texts = {name: text for one in maps for name, text in one["data"].items()}
-    return maps, {name: json.loads(text) for name, text in texts.items()}
-
-
-def queries(**where):
+def queries():
     """Return each query of all dashboards, with the values that Grafana shows first."""
-    found = dashboards(**where)[1].values()
+    maps = of_kind(render("dashboards: {enabled: true}"), "ConfigMap").items()
+    texts = [text for name, one in maps if "grafana-" in name for text in one["data"].values()]
     return [
         query
-        for one in found
+        for one in map(json.loads, texts)
         for panel in one["panels"]
         for query in expressions(one, panel).values()
     ]
@@ -157,7 +153,5 @@ def test_panels_query_metrics_of_the_release_alone():
 @needs_promtool
 def test_promtool_accepts_the_queries_of_the_panels(tmp_path):
     rules = [{"record": f"query{n}", "expr": query} for n, query in enumerate(queries())]
-    path = tmp_path / "rules.yaml"
-    path.write_text(yaml.safe_dump({"groups": [{"name": "panels", "rules": rules}]}))
-    done = subprocess.run(["promtool", "check", "rules", path], capture_output=True, text=True)
-    assert f"SUCCESS: {len(rules)} rules" in done.stdout, done.stdout + done.stderr
+    said = promtool(tmp_path, {"groups": [{"name": "panels", "rules": rules}]})
+    assert f"SUCCESS: {len(rules)} rules" in said

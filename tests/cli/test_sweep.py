@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -177,74 +178,68 @@ class Release:
 
 
 @pytest.fixture
-def fly_in_pods(write_sweep, monkeypatch, call):
-    """Return a function that flies a sweep in replaced pods, which print lines.
+def pods(monkeypatch):
+    """Pods of new Jobs: settings and own files of each, and the lines that each Job's pods print.
 
-    Each argument is a list of the lines of one Job. `make(rows)` returns such lists.
+    Without `lines`, they print the rows of all flights.
     """
-    monkeypatch.setattr("cloudrc.cli.sweep_run.release_from_flags", lambda options: Release())
-    monkeypatch.setattr(batch, "start", lambda *given, **words: None)
-    path = write_sweep()
-
-    def run(make, code):
-        made = [flight.row(flown()) for flight in read_plan(path).flights.values()]
-        jobs = make([json.dumps(row) for row in made])
-        monkeypatch.setattr(batch, "read_lines", lambda *given: jobs.pop(0) if jobs else [])
-        error = call("sweep run --out grid --on kubernetes", path, code=code).err
-        return made, rows("grid"), error
-
-    return run
-
-
-def test_each_row_is_taken_once_and_other_lines_are_not(fly_in_pods):
-    others = ["", "a warning", '{"key": "x"}', "[1]", "2"]
-
-    def make(lines):
-        foreign = json.dumps(json.loads(lines[0]) | {"key": "0"})
-        return [[*others, foreign, *lines[::-1], *lines]]
-
-    made, read, _ = fly_in_pods(make, 0)
-    assert read == made[::-1]
-    assert len(Path("grid/rows.jsonl").read_text().splitlines()) == 4
-
-
-@pytest.mark.parametrize(
-    ("make", "code", "count", "said"),
-    [
-        (lambda lines: [lines[:3], lines[3:]], 0, 4, "rows of 1 flights were lost with their pods"),
-        (lambda lines: [lines[:1]], 5, 1, "the pods printed no row of 3 flights"),
-    ],
-)
-def test_lost_rows_are_flown_again_as_long_as_rows_arrive(make, code, count, said, fly_in_pods):
-    made, read, error = fly_in_pods(make, code)
-    assert read == made[:count]
-    assert said in error
-
-
-@pytest.fixture
-def started(monkeypatch):
-    """What each new Job gets: settings, own files. Its pods print all rows."""
-    jobs = []
+    found = SimpleNamespace(jobs=[], lines=None)
 
     def start(release, name, flights, settings, own):
-        jobs.append((settings, own))
+        found.jobs.append((settings, own))
         Path("flights").write_bytes(flights)
 
     def read_lines(*given):
-        return [json.dumps(flight.row(flown())) for flight in unpack(Path("flights"))]
+        if found.lines is None:
+            return [json.dumps(flight.row(flown())) for flight in unpack(Path("flights"))]
+        return found.lines.pop(0) if found.lines else []
 
     monkeypatch.setattr("cloudrc.cli.sweep_run.release_from_flags", lambda options: Release())
     monkeypatch.setattr(batch, "start", start)
     monkeypatch.setattr(batch, "read_lines", read_lines)
-    return jobs
+    return found
 
 
-def test_files_of_plug_ins_travel_with_the_flights(write_sweep, started, tmp_path, call):
+IN_PODS = "sweep run --out grid --on kubernetes"
+
+
+def made(path):
+    return [flight.row(flown()) for flight in read_plan(path).flights.values()]
+
+
+def test_each_row_is_taken_once_and_other_lines_are_not(write_sweep, pods, call):
+    path = write_sweep()
+    lines = [json.dumps(row) for row in made(path)]
+    foreign = json.dumps(made(path)[0] | {"key": "0"})
+    others = ["", "a warning", '{"key": "x"}', "[1]", "2", foreign]
+    pods.lines = [[*others, *lines[::-1], *lines]]
+    call(IN_PODS, path)
+    assert rows("grid") == made(path)[::-1]
+    assert len(Path("grid/rows.jsonl").read_text().splitlines()) == 4
+
+
+@pytest.mark.parametrize(
+    ("jobs", "code", "count", "said"),
+    [
+        ([slice(3), slice(3, 4)], 0, 4, "rows of 1 flights were lost with their pods"),
+        ([slice(1)], 5, 1, "the pods printed no row of 3 flights"),
+    ],
+)
+def test_lost_rows_are_flown_again_as_long_as_rows_arrive(
+    jobs, code, count, said, write_sweep, pods, call
+):
+    path = write_sweep()
+    pods.lines = [[json.dumps(row) for row in made(path)[part]] for part in jobs]
+    assert said in call(IN_PODS, path, code=code).err
+    assert rows("grid") == made(path)[:count]
+
+
+def test_files_of_plug_ins_travel_with_the_flights(write_sweep, pods, tmp_path, call):
     (tmp_path / "mine.py").write_text("from helper import build\n")
     (tmp_path / "helper.py").write_text("from cloudrc.cloud.predictors.last_sample import build\n")
     path = write_sweep({"cloud.predictor": ["./mine.py"]}, set={})
-    call("sweep run --out grid --on kubernetes", path)
-    ((settings, own),) = started
+    call(IN_PODS, path)
+    ((settings, own),) = pods.jobs
     assert own == [str(tmp_path / name) for name in ("helper.py", "mine.py")]
     assert settings.shards == 1, "at most one per flight"
     with (tmp_path / "helper.py").open("a") as file:
@@ -254,20 +249,18 @@ def test_files_of_plug_ins_travel_with_the_flights(write_sweep, started, tmp_pat
     assert not Path("large").exists()
 
 
-def test_a_client_that_has_gone_attaches_with_the_same_flags(
-    write_sweep, started, monkeypatch, call
-):
+def test_a_client_that_has_gone_attaches_with_the_same_flags(write_sweep, pods, monkeypatch, call):
     def leave(*given):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(batch, "read_lines", leave)
-        line = "sweep run --out grid --on kubernetes --claim rows --set-job nodeSelector.disk=ssd"
-        error = call(line, write_sweep(), code=130).err
+        flags = "--claim rows --set-job nodeSelector.disk=ssd"
+        error = call(f"{IN_PODS} {flags}", write_sweep(), code=130).err
     assert "to continue, cloudrc sweep attach grid" in error
     assert "rows in rows/sweep-" in error
     call("sweep attach grid")
-    (first, _), (second, _) = started
+    (first, _), (second, _) = pods.jobs
     assert first == second
     assert first.changes == {("nodeSelector", "disk"): "ssd"}
     assert Path("grid/table.csv").exists()

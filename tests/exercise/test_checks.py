@@ -88,6 +88,12 @@ def test_whatever_a_file_does_the_other_parts_are_scored(tmp_path):
     assert {row["valid"] for row in rows} == {True}
 
 
+def hand_in(folder, head):
+    """Write the right predictor, behind other lines."""
+    text = (SOLUTION / "predictor.py").read_text()
+    (folder / "predictor.py").write_text(f"{head}\n{text}")
+
+
 def only(monkeypatch, part):
     """Let the exercise have one part."""
     task = TASK.model_copy(update={"parts": {part: TASK.parts[part]}})
@@ -121,8 +127,7 @@ def test_a_wait_costs_no_processor_time_and_ends_with_a_score_that_is_not_valid(
     tmp_path, monkeypatch
 ):
     """A loaded computer gives a right hand-in too little processor time, which costs no points."""
-    text = (SOLUTION / "predictor.py").read_text()
-    (tmp_path / "predictor.py").write_text(f"import time\ntime.sleep(60.0)\n{text}")
+    hand_in(tmp_path, "import time\ntime.sleep(60.0)")
     only(monkeypatch, "predictor")
     first, *_ = scoring.check(tmp_path, limit=10, patience=0.1)
     assert "too slow here" in first["seen"]
@@ -131,8 +136,7 @@ def test_a_wait_costs_no_processor_time_and_ends_with_a_score_that_is_not_valid(
 
 @pytest.mark.process
 def test_a_file_of_the_hand_in_is_found_by_its_name_from_everywhere(tmp_path, monkeypatch):
-    text = (SOLUTION / "predictor.py").read_text()
-    (tmp_path / "predictor.py").write_text(f"open('gains.json').close()\n{text}")
+    hand_in(tmp_path, "open('gains.json').close()")
     (tmp_path / "gains.json").touch()
     monkeypatch.chdir("/")
     data, _ = scoring.run_part("predictor", tmp_path, 20, 200.0)
@@ -160,9 +164,7 @@ def _command_of(process):
 def leave(child, folder):
     """Write a file that leaves a child, and return a text in the child's command line."""
     marker = f"9{os.getpid()}{time.monotonic_ns() % 10**6}"
-    head = f"import os, subprocess\nSLEEP = ['sleep', '{marker}']\n{child}\n"
-    text = (SOLUTION / "predictor.py").read_text()
-    (folder / "predictor.py").write_text(f"{head}{text}")
+    hand_in(folder, f"import os, subprocess\nSLEEP = ['sleep', '{marker}']\n{child}")
     return marker
 
 
