@@ -4,7 +4,7 @@ import json
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from importlib.util import find_spec
 
 import pytest
@@ -66,36 +66,21 @@ class Robot:
 
 
 @contextmanager
-def robot(heard=None):
-    made = Robot(heard or LOSSY)
-    try:
-        yield made
-    finally:
-        made.close()
+def relay(*words):
+    """Run the command in a process of its own; yield how to end it, with its report and words."""
+    command = [sys.executable, "-m", "cloudrc", *WORDS, "-o", "json", *words]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
-
-class Relay:
-    """The command in a process of its own."""
-
-    def __init__(self, *words):
-        command = [sys.executable, "-m", "cloudrc", *WORDS, "-o", "json", *words]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-
-    def end(self):
-        """End the relay; return its report and its words."""
-        self._process.terminate()
-        report, words = self._process.communicate(timeout=60)
-        assert self._process.returncode == 0, words
+    def end():
+        process.terminate()
+        report, words = process.communicate(timeout=60)
+        assert process.returncode == 0, words
         return json.loads(report), words.decode()
 
-
-@contextmanager
-def relay(*words):
-    made = Relay(*words)
     try:
-        yield made
+        yield end
     finally:
-        made._process.kill()
+        process.kill()
 
 
 @pytest.mark.smoke
@@ -103,10 +88,10 @@ def test_messages_cross_as_the_profile_and_the_seed_say(tmp_path):
     profile = tmp_path / "profile.yaml"
     profile.write_text(json.dumps(PROFILE))
     words = ["--link", str(profile), "--seed", "5", "--stream", "b", "--out", str(tmp_path / "run")]
-    with robot() as one, relay(*words) as link:
+    with closing(Robot(LOSSY)) as one, relay(*words) as end:
         one.meet()
         one.publish(400)
-        report, _ = link.end()
+        report, _ = end()
     up, _ = cloudrc.link.open(PROFILE, 5, stream="b")
     fates = [up.send(1, number, 24, 0) for number in range(400)]
     assert {n: len(ages) for n, ages in one.ages.items()} == {
@@ -121,9 +106,9 @@ def test_messages_cross_as_the_profile_and_the_seed_say(tmp_path):
 
 @pytest.mark.parametrize("flags", [[], ["--reliable"]])
 def test_a_subscription_that_wants_reliable_needs_a_flag_and_is_told_so(flags):
-    with robot(SAFE) as one, relay(*flags) as link:
+    with closing(Robot(SAFE)) as one, relay(*flags) as end:
         one.meet()
         one.publish(500)
-        _, words = link.end()
+        _, words = end()
     assert len(one.ages) == (500 if flags else 0)
     assert ("see --reliable" in words) is not bool(flags)

@@ -4,7 +4,7 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from importlib.util import find_spec
 from shutil import which
 
@@ -215,69 +215,55 @@ def nav2_controller(command):
     command.twist.linear.x, command.twist.angular.z = 0.3, -0.4
 
 
-def up(folder, *words):
-    """Begin a session; return its process once missions can fly."""
-    session = start(folder, "up", *words)
-    for said in session.stdout:
-        if "to end" in said:
-            return session
-    pytest.fail("the session has not begun")
-
-
-@pytest.fixture
-def rover(tmp_path, monkeypatch):
-    """A session with a rover and its bridge; yield what the command has said."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    session = up(tmp_path, "pillars", "--set", "world.scene=empty")
-    command = start(tmp_path, "ros", "bridge", "--rep-105")
-    yield
-    session.terminate()
-    output, _ = command.communicate(timeout=30)
+@contextmanager
+def session(folder, monkeypatch, *words, flags=()):
+    """Begin a session and its bridge, which has to end with it."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
+    flown = start(folder, "up", *words)
+    assert any("to end" in said for said in flown.stdout), "the session has not begun"
+    command = start(folder, "ros", "bridge", *flags)
+    try:
+        yield
+    finally:
+        flown.terminate()
+        output, _ = command.communicate(timeout=30)
+        flown.communicate(timeout=30)
     assert command.returncode == 0, output
-    session.communicate(timeout=30)
+    assert "the flight has ended" in output
 
 
-@pytest.mark.usefixtures("rover")
-def test_the_messages_of_teleop_keyboard_and_of_nav2_turn_a_rover():
+def test_the_messages_of_teleop_keyboard_and_of_nav2_turn_a_rover(tmp_path, monkeypatch):
     from diagnostic_msgs.msg import DiagnosticStatus
     from geometry_msgs.msg import Twist, TwistStamped
     from nav_msgs.msg import Odometry as RosOdometry
 
     watcher = Watcher(odom=("/odom", RosOdometry), mission=("/cloudrc/mission", DiagnosticStatus))
-    got = watcher.got
-    watcher.wait(lambda: len(got["odom"]) > 10, 60.0)
-    assert got["odom"][-1].header.frame_id == "odom"
-    for kind, fill in ((Twist, teleop_keyboard), (TwistStamped, nav2_controller)):
-        commands = watcher.node.create_publisher(kind, "/cmd_vel", 1)
-        watcher.wait(lambda commands=commands: commands.get_subscription_count(), 20.0)
-        command = kind()
-        fill(command)
-        wanted = getattr(command, "twist", command).angular.z
-        rates = []
-        for _ in range(30):
-            commands.publish(command)
-            end = time.monotonic() + 0.1
-            watcher.wait(lambda end=end: time.monotonic() > end)
-            rates.append(got["odom"][-1].twist.twist.angular.z)
-        assert sum(rates[10:]) / 20 == pytest.approx(wanted, rel=0.25)
-        commands.publish(kind())
-        watcher.node.destroy_publisher(commands)
-    assert "held" in {each.key: each.value for each in got["mission"][-1].values}["state"]
-    watcher.close()
+    got, ground = watcher.got, ("pillars", "--set", "world.scene=empty")
+    with closing(watcher), session(tmp_path, monkeypatch, *ground, flags=["--rep-105"]):
+        watcher.wait(lambda: len(got["odom"]) > 10, 60.0)
+        assert got["odom"][-1].header.frame_id == "odom"
+        for kind, fill in ((Twist, teleop_keyboard), (TwistStamped, nav2_controller)):
+            commands = watcher.node.create_publisher(kind, "/cmd_vel", 1)
+            watcher.wait(lambda commands=commands: commands.get_subscription_count(), 20.0)
+            command = kind()
+            fill(command)
+            wanted = getattr(command, "twist", command).angular.z
+            rates = []
+            for _ in range(30):
+                commands.publish(command)
+                end = time.monotonic() + 0.1
+                watcher.wait(lambda end=end: time.monotonic() > end)
+                rates.append(got["odom"][-1].twist.twist.angular.z)
+            assert sum(rates[10:]) / 20 == pytest.approx(wanted, rel=0.25)
+            commands.publish(kind())
+            watcher.node.destroy_publisher(commands)
+        assert "held" in {each.key: each.value for each in got["mission"][-1].values}["state"]
 
 
 def test_the_bridge_of_a_session_ends_with_it(tmp_path, monkeypatch):
     from nav_msgs.msg import Odometry as RosOdometry
 
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     watcher = Watcher(odom=("/odom", RosOdometry))
-    session = up(tmp_path, "hover")
-    command = start(tmp_path, "ros", "bridge")
-    watcher.wait(lambda: len(watcher.got["odom"]) > 100, 30.0)
-    assert watcher.call("/cloudrc/acknowledge").message
-    session.terminate()
-    output, _ = command.communicate(timeout=30)
-    assert command.returncode == 0, output
-    assert "the flight has ended" in output
-    session.communicate(timeout=30)
-    watcher.close()
+    with closing(watcher), session(tmp_path, monkeypatch, "hover"):
+        watcher.wait(lambda: len(watcher.got["odom"]) > 100, 30.0)
+        assert watcher.call("/cloudrc/acknowledge").message
