@@ -1,7 +1,5 @@
 """Fixtures of all tests: commands, a browser, scenes, sweeps, signals as in a new process."""
 
-from __future__ import annotations
-
 import gc
 import json
 import os
@@ -36,17 +34,17 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def nightly(*values: object) -> list[object]:
+def nightly(*values):
     """Mark values of a parametrized test as `full`: only `make nightly` tests them."""
     return nightly_rows(*((value,) for value in values))
 
 
-def nightly_rows(*rows: tuple[object, ...]) -> list[object]:
+def nightly_rows(*rows):
     """Mark rows of several values likewise."""
     return [pytest.param(*row, marks=pytest.mark.full) for row in rows]
 
 
-def _has_ipv6() -> bool:
+def _has_ipv6():
     try:
         with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as one:
             one.bind(("::1", 0))
@@ -67,7 +65,7 @@ def wait_until(condition, limit=120.0):
 needs_ipv6 = pytest.mark.skipif(not _has_ipv6(), reason="needs the IPv6 address ::1")
 
 
-def pytest_sessionfinish(session: pytest.Session) -> None:
+def pytest_sessionfinish(session):
     """Fail if tests were skipped and REQUIRE_ALL is set, as in CI; write the reasons to SKIPPED."""
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")
     skipped = reporter.stats.get("skipped", []) if reporter else []
@@ -82,7 +80,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+def pytest_xdist_make_scheduler(config, log):
     """Give each file to one process, so that what its tests share is flown once."""
     from xdist.scheduler import LoadFileScheduling
 
@@ -90,7 +88,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+def pytest_pyfunc_call(pyfuncitem):
     """Run a test with the mark `child` in a child process of one thread.
 
     A signal to a process with several threads may arrive late and elsewhere: then its
@@ -216,7 +214,7 @@ def browse(chromium):
     context = chromium.new_context(**size)  # a quarter of the pixels: a processor draws them
     errors, requests, own = [], [], []
 
-    def open_page(url: str, **options: object):
+    def open_page(url, **options):
         page = context.new_page()
         page.on("console", lambda said: said.type == "error" and errors.append(said.text))
         page.on("pageerror", lambda error: errors.append(str(error)))

@@ -4,8 +4,6 @@ A block of `bash` is typed line by line; one of `sh` is not. A block of `text` h
 commands have printed, in this order; `...` stands for any lines. A mark before a block says more.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -26,14 +24,14 @@ READY = "to end: "
 class Reader:
     """A person with two terminals in one folder."""
 
-    def __init__(self, folder: Path, **environment: str) -> None:
+    def __init__(self, folder, **environment):
         path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
         # PYTHONPATH is that of the tests; no page may open.
         self.environment = {**os.environ, "PATH": path, "BROWSER": "true", **environment}
         self.folder, self.said = folder, ""
-        self.first: subprocess.Popen[bytes] | None = None
+        self.first = None
 
-    def play(self, name: str, left_out: str = "") -> None:
+    def play(self, name, left_out=""):
         """Play a tutorial; blocks with the mark `left_out` are not typed."""
         for mark, language, body in BLOCK.findall((FOLDER / f"{name}.md").read_text("utf-8")):
             if mark and mark == left_out:
@@ -47,7 +45,7 @@ class Reader:
             elif mark:
                 (self.folder / mark).write_text(body, encoding="utf-8")
 
-    def type(self, line: str) -> None:
+    def type(self, line):
         """Type a line; its command may only fail if a mission fails."""
         if line.startswith("mkdir "):
             return  # the test has a folder of its own
@@ -61,7 +59,7 @@ class Reader:
         self.said += done.stdout + done.stderr
         assert done.returncode == ("FAILURE: " in done.stdout), f"{line}\n{self.said}"
 
-    def start(self, line: str) -> None:
+    def start(self, line):
         """Type a line in the first terminal, and wait until it is ready."""
         out = self.folder / "first.txt"
         with out.open("wb") as file:
@@ -71,7 +69,7 @@ class Reader:
         wait_until(lambda: READY in out.read_text("utf-8") or self.first.poll() is not None)
         self.said = out.read_text("utf-8")
 
-    def compare(self, body: str, is_live: bool) -> None:
+    def compare(self, body, is_live):
         """Check that the lines of a block were printed, one after the other."""
         shown = without_numbers if is_live else str
         rest = shown(self.said)
@@ -80,14 +78,14 @@ class Reader:
                 _, found, rest = rest.partition(shown(line))
                 assert found, f"not printed: {line}\n{self.said}"
 
-    def leave(self) -> None:
+    def leave(self):
         """End what the first terminal still does."""
         if self.first and self.first.poll() is None:
             self.first.send_signal(signal.SIGINT)
             self.first.wait(60)
 
 
-def without_numbers(text: str) -> str:
+def without_numbers(text):
     """Return a text in which all numbers, names of pods and blanks are equal."""
     text = re.sub(r"\b[0-9a-z]{5,10}-[0-9a-z]{5}\b", "POD", text)
     return re.sub(r"\s+", " ", re.sub(r"-?\d+(\.\d+)?", "0", text))

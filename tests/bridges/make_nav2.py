@@ -51,7 +51,7 @@ MORE = (
 )
 
 
-def generate(folder: Path) -> None:
+def generate(folder):
     """Write the code into nav2_msgs and introspection in `folder`."""
     lines = [
         '#include "builtin_interfaces/msg/Duration.idl"',
@@ -75,7 +75,7 @@ def generate(folder: Path) -> None:
         run(*about, output_path=out, **more)
 
 
-def build(folder: Path) -> None:
+def build(folder):
     """Compile the code."""
     made = folder / "nav2_msgs"
     include = PREFIX / "include"
@@ -85,7 +85,7 @@ def build(folder: Path) -> None:
     names = [f"{package}__rosidl_{kind}" for package in PACKAGES for kind in kinds]
     libraries = [f"-l:lib{name}.so" for name in [*names, *MORE]]
 
-    def link(sources: list[Path], name: str, target: Path, *more: str) -> None:
+    def link(sources, name, target, *more):
         objects = []
         for source in sources:
             objects.append(f"{source}.o")

@@ -35,9 +35,9 @@ apiVersion: v1
 kind: Namespace
 metadata: {{name: {NAMESPACE}, labels: {{pod-security.kubernetes.io/enforce: restricted}}}}
 """
-SUMMARY: list[str] = []
+SUMMARY = []
 """Lines that pytest prints after the tests."""
-TIMES: dict[str, float] = {}
+TIMES = {}
 """Event of the test session -> its time on the monotonic clock [s]."""
 
 
@@ -201,7 +201,7 @@ def mean_delays(seconds):
 
 def job_end(name, release=NAME):
     """Wait for the end of a Job; check that its state fits its end; return its end and its log."""
-    lines: list[str] = []
+    lines = []
     end = follow(place(release), name, lines.append)
     assert read("job", name)["status"].get("succeeded", 0) == (end.exit_code == 0), end
     return end, "\n".join(lines)

@@ -17,7 +17,7 @@ class Tapped(FaultRun):
 
     def __init__(self, life=1):
         super().__init__(Schedule(1, "ideal"), *HOVER, life=life)
-        self.heard: dict[str, list[bytes]] = {"world": [], "cloud": []}
+        self.heard = {"world": [], "cloud": []}
         self.ends = {"world": self.world, "cloud": self.cloud}
         for name, end in self.ends.items():
             end.tamper = lambda data, now_ns, heard=self.heard[name]: heard.append(data) or [data]
