@@ -5,7 +5,6 @@ import copy
 import pytest
 import yaml
 
-from cloudrc.cli.parser import build_parser
 from cloudrc.config.load import load_experiment
 from tests.chart.conftest import CHART, of_kind, render
 
@@ -76,18 +75,3 @@ def test_a_suspended_cron_job_is_the_template_of_jobs():
     configs = [thing["metadata"]["name"] for thing in objects if thing["kind"] == "ConfigMap"]
     assert volume["configMap"]["name"] == cron["metadata"]["name"]
     assert cron["metadata"]["name"] in configs
-    nightly = "mission: {cronJob: {enabled: true, schedule: 0 3 * * *}}"
-    (cron,) = of_kind(render(nightly), "CronJob").values()
-    assert (cron["spec"]["suspend"], cron["spec"]["schedule"]) == (False, "0 3 * * *")
-
-
-def test_the_job_of_a_mission_keeps_its_report_in_the_claim():
-    given = "{recordings: {storage: 1Gi, keepMissions: 7}, mission: {enabled: true}}"
-    (job,) = jobs(given)
-    pod = job["spec"]["template"]["spec"]
-    arguments = pod["containers"][0]["args"]
-    options = build_parser(["mission"]).parse_args(arguments)
-    (data,) = (each for each in pod["volumes"] if each["name"] == "data")
-    claim = of_kind(render(given), "PersistentVolumeClaim")["recordings"]["metadata"]["name"]
-    assert data["persistentVolumeClaim"]["claimName"] == claim
-    assert (str(options.report), options.keep) == ("/var/lib/cloudrc", 7)

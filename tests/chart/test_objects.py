@@ -34,6 +34,7 @@ mission: {enabled: true, queue: true}
 console: {enabled: true}
 ros: {enabled: true, steer: true}
 cloud: {backgroundLoad: {enabled: true, workers: 3}}
+recordings: {storage: 1Gi}
 """
 
 

@@ -29,6 +29,7 @@ from tests.chart.conftest import (
     values_of,
 )
 from tests.conftest import nightly
+from tests.support.snapshots import compare
 
 kubernetes_validate = pytest.importorskip("kubernetes_validate", reason="comes with the extra dev")
 
@@ -92,19 +93,12 @@ def default_lines():
     return lines(shown({}))
 
 
-def compare(name, text):
-    path = RENDERED / name
-    if not path.exists():
-        path.write_text(text)
-    assert text == path.read_text()
-
-
 def test_the_default_values_give_these_objects():
     assert METADATA["appVersion"] == cloudrc.__version__
     text = yaml.dump_all(
         shown({}), None, Dumper, sort_keys=False, width=100, default_flow_style=None
     )
-    compare("default.yaml", text)
+    compare(RENDERED / "default.yaml", text)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -112,7 +106,10 @@ def test_other_values_change_these_lines(name):
     found, default = lines(shown(CASES[name])), default_lines()
     gone = [f"- {line}" for line in default if line not in {*found}]
     new = [f"+ {line}" for line in found if line not in {*default}]
-    compare(f"{name}.diff", "".join(f"{line}\n" for line in sorted((*gone, *new), key=_place)))
+    compare(
+        RENDERED / f"{name}.diff",
+        "".join(f"{line}\n" for line in sorted((*gone, *new), key=_place)),
+    )
 
 
 def _place(line):

@@ -5,7 +5,7 @@ import tarfile
 import pytest
 import yaml
 
-from tests.chart.conftest import ROOT, containers, notes, of_kind, pod_specs, render
+from tests.chart.conftest import ROOT, notes, of_kind, render
 
 PACKED = sorted((ROOT / "tests" / "fixtures" / "charts").glob("*.tgz"))
 each_chart = pytest.mark.parametrize("path", PACKED, ids=lambda path: path.stem)
@@ -23,12 +23,6 @@ def but_secrets(objects):
 @each_chart
 def test_reused_values_of_an_earlier_chart_give_todays_objects(path):
     assert but_secrets(render(reused=defaults_of(path))) == but_secrets(render())
-
-
-def test_an_added_limit_that_is_taken_out_stays_out():
-    objects = render("ros: {enabled: true, resources: {limits: {cpu: null}}}")
-    bridge = containers(pod_specs(objects)["cloud"])["bridge"]
-    assert bridge["resources"]["limits"].keys() == {"memory"}
 
 
 GONE = """
