@@ -18,7 +18,7 @@ from cloudrc.messages import (
     Request,
     Start,
 )
-from cloudrc.records import Counted
+from cloudrc.records import Counted, GuardChange, TelemetrySent
 from cloudrc.runs.flight import fly_in_memory
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
@@ -167,6 +167,16 @@ class Bare:
     def take(self, kind):
         self.records += self.world.take_records()
         return [record for record in self.records if isinstance(record, kind)]
+
+    @property
+    def telemetry(self):
+        """The newest telemetry."""
+        return self.take(TelemetrySent)[-1].telemetry
+
+    @property
+    def change(self):
+        """The guard's last change."""
+        return self.take(GuardChange)[-1]
 
     def counts(self):
         self.wait(1000)

@@ -6,7 +6,7 @@ import pytest
 
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.messages import ZERO, Cause, GuardState, Request, Start
-from cloudrc.records import CommandApplied, Contact, GuardChange, SessionOpened, TelemetrySent
+from cloudrc.records import CommandApplied, Contact, GuardChange, SessionOpened
 from tests.flights.conftest import MS, Bare, ring, talking
 
 
@@ -27,8 +27,7 @@ def fly(talk, count):
 def ask(talk, number, request, start=Start.HERE):
     talk.request(number, request, start)
     talk.wait(20)
-    telemetry = talk.take(TelemetrySent)[-1].telemetry
-    return telemetry.guard, telemetry.mission
+    return talk.telemetry.guard, talk.telemetry.mission
 
 
 @pytest.mark.promise("only-the-operator-arms")
@@ -43,10 +42,10 @@ def test_a_start_is_refused_until_the_stop_is_acknowledged(talk, start):
     assert ask(talk, 5, Request.ACKNOWLEDGE) == (GuardState.GROUND, 5)
     assert ask(talk, 3, Request.START, start) == (GuardState.GROUND, 5)  # a late copy
     fly(talk, 5)
-    assert talk.take(GuardChange)[-1].state is GuardState.GROUND
+    assert talk.change.state is GuardState.GROUND
     assert ask(talk, 6, Request.START)[1] == 6
     fly(talk, 5)
-    assert talk.take(GuardChange)[-1].state is GuardState.TRACK
+    assert talk.change.state is GuardState.TRACK
 
 
 @pytest.mark.parametrize(
@@ -81,12 +80,12 @@ def test_after_a_stall_a_stop_counts_and_a_start_does_not(talk, request_):
 def test_commands_during_a_stop_or_a_hold_are_not_echoed(talk):
     applied = len(talk.take(CommandApplied))
     talk.wait(2_000)
-    echo_ns = talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns
+    echo_ns = talk.telemetry.echo_stamp_ns
     fly(talk, 9)
-    assert talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns == echo_ns
+    assert talk.telemetry.echo_stamp_ns == echo_ns
     fly(talk, 1)
     assert len(talk.take(CommandApplied)) == applied + 1
-    assert talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns > echo_ns
+    assert talk.telemetry.echo_stamp_ns > echo_ns
     talk.send(talk.command())
     talk.request(2, Request.ESTOP, Start.HERE)
     talk.wait(20)
@@ -102,7 +101,7 @@ def test_contacts_are_reported_until_the_next_mission_starts(talk):
     for number, mission_id, contacts in ((3, 0, 1), (4, 7, 0)):
         talk.request(number, Request.START, Start.HERE, mission_id)
         talk.wait(20)
-        assert talk.take(TelemetrySent)[-1].telemetry.obstacle_contacts == contacts
+        assert talk.telemetry.obstacle_contacts == contacts
 
 
 @pytest.mark.parametrize(
@@ -114,21 +113,20 @@ def test_what_a_mission_touches_is_no_obstacle(talk, touch, counted, speed):
     for body in ("pillar", "board", "floor", "world"):
         talk.world.robot.simulator.touches.append(Contact(0, body, ZERO, ZERO, ZERO, by_probe=True))
     talk.wait(20)
-    telemetry = talk.take(TelemetrySent)[-1].telemetry
-    assert telemetry.obstacle_contacts == counted
-    assert telemetry.touch_speed == pytest.approx(speed, nan_ok=True)
+    assert talk.telemetry.obstacle_contacts == counted
+    assert talk.telemetry.touch_speed == pytest.approx(speed, nan_ok=True)
 
 
 def test_the_end_of_a_mission_ends_the_hold_that_interrupts_it(talk):
     """The robot holds on, for no mission."""
     talk.wait(3_000)
-    before = talk.take(GuardChange)[-1]
+    before = talk.change
     for number in (2, 3):
         ask(talk, number, Request.END)
-    ended = talk.take(GuardChange)[-1]
+    ended = talk.change
     assert talk.take(GuardChange).count(ended) == 1
     assert (ended.state, ended.cause) == (GuardState.HOLD, Cause.ENDED.words)
-    assert talk.take(TelemetrySent)[-1].telemetry.cause is Cause.ENDED
+    assert talk.telemetry.cause is Cause.ENDED
     talk.wait(4_000)
     live = LiveMetrics("world")
     live.see(talk.records)
@@ -146,10 +144,10 @@ def test_commands_of_an_earlier_cloud_do_not_count(talk):
     talk.wait(260)
     assert talk.hello("another") > 0
     fly(talk, 2)
-    assert talk.take(GuardChange)[-1].state is GuardState.HOLD
+    assert talk.change.state is GuardState.HOLD
     fly(talk, 8)
     talk.wait(10)
-    assert talk.take(GuardChange)[-1].state is GuardState.TRACK
+    assert talk.change.state is GuardState.TRACK
 
 
 ID = 2**62 + 5
@@ -159,8 +157,7 @@ def progress(talk, request, number=0, *, start=Start.HERE, **fields):
     """Return the mission and the progress that the robot shows after a request."""
     talk.send(talk.speaker.ask(number, request, start, basis_ns=talk.now_ns, **fields))
     talk.wait(20)
-    telemetry = talk.take(TelemetrySent)[-1].telemetry
-    return telemetry.mission_id, telemetry.reached
+    return talk.telemetry.mission_id, talk.telemetry.reached
 
 
 def test_progress_rises_and_belongs_to_the_mission_started_last():
