@@ -16,6 +16,6 @@ needs_ros = [
 @pytest.fixture(autouse=True)
 def own_domain(monkeypatch):
     """Keep the tests apart from other nodes of this machine."""
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(101 + os.getpid() % 100))
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.chdir(Path(__file__).parents[2])  # nodes of the tests are modules of it

@@ -87,8 +87,9 @@ def test_the_flags_of_the_job_reach_it(api, release, tmp_path):
     batch.start(release, "sweep-2", b"", PODS._replace(bucket="s3://lab/x/"))
     (container,) = api.get("jobs", "sweep-2")["spec"]["template"]["spec"]["containers"]
     assert container["args"] == ["4", "--out=s3://lab/x/sweep-2"]
-    with pytest.raises(BadInputError, match=r"--set-job securityContext\.root: neither a Job"):
-        batch.check_changes({("securityContext", "root"): 1})
+    assert "did you mean tolera" in batch.unknown_field([("toleration", "x")])
+    assert batch.unknown_field([("securityContext", "root")]).startswith("securityContext.root: ")
+    assert not batch.unknown_field([("securityContext", "runAsUser")])
 
 
 def test_a_running_job_is_kept_and_a_failed_job_is_replaced(started, api, release):

@@ -155,5 +155,5 @@ def test_a_stop_gets_through_thirty_percent_loss(count):
         (stop,) = [change for change in flight.changes if change.state is ESTOP]
         took.append(stop.stamp_ns * 1e-9 - at)
         assert flight.changes[-1].state is GROUND
-        assert not flight.watch.breaches
+        assert not flight.breaches()
     assert max(took) <= drive.rtt + 0.1

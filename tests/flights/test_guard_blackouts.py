@@ -59,7 +59,7 @@ def interrupt(kill, at, *settings, calm=1.0):
     assert measures.calm_after(flight, held, back) <= calm + ROUNDING, "below 0.05 m/s"
     assert measures.drift(flight, held + calm, back) <= 0.10
     assert tracked - back <= 1.0 + ROUNDING
-    assert flight.watch.counts.total() == 0
+    assert not flight.breaches()
     assert flight.generations == {"world": 1, "cloud": 1 + kill}
 
 

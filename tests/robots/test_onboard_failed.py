@@ -124,6 +124,13 @@ def test_the_actuators_of_a_robot_that_failed_push_nothing(fly):
     assert falls[-1] < -0.3
 
 
+def test_an_accelerator_that_cannot_put_the_robot_on_the_ground_fails_as_a_users_code(fly):
+    fails = "    def put_on_ground(self, *why):\n        {}['spawn']\n\n    def run("
+    flight = fly(FASTER.replace("{what}", "pass").replace("    def run(", fails))
+    assert flight.failures[0].code == "onboard_failed"
+    assert "KeyError: 'spawn', own.py:11 in put_on_ground" in flight.failures[0].text
+
+
 def test_an_accelerator_that_holds_the_contract_flies_as_without_it(fly):
     faster = FASTER.replace("{what}", "pass")
     plain = faster.replace("def accelerator", "def _unused")
