@@ -18,4 +18,4 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def replace_flights(one_core, monkeypatch):
     """Return a function that replaces flights by `fly(experiment)`, in this process."""
-    return lambda fly: monkeypatch.setattr("cloudrc.runs.flight.fly_point", fly)
+    return lambda fly: monkeypatch.setattr("cloudrc.runs.flight.measure", fly)
