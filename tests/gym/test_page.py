@@ -1,12 +1,8 @@
 """The examples of docs/gym.md run."""
 
-import runpy
-
-from tests.support.pages import blocks
+from tests.support.pages import run_page
 
 
 def test_the_examples_of_the_page_run(tmp_path, capsys):
-    program = tmp_path / "page.py"
-    program.write_text("\n".join(blocks("gym", "python")))
-    runpy.run_path(str(program))
+    run_page("gym", tmp_path)
     assert "delay_measured" in capsys.readouterr().out
