@@ -5,7 +5,16 @@ from cloudrc.cloud.controllers.pid import build as pid
 from cloudrc.cloud.estimators.running_mean import build as running_mean
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.predictors.last_sample import build as last_sample
-from cloudrc.messages import NEVER_NS, UPRIGHT, ZERO, GuardState, Odometry, Setpoint, Telemetry
+from cloudrc.messages import (
+    NEVER_NS,
+    UPRIGHT,
+    ZERO,
+    Command,
+    GuardState,
+    Odometry,
+    Setpoint,
+    Telemetry,
+)
 
 MS = 1_000_000
 HERE = (1.0, 2.0, 3.0)
@@ -13,9 +22,15 @@ THERE = Setpoint((2.0, 2.0, 3.0))
 
 
 def telemetry(stamp_ms, echo_ms=None, hold_ms=0):
-    odometry = Odometry(stamp_ms * MS, HERE, UPRIGHT, ZERO, ZERO)
+    odometry = Odometry(round(stamp_ms * MS), HERE, UPRIGHT, ZERO, ZERO)
     echo_ns = NEVER_NS if echo_ms is None else echo_ms * MS
-    return Telemetry(stamp_ms * MS, odometry, (), echo_ns, hold_ms * MS, 0, 1, GuardState.TRACK)
+    return Telemetry(odometry.stamp_ns, odometry, (), echo_ns, hold_ms * MS, 0, 1, GuardState.TRACK)
+
+
+def planned(at_ms, *xs):
+    """Make a command whose plan begins at `at_ms` with the velocities `xs`, one per 10 ms."""
+    first, *rest = ((x, 0.0, 0.0) for x in xs)
+    return Command(at_ms * MS, 0, 0, first, 0.0, tuple(rest), at_ms * MS)
 
 
 def loop(estimator=None, predictor=None, controller=None, heard_ms=None, echo_ms=None, **limits):

@@ -53,20 +53,12 @@ delays = st.floats(0.0, 10.0)
 samples = st.builds(DelaySample, delays, delays)
 axes = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(c * c for c in q) > 1e-3)
 quaternions = axes.map(lambda q: tuple(c / sqrt(sum(c * c for c in q)) for c in q))
-odometry = st.builds(
-    Odometry, st.integers(0, 10**15), vectors, quaternions, vectors, st.tuples(*[numbers] * 3)
-)
 stamps = st.integers(0, 10**15)
+odometry = st.builds(Odometry, stamps, vectors, quaternions, vectors, vectors)
 plans = st.lists(vectors, max_size=5).map(tuple)
 commands = st.builds(Command, stamps, stamps, st.just(0), vectors, numbers, plans, stamps)
-setpoints = st.builds(
-    Setpoint,
-    vectors,
-    st.floats(-10 * pi, 10 * pi),
-    velocity=vectors,
-    motion=st.none(),
-    yaw_rate=numbers,
-)
+yaws = st.floats(-10 * pi, 10 * pi)
+setpoints = st.builds(Setpoint, vectors, yaws, velocity=vectors, yaw_rate=numbers)
 
 
 def are_finite(*values):

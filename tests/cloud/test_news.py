@@ -6,36 +6,32 @@ from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.news import SendOnDelta
 from cloudrc.cloud.predictors import Model
 from cloudrc.cloud.predictors.last_sample import LastSample
-from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState, Odometry
+from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
 from cloudrc.records import UNSENT
-from tests.cloud.conftest import MS, command, loop, telemetry
+from tests.cloud.conftest import MS, command, loop, planned, telemetry
 from tests.flights.conftest import both_ways, fly, numbers
 
 TRACK, HOLD = GuardState.TRACK, GuardState.HOLD
 
 
-def planned(at_ms, *xs, yaw_rate=0.0, plan=True):
-    """Make a command whose plan begins at `at_ms` with the velocities `xs`, one per 10 ms."""
-    first, *rest = ((x, 0.0, 0.0) for x in xs)
-    return Command(at_ms * MS, 0, 0, first, yaw_rate, tuple(rest) if plan else (), at_ms * MS)
-
-
 RISING = [0.1 * k for k in range(9)]
+NEXT = planned(10, *RISING[1:], 0.8)
+"""What the plan `RISING` has from 10 ms on, and one velocity more."""
 
 
 @pytest.mark.parametrize(
     ("second", "guard", "is_news"),
     [
-        (planned(10, *RISING[1:], 0.8), TRACK, False),
+        (NEXT, TRACK, False),
         (planned(10, *RISING), TRACK, True),  # the same velocities, but 10 ms later
         (planned(10, *(x + 0.049 for x in RISING[1:]), 0.8), TRACK, False),
         (planned(10, *(x + 0.051 for x in RISING[1:]), 0.8), TRACK, True),
         (planned(10, *RISING[1:5], *[9.0] * 5), TRACK, True),
         (planned(10, *RISING[1:6], *[9.0] * 4), TRACK, False),  # after the next beat
-        (planned(10, *RISING[1:], 0.8, yaw_rate=0.1), TRACK, True),
-        (planned(10, *RISING[1:], 0.8, plan=False), TRACK, True),
-        (planned(10, *RISING[1:], 0.8), HOLD, True),
-        (planned(10, *RISING[1:], 0.8), GuardState.GROUND, False),
+        (NEXT._replace(yaw_rate=0.1), TRACK, True),
+        (NEXT._replace(plan=()), TRACK, True),
+        (NEXT, HOLD, True),
+        (NEXT, GuardState.GROUND, False),
         (planned(29, *RISING[2:], 0.8, 0.8), TRACK, False),
         (planned(30, *RISING[3:], 0.8, 0.8, 0.8), TRACK, True),  # the beat
     ],

@@ -3,10 +3,9 @@
 import pytest
 
 from cloudrc.cloud.plan_log import PlanLog
-from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState, Odometry, Telemetry
+from cloudrc.messages import ZERO, Command
 from cloudrc.records import PlanFollowed
-
-MS = 1_000_000
+from tests.cloud.conftest import MS, telemetry
 
 
 @pytest.fixture
@@ -20,24 +19,17 @@ def log():
     return log
 
 
-def told(at_ms, echo_ms):
-    odometry = Odometry(round(at_ms * MS), ZERO, UPRIGHT, ZERO, ZERO)
-    return Telemetry(odometry.stamp_ns, odometry, (), echo_ms * MS, 0, 0, 1, GuardState.TRACK)
-
-
 @pytest.mark.parametrize(
     ("at_ms", "x"),
     [(95, 0.0), (100, 0.0), (104, 0.04), (110, 0.1), (125, 0.25), (129.999999, 0.3), (130, None)],
 )
 def test_between_its_steps_a_plan_predicts_the_position_until_it_ends(log, at_ms, x):
-    found = log.look_up(told(at_ms, 50), 7)
-    if x is None:
-        assert found is None
-    else:
-        assert found == PlanFollowed(7, round(at_ms * MS), pytest.approx((x, 0.0, 0.0)))
+    place = pytest.approx((x, 0.0, 0.0))
+    expected = None if x is None else PlanFollowed(7, round(at_ms * MS), place)
+    assert log.look_up(telemetry(at_ms, 50), 7) == expected
 
 
 def test_the_plan_is_that_of_the_echoed_command(log):
-    assert log.look_up(told(115, 60), 0).position == pytest.approx((0.0, 0.05, 0.0))
-    assert log.look_up(told(115, 50), 0) is None, "older commands are not followed again"
-    assert log.look_up(told(115, 55), 0) is None, "a command without a plan"
+    assert log.look_up(telemetry(115, 60), 0).position == pytest.approx((0.0, 0.05, 0.0))
+    assert log.look_up(telemetry(115, 50), 0) is None, "older commands are not followed again"
+    assert log.look_up(telemetry(115, 55), 0) is None, "a command without a plan"

@@ -11,8 +11,8 @@ from cloudrc.cloud.predictors._history import Replay
 from cloudrc.config.robot import facts
 from cloudrc.config.schema import World
 from cloudrc.messages import UPRIGHT, ZERO, Command, Odometry
+from tests.cloud.conftest import MS, planned
 
-MS = 1_000_000
 PELICAN = facts(World(), 12.0)
 AHEAD = 1234 * MS  # cloud's clock minus world's clock [ns]
 
@@ -33,21 +33,25 @@ def in_ms(parts):
 # When the robot follows which command
 
 
+ECHOES = {1: 60, 3: 75, 4: 95}
+"""Command -> when the robot began to follow it [ms]."""
+
+
 @pytest.mark.parametrize(
     ("echoes", "start_ms", "end_ms", "parts"),
     [
-        (((1, 60), (3, 75), (4, 95)), 60, 100, [(1, 15), (3, 20), (4, 5)]),
-        (((1, 60), (3, 75), (4, 95)), 70, 80, [(1, 5), (3, 5)]),
-        (((1, 60), (3, 75), (4, 95)), 50, 65, [(1, 5)]),
+        (ECHOES, 60, 100, [(1, 15), (3, 20), (4, 5)]),
+        (ECHOES, 70, 80, [(1, 5), (3, 5)]),
+        (ECHOES, 50, 65, [(1, 5)]),
         # With tunnel.order: arrival, the robot may follow an older command after a newer one.
-        (((0, 50), (2, 60), (1, 70)), 50, 80, [(0, 10), (2, 10), (1, 10)]),
+        ({0: 50, 2: 60, 1: 70}, 50, 80, [(0, 10), (2, 10), (1, 10)]),
     ],
 )
 def test_the_echoes_show_the_past(echoes, start_ms, end_ms, parts):
     history = Replay()
     for k in range(10):
         history.commanded(command(10 * k, float(k)))
-    for k, at_ms in echoes:
+    for k, at_ms in echoes.items():
         history.applied(command(10 * k, 0).stamp_ns, at_ms * MS)
     assert in_ms(history.past(start_ms * MS, end_ms * MS)) == parts
 
@@ -123,23 +127,14 @@ def test_a_silence_of_20_s_leaves_no_error(module, lost):
 # Plans
 
 
-def planned(stamp_ms, planned_ms, *speeds):
-    """Return a command along x, with a plan [m/s]."""
-    first, *rest = [(speed, 0.0, 0.0) for speed in speeds]
-    return Command(stamp_ms * MS, 0, 0, first, 0.0, tuple(rest), planned_ms * MS)
-
-
 def test_command_history_knows_the_plan_between_two_commands():
     """At 20 Hz the robot flies four steps of the plan before the next command."""
     planning, plain = command_history.build(robot=PELICAN), command_history.build(robot=PELICAN)
     for k in range(20):
-        planning.commanded(
-            planned(50 * k, 50 * k, *([0.0, 1.0, 1.0, 1.0, 1.0] if k > 9 else [0.0]))
-        )
-        plain.commanded(planned(50 * k, 50 * k, 0.0))
-    basis = Odometry(850 * MS, ZERO, UPRIGHT, ZERO, ZERO)
-    assert plain.predict(basis, 0.1).position[0] == 0.0
-    assert planning.predict(basis, 0.1).velocity[0] > 0.1
+        planning.commanded(planned(50 * k, 0.0, *[1.0] * (4 * (k > 9))))
+        plain.commanded(planned(50 * k, 0.0))
+    assert plain.predict(sample(850), 0.1).position[0] == 0.0
+    assert planning.predict(sample(850), 0.1).velocity[0] > 0.1
 
 
 # command_history
@@ -188,21 +183,20 @@ def test_values_of_a_file_replace_the_parameters(tmp_path):
 # model_based and kalman
 
 
-def fly(predictor, push=0.0, noise=0.0, seconds=6.0, speed=0.5):
-    """Fly a model under commands along x; `push` [m/s^2] acts on it, `noise` is measured [m, m/s].
+def fly(predictor, push=0.0, noise=0.0, seconds=6.0):
+    """Command a model to stand still; `push` [m/s^2] acts on it, `noise` is measured [m, m/s].
 
     Return the errors of the predictions by 100 ms, as (position [m], velocity [m/s]) along x.
     """
     rng, truth, states, predicted = np.random.default_rng(1), at_rest(), [], []
     for k in range(round(seconds * 100)):
-        u = speed * ((k // 100) % 2)
-        predictor.commanded(command(10 * k - 50, u))
-        predictor.applied(command(10 * k - 50, 0).stamp_ns, 10 * k * MS)
+        predictor.commanded(still := command(10 * k - 50, 0.0))
+        predictor.applied(still.stamp_ns, 10 * k * MS)
         state = truth.odometry() if k else sample(0)
         x, v = state.position[0], state.velocity[0]
         states.append((x, v))
         truth.velocity = (v + push * 0.01, *truth.velocity[1:])
-        truth.step((u, 0.0, 0.0), 0.01)
+        truth.step(ZERO, 0.01)
         measured = sample(10 * k, x + noise * rng.normal(), v + 4 * noise * rng.normal())
         predictor.observe(measured)
         later = predictor.predict(measured, 0.1)
@@ -222,7 +216,7 @@ def test_a_sinking_reference_leads_by_half_a_metre_per_second():
 
 
 def test_model_based_learns_a_constant_push():
-    errors = fly(model_based.build(robot=PELICAN), push=0.5, speed=0.0, seconds=12.0)
+    errors = fly(model_based.build(robot=PELICAN), push=0.5, seconds=12.0)
     assert rms(errors[-100:, 1]) < 0.3 * rms(errors[5:50, 1])
 
 
@@ -230,6 +224,6 @@ def test_model_based_learns_a_constant_push():
 def test_kalman_halves_the_noise_of_the_odometry(model):
     noisy = {"white_box": model_based, "first_order": command_history}[model].build(robot=PELICAN)
     quiet = kalman.build(robot=PELICAN, model=model)
-    raw, filtered = (fly(each, noise=0.005, speed=0.0)[100:] for each in (noisy, quiet))
+    raw, filtered = (fly(each, noise=0.005)[100:] for each in (noisy, quiet))
     assert rms(filtered[:, 0]) < 0.5 * rms(raw[:, 0])
     assert rms(filtered[:, 1]) < 0.5 * rms(raw[:, 1])

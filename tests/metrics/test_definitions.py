@@ -87,24 +87,19 @@ def test_counts_match_the_true_loss_and_reordering(seed, loss, jitter):
     for counter in sent:
         late += counter < newest
         newest = max(newest, counter)
-    assert stream.expected == count
-    assert stream.lost == count - len(sent)
-    assert stream.reordered == late
-
-
-def flying_along_x(predicted_lead, *, every_ms=10):
-    """Yield a flight at 1 m/s along x, predicted 25 ms ahead with an error `predicted_lead` [m]."""
-    for x in (ms * 1e-3 for ms in range(0, 400, every_ms)):
-        predicted = (x + 0.025 + predicted_lead, 0.0, 0.0)
-        yield control(7.0 + x, x, measured=(x, 0.0, 0.0), position=predicted, horizon=0.025)
+    assert (stream.expected, stream.lost, stream.reordered) == (count, count - len(sent), late)
 
 
 @pytest.mark.parametrize(("lead", "every_ms", "judged"), [(0.01, 10, 37), (1, 60, 0)])
 def test_a_prediction_is_compared_at_its_own_instant(lead, every_ms, judged):
-    """The last three wait for a measurement 25 ms later; none is compared across a gap."""
+    """The robot flies at 1 m/s along x; predictions by 25 ms are wrong by `lead` [m].
+
+    The last three wait for a measurement 25 ms later; none is compared across a gap.
+    """
     judge = PredictionJudge()
-    for period in flying_along_x(lead, every_ms=every_ms):
-        judge.take(period)
+    for x in (ms * 1e-3 for ms in range(0, 400, every_ms)):
+        predicted = {"position": (x + 0.025 + lead, 0.0, 0.0), "horizon": 0.025}
+        judge.take(control(7.0 + x, x, measured=(x, 0.0, 0.0), **predicted))
     assert judge.judged == judged
     assert judge.square == pytest.approx(judged * lead**2, abs=1e-12)
     assert judge.error == pytest.approx((lead, 0, 0) if judged else (math.nan,) * 3, nan_ok=True)
@@ -156,23 +151,23 @@ def seen_in(flight, cloud, kind):
     return live
 
 
-@pytest.mark.parametrize("flown", [("paper-verbatim", "link.profile=paper-p3"), LOSSY])
-def test_delays_of_the_loop_are_equal_live_and_in_the_report(flown):
+DELAYS = ("rtt", "loop_delay", "delay_sample")
+
+
+@pytest.mark.parametrize(
+    ("flown", "kind", "names"),
+    [
+        (("paper-verbatim", "link.profile=paper-p3"), Arrival, DELAYS),
+        (LOSSY, Arrival, DELAYS),
+        (LOSSY, Control, ("age_of_information",)),
+    ],
+)
+def test_delays_and_the_age_of_information_are_equal_live_and_in_the_report(flown, kind, names):
     flight, _, cloud = of(*flown)
-    live = seen_in(flight, cloud, Arrival)
-    for name in ("rtt", "loop_delay", "delay_sample"):
-        true = measured(flight, f"{name}_mean")
-        assert average(live, f"cloudrc_{name}_seconds") == pytest.approx(true, rel=1e-9), name
-
-
-def test_age_and_tracking_error_of_a_flight_are_equal_live_and_in_the_report():
-    flight, _, cloud = of(*LOSSY)
-    live = seen_in(flight, cloud, Control)
-    age = measured(flight, "age_of_information_mean")
-    assert average(live, "cloudrc_age_of_information_seconds") == pytest.approx(age, rel=1e-9)
-    newest = flight.control["setpoint"][-1] - flight.control["measured"][-1]
-    tracking = live.read()["cloudrc_tracking_error_meters"]
-    assert [tracking[axis,] for axis in "xyz"] == list(newest)
+    live = seen_in(flight, cloud, kind)
+    found = {name: average(live, f"cloudrc_{name}_seconds") for name in names}
+    report = {name: measured(flight, f"{name}_mean") for name in names}
+    assert found == pytest.approx(report, rel=1e-9)
 
 
 def test_the_loss_of_a_flight_is_equal_live_and_in_the_report():

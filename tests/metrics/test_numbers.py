@@ -29,7 +29,6 @@ from cloudrc.records import (
 )
 from tests.metrics.conftest import (
     ONE_PIPE,
-    OPEN_AIR,
     PELICAN,
     PERIOD,
     SECOND,
@@ -66,29 +65,27 @@ def contact():
     return log.flight(ONE_PIPE, touch="board")
 
 
-def changed(kind, how, scene=OPEN_AIR):
+def changed(kind, how):
     """Make a flight of which the n-th record of a class is replaced by `how(n, record)`."""
     log = flown()
     log.change(kind, how)
-    return log.flight(scene)
+    return log.flight()
 
 
-def plus(*records, scene=OPEN_AIR, waypoints=1):
+def plus(*records, waypoints=1):
     """Make a flight in which world recorded more."""
     log = flown()
     log.world += records
-    return log.flight(scene, waypoints=waypoints)
+    return log.flight(waypoints=waypoints)
 
 
 def echoes_at_once():
     """Each second telemetry waits in a queue: it arrives 39 ms late, just before the next one."""
-    log = flown()
     wait = 39_000_000
-    log.change(
+    return changed(
         Arrival,
         lambda n, a: a._replace(stamp_ns=a.stamp_ns + wait) if a.uplink and a.counter % 2 else a,
     )
-    return log.flight()
 
 
 def echoes_repeated():
@@ -123,15 +120,13 @@ HOLDS = [
 
 def traffic():
     """World sends 100 datagrams per second, cloud 50; cloud restarts 6 s after the start."""
-    log = flown()
-    for n in range(10):
-        log.world += [
-            Counted(at(n + 0.5), "world", "sent", 7 + 100 * n),
-            Counted(at(n + 0.5), "world", "sent_bytes", 20_000 * n),
-        ]
-        log.cloud.append(Counted(at(n + 0.5), "cloud", "sent", 50 * (n if n < 6 else n - 5)))
-    log.cloud.append(Counted(at(1.0), "cloud", "sent_bytes", 3))
-    return log.flight()
+    totals = {
+        ("world", "sent"): {0.5: 7, 9.5: 907},
+        ("world", "sent_bytes"): {0.5: 0, 9.5: 180_000},
+        ("cloud", "sent"): {0.5: 0, 5.5: 250, 6.5: 50, 9.5: 200},
+        ("cloud", "sent_bytes"): {1.0: 3},
+    }
+    return plus(*(Counted(at(t), *of, n) for of, each in totals.items() for t, n in each.items()))
 
 
 def planned():
@@ -162,14 +157,13 @@ def resting():
 
 def slow_machine():
     """World loses 0.5 s in 10 s; its wakes are 1 to 100 ms late, those of cloud half as much."""
-    log = flown()
+    records = [Counted(at(n), "cloud", "missed_periods", 7 * n) for n in (1, 2)]
     for n in range(101):
         stamp, late = at(n / 10), (n or 1) * 1e-3
         slip = 3 * SECOND + (SECOND // 2 if n > 50 else 0)
-        log.world.append(Lateness(stamp, "world", late, 1e-4, slip))
-        log.cloud.append(Lateness(stamp, "cloud", late / 2, 1e-4, 0))
-    log.cloud += [Counted(at(n), "cloud", "missed_periods", 7 * n) for n in (1, 2)]
-    return log.flight()
+        records.append(Lateness(stamp, "world", late, 1e-4, slip))
+        records.append(Lateness(stamp, "cloud", late / 2, 1e-4, 0))
+    return plus(*records)
 
 
 def faults_and_drops():

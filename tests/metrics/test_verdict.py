@@ -38,6 +38,11 @@ def judged(flight, *, interrupted=False):
     return judge(evidence)
 
 
+def to_board(log, **more):
+    """Return the flight of a log whose mission is to touch the board, past a pipe."""
+    return log.flight(ONE_PIPE, **{"touch": "board", **more})
+
+
 def codes(verdict):
     return [failure.code for failure in verdict.failures]
 
@@ -88,7 +93,7 @@ def met(speed):
     ],
 )
 def test_rules(log, limits, outcome, found):
-    verdict = judged(log().flight(ONE_PIPE, **{"touch": "board", **limits}))
+    verdict = judged(to_board(log(), **limits))
     assert (verdict.outcome, codes(verdict)) == (outcome, found)
 
 
@@ -112,7 +117,7 @@ def test_rules(log, limits, outcome, found):
     ],
 )
 def test_a_failure_says_what_when_and_where(log, code, text, time):
-    (failure,) = judged(log.flight(ONE_PIPE, touch="board")).failures
+    (failure,) = judged(to_board(log)).failures
     assert failure.code == code
     assert text in failure.text
     assert failure.time == pytest.approx(time)
@@ -172,11 +177,11 @@ def test_every_body_is_an_obstacle_but_the_floor_and_what_to_touch(body, wanted,
 
 def test_an_interrupted_run_lists_only_certain_failures():
     log = without_end(world(touch(3, "pipe_1"), log=flown))
-    verdict = judged(log.flight(ONE_PIPE, touch="board"), interrupted=True)
+    verdict = judged(to_board(log), interrupted=True)
     assert verdict.outcome == "interrupted"
     assert codes(verdict) == ["interrupted", "obstacle_touched"]
     # After the mission's end an interruption changes nothing.
-    assert judged(good().flight(ONE_PIPE, touch="board"), interrupted=True).outcome == "success"
+    assert judged(to_board(good()), interrupted=True).outcome == "success"
 
 
 MISSED = to_point(30.0, 0.1)
@@ -196,7 +201,7 @@ MISSED = to_point(30.0, 0.1)
     ],
 )
 def test_the_operator_knows_what_had_arrived(log, mission, report, operator):
-    flight = log.flight(ONE_PIPE, touch="board", mission=mission)
+    flight = to_board(log, mission=mission)
     numbers = measure_all(flight).numbers
     evidence = flight_evidence(flight, numbers, real_time=True, interrupted=False)
     assert codes(judged(flight)) == report
@@ -229,7 +234,7 @@ def test_a_failure_says_when_and_how_far_the_robot_left_a_waypoint_in_its_dwell_
 def test_real_time_is_kept_or_the_run_is_invalid(slip, factor, said):
     values = {"waypoints_reached": 1.0, "world_slip": slip, "real_time_factor": factor}
     numbers = {k: Number(value, "", "") for k, value in values.items() if value is not None}
-    flight = good().flight(ONE_PIPE, touch="board")
+    flight = to_board(good())
     real, virtual = (
         judge(flight_evidence(flight, numbers, real_time=how, interrupted=False))
         for how in (True, False)
@@ -247,19 +252,17 @@ def test_a_plug_in_may_fail_in_one_percent_of_the_periods(failures, found):
     text = "the predictor failed (KeyError: 'oops', my.py:12 in predict)"
     log.cloud.append(Fault(at(1), "predictor_failed", text))
     log.cloud.append(Counted(at(2), "cloud", "predictor_failed", failures))
-    verdict = judged(log.flight(ONE_PIPE, touch="board"))
+    verdict = judged(to_board(log))
     assert codes(verdict) == found
-    assert all(
-        "failed in 1.195% of its periods, above 1%:" in each.text for each in verdict.failures
-    )
-    assert all("my.py:12 in predict" in each.text for each in verdict.failures)
+    for said in ("failed in 1.195% of its periods, above 1%:", "my.py:12 in predict"):
+        assert all(said in each.text for each in verdict.failures)
 
 
 @pytest.mark.parametrize("when", [(-2.5, -0.5, 0.5, 8.0), (-0.5, 12.0)])
 def test_failures_of_an_earlier_mission_do_not_count(when):
     log = good()
     log.cloud += [Counted(at(time), "cloud", "predictor_failed", 400) for time in when]
-    flight = log.flight(ONE_PIPE, touch="board")
+    flight = to_board(log)
     assert judged(flight).outcome == "success"
     assert measure_all(flight).numbers["fault_count"].value == 0.0
 
@@ -268,7 +271,7 @@ def test_a_robot_that_never_flew_is_a_failure_and_only_what_explains_it_is_told(
     log = good()
     log.change(GuardChange, lambda n, change: change._replace(state=GuardState.GROUND))
     log.cloud.append(Counted(at(2), "cloud", "controller_failed", 400))
-    verdict = judged(log.flight(ONE_PIPE, touch="board"))
+    verdict = judged(to_board(log))
     assert sorted(codes(verdict)) == ["not_started", "plugin_failed"]
 
 

@@ -17,7 +17,7 @@ from cloudrc.link.exec import namespace
 from cloudrc.link.library import KIND
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.verify.packets import Period, judge_packets, recording
-from tests.link.profiles import changed, profile_of
+from tests.link.profiles import profile_of
 
 MS = 1_000_000
 PACKET = b"\x45" + bytes(99)
@@ -70,31 +70,23 @@ def log_of(profile, late_ns=0, count=2000):
     return log
 
 
-def verdicts(log, profile):
+def judged(log, profile):
+    """Return what the profile asks of these packets, and the verdicts, by quantity."""
     rows = judge_packets(log, Period(profile, 7, True, 0, 0))
-    return {row.name: row.verdict for _, row in rows}
+    return {row.name: value for value, row in rows}, {row.name: row.verdict for _, row in rows}
 
 
-def test_a_relay_that_keeps_its_times_is_believed():
+def test_a_relay_is_believed_unless_it_is_late_or_loses_packets_by_itself():
     profile = profile_of(0.040, 0.010, loss=0.02)
-    rows = judge_packets(log_of(profile, 20_000), Period(profile, 7, True, 0, 0))
-    assert {row.verdict for _, row in rows} == {"ok"}
-    asked = {row.name: value for value, row in rows}
+    log = log_of(profile, 20_000)
+    asked, verdicts = judged(log, profile)
+    assert {*verdicts.values()} == {"ok"}
     assert asked["mean"] == pytest.approx(0.040, abs=5e-4)
     assert asked["loss"] == pytest.approx(0.02, abs=5e-3)
-
-
-def test_a_late_relay_is_not_believed():
-    profile = profile_of(0.040, 0.010)
-    assert verdicts(log_of(profile, 5 * MS), profile)["mean"] == "off"
-
-
-def test_a_relay_that_loses_packets_by_itself_is_not_believed():
-    profile = profile_of(0.040)
-    log = log_of(profile)
+    assert judged(log_of(profile, 5 * MS), profile)[1]["mean"] == "off"
     for number in range(0, 2000, 10):
         log.copies[number] = 0
-    assert verdicts(log, profile)["loss"] == "off"
+    assert judged(log, profile)[1]["loss"] == "off"
 
 
 @pytest.mark.parametrize(
@@ -105,12 +97,10 @@ def test_a_relay_that_loses_packets_by_itself_is_not_believed():
     ],
 )
 def test_a_limited_rate_asks_for_what_these_packets_would_meet(rate, waits):
-    profile = changed(profile_of(0.040, rate=rate), queue_packets=10_000)
-    rows = judge_packets(log_of(profile), Period(profile, 7, True, 0, 0))
-    asked = {row.name: value for value, row in rows}
+    profile = profile_of(0.040, rate=rate, queue_packets=10_000)
+    asked, _ = judged(log_of(profile), profile)
     assert asked["mean"] == pytest.approx(0.040 + waits, abs=1e-4)
-    assert asked["loss"] == 0.0
-    assert asked["rate"] == rate
+    assert (asked["loss"], asked["rate"]) == (0.0, rate)
 
 
 def test_a_recording_is_a_log_that_link_record_reads(tmp_path, call):
