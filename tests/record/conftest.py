@@ -12,11 +12,12 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from cloudrc import records as rec
-from cloudrc.messages import GuardState, Odometry, Telemetry
+from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
+from tests.console.conftest import control
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -65,8 +66,7 @@ def world_records(count, start_ns=0):
     for n in range(count):
         now = start_ns + n * 10 * MS
         position, velocity = (0.01 * n, math.sin(n), 1.0), (1.0, math.cos(n), 0.1)
-        turn = (math.cos(n), 0.0, 0.0, math.sin(n))
-        odometry = Odometry(now, position, turn, velocity, (0.0, 0.1, 0.2))
+        odometry = Odometry(now, position, UPRIGHT, velocity, (0.0, 0.1, 0.2))
         telemetry = Telemetry(now, odometry, (0.1,), now - 5, 7, 0, 1, GuardState.TRACK)
         records += [
             rec.TelemetrySent(now, 1, n, telemetry),
@@ -80,26 +80,22 @@ def world_records(count, start_ns=0):
                 rec.Arrival(now + 3 * MS, False, 1, n - 3, 0.03, True),
                 rec.CommandApplied(now + 4 * MS, 1, n - 3, now - 60 * MS, velocity),
             ]
-    contact = rec.Contact(now, "board", position, velocity, (0.1, 0.0, 0.0), True)
-    records += [contact, rec.Counted(now, "world", "sent", count)]
+    records += [rec.Contact(now, "board", ZERO, ZERO, ZERO, True)]
+    records += [rec.Counted(now, "world", "sent", count)]
     return sorted(records, key=attrgetter("stamp_ns"))
 
 
-def cloud_records(count, start_ns=0, up_ns=40 * MS):
+def cloud_records(count, start_ns=0):
     """Make cloud's records at 100 Hz; a command leaves 3 ms after each period."""
     records = [rec.SessionOpened(start_ns, "cloud", 1, "world said yes")]
-    v = (0.1, 0.2, 0.3)
     for n in range(count):
         now = start_ns + n * 10 * MS
         period = now + 3 * MS
-        turn = (math.cos(n), math.sin(n), 0.0, 0.0)
-        records.append(rec.Arrival(now + up_ns, True, 1, n, math.nan, n % 7 > 0))
-        records.append(
-            rec.Control(
-                period, 1, n, now - 1, 0.08, 0.07, math.nan, v, v, turn, v, v, 2, v, 0.1, v, v, v
-            )
-        )
-        records.append(rec.PlanFollowed(period, now, v))
+        records += [
+            rec.Arrival(now + 40 * MS, True, 1, n, math.nan, n % 7 > 0),
+            control(period / SECOND, now / SECOND, counter=n, horizon=0.08, rtt=0.07),
+            rec.PlanFollowed(period, now, ZERO),
+        ]
     records.append(rec.MissionEvent(period, "done", 2, "mission done — ça va"))
     records += [rec.Fault(period, "late", ""), rec.Counted(period, "cloud", "", 3)]
     return sorted(records, key=attrgetter("stamp_ns"))

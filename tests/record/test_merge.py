@@ -42,10 +42,7 @@ def merged(folder):
     return mission, Recording.read(folder / "mission.mcap")
 
 
-@pytest.mark.parametrize(
-    ("start", "ahead"),
-    [(9 * SECOND, 5 * SECOND), (0, -SECOND)],
-)
+@pytest.mark.parametrize(("start", "ahead"), [(9 * SECOND, 5 * SECOND), (0, -SECOND)])
 def test_two_clocks_are_related_by_the_packets(tmp_path, start, ahead):
     """With delays of 40 ms up and 30 ms down, the estimate is wrong by 5 ms; its bound is 35 ms.
 
@@ -108,7 +105,7 @@ def test_the_same_clock_is_left_as_it_is(tmp_path):
     assert merged.attachments == texts | {"report.json": b"{}"}
 
 
-@pytest.mark.parametrize(("clock", "torn", "rows"), [("a", 1, 80), ("b", 1, 50), ("a", 2, 50)])
+@pytest.mark.parametrize(("clock", "torn", "rows"), [("a", 1, 80), ("b", 1, 50), ("a", 4, 50)])
 def test_a_complete_part_before_on_the_same_clock_belongs_to_a_recording(
     tmp_path, clock, torn, rows
 ):
@@ -156,23 +153,22 @@ def test_one_end_alone_is_better_than_nothing(tmp_path, lost, rows):
 
 
 def slipping(records, slips_ns):
-    """Make world's records; the n-th telemetry has the n-th slip, later ones the last slip."""
-    slips, slip, found = iter(slips_ns), 0, []
+    """Yield world's records; the n-th telemetry has the n-th slip, later ones the last slip."""
+    slips, slip = iter(slips_ns), 0
     for record in records:
         if isinstance(record, rec.TelemetrySent):
             slip = next(slips, slip)
             record = record._replace(telemetry=record.telemetry._replace(slip_ns=slip))
-        found.append(record)
-    return found
+        yield record
 
 
 def test_a_slip_of_world_is_taken_out_of_clouds_stamps(tmp_path):
     world = slipping(world_records(60, 4 * SECOND), [5 * SECOND])
     cloud = cloud_records(60, 4 * SECOND + 5 * SECOND)
     mission = merge(*files(tmp_path, world, cloud, ("same", "same")))
-    without = Recording.from_records([], cloud_records(60, 4 * SECOND))["/delay_estimate"]
-    stamps = mission["/delay_estimate"]["stamp_ns"]
-    assert stamps.tolist() == without["stamp_ns"].tolist()
+    without = Recording.from_records([], cloud_records(60, 4 * SECOND))
+    found, asked = (each["/delay_estimate"]["stamp_ns"].tolist() for each in (mission, without))
+    assert found == asked
 
 
 @settings(max_examples=50, deadline=None)

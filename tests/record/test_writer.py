@@ -1,8 +1,6 @@
 """The file is a valid MCAP, and only recording needs the packages for it."""
 
 import gc
-import subprocess
-import sys
 import tracemalloc
 from collections import defaultdict
 
@@ -15,9 +13,9 @@ from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import CHUNK_NS, McapWriter
 from cloudrc.records import GuardChange
 from tests.record.conftest import MS, SECOND, cloud_records, world_records, write
+from tests.support.programs import loaded
 
 RECORDS = [*world_records(150), *cloud_records(150, 1500 * MS)]
-NEEDED = ["mcap", "rosbags"]
 
 
 def test_other_programs_can_read_every_topic(tmp_path):
@@ -73,18 +71,11 @@ def test_an_hour_of_recording_takes_no_memory(tmp_path):
     assert Recording.read(path).note == ""
 
 
-def run(code):
-    words = [sys.executable, "-c", code]
-    return subprocess.run(words, capture_output=True, text=True, check=True).stdout
-
-
 def test_a_flight_needs_no_package_for_recording():
-    code = (
-        f"import sys; sys.modules.update(dict.fromkeys({NEEDED}))\n"
-        "from cloudrc.record import topics\n"
-        "print('numpy' in sys.modules)\n"
-        "from cloudrc.record import columns\n"
-        "import cloudrc.drivers.recording\n"
-        "print(len(columns.Recording.from_records([])['/pid']))"
+    topics = "import cloudrc.record.topics"
+    assert "numpy" not in loaded(topics)
+    absent = "import sys; sys.modules |= dict.fromkeys(('mcap', 'rosbags'))"
+    loaded(
+        f"{absent}; {topics}; from cloudrc.record.columns import Recording;"
+        "import cloudrc.drivers.recording; Recording.from_records([])['/pid']"
     )
-    assert run(code).split() == ["False", "0"]
