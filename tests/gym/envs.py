@@ -36,33 +36,24 @@ class Mixed(gymnasium.Env):
     render_mode = None
 
     def __init__(self):
+        keys = spaces.Tuple((spaces.MultiBinary(2), spaces.MultiDiscrete([2, 3])))
         self.action_space = spaces.Dict(
-            {
-                "move": spaces.Box(-1, 1, (2,), np.float32),
-                "jump": spaces.Discrete(3),
-                "keys": spaces.Tuple((spaces.MultiBinary(2), spaces.MultiDiscrete([2, 3]))),
-            }
+            move=spaces.Box(-1, 1, (2,), np.float32), jump=spaces.Discrete(3), keys=keys
         )
+        state = spaces.Tuple((spaces.Discrete(10), spaces.Box(-1, 1, (3,), np.float64)))
         self.observation_space = spaces.Dict(
-            {
-                "image": spaces.Box(0, 255, (4, 4, 3), np.uint8),
-                "state": spaces.Tuple((spaces.Discrete(10), spaces.Box(-1, 1, (3,), np.float64))),
-            }
+            image=spaces.Box(0, 255, (4, 4), np.uint8), state=state
         )
-
-    def _observe(self):
-        return {
-            "image": self.np_random.integers(0, 256, (4, 4, 3), dtype=np.uint8),
-            "state": (int(self.np_random.integers(10)), self.np_random.uniform(-1, 1, 3)),
-        }
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        return self._observe(), {}
+        self.observation_space.seed(seed)
+        return self.observation_space.sample(), {}
 
     def step(self, action):
         reward = float(np.sum(action["move"])) + float(action["jump"])
-        return self._observe(), reward, False, False, {"jumped": bool(action["jump"])}
+        told = {"jumped": bool(action["jump"])}
+        return self.observation_space.sample(), reward, False, False, told
 
 
 def both_ways(up_ms, down_ms, **keys):
