@@ -21,9 +21,10 @@ from cloudrc.eval.episode import as_actions, play, width_of
 from cloudrc.eval.setup import Episode, EvalSetup, link_at
 from cloudrc.outside.values import InvalidValueError
 from cloudrc.policy.actions import PolicyAnswerError
+from cloudrc.policy.codec import pack
 from cloudrc.policy.observation import Mapped, observe
 from tests.eval.conftest import LAW
-from tests.policy.conftest import serving, stock_like
+from tests.policy.conftest import after, serving, stock_like
 from tests.support.pages import blocks
 
 SHAKY = """
@@ -191,12 +192,12 @@ def test_the_map_makes_the_policys_observation(tmp_path):
 
 
 def test_a_round_trip_keeps_the_ratio_of_the_profile():
-    link = link_at("lte", 100.0)
-    assert (link.uplink.delay_ms, link.downlink.delay_ms) == (60.0, 40.0)
-    assert (link.uplink.jitter_ms, link.uplink.loss) == (8, 0.002)
-    none, even = link_at("lte", 0.0), link_at("ideal", 80.0)
-    assert (none.uplink.delay_ms, none.uplink.jitter_ms) == (0.0, 0.0)
-    assert (even.uplink.delay_ms, even.downlink.delay_ms) == (40.0, 40.0)
+    asked = ("lte", 100.0), ("lte", 0.0), ("ideal", 80.0)
+    links = [link_at(*each) for each in asked]
+    delays = [(each.uplink.delay_ms, each.downlink.delay_ms) for each in links]
+    assert delays == [(60.0, 40.0), (0.0, 0.0), (40.0, 40.0)]
+    others = [(each.uplink.jitter_ms, each.uplink.loss) for each in links[:2]]
+    assert others == [(8, 0.002), (0.0, 0.002)]
     with pytest.raises(BadInputError, match="change over time"):
         check_round_trips("handover", (80.0,))
 
@@ -248,25 +249,11 @@ def test_an_evaluation_has_a_table_a_page_and_rows_and_continues(law, tmp_path, 
     assert document["command"].startswith("cloudrc eval --env CartPole-v1")
 
 
-def after(count, last):
-    """Serve `LAW`'s first action `count` times, then `last`."""
-    from cloudrc.policy.codec import pack
-
-    left = iter(range(count))
-    return lambda connection, frame: (
-        pack({"actions": [[0]]}) if next(left, None) is not None else last
-    )
-
-
 @pytest.mark.parametrize(
-    ("last", "text"),
-    [
-        ("ValueError: no", "ValueError: no"),
-        (b"\x91\x01", "cannot be read"),
-    ],
+    ("last", "text"), [("ValueError: no", "ValueError: no"), (b"\x91\x01", "cannot be read")]
 )
 def test_a_server_that_fails_keeps_the_rows_and_is_one_line(tmp_path, capsys, last, text):
-    with stock_like(after(60, last)) as url:
+    with stock_like(after(60, last, pack({"actions": [[0]]}))) as url:
         assert run("--policy", url, "--seeds", 50, "--out", tmp_path / "e") == 5
     error = capsys.readouterr().err.splitlines()
     assert text in error[-1]

@@ -62,6 +62,18 @@ def actions(value):
     return msgpack.packb({"actions": {**data, b"shape": array.shape}})
 
 
+def after(count, last, answer):
+    """Send `answer` to the first `count` observations, then `last` or what it returns."""
+    left = iter(range(count))
+
+    def react(connection, frame):
+        if next(left, None) is not None:
+            return answer
+        return last(connection) if callable(last) else last
+
+    return react
+
+
 @contextmanager
 def stock_like(answer):
     """Serve as openpi does: `answer(connection, frame)` returns the frame to send, or None."""

@@ -15,6 +15,7 @@ import pytest
 import z3
 
 from cloudrc.config.resolved import ResolvedGuard
+from cloudrc.config.robot import RobotLimits
 from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState
 from cloudrc.robots.pelican.low_level import LowLevel
 from cloudrc.sim.readings import Readings
@@ -39,9 +40,9 @@ def sensed(position=HERE, velocity=ZERO):
     return Readings.of((*position, *UPRIGHT), (*velocity, *ZERO))
 
 
-def armed(limits=LIMITS, now_ns=0):
+def armed(limits=LIMITS, now_ns=0, fence=FENCE, **robot):
     """Return a guard in GROUND with a started mission."""
-    guard = Guard(limits, FENCE)
+    guard = Guard(limits, fence, RobotLimits(**robot))
     guard.start_mission(now_ns)
     return guard
 
@@ -61,13 +62,13 @@ def run(guard, start_ns, end_ns, position=HERE, velocity=ZERO):
     ]
 
 
-def feed(guard, start_ns, count, velocity=(1.0, 0.0, 0.0), every_ns=10 * MS, position=HERE):
-    """Give fresh commands and tick; return the time after the last one."""
+def feed(guard, start_ns, count, velocity=(1.0, 0.0, 0.0), position=HERE, moves=ZERO):
+    """Give fresh commands and tick, with constant readings; return the time after the last one."""
     now_ns = start_ns
     for _ in range(count):
         guard.accept_command(command(velocity, basis_ns=now_ns), now_ns)
-        run(guard, now_ns, now_ns + every_ns, position)
-        now_ns += every_ns
+        run(guard, now_ns, now_ns + 10 * MS, position, moves)
+        now_ns += 10 * MS
     return now_ns
 
 

@@ -99,7 +99,9 @@ def test_the_position_hold_is_no_faster_than_its_limits(speed_max, allowed):
         ((0.05, 0.05, 0.05), 60.0, 0.0, (-rules.INTEGRAL_MAX,) * 3),
         ((-0.05, -0.05, -0.05), 60.0, 0.0, (rules.INTEGRAL_MAX,) * 3),
         # Far from the hold point it stays: otherwise it would overshoot that point.
-        *(((0.06, 0.0, 0.0801)[k:] + (0.06, 0.0, 0.0801)[:k], 1.0, 0.0, ZERO) for k in range(3)),
+        ((0.06, 0.0, 0.0801), 1.0, 0.0, ZERO),
+        ((0.0801, 0.06, 0.0), 1.0, 0.0, ZERO),
+        ((0.0, 0.0801, 0.06), 1.0, 0.0, ZERO),
         ((0.03, -0.02, 0.5), 2.0, 0.5, (-0.012, 0.008, -0.5)),  # in a descent sideways only
     ],
 )

@@ -88,10 +88,8 @@ def test_put_on_the_ground_nothing_is_armed_or_remembered():
 def test_a_command_with_an_absurd_value_is_rejected(bad, axis):
     guard = tracking((0.5, 0.0, 0.0))
     before = run(guard, 0, 100 * MS)[-1]
-    values = [1.0, 1.0, 1.0, 0.1]
-    values[axis] = bad
-    absurd = command(tuple(values[:3]), 100 * MS, values[3])
-    assert guard.accept_command(absurd, 100 * MS) == "range"
+    *velocity, yaw_rate = (bad if k == axis else 0.1 for k in range(4))
+    assert guard.accept_command(command(velocity, 100 * MS, yaw_rate), 100 * MS) == "range"
     assert run(guard, 100 * MS, 102 * MS) == [before]
     assert guard.yaw_rate == 0.0
 
@@ -420,7 +418,7 @@ def test_an_acknowledgement_names_the_condition_of_a_take_off(velocity, cause):
 def felt(tilt_deg=0.0):
     """Return the readings of a robot that is tilted about x."""
     half = radians(tilt_deg) / 2
-    return Readings.of((*HERE, cos(half), sin(half), 0.0, 0.0), (*ZERO, *ZERO))
+    return Readings.of((*HERE, cos(half), sin(half), 0.0, 0.0), (0.0,) * 6)
 
 
 @pytest.mark.parametrize("make", [tracking, holding, landing])
