@@ -25,6 +25,12 @@ def law(tmp_path):
     return write
 
 
+@pytest.fixture
+def evaluate(call):
+    """Return a function that runs `cloudrc eval`, checks its exit code, and returns its output."""
+    return lambda *words, code=0: call("eval --env CartPole-v1 --jobs 1", *words, code=code)
+
+
 @pytest.fixture(autouse=True)
 def no_figures(monkeypatch):
     """Draw no figures, which takes seconds; a test of them begins with `monkeypatch.undo()`."""

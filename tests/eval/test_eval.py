@@ -15,7 +15,6 @@ from cloudrc.cli.eval_values import (
     read_compute,
     read_mapped,
 )
-from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.eval.episode import as_actions, play, width_of
 from cloudrc.eval.setup import Episode, EvalSetup, link_at
@@ -156,15 +155,15 @@ class Random(Task):
 gymnasium.register("Random-v0", Random)
 
 
-def test_an_environment_that_does_not_follow_its_seed_is_told_and_may_get_it(law, tmp_path, capsys):
-    words = ["eval", "--env", "Random-v0", "--policy", law(STILL), "--seeds", "1", "--jobs", "1"]
-    for name, more, warned in (("a", [], True), ("b", ["--env-arg", "seed={seed}"], False)):
-        assert main([*words, *more, "--out", str(tmp_path / name)]) == 0
-        assert ("not paired" in capsys.readouterr().err) is warned
-        page = (tmp_path / name / "report.html").read_text()
-        assert ("not paired" in page) is warned
-        document = json.loads((tmp_path / name / "eval.json").read_text())
-        assert document["repeatable"] is not warned
+@pytest.mark.parametrize(("more", "warned"), [([], True), (["--env-arg", "seed={seed}"], False)])
+def test_an_environment_that_does_not_follow_its_seed_is_told_and_may_get_it(
+    law, tmp_path, evaluate, more, warned
+):
+    words = "--env", "Random-v0", "--policy", law(STILL), "--seeds", 1, "--out", tmp_path / "e"
+    assert ("not paired" in evaluate(*words, *more).err) is warned
+    assert ("not paired" in (tmp_path / "e" / "report.html").read_text()) is warned
+    document = json.loads((tmp_path / "e" / "eval.json").read_text())
+    assert document["repeatable"] is not warned
 
 
 def test_spaces_without_numbers_are_refused_and_whole_numbers_are_integers():
@@ -202,10 +201,6 @@ def test_a_round_trip_keeps_the_ratio_of_the_profile():
         check_round_trips("handover", (80.0,))
 
 
-def run(*words):
-    return main(["eval", "--env", "CartPole-v1", "--jobs", "1", *map(str, words)])
-
-
 SEES = """
 import numpy as np
 def infer(observation):
@@ -217,30 +212,28 @@ def infer(observation):
 """
 
 
-def test_executors_have_parameters_and_the_policy_sees_what_the_robot_has(law, tmp_path, capsys):
+def test_executors_have_parameters_and_the_policy_sees_what_the_robot_has(law, tmp_path, evaluate):
     path, folder = law(SEES), tmp_path / "out"
-    words = ("--policy", path, "--rtt", "50", "--seeds", "1", "--max-steps", "20", "--out", folder)
-    law_of = ("--env", "Pendulum-v1", *words)
-    assert run(*law_of, "--executor", "rtc,async", "--set", "execute=2", "share=.25") == 0
-    assert run(*law_of, "--executor", "async", "--set", "share=.75", "-o", "json") == 0
+    words = "--rtt 50 --seeds 1 --max-steps 20 --env Pendulum-v1 --policy".split()
+    words += [path, "--out", folder, "--executor"]
+    evaluate(*words, "rtc,async", "--set", "execute=2", "share=.25")
+    evaluate(*words, "async", "--set", "share=.75", "-o", "json")
     rows = [json.loads(line) for line in (folder / "rows.jsonl").read_text().splitlines()]
     names = {row["point"]["executor"] for row in rows}
     assert names == {"no network", "rtc execute=2", "async share=0.25", "async share=0.75"}
     seen = Path(path + ".seen").read_text().splitlines()
     assert {*seen} == {"6 1 1"}  # after 2 of 8 actions; 50 ms are a step
-    capsys.readouterr()
-    assert run(*law_of, "--executor", "async", "--set", "shore=.5") == 2
-    assert "--set: no parameter named 'shore'; " in capsys.readouterr().err
+    refused = evaluate(*words, "async", "--set", "shore=.5", code=2).err
+    assert "--set: no parameter named 'shore'; " in refused
 
 
-def test_an_evaluation_has_a_table_a_page_and_rows_and_continues(law, tmp_path, capsys):
+def test_an_evaluation_has_a_table_a_page_and_rows_and_continues(law, tmp_path, evaluate):
     words = ["--policy", law(), "--rtt", "0,200", "--success-at", 500, "--out", tmp_path / "e"]
-    assert run(*words, "--seeds", 2) == 0
+    evaluate(*words, "--seeds", 2)
     rows = (tmp_path / "e" / "rows.jsonl").read_text().splitlines()
-    assert run(*words, "--seeds", 3, "-o", "json") == 0
+    document = json.loads(evaluate(*words, "--seeds", 3, "-o", "json").out)
     more = (tmp_path / "e" / "rows.jsonl").read_text().splitlines()
     assert (len(rows), len(more), more[:6]) == (6, 9, rows)
-    document = json.loads(capsys.readouterr().out.partition("\n{")[2].join("{}")[:-1])
     bare, near, far = document["outcomes"]
     assert (near["successes"], near["episodes"], far["successes"]) == (3, 3, 0)
     assert near["success_low"] == pytest.approx(0.292, abs=0.001)
@@ -252,10 +245,10 @@ def test_an_evaluation_has_a_table_a_page_and_rows_and_continues(law, tmp_path, 
 @pytest.mark.parametrize(
     ("last", "text"), [("ValueError: no", "ValueError: no"), (b"\x91\x01", "cannot be read")]
 )
-def test_a_server_that_fails_keeps_the_rows_and_is_one_line(tmp_path, capsys, last, text):
+def test_a_server_that_fails_keeps_the_rows_and_is_one_line(tmp_path, evaluate, last, text):
     with stock_like(after(60, last, pack({"actions": [[0]]}))) as url:
-        assert run("--policy", url, "--seeds", 50, "--out", tmp_path / "e") == 5
-    error = capsys.readouterr().err.splitlines()
+        said = evaluate("--policy", url, "--seeds", 50, "--out", tmp_path / "e", code=5)
+    error = said.err.splitlines()
     assert text in error[-1]
     assert "rows are kept" in error[-2]
     assert len((tmp_path / "e" / "rows.jsonl").read_text().splitlines()) > 2
@@ -270,13 +263,12 @@ def test_the_policy_of_the_documentation_stands_where_the_table_says(law, tmp_pa
 
 
 @pytest.mark.full
-def test_the_command_of_the_documentation_prints_its_table(law, tmp_path, capsys, monkeypatch):
+def test_the_command_of_the_documentation_prints_its_table(law, tmp_path, call, monkeypatch):
     law(blocks("eval", "python")[0])
     monkeypatch.chdir(tmp_path)
     command = next(each for each in blocks("eval", "bash") if each.startswith("cloudrc eval"))
-    assert main(shlex.split(command.replace("\\\n", " "))[1:]) == 0
+    said = call("", *shlex.split(command.replace("\\\n", " "))[1:])
     table = blocks("eval", "text")[0].strip().splitlines()
-    said = capsys.readouterr()
     assert table.pop(0) in said.err.splitlines()  # about the work, before it
     printed = iter(said.out.splitlines())  # in this order; "..." stands for lines between them
     assert [line for line in table if line != "..." and line not in printed] == []

@@ -1,7 +1,5 @@
 """Which folders an evaluation goes on with."""
 
-from cloudrc.cli.main import main
-
 LAW = "def infer(observation):\n    return {'actions': [[0]]}\n"
 OTHER = [
     "--env Pendulum-v1 --policy {law}",
@@ -11,21 +9,18 @@ OTHER = [
 ]
 
 
-def test_a_folder_takes_no_episodes_of_another_environment_or_policy(tmp_path, capsys):
-    path, out = tmp_path / "law.py", tmp_path / "out"
-    other = tmp_path / "other.py"
+def test_a_folder_takes_no_episodes_of_another_environment_or_policy(tmp_path, call):
+    path, other, out = (tmp_path / name for name in ("law.py", "other.py", "out"))
     for each in (path, other):
         each.write_text(LAW)
     first = f"eval --env CartPole-v1 --policy {path} --seeds 1 --jobs 1 --out {out}"
-    assert main(first.split()) == 0
+    call(first)
     before = {each.name: each.read_bytes() for each in out.iterdir()}
-    capsys.readouterr()
+    said = f"--out {out}: has the episodes of CartPole-v1 with {path}, or of other arguments"
     for line in OTHER:
-        words = line.format(law=path, other=other).split()
-        assert main(["eval", *words, "--seeds", "1", "--out", str(out)]) == 2
-        said = f"--out {out}: has the episodes of CartPole-v1 with {path}, or of other arguments"
-        assert said in capsys.readouterr().err
+        words = line.format(law=path, other=other)
+        assert said in call(f"eval --seeds 1 --out {out} {words}", code=2).err
         assert {each.name: each.read_bytes() for each in out.iterdir()} == before
-    assert main([*first.split(), "--rtt", "10", "--link", "lte", "--executor", "broker"]) == 0
+    call(f"{first} --rtt 10 --link lte --executor broker")
     rows = (out / "rows.jsonl").read_text().splitlines()
     assert len(rows) == 3  # that without a network is the same

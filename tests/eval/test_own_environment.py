@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
 from cloudrc.eval.episode import check_environment
 from cloudrc.eval.setup import EvalSetup
@@ -36,28 +35,25 @@ gymnasium.register("ID", entry_point=My)
 
 
 @pytest.mark.parametrize(
-    ("env", "place"),
+    ("place", "module", "name", "env"),
     [
-        ("beside_env:Beside-v0", "laws"),
-        pytest.param("elsewhere/else_env.py:space/Else-v0", "elsewhere", marks=pytest.mark.full),
+        ("laws", "beside_env", "Beside-v0", "beside_env:Beside-v0"),
+        pytest.param("elsewhere", "else_env", "space/Else-v0",
+                     "elsewhere/else_env.py:space/Else-v0", marks=pytest.mark.full),
     ],
-)
+)  # fmt: skip
 def test_an_environment_may_be_a_file_here_or_beside_the_policy(
-    tmp_path, monkeypatch, capsys, env, place
+    tmp_path, monkeypatch, call, place, module, name, env
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    module, name = env.removesuffix("/").split("/", 1)[-1].split(":")
-    module = module.removesuffix(".py")
-    Path("laws").mkdir()
-    Path(place).mkdir(exist_ok=True)
+    for folder in {"laws", place}:
+        Path(folder).mkdir()
     Path("laws/law.py").write_text(STILL)
-    source = MY_ENV.replace("NAME", module).replace("ID", name)
-    (Path(place) / f"{module}.py").write_text(source)
-    (Path(place) / f"{module}_sizes.py").touch()
-    line = f"eval --env {env} --policy laws/law.py --seeds 2 --jobs 2"
-    assert main(line.split()) == 0
-    assert "4 episodes, step 0.05 s (control_hz of My)" in capsys.readouterr().err
+    Path(place, f"{module}.py").write_text(MY_ENV.replace("NAME", module).replace("ID", name))
+    Path(place, f"{module}_sizes.py").touch()
+    said = call(f"eval --env {env} --policy laws/law.py --seeds 2 --jobs 2")
+    assert "4 episodes, step 0.05 s (control_hz of My)" in said.err
     (folder,) = (each for each in Path("runs").iterdir() if not each.is_symlink())
     assert ":" not in folder.name
     told = json.loads((folder / "eval.json").read_text())

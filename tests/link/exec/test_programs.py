@@ -187,17 +187,14 @@ def test_udp_from_end_to_end_has_the_delays_of_the_profile(folder, family, profi
     assert max(found.values()) <= DISTANCE, found
 
 
-def test_link_set_changes_the_link_between_running_programs(folder):
+def test_link_set_changes_the_link_between_running_programs(folder, call):
     client = "until [ -e changed ]; do sleep 0.1; done; "
     client += "curl -s -o copy -w '%{time_connect}\\n' http://{server}:8000/"
     process = start("-o", "out", client=client)
     try:
         wait_until((folder / "out/link/downlink/link.json").exists)
-        words = [sys.executable, "-m", "cloudrc", "link", "set", "--run", "out"]
-        changed = subprocess.run([*words, "downlink.delay_ms=150"], capture_output=True, text=True)
-        assert changed.returncode == 0, changed.stderr
-        refused = subprocess.run([*words, "downlink.loss=2"], capture_output=True, text=True)
-        assert refused.returncode == 2
+        call("link set --run out downlink.delay_ms=150")
+        call("link set --run out downlink.loss=2", code=2)
         (folder / "changed").touch()
     finally:
         out, _ = process.communicate(timeout=60)
@@ -209,16 +206,9 @@ def test_link_set_changes_the_link_between_running_programs(folder):
 
 def test_metrics_and_an_exposed_port_are_on_this_machine(folder):
     metrics, exposed = free_ports(2)
-    process = start(
-        "--link",
-        "paper-p3",
-        "--metrics-port",
-        str(metrics),
-        "--expose",
-        str(exposed),
-        server=f"exec {sys.executable} -m http.server {exposed}",
-        client="sleep 60",
-    )
+    flags = f"--link paper-p3 --metrics-port {metrics} --expose {exposed}".split()
+    server = f"exec {sys.executable} -m http.server {exposed}"
+    process = start(*flags, server=server, client="sleep 60")
 
     def fetch(port, path):
         with socket.create_connection(("127.0.0.1", port)) as one:
@@ -241,10 +231,7 @@ def test_metrics_and_an_exposed_port_are_on_this_machine(folder):
         assert fetch(exposed, "/blob").endswith((folder / "blob").read_bytes())
     finally:
         process.send_signal(signal.SIGINT)
-        process.wait(20)
-        process.stdout.close()
-        process.stderr.close()
-    assert process.returncode == 130
+    assert process.wait(20) == 130
 
 
 def children(process):
@@ -261,12 +248,7 @@ def alive(namespaces):
 
 
 @pytest.mark.parametrize(
-    "way",
-    [
-        "SIGTERM",
-        "holder",
-        pytest.param("SIGKILL", marks=pytest.mark.smoke),
-    ],
+    "way", ["SIGTERM", "holder", pytest.param("SIGKILL", marks=pytest.mark.smoke)]
 )
 def test_nothing_is_left_whatever_ends_the_command(folder, way):
     """The client ignores SIGTERM and leaves a child in a session of its own."""
