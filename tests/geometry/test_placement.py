@@ -83,12 +83,6 @@ POST = '<body name="post" pos="1.2 0 1"><geom type="capsule" size=".05 1"/></bod
 GROUND = '<geom type="plane" size="5 5 .1"/>'
 
 
-@pytest.fixture
-def own_scene(scene_with):
-    """Return a function that writes a scene with some bodies."""
-    return lambda bodies: World(scene=scene_with(bodies))
-
-
 @pytest.mark.parametrize(
     ("bodies", "waypoints", "reason"),
     [
@@ -98,9 +92,9 @@ def own_scene(scene_with):
         (POST.replace("<geom", '<geom contype="0" conaffinity="0"'), [(2.4, 0, 1)], ""),
     ],
 )
-def test_every_body_of_a_scene_of_ones_own_is_in_the_way(own_scene, bodies, waypoints, reason):
+def test_every_body_of_a_scene_of_ones_own_is_in_the_way(scene_with, bodies, waypoints, reason):
     mission = MissionConfig(waypoints=tuple(Waypoint(position_m=each) for each in waypoints))
-    said = "\n".join(map(str, check_mission(mission, own_scene(bodies))))
+    said = "\n".join(map(str, check_mission(mission, World(scene=scene_with(bodies)))))
     assert reason in said if reason else said == ""
 
 
@@ -113,7 +107,7 @@ def test_every_body_of_a_scene_of_ones_own_is_in_the_way(own_scene, bodies, wayp
         (POST.replace("1.2 0 1", "0 0 1"), None, ("world", "scene"), "touches post"),
     ],
 )
-def test_a_scene_fits_its_missions(own_scene, bodies, touch, path, reason):
-    problems = check_scene(own_scene(bodies), touch)
+def test_a_scene_fits_its_missions(scene_with, bodies, touch, path, reason):
+    problems = check_scene(World(scene=scene_with(bodies)), touch)
     assert [problem.path for problem in problems] == ([path] if path else [])
     assert all(reason in problem.reason for problem in problems)

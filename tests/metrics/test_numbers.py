@@ -344,13 +344,12 @@ def test_an_empty_recording_has_no_numbers():
 def test_a_waypoint_with_a_yaw_needs_the_true_yaw_too(degree, reached):
     half = radians(degree) / 2
 
-    def turned(record):
-        facing = (cos(half), 0.0, 0.0, sin(half))
-        return {"odometry": record.odometry._replace(orientation_wxyz=facing)}
+    def turned(odometry):
+        return odometry._replace(orientation_wxyz=(cos(half), 0.0, 0.0, sin(half)))
 
     log = flown()
-    log.change(GroundTruth, lambda n, record: record._replace(**turned(record)))
-    log.tell(lambda sent: turned(sent.telemetry))
+    log.change(GroundTruth, lambda _, row: row._replace(odometry=turned(row.odometry)))
+    log.tell(lambda sent: {"odometry": turned(sent.telemetry.odometry)})
     flight = log.flight(mission=to_point(10.0, 10.0, yaw_deg=90.0))
     assert measured(flight, "waypoints_reached") == reached
     assert measured(flight, "yaw_error") == pytest.approx(abs(radians(90 - degree)))

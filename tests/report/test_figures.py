@@ -7,17 +7,11 @@ import numpy as np
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.config.profile import DirectionConfig
 from cloudrc.report.figures import FIGURES, PRINT_KINDS, draw_all, own_settings
 from cloudrc.report.figures.style import RC, Look, Subject
 from cloudrc.robots.shapes import read_shapes
-from tests.metrics.conftest import ONE_PIPE, OPEN_AIR, START, flown
-
-CALM = DirectionConfig(delay_ms=50.0)
-
-
-def subject_of(log):
-    return Subject(log.flight(ONE_PIPE), CALM, CALM)
+from tests.metrics.conftest import OPEN_AIR, START, flown
+from tests.report.test_marks import CALM, subject_of
 
 
 @pytest.mark.parametrize("end_ns", [0, START], ids=["empty", "ends at the start"])
@@ -27,22 +21,22 @@ def test_a_flight_without_data_is_drawn(name, end_ns):
     for records in (log.world, log.cloud):
         records[:] = [record for record in records if record.stamp_ns <= end_ns]
     with matplotlib.rc_context(RC):
-        FIGURES[name][0](subject_of(log)).draw_without_rendering()
+        FIGURES[name][0](subject_of(log=log)).draw_without_rendering()
 
 
 def test_figures_ignore_the_users_matplotlib_settings(monkeypatch):
     """matplotlib reads settings in the working folder, which may be a run from somebody else."""
     monkeypatch.setattr("cloudrc.report.figures.FIGURES", {"error": FIGURES["error"]})
-    (picture,) = draw_all(subject_of(flown()))
+    (picture,) = draw_all(subject_of())
     theirs = {"text.usetex": True, "axes.facecolor": "red", "lines.linestyle": ":"}
     with matplotlib.rc_context(theirs):
-        assert draw_all(subject_of(flown())) == [picture]
+        assert draw_all(subject_of()) == [picture]
         assert matplotlib.rcParams["text.usetex"], "put back"
 
 
 def test_text_stays_text_and_a_flight_in_real_time_has_a_date(monkeypatch):
     monkeypatch.setattr("cloudrc.report.figures.FIGURES", {"error": FIGURES["error"]})
-    subject = replace(subject_of(flown()), look=Look(3.5, 8.0))
+    subject = replace(subject_of(), look=Look(3.5, 8.0))
     (picture,) = draw_all(subject)
     assert b"1970-01-0" not in picture.files["svg"]
     subject.flight.recording.metadata = {"wall_clock_offset_ns": "86400000000000"}
