@@ -1,10 +1,10 @@
-"""Cloud's side of the handshake, the faults that it causes, and an end's datagrams."""
+"""Cloud's side of the handshake, and the faults that it causes."""
 
 from collections import Counter
 
 import pytest
 
-from cloudrc.records import Fault, SessionOpened
+from cloudrc.records import Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Accept, Hello, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
@@ -155,16 +155,3 @@ def test_a_text_is_told_once_in_a_session():
         end._told.clear()
         end._tell_refusal("tag", codec.encode_header(kind, 1, 1, 1), 7)
         assert end.take_records() == [Fault(7, "key", KEY_TEXT)] * (kind <= Kind.BUSY)
-
-
-def test_an_end_gives_its_datagrams_and_records_once():
-    bare = Bare(ring())
-    world = bare.world
-    bare.send(bare.cloud("a").hello())
-    assert world.epoch == 1
-    assert any(isinstance(record, SessionOpened) for record in world.take_records())
-    assert world.take_records() == []
-    world.handle_deadline(world.next_deadline_ns())
-    assert codec.peek(world.take_datagrams()[-1])[:2] == (Kind.TELEMETRY, 1)
-    assert world.take_datagrams() == []
-    assert world.counts["sent"] == 3, "a challenge, an acceptance, telemetry"
