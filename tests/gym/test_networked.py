@@ -29,15 +29,7 @@ def equal(one, other):
     return one.dtype == other.dtype and one.tobytes() == other.tobytes()
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: gymnasium.make("Pendulum-v1"),
-        lambda: gymnasium.make("CartPole-v1"),
-        lambda: gymnasium.make("InvertedPendulum-v5"),
-        Mixed,
-    ],
-)
+@pytest.mark.parametrize("make", [lambda: gymnasium.make("InvertedPendulum-v5"), Mixed])
 def test_an_ideal_link_changes_no_bit(make):
     bare, env = make(), Networked(make())
     bare.action_space.seed(7)
@@ -237,8 +229,8 @@ def test_the_policy_may_observe_the_age_and_its_own_last_actions(space):
         Counter(space), both_ways(10, 20), observe_age=True, observe_actions=3, start="answer"
     )
     answers = [np.full(space.shape, n + 1, space.dtype)[()] for n in range(4)]
-    seen, _ = env.reset()
-    assert seen["actions"].tolist() == np.zeros((3, *space.shape)).tolist()
+    nothing = np.zeros((3, *space.shape)).tolist()
+    assert env.reset()[0]["actions"].tolist() == nothing
     for answer in answers[:2]:  # the first observation is asked for, and none in the next tick
         seen, *_ = env.step(answer)
         assert env.observation_space.contains(seen)
@@ -248,4 +240,4 @@ def test_the_policy_may_observe_the_age_and_its_own_last_actions(space):
     for answer in answers[2:]:
         seen, *_ = env.step(answer)
     assert seen["actions"].tolist() == [answers[n].tolist() for n in (0, 2, 3)]
-    assert env.reset()[0]["actions"].tolist() == np.zeros((3, *space.shape)).tolist()
+    assert env.reset()[0]["actions"].tolist() == nothing
