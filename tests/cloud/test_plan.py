@@ -116,6 +116,11 @@ class Lost(Modelled):
 NOWHERE = Odometry(0, (nan, 0.0, 0.0), UPRIGHT, ZERO, ZERO)
 
 
+def turned(length):
+    """Return a state whose orientation has this length."""
+    return Odometry(0, ZERO, (0.0, 0.6 * length, 0.8 * length, 0.0), ZERO, ZERO)
+
+
 @pytest.mark.parametrize(
     ("predictor", "controller", "kind", "text"),
     [
@@ -123,6 +128,8 @@ NOWHERE = Odometry(0, (nan, 0.0, 0.0), UPRIGHT, ZERO, ZERO)
         (Modelled(), Breaking(nan), "controller", "its planned velocity at [1] is nan"),
         (Lost(NOWHERE), Integrating(), "predictor", "its position at [0] is nan"),
         (Lost(None), Integrating(), "predictor", "its result is None, not 5 values"),
+        (Lost(turned(0.99)), Integrating(), "predictor", "has the length 0.99, not 1"),
+        (Lost(turned(1.01)), Integrating(), "predictor", "has the length 1.01, not 1"),
     ],
 )
 def test_without_its_plan_a_command_leaves_and_a_fault_says_why(predictor, controller, kind, text):

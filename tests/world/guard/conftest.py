@@ -196,7 +196,6 @@ class Symbol:
 
     __add__ = __radd__ = arithmetic(z3.fpAdd)
     __sub__ = arithmetic(z3.fpSub)
-    __rsub__ = arithmetic(lambda rounding, a, b: z3.fpSub(rounding, b, a))
     __mul__ = __rmul__ = arithmetic(z3.fpMul)
     __lt__, __le__ = comparison(z3.fpLT), comparison(z3.fpLEQ)
     __gt__, __ge__ = comparison(z3.fpGT), comparison(z3.fpGEQ)
@@ -256,8 +255,6 @@ def root(x, top=LARGEST):
 
     For x up to `top` it is at most the root of `top`: a correctly rounded root is monotonic.
     """
-    if isinstance(x, float):
-        return sqrt(x)
     x.run.prove(z3.And(x.term >= 0.0, z3.Not(z3.fpIsInf(x.term))))
     r = x.run.fresh("root")
     x.run.learn(z3.And(r.term >= 0.0, r.term <= 1.5e154))

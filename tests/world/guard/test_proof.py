@@ -55,8 +55,8 @@ def test_clamp_moves_only_values_outside_into_the_interval():
 def test_approach_speed_is_a_number_and_has_its_lower_bound(braking, caution):
     def check(run):
         reach = run.fresh("reach")
-        answer = rules.approach_speed(reach, rules.stop_coefficient(braking), caution)
-        term = answer.term if hasattr(answer, "term") else z3.FPVal(answer, z3.Float64())
+        speed = rules.approach_speed(reach, rules.stop_coefficient(braking), caution)
+        term = lift(run, speed).term
         run.prove(term >= -rules.RETURN_SPEED_MAX)
         # At the face or outside never outwards; inside never back.
         run.prove(z3.Implies(reach.term <= 0.0, term <= 0.0))
