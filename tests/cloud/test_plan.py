@@ -32,6 +32,11 @@ class Modelled(LastSample):
         return Obedient(self.position)
 
 
+def planning(predictor=None, controller=None):
+    """Return a loop with plans of 50 ms, which has heard telemetry."""
+    return loop(None, predictor or Modelled(), controller, heard_ms=1090, echo_ms=1000, plan=0.05)
+
+
 def make_plan(controller, setpoint, velocity, now_ns, count):
     """Plan `count` commands for a robot at the origin."""
     a_loop = loop(None, Modelled(ZERO), controller, plan=0.01 * count)
@@ -82,7 +87,7 @@ def test_a_plan_ends_before_a_velocity_that_the_guard_refuses():
 
 
 def test_a_command_has_the_plan_and_its_time():
-    a_loop = loop(predictor=Modelled(), heard_ms=1090, echo_ms=1000, plan=0.05)
+    a_loop = planning()
     sent, control = command(a_loop, 1094)
     assert sent.planned_ns == 100 * MS + round(control.horizon * 1e9) == 190 * MS
     assert along_x(sent.plan) == pytest.approx([0.8 * 0.992**k for k in range(1, 6)])
@@ -90,9 +95,8 @@ def test_a_command_has_the_plan_and_its_time():
 
 
 def test_without_a_model_or_while_frozen_there_is_no_plan():
-    a_loop = loop(predictor=Modelled(), heard_ms=1100, echo_ms=1000, plan=0.05)
-    assert command(a_loop, 1600)[0][3:] == (ZERO, 0.0, (), -1)
-    sent, _ = command(loop(heard_ms=1090, echo_ms=1000, plan=0.05), 1094)
+    assert command(planning(), 1600)[0][3:] == (ZERO, 0.0, (), -1)
+    sent, _ = command(planning(LastSample()), 1094)
     assert (sent.plan, sent.planned_ns) == ((), -1)
 
 
@@ -133,7 +137,7 @@ def turned(length):
     ],
 )
 def test_without_its_plan_a_command_leaves_and_a_fault_says_why(predictor, controller, kind, text):
-    a_loop = loop(None, predictor, controller, heard_ms=1090, echo_ms=1000, plan=0.05)
+    a_loop = planning(predictor, controller)
     sent, _ = command(a_loop, 1094)
     assert (sent.plan, sent.velocity) == ((), (1.0, 0.0, 0.0))
     assert a_loop.counts == {f"{kind}_failed": 1}
@@ -157,7 +161,7 @@ class Planning(Controller):
 
 def test_cloud_sends_a_controllers_own_plan_and_remembers_its_positions():
     controller = Planning([(1.0, 0.0, 0.0), (2, 0, 0), (3.0, 0.0, 0.0), (2000.0, 0.0, 0.0)])
-    a_loop = loop(None, Modelled(), controller, heard_ms=1090, echo_ms=1000, plan=0.05)
+    a_loop = planning(None, controller)
     sent, _ = command(a_loop, 1094)
     assert (sent.velocity, sent.yaw_rate) == ((1.0, 0.0, 0.0), 0.25)
     assert sent.plan == ((2.0, 0.0, 0.0), (3.0, 0.0, 0.0)), "the guard refuses the last one"
@@ -170,6 +174,6 @@ def test_cloud_sends_a_controllers_own_plan_and_remembers_its_positions():
 
 @pytest.mark.parametrize("wrong", [[(nan, 0.0, 0.0)], [(1.0, 2.0)], [], None])
 def test_a_wrong_plan_is_a_failure(wrong):
-    a_loop = loop(None, Modelled(), Planning(wrong), heard_ms=1090, echo_ms=1000, plan=0.05)
+    a_loop = planning(None, Planning(wrong))
     assert command(a_loop, 1094)[0].velocity == ZERO
     assert a_loop.counts == {"controller_failed": 1}

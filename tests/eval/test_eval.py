@@ -101,8 +101,6 @@ class Task(gymnasium.Env):
     dt = 0.1
     action_space = gymnasium.spaces.Box(-1, 1, (2,))
     observation_space = gymnasium.spaces.Dict({"eye": gymnasium.spaces.Box(0, 255, (2,), np.uint8)})
-    metadata = {"render_modes": []}  # noqa: RUF012
-    render_mode = None
 
     def __init__(self, key="success", fails=False):
         self.key, self.fails = key, fails

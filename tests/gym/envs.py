@@ -9,8 +9,6 @@ class Counter(gymnasium.Env):
     """Observes the number of the step; keeps the actions that it executed."""
 
     dt = 0.01
-    metadata = {"render_modes": []}  # noqa: RUF012
-    render_mode = None
 
     def __init__(self, action_space=None, limit=10**9):
         self.action_space = action_space or spaces.Box(-1000.0, 1000.0, (1,))
@@ -32,8 +30,7 @@ class Counter(gymnasium.Env):
 class Mixed(gymnasium.Env):
     """Has spaces of every kind."""
 
-    metadata = {"render_modes": [], "render_fps": 50}  # noqa: RUF012
-    render_mode = None
+    metadata = {"render_fps": 50}  # noqa: RUF012
 
     def __init__(self):
         keys = spaces.Tuple((spaces.MultiBinary(2), spaces.MultiDiscrete([2, 3])))

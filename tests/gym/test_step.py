@@ -12,7 +12,7 @@ from tests.gym.envs import Counter
 
 def telling(fps=None, **told):
     """Return an environment that tells the given times and rates."""
-    attributes = {"dt": None, "metadata": {"render_modes": [], "render_fps": fps}, **told}
+    attributes = {"dt": None, "metadata": {"render_fps": fps}, **told}
     return type("Told", (Counter,), attributes)()
 
 

@@ -79,6 +79,11 @@ class Log:
             changed = [next(new) if isinstance(each, kind) else each for each in records]
             records[:] = [each for each in changed if each is not None]
 
+    def keep(self, wanted):
+        """Drop the records whose stamps [ns] are not `wanted`."""
+        for records in (self.world, self.cloud):
+            records[:] = [each for each in records if wanted(each.stamp_ns)]
+
     def tell(self, how):
         """Replace those values of each telemetry that `how(sent)` returns."""
 

@@ -17,8 +17,7 @@ from tests.metrics.conftest import SECOND, at, flown, good
 def lossy(log, *spans, **options):
     """Return the flight of a log without the records of the spans of time [s]."""
     holes = [Hole(at(first), at(last)) for first, last in spans]
-    for records in (log.world, log.cloud):
-        records[:] = [each for each in records if not any(b < each.stamp_ns < e for b, e in holes)]
+    log.keep(lambda stamp_ns: not any(b < stamp_ns < e for b, e in holes))
     flight = log.flight(**options)
     flight.recording.holes, flight.recording.told = tuple(holes), "damaged"
     return flight
@@ -91,8 +90,7 @@ def test_a_trace_has_no_loss_at_the_edges_of_a_hole():
 
 def test_a_recording_cut_short_is_measured_up_to_its_end():
     log = flown()
-    for records in (log.world, log.cloud):
-        records[:] = [each for each in records if each.stamp_ns <= at(6)]
+    log.keep(lambda stamp_ns: stamp_ns <= at(6))
     flight = log.flight()
     flight.recording.holes, flight.recording.lacking = (Hole(at(6), END_NS),), "cut short"
     assert "age_at_actuator_max" in measure_all(flight)[0]

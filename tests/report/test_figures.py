@@ -18,8 +18,7 @@ from tests.report.test_marks import CALM, subject_of
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_flight_without_data_is_drawn(name, end_ns):
     log = flown()
-    for records in (log.world, log.cloud):
-        records[:] = [record for record in records if record.stamp_ns <= end_ns]
+    log.keep(lambda stamp_ns: stamp_ns <= end_ns)
     with matplotlib.rc_context(RC):
         FIGURES[name][0](subject_of(log=log)).draw_without_rendering()
 

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -42,10 +43,6 @@ def report(folder):
     return json.loads((folder / "report.json").read_text())
 
 
-def filtered(**options):
-    return lambda source, target: rewrite(source, target, **options)
-
-
 def cut(source, target):
     target.write_bytes(source.read_bytes()[: source.stat().st_size // 2])
 
@@ -67,7 +64,7 @@ OTHER = b"seed: 2\nmission: pipes\n"
     ("change", "said"),
     [
         (
-            filtered(keep=lambda c, m: c.topic in ("/odometry", "/cmd_vel")),
+            partial(rewrite, keep=lambda c, m: c.topic in ("/odometry", "/cmd_vel")),
             "it holds 0 of 401 on /telemetry, .* and 12 more",
         ),
         (cut, "cut short: .* but report.json describes the whole"),
@@ -78,9 +75,9 @@ def test_an_insufficient_recording_is_refused(run, refused, change, said):
     (run / "report.html").write_text("the page")
     change(run / "mission.mcap", run / "n.mcap")
     (run / "n.mcap").replace(run / "mission.mcap")
-    before = {path: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    before = {path: path.read_bytes() for path in run.glob("*.*")}
     assert re.search(said, refused("report", run))
-    assert {path: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
+    assert {path: path.read_bytes() for path in run.glob("*.*")} == before
 
 
 def test_a_torn_recording_has_a_report_that_says_so(run):
