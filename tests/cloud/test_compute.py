@@ -51,10 +51,10 @@ def test_a_command_leaves_after_its_stamp_and_compute_time(compute_ms):
     assert late == ["late"] * (compute_ms > 10), "it is reported once"
 
 
-def begun_and_lasted(cost_ms, share, seconds=20):
-    """Compute a command per 10 ms, or as soon as the last one is done; return both times [ms]."""
+def begun_and_lasted(cost_ms, share):
+    """For 20 s, compute a command per 10 ms or after the last one; return both times [ms]."""
     compute, now_ns, found = ComputeTime(cost_ms * MS, 0.0, None, None, share), 0, []
-    while now_ns < seconds * 1000 * MS:
+    while now_ns < 20_000 * MS:
         lasts_ns = compute.end(now_ns)
         found.append((now_ns / MS, lasts_ns / MS))
         now_ns = max(now_ns + lasts_ns, (now_ns // (10 * MS) + 1) * 10 * MS)

@@ -34,10 +34,10 @@ def infer(observation):
 """
 
 
-def bare(env_id, decide, seed):
-    """Play without cloudrc; return the return and the hash of the world."""
+def bare(env_id, decide):
+    """Play the seed 3 without cloudrc; return the return and the hash of the world."""
     env, digest, total = gymnasium.make(env_id), sha256(), 0.0
-    observation, _ = env.reset(seed=seed)
+    observation, _ = env.reset(seed=3)
     digest.update(observation.tobytes())
     ended = False
     while not ended:
@@ -73,7 +73,7 @@ def test_an_ideal_link_without_compute_time_changes_no_bit_in_a_file_or_behind_a
     with serving(path) as url:
         rows.append(play(episode, EvalSetup(env_id, url)))
     for row in rows:
-        assert (row["numbers"]["return"], row["records_sha256"]) == bare(env_id, decide, 3)
+        assert (row["numbers"]["return"], row["records_sha256"]) == bare(env_id, decide)
 
 
 @pytest.mark.parametrize("told", ["0.06", "times.csv"])

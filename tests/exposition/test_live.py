@@ -39,8 +39,8 @@ def value(live, name, *label_values):
     return live.read()[name][label_values]
 
 
-def wake(at_ms, *, slip_ms=0.0, lateness=1e-4):
-    return Lateness(round((at_ms - slip_ms) * MS), "world", lateness, 2e-4, round(slip_ms * MS))
+def wake(at_ms):
+    return Lateness(at_ms * MS, "world", 1e-4, 2e-4, 0)
 
 
 @pytest.mark.promise("unknown-is-absent")
@@ -111,8 +111,8 @@ def opened(role, at_ms, epoch):
     return SessionOpened(at_ms * MS, role, epoch, "")
 
 
-def arrived(role, at_ms, counter=0, epoch=1):
-    return Arrival(at_ms * MS, role == "cloud", epoch, counter, math.nan, True)
+def arrived(role, at_ms, counter=0):
+    return Arrival(at_ms * MS, role == "cloud", 1, counter, math.nan, True)
 
 
 @pytest.mark.parametrize("role", table.ENDS)

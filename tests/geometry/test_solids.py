@@ -62,20 +62,16 @@ def near(size):
     return np.concatenate((points, np.zeros((1, 3)), np.diag(size), 0.5 * np.diag(size)))
 
 
-def solid_of(shape, size, faces=None):
-    return Solid("it", shape, np.zeros(3), np.eye(3), np.array(size), faces)
-
-
 def test_a_box_of_a_mesh_is_as_far_away_as_a_box(read, monkeypatch):
     monkeypatch.setattr(solids, "_CELLS_MAX", 1000)  # many parts
     geom = '<geom type="mesh" mesh="cube" euler="0 0 45"/>'
     cube = f'<asset><mesh name="cube" vertex="{CUBE}"/></asset>'
     (mesh,) = read(f'<body name="it" pos="1 2 3">{geom}</body>', cube).solids
-    size = (0.2, 0.3, 0.4)
-    points = near(size)
+    size = np.array((0.2, 0.3, 0.4))
+    box, points = Solid("it", "box", np.zeros(3), np.eye(3), size, None), near(size)
     turned = np.array(((1, -1, 0), (1, 1, 0), (0, 0, 2**0.5))) / 2**0.5
     found = mesh.distance(points @ turned.T + (1, 2, 3))
-    assert found == pytest.approx(solid_of("box", size).distance(points), abs=3e-5)
+    assert found == pytest.approx(box.distance(points), abs=3e-5)
     assert mesh.distance(np.ones((4, 2, 3))).shape == (4, 2)
 
 

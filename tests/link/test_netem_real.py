@@ -88,12 +88,12 @@ class Flow:
             meanwhile()
             time.sleep(max(0.0, begin + (index + 1) * period - time.monotonic()))
 
-    def settle(self, quiet=0.5):
+    def settle(self):
         """Wait until nothing arrives any more, then close."""
         count = -1
         while count != len(self.arrived):
             count = len(self.arrived)
-            time.sleep(quiet)
+            time.sleep(0.5)
         self._open = False
         self._thread.join()
         self._out.close()

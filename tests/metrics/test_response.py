@@ -11,13 +11,13 @@ from cloudrc.records import Control, MissionEvent
 from tests.metrics.conftest import SECOND, START, at, flown, measured
 
 
-def second_order(damping, frequency=3.0):
-    """Return the position [m] over time [s] of a step by 1 m along x at t = 0, 1 m up."""
+def second_order(damping):
+    """Return the position [m] over time [s] of a step by 1 m along x at t = 0, with 3 rad/s."""
     root = sqrt(1 - damping**2)
 
     def path(t):
-        phase = frequency * root * max(t, 0.0)
-        decay = exp(-damping * frequency * max(t, 0.0))
+        phase = 3.0 * root * max(t, 0.0)
+        decay = exp(-damping * 3.0 * max(t, 0.0))
         return 1 - decay * (cos(phase) + damping / root * sin(phase)), 0.0, 1.0
 
     return path
@@ -46,7 +46,7 @@ def test_a_step_of_a_second_order_system(damping):
     path = second_order(damping)
     outside = [t for t in (n / 1000 for n in range(10_000)) if abs(path(t)[0] - 1.0) > 0.05]
     assert step.settling_time == pytest.approx(outside[-1], abs=0.05)
-    # Integral of the squared error of a unit step: (1 + 4 damping^2) / (4 damping frequency).
+    # Integral of the squared error of a unit step: (1 + 4 damping^2) / (4 damping 3 rad/s).
     assert step.ise == pytest.approx((1 + 4 * damping**2) / (12 * damping), rel=0.03)
     cost = measured(flight(path), "control_cost")
     assert cost == pytest.approx(step.ise, rel=0.02)

@@ -6,25 +6,12 @@ from math import inf, nan
 
 import numpy as np
 
+from cloudrc.errors import BadInputError
+
 TEXTS = {
     **{"5": 5, "+5": 5, "5.": 5.0, ".5": 0.5, "1e3": 1000.0, " 5 ": 5, "-1": -1},
-    **dict.fromkeys(
-        (
-            "5,0",
-            "5_0",
-            "0x5",
-            "",
-            "nan",
-            "inf",
-            "True",
-            "null",
-            "\uff15",
-            "\u0663",
-            "5 ms",
-            "5%",
-            "1e999",
-        )
-    ),
+    **dict.fromkeys(("5,0", "5_0", "0x5", "", "nan", "inf", "True", "null", "5 ms", "5%", "1e999")),
+    **dict.fromkeys(("\uff15", "\u0663")),  # digits of other writings
 }
 """Text -> its number, None for a text that is no number. An int is a whole number."""
 OBJECTS = (
@@ -74,14 +61,14 @@ def disagreements(values, quantity, read, refused):
     return found
 
 
-def taken_otherwise(quantity, take, refused):
+def taken_otherwise(quantity, take):
     """Return the objects that `take` takes or refuses otherwise than `quantity`."""
     found = []
     for value, number in OBJECTS:
         try:
             take(value)
             is_taken = True
-        except refused:
+        except BadInputError:
             is_taken = False
         if is_taken != (expected(number, quantity) is not None):
             found.append((value, is_taken))

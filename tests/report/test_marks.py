@@ -1,6 +1,5 @@
 """Figures show the delays of the link profile, and mark changes of the link and HOLD."""
 
-import json
 import math
 
 import numpy as np
@@ -16,22 +15,16 @@ from tests.metrics.conftest import ONE_PIPE, at, flown
 CALM = DirectionConfig(delay_ms=50.0)
 
 
-def changed(time, direction, cause, age=0.0, *, uplink=True):
-    conditions = json.dumps(direction.model_dump(mode="json", exclude_defaults=True))
-    measured = (0.0, 0.0, 0.0, math.nan)
-    return LinkChanged(at(time), uplink, "relay", cause, age, age, *measured, conditions)
-
-
-def subject_of(*changes, uplink=CALM, log=None):
+def subject_of(*more, uplink=CALM, log=None):
+    """Return what figures show of a flight in which world recorded more."""
     log = log or flown()
-    log.world += [change for change in changes if change.uplink]
-    log.cloud += [change for change in changes if not change.uplink]
+    log.world += more
     return Subject(log.flight(ONE_PIPE), uplink, CALM)
 
 
-def band(subject, time, *, uplink=True):
-    """Return the bounds of the delay [ms] at a time since the start of the flight [s]."""
-    return bounds(subject, np.array([time]), uplink=uplink)[:, 0].tolist()
+def band(subject, time):
+    """Return the bounds of the uplink's delay [ms] at a time since the start of the flight [s]."""
+    return bounds(subject, np.array([time]), uplink=True)[:, 0].tolist()
 
 
 def test_the_band_follows_the_profile():
@@ -43,18 +36,15 @@ def test_the_band_follows_the_profile():
 
 
 def test_a_profile_that_another_version_recorded_is_left_out():
-    change = changed(2.0, CALM, "set")._replace(conditions='{"delay_ms": 5, "ecn": true}')
+    unknown = '{"delay_ms": 5, "ecn": true}'
+    change = LinkChanged(at(2.0), True, "relay", "", *(0.0,) * 5, math.nan, unknown)
     assert band(subject_of(change), 3.0) == pytest.approx((50, 50))
 
 
 def test_holds_are_marked():
     assert legend(subject_of()) == ""
-    log = flown()
-    log.world += [
-        GuardChange(at(2), GuardState.HOLD, "command age"),
-        GuardChange(at(3), GuardState.TRACK, "fresh command"),
-    ]
-    subject = subject_of(log=log)
+    hold = GuardChange(at(2), GuardState.HOLD, "command age")
+    subject = subject_of(hold, GuardChange(at(3), GuardState.TRACK, "fresh command"))
     assert legend(subject) == HELD
     axes = new_figure(2.0, 3.0).subplots()
     mark_events(axes, subject)

@@ -26,10 +26,10 @@ def pair(epoch=1, secret=b"p" * 32):
 class Doorstep:
     """World's side of the handshake, with a cloud that sends hellos."""
 
-    def __init__(self, nonce=WORLD, key=KEY):
-        self.world = Session(Direction.UPLINK, KeyRing(KeySet(key)))
+    def __init__(self):
+        self.world = Session(Direction.UPLINK, KeyRing(KeySet(KEY)))
         self.cloud = Session(Direction.DOWNLINK, self.world.ring)
-        self.door = ServerHandshake(self.world, nonce, CLOCK, 250 * MS)
+        self.door = ServerHandshake(self.world, WORLD, CLOCK, 250 * MS)
         self.now_ns = 10 * COOKIE_NS
         self.counter = 0
 

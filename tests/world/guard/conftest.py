@@ -93,8 +93,8 @@ def bring_down(guard, now_ns):
     return guard
 
 
-def stopped(guard, now_ns=0):
-    guard.stop(now_ns)
+def stopped(guard):
+    guard.stop(0)
     assert guard.state is GuardState.ESTOP
     return guard
 
