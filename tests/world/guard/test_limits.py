@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.resolved import Bounds, ResolvedGuard, speed_cap
-from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits
+from cloudrc.config.resolved import ResolvedGuard
+from cloudrc.config.robot import DEFAULT_LIMITS
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.hold import brake_start
@@ -41,18 +41,6 @@ def test_a_speed_beyond_the_stop_rule_is_refused(age_ms, fastest):
     ResolvedGuard(command_age_max_ms=10_000.0, speed_max_mps=0.5)
     with pytest.raises(ValueError, match="command_age_max_ms"):
         ResolvedGuard(command_age_max_ms=10_001.0, speed_max_mps=0.5)
-
-
-@pytest.mark.parametrize("braking", [0.1, 2.0, 3.0, 10.0])
-def test_a_robot_that_brakes_less_has_a_lower_speed_cap(braking):
-    # v (T + 0.2) + v^2 / (2a) = 8.7 m
-    cap = speed_cap(250.0, 0.8, Bounds(RobotLimits(braking_mps2=braking), 8.7))
-    assert cap * 1.25 + cap * cap / (2.0 * braking) == pytest.approx(8.7, abs=1e-4)
-
-
-def test_the_cap_is_no_higher_than_the_speed_of_the_robot():
-    assert speed_cap(250.0, 0.0, Bounds(RobotLimits(speed_max_mps=1.5), 8.7)) == 1.5
-    assert speed_cap(250.0, 0.0, Bounds(RobotLimits(speed_max_mps=9.0), 8.7)) == 6.0
 
 
 @pytest.mark.parametrize(("hold_s", "waited_s"), [(0.1, 10), (11, 11)])
