@@ -23,11 +23,6 @@ FILES = {"robot": find_robot("pelican").model, "scene": file_of("empty")}
 ROBOTS, SCENES = names("robot"), names("scene")
 
 
-@pytest.fixture(scope="module")
-def pipes():
-    return model_of("pelican", "pipes")
-
-
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_every_robot_compiles_in_every_scene(robot, scene, tmp_path, monkeypatch):
