@@ -53,6 +53,12 @@ class Mixed(gymnasium.Env):
         return self.observation_space.sample(), reward, False, False, told
 
 
+def told(env, steps, seed=None):
+    """Begin an episode and answer 0 in each step; return what the steps tell about the link."""
+    env.reset(seed=seed)
+    return [env.step(np.zeros(1, np.float32))[4]["cloudrc"] for _ in range(steps)]
+
+
 def both_ways(up_ms, down_ms, **keys):
     """Return a link with constant delays [ms]."""
     return {"uplink": {"delay_ms": up_ms, **keys}, "downlink": {"delay_ms": down_ms, **keys}}

@@ -12,7 +12,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from cloudrc.errors import BadInputError
 from cloudrc.gym import Networked, NetworkedVector
-from tests.gym.envs import Counter, Mixed, both_ways
+from tests.gym.envs import Counter, Mixed, both_ways, told
 from tests.support.programs import loaded
 from tests.tensors import KINDS, Tensor
 
@@ -37,18 +37,16 @@ def test_an_ideal_link_changes_no_bit(make):
     for _ in range(60):
         action = bare.action_space.sample()
         expected, found = bare.step(action), env.step(action)
-        told = found[4].pop("cloudrc")
+        link = found[4].pop("cloudrc")
         assert equal(expected, found)
-        assert (told["observation_age"], told["action_age"], told["held"]) == (0.0, 0.0, False)
+        assert (link["observation_age"], link["action_age"], link["held"]) == (0.0, 0.0, False)
         if expected[2] or expected[3]:
             break
 
 
 def test_a_seed_of_the_environment_selects_the_network_and_later_episodes_have_others():
     def losses(env, seed):
-        env.reset(seed=seed)
-        told = [env.step(np.zeros(1, np.float32))[4]["cloudrc"] for _ in range(100)]
-        return [each["lost_uplink"] for each in told]
+        return [each["lost_uplink"] for each in told(env, 100, seed)]
 
     env = Networked(Counter(), SHAKY, 1)
     first, second, again = losses(env, 3), losses(env, None), losses(env, 3)
@@ -103,10 +101,7 @@ def test_ages_and_the_worst_window_of_late_steps_and_of_steps_without_a_new_acti
     silent = {"delay_ms": 10, "blackouts": [{"start_s": 0.13, "duration_s": 0.02}]}
     late = {"changes": [{"at_s": 0.3, "delay_ms": 20}]}
     env = Networked(Counter(limit=40), {"downlink": {**silent, **late}}, 1)
-    env.reset()
-    for _ in range(40):
-        _, _, _, _, info = env.step(np.zeros(1, np.float32))
-    found = info["cloudrc"]["episode"]
+    found = told(env, 40)[-1]["episode"]
     assert found["age_counts"] == [0, 27, 10, 1]
     names = ("action_age_mean", "action_age_max", "action_age_peak_mean", "observation_age_max")
     assert [found[name] for name in names] == pytest.approx([0.5 / 38, 0.03, 0.44 / 34, 0.0])
@@ -116,9 +111,7 @@ def test_ages_and_the_worst_window_of_late_steps_and_of_steps_without_a_new_acti
 def test_a_bottleneck_sees_the_sizes_of_observations_and_answers():
     slow = both_ways(0, 0, rate_kbit=1000)
     env = Networked(Counter(), slow, observation_bytes=10_000 - 28, action_bytes=2_500 - 28)
-    env.reset()
-    told = [env.step(np.zeros(1, np.float32))[4]["cloudrc"] for _ in range(20)]
-    assert told[-1]["observation_age"] == pytest.approx(0.18)  # 80 ms a packet: the second
+    assert told(env, 20)[-1]["observation_age"] == pytest.approx(0.18)  # 80 ms a packet: the second
     assert Networked(Counter(), slow)._loop._up._size == 8
 
 

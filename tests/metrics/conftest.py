@@ -13,7 +13,8 @@ from cloudrc.config.schema import Criteria, MissionConfig, Touch, Waypoint
 from cloudrc.geometry.scene import Plate, Scene, Tube
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.metrics.flight import Flight
-from cloudrc.metrics.measure import SHIPPED
+from cloudrc.metrics.measure import SHIPPED, measure_all
+from cloudrc.metrics.verdict import flight_evidence, judge
 from cloudrc.record.columns import Recording
 from cloudrc.records import (
     Arrival,
@@ -56,6 +57,13 @@ def straight(seconds):
 def measured(flight, name):
     """Return the number of a flight that a metric of cloudrc gives."""
     return SHIPPED[name].measure(flight)
+
+
+def judged(flight, numbers=None, *, real_time=False, interrupted=False):
+    """Return the verdict on a flight, by default with the numbers that it has."""
+    numbers = measure_all(flight).numbers if numbers is None else numbers
+    known = flight_evidence(flight, numbers, real_time=real_time, interrupted=interrupted)
+    return judge(known)
 
 
 def to_point(x, tolerance, dwell=0.0, **more):

@@ -7,11 +7,10 @@ import pytest
 
 from cloudrc.metrics.measure import IN_SPITE_OF_HOLES, SHIPPED, measure_all
 from cloudrc.metrics.response import steps
-from cloudrc.metrics.verdict import flight_evidence, judge
 from cloudrc.record.holes import END_NS, SOMEWHERE, Hole
 from cloudrc.records import Control
 from cloudrc.runs.links.trace import one_way
-from tests.metrics.conftest import SECOND, at, flown, good
+from tests.metrics.conftest import SECOND, at, flown, good, judged
 
 
 def lossy(log, *spans, **options):
@@ -34,8 +33,7 @@ def lossy(log, *spans, **options):
 )
 def test_an_incomplete_recording_proves_neither_success_nor_a_missed_goal(spans, mission, known):
     flight = lossy(good() if mission.get("touch") else flown(), *spans, **mission)
-    numbers = measure_all(flight).numbers
-    verdict = judge(flight_evidence(flight, numbers, real_time=False, interrupted=False))
+    verdict = judged(flight)
     assert verdict.outcome == "invalid"
     (failure,) = verdict.failures
     assert failure.code == "recording_incomplete"

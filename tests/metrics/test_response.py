@@ -6,9 +6,8 @@ import pytest
 
 from cloudrc.config.schema import MissionConfig, Steps
 from cloudrc.metrics.response import responses, steps
-from cloudrc.metrics.verdict import flight_evidence, judge
 from cloudrc.records import Control, MissionEvent
-from tests.metrics.conftest import SECOND, START, at, flown, measured
+from tests.metrics.conftest import SECOND, START, at, flown, judged, measured
 
 
 def second_order(damping):
@@ -33,9 +32,8 @@ def flight(path, setpoint=lambda t: (1.0, 0.0, 1.0), **conditions):
     return log.flight(**conditions)
 
 
-def judged(a_flight):
-    verdict = judge(flight_evidence(a_flight, {}, real_time=False, interrupted=False))
-    return {failure.code: failure.text for failure in verdict.failures}
+def failures(a_flight):
+    return {failure.code: failure.text for failure in judged(a_flight, {}).failures}
 
 
 @pytest.mark.parametrize("damping", [0.2, 0.8])
@@ -72,7 +70,7 @@ def test_the_squared_command_is_integrated_over_each_step():
 
 @pytest.mark.parametrize("path", [growing, second_order(0.0)])
 def test_an_oscillation_without_decay_is_unstable(path):
-    assert "unstable" in judged(flight(path))
+    assert "unstable" in failures(flight(path))
 
 
 def test_a_small_or_decaying_oscillation_is_stable():
@@ -108,16 +106,16 @@ def test_the_end_of_a_moving_setpoint_is_judged_but_is_no_step():
     assert steps(ended) == ()
     assert [round(each.length, 2) for each in responses(ended)] == [0.1]
     assert measured(ended, "unstable_steps") == 1.0
-    assert "unstable" in judged(ended)
+    assert "unstable" in failures(ended)
 
 
 def test_random_steps_must_settle_and_null_switches_it_off():
     far = second_order(0.5), lambda t: (1.3, 0.0, 1.0)
     mission = MissionConfig(steps=Steps(count=1))
-    text = judged(flight(*far, mission=mission))["not_settled"]
+    text = failures(flight(*far, mission=mission))["not_settled"]
     assert "in step 1 the robot was 0.3 m from the setpoint" in text
     assert "criteria.settle_m 0.15 m" in text
-    assert "not_settled" not in judged(flight(*far, mission=mission, settle_m=None))
+    assert "not_settled" not in failures(flight(*far, mission=mission, settle_m=None))
 
 
 @pytest.mark.parametrize("ending", ["timed_out", None])
@@ -135,9 +133,9 @@ def test_a_step_whose_end_was_not_flown_has_neither_settled_nor_failed_to(ending
 
     log.change(Control, aim)
     done = log.flight(mission=mission)
-    assert judged(done)["not_settled"].startswith("1 of 2 steps")
+    assert failures(done)["not_settled"].startswith("1 of 2 steps")
     log.change(MissionEvent, end)
     cut = log.flight(mission=mission)
-    assert "not_settled" not in judged(cut)
+    assert "not_settled" not in failures(cut)
     assert [measured(each, "unsettled_steps") for each in (done, cut)] == [1.0, 0.0]
     assert measured(flight(growing), "settling_time_mean") is None

@@ -29,13 +29,7 @@ from cloudrc.records import (
     MissionEvent,
     SessionOpened,
 )
-from tests.metrics.conftest import ONE_PIPE, at, flown, good, measured, to_point, touch
-
-
-def judged(flight, *, interrupted=False):
-    numbers = measure_all(flight).numbers
-    evidence = flight_evidence(flight, numbers, real_time=False, interrupted=interrupted)
-    return judge(evidence)
+from tests.metrics.conftest import ONE_PIPE, at, flown, good, judged, measured, to_point, touch
 
 
 def to_board(log, **more):
@@ -235,10 +229,7 @@ def test_real_time_is_kept_or_the_run_is_invalid(slip, factor, said):
     values = {"waypoints_reached": 1.0, "world_slip": slip, "real_time_factor": factor}
     numbers = {k: Number(value, "", "") for k, value in values.items() if value is not None}
     flight = to_board(good())
-    real, virtual = (
-        judge(flight_evidence(flight, numbers, real_time=how, interrupted=False))
-        for how in (True, False)
-    )
+    real, virtual = (judged(flight, numbers, real_time=how) for how in (True, False))
     assert real.outcome == ("invalid" if said else "success")
     assert codes(real) == ["not_real_time"] * bool(said)
     assert not said or said in real.failures[0].text
