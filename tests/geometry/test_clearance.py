@@ -56,12 +56,11 @@ def test_clearance_on_the_axis_is_that_of_the_plant():
 
 
 def test_points_are_those_of_the_plant_and_turn_with_the_robot():
-    points = FEW
-    assert points.positions.shape == (225, 3)
+    assert FEW.positions.shape == (225, 3)
     # A third of a turn about (1, 1, 1) takes x to y, y to z, z to x.
-    placed = place_points(points, np.zeros((1, 3)), np.array([[0.5, 0.5, 0.5, 0.5]]))[0]
-    assert placed == pytest.approx(points.positions[:, [2, 0, 1]])
-    tip = place_points(points, np.array([[8.135, -6.422, 0.7]]), np.array([LEVEL]))[0, 8]
+    placed = place_points(FEW, np.zeros((1, 3)), np.array([[0.5, 0.5, 0.5, 0.5]]))[0]
+    assert placed == pytest.approx(FEW.positions[:, [2, 0, 1]])
+    tip = place_points(FEW, np.array([[8.135, -6.422, 0.7]]), np.array([LEVEL]))[0, 8]
     assert tip == pytest.approx((8.535, -6.422, 0.87))  # at the contact pose
 
 

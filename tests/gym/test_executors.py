@@ -10,16 +10,17 @@ from cloudrc.gym import Networked
 from tests.gym.envs import Counter, both_ways
 
 
-def flown(executor, link, steps=12, **options):
-    """Return the actions that the robot executes, in thousands: the tick of the observation.
+def answer(observation, size):
+    """Return the chunk to an observation: action i is its tick plus i / 1000."""
+    return (observation[0] + np.arange(size) / 1000)[:, None].astype(np.float32)
 
-    Action i of the chunk to the observation of tick n is n + i / 1000.
-    """
+
+def flown(executor, link, steps=12, **options):
+    """Return the actions that the robot executes."""
     env = Networked(Counter(), link, chunk=4, executor=executor, **options)
     observation, _ = env.reset()
     for _ in range(steps):
-        answer = (observation[0] + np.arange(4) / 1000)[:, None].astype(np.float32)
-        observation, *_ = env.step(answer)
+        observation, *_ = env.step(answer(observation, 4))
     return [round(float(each[0]), 3) for each in env.unwrapped.executed]
 
 
@@ -65,17 +66,15 @@ def test_executors_with_one_open_question_ask_again_after_a_loss(name):
 
 def test_rtc_tells_what_is_left_and_the_largest_delay_of_late():
     executor = {"name": "rtc", "execute": 4, "memory": 2}
-    ways = both_ways(0, 0)
-    ways["downlink"] = {"delay_ms": 20, "changes": [{"at_s": 0.15, "delay_ms": 5}]}
-    env = Networked(Counter(), ways, chunk=8, executor=executor, start="answer")
+    way = {"downlink": {"delay_ms": 20, "changes": [{"at_s": 0.15, "delay_ms": 5}]}}
+    env = Networked(Counter(), way, chunk=8, executor=executor, start="answer")
     observation, info = env.reset()
     told = {}
     for _ in range(30):
         about = info["cloudrc"]
         if about["asked"] and observation[0]:
             told[int(observation[0])] = [float(each[0]) for each in about["prefix"]], about["delay"]
-        answer = (observation[0] + np.arange(8) / 1000)[:, None].astype(np.float32)
-        observation, *_, info = env.step(answer)
+        observation, *_, info = env.step(answer(observation, 8))
     assert told[4][0] == pytest.approx([0.004, 0.005, 0.006, 0.007], abs=1e-6)
     assert list(told) == [4, 8, 12, 16, 20, 24, 28]
     assert [each for _, each in told.values()] == [1, 2, 2, 2, 2, 1, 1]  # the first is expected
