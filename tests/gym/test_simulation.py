@@ -25,7 +25,7 @@ IDLE = np.zeros(1, np.float32)
 """Action of a robot without answers."""
 BYTES = {"observation_bytes": 60, "action_bytes": 40}
 LINKS = {
-    "constant": both_ways(30, 30),
+    "constant": both_ways(50, 10),
     "uniform, loss": both_ways(40, 40, jitter_ms=15, distribution="uniform", loss=0.1),
     "lte": "lte",
 }
@@ -299,7 +299,7 @@ LATE = [
     )
     for *executor, uses in EXECUTORS
 ]
-"""With the link `constant`, answers arrive exactly two steps after their observations."""
+"""With the link `constant`, observations and answers arrive exactly at a step."""
 OTHER_TIMES = [
     Setup(link, *executor, compute, uses_prefix=uses)
     for link in LINKS
