@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import cloudrc.link
+from cloudrc.config import shipped
 from cloudrc.errors import BadInputError
 from cloudrc.link import DirectionProfile, GilbertElliott, OneWay, Trace
 from cloudrc.link.library import KIND
@@ -44,6 +45,13 @@ def test_a_link_without_a_name_has_the_random_numbers_of_the_testbed():
     for n in range(300):
         assert way.send(2, n, 100, n * MS) == model.send(2, KIND, n, 100, n * MS)
     assert max(Kind) < KIND
+
+
+@pytest.mark.parametrize("name", shipped.names("profile"))
+def test_every_shipped_profile_opens_and_its_table_is_what_send_tells(name):
+    for way in cloudrc.link.open(name, 5, stream="a"):
+        found = way.table(600, 0.01, episode=2, first=100)
+        assert np.array_equal(found, sent(way, 600, 100, episode=2), equal_nan=True)
 
 
 @settings(max_examples=60, deadline=None)

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.resolved import ResolvedGuard
-from cloudrc.config.robot import DEFAULT_LIMITS
+from cloudrc.config.resolved import Bounds, ResolvedGuard, speed_cap
+from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.hold import brake_start
@@ -41,6 +41,11 @@ def test_a_speed_beyond_the_stop_rule_is_refused(age_ms, fastest):
     ResolvedGuard(command_age_max_ms=10_000.0, speed_max_mps=0.5)
     with pytest.raises(ValueError, match="command_age_max_ms"):
         ResolvedGuard(command_age_max_ms=10_001.0, speed_max_mps=0.5)
+
+
+def test_the_cap_is_no_higher_than_the_speed_of_the_robot():
+    assert speed_cap(250.0, 0.0, Bounds(RobotLimits(speed_max_mps=1.5), 8.7)) == 1.5
+    assert speed_cap(250.0, 0.0, Bounds(RobotLimits(speed_max_mps=9.0), 8.7)) == 6.0
 
 
 @pytest.mark.parametrize(("hold_s", "waited_s"), [(0.1, 10), (11, 11)])
