@@ -78,12 +78,14 @@ class MissionFlight:
         self,
         now_ns: int,
         mission: MissionRecord,
+        former: int,
         aim: Aim,
         requests: RequestSender,
         tell: Callable[[MissionEvent], object],
     ) -> None:
         """Ask the robot to start; `tell` gets each event.
 
+        `former` is the number of the mission that this process has flown before; 0: none.
         If an earlier teleop process has begun the mission, continue at its waypoint.
         """
         self.plan, self.number, self._id = mission.order.plan, mission.number, mission.id
@@ -107,7 +109,8 @@ class MissionFlight:
             requests.ask(Request.START, Start.HERE)
             return
         if self.plan.start is Start.HERE and (here := aim.seen):
-            self._world, self._expected = here.world, (here.mission_id, self.number)
+            # The newest telemetry may be older than the start of the former mission.
+            self._world, self._expected = here.world, (here.mission_id, former, self.number)
         requests.ask(Request.START, self.plan.start, after=True)
 
     def elapsed(self, now_ns: int) -> float:
@@ -386,7 +389,9 @@ class Teleop:
 
         The robot stores the progress under the mission's number, unless this number is 0.
         """
-        self.flight = MissionFlight(now_ns, mission, self.aim, self.requests, self.outputs.append)
+        former = self.flight.number if self.flight else 0
+        to = self.aim, self.requests, self.outputs.append
+        self.flight = MissionFlight(now_ns, mission, former, *to)
         if self.seen:  # an earlier teleop may have flown the mission, or world has restarted
             self.see(self.seen, now_ns)
 

@@ -73,6 +73,8 @@ a start leads it away once it starts: mute create 0.05 cloud TRACK foreign away 
 taken over in flight: create 0.05 A foreign mark 0.3 -> failure=taken_over waypoint=-1 asked=
 from here before the start: HOLD away restart mute here 0.1 cloud foreign TRACK B
   -> failure=taken_over setpoint=B:-1
+its own, which it has not seen start, is nobody else's: 0.05 deaf create 60 link goto 0.3
+  -> states=failed,flying
 a lost mission does not take off: foreign mark 0.05 -> asked=END setpoint=floor:-1 settled=True
 
 # Restarts of teleop
