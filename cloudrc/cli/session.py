@@ -34,8 +34,8 @@ the robot waits on the ground
   API      {api}
   metrics  http://127.0.0.1:PORT/metrics ({ports})
 in another terminal:
-  cloudrc mission run {mission}
   cloudrc mission goto {point}
+  cloudrc mission run {mission}
   cloudrc link set --profile paper-p3
 to end: Ctrl-C here, or cloudrc down"""
 UP_EPILOG = """\

@@ -63,19 +63,19 @@ def find_crossed(
     result = np.full(len(starts), -1, dtype=np.int64)
     length = np.linalg.norm(ends - starts, axis=1)
     flown = np.zeros(len(starts))
-    least = np.full(len(starts), np.inf)
     flying = np.arange(len(starts) if obstacles else 0)
+    least = None  # distance from each obstacle below which a way leads into it [m], shape (n, m)
     while len(flying):
         share = flown[flying] / np.maximum(length[flying], 1e-12)
         at = starts[flying] + share[:, None] * (ends - starts)[flying]
         distances = _distances(obstacles, robot, at)
-        nearest = distances.min(axis=1)
-        if np.isinf(least).any():  # a way may begin near a wall
-            least = np.minimum(CLEARANCE_MIN, nearest - STEP_MIN)
-        touching = nearest < least[flying]
-        result[flying[touching]] = distances[touching].argmin(axis=1)
+        if least is None:  # a way may begin near an obstacle, or press on it
+            least = np.minimum(CLEARANCE_MIN, distances - STEP_MIN)
+        room = distances - least[flying]
+        touching = room.min(axis=1) < 0.0
+        result[flying[touching]] = room[touching].argmin(axis=1)
         going = ~touching & (flown[flying] < length[flying])
-        step = np.maximum(nearest - CLEARANCE_MIN, STEP_MIN)[going]
+        step = np.maximum(distances.min(axis=1) - CLEARANCE_MIN, STEP_MIN)[going]
         flying = flying[going]
         flown[flying] = np.minimum(flown[flying] + step, length[flying])
     return result

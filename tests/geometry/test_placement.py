@@ -21,6 +21,8 @@ from cloudrc.geometry.scene import load_scene
 
 KNOWN = obstacles(load_scene("pipes"), touch="board")
 FEW = hull_of("pelican")
+BESIDE_AND_ALONG = (0.5, 0.0, 1.2), (2.821, -6.418, 0.7)
+"""A point beside the third pipe, and one before its mouth [m]."""
 
 
 def hit(position):
@@ -49,6 +51,15 @@ def test_a_way_touches_a_wall_if_one_of_its_points_does(start, end):
     distance = clearance(KNOWN, points, np.tile([1.0, 0, 0, 0], (len(points), 1)), FEW).min()
     if abs(distance - CLEARANCE_MIN) > 0.02:
         assert (crossed(start, end) >= 0) is bool(distance < CLEARANCE_MIN)
+
+
+def test_a_robot_that_presses_on_the_board_leads_through_no_pipe():
+    solid = obstacles(load_scene("pipes"), touch="")
+    presses = np.array([[8.16, -6.42, 0.7]])
+    assert [find_crossed(solid, FEW, presses, np.array([end])) for end in BESIDE_AND_ALONG] == [
+        2,
+        -1,
+    ]
 
 
 @pytest.mark.parametrize(
