@@ -132,6 +132,7 @@ def turned(length):
         (Modelled(), Breaking(nan), "controller", "its planned velocity at [1] is nan"),
         (Lost(NOWHERE), Integrating(), "predictor", "its position at [0] is nan"),
         (Lost(None), Integrating(), "predictor", "its result is None, not 5 values"),
+        (Lost(turned(0.0)), Integrating(), "predictor", "has the length 0, not 1"),
         (Lost(turned(0.99)), Integrating(), "predictor", "has the length 0.99, not 1"),
         (Lost(turned(1.01)), Integrating(), "predictor", "has the length 1.01, not 1"),
     ],

@@ -170,6 +170,13 @@ def test_delays_and_the_age_of_information_are_equal_live_and_in_the_report(flow
     assert found == pytest.approx(report, rel=1e-9)
 
 
+def test_the_tracking_error_of_a_flight_is_equal_live_and_in_the_report():
+    flight, _, cloud = of(*LOSSY)
+    newest = flight.control["setpoint"][-1] - flight.control["measured"][-1]
+    tracking = seen_in(flight, cloud, Control).read()["cloudrc_tracking_error_meters"]
+    assert [tracking[axis,] for axis in "xyz"] == list(newest)
+
+
 def test_the_loss_of_a_flight_is_equal_live_and_in_the_report():
     flight, world, cloud = of(*LOSSY)
     last_ns = flight.recording["/telemetry"]["stamp_ns"][-1]

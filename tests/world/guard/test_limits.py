@@ -106,6 +106,15 @@ def test_limit_length_keeps_a_vector_of_the_allowed_length():
     assert rules.limit_length(longer, 1.0) == longer  # rounding makes its length 1.0 again
 
 
+@given(SPEEDS, PLACES)
+@MANY
+def test_limit_to_fence_lets_the_robot_stop_before_each_face(velocity, position):
+    axes = zip(fenced(velocity, position), position, FENCE.low, FENCE.high, strict=True)
+    for v, at, low, high in axes:
+        room = high - at if v > 0 else at - low
+        assert v == 0.0 or 0.2 * abs(v) + v * v / 6 <= room - 0.1 + 1e-12 or room > 5
+
+
 @pytest.mark.parametrize(
     ("velocity", "position", "limited"),
     [
