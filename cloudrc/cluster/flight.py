@@ -147,11 +147,10 @@ def _pod_state(release: Release, pod: Any) -> tuple[str, bool]:
     if failed:
         return failed[-1], any(words in failed[-1] for words in MISSING)
     waiting = [each.name for each in pods.container_statuses(pod) if not each.ready]
-    if waiting or pod.status.phase == "Pending":
-        return (
-            f"container {' and '.join(waiting)} is not ready yet" if waiting else "it starts",
-            False,
-        )
+    if waiting:
+        return f"container {' and '.join(waiting)} is not ready yet", False
+    if pod.status.phase == "Pending":
+        return "it starts", False
     # Kubernetes, not the kubelet, has taken the readiness from a pod whose containers are ready.
     return f"its node '{pod.spec.node_name}' does not answer, see: kubectl get nodes", False
 

@@ -16,7 +16,7 @@ from cloudrc.cluster.client import (
     Release,
     connect,
 )
-from cloudrc.errors import CloudrcError, StateError
+from cloudrc.errors import BadInputError, StateError
 
 INSTANCE = "app.kubernetes.io/instance"
 """Label with the name of the release."""
@@ -112,7 +112,7 @@ def _link(files: dict[str, str]) -> str:
             (folder / key).write_text(text, encoding="utf-8")
         try:
             link = load_link(folder / "profile.yaml", folder / "experiment.yaml")
-        except CloudrcError:
+        except BadInputError:
             return "invalid"
     values = link.model_dump(mode="json", exclude_defaults=True)
     texts = [_way(values.get(way, {})) for way in DIRECTIONS]

@@ -37,7 +37,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.faults.observer import NEVER_NS, ROW, RobotObserver
+from cloudrc.faults.observer import LONG_NS, ROW, RobotObserver
 from cloudrc.faults.rules import ESTOP, FLOWN, HOLD, LAND, TRACK, Breach, Rules
 from cloudrc.messages import GuardState
 from cloudrc.records import CommandApplied, Record, SessionOpened
@@ -100,7 +100,7 @@ class FlightSteps:
     def since(self, event: Array) -> Array:
         """Return the time [ns] since the last step in which `event` was true, this one included."""
         now_ns: Array = self.rows.now_ns
-        return now_ns - np.maximum.accumulate(np.where(event, now_ns, -NEVER_NS))
+        return now_ns - np.maximum.accumulate(np.where(event, now_ns, -LONG_NS))
 
     @property
     def smallest_margin(self) -> float:
@@ -205,7 +205,7 @@ def _rest(steps: FlightSteps) -> Broken:
     speed = np.fmax(_norm(rows.velocity), _norm(steps.before))[last]
     way = _norm((rows.position - rows.position[last])[:, :2])
     far = (way > _stop_distance(speed, rules) + REST) & (steps.touched_ns >= left_ns + REELS_NS)
-    waits = steps.flown & (rows.state != TRACK) & rows.is_on & (left_ns < NEVER_NS)
+    waits = steps.flown & (rows.state != TRACK) & rows.is_on & (left_ns < LONG_NS)
     yield "rest", waits & far, "far from where the last command ended"
     excused = rows.asked | (rows.touch_age <= REELS_NS * 1e-9)
     goes_off = _before(rows.is_on) & ~rows.is_on

@@ -22,7 +22,8 @@ INVALID_COMMANDS, INVALID_NS = 5, 1_000_000_000
 INVALID = ("range", "vertical", "future")  # why the guard rejects impossible commands
 GROUND_NS = 10_000_000_000
 """Shortest time that a robot on the ground waits for a mission's first command [ns]."""
-NEVER_NS = 1 << 60
+LONG_NS = 1 << 60
+"""Longer than any flight [ns]."""
 RAMP_MIN = 1.0
 """Shortest time of slow growth of the velocity reference after a HOLD [s]."""
 ROW = np.dtype([
@@ -96,7 +97,7 @@ class RobotObserver:
         is_on = commands is not self._robot.onboard.stopped
         motion = readings.position, readings.velocity, guard.reference, guard.yaw_rate
         others = is_on, simulator.touch_age, now_ns < self._ramp_until_ns
-        waits_until_ns = self._alone_ns + self._waits_ns.get(state, NEVER_NS)
+        waits_until_ns = self._alone_ns + self._waits_ns.get(state, LONG_NS)
         mission = self._armed, self._fresh_until_ns, waits_until_ns, self._asked, self._downed
         self.rows.append((now_ns, simulator.steps, state, *motion, *others, *mission))
         self._was, self._state, self._asked, self._downed = state, state, False, False
@@ -169,7 +170,7 @@ class RobotObserver:
             self._alone_ns = now_ns
         elif state is LAND and not self._impossible:
             alone_ns = now_ns - self._alone_ns
-            if alone_ns <= self._waits_ns.get(was, NEVER_NS):
+            if alone_ns <= self._waits_ns.get(was, LONG_NS):
                 text = f"LAND out of {was.name} after {alone_ns * 1e-9:.3f} s alone"
                 self._note(now_ns, "hold", text)
         if state is not HOLD:

@@ -28,7 +28,7 @@ from cloudrc.report.document import Assessment, Run
 from cloudrc.report.fleet import FleetFlown, fleet_document
 from cloudrc.report.write import assess
 from cloudrc.runs import flight
-from cloudrc.runs.experiment import check_no_seed, check_world, load, robots_of
+from cloudrc.runs.experiment import check_no_seed, load, robots_of
 from cloudrc.runs.fleet import assemble_fleet
 from cloudrc.runs.interrupts import raise_if_interrupted
 from cloudrc.trials.fingerprint import experiment_facts, fingerprint
@@ -49,8 +49,6 @@ def plan_fleet(
     if fleet.cloud.controller.name in OUTSIDE:
         raise problem_at("cloud.controller", "flies with `cloudrc run` only")
     robots = robots_of(fleet, experiment, settings)
-    for robot in robots:
-        check_world(robot.world, turns=robot.mission.turns)
     known = fingerprint(*map(experiment_facts, (fleet, *robots)))
     fly = partial(fly_fleet, robots, until_failure)
     return PlannedFlight(known, {**point}, 1, fleet, fly)
