@@ -78,21 +78,21 @@ class MissionFlight:
         self,
         now_ns: int,
         mission: MissionRecord,
-        former: int,
         aim: Aim,
         requests: RequestSender,
         tell: Callable[[MissionEvent], object],
+        is_ended: Callable[[int], bool],
     ) -> None:
         """Ask the robot to start; `tell` gets each event.
 
-        `former` is the number of the mission that this process has flown before; 0: none.
+        `is_ended` tells whether a number is that of a mission of this operator that has ended.
         If an earlier teleop process has begun the mission, continue at its waypoint.
         """
         self.plan, self.number, self._id = mission.order.plan, mission.number, mission.id
         self.route = Route(self.plan, mission.waypoint, aim)
         self.state = STARTING
         self.outcome: MissionEvent | None = None
-        self._aim, self._requests, self._tell = aim, requests, tell
+        self._aim, self._requests, self._tell, self._is_ended = aim, requests, tell, is_ended
         self._began_ns = now_ns - round(mission.elapsed * 1e9)
         # Whether an earlier teleop has begun the mission, and whether it was held then.
         self._continued, self._was_held = bool(mission.world), mission.state == HELD
@@ -109,8 +109,7 @@ class MissionFlight:
             requests.ask(Request.START, Start.HERE)
             return
         if self.plan.start is Start.HERE and (here := aim.seen):
-            # The newest telemetry may be older than the start of the former mission.
-            self._world, self._expected = here.world, (here.mission_id, former, self.number)
+            self._world, self._expected = here.world, (here.mission_id, self.number)
         requests.ask(Request.START, self.plan.start, after=True)
 
     def elapsed(self, now_ns: int) -> float:
@@ -248,7 +247,9 @@ class MissionFlight:
         """Return an event's code and text if telemetry shows that the mission fails, else None."""
         if self._world not in ("", seen.world):
             return "world_restarted", "world restarted"
-        if self._expected and seen.mission_id not in self._expected:
+        is_other = bool(self._expected) and seen.mission_id not in self._expected
+        # A robot that has not started yet may report an earlier mission of this operator.
+        if is_other and not (self.state == STARTING and self._is_ended(seen.mission_id)):
             return "taken_over", "somebody else has started another mission"
         repeated = self.state == STARTING and self._from_spawn  # after an earlier teleop
         if self._onboard >= (len(self.plan.legs) if repeated else MISSION_OVER):
@@ -389,9 +390,8 @@ class Teleop:
 
         The robot stores the progress under the mission's number, unless this number is 0.
         """
-        former = self.flight.number if self.flight else 0
-        to = self.aim, self.requests, self.outputs.append
-        self.flight = MissionFlight(now_ns, mission, former, *to)
+        parts = self.aim, self.requests, self.outputs.append, self._is_ended
+        self.flight = MissionFlight(now_ns, mission, *parts)
         if self.seen:  # an earlier teleop may have flown the mission, or world has restarted
             self.see(self.seen, now_ns)
 

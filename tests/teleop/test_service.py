@@ -75,6 +75,8 @@ from here before the start: HOLD away restart mute here 0.1 cloud foreign TRACK 
   -> failure=taken_over setpoint=B:-1
 its own, which it has not seen start, is nobody else's: 0.05 deaf create 60 link goto 0.3
   -> states=failed,flying
+nor is the last but one: 0.05 deaf create 0.1 cancel goto cancel goto link 0.3
+  -> states=cancelled,cancelled,flying
 a lost mission does not take off: foreign mark 0.05 -> asked=END setpoint=floor:-1 settled=True
 
 # Restarts of teleop
