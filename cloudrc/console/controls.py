@@ -149,13 +149,15 @@ class Controls:
         numbers = add("Target [m]", self._shown(start), step=0.01)
         send = gui.add_button("Send", hint="Go to the target; a mission is held first")
 
+        # viser awaits a coroutine where the value arrives, so that neither `update` nor a click on
+        # Send comes between; a function would wait for a free thread.
         @gizmo.on_update
-        def _(event: Any) -> None:
+        async def _(event: Any) -> None:
             if event.client is not None:  # somebody drags
                 self._is_moved = True
                 numbers.value = self._shown(np.round(gizmo.position, 2))
 
-        def move(event: Any) -> None:
+        async def move(event: Any) -> None:
             if event.client is not None:  # somebody has typed
                 self._is_moved = True
                 gizmo.position = (*numbers.value, gizmo.position[2])[:3]
