@@ -36,8 +36,8 @@ from tools.dashboards import counts
 pytestmark = pytest.mark.real_time
 
 SET_WITHIN = 1.0
-"""Time limit for `link set` until the change is in force [s]. The fastest of three calls counts,
-because the machine also runs the cluster."""
+"""Time limit for `link set` until the change is in force, on a machine of nominal pace [s]. The
+fastest of three calls counts, because the machine also runs the cluster."""
 ASKED_CPU = 0.200
 """CPU limit for all containers of a release, on an idle machine of nominal pace [cores]."""
 LIMIT_CPU = 0.300
@@ -150,8 +150,9 @@ def test_the_link_is_set_by_hand_and_read_back(readings, note):
     finally:
         told = set_link("--profile", "paper-p2")
         took.append(told["seconds"])
-    note(f"link set: asked {SET_WITHIN:g} s | in force after {min(took):.2f} s")
-    assert min(took) <= SET_WITHIN
+    asked = SET_WITHIN * pace()
+    note(f"link set: asked {asked:.2f} s | in force after {min(took):.2f} s")
+    assert min(took) <= asked
     assert told["links"]["downlink"]["asked"]["delay"] == 0.045
     # Cloud notes a change of the downlink for its recording. The uplink has not changed.
     said = "link: downlink 45 ± 25 ms (profile paper-p2)"
