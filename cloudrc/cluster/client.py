@@ -106,6 +106,12 @@ class Release:
         """Flags that select context and namespace in helm."""
         return [flag.replace("--context", "--kube-context") for flag in self.flags]
 
+    def upgrade(self, *settings: str) -> str:
+        """Return the helm command that changes `settings` and keeps all other values."""
+        sets = [f"--set {each}" for each in settings]
+        words = [self.name, "charts/cloudrc", *self.helm_flags, "--reset-then-reuse-values", *sets]
+        return f"helm upgrade {' '.join(words)}"
+
     def labels(self, component: str) -> dict[str, str]:
         """Return the Kubernetes labels of a component: "world", "cloud" or "mission"."""
         return {

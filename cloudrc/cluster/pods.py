@@ -302,11 +302,8 @@ def follow_page(release: Release, port: int, tell: Callable[[str], None]) -> Ite
     """
     pod = find_pod(release, "cloud")
     if not has_container(pod, CONSOLE):
-        raise ClusterError(
-            f"{release} has no console; add it: helm upgrade "
-            f"{release.name} charts/cloudrc {' '.join(release.helm_flags)} "
-            "--reset-then-reuse-values --set console.enabled=true"
-        )
+        add = release.upgrade("console.enabled=true")
+        raise ClusterError(f"{release} has no console; add it: {add}")
     name = pod.metadata.name
     words = ["logs", f"pod/{name}", f"--container={CONSOLE}", "--follow", "--since=1s"]
     command = [program("kubectl"), *release.flags, *words]

@@ -17,6 +17,10 @@ def test_flags_override_the_kubeconfig(api):
     assert release == Release("elsewhere", "mine", "paper")
     assert release.flags == ["--context=elsewhere", "--namespace=mine"]
     assert release.helm_flags == ["--kube-context=elsewhere", "--namespace=mine"]
+    assert release.upgrade("link.profile=lte") == (
+        "helm upgrade paper charts/cloudrc --kube-context=elsewhere --namespace=mine "
+        "--reset-then-reuse-values --set link.profile=lte"
+    )
     with pytest.raises(MissingPrerequisiteError, match=r"no context 'x'.*elsewhere, here"):
         connect("x")
 
