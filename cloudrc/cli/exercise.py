@@ -7,6 +7,7 @@ the user.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -72,23 +73,26 @@ def _new(task: str | None, folder: Path) -> None:
     if task is None and folder.suffix in (".yaml", ".yml"):
         task, folder = str(folder), Path(folder.stem)
     source = Path(task) if task else SHIPPED
-    _read(source)
-    names = write_files(folder, source)
+    _, needed = _read(source)
+    for file in needed:
+        if not file.is_relative_to(source.resolve().parent):
+            raise BadInputError(f"{source}: a flight needs {file}; put it beside the task")
+    names = write_files(folder, source, needed)
     command = f"cloudrc class check {quote(str(folder))}"
     print_line(f"fill in {', '.join(names)} in {folder}, then: {command}")
 
 
-def _read(source: Path) -> Task:
-    """Read a task, and check the flights of a lecturer's own."""
+def _read(source: Path) -> tuple[Task, set[Path]]:
+    """Read a task, and check the flights of a lecturer's own; also return the files they need."""
     from cloudrc.config.task import read_task
     from cloudrc.exercise.files import SHIPPED
 
     task = read_task(source)
-    if source != SHIPPED:
-        from cloudrc.exercise.checks import check_flights
+    if source == SHIPPED:
+        return task, set()
+    from cloudrc.exercise.checks import check_flights
 
-        check_flights(task, source.resolve().parent)
-    return task
+    return task, check_flights(task, source.resolve().parent)
 
 
 def _check(options: Options, folder: Path) -> None:
@@ -99,7 +103,7 @@ def _check(options: Options, folder: Path) -> None:
     from cloudrc.exercise.scoring import check
 
     source = task_of(folder, options.task)
-    task = _read(source)
+    task, _ = _read(source)
     if options.output != "gradescope":  # there, a hand-in without the files gets 0 points
         _check_files(folder, [*task.files.values()])
     rows = []
@@ -126,14 +130,23 @@ def _check_all(options: Options, folders: Sequence[Path]) -> None:
     if task:
         _read(task)
     results = dict[str, Any]()
-    work = [folder.resolve() for folder in folders]
-    with Progress(f"scores {len(folders)} hand-ins") as view:
-        for folder, result in zip(
-            folders, map_in_order(partial(score, task), work, options.jobs), strict=True
+    work = list(dict.fromkeys(folder.resolve() for folder in folders))
+    with Progress(f"scores {len(work)} hand-ins") as view:
+        for name, result in zip(
+            _names_of(work), map_in_order(partial(score, task), work, options.jobs), strict=True
         ):
-            results[folder.name] = result
-            view.say(f"{folder}: {result['score']:g}/{result['max_score']:g}")
+            results[name] = result
+            view.say(f"{name}: {result['score']:g}/{result['max_score']:g}")
     print_result(options.output, {"hand_ins": results}, as_csv(results), csv=as_csv(results))
+
+
+def _names_of(folders: Sequence[Path]) -> list[str]:
+    """Return the name of each folder; if two are equal, the paths below the folder of all."""
+    names = [folder.name for folder in folders]
+    if len(set(names)) == len(names):
+        return names
+    shared = os.path.commonpath(folders)
+    return [str(folder.relative_to(shared)) for folder in folders]
 
 
 def _check_files(folder: Path, names: Sequence[str]) -> None:

@@ -76,12 +76,6 @@ class Task(Section):
         """Part -> the student's file."""
         return {name: part.file for name, part in self.parts.items() if part.file}
 
-    @property
-    def experiments(self) -> set[str]:
-        """The experiments of all tests."""
-        parts = self.parts.values()
-        return {test.experiment for part in parts for test in part.tests.values()}
-
     def key(self, part: str) -> str:
         """Return the key of the experiment that gets the file of a part."""
         return self.parts[part].key or f"cloud.{part}"

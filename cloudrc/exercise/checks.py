@@ -26,8 +26,10 @@ from cloudrc.errors import CloudrcError, PlacedError, describe_error
 from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
 from cloudrc.metrics import measure
 from cloudrc.outside import code
+from cloudrc.outside.document import read_document
 from cloudrc.outside.values import WHOLE, InvalidValueError
 from cloudrc.runs.flight import fly_in_memory
+from cloudrc.runs.own_files import hash_all
 
 REFERENCES = {"estimator": "running_mean", "predictor": "constant_velocity", "controller": "pid"}
 """Part -> cloudrc's plug-in."""
@@ -110,22 +112,47 @@ def compare(formula: FormulaName, part: str, file: Path) -> tuple[float, str]:
     raise InvalidValueError(f"gives {seen.round(3).tolist()}, not {wanted.round(3).tolist()}")
 
 
-def check_flights(task: Task, beside: Path) -> None:
-    """Check the experiments of a task's flights, their keys and their numbers."""
+def check_flights(task: Task, beside: Path) -> set[Path]:
+    """Check the experiments of a task's flights, their keys and their numbers.
+
+    Return the lecturer's files that the flights need.
+    """
     files = {task.key(part): beside / name for part, name in task.files.items()}
     there = {key: file for key, file in files.items() if file.is_file()}
+    needed = set[Path]()
     for part in task.parts.values():
         for test in part.tests.values():
             if test.number:
-                own = _experiment(test, there, beside).report.metrics
-                if test.number not in map(measure.name_of, own):
+                experiment = _experiment(test, there, beside)
+                if test.number not in map(measure.name_of, experiment.report.metrics):
                     measure.find(test.number, look=True)
+                needed |= {*map(Path, hash_all(experiment)), *_named_files(test, beside)}
+    return needed - {*files.values()}
+
+
+def _named_files(test: TestConfig, beside: Path) -> Iterator[Path]:
+    """Yield the files that a flight's values name, its experiment among them."""
+    waiting: list[Any] = [test.experiment, test.set]
+    experiment = beside / test.experiment
+    if experiment.is_file():
+        waiting.append(read_document(experiment, str(experiment)).tree)
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, dict | list):
+            waiting += value.values() if isinstance(value, dict) else value
+        elif isinstance(value, str) and os.path.isfile(beside / value):
+            yield (beside / value).resolve()
 
 
 def _experiment(test: TestConfig, own: Mapping[str, Path], beside: Path) -> ResolvedExperiment:
+    """Load the experiment of a flight; paths are relative to the folder `beside`."""
+    values = dict(test.set)
+    for key, value in values.items():
+        if isinstance(value, str) and (value.startswith(".") or os.path.isfile(beside / value)):
+            values[key] = str(beside / value)
+    values |= {key: str(file) for key, file in own.items()}
     file = beside / test.experiment
     name = str(file) if file.is_file() else test.experiment
-    values = {**test.set, **{key: str(file) for key, file in own.items()}}
     return load_experiment(name, [f"{key}={json.dumps(value)}" for key, value in values.items()])
 
 

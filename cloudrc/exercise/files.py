@@ -22,23 +22,23 @@ def task_of(folder: Path, given: Path | None = None) -> Path:
     return given or (copy if copy.is_file() else SHIPPED)
 
 
-def write_files(folder: Path, source: Path = SHIPPED) -> list[str]:
+def write_files(folder: Path, source: Path = SHIPPED, needed: Collection[Path] = ()) -> list[str]:
     """Write the files that students fill in, none of which may exist; return their names.
 
-    The files lie beside the task `source`. That of a lecturer is copied, too, with its experiments.
+    The files lie beside the task `source`. That of a lecturer is copied, too, with the files that
+    its flights need.
     """
-    task = read_task(source)
-    names = [*task.files.values()]
-    given = {name: source.with_name(name) for name in names}
+    names = [*read_task(source).files.values()]
+    beside = source.resolve().parent
+    given = {str(path.relative_to(beside)): path for path in sorted(needed)}
+    given |= {name: source.with_name(name) for name in names}
     if source != SHIPPED:
-        beside = {name: source.parent / name for name in sorted(task.experiments)}
-        given |= {name: path for name, path in beside.items() if path.is_file()}
         given[COPY] = source
     for name, path in given.items():
         check_there(path, f"{source} names it; write it as students shall get it")
         check_new(folder / name, "name another folder")
-    folder.mkdir(parents=True, exist_ok=True)
     for name, path in given.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_atomically(folder / name, path.read_bytes())
     return names
 
