@@ -12,10 +12,12 @@ from tests.e2e.conftest import (
     NAMESPACE,
     cloudrc,
     command,
+    eventually,
     helm,
     in_release,
     job_end,
     kubectl,
+    read,
     report,
     until_ready,
 )
@@ -48,10 +50,11 @@ def rover(installed):
     """
     world = "experiment.world.robot=rover,experiment.world.scene=pillars"
     given = (
-        f"experiment.mission=pillars,mission.cronJob.enabled=true,recordings.storage=100Mi,{world}"
+        f"link.mode=relay,mission.plan=,experiment.mission=pillars,recordings.storage=100Mi,{world}"
     )
+    patrol = CHART / "examples" / "values-patrol.yaml"
     try:
-        helm("install", ROVER, str(CHART), f"--set=link.mode=relay,{given}")
+        helm("install", ROVER, str(CHART), f"--values={patrol}", f"--set={given}")
         kubectl("create", "job", "by-hand", f"--from=cronjob/{ROVER}-cloudrc-mission")
         yield
     finally:
@@ -127,3 +130,15 @@ def test_kubectl_alone_drives_another_robot_whose_report_is_kept_when_its_pods_a
     until_ready(ROVER)
     found = report(tmp_path / "kept", ROVER, name)
     assert (found["verdict"], found["complete"]) == ("success", True)
+
+
+@pytest.mark.full
+def test_a_patrol_flies_by_itself_when_its_schedule_asks():
+    def flown():
+        jobs = read("jobs")["items"]
+        own = [job for job in jobs if job["metadata"]["name"].startswith(f"{ROVER}-cloudrc-miss")]
+        return [job for job in own if job["status"].get("succeeded")]
+
+    each_minute = "--set=mission.cronJob.schedule=* * * * *"
+    helm("upgrade", ROVER, str(CHART), "--reset-then-reuse-values", each_minute)
+    eventually(flown, "a Job of the CronJob has succeeded", 240.0)
