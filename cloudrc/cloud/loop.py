@@ -288,6 +288,8 @@ class ControlLoop:
             self._echoed_ns = now_ns
         if now_ns - self._echoed_ns > horizon * 1e9 + self._freeze_after_ns:  # no new echo
             self.counts["frozen"] += 1
+            if self._plans_itself:  # its last plan is no longer what the robot follows
+                self._call("controller", self._controller.reset)
         elif self._plans_itself and (planned := self._ask_plan(moving, now_ns, dt)):
             output, plan, positions = planned
         else:
@@ -345,11 +347,11 @@ class ControlLoop:
 
     def _ask_plan(
         self, setpoint: Setpoint, now_ns: int, dt: float
-    ) -> tuple[ControlOutput, list[Vector], list[Vector]] | None:
+    ) -> tuple[ControlOutput | None, list[Vector], list[Vector]] | None:
         """Let a controller plan by itself; return its command, and the results of `_plan`.
 
-        Return None if the predictor has no model. `now_ns` is the time of the command [ns], cloud's
-        clock, `dt` the time since the last one [s].
+        Return None if the predictor has no model. If the controller plans nothing, the command is
+        None. `now_ns` is the time of the command [ns], cloud's clock, `dt` that since the last [s].
         """
         later, plug_in = path_of(setpoint), "predictor"
         try:
@@ -357,9 +359,11 @@ class ControlLoop:
             if model is None:
                 return None
             plug_in = "controller"
-            velocities, positions, yaw_rate = self._plans_itself(
-                model, lambda ahead: later(now_ns + round(ahead * 1e9)), dt
-            )
+            made = self._plans_itself(model, lambda ahead: later(now_ns + round(ahead * 1e9)), dt)
+            if made is None:
+                self._echoed_ns = now_ns  # without a command, there is no echo to wait for
+                return None, [], []
+            velocities, positions, yaw_rate = made
             command, *rest = to_vectors(velocities[: self._planned + 1], "planned velocities")
             fits = takewhile(lambda velocity: max(map(abs, velocity)) <= PLANNED_MAX, rest)
             output = ControlOutput(command, RESULT.of(yaw_rate, "yaw rate"))

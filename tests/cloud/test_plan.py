@@ -178,3 +178,20 @@ def test_a_wrong_plan_is_a_failure(wrong):
     a_loop = planning(None, Planning(wrong))
     assert command(a_loop, 1094)[0].velocity == ZERO
     assert a_loop.counts == {"controller_failed": 1}
+
+
+def test_a_controller_may_plan_nothing():
+    controller = Planning(None)
+    controller.plan = lambda model, goals, dt: None
+    a_loop = planning(None, controller)
+    assert command(a_loop, 1094)[0] is None
+    assert (a_loop.counts, controller.asked) == ({"commands_withheld": 1}, 0)
+
+
+def test_a_plan_is_forgotten_while_cloud_stands_still():
+    controller, seen = Planning([(1.0, 0.0, 0.0)]), []
+    a_loop = planning(None, controller)
+    controller.reset = lambda: seen.append(a_loop.counts["frozen"])
+    for now_ms in (1094, 1400, 1700, 1710):
+        command(a_loop, now_ms)
+    assert seen == [1, 2]

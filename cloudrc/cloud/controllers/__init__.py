@@ -64,7 +64,7 @@ class Controller:
             the predicted state of the robot; `dt` is the time since the last call [s].
     """
 
-    plan: Callable[[Model, Goals, float], Planned] | None = None
+    plan: Callable[[Model, Goals, float], Planned | None] | None = None
 
     def reset(self) -> None:
         """Reset the controller at the start of a session or mission."""
