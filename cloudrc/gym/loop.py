@@ -51,6 +51,7 @@ class Settings:
     seed: int  # of the link
     dt: float  # time of a tick [s]
     answer_within: float  # how long the robot waits in a tick for an answer [s]
+    deadline: float | None  # age of an action above which a step is late [s]
     compute: tuple[float, float]  # mean and standard deviation of the time for an answer [s]
     repeats: bool  # whether the robot repeats its last action if it has none, or executes `start`
     start: Any  # action before the first answer
@@ -274,12 +275,15 @@ class RemoteLoop:
     def summary(self, deadline: float | None = None) -> dict[str, Any]:
         """Return what the loop was like in this episode: asked and measured.
 
-        `late_share` is the share of steps whose action is older than `deadline` [s]. `age_counts`
-        has the steps by the action's age in ticks, rounded up; the last possible, all older ones.
+        `late_share` is the share of steps whose action is older than `deadline` [s], by default
+        that of the settings. `age_counts` has the steps by the action's age in ticks, rounded up;
+        the last possible, all older ones.
         """
         ticks, dt = self._tick, self._settings.dt
         if ticks < 0:
             raise ResetNeeded("call reset() before summary()")
+        if deadline is None:
+            deadline = self._settings.deadline
         actions = np.array(self._action_ages) * dt
         late = nan
         if deadline is not None and len(actions):

@@ -67,6 +67,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             compute: Time that the policy needs for an answer [s], in which it takes no other
                 observation; or a pair, mean and standard deviation of a gamma distribution.
             answer_within: Time for which the robot waits in a step for an answer [s]; None: 5 %.
+            deadline: Age of an action [s] above which the summary counts a step as late.
             chunk: Number of actions in an answer, for the ticks from the observation's on; None:
                 an answer is a single action.
             executor: How the robot executes answers: the name of a plug-in, or the path of a file.
@@ -119,8 +120,8 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def summary(self, deadline: float | None = None) -> dict[str, Any]:
         """Return what `info["cloudrc"]["episode"]` has, also before the end of an episode.
 
-        With a `deadline` [s], `late_share` is the share of steps whose action is older. Raise
-        gymnasium's ResetNeeded before the first `reset`.
+        A `deadline` [s] takes the place of the argument of this name. Raise gymnasium's ResetNeeded
+        before the first `reset`.
         """
         return self._loop.summary(deadline)
 

@@ -29,6 +29,8 @@ COUNTS = {
 """Option -> which whole numbers it takes, and what they mean."""
 COMPUTE = Quantity("s", 0.0, 3600.0)
 """Time for an answer."""
+AGE = Quantity("s", 0.0)
+"""Age of an action."""
 WAIT = 0.05
 """How long a robot waits in a step for an answer, as a share of the step."""
 ANSWER = "answer"
@@ -40,6 +42,7 @@ class Options(TypedDict, total=False):
 
     compute: float | tuple[float, float]
     answer_within: float | None
+    deadline: float | None
     chunk: int | None
     executor: str | Path | Mapping[str, Any]
     hold: str
@@ -51,6 +54,7 @@ class Options(TypedDict, total=False):
 DEFAULTS: Options = {
     "compute": 0.0,
     "answer_within": None,
+    "deadline": None,
     "chunk": None,
     "executor": "newest",
     "hold": "repeat",
@@ -76,6 +80,9 @@ def read_options(what: str, given: Options, more: Sequence[str] = ()) -> Options
         if read[name] is not None:
             with naming(name, f"None, or {wanted}"):
                 read[name] = quantity.of(read[name])
+    if read["deadline"] is not None:
+        with naming("deadline", "None, or the largest age of an action that is no miss"):
+            read["deadline"] = AGE.of(read["deadline"])
     return cast(Options, read)
 
 
@@ -105,6 +112,7 @@ def connect(
         seed=seed,
         dt=dt,
         answer_within=_read_wait(options["answer_within"], dt),
+        deadline=options["deadline"],
         compute=compute_times(options["compute"]),
         repeats=options["hold"] == "repeat",
         start=copied(start),

@@ -100,12 +100,13 @@ def test_ages_and_the_worst_window_of_late_steps_and_of_steps_without_a_new_acti
     """
     silent = {"delay_ms": 10, "blackouts": [{"start_s": 0.13, "duration_s": 0.02}]}
     late = {"changes": [{"at_s": 0.3, "delay_ms": 20}]}
-    env = Networked(Counter(limit=40), {"downlink": {**silent, **late}}, 1)
+    env = Networked(Counter(limit=40), {"downlink": {**silent, **late}}, 1, deadline=0.015)
     found = told(env, 40)[-1]["episode"]
     assert found["age_counts"] == [0, 27, 10, 1]
     names = ("action_age_mean", "action_age_max", "action_age_peak_mean", "observation_age_max")
     assert [found[name] for name in names] == pytest.approx([0.5 / 38, 0.03, 0.44 / 34, 0.0])
-    assert [env.summary(limit)["misses_in_10"] for limit in (None, 0.015, 0.005)] == [2, 9, 10]
+    assert found["late_share"] == pytest.approx(11 / 38)
+    assert [env.summary(limit)["misses_in_10"] for limit in (1.0, None, 0.005)] == [2, 9, 10]
 
 
 def test_a_bottleneck_sees_the_sizes_of_observations_and_answers():
