@@ -6,9 +6,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from examples import canon
-from tests.conftest import nightly
+from tests.conftest import nightly_rows
 
-ROWS = {row.name: row for row in canon.rows() if row.name != canon.HEAVY}
+ROWS = {row.name: row for row in canon.rows()}
 LIKE_ANOTHER = [
     "E[x²] through `Networked`, loss .1",
     "the same with loss in bursts",
@@ -20,8 +20,14 @@ LIKE_ANOTHER = [
 """Rows that differ from one that is measured daily in a parameter or in a rule."""
 
 
-@pytest.mark.parametrize("name", sorted(ROWS.keys() - LIKE_ANOTHER) + nightly(*LIKE_ANOTHER))
-@pytest.mark.parametrize("scale", [0.1, pytest.param(1.0, marks=pytest.mark.full)])
+DAILY = sorted(ROWS.keys() - {canon.HEAVY, *LIKE_ANOTHER})
+
+
+@pytest.mark.parametrize(
+    ("name", "scale"),
+    [(name, 0.1) for name in DAILY]
+    + nightly_rows(*[(name, 0.1) for name in LIKE_ANOTHER], *[(name, 1.0) for name in ROWS]),
+)
 def test_a_closed_form_is_measured(name, scale):
     exact, mean, error = ROWS[name].at(scale)
     assert error < 0.04 * exact
