@@ -73,26 +73,30 @@ def _new(task: str | None, folder: Path) -> None:
     if task is None and folder.suffix in (".yaml", ".yml"):
         task, folder = str(folder), Path(folder.stem)
     source = Path(task) if task else SHIPPED
-    _, needed = _read(source)
-    for file in needed:
-        if not file.is_relative_to(source.resolve().parent):
-            raise BadInputError(f"{source}: a flight needs {file}; put it beside the task")
+    read, needed = _read(source), set[Path]()
+    if source != SHIPPED:
+        from cloudrc.exercise.checks import needed_files
+
+        beside = source.resolve().parent
+        needed = needed_files(read, beside)
+        if outside := [file for file in needed if not file.is_relative_to(beside)]:
+            raise BadInputError(f"{source}: a flight needs {outside[0]}; put it beside the task")
     names = write_files(folder, source, needed)
     command = f"cloudrc class check {quote(str(folder))}"
     print_line(f"fill in {', '.join(names)} in {folder}, then: {command}")
 
 
-def _read(source: Path) -> tuple[Task, set[Path]]:
-    """Read a task, and check the flights of a lecturer's own; also return the files they need."""
+def _read(source: Path) -> Task:
+    """Read a task, and check the flights of a lecturer's own."""
     from cloudrc.config.task import read_task
     from cloudrc.exercise.files import SHIPPED
 
     task = read_task(source)
-    if source == SHIPPED:
-        return task, set()
-    from cloudrc.exercise.checks import check_flights
+    if source != SHIPPED:
+        from cloudrc.exercise.checks import check_flights
 
-    return task, check_flights(task, source.resolve().parent)
+        check_flights(task, source.resolve().parent)
+    return task
 
 
 def _check(options: Options, folder: Path) -> None:
@@ -103,7 +107,7 @@ def _check(options: Options, folder: Path) -> None:
     from cloudrc.exercise.scoring import check
 
     source = task_of(folder, options.task)
-    task, _ = _read(source)
+    task = _read(source)
     if options.output != "gradescope":  # there, a hand-in without the files gets 0 points
         _check_files(folder, [*task.files.values()])
     rows = []

@@ -112,36 +112,45 @@ def compare(formula: FormulaName, part: str, file: Path) -> tuple[float, str]:
     raise InvalidValueError(f"gives {seen.round(3).tolist()}, not {wanted.round(3).tolist()}")
 
 
-def check_flights(task: Task, beside: Path) -> set[Path]:
-    """Check the experiments of a task's flights, their keys and their numbers.
+def check_flights(task: Task, beside: Path) -> None:
+    """Check the experiments of a task's flights, their keys and their numbers."""
+    for test, experiment in _flights(task, beside):
+        if test.number not in map(measure.name_of, experiment.report.metrics):
+            measure.find(test.number, look=True)
 
-    Return the lecturer's files that the flights need.
-    """
+
+def needed_files(task: Task, beside: Path) -> set[Path]:
+    """Return the lecturer's files that a task's flights need, without those to fill in."""
+    found = set[Path]()
+    for test, experiment in _flights(task, beside):
+        found |= {*map(Path, hash_all(experiment)), *_named_files(test, beside)}
+    return found - {beside / name for name in task.files.values()}
+
+
+def _flights(task: Task, beside: Path) -> Iterator[tuple[TestConfig, ResolvedExperiment]]:
+    """Load the experiment of each flight, with those files to fill in that are there."""
     files = {task.key(part): beside / name for part, name in task.files.items()}
     there = {key: file for key, file in files.items() if file.is_file()}
-    needed = set[Path]()
     for part in task.parts.values():
         for test in part.tests.values():
             if test.number:
-                experiment = _experiment(test, there, beside)
-                if test.number not in map(measure.name_of, experiment.report.metrics):
-                    measure.find(test.number, look=True)
-                needed |= {*map(Path, hash_all(experiment)), *_named_files(test, beside)}
-    return needed - {*files.values()}
+                yield test, _experiment(test, there, beside)
 
 
 def _named_files(test: TestConfig, beside: Path) -> Iterator[Path]:
     """Yield the files that a flight's values name, its experiment among them."""
-    waiting: list[Any] = [test.experiment, test.set]
-    experiment = beside / test.experiment
-    if experiment.is_file():
-        waiting.append(read_document(experiment, str(experiment)).tree)
+    waiting: list[tuple[Path, Any]] = [(beside, [test.experiment, test.set])]
+    file = beside / test.experiment
+    if file.is_file():
+        waiting.append((file.parent, read_document(file, str(file)).tree))
     while waiting:
-        value = waiting.pop()
-        if isinstance(value, dict | list):
-            waiting += value.values() if isinstance(value, dict) else value
-        elif isinstance(value, str) and os.path.isfile(beside / value):
-            yield (beside / value).resolve()
+        folder, value = waiting.pop()
+        if isinstance(value, dict):
+            value = [*value.values()]
+        if isinstance(value, list):
+            waiting += [(folder, each) for each in value]
+        elif isinstance(value, str) and os.path.isfile(folder / value):
+            yield (folder / value).resolve()
 
 
 def _experiment(test: TestConfig, own: Mapping[str, Path], beside: Path) -> ResolvedExperiment:

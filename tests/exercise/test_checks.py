@@ -251,29 +251,29 @@ def test_a_class_with_its_own_task_gets_one_table(lecture, call):
 
 @pytest.mark.process
 def test_a_task_hands_out_the_files_that_its_flights_name(lecture, call, refused):
-    Path("scenes").mkdir()
-    Path("scenes/lab.xml").write_bytes(file_of("empty").read_bytes())
-    Path("leg.yaml").write_text("waypoints: [{position_m: [0.5, 0, 1]}]")
+    Path("flights").mkdir()
+    Path("lab.xml").write_bytes(file_of("empty").read_bytes())
+    Path("flights/leg.yaml").write_text("waypoints: [{position_m: [0.5, 0, 1]}]")
     Path("slow.yaml").write_text("uplink: &way {trace: slow.csv}\ndownlink: *way")
     Path("slow.csv").write_text("time_s,delay_ms\n0,60\n1,60\n")
-    Path("mine.yaml").write_text(
-        "mission: leg.yaml\nworld: {scene: scenes/lab.xml}\ncriteria: {time_limit_s: 1}\n"
-    )
+    mine = "mission: leg.yaml\nworld: {scene: ../lab.xml}\ncriteria: {time_limit_s: 1}\n"
+    Path("flights/mine.yaml").write_text(mine)
+    task = OWN.replace("mine.yaml", "flights/mine.yaml")
     keys = "set: {link.profile: ./slow.yaml}, number: uplink_delay_mean, full: 0.06, none: 0"
-    Path("own.yaml").write_text(OWN.replace("number: duration, full: 0.5, none: 100", keys))
+    Path("own.yaml").write_text(task.replace("number: duration, full: 0.5, none: 100", keys))
     call("class new own.yaml anna/own")
     shutil.copytree("anna", "bert")
     Path("bert/own/predictor.py").unlink()
     handed = {str(path.relative_to("anna/own")) for path in Path("anna").rglob("*.*")}
-    own = {"leg.yaml", "mine.yaml", "scenes/lab.xml", "slow.csv", "slow.yaml"}
+    own = {"flights/leg.yaml", "flights/mine.yaml", "lab.xml", "slow.csv", "slow.yaml"}
     assert handed == own | {"predictor.py", "task.yaml"}
     for words in ("", " --task own.yaml"):
         anna, bert = csv.DictReader(call(f"class check anna/own bert/own{words}").out.splitlines())
         # The delay is 60 ms; the flight ends before its waypoint, so 30 % of the points is all.
         assert (anna["hand_in"], anna["score"], anna["remarks"]) == ("anna/own", "0.9", "")
         assert (bert["hand_in"], bert["score"]) == ("bert/own", "0.0")
-    Path("scenes/lab.xml").rename("../lab.xml")
-    Path("mine.yaml").write_text("mission: leg.yaml\nworld: {scene: ../lab.xml}")
+    Path("lab.xml").rename("../lab.xml")
+    Path("flights/mine.yaml").write_text(mine.replace("../", "../../"))
     assert "lab.xml; put it beside the task" in refused("class new own.yaml carl")
 
 
