@@ -366,7 +366,7 @@ class ControlLoop:
             velocities, positions, yaw_rate = made
             command, *rest = to_vectors(velocities[: self._planned + 1], "planned velocities")
             fits = takewhile(lambda velocity: max(map(abs, velocity)) <= PLANNED_MAX, rest)
-            output = ControlOutput(command, RESULT.of(yaw_rate, "yaw rate"))
+            self._output = output = ControlOutput(command, RESULT.of(yaw_rate, "yaw rate"))
             positions = to_vectors(positions[: self._planned], "planned positions")
             return output, list(map(as_planned, fits)), positions
         except FAILURES as error:

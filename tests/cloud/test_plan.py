@@ -181,10 +181,12 @@ def test_a_wrong_plan_is_a_failure(wrong):
 
 
 def test_a_controller_may_plan_nothing():
-    controller = Planning(None)
-    controller.plan = lambda model, goals, dt: None
+    controller = Planning([(1.0, 0.0, 0.0)])
     a_loop = planning(None, controller)
-    assert command(a_loop, 1094)[0] is None
+    assert command(a_loop, 1094)[0].velocity == (1.0, 0.0, 0.0)
+    a_loop._plans_itself = lambda model, goals, dt: None
+    sent, control = command(a_loop, 1104)
+    assert (sent, control.command) == (None, (1.0, 0.0, 0.0))
     assert (a_loop.counts, controller.asked) == ({"commands_withheld": 1}, 0)
 
 
