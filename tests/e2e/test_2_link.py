@@ -36,8 +36,8 @@ from tools.dashboards import counts
 pytestmark = pytest.mark.real_time
 
 SET_WITHIN = 1.0
-"""Time limit for `link set` until the change is in force, on a machine of nominal pace [s]. The
-fastest of three calls counts, because the machine also runs the cluster."""
+"""Time limit for `link set` until the change is in force [s]. The fastest call counts, because the
+machine also runs the cluster."""
 ASKED_CPU = 0.200
 """CPU limit for all containers of a release, on an idle machine of nominal pace [cores]."""
 LIMIT_CPU = 0.300
@@ -48,8 +48,8 @@ LIMIT_MEMORY = 320 * 2**20
 TOLERANCE = 0.002
 """Tolerance of a mean one-way delay [s]."""
 WINDOWS = 4
-"""Largest number of measurements of a delay or of a cost. Other programs on the machine only add to
-both, so one good measurement decides."""
+"""Largest number of measurements, where other programs on the machine only add to what is measured:
+one good measurement decides."""
 PROFILES = [
     ("paper-p1", 0.020, 4.0),
     *nightly_rows(("paper-p3", 0.070, 20.0), ("paper-p2", 0.045, 10.0)),
@@ -124,7 +124,7 @@ def check_delays(name, wanted, seconds, directions, note):
             assert count > 50 * seconds, "datagrams arrive all the time"
             note(f"{name} {direction}: {mean * 1e3:.2f} ms, wanted {wanted * 1e3:.0f} ms")
         if off < TOLERANCE:
-            break
+            return
     assert off < TOLERANCE
 
 
@@ -150,9 +150,12 @@ def test_the_link_is_set_by_hand_and_read_back(readings, note):
     finally:
         told = set_link("--profile", "paper-p2")
         took.append(told["seconds"])
-    asked = SET_WITHIN * pace()
-    note(f"link set: asked {asked:.2f} s | in force after {min(took):.2f} s")
-    assert min(took) <= asked
+    for _ in range(WINDOWS):
+        if min(took) <= SET_WITHIN:
+            break
+        took.append(set_link("--profile", "paper-p2")["seconds"])
+    note(f"link set: asked {SET_WITHIN:g} s | in force after {min(took):.2f} s")
+    assert min(took) <= SET_WITHIN
     assert told["links"]["downlink"]["asked"]["delay"] == 0.045
     # Cloud notes a change of the downlink for its recording. The uplink has not changed.
     said = "link: downlink 45 ± 25 ms (profile paper-p2)"
