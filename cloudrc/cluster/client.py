@@ -106,7 +106,7 @@ class Release:
         """Flags that select context and namespace in helm."""
         return [flag.replace("--context", "--kube-context") for flag in self.flags]
 
-    def upgrade(self, *settings: str) -> str:
+    def helm_upgrade(self, *settings: str) -> str:
         """Return the helm command that changes `settings` and keeps all other values."""
         sets = [f"--set {each}" for each in settings]
         words = [self.name, "charts/cloudrc", *self.helm_flags, "--reset-then-reuse-values", *sets]

@@ -119,7 +119,7 @@ def _read_template(release: Release) -> Any:
     """Read the Job of a mission that the chart has made from the release's values."""
     for found in release.find("configmaps", TEMPLATE):
         return yaml.safe_load(found.data[TEMPLATE_FILE])
-    raise ClusterError(f"{release} has another version of the chart: {release.upgrade()}")
+    raise ClusterError(f"{release} has another version of the chart: {release.helm_upgrade()}")
 
 
 def read_example(release: Release, component: str, name: str) -> tuple[Any, Any]:

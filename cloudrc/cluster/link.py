@@ -73,7 +73,7 @@ def read_link(release: Release) -> LinkParts:
     if not pods.keys() >= set(COMPONENTS):
         raise ClusterError(f"a pod of {release} does not run")
     if any(each["kind"] == "Pod" and INDEX in each["metadata"]["labels"] for each in found):
-        change = release.upgrade("link.profile=NAME")
+        change = release.helm_upgrade("link.profile=NAME")
         raise ClusterError(f"{release} is a fleet; change its link: {change}")
     experiments = [each["data"] for each in found if EXPERIMENT in each.get("data", {})]
     files = {EXPERIMENT: "{}", **(experiments[0] if experiments else {}), **maps[0]["data"]}

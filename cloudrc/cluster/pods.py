@@ -302,7 +302,7 @@ def follow_page(release: Release, port: int, tell: Callable[[str], None]) -> Ite
     """
     pod = find_pod(release, "cloud")
     if not has_container(pod, CONSOLE):
-        add = release.upgrade("console.enabled=true")
+        add = release.helm_upgrade("console.enabled=true")
         raise ClusterError(f"{release} has no console; add it: {add}")
     name = pod.metadata.name
     words = ["logs", f"pod/{name}", f"--container={CONSOLE}", "--follow", "--since=1s"]

@@ -71,7 +71,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             chunk: Number of actions in an answer, for the ticks from the observation's on; None:
                 an answer is a single action.
             executor: How the robot executes answers: the name of a plug-in, or the path of a file.
-            hold: Without a new action the robot executes its last one, "repeat", or "start".
+            hold: Without an action it executes the last one, "repeat", or `start`, "start".
             start: Action before the first answer arrives; None: 0, or what is nearest to it;
                 "answer": the robot waits for the first answer, and the episode begins then.
             observation_bytes: Size of an observation on the wire [bytes]; None: that of its arrays.

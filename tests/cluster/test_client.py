@@ -17,7 +17,7 @@ def test_flags_override_the_kubeconfig(api):
     assert release == Release("elsewhere", "mine", "paper")
     assert release.flags == ["--context=elsewhere", "--namespace=mine"]
     assert release.helm_flags == ["--kube-context=elsewhere", "--namespace=mine"]
-    assert release.upgrade("link.profile=lte") == (
+    assert release.helm_upgrade("link.profile=lte") == (
         "helm upgrade paper charts/cloudrc --kube-context=elsewhere --namespace=mine "
         "--reset-then-reuse-values --set link.profile=lte"
     )
