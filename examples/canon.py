@@ -12,7 +12,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from functools import partial
-from math import ceil, comb, floor, log10, sqrt
+from math import ceil, comb, floor, inf, log10, pi, sqrt
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -74,6 +75,28 @@ def kalman_networked(a: float, p: float, runs: int, steps: int) -> Found:
             seen, reward, *_ = env.step(-a * seen)
             found[seed] -= float(reward) / steps
     return 1.0 / (1.0 - a * a * p), found
+
+
+def kalman_variance(a: float, p: float, runs: int, steps: int) -> Found:
+    """Variance of P, the variance of the error before an observation."""
+    mean, exact = moments_of_p(a, p)
+    variance, squares = np.ones(runs), np.zeros(runs)
+    for lost in losses(p, runs, steps):
+        squares += (variance - mean) ** 2
+        variance = a * a * variance * lost + 1.0
+    return exact, squares / steps
+
+
+def moments_of_p(a: float, p: float) -> tuple[float, float]:
+    """Return mean and variance of P. The variance is finite only for p < 1 / a^4.
+
+    A loss multiplies P by a^2, and so its square by a^4.
+    """
+    if a**4 * p >= 1.0:
+        return (1.0 / (1.0 - a * a * p) if a * a * p < 1.0 else inf), inf
+    mean = 1.0 / (1.0 - a * a * p)
+    square = (1.0 + 2.0 * a * a * p * mean) / (1.0 - a**4 * p)
+    return mean, square - mean**2
 
 
 def tail_index(a: float, loss: Any, runs: int, steps: int) -> Found:
@@ -180,26 +203,40 @@ def packetised_exact(p: float, size: int, hold: bool) -> float:
     return float(moments[:, 0, 0].sum() + used)
 
 
-# Sending on a threshold. K. J. Astrom, B. Bernhardsson, "Comparison of Riemann and Lebesgue
-# Sampling for First Order Stochastic Systems", CDC 2002.
+# Sending on a threshold, with the executor of send_on_delta.py. K. J. Astrom, B. Bernhardsson,
+# "Comparison of Riemann and Lebesgue Sampling for First Order Stochastic Systems", CDC 2002.
+ON_DELTA = str(Path(__file__).with_name("send_on_delta.py"))
 
 
-def send_on_delta(runs: int, steps: int) -> Found:
-    """Variance of a periodically reset integrator over that of one reset at |x| = 1, equal rates.
+def send_on_delta(delta: float, runs: int, steps: int) -> Found:
+    """Mean square of an integrator with noise, whose state is sent and reset from `delta` on."""
+    found, executor = np.zeros(runs), {"name": ON_DELTA, "delta": delta}
+    for seed in range(runs):
+        plant = gymnasium.make("cloudrc/Linear-v0", A=1.0)
+        env = Networked(plant, seed=seed, hold="start", executor=executor)
+        seen, _ = env.reset(seed=seed)
+        for _ in range(steps):
+            seen, reward, *_ = env.step(-seen)
+            found[seed] -= float(reward) / steps
+    return send_on_delta_exact(delta)[0], found
 
-    Steps of 1 ms; a threshold that is met late scales both variances, and so not their ratio.
+
+def send_on_delta_exact(delta: float, nodes: int = 200) -> tuple[float, float]:
+    """Return the mean square, and the share of the steps in which the state is sent.
+
+    Between two resets, the density of the state obeys an integral equation of Fredholm; its nodes
+    are those of Gauss and Legendre.
     """
-    step_s = 1e-3
-    noise = np.random.default_rng(1)
-    x, squares, resets = np.zeros(runs), np.zeros(runs), np.zeros(runs)
-    for _ in range(steps):
-        x += noise.standard_normal(runs) * sqrt(step_s)
-        squares += x**2
-        over = np.abs(x) >= 1.0
-        resets += over
-        x[over] = 0.0
-    interval = steps * step_s / resets
-    return 3.0, interval / 2.0 / (squares / steps)
+    x, weights = np.polynomial.legendre.leggauss(nodes)
+    x, weights = delta * x, delta * weights
+
+    def normal(y: Floats) -> Floats:
+        return np.exp(-y * y / 2.0) / sqrt(2.0 * pi)
+
+    kernel = normal(x[:, None] - x) * weights
+    visits = np.linalg.solve(np.eye(nodes) - kernel, normal(x))  # of a state, between two resets
+    share = 1.0 / (1.0 + weights @ visits)
+    return float(1.0 + share * (weights @ (x * x * visits))), float(share)
 
 
 # Age of information: the age of the newest data that has arrived. S. Kaul et al., "Real-Time
@@ -257,7 +294,7 @@ def starvation(share: float, delay: int, runs: int, steps: int) -> Found:
     The answer comes `delay` steps late.
     """
     size = 50
-    asks_at = int(share * size)
+    asks_at = floor(share * size)
     exact = max(0.0, delay - asks_at) / (size - 2 * asks_at + delay)
     link = {"downlink": {"delay_ms": 1e3 * delay * PERIOD}}
     plant = gymnasium.make("cloudrc/Linear-v0", A=0.0)
@@ -342,6 +379,7 @@ def rows() -> list[Row]:
         Row("Sinopoli 2004: E[P], loss .1", partial(kalman, 1.25, 0.1), 100, 20_000),
         Row("E[P], loss .3", partial(kalman, 1.25, 0.3), 100, 50_000),
         Row(HEAVY, partial(kalman, 1.25, 0.45), 100, 500_000),
+        Row("Var[P], loss .1", partial(kalman_variance, 1.25, 0.1), 100, 50_000),
         Row("E[x²] through `Networked`, loss .1", partial(kalman_networked, 1.25, 0.1), 20, 10_000),
         Row("E[x²] through `Networked`, loss .3", partial(kalman_networked, 1.25, 0.3), 20, 10_000),
         Row("tail index at the limit, loss .64", partial(tail_index, 1.25, limit), 40, 200_000),
@@ -356,7 +394,8 @@ def rows() -> list[Row]:
         ("Schenato 2009: 1 input, held", 1, True),
     ):
         found.append(Row(name, partial(packetised, 0.2, size, hold), 200, 10_000))
-    found.append(Row("Åström 2002: periodic / send-on-delta", send_on_delta, 50, 400_000))
+    for delta, name in ((1, "Åström 2002: send-on-delta at 1"), (2, "at 2"), (3, "at 3")):
+        found.append(Row(name, partial(send_on_delta, delta), 20, 4_000))
     for part, name in (
         ("mean", "Kaul 2012: age, loss .1 [s]"),
         ("peak_mean", "Costa 2016: peak age [s]"),

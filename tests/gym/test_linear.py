@@ -11,6 +11,8 @@ from tests.conftest import nightly_rows
 ROWS = {row.name: row for row in canon.rows()}
 LIKE_ANOTHER = [
     "E[x²] through `Networked`, loss .1",
+    "at 2",
+    "at 3",
     "the same with loss in bursts",
     "LQG, loss .3, UDP-like",
     "2 inputs in a packet",
@@ -32,6 +34,33 @@ def test_a_closed_form_is_measured(name, scale):
     exact, mean, error = ROWS[name].at(scale)
     assert error < 0.04 * exact
     assert abs(mean - exact) < 3.0 * error
+
+
+@pytest.mark.parametrize(("p", "is_finite"), [(0.1, True), (0.4, True), (0.41, False)])
+def test_the_variance_of_p_is_finite_below_one_over_the_fourth_power(p, is_finite):
+    """a = 1.25: 1 / a^4 = .4096. After k losses in a row, P is 1 + a^2 + ... + a^(2 k)."""
+    k = np.arange(700)
+    values, chances = np.cumsum(1.25 ** (2.0 * k)), (1.0 - p) * p**k
+    mean, variance = canon.moments_of_p(1.25, p)
+    assert mean == pytest.approx((chances * values).sum())
+    squares = np.cumsum(chances * values**2)
+    assert bool(squares[-1] < 1.01 * squares[350]) is is_finite
+    assert variance == pytest.approx(squares[-1] - mean**2) if is_finite else np.isinf(variance)
+
+
+def test_send_on_delta_needs_a_third_of_the_variance_where_steps_are_short():
+    """The mean square of a state that is reset every n steps is (n + 1) / 2."""
+    square, share = canon.send_on_delta_exact(30.0)
+    assert (1.0 / share + 1.0) / 2.0 / square == pytest.approx(3.0, abs=0.05)
+    few = [canon.send_on_delta_exact(delta)[0] for delta in (1.0, 2.0, 3.0)]
+    assert few == pytest.approx([1.191, 1.860, 2.878], abs=0.001)
+
+
+def test_async_starves_from_the_whole_number_of_actions_at_which_it_asks():
+    """A share of .45 asks when 22 of 50 actions are left, not 22.5."""
+    exact, found = canon.starvation(0.45, 30, 1, 5_000)
+    assert exact == 8 / 36
+    assert found.mean() == pytest.approx(exact, abs=0.004)
 
 
 def test_a_step_follows_the_matrices():
