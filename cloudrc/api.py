@@ -242,6 +242,7 @@ def sweep(
     from cloudrc.studies import sweep as work
     from cloudrc.trials.plan import read_plan
     from cloudrc.trials.play import run
+    from cloudrc.trials.tables import NUMBERS
 
     jobs = _count(jobs, "jobs")
     plan = read_plan(grid if isinstance(grid, Mapping) else Path(grid))
@@ -256,7 +257,7 @@ def sweep(
     if stopped:
         raise _as_exception(stopped)
     columns = work.columns_of(flown, plan)
-    numbers = {name for name in plan.axes if {*map(type, columns[name])} <= work.NUMBERS}
+    numbers = {name for name in plan.axes if {*map(type, columns[name])} <= NUMBERS}
     arrays = {
         name: np.array(values, dtype=float if name in numbers or None in values else None)
         for name, values in columns.items()

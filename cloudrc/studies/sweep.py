@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,17 +28,17 @@ from cloudrc.outside.document import read_document, write_yaml
 from cloudrc.outside.paths import LOCK, lock_folder
 from cloudrc.runs.fly import fly
 from cloudrc.runs.folder import new_folder
-from cloudrc.text import csv_table, table
+from cloudrc.text import table
+from cloudrc.trials import tables
 from cloudrc.trials.plan import COLUMNS, PlannedFlight, SweepPlan, read_plan
 from cloudrc.trials.rows import SIZE_MAX, Row, Rows, read_rows
 from cloudrc.trials.summary import count_successes, count_verdicts, normalise
+from cloudrc.trials.tables import Columns, as_text, write_table
 from cloudrc.trials.workers import map_in_order, take_each
 from cloudrc.version import __version__
 
 FILE, SUMMARY, PODS = "sweep.yaml", "sweep.json", "pods.json"
 TABLE, PARQUET = "table.csv", "table.parquet"
-NUMBERS = {int, float, type(None)}
-"""Types of the values of an axis of numbers; None is the value null."""
 Shard = tuple[int, int] | None
 """Number of a part of the flights, from 1, and how many parts there are; None: all flights."""
 
@@ -103,10 +102,8 @@ def finish(folder: Path, plan: SweepPlan) -> dict[str, Row]:
     _write_summary(folder, plan, rows)
     if rows.kept.keys() == plan.flights.keys():
         columns = columns_of(rows.kept, plan)
-        write_atomically(folder / TABLE, as_csv(columns, plan.units).encode())
-        if find_spec("pyarrow"):
-            parquet, tables = import_module("pyarrow.parquet"), import_module("pyarrow")
-            parquet.write_table(tables.table(columns), folder / PARQUET)
+        for name in (TABLE, *([PARQUET] if find_spec("pyarrow") else [])):
+            write_table(folder / name, columns, plan.units)
     return rows.kept
 
 
@@ -137,36 +134,11 @@ def read_summary(folder: Path) -> dict[str, Any]:
     return found
 
 
-def as_csv(columns: Mapping[str, Sequence[Any]], unit_of: Mapping[str, str]) -> str:
-    """Format columns of equal length as CSV; the first line has names, and units in brackets."""
-    head = [f"{name} [{unit_of[name]}]" if name in unit_of else name for name in columns]
-    rows = zip(*columns.values(), strict=True)
-    return csv_table([dict(zip(head, row, strict=True)) for row in rows]) + "\n"
-
-
-def columns_of(kept: Mapping[str, Row], plan: SweepPlan) -> dict[str, list[Any]]:
-    """Return the columns of a sweep's tables; an axis of numbers and other values becomes text."""
+def columns_of(kept: Mapping[str, Row], plan: SweepPlan) -> Columns:
+    """Return the columns of a sweep's tables, in the order of its flights."""
     known = normalise(kept, plan.baselines)
     rows = [known[key] for key in plan.flights if key in known]
-
-    axes = {axis: _axis_column([row["point"][axis] for row in rows]) for axis in plan.axes}
-    names = sorted({name for row in rows for name in row["numbers"]})
-    own = {name: [row.get(name, "") for row in rows] for name in COLUMNS}
-    own["failures"] = [" ".join(codes) for codes in own["failures"]]
-    numbers = {name: [row["numbers"].get(name) for row in rows] for name in names}
-    return {"key": own.pop("key"), **axes, **own, **numbers}
-
-
-def _axis_column(values: list[Any]) -> list[Any]:
-    """Return the column of an axis: texts, truth values, or numbers and None; else all as text."""
-    types = {*map(type, values)}
-    plain = types <= NUMBERS or types in ({str}, {bool})
-    return values if plain else [*map(as_text, values)]
-
-
-def as_text(value: Any) -> str:
-    """Format the value of an axis or a setting."""
-    return value if isinstance(value, str) else json.dumps(value)
+    return tables.columns_of(rows, plan.axes, COLUMNS)
 
 
 # Recordings of flights.

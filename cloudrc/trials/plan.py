@@ -25,8 +25,8 @@ from cloudrc.trials.fingerprint import experiment_facts, fingerprint, key_of
 from cloudrc.trials.rows import Row
 from cloudrc.trials.summary import RATIO
 
-COLUMNS = ("key", "seed", "verdict", "failures", "code", "physics_steps")
-"""Columns of the table besides the axes and the numbers."""
+COLUMNS = ("seed", "verdict", "failures", "code", "physics_steps")
+"""Columns of the table besides the key, the axes and the numbers."""
 
 
 class PlannedFlight(NamedTuple):
