@@ -1,5 +1,6 @@
 """How a robot executes chunks of actions that arrive late."""
 
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -8,6 +9,7 @@ from cloudrc import plugins
 from cloudrc.errors import BadInputError
 from cloudrc.gym import Networked
 from tests.gym.envs import Counter, both_ways
+from tests.support.pages import blocks
 
 
 def answer(observation, size):
@@ -146,3 +148,27 @@ def test_every_executor_says_what_it_is_and_forgets_the_last_episode(name):
         return [float(each[0]) for each in env.unwrapped.executed]
 
     assert fly() == fly()
+
+
+def test_an_executor_corrects_actions_with_the_newest_observation(tmp_path):
+    """The chunks stand still; the example of the page damps what it sees on board."""
+    (tmp_path / "corrected.py").write_text(
+        next(each for each in blocks("gym", "python") if "Corrected" in each)
+    )
+    executed, speeds = [], []
+    for link in ("ideal", "lte"):
+        pendulum = gymnasium.wrappers.TransformAction(
+            gymnasium.make("Pendulum-v1"),
+            lambda action: executed.append(float(action[0])) or action,
+            None,
+        )
+        name = str(tmp_path / "corrected.py")
+        env = Networked(pendulum, link, 1, chunk=30, executor=name, start="answer")
+        env.reset(seed=1)
+        for _ in range(20):
+            speeds.append(pendulum.unwrapped.state[1])
+            env.step(np.zeros((30, 1), np.float32))
+    both = [(-0.5 * speed, action) for speed, action in zip(speeds, executed, strict=True)]
+    assert [action for _, action in (both[0], both[20])] == [0.0, 0.0]
+    expected, found = zip(*(both[1:20] + both[21:]), strict=True)
+    assert found == pytest.approx(expected, abs=1e-6)
