@@ -159,6 +159,11 @@ def tell(text: str) -> None:
     print_line(f"cloudrc: {text}", sys.stderr)
 
 
+def again(out: Path | None, folder: Path) -> str:
+    """Say how to continue with `folder` after a command has ended early; `out` is its --out."""
+    return "to continue, give the same command again" if out else f"to continue, add --out {folder}"
+
+
 def warn(*experiments: ResolvedExperiment) -> None:
     """Print warnings about experiments on stderr."""
     from cloudrc.runs.experiment import advice_on

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cloudrc.cli.output import TABLE, output_argument, print_result, tell, warn
+from cloudrc.cli.output import TABLE, again, output_argument, print_result, tell, warn
 from cloudrc.cli.parser import (
     COUNT_MAX,
     Options,
@@ -69,7 +69,7 @@ def execute(options: Options) -> int:
         with SweepView(head, len(missing), on_stdout=options.output == TABLE) as view:
             stopped = run(missing, rows, options.jobs, view.see, in_order=False)
     if stopped:
-        tell(f"{stopped}; to continue, add --out {folder}")
+        tell(f"{stopped}; {again(options.out, folder)}")
     document = {
         **{"experiment": name, "overrides": options.set, "disturbances": study.disturbances},
         **{"seeds": study.seeds, "interrupted": bool(stopped)},

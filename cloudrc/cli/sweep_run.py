@@ -7,7 +7,15 @@ import secrets
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.output import leave_message, print_line, print_or_drop, print_result, tell, warn
+from cloudrc.cli.output import (
+    again,
+    leave_message,
+    print_line,
+    print_or_drop,
+    print_result,
+    tell,
+    warn,
+)
 from cloudrc.cli.parser import Options
 from cloudrc.cli.progress import Progress, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
@@ -64,8 +72,8 @@ def run(options: Options) -> int:
                     mine, rows.kept, options.record, folder, options.jobs
                 )
         if stopped:
-            again = f"cloudrc sweep attach {folder}" if options.on else f"add --out {folder}"
-            tell(f"{stopped}; to continue, {again}")
+            attach = f"to continue, cloudrc sweep attach {folder}"
+            tell(f"{stopped}; {attach if options.on else again(options.out, folder)}")
         done = sweep.finish(folder, plan)
         name = sweep.TABLE if len(done) == len(plan.flights) else sweep.SUMMARY
         text = f"\n{summaries.count_verdicts(done.values())}\n\n{escape(str(folder / name))}"

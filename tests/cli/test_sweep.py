@@ -147,7 +147,7 @@ def test_an_error_of_the_machine_ends_a_sweep_and_is_no_row(break_seed_2, write_
     error = call("sweep run --out grid", write_sweep(ONE, seeds=[1, 2, 3]), code=3).err
     line = error.splitlines()[-1]
     assert "memory ran out" in line
-    assert "; to continue, add --out grid" in line
+    assert "; to continue, give the same command again" in line
     assert [row["seed"] for row in rows("grid")] == [1]
 
 
