@@ -24,6 +24,7 @@ WEIGHTS = {
     "late_share": "action_age_of",
     **dict.fromkeys(("loop_age", "observation_age_p99", "action_age_p99", "seam_jump")),
     **dict.fromkeys(("observation_age_peak", "action_age_peak")),
+    **dict.fromkeys(("delay_asked_uplink", "delay_asked_downlink")),
     **dict.fromkeys(("delay_measured_uplink", "delay_measured_downlink")),
     **dict.fromkeys(("loss_uplink", "loss_downlink")),
 }
@@ -34,10 +35,9 @@ LARGEST = (
     ("action_age_max", "_ms", 1e3),
 )
 """Numbers of an episode whose largest a summary has: name, suffix and factor of its unit."""
-SURVIVES = (
-    "Survives up to N ms: with 95 % confidence, at each asked round trip up to N ms the policy "
-    "succeeds in more than half of the episodes in which it succeeds without a network. It takes "
-    "at least 5 of 5, 9 of 10, 15 of 20 or 59 of 100 of them. What is not shown may still hold."
+SEEDS_CHANGED = (
+    "The number of seeds has changed in this folder: {}. If a result was seen in between, a claim "
+    "is wrong more often than 5 %; decide the number, and play it in a new folder"
 )
 NOTHING = (
     "survival is unknown: no episode without a network is known to succeed; --success-at says "
@@ -100,29 +100,53 @@ def survivals(groups: Groups) -> list[dict[str, Any]]:
 
     From the smallest round trip on, an exact test asks of the seeds with a success without a
     network whether more than half have a success over the network. The first round trip at which
-    this is not shown ends the sequence. So the probability that a claim is wrong for any of its
-    round trips is at most 5 %, without an adjustment.
+    this is not shown ends the sequence, so that its round trips need no adjustment. Each of k
+    executors has the level .05 / k (Bonferroni): the probability that any claim is wrong is at most
+    5 %.
 
     Source: A. C. Tamhane, C. W. Dunnett, J. W. Green, J. D. Wetherington, "Multiple test procedures
     for identifying the maximum safe dose", 2001.
     """
     base, found = _seeds(groups[BASELINE][None]), list[dict[str, Any]]()
-    too_few = tail(0, len(base)) >= LEVEL
+    least = least_kept(len(base), len(groups) - 1)
     for executor, conditions in groups.items():
         each: dict[str, Any] = {"executor": executor, "of": len(base)}
         text = f"{executor} is not shown to survive a round trip that was asked"
-        if too_few:
+        if least is None:
             text += f": {len(base)} successes without a network are too few to show it"
         for rtt, rows in conditions.items():
             kept = len(base & _seeds(rows))
             each |= {"tried_ms": rtt, "kept": kept, "p": tail(len(base) - kept, len(base))}
-            if each["p"] >= LEVEL:
+            if least is None or kept < least:
                 text += f"; at {place(rtt)} it keeps {kept} of {len(base)} successes"
                 break
             each["up_to_ms"] = rtt
             text = f"{executor} survives up to {place(rtt)}"
         found.append({**each, "text": text})
     return found[1:]
+
+
+def least_kept(count: int, executors: int) -> int | None:
+    """Return how many of `count` successes show that more than half are kept; None: all too few.
+
+    Each of the `executors` has an equal part of the 5 % at which a claim may be wrong.
+    """
+    level = LEVEL / max(1, executors)
+    return next((n for n in range(count + 1) if tail(count - n, count) < level), None)
+
+
+def explain_survival(count: int, executors: int) -> str:
+    """Say what "survives" means with so many successes without a network, and executors."""
+    least = least_kept(count, executors)
+    told = f"{least} of these {count}" if least else f"more than these {count}"
+    together = f" for the {executors} executors together" if executors > 1 else ""
+    return (
+        f"Survives up to N ms: with 95 % confidence{together}, at each asked round trip up to N ms "
+        "the policy succeeds in more than half of the episodes in which it succeeds without a "
+        f"network. It takes {told}: each executor is tested at the level "
+        f"{LEVEL / max(1, executors):.2g}. What is not shown may still hold. This is true if the "
+        "number of seeds was decided before the first result was seen."
+    )
 
 
 def _seeds(rows: Sequence[Row]) -> set[int]:
@@ -166,10 +190,13 @@ def _compare(first: Sequence[Row], second: Sequence[Row]) -> dict[str, Any]:
     return found
 
 
-def judge(rows: Sequence[Row], before: Sequence[Row] = (), name: str = "") -> dict[str, Any]:
+def judge(
+    rows: Sequence[Row], before: Sequence[Row] = (), name: str = "", seeds: Sequence[int] = ()
+) -> dict[str, Any]:
     """Return summaries, survival and tests of rows, and notes on them.
 
-    The rows `before` are those of another policy, in the folder `name`.
+    The rows `before` are those of another policy, in the folder `name`; `seeds` are the different
+    numbers of seeds that the calls asked for.
     """
     groups = group(rows)
     outcomes = [
@@ -181,7 +208,10 @@ def judge(rows: Sequence[Row], before: Sequence[Row] = (), name: str = "") -> di
     notes = [NOTHING]
     if outcomes[0].get("successes"):
         survival = survivals(groups)
-        notes = [SURVIVES, *(each["text"] for each in survival)]
+        words = explain_survival(survival[0]["of"], len(survival))
+        notes = [words, *(each["text"] for each in survival)]
+    if len(seeds) > 1:
+        notes.append(SEEDS_CHANGED.format(", then ".join(map(str, seeds))))
     intervals = [key for each in outcomes for key in each if key.endswith("_low")]
     count = len(intervals) + sum(len(each.keys() & {"success", "return"}) for each in tests)
     notes += doubts(outcomes)

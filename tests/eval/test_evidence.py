@@ -5,7 +5,7 @@ from statistics import fmean
 
 import pytest
 
-from cloudrc.eval.evidence import NOTHING, group, judge, summarize, survivals
+from cloudrc.eval.evidence import NOTHING, group, judge, least_kept, summarize, survivals
 from cloudrc.eval.setup import BASELINE
 
 
@@ -55,6 +55,56 @@ def test_a_policy_survives_the_round_trips_before_the_first_that_is_not_shown(ke
     assert found["text"].startswith(f"newest {text}")
     few = 20 - found["kept"]
     assert found["p"] == pytest.approx(sum(comb(20, n) for n in range(few + 1)) / 2**20)
+
+
+@pytest.mark.parametrize(
+    ("executors", "least"),
+    [
+        (1, {5: 5, 6: 6, 8: 7, 10: 9, 15: 12, 20: 15, 50: 32, 100: 59}),
+        (2, {5: None, 6: 6, 8: 8, 10: 9, 15: 12, 20: 15, 50: 33, 100: 61}),
+        (3, {5: None, 6: 6, 8: 8, 10: 9, 15: 13, 20: 16, 50: 33, 100: 62}),
+        (4, {5: None, 6: None, 8: 8, 10: 9, 15: 13, 20: 16, 50: 34, 100: 62}),
+    ],
+)
+def test_more_executors_have_to_keep_more(executors, least):
+    assert {count: least_kept(count, executors) for count in least} == least
+
+
+def claims(count, kept, executors):
+    """Return whether the first of so many executors is said to survive if it keeps `kept`."""
+    world = rows(BASELINE, None, [True] * count)
+    for n in range(executors):
+        world += rows(f"executor {n}", 0.0, [each < (0 if n else kept) for each in range(count)])
+    first, *_ = survivals(group(world))
+    return "up_to_ms" in first
+
+
+@pytest.mark.parametrize(
+    ("count", "before"), [(5, 0.091), (8, 0.102), (10, 0.032), (13, 0.132), (18, 0.138)]
+)
+def test_a_false_claim_for_any_of_three_executors_has_at_most_5_percent(count, before):
+    """Exact: each executor keeps half of the successes, the most for which a claim is false."""
+    wrong = [
+        sum(comb(count, n) for n in range(count + 1) if claims(count, n, executors)) / 2**count
+        for executors in (1, 3)
+    ]
+    at_5_percent, adjusted = (1 - (1 - each) ** 3 for each in wrong)
+    assert at_5_percent == pytest.approx(before, abs=0.0005)
+    assert adjusted <= 0.05
+
+
+def test_who_adds_seeds_until_it_shows_is_wrong_more_often_and_the_notes_say_so():
+    """Exact: look after every 10 seeds, up to 100, at one executor that keeps half."""
+    chances, wrong = {0: 1.0}, 0.0  # successes kept -> chance, of those who go on
+    for count in range(1, 101):
+        kept = range(count + 1)
+        chances = {n: (chances.get(n, 0.0) + chances.get(n - 1, 0.0)) / 2 for n in kept}
+        if count % 10 == 0:
+            wrong += sum(chances.pop(n) for n in kept if n >= least_kept(count, 1))
+    assert wrong == pytest.approx(0.125, abs=0.0005)
+    notes = judge(flight(20), seeds=(10, 20))["notes"]
+    assert any("10, then 20" in each for each in notes)
+    assert not any("has changed" in each for each in judge(flight(20), seeds=(20,))["notes"])
 
 
 def test_successes_that_the_network_gives_do_not_make_up_for_lost_ones():
