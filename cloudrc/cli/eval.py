@@ -7,7 +7,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.output import TABLES, output_argument, print_result, tell
+from cloudrc.cli.output import TABLES, again, output_argument, print_result, tell
 from cloudrc.cli.parser import COUNT_MAX, Options, Parser, flags, number, read_count, whole_number
 from cloudrc.errors import CloudrcError
 from cloudrc.outside.paths import lock_folder
@@ -17,6 +17,7 @@ from cloudrc.runs.requirements import require
 from cloudrc.text import cells, csv_table, escape, latex_table
 
 if TYPE_CHECKING:
+    from cloudrc.eval.results import Before
     from cloudrc.eval.setup import Episode, EvalSetup
     from cloudrc.trials.rows import Row
 
@@ -64,6 +65,7 @@ def arguments(parser: Parser) -> None:
     about = "parallel processes for a policy in a file (default: one per core)"
     add("--jobs", "N", about, COUNT_MAX, read_count)
     add("--out", "DIR", "folder (default: a new one in runs/); if it has rows, play the others")
+    add("--rows", "FILE", "also write a line per episode into this file: .csv or .parquet")
     add("--versus", "DIR", "folder of another policy's evaluation, to compare with in pairs")
     output_argument(parser, forms=TABLES)
 
@@ -93,23 +95,31 @@ def execute(options: Options) -> int:
     if not setup.follows_seed:
         tell(f"warning: --env {setup.env}: {results.SEEDLESS}")
     episodes = [*(Episode(None, BASELINE, n + 1) for n in range(options.seeds)), *episodes]
-    before = []
-    if options.versus:
-        with naming(f"--versus {options.versus}"):
-            before = results.read_versus(options.versus, setup, episodes)
+    known = results.read_before(folder, setup) if goes_on else results.Before()
+    known, before = _versus(options, known, setup, episodes)
     if not goes_on:
         folder = new_folder(folder, f"eval-{Path(setup.env).name}", "latest-eval")
-    with lock_folder(folder), Progress("plays episodes", len(episodes)) as view:
-        view.say(f"{setup.env}: {len(episodes)} episodes, step {setup.step}")
-        try:
-            rows, stopped = results.play_missing(folder, setup, episodes, options.jobs, view.count)
-        except CloudrcError:
-            tell(f"the rows are kept; the same call with --out {folder} goes on")
-            raise
+    with lock_folder(folder):
+        with Progress("plays episodes", len(episodes)) as view:
+            view.say(f"{setup.env}: {len(episodes)} episodes, step {setup.step}")
+            try:
+                rows, stopped = results.play_missing(
+                    folder, setup, episodes, options.jobs, known, view.count
+                )
+            except CloudrcError:
+                tell(f"the rows are kept; the same call with --out {folder} goes on")
+                raise
         if stopped:
-            tell(f"{stopped}; to continue, add --out {folder}")
+            tell(f"{stopped}; {again(options.out, folder)}")
             return stopped.exit_code
-        document, page = _report(options, setup, folder, rows, before)
+        if options.rows:
+            results.write_rows(options.rows, rows)
+        try:
+            with Progress("draws the page"):
+                document, page = _report(options, setup, folder, rows, before, known)
+        except KeyboardInterrupt:
+            tell(f"interrupted; {again(options.out, folder)}")
+            raise
     rows = document["outcomes"]
     tables = {"csv": csv_table(rows), "latex": latex_table(cells(rows, results.COLUMNS))}
     text = f"{results.as_text(document)}\n{escape(str(page))}"
@@ -117,8 +127,35 @@ def execute(options: Options) -> int:
     return 0
 
 
+def _versus(
+    options: Options, known: Before, setup: EvalSetup, episodes: list[Episode]
+) -> tuple[Before, list[Row]]:
+    """Return what the folder has to know, and the rows of the policy to compare with.
+
+    Without --versus, the comparison of an earlier call stays, if its folder still fits.
+    """
+    from cloudrc.eval.results import read_versus
+
+    given = options.versus or known.versus
+    seeds = tuple(dict.fromkeys([*known.seeds, options.seeds]))
+    try:
+        with naming(f"--versus {given}"):
+            rows = read_versus(Path(given), setup, episodes) if given else []
+    except CloudrcError as error:
+        if options.versus:
+            raise
+        tell(f"warning: the comparison of an earlier call is left out: {error}")
+        given, rows = "", []
+    return known._replace(versus=str(given), seeds=seeds), rows
+
+
 def _report(
-    options: Options, setup: EvalSetup, folder: Path, rows: list[Row], before: list[Row]
+    options: Options,
+    setup: EvalSetup,
+    folder: Path,
+    rows: list[Row],
+    before: list[Row],
+    known: Before,
 ) -> tuple[dict[str, Any], Path]:
     """Judge the rows; write and return the file of the evaluation, and the path of its page."""
     from cloudrc.eval import results
@@ -126,7 +163,7 @@ def _report(
     from cloudrc.eval.page import write_page
     from cloudrc.eval.provenance import provenance
 
-    found = judge(rows, before, str(options.versus or ""))
+    found = judge(rows, before, *known) | known._asdict()
     found["success"] = results.describe_success(setup, found["outcomes"])
     found |= provenance(setup, shlex.join(["cloudrc", *options.given]))
     document = results.write(folder, setup, found)
@@ -154,6 +191,7 @@ def _read(options: Options) -> tuple[EvalSetup, list[Episode]]:
         deadline=options.deadline,
     )
     values.check_policy(setup.policy)
+    values.check_rows(options.rows)
     values.check_round_trips(setup.link, options.rtt)
     given = values.read_parameters([*chain(*options.set)], executors)
     episodes = [

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Mapping
+from importlib.util import find_spec
 from math import nan
 from pathlib import Path
 from typing import Any
 
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.eval.setup import FILE, MEASURED, SEED, Compute
 from cloudrc.link.library import read_profile
 from cloudrc.link.traces import read_lines
 from cloudrc.outside.document import parse_value, read_document
+from cloudrc.outside.paths import check_new
 from cloudrc.outside.refusal import check_names
 from cloudrc.outside.values import ANY
 from cloudrc.plugins import is_path, signature
 from cloudrc.policy.address import check_url
 from cloudrc.policy.observation import Mapped
+from cloudrc.trials.tables import CSV, PARQUET
 
+TABLE_BEGINS = {CSV: b"key,", PARQUET: b"PAR1"}
+"""Ending of a file of rows -> how its content begins."""
 COMPUTE_MAX = 3600.0
 """Largest time for an answer [s]."""
 
@@ -35,6 +40,24 @@ def check_policy(policy: str) -> None:
             f"--policy {policy}: there is no such file; give a Python file, such as "
             "./expert.py, or the address of a server, such as ws://127.0.0.1:8000"
         )
+
+
+def check_rows(path: Path | None) -> None:
+    """Check that a file for the rows of the episodes is new, or one of an earlier call."""
+    if path is None:
+        return
+    what, begin = f"--rows {path}", TABLE_BEGINS.get(path.suffix)
+    if begin is None:
+        raise BadInputError(f"{what}: name a file that ends in {' or '.join(TABLE_BEGINS)}")
+    if path.suffix == PARQUET and not find_spec("pyarrow"):
+        raise MissingPrerequisiteError(f"{what}: needs pyarrow; run: pip install pyarrow")
+    if not path.parent.is_dir():
+        raise BadInputError(f"{what}: there is no folder {path.parent}; make it, or name another")
+    if path.is_file():
+        with path.open("rb") as file:
+            is_ours = file.read(len(begin)) == begin
+        if not is_ours:
+            check_new(path, "name another file with --rows")
 
 
 def check_round_trips(profile: str, round_trips: tuple[float | None, ...]) -> None:

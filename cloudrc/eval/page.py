@@ -16,6 +16,7 @@ from cloudrc.eval.results import COLUMNS, LEGEND, SEEDLESS, TESTS
 from cloudrc.eval.setup import BASELINE, EvalSetup
 from cloudrc.files import write_atomically
 from cloudrc.gym.loop import AGES
+from cloudrc.gym.options import compute_times
 from cloudrc.outside.document import write_yaml
 from cloudrc.report.figures import PRINT_KINDS, own_settings, save
 from cloudrc.report.figures.bands import Panel, Point, draw
@@ -30,8 +31,8 @@ CAPTION = (
     "action. Dashed: without a network. Success: share, with the 95 % interval of Clopper and "
     "Pearson. Return and length: median, with its 95 % interval from 6 episodes on. Age: mean over "
     "the steps, up to the mean of the episodes' p99. All conditions have the same seeds, so that "
-    "they meet the same environments and networks. A condition without any answer has no age: "
-    "it is in the table alone."
+    "they meet the same environments and networks. Hollow: all episodes ended before an answer to "
+    "an observation over the network could act; the point is at the asked time."
 )
 TAILS_CAPTION = (
     "Age of the observation behind an action, a line for each round trip: the share of the steps "
@@ -87,7 +88,8 @@ def write_page(folder: Path, setup: EvalSetup, document: Mapping[str, Any]) -> P
     `document` is the content of the file of the evaluation.
     """
     outcomes = document["outcomes"]
-    figure = draw_outcomes(outcomes)
+    compute = 0.0 if setup.is_measured else compute_times(setup.compute_times)[0]
+    figure = draw_outcomes(outcomes, compute)
     tails = draw_ages(outcomes, document["step"]["seconds"], setup.deadline)
     for name, pictures in ((FIGURE, figure), (TAILS, tails)):
         for kind, data in pictures.items():
@@ -131,23 +133,34 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
     return "".join(f"<tr>{line}</tr>" for line in lines)
 
 
-def draw_outcomes(outcomes: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:
+def draw_outcomes(outcomes: Sequence[Mapping[str, Any]], compute: float) -> dict[str, bytes]:
     """Draw success or return, the episodes' lengths and ends, and what the robot acts on.
 
-    Return the figure as PDF, PNG and SVG by suffix.
+    `compute` is the mean time for an answer [s]. Return the figure as PDF, PNG and SVG by suffix.
     """
     left_out = "return" if "success" in outcomes[0] else "success"
-    panels = [_panel(outcomes, *each) for each in PANELS if left_out not in each]
+    panels = [panel_of(outcomes, compute, *each) for each in PANELS if left_out not in each]
     return draw(panels, "age of the loop_ms", [], "executor", look=Look(width=WIDTH))
 
 
-def _panel(outcomes: Sequence[Mapping[str, Any]], title: str, unit: str, *keys: str) -> Panel:
+def panel_of(
+    outcomes: Sequence[Mapping[str, Any]], compute: float, title: str, unit: str, *keys: str
+) -> Panel:
+    """Return a panel of `PANELS`; `compute` is the mean time for an answer [s]."""
     lines, factor = dict[str, list[Point]](), 100.0 if unit == "%" else 1.0
     for each in outcomes:
         middle, low, high = (factor * each.get(key, nan) for key in keys)
-        point = Point(each.get("loop_age_ms", nan), middle, low, high, False)
+        answered = "loop_age_ms" in each
+        age = each["loop_age_ms"] if answered else _asked_age_ms(each, compute)
+        point = Point(age, middle, low, high, not answered)
         lines.setdefault(each["executor"], []).append(point)
     return Panel(title, unit, lines, lines.pop(BASELINE)[0].middle)
+
+
+def _asked_age_ms(outcome: Mapping[str, Any], compute: float) -> float:
+    """Return the mean time from an observation to its answer that was asked for [ms]."""
+    up, down = (outcome.get(f"delay_asked_{way}_ms", nan) for way in ("uplink", "downlink"))
+    return float(up + down + 1e3 * compute)
 
 
 def draw_ages(

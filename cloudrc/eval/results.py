@@ -19,6 +19,7 @@ from cloudrc.statistics import LEVEL
 from cloudrc.text import cells, table
 from cloudrc.trials.play import run
 from cloudrc.trials.rows import Row, Rows, read_rows
+from cloudrc.trials.tables import columns_of, write_table
 
 FILE = "eval.json"
 """File in the folder of an evaluation: what it plays, and the summary of its rows."""
@@ -78,6 +79,10 @@ TESTS = {
 """Head -> cell of the table of tests."""
 
 
+FLAT = ("seed", "verdict", "ended", "records_sha256", "code")
+"""Fields of a row that a flat line has beside its condition and its numbers."""
+
+
 def is_begun(folder: Path) -> bool:
     """Return whether a folder has an evaluation."""
     return (folder / FILE).is_file()
@@ -108,6 +113,20 @@ def _place(policy: str) -> str:
     return policy if "://" in policy else os.path.abspath(policy)
 
 
+class Before(NamedTuple):
+    """What earlier calls have left in a folder."""
+
+    versus: str = ""  # folder of the evaluation with which the page compares
+    seeds: tuple[int, ...] = ()  # different numbers of seeds of the same evaluation
+
+
+def read_before(folder: Path, setup: EvalSetup) -> Before:
+    """Return what earlier calls have left in a folder; seeds of other episodes do not count."""
+    had = _read(folder)
+    is_same = had["identity"] == setup.identity()
+    return Before(had.get("versus", ""), tuple(had.get("seeds", ())) if is_same else ())
+
+
 class EpisodeTrial(NamedTuple):
     """An episode of an evaluation."""
 
@@ -125,17 +144,19 @@ def play_missing(
     setup: EvalSetup,
     episodes: Sequence[Episode],
     jobs: int,
-    see: Callable[[int], None] = lambda done: None,
+    known: Before,
+    see: Callable[[int], None],
 ) -> tuple[list[Row], CloudrcError | None]:
     """Play the episodes without a row in `folder`; return the rows of all, and why it ended early.
 
-    `see` gets the number of episodes that have a row, at the beginning and after each one.
+    `see` gets the number of episodes that have a row, at the beginning and after each one. The
+    file of the folder gets what is `known`.
 
     Raises:
         CloudrcError: If environment or policy fail; the rows before are kept.
     """
     rows, identity = Rows(folder), setup.identity()
-    write(folder, setup, {})
+    write(folder, setup, known._asdict())
     with reuse_results():  # the code of an executor is that of all its episodes
         trials = [EpisodeTrial(each.key(identity), each, setup) for each in episodes]
     done = count(sum(each.key in rows.kept for each in trials))
@@ -163,6 +184,14 @@ def write(folder: Path, setup: EvalSetup, found: Mapping[str, Any]) -> dict[str,
     }
     write_json(folder / FILE, document)
     return document
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Write a flat line per episode into a CSV or Parquet file; times are in s."""
+    columns = columns_of(rows, ("rtt_ms", "executor"), FLAT)
+    times = [name for name in columns if "age" in name or "delay" in name]
+    units = {name: "s" for name in times if not name.endswith("_of")}
+    write_table(path, columns, units)
 
 
 def read_versus(folder: Path, setup: EvalSetup, episodes: Sequence[Episode]) -> list[Row]:

@@ -1,10 +1,16 @@
 """What `cloudrc eval` keeps and prints beside success and return."""
 
+import csv
 import json
+import shutil
+import sys
+from pathlib import Path
 
 import pytest
 
+from cloudrc.errors import InterruptedRunError
 from cloudrc.eval.episode import play
+from cloudrc.eval.page import PANELS, panel_of
 from cloudrc.eval.setup import BASELINE, Episode, EvalSetup
 from tests.eval.test_eval import bare, stand
 
@@ -43,6 +49,96 @@ def test_two_policies_are_compared_in_pairs_and_other_conditions_are_refused(
         refused = evaluate(*versus, tmp_path / "c", f"--{name}", value, code=2).err
         assert f"a: differs in {name.replace('-', '_')}; " in refused
     assert not (tmp_path / "c").exists()
+
+
+def test_a_later_call_keeps_the_comparison_and_adds_no_seeds_unmarked(law, tmp_path, evaluate):
+    for name in ("left", "right"):
+        path, action = tmp_path / f"{name}.py", int(name == "right")
+        path.write_text(f"def infer(o):\n    return {{'actions': [[{action}]]}}\n")
+        words = ["--success-at", 5, "--policy", path, "--out", tmp_path / name, "--seeds"]
+        more = ["--versus", tmp_path / "left"] if action else []
+        evaluate(*words, 2, *more)
+    said = evaluate(*words, 2)
+    document = json.loads((tmp_path / "right" / "eval.json").read_text())
+    assert (document["versus"], document["seeds"]) == (str(tmp_path / "left"), [2])
+    assert len(document["tests"]) == 2
+    assert "number of seeds has changed" not in said.out
+    assert "changed in this folder: 2, then 3" in evaluate(*words, 3).out
+    shutil.rmtree(tmp_path / "left")
+    said = evaluate(*words, 3)
+    assert f"comparison of an earlier call is left out: --versus {tmp_path}/left" in said.err
+    assert json.loads((tmp_path / "right" / "eval.json").read_text())["tests"] == []
+
+
+COUNTING = """
+def infer(observation):
+    with open(__file__ + ".asked", "a") as file:
+        file.write(".")
+    return {"actions": [[0]]}
+"""
+
+
+def test_rows_are_also_written_flat_and_then_nothing_is_played(law, tmp_path, evaluate):
+    path, file = law(COUNTING), tmp_path / "flat.csv"
+    words = ["--policy", path, "--rtt", 40, "--seeds", 2, "--out", tmp_path / "e"]
+    evaluate(*words)
+    asked = Path(path + ".asked").read_text()
+    for _ in range(2):
+        evaluate(*words, "--rows", file)
+    assert Path(path + ".asked").read_text() == asked
+    lines = list(csv.DictReader(file.read_text().splitlines()))
+    rows = [json.loads(line) for line in (tmp_path / "e" / "rows.jsonl").read_text().splitlines()]
+    assert [each["key"] for each in lines] == [each["key"] for each in rows]
+    assert [(each["executor"], each["rtt_ms"], each["seed"]) for each in lines] == [
+        ("no network", "", "1"),
+        ("no network", "", "2"),
+        ("newest", "40.0", "1"),
+        ("newest", "40.0", "2"),
+    ]
+    last, numbers = lines[-1], rows[-1]["numbers"]
+    assert float(last["delay_measured_uplink [s]"]) == numbers["delay_measured_uplink"]
+    assert (float(last["return"]), last["ended"]) == (numbers["return"], rows[-1]["ended"])
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "text"),
+    [
+        ("flat.txt", 2, "name a file that ends in .csv or .parquet"),
+        ("none/flat.csv", 2, "there is no folder"),
+        ("times.csv", 2, "already there; name another file with --rows"),
+        ("flat.parquet", 3, "needs pyarrow; run: pip install pyarrow"),
+    ],
+)
+def test_a_file_for_rows_that_cannot_be_written_is_refused_before(
+    law, tmp_path, evaluate, monkeypatch, name, code, text
+):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    (tmp_path / "times.csv").write_text("0.1\n")
+    words = ["--policy", law(), "--out", tmp_path / "e", "--rows", tmp_path / name]
+    assert text in evaluate(*words, code=code).err
+    assert not (tmp_path / "e").exists()
+
+
+def test_the_line_to_continue_fits_the_call(law, tmp_path, evaluate, monkeypatch):
+    def interrupted(folder, *_):
+        return [], InterruptedRunError("interrupted")
+
+    monkeypatch.setattr("cloudrc.eval.results.play_missing", interrupted)
+    monkeypatch.chdir(tmp_path)
+    words, code = ["--policy", law(), "--seeds", 1], InterruptedRunError.exit_code
+    said = evaluate(*words, code=code).err
+    assert "interrupted; to continue, add --out runs/eval-CartPole-v1-1\n" in said
+    said = evaluate(*words, "--out", "e", code=code).err
+    assert "interrupted; to continue, give the same command again\n" in said
+
+
+def test_a_condition_without_any_answer_stands_at_the_asked_time():
+    bare = {"executor": BASELINE, "success": 1.0, "loop_age_ms": 0.0}
+    asked = {"delay_asked_uplink_ms": 180.0, "delay_asked_downlink_ms": 120.0}
+    known = {"executor": "broker", "success": 0.5, "loop_age_ms": 65.0}
+    unknown = {"executor": "broker", "success": 0.0, **asked}
+    points = panel_of([bare, {**known, **asked}, unknown], 0.05, *PANELS[0]).lines["broker"]
+    assert [(each.x, each.failed) for each in points] == [(65, False), (350, True)]
 
 
 def test_the_page_has_figure_tests_notes_and_how_it_was_made(law, tmp_path, monkeypatch, evaluate):
