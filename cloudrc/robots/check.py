@@ -23,7 +23,7 @@ from cloudrc.geometry.vectors import step_towards
 from cloudrc.messages import ZERO, Vector
 from cloudrc.outside.code import calling
 from cloudrc.robots.build import advise, build_robot, check_robot
-from cloudrc.sim.airframe import thrust_to_weight
+from cloudrc.sim.airframe import read_turns, thrust_to_weight
 from cloudrc.sim.bodies import reach_of
 from cloudrc.sim.scene import ROBOT_PREFIX
 from cloudrc.text import table
@@ -84,6 +84,7 @@ def _read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
     """Return the facts that need no motion."""
     base = model.jnt_bodyid[0]
     ratio = thrust_to_weight(model) if not robot.planar else None
+    turns = read_turns(model)
     size = reach_of(robot.model)
     return {
         "model": str(robot.model),
@@ -91,6 +92,7 @@ def _read_facts(world: World, robot: RobotFiles, model: Any) -> dict[str, Any]:
         "actuators": [
             model.actuator(n).name.removeprefix(ROBOT_PREFIX) or str(n) for n in range(model.nu)
         ],
+        **({"rotors_turn": turns} if turns else {}),
         **({} if ratio is None else {"thrust_to_weight": ratio, "hover_thrust": 1.0 / ratio}),
         "planar": robot.planar,
         "heading": robot.heading,

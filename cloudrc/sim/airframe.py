@@ -99,6 +99,21 @@ def thrust_to_weight(model: Any) -> float | None:
     return float(most / weight)
 
 
+def read_turns(model: Any) -> dict[str, str]:
+    """Return which way each rotor turns, seen from the side that it pushes to: actuator -> word.
+
+    A rotor turns against its torque on the robot. An actuator at no site, or without force or
+    torque, is no rotor. The model is a compiled `MjModel`.
+    """
+    forces, torques = np.split(model.actuator_gear, 2, axis=1)
+    along = (forces * torques).sum(axis=1) * (model.actuator_trntype == TRANSMISSION.mjTRN_SITE)
+    turns = {}
+    for number in np.flatnonzero(along).tolist():
+        word = "clockwise" if along[number] > 0 else "counter-clockwise"
+        turns[_name(model.actuator(number), number)] = word
+    return turns
+
+
 def _inertia(model: Any, data: Any) -> Inertia:
     """Read mass, centre of mass and inertia from the mass matrix of the free joint.
 

@@ -63,6 +63,8 @@ def test_a_new_robot_needs_no_change(mine, as_json):
     found = as_json("robot check", mine)
     assert found["ok"]
     assert found["facts"]["mass_kg"] == pytest.approx(1.3)
+    assert found["facts"]["rotors_turn"]["front_right"] == "clockwise"
+    assert found["facts"]["rotors_turn"]["front_left"] == "counter-clockwise"
     assert (mine / "check.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 import cloudrc
+from cloudrc.config.resolved import ResolvedGuard
 from cloudrc.config.robot import find_robot
+from cloudrc.config.schema import World
+from cloudrc.robots.build import build_robot
+from cloudrc.sim.airframe import read_airframe
 
 STEPS = {"mission.steps.count": 3, "link.profile": "paper-p2"}
 
@@ -39,3 +43,19 @@ def test_a_drone_turns_the_short_way_to_the_yaws_of_its_waypoints(carrot):
     yaws = np.degrees(np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))))
     assert yaws[-1] == pytest.approx(190, abs=6)
     assert yaws.max() < 200
+
+
+def test_the_rotors_of_the_nano_push_and_turn_as_those_of_a_crazyflie():
+    """The firmware's mixer adds roll, pitch and yaw to the thrusts of its motors 1 to 4 so."""
+    mixer = {
+        "front_right": (-1, -1, -1),
+        "back_right": (-1, 1, 1),
+        "back_left": (1, 1, -1),
+        "front_left": (1, -1, 1),
+    }
+    world = World.model_validate({"robot": "nano", "scene": "empty"})
+    robot = build_robot(world, ResolvedGuard.model_validate({}))
+    frame = read_airframe(robot.simulator.model)
+    roll, pitch, _, yaw = frame.wrench
+    signs = np.sign([roll, pitch, yaw]).T.astype(int)
+    assert dict(zip(frame.names, map(tuple, signs.tolist()), strict=True)) == mixer
