@@ -287,7 +287,8 @@ def compare(
         seeds: Fly the seeds 1 to `seeds`.
         numbers: Metrics to compare; by default those that matter first.
         jobs: Number of processes.
-        cost: Whether to fly both also without a network, which gives the number J/J0.
+        cost: Whether to fly both also without a network, which gives the number J/J0; where the
+            setpoint waits for the robot, off_ideal_path and T/T0.
 
     Raises:
         cloudrc.errors.BadInputError: If a setting is invalid, or if no pair has a metric.

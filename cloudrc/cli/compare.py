@@ -37,7 +37,8 @@ def arguments(parser: Parser) -> None:
     about = "compare this metric instead of the default ones; repeatable"
     add("--number", "NAME", about, many=True)
     about = "fly each seed once more without a network; compare J/J0, the cost of control relative"
-    add("--cost", "", f"{about} to that flight, and the bytes")
+    where = "where the setpoint waits for the robot off_ideal_path and T/T0"
+    add("--cost", "", f"{about} to that flight, {where}, and the bytes")
     output_argument(parser, forms=TABLES)
 
 

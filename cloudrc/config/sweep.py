@@ -45,7 +45,8 @@ class SweepFile(Section):
     seeds: Annotated[list[Seed], Field(min_length=1, max_length=SEEDS_MAX)] = [1]  # noqa: RUF012
     """Number of seeds, which begin with 1, or a list of seeds"""
     cost: bool = False
-    """Whether to fly every point without a network, too, which gives the number J/J0"""
+    """Whether to fly every point without a network, too, which gives the number J/J0; where the
+    setpoint waits for the robot, off_ideal_path and T/T0"""
     folder: str | None = None
     """Folder in which relative paths start (default: that of the file)"""
 

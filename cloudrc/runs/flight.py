@@ -54,7 +54,11 @@ def explain(error: BaseException) -> str:
 
 def measure(experiment: ResolvedExperiment) -> Row:
     """Fly an experiment in virtual time and measure it."""
-    found = fly_in_memory(experiment)
+    return row_of(fly_in_memory(experiment), experiment)
+
+
+def row_of(found: Assessment, experiment: ResolvedExperiment) -> Row:
+    """Return the row of a flight in virtual time."""
     failures = found.verdict.failures
     notes = (note for note in found.notes if note.startswith(METRIC_NOTE))
     return {

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cloudrc.config.problems import problem_at
 from cloudrc.config.sweep import draft_of
 from cloudrc.errors import CloudrcError, NothingFlownError
 from cloudrc.metrics.measure import SHIPPED
@@ -18,6 +19,9 @@ from cloudrc.trials.plan import SweepPlan, check
 from cloudrc.trials.play import run
 from cloudrc.trials.rows import Row, Rows
 from cloudrc.trials.summary import (
+    NO_RATIO,
+    OFF_PATH,
+    RATIO,
     Pair,
     adjust,
     compare_number,
@@ -132,6 +136,8 @@ def _valid(pairs: Sequence[Pair]) -> list[Pair]:
 
 
 def _check_numbers(names: Iterable[str], known: Iterable[str]) -> None:
+    if RATIO in names and RATIO not in known and OFF_PATH in known:
+        raise problem_at("--number", NO_RATIO)
     check_names("number", names, sorted(known), "--number: ")
 
 

@@ -9,6 +9,7 @@ from cloudrc.metrics.measure import scale
 from cloudrc.statistics import LEVEL, by_chance
 from cloudrc.studies.compare import LEFT_OUT
 from cloudrc.text import FAILED_MARK, FAILED_NOTE, format_number, table
+from cloudrc.trials.summary import NO_RATIO, OFF_PATH
 
 TITLES = (
     "number",
@@ -47,6 +48,7 @@ def as_text(document: Mapping[str, Any]) -> str:
         f"p Holm = {success['p_holm']:.2g}",
         document["method"],
         by_chance(1 + len(document["numbers"])),
+        *([NO_RATIO] if OFF_PATH in document["numbers"] else []),
         *([FAILED_NOTE] if any(failed) else []),
         "",
         _answer(document),

@@ -32,7 +32,7 @@ from cloudrc.text import table
 from cloudrc.trials import tables
 from cloudrc.trials.plan import COLUMNS, PlannedFlight, SweepPlan, read_plan
 from cloudrc.trials.rows import SIZE_MAX, Row, Rows, read_rows
-from cloudrc.trials.summary import count_successes, count_verdicts, normalise
+from cloudrc.trials.summary import added, count_successes, count_verdicts, normalise
 from cloudrc.trials.tables import Columns, as_text, write_table
 from cloudrc.trials.workers import map_in_order, take_each
 from cloudrc.version import __version__
@@ -239,7 +239,7 @@ def read_sweep(folder: Path) -> Flown:
         text = f"has rows of another grid than that in {SUMMARY}; name the folder of one sweep"
         raise StateError(f"{folder}: {text}") from None
     unknown = dict.fromkeys((name for row in ordered for name in row["numbers"]), "")
-    count = len(baselines) or summary["flights"]
+    count = summary["flights"] - len(added(baselines))
     return Flown(ordered, {**unknown, **summary["units"]}, axes, count)
 
 

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 from cloudrc import files, source
 from cloudrc.config import sweep
 from cloudrc.config.resolved import ResolvedExperiment, local_files
-from cloudrc.config.schema import Link
 from cloudrc.config.sweep import Draft
 from cloudrc.errors import StateError
 from cloudrc.metrics import measure
@@ -21,9 +20,10 @@ from cloudrc.outside.refusal import reading
 from cloudrc.outside.reuse import reuse_results
 from cloudrc.runs import flight
 from cloudrc.runs.experiment import load
+from cloudrc.trials.beside_ideal import fly_beside_ideal, setpoint_waits, without_network
 from cloudrc.trials.fingerprint import experiment_facts, fingerprint, key_of
 from cloudrc.trials.rows import Row
-from cloudrc.trials.summary import RATIO
+from cloudrc.trials.summary import OFF_PATH, RATIO, TIME_RATIO
 
 COLUMNS = ("seed", "verdict", "failures", "code", "physics_steps")
 """Columns of the table besides the key, the axes and the numbers."""
@@ -42,6 +42,11 @@ class PlannedFlight(NamedTuple):
     def key(self) -> str:
         """16 hexadecimal digits; equal keys mean equal flights."""
         return key_of(self.fingerprint, self.seed)
+
+    @property
+    def is_beside_ideal(self) -> bool:
+        """Whether its row has the numbers beside its flight over an ideal link."""
+        return self.fly is fly_beside_ideal
 
     @property
     def experiment(self) -> ResolvedExperiment:
@@ -65,7 +70,7 @@ class SweepPlan:
     draft: Draft
     points: list[ResolvedExperiment]
     flights: dict[str, PlannedFlight]  # key -> flight, in the order of the grid, then those for J0
-    baselines: dict[str, str]  # key of each flight of the grid -> key of the one for J0; or {}
+    baselines: dict[str, str]  # key of a flight that has J/J0 -> key of the one for J0
     units: dict[str, str]  # metric -> unit
     files: dict[str, str]  # path of each of the user's files on which a flight depends -> its hash
 
@@ -104,29 +109,39 @@ def check(draft: Draft) -> SweepPlan:
     with reuse_results():
         for point, settings in draft.points():
             points.append(load(draft.experiment, settings))
-            facts = experiment_facts(points[-1])
-            own_files |= facts[-1]
-            first = PlannedFlight(fingerprint(facts), point, draft.seeds[0], points[-1])
+            own_files |= experiment_facts(points[-1])[-1]
+            is_beside = draft.cost and setpoint_waits(points[-1].mission)
+            first = _first_flight(point, draft.seeds[0], points[-1], beside_ideal=is_beside)
             if (same := flights.get(first.key)) is not None:
                 text = f"{point} is the same experiment as {same.point}; change one of them"
                 raise draft.problem(text)
             every = [first._replace(seed=seed) for seed in draft.seeds]
             flights |= {each.key: each for each in every}
-            if draft.cost:
-                bare = _without_network(first)
+            if draft.cost and not is_beside:
+                bare = _first_flight({}, first.seed, without_network(first.resolved))
                 baselines |= {each.key: bare._replace(seed=each.seed) for each in every}
     for each in baselines.values():
         flights.setdefault(each.key, each)
     own_metrics = {metric for point in points for metric in point.report.metrics}
-    units = flight.units(own_metrics) | ({RATIO: "1"} if draft.cost else {})
+    units = flight.units(own_metrics) | ({RATIO: "1"} if baselines else {})
+    if any(each.is_beside_ideal for each in flights.values()):
+        units |= {OFF_PATH: "m", TIME_RATIO: "1"}
     keys = {key: each.key for key, each in baselines.items()}
     return SweepPlan(draft, points, flights, keys, units, own_files)
 
 
-def _without_network(flown: PlannedFlight) -> PlannedFlight:
-    """Return a flight with the same settings and seed over an ideal link; it is of no point."""
-    resolved = flown.resolved.model_copy(update={"link": Link(profile="ideal")})
-    return PlannedFlight(fingerprint(experiment_facts(resolved)), {}, flown.seed, resolved)
+def _first_flight(
+    point: dict[str, Any], seed: int, resolved: ResolvedExperiment, *, beside_ideal: bool = False
+) -> PlannedFlight:
+    """Return the flight of a point with a seed; `point` is {} for a flight for J0.
+
+    A row with the numbers beside the flight over an ideal link has a key of its own.
+    """
+    facts = experiment_facts(resolved)
+    if beside_ideal:
+        known = fingerprint(facts, OFF_PATH)
+        return PlannedFlight(known, point, seed, resolved, fly_beside_ideal)
+    return PlannedFlight(fingerprint(facts), point, seed, resolved)
 
 
 def pack(flights: Iterable[PlannedFlight]) -> bytes:
@@ -139,7 +154,8 @@ def pack(flights: Iterable[PlannedFlight]) -> bytes:
     for told, group in groupby(flights, key=lambda each: each.fingerprint):
         first, *more = group
         seeds = [first.seed, *(each.seed for each in more)]
-        points.append([told, first.point, first.resolved.model_dump(mode="json"), seeds])
+        values = first.resolved.model_dump(mode="json")
+        points.append([told, first.point, values, seeds, first.is_beside_ideal])
     return gzip.compress(json.dumps(points).encode(), mtime=0)
 
 
@@ -151,10 +167,12 @@ def unpack(path: Path) -> list[PlannedFlight]:
     flights = list[PlannedFlight]()
     build = "build the image from the code that runs this command, with the same packages"
     with reading(path, f"holds no flights of this version of cloudrc; {build}"), reuse_results():
-        for told, point, values, seeds in json.loads(gzip.decompress(files.read(path))):
+        points = json.loads(gzip.decompress(files.read(path)))
+        for told, point, values, seeds, beside_ideal in points:
             resolved = ResolvedExperiment.model_validate_json(json.dumps(values))
-            flights += [PlannedFlight(told, point, seed, resolved) for seed in seeds]
-            if told != fingerprint(experiment_facts(resolved)):
+            first = _first_flight(point, seeds[0], resolved, beside_ideal=beside_ideal)
+            flights += [first._replace(seed=seed) for seed in seeds]
+            if told != first.fingerprint:
                 text = f"its flights are of other code or plug-ins than code {source.code_hash()}"
                 raise StateError(f"{path}: {text}; {build}")
     return flights

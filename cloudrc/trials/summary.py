@@ -8,6 +8,8 @@ from dataclasses import asdict
 from statistics import median
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from cloudrc.rounding import differences
 from cloudrc.runs.flight import counts
 from cloudrc.statistics import (
@@ -34,8 +36,19 @@ NUMBERS = (
 """Metrics that are compared and drawn by default."""
 COST, RATIO = "control_cost", "J/J0"
 """Number of a flight: its `control_cost` relative to that of the same flight without a network."""
-COSTS = (RATIO, "bytes_sent_uplink", "bytes_sent_downlink")
-"""Metrics that come first where J/J0 is known: what control costs, and what it sends for that."""
+OFF_PATH, TIME_RATIO = BESIDE_IDEAL = "off_ideal_path", "T/T0"
+"""Numbers of a flight beside the same flight without a network, in place of J/J0 where the setpoint
+waits for the robot: how far its path is off, and how much longer its mission takes."""
+NO_RATIO = (
+    f"{OFF_PATH} and {TIME_RATIO} stand in place of {RATIO}: in this mission the setpoint waits "
+    "for the robot; a failed flight counts as worse than every success"
+)
+"""Why there is no J/J0, and how the numbers in its place are compared."""
+BEHIND = 1.0 + 1e-6
+"""Value of a failed flight, relative to that of the worst success, if its own is not larger [1]."""
+COSTS = (RATIO, *BESIDE_IDEAL, "bytes_sent_uplink", "bytes_sent_downlink")
+"""Metrics that come first where the flights without a network are known: what control costs, and
+what it sends for that."""
 METHOD = "95 % interval of the median, by order statistics"
 
 
@@ -58,7 +71,7 @@ def values_of(rows: Sequence[Row]) -> dict[str, list[Any]]:
 
 def default_numbers(known: Container[str]) -> list[str]:
     """Return those of the `known` metrics that matter first."""
-    first = COSTS if RATIO in known else ()
+    first = COSTS if RATIO in known or OFF_PATH in known else ()
     return [name for name in (*first, *NUMBERS) if name in known]
 
 
@@ -73,7 +86,13 @@ def normalise(rows: Mapping[str, Row], baselines: Mapping[str, str]) -> dict[str
             continue
         if bare_cost := bare["numbers"].get(COST):
             own["numbers"][RATIO] = own["numbers"][COST] / bare_cost
-    return {key: row for key, row in rows.items() if not baselines or key in baselines}
+    without_point = added(baselines)
+    return {key: row for key, row in rows.items() if key not in without_point}
+
+
+def added(baselines: Mapping[str, str]) -> set[str]:
+    """Return the keys of the flights that are of no point of the grid; see `normalise`."""
+    return {*baselines.values()} - baselines.keys()
 
 
 # Medians.
@@ -163,11 +182,27 @@ def compare_number(pairs: Sequence[Pair], name: str, unit: str) -> dict[str, Any
         "unit": unit,
         "a_median": median(first),
         "b_median": median(second),
-        **asdict(paired(differences(first, second).tolist())),
+        **asdict(paired(_differences(known, name))),
         "a_failed": failed[0],
         "b_failed": failed[1],
         "left_out": len(pairs) - len(known),
     }
+
+
+def _differences(pairs: Sequence[Pair], name: str) -> list[float]:
+    """Return B - A of a number that both flights of each pair have.
+
+    Beside the flight without a network, a failed flight is worse than every success: a robot that
+    stops at once has a short time and a small error. Between two failures there is no difference.
+    """
+    sides = _sides(pairs)
+    values = np.array([[row["numbers"][name] for row in side] for side in sides])
+    if name in BESIDE_IDEAL:
+        failed = np.array([[row["verdict"] != "success" for row in side] for side in sides])
+        worst = BEHIND * values[~failed].max(initial=0.0)
+        values = np.where(failed, np.maximum(values, worst), values)
+        values[:, failed.all(axis=0)] = worst
+    return list(map(float, differences(*values)))
 
 
 def _sides(pairs: Sequence[Pair]) -> tuple[list[Row], list[Row]]:

@@ -60,6 +60,24 @@ def test_the_relative_cost_and_the_bytes_come_first_where_they_are_known():
     assert list(found) == ["J/J0", "bytes_sent_uplink", "iae_mean"]
 
 
+def test_where_the_setpoint_waits_a_failure_is_worse_than_every_success():
+    """It has the number of what it flew, which is small if it stopped at once."""
+    ok, late, bad = (
+        flown(verdict, **{"off_ideal_path": size, "T/T0": 1.0})
+        for verdict, size in (("success", 0.005), ("success", 0.012), ("failure", 0.001))
+    )
+    both = [(ok, bad)] * 5 + [(late, bad), (bad, bad)]
+    units = {"off_ideal_path": "m", "T/T0": "1"}
+    found = compare(pairs(*both), units)
+    off = found["numbers"]["off_ideal_path"]
+    assert (off["lower"], off["higher"], off["count"]) == (0, 6, 7)
+    assert (off["b_median"], off["b_failed"]) == (0.001, 7)
+    assert off["difference"] == pytest.approx(0.007, rel=1e-3)
+    text = as_text({"a": "x=1", "b": "x=2", "of": "paper", **found})
+    assert "1*" in text
+    assert "in place of J/J0" in text
+
+
 @pytest.mark.parametrize("code", ["plugin_failed", "onboard_failed"])
 def test_numbers_of_a_plugin_that_failed_do_not_count(code):
     """Another plug-in took over, so B would look equal to A."""

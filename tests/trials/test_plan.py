@@ -43,6 +43,23 @@ def test_points_that_differ_in_the_network_share_their_flights_without_one(write
     assert (bare.uplink.delay_ms, bare.guard.command_age_max_ms) == (0.0, 900.0)
 
 
+def test_where_the_setpoint_waits_a_flight_is_compared_with_its_path_over_an_ideal_link(
+    write_sweep, tmp_path
+):
+    """The missions with a carrot beside it keep J/J0."""
+    grid = {"mission.carrot": [None, {"speed_mps": 0.5}]}
+    grow = {"experiment": "paper", "set": {}, "seeds": 2}
+    plain = read_plan(write_sweep(grid, **grow))
+    sweep = read_plan(write_sweep(grid, cost=True, **grow))
+    flights = [*sweep.flights.values()]
+    assert [each.is_beside_ideal for each in flights] == [True] * 2 + [False] * 4
+    assert list(sweep.baselines.items()) == [(flights[n].key, flights[n + 2].key) for n in (2, 3)]
+    assert sweep.units.keys() - plain.units.keys() == {"J/J0", "off_ideal_path", "T/T0"}
+    assert [key in plain.flights for key in sweep.flights] == [False] * 2 + [True] * 2 + [False] * 2
+    (tmp_path / "flights").write_bytes(pack(flights))
+    assert unpack(tmp_path / "flights") == flights
+
+
 def test_an_axis_may_have_named_settings(write_sweep):
     grid = {"gains": {"low": {"cloud.controller.gain_p": [1, 1, 1]}, "default": {}}}
     sweep = read_plan(write_sweep(grid))
