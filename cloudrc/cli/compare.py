@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.output import TABLES, output_argument, print_result, tell, warn
+from cloudrc.cli.output import TABLES, output_argument, print_result, tell, warn_about
 from cloudrc.cli.parser import Options, Parser, flags, read_count
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.text import csv_table, latex_table
@@ -104,7 +104,7 @@ def _fly_both(options: Options) -> tuple[Pairs, CloudrcError | None]:
     sides = split_settings(options.a), split_settings(options.b)
     asked = options.experiment, options.set, *sides, options.seeds, options.number
     plan = plan_sides(*asked, cost=options.cost)
-    warn(*plan.points)
+    warn_about(plan)
     count = len(plan.flights)
     flown = "A, B and both without a network" if options.cost else "A and B"
     head = f"{plan.name}: {flown}, each with seeds 1 to {options.seeds}, {count} flights"

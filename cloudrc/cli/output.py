@@ -17,6 +17,7 @@ from cloudrc.text import escape
 
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
+    from cloudrc.trials.plan import SweepPlan
 
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1"}
 
@@ -162,6 +163,13 @@ def tell(text: str) -> None:
 def again(out: Path | None, folder: Path) -> str:
     """Say how to continue with `folder` after a command has ended early; `out` is its --out."""
     return "to continue, give the same command again" if out else f"to continue, add --out {folder}"
+
+
+def warn_about(plan: SweepPlan) -> None:
+    """Print warnings about the points of a plan on stderr, and where the speed cap changes."""
+    warn(*plan.points)
+    if plan.speed_caps:
+        tell(plan.speed_caps)
 
 
 def warn(*experiments: ResolvedExperiment) -> None:

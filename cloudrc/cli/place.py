@@ -19,15 +19,16 @@ from cloudrc.text import escape
 EPILOG = """\
 examples:
   cloudrc place fast
-  cloudrc place steps --compute 0,5,20,60 --robots 1,4,10 --seeds 3
+  cloudrc place steps --compute 0,5,20,60 --robots 1,4,10
   cloudrc place fast --places onboard,./factory.yaml --set cloud.controller=mpc
 
 A computing time holds for a core of speed 1; each place has a speed, see
 'cloudrc list places'. The best place is where most robots succeed; of equal
 ones the one with the shortest time in HOLD, then the smallest cross-track
-error, then the shortest settling time. A place loses if it is worse by more
-than 5 % with every seed. With --out DIR of an earlier call, only what is
-missing flies."""
+error, then the shortest settling time. A place loses if the exact sign test
+over the seeds finds it worse (p below 5 %); numbers that differ by less than
+5 % count as equal. With --out DIR of an earlier call, only what is missing
+flies."""
 
 
 def arguments(parser: Parser) -> None:
@@ -41,7 +42,7 @@ def arguments(parser: Parser) -> None:
     about = "shipped places or YAML files (default: onboard,edge,cloud)"
     add("--places", "PLACE,...", about, "onboard,edge,cloud", read_list(str))
     add("--set", "KEY=VALUE", "change one key of the experiment; repeatable")
-    add("--seeds", "N", "fly seeds 1 to N (default: 3)", 3, read_count)
+    add("--seeds", "N", "fly seeds 1 to N (default: 6)", 6, read_count)
     add("--calm", "", "fly without wind and without a payload")
     add("--jobs", "N", "parallel processes (default: one per core)", COUNT_MAX, read_count)
     add("--out", "DIR", "folder (default: a new one in runs/); if it has rows, fly the others")

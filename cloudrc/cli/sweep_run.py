@@ -15,6 +15,7 @@ from cloudrc.cli.output import (
     print_result,
     tell,
     warn,
+    warn_about,
 )
 from cloudrc.cli.parser import Options
 from cloudrc.cli.progress import Progress, SeedsView, SweepView
@@ -120,7 +121,7 @@ def _check(options: Options) -> SweepPlan:
 
         _pods(options)
         check_size(plan.own_files)
-    warn(*plan.points)
+    warn_about(plan)
     return plan
 
 

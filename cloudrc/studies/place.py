@@ -16,6 +16,7 @@ from typing import Any
 
 from cloudrc.config.overrides import parse_settings
 from cloudrc.outside.reuse import reuse_results
+from cloudrc.statistics import LEVEL, PAIRS_MIN, sign_test
 from cloudrc.text import cells, escape, table
 from cloudrc.trials.fleet import plan_fleet
 from cloudrc.trials.plan import PlannedFlight
@@ -48,6 +49,8 @@ JUDGED = {
 name, its form, and a difference that counts as none [unit of the number]. Less is better."""
 SAME = 0.05
 """Relative difference that counts as none."""
+TOO_FEW = f"fewer than {PAIRS_MIN} seeds cannot decide between places"
+"""Why no place loses."""
 TABLE = {
     "compute [ms]": "{compute_ms:g}",
     "robots": "{robots}",
@@ -124,10 +127,14 @@ def _describe_point(trial: PlannedFlight, rows: Sequence[Row]) -> dict[str, Any]
         "name": Path(point["place"]).stem,
         "succeeded": sum(each.get("succeeded", 0) for each in numbers),
         "flown": fleet.fleet.robots * len(rows),
-        "by_seed": {name: [each.get(f"{name}_median") for each in numbers] for name in SHOWN},
+        "by_seed": {
+            "succeeded": [each.get("succeeded", 0) for each in numbers],
+            **{name: [each.get(f"{name}_median") for each in numbers] for name in SHOWN},
+        },
         "rate_kbit": mean(sent) if sent else None,
     }
-    for name, values in found["by_seed"].items():
+    for name in SHOWN:
+        values = found["by_seed"][name]
         if known := [value for value in values if value is not None]:
             found[name] = median(known)
     if not fleet.link_values:  # on board, nothing leaves the robot
@@ -140,32 +147,51 @@ def _describe_point(trial: PlannedFlight, rows: Sequence[Row]) -> dict[str, Any]
 def judge(places: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the names of the best of places, several if they do not differ, and by what they win.
 
-    First decides how many robots succeed, then the numbers in `JUDGED`: a place loses if it is
-    worse with every seed. All have the same wind with a seed.
+    First decides how many robots succeed, then the numbers in `JUDGED`: a place loses if the exact
+    sign test over the seeds finds it worse than the best one. All have the same wind with a seed.
     """
-    most = max(each["succeeded"] for each in places)  # of equally many
-    if most == 0:
+    first = max(places, key=itemgetter("succeeded"))
+    if first["succeeded"] == 0:
         return {"places": [], "by": "no robot succeeds anywhere"}
-    best = [each for each in places if each["succeeded"] == most]
-    by, lost = list[str](), [each for each in places if each["succeeded"] < most]
+    if len(_missed(first)) < PAIRS_MIN:
+        return {"places": [each["name"] for each in places], "by": TOO_FEW}
+    lost = [each for each in places if _is_worse(_missed(first), _missed(each))]
+    best, by = [each for each in places if each not in lost], list[str]()
     if lost:
         shares = (f"{each['succeeded']}/{each['flown']} ({each['name']})" for each in lost)
-        by.append(f"{most}/{best[0]['flown']} succeed, not {', '.join(shares)}")
+        by.append(f"{first['succeeded']}/{first['flown']} succeed, not {', '.join(shares)}")
     for name, (words, form, same) in JUDGED.items():
         if not all(name in each for each in best):
             continue
         first = min(best, key=itemgetter(name))
-        pairs = (zip(first["by_seed"][name], each["by_seed"][name], strict=True) for each in best)
-        worse = [
-            each
-            for each, of_seeds in zip(best, pairs, strict=True)
-            if all(None not in (a, b) and b > a + max(same, SAME * a) for a, b in of_seeds)
-        ]
-        if worse:
-            best = [each for each in best if each not in worse]
-            others = (f"{form.format(each[name])} ({each['name']})" for each in worse)
+        values = first["by_seed"][name]
+        lost = [each for each in best if _is_worse(values, each["by_seed"][name], same, SAME)]
+        if lost:
+            best = [each for each in best if each not in lost]
+            others = (f"{form.format(each[name])} ({each['name']})" for each in lost)
             by.append(f"{words} {form.format(first[name])}, not {', '.join(others)}")
     return {"places": [each["name"] for each in best], "by": "; ".join(by)}
+
+
+def _missed(place: Mapping[str, Any]) -> list[float]:
+    """Return how many robots of a place failed with each seed, up to a constant."""
+    return [-each for each in place["by_seed"]["succeeded"]]
+
+
+def _is_worse(
+    first: Sequence[float | None],
+    other: Sequence[float | None],
+    same: float = 0.0,
+    share: float = 0.0,
+) -> bool:
+    """Return whether the exact sign test finds `other` larger than `first`; one value per seed.
+
+    Values that differ by at most `same`, or by this `share` of the smaller one, count as equal.
+    """
+    known = [(a, b) for a, b in zip(first, other, strict=True) if a is not None and b is not None]
+    larger = sum(b > a + max(same, share * a) for a, b in known)
+    smaller = sum(a > b + max(same, share * b) for a, b in known)
+    return larger > smaller and sign_test(smaller, larger) < LEVEL
 
 
 def as_text(document: Mapping[str, Any]) -> str:
@@ -175,7 +201,8 @@ def as_text(document: Mapping[str, Any]) -> str:
     lines = list[str]()
     for each in document["best"]:
         names, by = each["places"], each["by"]
-        where = "anywhere" if len(names) == count > 1 else " or ".join(names) or "nowhere"
+        all_of_them = "undecided" if by else "anywhere"
+        where = all_of_them if len(names) == count > 1 else " or ".join(names) or "nowhere"
         robots = f"{each['robots']} robot{'s' * (each['robots'] > 1)}"
         lines.append(
             escape(f"{each['compute_ms']:g} ms, {robots}: {where}{f': {by}' if by else ''}")

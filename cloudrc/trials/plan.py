@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import groupby
@@ -14,7 +15,7 @@ from cloudrc import files, source
 from cloudrc.config import sweep
 from cloudrc.config.resolved import ResolvedExperiment, local_files
 from cloudrc.config.sweep import Draft
-from cloudrc.errors import StateError
+from cloudrc.errors import BadInputError, StateError
 from cloudrc.metrics import measure
 from cloudrc.outside.refusal import reading
 from cloudrc.outside.reuse import reuse_results
@@ -83,6 +84,29 @@ class SweepPlan:
     def axes(self) -> dict[str, list[Any]]:
         """Axis -> its values or names."""
         return {axis: [label for label, _ in each] for axis, each in self.draft.axes.items()}
+
+    @property
+    def speed_caps(self) -> str:
+        """Where settings changed the guard's speed cap, in words; "" if nowhere.
+
+        A longer limit of the age of commands, or a longer plan, makes the guard allow less speed.
+        """
+        try:
+            before = f"{load(self.draft.experiment, []).guard.speed_max_mps:.3g}"
+        except BadInputError:  # the experiment flies with the settings alone
+            return ""
+        places = defaultdict[str, list[list[str]]](list)
+        for (labels, _), point in zip(self.draft.points(), self.points, strict=True):
+            named = [f"{axis}={label}" for axis, label in labels.items()]
+            places[f"{point.guard.speed_max_mps:.3g}"].append(named)
+        places.pop(before, None)
+        caps = list[str]()
+        for cap, each in places.items():  # named by what its points share
+            shared = [name for name in each[0] if all(name in named for named in each)]
+            count = f"{len(each)} of {len(self.points)} points"
+            caps.append(f"{cap} m/s ({', '.join(shared) or count})")
+        text = f"the settings change the guard's speed cap from {before} m/s to {', '.join(caps)}"
+        return text if caps else ""
 
     @property
     def own_files(self) -> list[str]:

@@ -60,6 +60,13 @@ def test_where_the_setpoint_waits_a_flight_is_compared_with_its_path_over_an_ide
     assert unpack(tmp_path / "flights") == flights
 
 
+def test_settings_that_change_the_guards_speed_cap_are_named(write_sweep):
+    grid = {"guard.command_age_max_ms": [250, 1500], "cloud.predictor": ["kalman", "last_sample"]}
+    caps = read_plan(write_sweep(grid)).speed_caps
+    assert caps.endswith("from 6 m/s to 3.74 m/s (guard.command_age_max_ms=1500)")
+    assert read_plan(write_sweep()).speed_caps == ""
+
+
 def test_an_axis_may_have_named_settings(write_sweep):
     grid = {"gains": {"low": {"cloud.controller.gain_p": [1, 1, 1]}, "default": {}}}
     sweep = read_plan(write_sweep(grid))
