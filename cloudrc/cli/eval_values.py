@@ -5,18 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Mapping
 from importlib.util import find_spec
-from math import nan
 from pathlib import Path
 from typing import Any
 
+from cloudrc.config.compute import read_times
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.eval.setup import FILE, MEASURED, SEED, Compute
 from cloudrc.link.library import read_profile
-from cloudrc.link.traces import read_lines
 from cloudrc.outside.document import parse_value, read_document
 from cloudrc.outside.paths import check_new
 from cloudrc.outside.refusal import check_names
-from cloudrc.outside.values import ANY
+from cloudrc.outside.tables import SECONDS
+from cloudrc.outside.values import ANY, Quantity
 from cloudrc.plugins import is_path, signature
 from cloudrc.policy.address import check_url
 from cloudrc.policy.observation import Mapped
@@ -24,8 +24,8 @@ from cloudrc.trials.tables import CSV, PARQUET
 
 TABLE_BEGINS = {CSV: b"key,", PARQUET: b"PAR1"}
 """Ending of a file of rows -> how its content begins."""
-COMPUTE_MAX = 3600.0
-"""Largest time for an answer [s]."""
+COMPUTE = Quantity("s", 0, 3600)
+"""Time for an answer."""
 
 
 def check_policy(policy: str) -> None:
@@ -75,7 +75,7 @@ def check_round_trips(profile: str, round_trips: tuple[float | None, ...]) -> No
 def read_compute(text: str) -> tuple[Compute, tuple[float, ...]]:
     """Read the time for an answer: a number [s], "MEAN,DEVIATION" [s], "measured", or a file.
 
-    Also return the times that a file has [s].
+    Also return the times that a file has [s]; the head of its column says the unit.
     """
     if text == MEASURED:
         return (MEASURED, ""), ()
@@ -83,34 +83,14 @@ def read_compute(text: str) -> tuple[Compute, tuple[float, ...]]:
         numbers = [ANY.read(each) for each in text.split(",")]
     except ValueError:
         if os.path.lexists(text):
-            return (FILE, text), read_times(text)
+            return (FILE, text), read_times(Path(text), f"--compute {text}", SECONDS, COMPUTE)
         numbers = []
-    if len(numbers) not in (1, 2) or not all(0.0 <= each <= COMPUTE_MAX for each in numbers):
+    if len(numbers) not in (1, 2) or not all(COMPUTE.ge <= each <= COMPUTE.le for each in numbers):
         raise BadInputError(
             f"--compute {text}: give the time for an answer: a number of s such as 0.05, "
             f"MEAN,DEVIATION in s, the path of a file that exists, or '{MEASURED}'"
         )
     return (numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])), ()
-
-
-def read_times(path: str) -> tuple[float, ...]:
-    """Read the times of a file [s]: the last column of a CSV file; a head is skipped."""
-    what, found = f"--compute {path}", list[float]()
-    lines = read_lines(Path(path), what, "give a text file with one time in seconds per line")
-    for number, line in enumerate(lines, start=1):
-        text = line.rpartition(",")[2].strip(' \t"')
-        try:
-            time = ANY.read(text)
-        except ValueError:
-            if number == 1 or not text:
-                continue  # the head, or an empty line
-            time = nan
-        if not 0.0 <= time <= COMPUTE_MAX:
-            raise BadInputError(f"{what}, line {number}: {text[:40]!r} is no time in seconds")
-        found.append(time)
-    if not found:
-        raise BadInputError(f"{what}: has no times")
-    return tuple(found)
 
 
 def read_env_args(texts: list[str]) -> tuple[tuple[str, Any], ...]:

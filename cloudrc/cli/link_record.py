@@ -19,7 +19,8 @@ sources:
   irtt client -o FILE.json HOST
                 with --direction, or with --halve-rtt
   a CSV file    columns time_s and delay_ms (units: _s, _ms, _us or _ns);
-                rtt_ms with --halve-rtt; a loss: lost = 1, or an empty delay
+                rtt_ms with --halve-rtt; a loss: lost = 1, received = 0, or an
+                empty delay
 
 examples:
   cloudrc link record runs/latest -o trace.csv

@@ -24,7 +24,8 @@ timed. --cpus limits this process as a container is limited: of each 100 ms it
 computes for a share, and then stands still. Of a RUN, the file gets the periods
 of cloud's loop in real time, or the times of cloud.compute_measured.
 
-The file has a duration in ms in each line; cloud.compute_ms takes it."""
+The file has the head compute_ms, and a duration in ms in each further line.
+cloud.compute_ms takes it, and so does cloudrc eval --compute."""
 
 
 def arguments(parser: Parser) -> None:
@@ -55,7 +56,8 @@ def execute(options: Options) -> None:
         tell(f"warning: measured without a CPU limit: {found.unlimited}")
     if not (times := sorted(found.times_ms)):
         raise BadInputError(f"{options.what}: there is no computation to measure")
-    lines = [f"# computing times of {found.where} [ms]", *(f"{t:.4f}" for t in found.times_ms)]
+    head = f"# computing times of {found.where}", "compute_ms"
+    lines = [*head, *(f"{time:.4f}" for time in found.times_ms)]
     options.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
     mean, last = sum(times) / len(times), len(times) - 1
     shown = [f"{name} {times[round(last * q)]:.3g}" for name, q in QUANTILES.items()]

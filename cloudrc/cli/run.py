@@ -154,6 +154,10 @@ def _warn(options: Options, experiment: ResolvedExperiment, *flights: ResolvedEx
     from cloudrc.runs.own_files import describe_changes
 
     warn(*flights)
+    fleet = experiment.fleet
+    if fleet.only is None and len(fleet.vary) > fleet.robots:
+        numbers = f"{len(fleet.vary)} entries for {fleet.robots} robots"
+        tell(f"warning: fleet.vary has {numbers}, so the last ones are not used")
     if changes := describe_changes(options.experiment, experiment):
         tell(f"warning: {changes}")
 

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Mapping
 from pathlib import Path
 
 from cloudrc.config.problems import problem_at
 from cloudrc.config.schema import Cloud
 from cloudrc.errors import BadInputError
-from cloudrc.link.traces import read_lines
 from cloudrc.outside.reuse import reuse
-from cloudrc.outside.values import InvalidValueError, Quantity
+from cloudrc.outside.tables import MILLISECONDS, CsvTable
+from cloudrc.outside.values import Quantity
+from cloudrc.text import list_some
 
 _TIME = Quantity("ms", 0, 100_000)
 
 
 def compute_times(given: float | str) -> tuple[float, ...]:
-    """Return the computing times of `cloud.compute_ms` [ms]: one, or all lines of a file.
+    """Return the computing times of `cloud.compute_ms` [ms]: one, or all rows of a file.
 
-    Lines that are empty or begin with # do not count. Raise a BadInputError if the file is invalid.
+    Raise a BadInputError if the file is invalid.
     """
-    return (given,) if isinstance(given, float) else reuse(("compute", given), lambda: _read(given))
+    if isinstance(given, float):
+        return (given,)
+    words = Path(given), f"compute_ms {given}", MILLISECONDS, _TIME
+    return reuse(("compute", given), lambda: read_times(*words))
 
 
 def check_unshared(cloud: Cloud) -> None:
@@ -29,15 +35,20 @@ def check_unshared(cloud: Cloud) -> None:
         raise problem_at("cloud.cores", text)
 
 
-def _read(path: str) -> tuple[float, ...]:
-    found, remedy = list[float](), "give a file with a time in ms in each line"
-    for number, line in enumerate(read_lines(Path(path), f"compute_ms {path}", remedy), start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        try:
-            found.append(_TIME.read(line.strip()))
-        except InvalidValueError as error:
-            raise BadInputError(f"{path}:{number}: {error}; {remedy}") from error
+def read_times(
+    path: Path, place: str, units: Mapping[str, float], longest: Quantity
+) -> tuple[float, ...]:
+    """Read a file with a computing time in each row; the head of its column gives the unit.
+
+    `units` are unit -> size in the unit of `longest`, the valid times. The log names the columns
+    that are left out. Raise a BadInputError if the file is invalid, which `place` names.
+    """
+    table = CsvTable.read(path, place, "compute_ms")
+    column = table.only("compute", units, longest)
+    if others := table.others(column):
+        text = "%s: the column %s counts; left out: %s"
+        logging.getLogger("cloudrc").warning(text, place, column.name, list_some(others, 8))
+    found = tuple(row.number(column) * column.scale for row in table.rows)
     if not any(found):
-        raise BadInputError(f"{path}: has no time above 0; {remedy}")
-    return tuple(found)
+        raise BadInputError(f"{place}: has no time above 0; give a time in each line")
+    return found

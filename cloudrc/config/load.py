@@ -7,7 +7,6 @@ error lists all problems of an experiment, each with its file and line.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from math import inf
@@ -51,9 +50,10 @@ from cloudrc.config.schema import (
     World,
 )
 from cloudrc.errors import BadInputError
-from cloudrc.link.traces import read_lines, read_trace
+from cloudrc.link.traces import read_trace
 from cloudrc.outside.document import Document, KeyPath, parse_value, read_document
 from cloudrc.outside.reuse import reuse, reuse_results
+from cloudrc.outside.tables import CsvTable
 
 _NO_BOUNDS = Bounds(DEFAULT_LIMITS.model_copy(update={"acceleration_max_mps2": inf}), inf)
 """Bounds of a flight that is over: it had the limits that its file gives."""
@@ -182,11 +182,14 @@ def _settings_of_robot(document: Document, changes: Settings) -> Settings:
 
 def _read_robots(path: Path) -> list[dict[str, Any]]:
     """Read a CSV file with a key in each column and the settings of a robot in each row."""
-    rows = csv.DictReader(read_lines(path, f"fleet {path}", "give a CSV file: KEY,KEY"))
-    return [
-        {key: parse_value(value, f"{path.name}: {key}") for key, value in row.items()}
-        for row in rows
-    ]
+    table = CsvTable.read(path, f"fleet {path}", "world.robot,link.both.delay_ms")
+    found = list[dict[str, Any]]()
+    for row in table.rows:
+        cells = dict(zip(table.head, row.cells, strict=True))
+        for key, cell in cells.items():
+            row.refuse_comma(key, cell)
+        found.append({key: parse_value(cell, f"{row.where}: {key}") for key, cell in cells.items()})
+    return found
 
 
 def _judge(document: Document, experiment: ResolvedExperiment, name: str) -> ResolvedExperiment:

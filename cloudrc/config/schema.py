@@ -378,10 +378,10 @@ class Cloud(Section):
     """Rate of the commands [Hz]. At less than 20 Hz the guard would never leave HOLD, which takes
     10 commands within 500 ms"""
     compute_ms: ComputeMs = 0.0
-    """Mean of the emulated computing time of a command [ms]; or a file with a time in each line, of
-    which each command takes a random one: `cloudrc measure compute` writes it. In real time, the
-    true computing time is added. Cloud begins the next command only after this time. Reports count
-    this time as part of the downlink delay"""
+    """Mean of the emulated computing time of a command [ms]; or a CSV file with the column
+    compute_ms or compute_s, of which each command takes a random row: `cloudrc measure compute`
+    writes it. In real time, the true computing time is added. Cloud begins the next command only
+    after this time. Reports count this time as part of the downlink delay"""
     compute_deviation_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
     """Standard deviation of the time compute_ms [ms], which then has a gamma distribution; needs
     compute_ms above 0"""

@@ -10,8 +10,8 @@ import numpy as np
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import Fence
-from cloudrc.link.traces import read_lines, read_rows
 from cloudrc.messages import Vector
+from cloudrc.outside.tables import METRES, SECONDS, CsvTable
 
 COLUMNS = ["time_s", "x_m", "y_m", "z_m"]
 DRIVE_FILE = "drive.csv"
@@ -28,17 +28,19 @@ def read_setpoints(path: Path, fence: Fence) -> tuple[TimedPosition, ...]:
     Raise a BadInputError if the file is not usable, or if it leads out of the box in which the
     guard lets the robot fly inside `fence`. A robot that stays on the ground needs no column z_m.
     """
-    name, fits = f"setpoints {path}", COLUMNS if fence.ground is None else COLUMNS[:3]
-    columns, rows = read_rows(read_lines(path, name, f"give a CSV file: {','.join(fits)}"), name)
-    if columns not in (COLUMNS, fits):
-        given = ",".join(columns)[:80] or "missing"
-        raise BadInputError(f"{name}: the header is {given}; it must be {','.join(fits)}")
+    example = ",".join(COLUMNS if fence.ground is None else COLUMNS[:3])
+    table = CsvTable.read(path, f"setpoints {path}", example)
+    clock = table.column(("time",), SECONDS)
+    columns = [table.column((axis,), METRES) for axis in "xy"]
+    if height := (table.column if "z_m" in example else table.find)(("z",), METRES):
+        columns.append(height)
+    table.refuse_others(clock, *columns)
     found = list[TimedPosition]()
-    for row in rows:
-        time, *place = map(row.number, columns)
+    for row in table.rows:
+        time, place = row.number(clock) * clock.scale, map(row.number, columns)
         x, y, z = (*place, fence.inner_low[2])[:3]
         if found and time <= found[-1][0]:
-            raise BadInputError(f"{row.where}: time_s {time:g} does not rise")
+            raise BadInputError(f"{row.where}: time {time:g} s does not rise")
         for column, low, at, high in zip(
             COLUMNS[1:], fence.inner_low, (x, y, z), fence.inner_high, strict=True
         ):
@@ -47,7 +49,7 @@ def read_setpoints(path: Path, fence: Fence) -> tuple[TimedPosition, ...]:
                 raise BadInputError(f"{row.where}: {reason}")
         found.append((time, (x, y, z)))
     if len(found) < 2:
-        raise BadInputError(f"{name}: has {len(found)} rows; give at least two")
+        raise BadInputError(f"{table.place}: has {len(found)} rows; give at least two")
     return tuple((time - found[0][0], position) for time, position in found)
 
 

@@ -16,7 +16,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isnan, nan
 from typing import Any, Literal
 
@@ -24,7 +24,7 @@ import numpy as np
 
 from cloudrc.link.profile import Trace
 from cloudrc.link.streams import Stream
-from cloudrc.link.traces import read_rows
+from cloudrc.outside.tables import SECONDS, CsvTable
 from cloudrc.outside.values import InvalidValueError, Quantity
 
 Direction = Literal["uplink", "downlink"]
@@ -160,52 +160,53 @@ def _read_trips(trips: list[dict[str, Any]], direction: Direction | None) -> lis
     return entries
 
 
-SCALES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-TIMES, DELAYS = "time|timestamp|sent", "delay|rtt"
+EXAMPLE = "time_s,delay_ms,lost"
+_PERCENT = re.compile("%|pct|percent", re.IGNORECASE)
 
 
 def read_csv(lines: Iterable[str], name: str, *, halve: bool) -> Packets:
-    """Read a CSV log with a header; unknown columns are skipped.
+    """Read a CSV log with a header; the notes name columns that are left out.
 
-    A packet counts as lost if its delay is empty or `nan`, or if its column `loss` contains 1. With
-    `halve`, the log may have round-trip times; half of each counts as one-way delay. `name` is the
-    file name for errors about a line.
+    A packet counts as lost if its delay is empty or `nan`, or if its column `loss` or `lost`
+    contains 1, or `received` contains 0. With `halve`, the log may have round-trip times; half of
+    each counts as one-way delay. `name` is the file name for errors about a line.
 
     Raises:
         BadInputError: If a value cannot be used; the text names line, value and remedy.
         InvalidValueError: If the log cannot be used.
     """
-    columns, rows = read_rows(lines, name)
-    (time, time_scale), (delay, scale) = (_find(columns, kind) for kind in (TIMES, DELAYS))
-    halved = delay.startswith("rtt")
+    table = CsvTable(lines, name, EXAMPLE)
+    time = table.column(("time", "timestamp", "sent"), SECONDS)
+    delay = table.column(("delay", "rtt"), SECONDS)
+    halved = delay.name.lower().startswith("rtt")
     if halved and not halve:
-        raise InvalidValueError(f"column {delay}: has round trips; {HALVE}")
-    scale *= 0.5 if halved else 1.0
+        raise InvalidValueError(f"column {delay.name}: has round trips; {HALVE}")
     # Whatever its name: a share of losses must not be passed over in silence.
-    losses = [column for column in columns if "loss" in column or "lost" in column]
+    losses = table.containing("loss|lost", LOST)
+    for column in losses:
+        if _PERCENT.search(column.name):
+            raise InvalidValueError(
+                f"column {column.name}: is a share in percent, but here a row is one packet, lost "
+                "or not: give a column lost of 1 and 0; a trace may have shares (docs/traces.md)"
+            )
+    received = table.find(("received",), {"": 1.0}, LOST)
+    scale = delay.scale * (0.5 if halved else 1.0)
     sent, delays = list[float](), list[float]()
-    for row in rows:
-        is_lost = any([row.number(column, LOST) for column in losses])
-        is_lost |= row.cells[delay].lower() in ("", "nan")
+    for row in table.rows:
+        is_lost = any([row.number(column) for column in losses])
+        is_lost |= received is not None and not row.number(received)
+        is_lost |= row.cells[delay.at].lower() in ("", "nan")
         sent.append(row.number(time))
         delays.append(nan if is_lost else row.number(delay) * scale)
     # For nanoseconds since 1970 a float has a resolution of 256 ns, which is enough here.
     start = min(sent, default=0.0)
     entries = [
-        ((at - start) * time_scale, value, not isnan(value))
+        ((at - start) * time.scale, value, not isnan(value))
         for at, value in zip(sent, delays, strict=True)
     ]
-    return packets_of(entries, halved=halved)
-
-
-def _find(columns: list[str], kinds: str) -> tuple[str, float]:
-    """Return the only column of these kinds, such as `delay_ms`, and the scale of its unit."""
-    pattern = re.compile(f"({kinds})_({'|'.join(SCALES)})")
-    found = [(column, SCALES[it[2]]) for column in columns if (it := pattern.fullmatch(column))]
-    if len(found) != 1:
-        shown = ",".join(columns)[:200]
-        raise InvalidValueError(f"needs one column ({kinds})_({'|'.join(SCALES)}), has {shown!r}")
-    return found[0]
+    packets = packets_of(entries, halved=halved)
+    others = ", ".join(table.others(time, delay, received, *losses))
+    return replace(packets, notes=(*packets.notes, *[f"columns left out: {others}"] * bool(others)))
 
 
 SESSIONS = "has more than one session of ping; give the lines of one session"

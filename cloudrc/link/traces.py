@@ -1,18 +1,18 @@
 """Read and write traces: CSV files of delay and loss over time, which link profiles use.
 
-A trace has the header `time_s,delay_ms` or `time_s,delay_ms,loss`, and one row per instant in
-rising order of time; `delay_us` may replace `delay_ms`. Delays are one way.
+A trace has the columns `time_s` and `delay_ms`, also in other units, and may have `loss`. Each row
+is an instant, in rising order of time. Delays are one way.
 `link/trace_logs.py` converts the logs of other tools to traces.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import fields
 from functools import lru_cache
 from math import fsum, sqrt
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from cloudrc.errors import BadInputError
 from cloudrc.files import version
@@ -24,15 +24,12 @@ from cloudrc.link.profile import (
     GilbertElliott,
     Trace,
 )
-from cloudrc.outside.paths import read_file
-from cloudrc.outside.refusal import naming
-from cloudrc.outside.values import ANY, Quantity
+from cloudrc.outside.tables import SECONDS, SHARE, SIZE_MAX, CsvTable, read_lines
+from cloudrc.outside.values import Quantity
 from cloudrc.rounding import differences
 
-SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a second
 START_MAX = 600.0  # if the first row is later, times count from the first row [s]
-_COLUMNS = dict.fromkeys(("time_s", "delay_ms", "delay_us"), Quantity(ge=0))
-_COLUMNS["loss"] = Quantity(ge=0, le=1)
+EXAMPLE = "time_s,delay_ms,loss"
 
 
 def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
@@ -48,7 +45,7 @@ def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
 @lru_cache(maxsize=4)  # of both directions: a large trace takes seconds
 def _read_trace(path: Path, size_max: int, state: object) -> Trace:
     """Read a trace; `state` changes with the file."""
-    remedy = "give a CSV file with the columns time_s,delay_ms"
+    remedy = f"give a CSV file with the columns {EXAMPLE}"
     return parse_trace(read_lines(path, f"trace {path}", remedy, size_max), str(path))
 
 
@@ -75,11 +72,6 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def read_lines(path: Path, name: str, remedy: str, size_max: int = SIZE_MAX) -> list[str]:
-    """Read the lines of a text file; if that fails, raise a BadInputError with a remedy."""
-    return read_file(path, name, remedy, size_max).decode("utf-8-sig", "replace").splitlines()
-
-
 def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
     """Read the distribution of a trace's delays, without lost packets.
 
@@ -101,31 +93,24 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
 
     If the first row's time is above `START_MAX` [s], subtract this time from all times.
     """
-    place = f"trace {name}"
-    columns, rows = read_rows(lines, place)
-    delay = "delay_us" if "delay_us" in columns else "delay_ms"
-    wanted = ["time_s", delay, "loss"][: len(columns)]
-    if sorted(columns) != sorted(wanted) or len(wanted) < 2:
-        shown = ",".join(columns)[:200] or "missing"
-        raise BadInputError(
-            f"{place}: the header is {shown}; it must be time_s,delay_ms or time_s,delay_us, and "
-            "may end in ,loss"
-        )
+    table = CsvTable(lines, f"trace {name}", EXAMPLE)
+    columns = [table.column((each,), SECONDS, Quantity(ge=0)) for each in ("time", "delay")]
+    if loss := table.find(("loss",), SHARE, Quantity(ge=0, le=1)):
+        columns.append(loss)
+    table.refuse_others(*columns)
     found = list[list[float]]()
-    for row in rows:
-        found.append([row.number(column, _COLUMNS[column]) for column in wanted])
+    for row in table.rows:
+        found.append([row.number(column) * column.scale for column in columns])
         if len(found) > 1 and found[-1][0] <= found[-2][0]:
             raise BadInputError(
-                f"{row.where}: time_s {found[-1][0]:.12g} does not come after "
-                f"{found[-2][0]:.12g}; sort the rows by time and give each time once"
+                f"{row.where}: time {found[-1][0]:.12g} s does not come after "
+                f"{found[-2][0]:.12g} s; sort the rows by time and give each time once"
             )
     if not found:
-        raise BadInputError(f"{place}: no rows; give at least one, for example: 0,45")
+        raise BadInputError(f"{table.place}: no rows; give at least one, for example: 0,45")
     times, delays, *losses = zip(*found, strict=True)
     start = times[0] if times[0] > START_MAX else 0.0
-    scale = 1e-6 if delay == "delay_us" else 1e-3
-    scaled = tuple(one * scale for one in delays)
-    return Trace(tuple(time - start for time in times), scaled, losses[0] if losses else None)
+    return Trace(tuple(time - start for time in times), delays, losses[0] if losses else None)
 
 
 def write_trace(trace: Trace) -> str:
@@ -139,44 +124,3 @@ def write_trace(trace: Trace) -> str:
 
 def _short(value: float, digits: int) -> str:
     return f"{value:.{digits}f}".rstrip("0").rstrip(".")
-
-
-class Row(NamedTuple):
-    """One row of a trace or log in a CSV file."""
-
-    where: str  # file and line, for messages
-    cells: dict[str, str]  # column -> text without blanks and quotes at its ends
-
-    def number(self, column: str, valid: Quantity = ANY) -> float:
-        """Parse a cell as a number, or raise a BadInputError that says what is valid."""
-        with naming(f"{self.where}: {column}"):
-            return float(valid.read(self.cells[column]))
-
-
-def read_rows(lines: Iterable[str], name: str) -> tuple[list[str], Iterator[Row]]:
-    """Read a CSV file: a header, and rows whose cells commas separate.
-
-    Blank lines and comments are skipped. A row with more or fewer cells than the header is refused.
-
-    Returns:
-        Names of the columns in lower case, and the rows.
-    """
-    kept = ((n, one) for n, one in enumerate(lines, 1) if one.strip() and one[0] != "#")
-    _, header = next(kept, (1, ""))
-    columns = [cell.lower() for cell in _cells(header)]
-
-    def rows() -> Iterator[Row]:
-        for number, line in kept:
-            where, cells = f"{name}, line {number}", _cells(line)
-            if len(cells) != len(columns):
-                raise BadInputError(
-                    f"{where}: {len(cells)} values for {len(columns)} columns; write numbers "
-                    "without commas"
-                )
-            yield Row(where, dict(zip(columns, cells, strict=True)))
-
-    return columns, rows()
-
-
-def _cells(line: str) -> list[str]:
-    return [cell.strip(' \t"') for cell in line.split(",")]

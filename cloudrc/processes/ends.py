@@ -27,10 +27,11 @@ from cloudrc.drivers.teleop import RemoteTeleop, UnixDatagrams, UnixPeer
 from cloudrc.files import warn_if_readable, write_atomically
 from cloudrc.link.follow import PEER_PAUSE, PeerName
 from cloudrc.link.state import STATE_FILE
-from cloudrc.link.traces import SIZE_MAX, link_profile
+from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.judge import Flow
 from cloudrc.messages import GuardState, plan_length
 from cloudrc.outside.code import apart
+from cloudrc.outside.tables import SIZE_MAX
 from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, repeat, warn
 from cloudrc.record import part_before
 from cloudrc.records import Fault

@@ -1,9 +1,12 @@
 """`cloudrc measure compute`: the file of computing times, which cloud.compute_ms takes."""
 
 import json
+from pathlib import Path
 
 import pytest
 
+from cloudrc.cli.eval_values import read_compute
+from cloudrc.config.compute import compute_times
 from cloudrc.drivers import cpu_limit, machine
 from tests.cli.conftest import FLY
 
@@ -11,8 +14,9 @@ TIMES = ["--report", "none", "--set", "link.profile=paper-p1", "--set"]
 
 
 def times(path):
-    lines = path.read_text().splitlines()
-    return [float(line) for line in lines if not line.startswith("#")]
+    comment, head, *lines = path.read_text().splitlines()
+    assert (comment[0], head) == ("#", "compute_ms")
+    return [*map(float, lines)]
 
 
 def test_the_times_of_a_measured_flight_are_flown_again(folder, call):
@@ -38,9 +42,28 @@ def test_a_controller_is_measured_without_a_limit_where_none_is_allowed(folder, 
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
-    [("", "has no time above 0"), ("1\nx\n", "t.txt:2: "), ("1\n-3\n", "t.txt:2: ")],
+    ("lines", "said"),
+    [
+        ("compute_ms\n", "has no time above 0"),
+        ("compute_ms\n1\nx\n", "t.txt, line 3: "),
+        ("compute_s\n1\n-3\n", "t.txt, line 3: "),
+        ("4\n5\n", "t.txt, line 1: numbers without a header"),
+        ("compute\n4\n", "column compute has no unit"),
+    ],
 )
-def test_a_wrong_file_is_refused(line, said, folder, refused):
-    (folder / "t.txt").write_text(line)
+def test_a_wrong_file_is_refused(lines, said, folder, refused):
+    (folder / "t.txt").write_text(lines)
     assert said in refused("run steps --mode virtual --set cloud.compute_ms=./t.txt")
+    assert said in refused("eval --env E --policy ./p.py --compute t.txt")
+
+
+@pytest.mark.parametrize(
+    ("lines", "told"),
+    [("compute_ms\n4\n", ""), ("step,latency_s\n7,0.004\n", "latency_s counts; left out: step")],
+)
+def test_a_file_has_one_unit_at_all_doors(lines, told, folder, caplog):
+    Path("t.txt").write_text(lines)
+    assert compute_times("./t.txt") == (4.0,)
+    assert read_compute("t.txt") == (("file", "t.txt"), (0.004,))
+    assert caplog.text.count("left out") == 2 * bool(told)
+    assert told in caplog.text

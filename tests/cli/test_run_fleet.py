@@ -47,8 +47,11 @@ def test_a_fleet_that_flies_again_tells_which_own_files_have_changed(folder, cal
     file.write_text("from cloudrc.cloud.predictors.last_sample import build\n")
     call(*line, "a", "--set", "cloud.predictor=./mine.py")
     file.write_text(f"# new\n{file.read_text()}")
-    again = call("run a/config.yaml --mode virtual --report none --out b")
+    (folder / "robots.csv").write_text("link.both.delay_ms\n" + "20\n" * 9)
+    words = "run a/config.yaml --mode virtual --report none --out b --set fleet.vary=robots.csv"
+    again = call(words)
     assert "changed since the flight of a: cloud.predictor" in again.err
+    assert "fleet.vary has 9 entries for " in again.err
 
 
 def test_a_robot_flies_alone_as_in_a_fleet_without_a_cell(folder, call):

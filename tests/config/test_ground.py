@@ -44,7 +44,7 @@ def test_a_mission_that_leads_off_the_ground_or_away_is_refused_in_one_line(sett
     [
         ("time_s,x_m,y_m,z_m", ",0.1", ""),
         ("time_s,x_m,y_m,z_m", ",1", "line 2: z_m is 1; the guard moves the robot from 0.1"),
-        ("time_s,x_m", "", "the header is time_s,x_m; it must be time_s,x_m,y_m"),
+        ("time_s,x_m", "", "no column y_m; it has time_s, x_m; its first line must name the"),
     ],
 )
 def test_a_file_of_setpoints_needs_no_height_and_has_no_other_one(tmp_path, head, z, message):

@@ -27,3 +27,12 @@ def test_the_wrong_row_of_setpoints_is_named_by_its_line(tmp_path, row):
     path.write_text(f"{HEAD}\n0,0,0,1\n1,0,0,1\n{row}\n4,0,0,1\n")
     with pytest.raises(BadInputError, match=r"drive\.csv, line 4: "):
         read_setpoints(path, FENCE)
+
+
+def test_setpoints_are_read_in_the_units_of_their_head(tmp_path):
+    path = tmp_path / "drive.csv"
+    path.write_text("z_m;time_ms;x_m;y_m\n1;7000;0;0\n1.2;8500;0.5;0\n")
+    assert read_setpoints(path, FENCE) == ((0.0, HERE), (1.5, THERE))
+    path.write_text("time_s,x_mm,y_m,z_m\n0,0,0,1\n")
+    with pytest.raises(BadInputError, match="no column x_m; it has time_s, x_mm"):
+        read_setpoints(path, FENCE)

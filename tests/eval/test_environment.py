@@ -21,7 +21,7 @@ FILES = {
     ),
     "t.csv": "time_s,delay_ms\n0,10\n1,20\n",
     "d.csv": "time_s,delay_ms\n0,1\n1,2\n2,4\n",
-    "times.csv": "0.1\n",
+    "times.csv": "step,compute_s\n0,0.1\n",
     "scene.txt": "a",
     "other.txt": "a",
     "site-packages/parts/__init__.py": "from gymnasium import Env\nclass Part(Env):\n  dt = 0.1\n",

@@ -105,12 +105,29 @@ def test_how_far_robots_fly_on_alone_changes_nothing(monkeypatch):
 
 def test_settings_of_single_robots_come_from_a_file_too(tmp_path):
     table = tmp_path / "robots.csv"
-    table.write_text("world.robot,link.both.delay_ms\nx2,20\npelican,60\n")
+    table.write_text("world.robot;link.both.delay_ms\nx2;20\npelican;60\n")
     settings = f"fleet.vary={table}", "fleet.robots=3"
     robots = robots_of(load_experiment("steps", settings), "steps", settings)
     assert [robot.world.robot for robot in robots] == ["x2", "pelican", "x2"]
     assert [robot.uplink.delay_ms for robot in robots] == [20.0, 60.0, 20.0]
     assert [robot.fleet.only for robot in robots] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("link.both.delay_ms\n10,5\n20\n", "robots.csv, line 2: 2 values for 1 columns"),
+        ("link.both.delay_ms,world.robot\n10\n20,nano\n", "line 2: 1 values for 2 columns"),
+        (
+            "world.robot;link.both.delay_ms\nx2;10,5\n",
+            "line 2: link.both.delay_ms: '10,5' has a de",
+        ),
+        ("seed,seed\n1,2\n", "column seed is there twice"),
+    ],
+)
+def test_a_file_of_robots_that_could_be_misread_is_refused(text, says, tmp_path):
+    (tmp_path / "robots.csv").write_text(text)
+    assert says in refused("steps", f"fleet.vary={tmp_path / 'robots.csv'}")
 
 
 @pytest.mark.parametrize(

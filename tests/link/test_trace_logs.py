@@ -40,18 +40,23 @@ def test_a_row_of_a_trace_begins_halfway_between_two_packets():
 
 
 @pytest.mark.parametrize(
-    ("text", "delays"),
+    ("text", "delays", "notes"),
     [
-        ("host,delay_s,sent_us,note\na,0.045,1000000,x\n\nb,0.060,1500000,y", (0.045, 0.060)),
-        ("time_ns,rtt_ns\n1700000000000000000,9e7\n1700000000500000000,", (0.045, None)),
-        ("time_s,delay_ms,lost\n0,45,0\n0.5,0,1", (0.045, None)),
+        (
+            "host,delay_s,sent_us,status\na,0.045,1000000,ok\n\nb,0.060,1500000,late",
+            (0.045, 0.060),
+            ("columns left out: host, status",),
+        ),
+        ("time_ns,rtt_ns\n1700000000000000000,9e7\n1700000000500000000,", (0.045, None), ()),
+        ("time_s,delay_ms,lost\n0,45,0\n0.5,0,1", (0.045, None), ()),
+        ("time_s;rtt_ms;received\n0;90;1\n0.5;0;0", (0.045, None), ()),
     ],
 )
-def test_units_and_losses_are_those_of_the_columns(text, delays):
+def test_units_and_losses_are_those_of_the_columns(text, delays, notes):
     packets = read(text, halve=True)
     assert packets.sent == pytest.approx((0.0, 0.5))
     assert delays_of(packets) == pytest.approx(delays)
-    assert packets.notes == ()
+    assert packets.notes == notes
 
 
 def test_round_trips_are_halved_only_on_request():
@@ -65,6 +70,8 @@ def test_round_trips_are_halved_only_on_request():
     ("text", "says"),
     [
         ("time_s,delay_ms,loss\n0,45,0.1", "line 2: loss: '0.1' is not a whole number"),
+        ("time_s,delay_ms,loss%\n0,45,1", "column loss%: is a share in percent, but here a row is"),
+        ("time_s,delay_ms,received\n0,45,7", "line 2: received: '7' is not a whole number"),
         ("time_s,delay_ms\n0,45\n1,-3", "arrived 3 ms before it was sent: the two clocks differ;"),
         ("time_s,delay_ms\n98,4\n99,4\n100,4\n0,4\n1,4", "at packet 4 the times go back by 100 s"),
     ],

@@ -14,6 +14,7 @@ HEAD = "time_s,delay_ms"
     [
         (f"{HEAD}, loss\n0, 45, 0\n.5, 60, .2\n\n2,0,1\n", (0, 0.5, 2), (45, 60, 0), (0, 0.2, 1)),
         ("delay_us,time_s\n45000,0\n", (0,), (45,), None),
+        ("time_ms;delay_s;loss_pct\n500;0.045;1\n", (0.5,), (45,), (0.01,)),
         ('\ufeff"time_s","delay_ms"\r\n0,45\r\n', (0,), (45,), None),
         (f"# measured\n{HEAD}\n1705744800.5,45\n1705744801.5,46\n", (0, 1), (45, 46), None),
     ],
@@ -30,8 +31,9 @@ def test_a_trace_is_read_into_si(tmp_path, data, times, delays, losses):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("0,45\n1,46", "the header is 0,45; it must be time_s,delay_ms"),
-        (f"{HEAD}\n1,45\n1,45", "line 3: time_s 1 does not come after 1; sort"),
+        ("0,45\n1,46", "line 1: numbers without a header"),
+        ("time_s,rtt_ms\n0,45", "no column delay_s or delay_ms"),
+        (f"{HEAD}\n1,45\n1,45", "line 3: time 1 s does not come after 1 s; sort"),
         (f"{HEAD}\n0,-1", "line 2: delay_ms: '-1' is not a number >= 0"),
         (f"{HEAD},loss\n0,45,1.2", "line 2: loss: '1.2' is not a number >= 0 and <= 1"),
     ],

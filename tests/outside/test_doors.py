@@ -20,9 +20,9 @@ from cloudrc.errors import BadInputError
 from cloudrc.gym import Networked
 from cloudrc.link import open as open_link
 from cloudrc.link.library import read_profile
-from cloudrc.link.traces import Row
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.outside.document import parse_value, parse_yaml
+from cloudrc.outside.tables import Column, Row
 from cloudrc.outside.values import ANY, RESULT, WHOLE, InvalidValueError, Quantity
 from cloudrc.runs.experiment import load
 from tests.outside.values import OBJECTS, TEXTS, disagreements, taken_otherwise
@@ -115,7 +115,7 @@ def test_a_mapping_of_a_profile_reads_what_the_table_says(path):
 
 def test_a_cell_of_a_csv_file_reads_what_the_table_says():
     def read(text):
-        return Row("file, line 2", {"delay_ms": text}).number("delay_ms")
+        return Row("file", 2, [text]).number(Column("delay_ms", 0, 1.0, ANY))
 
     texts = TEXTS | {" 5 ": 5}
     assert disagreements(texts.items(), ANY, read, BadInputError) == []

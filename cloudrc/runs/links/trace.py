@@ -25,9 +25,10 @@ from cloudrc.link.trace_logs import (
     read_ping,
     trace_of,
 )
-from cloudrc.link.traces import read_lines, write_trace
+from cloudrc.link.traces import write_trace
 from cloudrc.outside.paths import check_there
 from cloudrc.outside.refusal import naming
+from cloudrc.outside.tables import read_lines
 from cloudrc.outside.values import InvalidValueError
 from cloudrc.runs.requirements import require
 
