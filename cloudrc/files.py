@@ -5,11 +5,8 @@ Reading never blocks. Writing replaces the file in one step.
 
 from __future__ import annotations
 
-import fcntl
-import grp
 import json
 import os
-import pwd
 import stat
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -19,6 +16,7 @@ from typing import IO, Any
 
 SIZE_MAX = 1 << 20
 """Default size limit of a file that is read [bytes]: the size limit of a ConfigMap."""
+_AT_ONCE = getattr(os, "O_NONBLOCK", 0)  # Windows has no such flag, and no pipes in its folders
 
 
 class TooLongError(ValueError):
@@ -83,7 +81,7 @@ def open_file(path: Path) -> FileIO:
 
     Raise an OSError if it cannot be opened, or a ValueError if it is no regular file.
     """
-    file = FileIO(path, opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
+    file = FileIO(path, opener=lambda name, flags: os.open(name, flags | _AT_ONCE))
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         return file
     file.close()
@@ -128,6 +126,9 @@ def make_own_folder(path: Path) -> str:
 
 def _is_group_of_one(gid: int) -> bool:
     """Return whether a group is the one that many systems make for this user alone."""
+    import grp  # here, because Windows, where the link is a library, has none of these
+    import pwd
+
     try:
         user, group = pwd.getpwuid(os.geteuid()), grp.getgrgid(gid)
     except KeyError:
@@ -161,11 +162,13 @@ def at_place(place: Path | str) -> Iterator[None]:
         raise
 
 
-def try_lock(file: IO[Any], *, shared: bool = False) -> bool | None:
+def try_lock(file: IO[Any] | int, *, shared: bool = False) -> bool | None:
     """Lock a file until it is closed, for this process alone or `shared` with others of its kind.
 
     Return False if another process has it. None: the file system has no locks.
     """
+    import fcntl  # here, because Windows, where the link is a library, has none
+
     try:
         fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:

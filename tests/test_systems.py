@@ -39,3 +39,27 @@ def test_windows_is_sent_to_wsl2():
     found = python("-c", program)
     assert (found.returncode, found.stderr.count("\n")) == (3, 1)
     assert "WSL2" in found.stderr
+
+
+NOT_WINDOWS = "fcntl grp pwd resource termios pty tty"
+"""Modules of Python that Windows lacks, and names of os. Source: the documentation of Python."""
+NOT_WINDOWS_OS = "O_NONBLOCK O_CLOEXEC geteuid getuid getgid fork sched_getaffinity"
+
+
+def test_the_link_as_a_library_needs_nothing_that_windows_lacks(tmp_path):
+    trace = tmp_path / "trace.csv"
+    trace.write_text("time_s,delay_ms\n0,45\n")
+    program = f"""
+import os, sys
+[sys.modules.__setitem__(name, None) for name in "{NOT_WINDOWS}".split()]
+[delattr(os, name) for name in "{NOT_WINDOWS_OS}".split()]
+import cloudrc.link as link
+[getattr(link, name) for name in link.__all__]
+up, down = link.open("lte", 1)
+print(up.table(10, 0.01).shape, up.expected().mean > 0, down.send(0, 0, 100, 0) != [])
+up, _ = link.open({{"uplink": {{"trace": {str(trace)!r}}}}}, 1)
+print(up.send(0, 0, 100, 0))
+"""
+    found = python("-c", program)
+    assert found.stderr == ""
+    assert found.stdout == "(10,) True True\n(45000000,)\n"
