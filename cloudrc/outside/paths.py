@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -21,6 +22,8 @@ LOCK = ".lock"
 """File of a folder that each command locks; the names of further locks begin so."""
 TOKEN_VARIABLE = "CLOUDRC_TOKEN_FILE"
 """Environment variable of a command that names the file with the API's token."""
+_taken = list[int]()
+"""The descriptor of the newest folder of results, which is locked; or none."""
 _TOKEN = re.compile(rb"[!-~]{16,512}")
 _Secret = TypeVar("_Secret")
 
@@ -50,11 +53,18 @@ def check_picture(path: Path, flag: str) -> None:
 def make_folder(folder: Path, named: str = "") -> None:
     """Make a folder for results; `named` precedes its path in errors, as the flag that gave it.
 
-    Raise a BadInputError if it exists and is not an empty folder, or if it cannot be made.
+    Of commands that begin at the same time, one gets the folder: it locks the folder until it makes
+    its next one, so long before that the folder is not empty.
+
+    Raise a BadInputError if it exists and is not an empty folder, if another command has it, or if
+    it cannot be made.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        is_used = any(folder.iterdir())
+        while _taken:
+            os.close(_taken.pop())
+        _taken.append(os.open(folder, os.O_RDONLY))
+        is_used = try_lock(_taken[0]) is False or any(folder.iterdir())
     except FileExistsError:
         is_used = True
     except OSError as error:
