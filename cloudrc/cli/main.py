@@ -7,7 +7,7 @@ import contextlib
 import sys
 from collections.abc import Sequence
 
-from cloudrc.cli.output import STDOUT, TABLE, discard_output, reserve_stdout
+from cloudrc.cli.output import STDOUT, TABLE, discard_output, open_streams, reserve_stdout
 from cloudrc.cli.parser import build_parser
 from cloudrc.errors import (
     DISK_FULL,
@@ -28,6 +28,7 @@ INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command in `arguments`, or this process's command; return the exit code."""
     given = sys.argv[1:] if arguments is None else list(arguments)
+    open_streams()
     try:
         return _dispatch(given)
     except KeyboardInterrupt:

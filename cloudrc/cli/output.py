@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
+import io
 import json
 import os
 import sys
@@ -20,6 +22,9 @@ if TYPE_CHECKING:
     from cloudrc.trials.plan import SweepPlan
 
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1"}
+
+_SUBSTITUTES = {"±": "+-", "²": "^2", "·": "-", "π": "pi"}
+"""Sign -> text in an output whose encoding lacks the sign."""
 
 TABLE = "table"
 """Form of the output that is for people."""
@@ -66,6 +71,26 @@ def print_result(form: str, document: Mapping[str, Any], text: str, **others: st
         discard_output(sys.stdout)
         if error.errno in DISK_FULL:
             raise
+
+
+def open_streams() -> None:
+    """Let stdout and stderr take every text: a closed one drops it, others write substitutes.
+
+    An encoding such as ISO 8859-2 has no ±, and file names may have bytes that are no text.
+    """
+    codecs.register_error("substitute", _substitute)
+    for name in ("stdin", "stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # closed by the shell, so no file of ours may get its descriptor
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))
+        elif name != "stdin" and isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="substitute")
+
+
+def _substitute(error: UnicodeError) -> tuple[str, int]:
+    assert isinstance(error, UnicodeEncodeError)
+    text = error.object[error.start : error.end]
+    return "".join(_SUBSTITUTES.get(sign, "?") for sign in text), error.end
 
 
 @contextlib.contextmanager

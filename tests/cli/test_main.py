@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from io import BytesIO, TextIOWrapper
 from unittest.mock import Mock
 
 import pytest
@@ -89,6 +90,24 @@ def test_a_closed_pipe_is_no_error():
     line = f"{sys.executable} -m cloudrc list -o json | true; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("0\n", "")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "shown"),
+    [("ascii", "3 +- 1 ? 2"), ("iso8859-2", "3 +- 1 ? 2"), ("utf-8", "3 ± 1 € 2")],
+)
+def test_an_output_without_a_sign_gets_a_substitute(encoding, shown, monkeypatch):
+    stream = TextIOWrapper(BytesIO(), encoding=encoding)
+    monkeypatch.setattr(sys, "stdout", stream)
+    monkeypatch.setattr("cloudrc.cli.list.execute", lambda options: print("3 ± 1 € 2"))
+    assert main(["list"]) == 0
+    assert stream.buffer.getvalue().decode(encoding) == f"{shown}\n"
+
+
+def test_a_closed_output_is_no_error():
+    line = f"{sys.executable} -m cloudrc list -o json >&-; {sys.executable} -m cloudrc list >&-"
+    done = subprocess.run(["bash", "-ec", line], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_the_plugin_of_kubectl_calls_itself_as_it_is_typed(monkeypatch, capsys):
