@@ -29,6 +29,8 @@ COMPONENT = "sweep"
 """Label `component` of the Jobs and pods of sweeps, and name of their container."""
 FILE = "flights.json.gz"
 """Key in the ConfigMap under which the flights are stored."""
+VOLUME = "flights"
+"""Volume of the pods with this ConfigMap."""
 REMEDY = (
     "repeat the command, perhaps with --cpu 500m, --cpu-limit 1, --memory 512Mi or fewer --shards"
 )
@@ -129,14 +131,14 @@ def start(
     for number, own in enumerate(own_files):
         key = f"own-{number}"
         files["binaryData"][key] = base64.b64encode(Path(own).read_bytes()).decode()
-        mount = {"name": "flights", "mountPath": own, "subPath": key, "readOnly": True}
+        mount = {"name": VOLUME, "mountPath": own, "subPath": key, "readOnly": True}
         container["volumeMounts"].append(mount)
     for path, value in settings.changes.items():
         node = dict(zip(LEVELS, (job["spec"], pod, container), strict=True))[_level_of(path)]
         for part in path[:-1]:
             node = node.setdefault(part, {})
         node[path[-1]] = value
-    create_job(release, job, files, field_validation="Strict")
+    create_job(release, job, files, VOLUME, field_validation="Strict")
 
 
 def _set_up(job: Any, name: str, settings: PodSettings) -> None:

@@ -36,6 +36,8 @@ COMPONENT = "mission"
 """Label `component` of the Jobs, pods and ConfigMaps of missions, and name of their container."""
 FILE = "mission.yaml"
 """Key in the ConfigMap under which the mission is stored."""
+VOLUME = "mission"
+"""Volume of the Job's pod with this ConfigMap."""
 KILLED_WATCHER = (137, 143)
 """Exit codes of a watcher that was killed: by SIGKILL, or by SIGTERM."""
 UID_LABEL = "batch.kubernetes.io/controller-uid"
@@ -111,7 +113,7 @@ def run_job(
         job["spec"] |= {"completions": robots, "parallelism": robots}
         arguments.append(f"{AT}{ceil(time.time() + together)}")
     data = {FILE: json.dumps(mission, indent=2) + "\n"}
-    create_job(release, job, {"apiVersion": "v1", "kind": "ConfigMap", "data": data})
+    create_job(release, job, {"apiVersion": "v1", "kind": "ConfigMap", "data": data}, VOLUME)
     return name
 
 
@@ -137,15 +139,15 @@ def read_example(release: Release, component: str, name: str) -> tuple[Any, Any]
     return files, job
 
 
-def create_job(release: Release, job: Any, files: Any, **given: str) -> None:
-    """Create a Job, and `files` as a ConfigMap of the same name, which its pods mount.
+def create_job(release: Release, job: Any, files: Any, volume: str, **given: str) -> None:
+    """Create a Job, and `files` as a ConfigMap of the same name, which its pods mount as `volume`.
 
     If the ConfigMap cannot be created, delete the Job. `given` are arguments of the client.
     """
     name = job["metadata"]["name"]
-    for volume in job["spec"]["template"]["spec"]["volumes"]:
-        if "configMap" in volume:
-            volume["configMap"]["name"] = name
+    for each in job["spec"]["template"]["spec"]["volumes"]:
+        if each["name"] == volume:  # the others are the release's, or the user's
+            each["configMap"]["name"] = name
     created = release.request("create", "jobs", body=job, **given)
     owner = owner_of("batch/v1", "Job", created)
     labels = job["metadata"]["labels"]

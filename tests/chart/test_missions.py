@@ -1,17 +1,11 @@
-"""Missions as Jobs of the chart, of the examples and of `helm test`; each flies once."""
-
-import copy
+"""Missions as Jobs of the chart, of its CronJob and of `cloudrc mission run`; each flies once."""
 
 import pytest
 import yaml
 
 from cloudrc.config.load import load_experiment
-from tests.chart.conftest import CHART, of_kind, render
+from tests.chart.conftest import of_kind, render
 
-EXAMPLES = {
-    name: list(yaml.safe_load_all((CHART / "examples" / f"{name}.yaml").read_text()))
-    for name in ("mission-job", "mission-paper")
-}
 ENABLED = "mission: {enabled: true}"
 
 
@@ -50,17 +44,19 @@ def test_only_another_mission_makes_another_job():
     assert len(set(names)) == 3
 
 
-def test_the_chart_makes_the_job_of_the_example():
-    """`cloudrc mission run` also uses the Job of the example."""
-    found = (*jobs(ENABLED, release="cloudrc"), EXAMPLES["mission-job"][1])
-    ours, theirs = (job["spec"]["template"]["spec"] for job in copy.deepcopy(found))
-    for pod in (ours, theirs):
-        (container,) = pod["containers"]
-        key = container["env"][0].pop("name")
-        container["args"] = sorted(word.replace(key, "KEY") for word in container["args"])
-        pod["volumes"][0]["configMap"] = {}
-        pod.pop("serviceAccountName", None)
-    assert ours == theirs
+def test_the_chart_kubectl_and_cloudrc_make_the_same_job():
+    """In the volume of the recordings each of them leaves a report."""
+    values = {"mission": {"enabled": True, "cronJob": {"enabled": True}}}
+    objects = render({**values, "recordings": {"storage": "1Gi"}})
+    (cron,) = of_kind(objects, "CronJob").values()
+    job = yaml.safe_load(of_kind(objects, "ConfigMap")["mission-job"]["data"]["job.yaml"])
+    specs = [*jobs({**values, "recordings": {"storage": "1Gi"}}), job, cron["spec"]["jobTemplate"]]
+    for spec in (each["spec"] for each in specs):
+        files, *_ = spec["template"]["spec"]["volumes"]
+        assert files["name"] == "mission"
+        del files["configMap"]
+        assert spec == specs[0]["spec"]
+    assert "--report=/var/lib/cloudrc" in str(job)
 
 
 def test_a_suspended_cron_job_is_the_template_of_jobs():

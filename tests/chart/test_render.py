@@ -131,7 +131,7 @@ def test_the_objects_and_the_examples_are_valid(version, monkeypatch):
             for names in (named, *([p["name"] for p in part.get("ports", ())] for part in parts)):
                 assert len(names) == len(set(names))
                 assert max(map(len, names), default=0) <= 15
-    for name in ("link-set-role", "mission-job", "mission-paper", "sweep-job"):
+    for name in ("link-set-role", "sweep-job"):
         for thing in yaml.safe_load_all((CHART / "examples" / f"{name}.yaml").read_text()):
             kubernetes_validate.validate(thing, version, strict=True)
 

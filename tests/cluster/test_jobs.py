@@ -6,7 +6,7 @@ import pytest
 
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import follow, run_job
-from tests.cluster.conftest import MISSION, TOKEN, waiting
+from tests.cluster.conftest import MISSION, TOKEN, put_template_and_token, waiting
 
 
 def pod_of(api, name):
@@ -30,6 +30,21 @@ def test_a_job_posts_the_mission_to_its_release(running, release):
     assert TOKEN not in str(job)
     run_job(release, MISSION, name="patient", queue=True)
     assert "--queue" in pod_of(running, "patient")["containers"][0]["args"]
+
+
+def test_only_the_missions_volume_gets_the_missions_name(running, release):
+    """The report needs the release's experiment and link; a user has files of his own."""
+    own = [{"name": "own", "configMap": {"name": "mine"}}]
+    values = {"recordings": {"storage": "1Gi"}, "mission": {"extraVolumes": own}}
+    put_template_and_token(running, values)
+    run_job(release, MISSION, name="first")
+    volumes = pod_of(running, "first")["volumes"]
+    assert {each["name"]: each["configMap"]["name"] for each in volumes if "configMap" in each} == {
+        "mission": "first",
+        "experiment": "cloudrc-experiment",
+        "link": "cloudrc-link",
+        "own": "mine",
+    }
 
 
 def test_follow_ends_when_the_pod_cannot_run(running, release):

@@ -16,6 +16,7 @@ from cloudrc.cluster.client import connect
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import METRICS, fetch_recording, forwarded
+from cloudrc.config.load import load_experiment
 from cloudrc.errors import CloudrcError
 from cloudrc.runs.links.verify import fetch
 from tests.drivers.conftest import WORK, slower
@@ -220,6 +221,8 @@ def fly(name, waypoints, limit=60.0, release=NAME, **keys):
     run_job(place(release), mission, name=name)
 
 
+PIPES = load_experiment("paper").mission.model_dump(mode="json", include={"waypoints", "touch"})
+"""The paper's mission."""
 INTERRUPTED = 130
 """Exit code of a mission that was cancelled."""
 LONG = [

@@ -8,10 +8,11 @@ from types import SimpleNamespace
 import pytest
 
 from tests.e2e.conftest import (
-    EXAMPLES,
     NAME,
+    PIPES,
     TIMES,
     eventually,
+    fly,
     job_end,
     job_log,
     kubectl,
@@ -34,7 +35,7 @@ PORTS = {"world": (9100, 9102), "cloud": (8080, 9100, 9101, 9102)}
 @pytest.fixture(scope="module")
 def first(prometheus):
     """Observations of the first mission; two counts of malformed datagrams, by their sender."""
-    kubectl("apply", f"--filename={EXAMPLES / 'mission-paper.yaml'}")
+    fly(MISSION, **PIPES, limit=180.0)
     eventually(lambda: "waypoint 1 of 7" in job_log(MISSION), "the mission flies", 60.0)
     tried = {
         "tcp": [(ip(component), port) for component, ports in PORTS.items() for port in ports],

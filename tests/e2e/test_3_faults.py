@@ -10,12 +10,12 @@ import pytest
 
 from cloudrc.cli.mission import LEASE
 from cloudrc.cluster.pods import fetch_recording
-from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 from tests.drivers.conftest import ages_at_hold
 from tests.e2e.conftest import (
     NAME,
+    PIPES,
     eventually,
     fly,
     job_end,
@@ -32,8 +32,6 @@ from tests.e2e.conftest import (
 
 pytestmark = pytest.mark.real_time
 
-MISSION = load_experiment("paper").mission.model_dump(mode="json")
-PIPES = {name: MISSION[name] for name in ("waypoints", "touch")}
 LINE = [{"position_m": [0.5, 0.0, 0.7]}, {"position_m": [0.5, 2.5, 0.7], "dwell_s": 3.0}]
 """Two waypoints; from one to the other the robot flies for some seconds."""
 ENDS_IN = 2.0

@@ -121,10 +121,16 @@ def test_a_run_in_a_cluster_is_that_of_virtual_time(
 
 
 @pytest.mark.real_time
-def test_kubectl_alone_drives_another_robot_whose_report_is_kept_when_its_pods_are_gone(tmp_path):
+def test_kubectl_alone_drives_another_robot():
     end, log = job_end("by-hand", ROVER)
     assert end.exit_code == 0, (end, log)
     assert "waypoint 4 of 4 reached" in log
+    assert "report: " in log
+
+
+@pytest.mark.real_time
+def test_mission_run_leaves_a_report_that_stays_when_the_pods_are_gone(tmp_path):
+    log = in_release("mission", "run", "pillars", release=ROVER)
     (name,) = (line.split()[-1] for line in log.splitlines() if line.startswith("report: "))
     kubectl("delete", "pods", f"--selector=app.kubernetes.io/instance={ROVER}")
     until_ready(ROVER)

@@ -1,13 +1,12 @@
 """Uninstalling leaves only Secrets."""
 
-from tests.e2e.conftest import EXAMPLES, NAME, eventually, helm, kubectl, read
+from tests.e2e.conftest import NAME, eventually, helm, read
 
 KINDS = "deployment,service,configmap,networkpolicy,secret,serviceaccount,pvc,job,pod"
 
 
 def test_uninstalling_leaves_only_the_secrets(installed):
-    """The Jobs of `cloudrc mission run` are deleted, too; a Job that a user applied is not."""
-    kubectl("delete", f"--filename={EXAMPLES / 'mission-paper.yaml'}", "--ignore-not-found")
+    """The Jobs of `cloudrc mission run` are deleted, too."""
     helm("uninstall", NAME, "--wait")
 
     def left():
