@@ -142,6 +142,28 @@ def helm(*arguments):
     return subprocess.run(["helm", *arguments], capture_output=True, text=True)
 
 
+NUMBERS = """\
+world: {recordingSizeLimit: 2147483648}
+cloud: {recordingSizeLimit: 1500000000}
+recordings: {storage: 10737418240, keepMissions: 1000000, keepDays: 2000000}
+mission: {enabled: true, ttlSecondsAfterFinished: 3000000}
+experiment: {seed: 2147483648, link: {uplink: {rate_kbit: 1000000}}}
+teleop: {journal: {size: 104857600}}
+"""
+
+
+def test_numbers_of_a_values_file_arrive_as_numbers(tmp_path):
+    """Helm reads 2147483648 in a file as 2.147483648e+09; --set would hide it."""
+    path = tmp_path / "values.yaml"
+    path.write_text(NUMBERS)
+    done = helm("template", "x", str(CHART), "--kube-version", OLDEST, "--values", str(path))
+    assert re.findall(r".*\de\+\d.*", done.stdout) == []
+    wanted = ("--record-max=2147483648", "--record-max=1500000000", "--keep=1000000")
+    wanted += ("--keep-days=2000000", "ttlSecondsAfterFinished: 3000000", "storage: 10737418240")
+    wanted += ("seed: 2147483648", "rate_kbit: 1000000", "storage: 104857600")
+    assert [each for each in wanted if each not in done.stdout] == []
+
+
 @pytest.mark.parametrize("path", [*VALUES[:2], *nightly(*VALUES[2:])], ids=lambda path: path.stem)
 def test_helm_renders_the_same_objects(path):
     flags = ("--kube-version", OLDEST, "--values", str(path))

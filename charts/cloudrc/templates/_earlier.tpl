@@ -5,8 +5,23 @@
      them in an order of its own, with the same values. */}}
 {{- define "cloudrc.addDefaults" -}}
 {{- if not (hasKey .Values "defaultsAdded") -}}
+{{- include "cloudrc.wholeNumbers" .Values -}}
 {{- include "cloudrc.addKeys" (dict "to" .Values "from" (.Files.Get "files/added.yaml" | fromYaml)) -}}
 {{- $_ := set .Values "defaultsAdded" true -}}
+{{- end -}}
+{{- end }}
+
+{{/* Helm reads the numbers of a file as floating point, and would print 2147483648 as 2.147483648e+09.
+     toYaml, which prints lists, does not. */}}
+{{- define "cloudrc.wholeNumbers" -}}
+{{- range $key, $value := . -}}
+{{- if kindIs "map" $value -}}
+{{- include "cloudrc.wholeNumbers" $value -}}
+{{- else if kindIs "float64" $value -}}
+{{- if eq $value (floor $value) -}}
+{{- $_ := set $ $key (int64 $value) -}}
+{{- end -}}
+{{- end -}}
 {{- end -}}
 {{- end }}
 
