@@ -249,9 +249,11 @@ dist: $(VENV)/dev ## build wheel, sdist and chart into dist/; needs helm
 	$(bin)/python -m tools.pack_chart dist $(EPOCH)
 
 # The account that publishes; docs/install.md says where it stands.
-owner: ## write the account that publishes into pages, notebooks and badges: make owner OWNER=me
+owner: $(VENV)/dev ## write the account that publishes into pages, badges and links of alerts: make owner OWNER=me
 	@test '$(OWNER)' || { echo "name the account: make owner OWNER=me" >&2; exit 2; }
 	grep -rlw OWNER docs charts/cloudrc/README.md | xargs sed -i 's/\bOWNER\b/$(OWNER)/g'
+	sed -i 's|^  runbooks: ""|  runbooks: https://$(OWNER).github.io/cloudrc|' charts/cloudrc/values.yaml
+	$(bin)/python -m tools.docs
 
 images: ## build the container images; needs Docker
 	@command -v docker >/dev/null || { \

@@ -127,6 +127,7 @@ RULES = {
     "leaseSeconds": {"type": "integer", "minimum": 5, "maximum": 3600},
     "allowFrom": PEERS,
     "dns": PEERS,
+    "runbooks": _text("^$|^https?://"),
     "plan": _either(STRING, _ref("MissionConfig"), NULL),
     "interval": _text(r"^[0-9]+(ms|s|m)$"),
     "namespace": TypeAdapter(RosNamespace).json_schema(),

@@ -6,6 +6,7 @@ has restarted. If an emergency stop has not reached the robot, the new process s
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -38,6 +39,7 @@ class MissionRunner:
         book: The missions.
         current: The mission under way; None without one.
         ends: Whether this process ends; the next process flies the queue.
+        verdicts: Number of missions that have ended in this process, by verdict.
     """
 
     def __init__(self, book: MissionStore, fence: Fence, units: Mapping[str, str]) -> None:
@@ -47,6 +49,7 @@ class MissionRunner:
         """
         self.book, self.ends = book, False
         self.current: MissionRecord | None = None
+        self.verdicts = Counter[str]()
         self._teleop, self._fence = Teleop(fence, book.has_ended), fence
         self._view = RobotView(units)
         self._outputs: list[Output | Fault] = []
@@ -178,6 +181,8 @@ class MissionRunner:
         """Store an event of a mission, and the fields that it has `changed`."""
         if mission is self.current:
             changed["elapsed"] = round(self._flight.elapsed(now_ns), 3)
+        if "verdict" in changed:
+            self.verdicts[changed["verdict"]["outcome"]] += 1
         self.book.note(mission, event, text, **changed)
 
     def tell_link(self, text: str, now_ns: int) -> None:

@@ -52,7 +52,7 @@ def test_a_fleet_has_few_objects_one_set_of_rules_and_five_dashboards():
     # Kubernetes adds an EndpointSlice per Service and family and a revision per set, Helm a Secret.
     assert len(objects) + 2 * len(of_kind(objects, "Service")) + len(sets) + 1 <= 60
     (rules,) = of_kind(objects, "PrometheusRule").values()
-    assert sum(len(group["rules"]) for group in rules["spec"]["groups"]) == 22
+    assert sum(len(group["rules"]) for group in rules["spec"]["groups"]) == 23
     maps = [name for name in of_kind(objects, "ConfigMap") if name.startswith("grafana-")]
     assert len(maps) == 5
 

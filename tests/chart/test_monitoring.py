@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from cloudrc.exposition.table import METRICS, MetricKind
-from tests.chart.conftest import CHART, OPERATOR, notes, of_kind, render
+from tests.chart.conftest import CHART, OPERATOR, ROOT, notes, of_kind, render
 from tools.dashboards import expressions
 
 KINDS = {"PodMonitor", "PrometheusRule"}
@@ -57,7 +57,8 @@ def test_the_rules_use_existing_metrics_of_the_release_and_say_what_to_do():
 
 def in_release(labels):
     """Give the labels of alerts.yaml the namespace and the pod names of the release."""
-    pod = f"demo-cloudrc-world-{labels.get('pod', 'x')}"
+    pod = labels.get("pod", "x")
+    pod = f"demo-cloudrc-{pod if re.search('-[0-9]', pod) else 'world-' + pod}"
     return {**labels, "namespace": "lab", "pod": pod}
 
 
@@ -82,9 +83,10 @@ def promtool_test(case):
         more = ALERTS[name]["labels"] | {"release": "demo"}
         expected = []
         for labels in fired:
-            # What is absent has no pod.
-            seen = {**labels, "namespace": "lab"} if "Absent" in name else in_release(labels)
-            texts = ALERTS[name]["annotations"]
+            # A role that is absent has no pod.
+            has_pod = "Absent" not in name or "pod" in labels
+            seen = in_release(labels) if has_pod else {**labels, "namespace": "lab"}
+            texts = {**ALERTS[name]["annotations"], "runbook_url": f"docs/on-call.md#{name.lower()}"}
             expected.append({"exp_labels": seen | more, "exp_annotations": texts})
         alerts.append({"eval_time": time, "alertname": name, "exp_alerts": expected})
     samples = []
@@ -109,9 +111,27 @@ def test_the_alerts_fire_when_they_should_and_only_then(tmp_path):
     rows = [row for case in cases for row in case.get("fires", ())]
     assert {name for _, name, *fired in rows if fired} == ALERTS.keys(), "each alert has a case"
     assert cases[-1]["recorded"].keys() == RECORDED
-    on = "metrics: {prometheusRule: {enabled: true, force: true}}"
-    (rules,) = of_kind(render(on), "PrometheusRule").values()
-    promtool(tmp_path, rules["spec"], *map(promtool_test, cases))
+    cell = {"experiment": {"cell": {"rate_kbit": 500}}}
+    for values in ({}, cell):
+        chosen = [case for case in cases if case.get("cell", False) == bool(values)]
+        promtool(tmp_path, rules(values), *map(promtool_test, chosen))
+
+
+def rules(values, runbooks=""):
+    """Render the rules of a release; `runbooks` is the address of a site."""
+    on = {"runbooks": runbooks, "prometheusRule": {"enabled": True, "force": True}}
+    (found,) = of_kind(render({**values, "metrics": on}), "PrometheusRule").values()
+    return found["spec"]
+
+
+@pytest.mark.parametrize("site", ["", "https://me.github.io", "https://me.github.io/cloudrc/"])
+def test_each_alert_leads_to_its_section_of_the_page_on_call(site):
+    page = ROOT / "docs" / "on-call.md"
+    heads = re.findall(r"^## (\w+)$", page.read_text(), re.MULTILINE)
+    (group,) = rules({}, site)["groups"]
+    urls = [rule["annotations"]["runbook_url"] for rule in group["rules"] if "alert" in rule]
+    place = f"{site.rstrip('/')}/on-call/" if site else page.relative_to(ROOT).as_posix()
+    assert sorted(urls) == sorted(f"{place}#{head.lower()}" for head in heads)
 
 
 def promtool(folder, rules, *tests):
