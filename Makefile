@@ -12,6 +12,14 @@ CLUSTER ?= cloudrc
 # For ROS 2 in the cluster also cloud-ros: IMAGES=cloud-ros, and ROS=kilted for another distribution.
 IMAGES := world cloud
 ROS :=
+# The second tag of the images, by which a rebuilt image restarts pods: VERSION-gCOMMIT, and -dirty with a
+# hash of the files of the images that differ from it.
+IN_IMAGES := cloudrc images pyproject.toml hatch_build.py examples/ros2/cloudrc_nodes
+CHANGED = $(shell { git diff --name-only HEAD -- $(IN_IMAGES); \
+	git ls-files --others --exclude-standard -- $(IN_IMAGES); } 2>/dev/null)
+COMMIT = $(shell git rev-parse --short HEAD 2>/dev/null)
+BUILT = $(VERSION)-g$(or $(COMMIT),unknown)$(if $(CHANGED),-dirty-$(shell \
+	cat $(CHANGED) 2>/dev/null | git hash-object --stdin | cut -c1-7))
 SCRIPTS := .ci/run .ci/once_more images/cloud-ros/with-ros
 # Number of flights at once in the search for faults.
 JOBS ?= $(shell nproc 2>/dev/null || echo 2)
@@ -260,16 +268,23 @@ images: ## build the container images; needs Docker
 		echo "make images needs Docker: https://docs.docker.com/engine/install" >&2; exit 3; }
 	for role in $(IMAGES); do \
 		DOCKER_BUILDKIT=1 docker build --quiet --file images/$$role/Dockerfile \
-			--tag $(REGISTRY)cloudrc/$$role:$(VERSION) $(BUILD_ARGS) . || exit 1; \
+			--tag $(REGISTRY)cloudrc/$$role:$(VERSION) --tag $(REGISTRY)cloudrc/$$role:$(BUILT) \
+			$(BUILD_ARGS) . || exit 1; \
 	done
+	@mkdir -p build && echo $(BUILT) > build/image-tag
 
+kind-load: LOADED = $(shell cat build/image-tag 2>/dev/null || echo $(VERSION))
 kind-load: ## load the images into the kind cluster CLUSTER (cloudrc)
 	@command -v kind >/dev/null || { \
 		echo "make kind-load needs kind: https://kind.sigs.k8s.io" >&2; exit 3; }
 	@kind get clusters 2>/dev/null | grep -qx $(CLUSTER) || { \
 		echo "no kind cluster '$(CLUSTER)': kind create cluster --config kind-config.yaml" >&2; \
 		exit 3; }
-	kind load docker-image --name $(CLUSTER) $(IMAGES:%=$(REGISTRY)cloudrc/%:$(VERSION))
+	kind load docker-image --name $(CLUSTER) \
+		$(foreach tag,$(VERSION) $(LOADED),$(IMAGES:%=$(REGISTRY)cloudrc/%:$(tag)))
+	@mkdir -p build/loaded && echo $(LOADED) > build/loaded/kind-$(CLUSTER)
+	@echo "to restart the pods of a release with these images: helm upgrade cloudrc charts/cloudrc" \
+		"--reset-then-reuse-values --set image.tag=$(LOADED)"
 
 lock: $(VENV)/bin/python ## update the locked requirements of images and tests
 	$(bin)/python -m pip install --quiet uv

@@ -116,9 +116,13 @@ def test_two_builds_of_one_tree_are_byte_equal(copied, built, tmp_path):
 
 
 @pytest.mark.skipif(not shutil.which("helm"), reason="no helm here")
-def test_every_image_of_a_releases_chart_is_in_the_registry_that_it_publishes_to(tmp_path):
+@pytest.mark.parametrize("is_published", [False, True])
+def test_every_image_of_a_releases_chart_is_the_one_that_it_publishes(tmp_path, is_published):
+    """The chart names digests; the wheel, which is built before them, the version."""
     chart = shutil.copytree(ROOT / "charts" / "cloudrc", tmp_path / "cloudrc")
-    set_registry(chart, "ghcr.io/me")
+    names = ("world", "cloud", "cloud-ros")
+    ends = {name: f"@sha256:{n:064}" for n, name in enumerate(names)}
+    set_registry(chart, "ghcr.io/me", {k: end[1:] for k, end in ends.items() if is_published})
     packed = pack(chart, tmp_path / "packed", 0)
     parts = ["mission.enabled=true", "console.enabled=true", "cloud.backgroundLoad.enabled=true"]
 
@@ -129,8 +133,8 @@ def test_every_image_of_a_releases_chart_is_in_the_registry_that_it_publishes_to
     texts = rendered(*parts), rendered(*parts, "cloud.ros.enabled=true")
     for text in (*texts, *(path.read_text() for path in (chart / "examples").glob("*-job.yaml"))):
         images = set(re.findall(r"\bimage: (\S+)", text))
-        names = ("world", "cloud", "cloud-ros")
-        roles = {f"ghcr.io/me/cloudrc/{name}:{cloudrc.__version__}" for name in names}
+        ends = ends if is_published else dict.fromkeys(names, f":{cloudrc.__version__}")
+        roles = {f"ghcr.io/me/cloudrc/{name}{ends[name]}" for name in names}
         assert images
         assert images <= roles
 

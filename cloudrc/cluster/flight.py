@@ -15,10 +15,12 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.cluster import pods
 from cloudrc.cluster.client import (
     COMPONENTS,
+    PACKAGE,
     ClusterError,
     NoAnswerError,
     Release,
     chart_folder,
+    explain_errors,
     program,
     run,
 )
@@ -35,6 +37,7 @@ from cloudrc.cluster.missions import release_api, settle_mission
 from cloudrc.cluster.own_files import find_own_files, give_to_release, send_own_files
 from cloudrc.errors import CloudrcError, InterruptedRunError, TimedOutError
 from cloudrc.teleop.client import Api, find_mission
+from cloudrc.version import __version__
 
 if TYPE_CHECKING:
     from cloudrc.config.resolved import ResolvedExperiment
@@ -259,7 +262,8 @@ def fly_in_cluster(
     try:
         began = time.monotonic()
         own = send_own_files(release, find_own_files(experiment.world))
-        install(release, chart_values(experiment, current_values(release), own), timeout, tell)
+        values = chart_values(experiment, current_values(release), own, loaded_tag(release))
+        install(release, values, timeout, tell)
         give_to_release(release, own)
         took = time.monotonic() - began
         tell(f"{release} is ready after {took:.0f} s")
@@ -272,14 +276,33 @@ def fly_in_cluster(
     return report_flight(experiment, folder, mission, interrupted, page=page, figures=figures)
 
 
+def loaded_tag(release: Release, clone: Path = PACKAGE.parent) -> str:
+    """Return the tag of the images that `make kind-load` loaded last from `clone`; "" if none.
+
+    An image that was built again has another tag, so that it restarts the pods.
+    """
+    from kubernetes import config
+
+    list_contexts: Any = config.list_kube_config_contexts  # not annotated
+    with explain_errors("read the kubeconfig", release.where):
+        context = release.context or list_contexts()[1]["name"]
+    file = clone / "build" / "loaded" / context.replace("/", "-")
+    return file.read_text("utf-8").strip() if file.is_file() else ""
+
+
 def chart_values(
-    experiment: ResolvedExperiment, before: Mapping[str, Any], own: Mapping[str, str]
+    experiment: ResolvedExperiment, before: Mapping[str, Any], own: Mapping[str, str], tag: str = ""
 ) -> dict[str, Any]:
     """Return Helm values for a flight: the release's present values `before`, with `experiment`.
 
     `own` has the names of the ConfigMaps with the user's robot and scene. The chart's own mission
-    is disabled, because it would fly in addition.
+    is disabled, because it would fly in addition. `tag` is that of the loaded images, "" if it is
+    not known; a user's own registry or tag stays.
     """
+    image = before.get("image", {})
+    is_loaded = not image.get("tag") or image["tag"].startswith(f"{__version__}-g")
+    if tag and is_loaded and not image.get("registry"):
+        before = {**before, "image": {**image, "tag": tag}}
     link = {**before.get("link", {}), "profile": ""}
     # With a mission, the chart would start a second Job.
     mission = {**before.get("mission", {}), "enabled": False}

@@ -86,7 +86,10 @@ def promtool_test(case):
             # A role that is absent has no pod.
             has_pod = "Absent" not in name or "pod" in labels
             seen = in_release(labels) if has_pod else {**labels, "namespace": "lab"}
-            texts = {**ALERTS[name]["annotations"], "runbook_url": f"docs/on-call.md#{name.lower()}"}
+            texts = {
+                **ALERTS[name]["annotations"],
+                "runbook_url": f"docs/on-call.md#{name.lower()}",
+            }
             expected.append({"exp_labels": seen | more, "exp_annotations": texts})
         alerts.append({"eval_time": time, "alertname": name, "exp_alerts": expected})
     samples = []

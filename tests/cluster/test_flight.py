@@ -10,6 +10,7 @@ import pytest
 
 from cloudrc.cluster import flight
 from cloudrc.cluster.client import connect
+from cloudrc.cluster.flight import chart_values, loaded_tag
 from cloudrc.cluster.jobs import run_job
 from cloudrc.config.load import load_experiment
 from cloudrc.config.shipped import FOLDERS
@@ -108,6 +109,24 @@ def test_a_flight_on_a_cluster_writes_a_whole_run(ready, tmp_path, call):
     line = (tmp_path / "helm").read_text()
     assert "upgrade --install cloudrc " in line
     assert "--namespace=demo --create-namespace" in line
+
+
+@pytest.mark.parametrize(
+    ("before", "tag"),
+    [
+        ({}, "0.1.0-g2"),
+        ({"image": {"tag": "0.1.0-g1", "pullPolicy": "Never"}}, "0.1.0-g2"),
+        ({"image": {"tag": "mine"}}, "mine"),
+        ({"image": {"registry": "lab"}}, None),
+    ],
+)
+def test_a_rebuilt_image_that_was_loaded_restarts_the_pods(release, tmp_path, before, tag):
+    assert loaded_tag(release, tmp_path) == ""
+    (tmp_path / "build" / "loaded").mkdir(parents=True)
+    (tmp_path / "build" / "loaded" / "here").write_text("0.1.0-g2\n")
+    loaded = loaded_tag(release, tmp_path)
+    image = chart_values(load_experiment(NAME), before, {}, loaded).get("image", {})
+    assert image == {**before.get("image", {}), **({"tag": tag} if tag else {})}
 
 
 def test_the_users_robot_and_scene_fly_as_configmaps_that_belong_to_the_release(

@@ -1,11 +1,15 @@
 """Dockerfiles and locks: pinned versions, and small images."""
 
 import re
+import shutil
+import subprocess
 import tomllib
 from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+
+from cloudrc import __version__
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -50,3 +54,49 @@ def test_every_package_has_a_hash_and_no_address(lock):
     assert all("--hash=sha256:" in block for block in blocks)
     assert blocks
     assert "://" not in text
+
+
+LOG = """#!/bin/sh
+case "$*" in *clusters*) echo cloudrc ;; *) echo $* >> log ;; esac
+"""
+"""A docker or kind that writes down what it is asked."""
+
+
+def test_a_rebuilt_image_has_a_tag_of_its_own_and_is_loaded_under_both(tmp_path, monkeypatch):
+    for name in ("Makefile", "cloudrc/version.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    for name in ("docker", "kind"):
+        (tmp_path / "bin").mkdir(exist_ok=True)
+        (tmp_path / "bin" / name).write_text(LOG)
+        (tmp_path / "bin" / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"), prepend=":")
+
+    def run(*words):
+        done = subprocess.run(words, cwd=tmp_path, check=True, capture_output=True, text=True)
+        return done.stdout
+
+    def load(*targets):
+        (tmp_path / "log").write_text("")
+        said, log = run("make", *(targets or ("images", "kind-load"))), tmp_path / "log"
+        (tag,) = re.findall(r"image\.tag=(\S+)", said)
+        for role in ("world", "cloud"):
+            for each in (tag, __version__):
+                assert log.read_text().count(f"cloudrc/{role}:{each}")
+        assert (tmp_path / "build" / "loaded" / "kind-cloudrc").read_text().strip() == tag
+        return tag
+
+    run("git", "init", "-q")
+    run("git", "add", "Makefile", "cloudrc")
+    run("git", "-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "first")
+    clean = load()
+    assert re.fullmatch(rf"{__version__}-g[0-9a-f]{{7,}}", clean)
+    (tmp_path / "cloudrc" / "new.py").write_text("1")
+    dirty = load()
+    assert dirty.startswith(f"{clean}-dirty-")
+    (tmp_path / "cloudrc" / "new.py").write_text("2")
+    assert load("kind-load") == dirty, "what was built"
+    assert load() not in (clean, dirty)
+    (tmp_path / "cloudrc" / "new.py").unlink()
+    (tmp_path / "notes.txt").write_text("no part of an image")
+    assert load() == clean
