@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from math import inf
 from types import FrameType
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from cloudrc.cli.output import (
     leave_message,
@@ -59,6 +59,9 @@ from cloudrc.teleop.telling import (
 )
 from cloudrc.text import escape
 
+if TYPE_CHECKING:
+    from cloudrc.cluster.client import Release
+
 EPILOG = """\
 where:
   a run on this machine ('cloudrc up', 'cloudrc run'): found automatically, or
@@ -84,7 +87,7 @@ robot in the air falls. After an emergency stop or a landing, 'acknowledge'
 allows the next mission. An API in a network asks for a token: give --token-file
 or CLOUDRC_TOKEN_FILE; for a release the command reads its Secret with your
 rights in the cluster. A run that is found on this machine needs no token."""
-READS = ("list", "status", "logs")
+READS = ("list", "status", "logs", "attach")
 """Verbs that do not steer the robot."""
 RUN_TIMEOUT, API_TIMEOUT = 10.0, 180.0
 """Time limits for an API that does not answer [s]: for a user's command, and for the pod of a Job.
@@ -110,6 +113,7 @@ def arguments(parser: Parser) -> None:
     flags(run)("mission", "FILE", "mission file, or name of a shipped mission", read=str)
     timeout_argument(run)
     flags(run)("--name", None, "name shown to people (default: the file's name)", "")
+    flags(run)("--detach", "", "return once the mission is posted; follow it by 'mission attach'")
     add = flags(fly)
     add("--mission", "FILE", "mission file", read=str, required=True)
     add("--key", None, "a mission posted twice under one key flies once", "")
@@ -125,6 +129,8 @@ def arguments(parser: Parser) -> None:
     ids = {"status": "show the robot", "cancel": "the current one", "logs": "all"}
     for name, default in ids.items():
         flags(verbs[name])("id", "ID", f"mission (default: {default})", nargs="?")
+    about = "mission, or Job of 'mission run' (default: the last Job, or the current mission)"
+    flags(verbs["attach"])("id", "ID|JOB", about, nargs="?")
     flags(verbs["logs"])("-f --follow", "", "keep printing new events")
     add, about, metres = flags(verbs["goto"]), "[m], world frame", number(-1000, 1000, "metres")
     add("x", "X", about, read=metres)
@@ -169,6 +175,10 @@ def execute(options: Options) -> int | None:
         return carry_out(options, api)
     if verb == "run" and options.robot is None:
         return _run_job(options)
+    if verb == "attach" and options.robot is None:
+        release = need_release(options)
+        if job := _find_job(release, options.id):
+            return _follow_job(release, job)
     with _forwarded_api(options) as forwarded:
         return carry_out(options, forwarded)
 
@@ -183,7 +193,24 @@ def _run(options: Options, api: Api) -> int:
         tell(f"mission {mission} goes on; cancel it: cloudrc mission cancel {mission}")
 
     follower = MissionFollower(api, RUN_TIMEOUT, tell=print_line)
-    return _follow(options, follower, read_mission(options.mission, options.name), stopped)
+    order = read_mission(options.mission, options.name)
+    if options.detach:
+        mission = follower.post({**order, "queue": options.queue})
+        print_line(f"follow it: cloudrc mission attach {mission}")
+        return 0
+    return _follow(options, follower, order, stopped)
+
+
+def _attach(options: Options, api: Api) -> int:
+    """Follow a mission to its verdict, and return the exit code of the verdict."""
+    state = api.get("/v1/state")
+    under_way = [state["mission"]["id"]] if state["mission"] else state["queue"]
+    if not (options.id or under_way):
+        raise BadInputError("no mission is under way; 'cloudrc mission list' shows all")
+    follower = MissionFollower(api, RUN_TIMEOUT, tell=print_line)
+    verdict = follower.follow(options.id or under_way[0])
+    print_line(describe_verdict(verdict))
+    return int(verdict["exit_code"])
 
 
 def _fly(options: Options, api: Api) -> int:
@@ -371,6 +398,7 @@ def _drive(_: Options, api: Api) -> None:
 
 VERBS: dict[str, tuple[str, Callable[[Options, Api], int | None]]] = {
     "run": ("fly a mission and show its progress until the verdict", _run),
+    "attach": ("follow a mission that flies, as 'run' does, until the verdict", _attach),
     "list": ("list all missions", _list),
     "status": ("show the robot's state, or the state of a mission", _status),
     "cancel": ("cancel a mission; the robot holds its position", _cancel),
@@ -413,13 +441,35 @@ def _forwarded_api(options: Options) -> Iterator[Api]:
 
 
 def _run_job(options: Options) -> int:
-    """Create the Job of a mission, follow its log, and return the exit code of its verdict."""
+    """Create the Job of a mission; follow its log, and return the exit code of its verdict."""
     mission, release = read_mission(options.mission, options.name), need_release(options)
-    from cloudrc.cluster.fleet_mission import follow_fleet
-    from cloudrc.cluster.flight import begin_job, cancelling_command, follow_job
-    from cloudrc.cluster.pods import fleet_size
+    from cloudrc.cluster.flight import begin_job
 
     job = begin_job(release, mission, print_line, options.timeout, queue=options.queue)
+    if options.detach:
+        where = " ".join([*release.flags, f"--release={release.name}"])
+        print_line(f"follow it: cloudrc mission attach {job} {where}")
+        return 0
+    return _follow_job(release, job)
+
+
+def _find_job(release: Release, name: str | None) -> str:
+    """Return the Job `name`, by default the last one; "" if there is none: a mission is meant."""
+    from cloudrc.cluster.jobs import COMPONENT, find_job
+
+    if name:
+        return name if find_job(release, name) else ""
+    jobs = release.find("jobs", COMPONENT)
+    jobs.sort(key=lambda job: str(job.metadata.creation_timestamp))
+    return str(jobs[-1].metadata.name) if jobs else ""
+
+
+def _follow_job(release: Release, job: str) -> int:
+    """Follow the log of a mission's Job, and return the exit code of its verdict."""
+    from cloudrc.cluster.fleet_mission import follow_fleet
+    from cloudrc.cluster.flight import cancelling_command, follow_job
+    from cloudrc.cluster.pods import fleet_size
+
     follow = follow_fleet if fleet_size(release) else follow_job
     try:
         return follow(release, job, print_line).exit_code

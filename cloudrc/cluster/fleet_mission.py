@@ -51,6 +51,8 @@ def follow_fleet(release: Release, name: str, tell: Callable[[str], None]) -> En
     if left > 0:
         tell(f"{job.spec.completions} robots begin together in {left:.0f} s")
         time.sleep(left)
+    else:
+        tell("the robots fly already: ages and HOLD count from now on")
     start = max((each.time_s for each in _read_cell(release)), default=0.0)
     ended = {
         robot: Ended(ClusterError.exit_code, "INTERRUPTED: no_verdict")

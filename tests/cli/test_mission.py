@@ -4,7 +4,7 @@ import json
 import subprocess
 import sys
 import threading
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import pytest
 
@@ -21,6 +21,7 @@ waypoints:
   - {position_m: [1.0, 0.0, 1.0], dwell_s: 0.0}
   - {position_m: [2.0, 0.0, 1.0], dwell_s: 0.0}
 """
+SUCCESS = {"outcome": "success", "exit_code": 0, "failures": []}
 
 
 @pytest.fixture
@@ -64,6 +65,19 @@ def test_run_follows_to_the_verdict(api, mission):
     assert lines[0] == "mission m1: starting, waypoints: 2"
     assert [line for line in lines if "waypoint 1 of 2 reached" in line]
     assert lines[-1] == "SUCCESS: every waypoint reached, every criterion met"
+
+
+def test_a_detached_mission_is_followed_later(api, mission):
+    said = mission("run two.yaml --detach").out.splitlines()
+    assert said[-1] == "follow it: cloudrc mission attach m1"
+    with patch.object(command.MissionFollower, "follow", return_value=SUCCESS) as follow:
+        mission("attach")
+    assert follow.call_args.args == ("m1",), "the current one"
+    pilot(api, A, B).join()
+    lines = mission("attach m1").out.splitlines()
+    assert [line for line in lines if "waypoint 1 of 2 reached" in line]
+    assert lines[-1] == "SUCCESS: every waypoint reached, every criterion met"
+    assert "no mission is under way" in mission("attach", 2).err
 
 
 def test_fly_under_one_key_flies_once_and_leaves_its_verdict(api, mission, folder, monkeypatch):

@@ -52,6 +52,18 @@ def test_run_prints_the_log_of_its_job_and_ends_with_the_verdict(running, call, 
     assert lines == ["waypoint 1 of 1 reached", VERDICT[code]]
 
 
+def test_the_job_of_a_detached_mission_is_followed_later(running, call):
+    said = call("mission run one.yaml --detach").out.splitlines()
+    (job,) = (body["metadata"]["name"] for body in running.jobs())
+    assert said[-1] == f"follow it: cloudrc mission attach {job} --namespace=demo --release=cloudrc"
+    running.start_pod(job, state=terminated(1, VERDICT[1]))
+    running.logs[f"{job}-x"] = f"waypoint 1 of 1 reached\n{VERDICT[1]}\n"
+    running.end(job, "Failed")
+    for words in ("", job):
+        lines = call(f"mission attach {words}", code=1).out.splitlines()
+        assert lines == ["waypoint 1 of 1 reached", VERDICT[1]]
+
+
 def test_the_other_verbs_go_to_the_api_of_the_release(running, teleop, call, as_json, refused):
     assert as_json("mission list")["missions"] == []
     said = call("mission acknowledge").out
