@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from cloudrc.cli.output import print_line, tell
 from cloudrc.cli.parser import Options, Parser, add_verbs, flags, number
+from cloudrc.drivers.machine import usable_cores
 from cloudrc.errors import BadInputError
 from cloudrc.outside.paths import check_new
 
@@ -47,11 +49,15 @@ def execute(options: Options) -> None:
     from cloudrc.cli.progress import Progress
     from cloudrc.studies.compute import of_controller, of_run
 
+    load, cores = os.getloadavg()[0], usable_cores()
     with Progress(f"measures {options.what}"):
         if Path(options.what).is_dir():
             found = of_run(Path(options.what))
         else:
             found = of_controller(options.what, options.set, options.cpus, options.seconds)
+    if load > cores and not Path(options.what).is_dir():
+        why = "the times have waits of this machine; close programs, and measure again"
+        tell(f"warning: {cores} cores with a load of {load:.1f}: {why}")
     if found.unlimited:
         tell(f"warning: measured without a CPU limit: {found.unlimited}")
     if not (times := sorted(found.times_ms)):

@@ -8,6 +8,7 @@ posts the mission to the release's API, follows it, and ends with the exit code 
 from __future__ import annotations
 
 import json
+import re
 import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -63,6 +64,8 @@ AT = "--at="
 """Flag of the Job's container: the Unix time at which a robot begins [s]."""
 NO_LOG = "unable to retrieve container logs for "
 """What the kubelet sends in place of the log of a container that is gone."""
+NO_CLAIM = re.compile('persistentvolumeclaim "[^"]*" not found')
+"""What Kubernetes says of a pod whose claim does not exist: nobody else makes it."""
 DELETE_LIMIT = 40.0
 """Time limit for a deleted Job to end [s]; Kubernetes gives the Job's pods 30 s."""
 
@@ -364,7 +367,8 @@ def why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
         found = events_of(release, job, "FailedCreate")
     name = job.metadata.name
     for why in found:
-        if why and not why.startswith(UNSCHEDULED):
+        never = not why.startswith(UNSCHEDULED) or NO_CLAIM.search(why)
+        if why and never:
             raise ClusterError(
                 f"Job '{name}' cannot start: {why}; fix this, then delete the Job: "
                 f"{release.kubectl} delete job {name}"

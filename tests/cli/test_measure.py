@@ -32,12 +32,17 @@ def test_the_times_of_a_measured_flight_are_flown_again(folder, call):
     assert "needs a flight in real time" in call("measure compute b --out d.txt", code=2).err
 
 
-def test_a_controller_is_measured_without_a_limit_where_none_is_allowed(folder, call, monkeypatch):
+@pytest.mark.parametrize("load", [0.5, 99.0])
+def test_a_controller_is_measured_without_a_limit_where_none_is_allowed(
+    load, folder, call, monkeypatch
+):
+    monkeypatch.setattr("os.getloadavg", lambda: (load, 0.0, 0.0))
     monkeypatch.setattr(machine, "CGROUP", folder / "none")
     monkeypatch.setattr(cpu_limit.time, "sleep", lambda seconds: None)
     out, err = call("measure compute pid --cpus 0.5 --seconds 1")
     assert out.startswith("pid, 100 Hz: ")
     assert "measured without a CPU limit: this system has no control groups" in err
+    assert ("with a load of 99.0" in err) == (load == 99.0)
     assert len(times(folder / "compute.txt")) > 20
 
 

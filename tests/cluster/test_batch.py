@@ -177,6 +177,15 @@ def test_running_pods_are_read_in_turn_and_a_forgotten_watch_begins_again(starte
     assert found == ["row a", "row b", "row c"]
 
 
+def test_a_claim_that_does_not_exist_ends_the_sweep(started, api, release):
+    """A pod that waits for a node may get one; nobody makes the claim."""
+    said = '0/1 nodes are available: persistentvolumeclaim "rows" not found. not found'
+    waits = [{"type": "PodScheduled", "status": "False", "message": said}]
+    add_pod(api, "a", "Pending", conditions=waits, ready=False)
+    with pytest.raises(ClusterError, match=r'cannot start: .*claim "rows" not found'):
+        lines(release)
+
+
 def test_a_field_that_kubernetes_does_not_know_is_named(release):
     pods = PODS._replace(changes={("tolerations",): [{"kee": "x"}]})
     with pytest.raises(ClusterError, match=r"spec.template.spec.tolerations.0.kee Extra inputs"):
