@@ -127,7 +127,14 @@ def test_every_image_of_a_releases_chart_is_the_one_that_it_publishes(tmp_path, 
     parts = ["mission.enabled=true", "console.enabled=true", "cloud.backgroundLoad.enabled=true"]
 
     def rendered(*parts):
-        command = ["helm", "template", "x", packed, *(f"--set={part}" for part in parts)]
+        command = [
+            "helm",
+            "template",
+            "x",
+            packed,
+            "--kube-version=1.29.0",
+            *(f"--set={part}" for part in parts),
+        ]
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
     texts = rendered(*parts), rendered(*parts, "cloud.ros.enabled=true")

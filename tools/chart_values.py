@@ -102,6 +102,8 @@ RULES = {
     },
     "resources": _ref("Resources"),
     "tolerations": OBJECTS,
+    "topologySpreadConstraints": OBJECTS,
+    "extraObjects": {"type": "array", "items": _either(OBJECT, STRING)},
     "affinity": OBJECT,
     "commonLabels": LABELS,
     "podLabels": LABELS,

@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
+from math import ceil
 from typing import Any, Literal, NamedTuple
 
 import yaml
@@ -114,7 +115,7 @@ def permissions(release: Release) -> Finding:
 def render_chart(release: Release, values: Sequence[str]) -> list[Any]:
     """Render the objects of the chart as `helm install` would."""
     arguments = ["template", release.name, str(chart_folder()), *release.helm_flags]
-    arguments += ["--dry-run=server", *values]
+    arguments += ["--dry-run=server", "--validate", *values]  # of the server's version
     return [thing for thing in yaml.safe_load_all(run("helm", arguments)) if thing]
 
 
@@ -175,7 +176,7 @@ def quotas(
         name, hard = f"quota {quota.metadata.name}", quota.status.hard or {}
         used = Counter(quota.status.used or {})
         lacks = [
-            f"more {key}: {used[key]} of {hard[key]} are used"
+            f"{_shown(key, needed[key])} {key}: {used[key]} of {hard[key]} are used"
             for key in needed.keys() & hard.keys()
             if needed[key] > amount(hard[key]) - amount(used[key])
         ]
@@ -184,6 +185,13 @@ def quotas(
             yield Finding(name, "missing", f"the release needs {'; '.join(sorted(lacks))}", fix)
         else:
             yield Finding(name, "ok", "has enough left for one release")
+
+
+def _shown(key: str, amount: Any) -> str:
+    """Return an amount of a quota's resource as Kubernetes writes it: CPU in m, memory in Mi."""
+    if "cpu" in key:
+        return f"{ceil(amount * 1000)}m"
+    return f"{ceil(amount / 2**20)}Mi" if "memory" in key else f"{amount}"
 
 
 def _needed(

@@ -34,7 +34,7 @@ from tests.support.snapshots import compare
 kubernetes_validate = pytest.importorskip("kubernetes_validate", reason="comes with the extra dev")
 
 RENDERED = Path(__file__).parent / "rendered"
-OLDEST = re.match(r">=(\d+\.\d+)\.0-0 ", METADATA["kubeVersion"])[1]
+OLDEST = re.match(r">=(\d+\.\d+)\.0-0$", METADATA["kubeVersion"])[1]
 NEWEST = ".".join(kubernetes_validate.latest_version().split(".")[:2])
 CASES = {
     **values_of(Path(__file__).with_name("cases.yaml")),

@@ -9,8 +9,20 @@ jsonschema = pytest.importorskip("jsonschema", reason="comes with kubernetes-val
 DEFAULTS = values_of(CHART / "values.yaml")
 # Values that Helm, Kubernetes or a plug-in defines and checks.
 CONTEXTS = {"podSecurityContext", "containerSecurityContext"}
-EXTRAS = {"extraEnv", "extraVolumes", "extraVolumeMounts"}
-OPEN = {"global", "affinity", "tolerations", "allowFrom", "dns", "parentRefs"} | CONTEXTS | EXTRAS
+EXTRAS = {"extraEnv", "extraVolumes", "extraVolumeMounts", "extraObjects"}
+OPEN = (
+    {
+        "global",
+        "affinity",
+        "tolerations",
+        "topologySpreadConstraints",
+        "allowFrom",
+        "dns",
+        "parentRefs",
+    }
+    | CONTEXTS
+    | EXTRAS
+)
 
 
 def parts(node, path=()):

@@ -91,6 +91,6 @@ def test_a_quota_is_compared_with_all_pods_together(
     cluster.put("resourcequotas", {"metadata": {"name": "small"}, "status": status})
     seen = found(release)["quota small"]
     assert seen.state == "missing"
-    assert f"needs more requests.cpu: 0 of {less} are used" in seen.found
+    assert f"needs {enough} requests.cpu: 0 of {less} are used" in seen.found
     status["hard"]["requests.cpu"] = enough
     assert found(release)["quota small"].state == "ok"

@@ -29,7 +29,8 @@ securityContext:
 {{- end }}
 
 {{/* Probes on the metrics port. Readiness needs the peer, liveness does not: the guard handles a lost
-     link, and a restart would not help. */}}
+     link, and a restart would not help. On a busy node a link, which asks for little CPU, answers late, but
+     still delays packets: a restart would interrupt the flight. */}}
 {{- define "cloudrc.probes" -}}
 startupProbe:
   httpGet: {path: /healthz, port: {{ . }}}
@@ -42,8 +43,8 @@ readinessProbe:
 livenessProbe:
   httpGet: {path: /healthz, port: {{ . }}}
   periodSeconds: 10
-  timeoutSeconds: 5
-  failureThreshold: 3
+  timeoutSeconds: {{ eq . "link-metrics" | ternary 10 5 }}
+  failureThreshold: {{ eq . "link-metrics" | ternary 18 3 }}
 {{- end }}
 
 {{/* Additional environment of a container without one of its own. Argument: its values. */}}
@@ -107,6 +108,10 @@ tolerations:
 {{- end }}
 {{- with .affinity }}
 affinity:
+  {{- toYaml . | nindent 2 }}
+{{- end }}
+{{- with .topologySpreadConstraints }}
+topologySpreadConstraints:
   {{- toYaml . | nindent 2 }}
 {{- end }}
 {{- end }}

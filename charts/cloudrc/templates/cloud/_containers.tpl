@@ -133,8 +133,8 @@
     {{- include "cloudrc.rosMounts" $shows | nindent 4 }}
 {{- end }}
 {{- if .Values.console.enabled }}
-# Serves a page at the pod's loopback address, which only kubectl port-forward reaches, so no
-# probe can. It steers through the API, like any operator. It cannot change the link: 'cloudrc
+# Serves a page at the pod's loopback address, which only kubectl port-forward reaches, so its
+# probe runs in the container; any answer will do, also that a token is missing. It steers through the API, like any operator. It cannot change the link: 'cloudrc
 # console --cluster' reads the changes that it asks for in its log, and carries them out.
 - name: console
   image: {{ include "cloudrc.image" (dict "root" . "role" "world") }}
@@ -160,6 +160,18 @@
     {{- with .Values.console.extraEnv }}
     {{- toYaml . | nindent 4 }}
     {{- end }}
+  livenessProbe:
+    exec:
+      # Without `site`, Python starts in a third of the time, which matters on a busy node.
+      command:
+        - python
+        - -IS
+        - -c
+        - "import socket; s = socket.create_connection(('127.0.0.1', 8090), 25); s.sendall(b'GET / HTTP/1.0' + bytes([13, 10, 13, 10])); s.recv(1)[0]"
+    initialDelaySeconds: 60
+    periodSeconds: 60
+    timeoutSeconds: 30
+    failureThreshold: 5
   terminationMessagePolicy: FallbackToLogsOnError
   {{- include "cloudrc.containerSecurity" $ | nindent 2 }}
   resources:
