@@ -6,6 +6,7 @@ t = round(k dt), and W is how long the robot waits in a tick for an answer:
 
 1. The robot receives the answers that have arrived by t.
 2. If its executor asks, the observation of tick k leaves at t.
+   A message is a packet, or several that leave together; a stream repairs what is lost.
 3. Policy, up to t + W: it begins when an observation has arrived and its last answer is computed.
    It takes the newest observation that has arrived by then, and drops older ones. The answer leaves
    after the compute time, as the packet whose number is the tick of the observation: so the fate of
@@ -21,25 +22,37 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from math import ceil, inf, nan
-from typing import Any
+from math import ceil, inf, isnan, nan
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.error import ResetNeeded
 
 from cloudrc.gym.executors import Chunk, Committed, Executor
 from cloudrc.gym.values import copied, size_of
+from cloudrc.link.carry.tcp.medium import Medium
+from cloudrc.link.carry.tcp.stream import MessageStream, run_due
 from cloudrc.link.draws import Floats, stream_key
-from cloudrc.link.library import LinkProfile, OneWay
-from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.library import Cut, LinkProfile, OneWay
+from cloudrc.link.model import HEADER_BYTES
+from cloudrc.link.profile import DirectionProfile, Timeline, summary, whole_share
 from cloudrc.link.queue import PacketQueue
 from cloudrc.metrics.age import most_missed
 from cloudrc.outside.values import Quantity
 
 EPISODES = 1 << 20
 """Number of episodes that belong to a seed of the environment."""
+DATAGRAMS, STREAM = "datagrams", "stream"
+DELIVERIES = (DATAGRAMS, STREAM)
+"""How messages arrive: whole if no packet is lost; or all, in order, and some of them late."""
 AGES = 100
 """Ages of actions that are counted apart [ticks]."""
+PACKETS = 50_000
+"""Packets of a simulation of what a profile asks for."""
+MESSAGES_MIN = 200
+"""Fewest messages of it."""
+SETTLED_NS = 100_000_000_000
+"""Time after which what is still repaired counts as lost there [ns]."""
 _COMPUTE = 129  # kind of the random numbers of the compute time
 
 
@@ -58,55 +71,171 @@ class Settings:
     waits: bool  # whether the robot starts only when it has the first answer
     observation_bytes: int
     action_bytes: int
+    delivery: str  # one of DELIVERIES
+    packet_bytes: int  # most bytes of a packet
+
+    @property
+    def wires(self) -> tuple[Wire, Wire]:
+        """The wire of observations and that of answers."""
+        up, down = (
+            Wire(self.link, is_up, size, self.delivery, self.packet_bytes)
+            for is_up, size in ((True, self.observation_bytes), (False, self.action_bytes))
+        )
+        return up, down
+
+
+class Wire(NamedTuple):
+    """What decides how the messages of one direction arrive, but for their random numbers."""
+
+    link: LinkProfile
+    uplink: bool  # whether they leave the robot
+    size: int  # of a message, usually [bytes]
+    delivery: str  # one of DELIVERIES
+    packet_bytes: int  # most bytes of a packet
+
+    @property
+    def profile(self) -> DirectionProfile:
+        """The direction's own profile."""
+        return self.link.uplink if self.uplink else self.link.downlink
+
+    @property
+    def back(self) -> DirectionProfile:
+        """The profile of the other direction."""
+        return self.link.downlink if self.uplink else self.link.uplink
+
+    @property
+    def cut(self) -> Cut:
+        """How messages are cut into packets."""
+        return Cut(self.packet_bytes).for_size(self.size)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether a usual message is one packet that nobody repairs."""
+        return self.delivery == DATAGRAMS and self.size <= self.packet_bytes
+
+    @property
+    def bits(self) -> int:
+        """Size of a usual message with the headers of its packets [bit]."""
+        return 8 * (self.size + self.cut.usual * HEADER_BYTES)
+
+    @property
+    def occupies(self) -> float:
+        """Time for which a usual message occupies the bottleneck [s]; NaN without one."""
+        rate = summary(self.profile)["rate"]
+        return self.bits / rate if rate else nan
 
 
 @lru_cache(maxsize=64)
-def expected(profile: DirectionProfile, period: float, size: int) -> tuple[float, float]:
-    """Return the mean delay [s] and the loss of packets of `size` bytes, one per `period` [s]."""
-    asked = OneWay(profile, 0, uplink=True).expected(period, size)
-    return asked.mean, asked.loss
+def expected(wire: Wire, period: float) -> tuple[float, float]:
+    """Return the mean delay [s] and the loss of messages, one per `period` [s]."""
+    if wire.is_plain:
+        asked = OneWay(wire.profile, 0, uplink=True).expected(period, wire.size)
+        return asked.mean, asked.loss
+    count = max(MESSAGES_MIN, PACKETS // wire.cut.usual)
+    lane, period_ns = Lane(wire, 0, " expected"), round(period * 1e9)
+    for number in range(count):
+        lane.send(number, number * period_ns, None)
+    lane.run(count * period_ns + SETTLED_NS)
+    found = lane.summary(period, asked=(nan, nan))
+    is_simple = wire.delivery == DATAGRAMS and isnan(wire.occupies)
+    only = Timeline(wire.profile).only() if is_simple else None
+    share = 1.0 - lane.arrived / count
+    if only is not None and not only.blackout:
+        intact = (1.0 - wire.profile.corrupt) ** wire.cut.usual
+        share = 1.0 - intact * whole_share(only.loss, wire.cut.usual)
+    return found["delay_measured"], share
 
 
 class Lane:
-    """The packets of one direction, in flight and counted.
+    """The messages of one direction, in flight and counted.
 
     Attributes:
-        queue: The packets in flight.
+        queue: The messages in flight; of a stream, those that have arrived.
+        is_stream: Whether losses are repaired. Then call `run` before you look into the queue.
     """
 
-    def __init__(self, way: OneWay, size: int) -> None:
-        """Send packets of `size` bytes."""
-        self._way, self._size = way, size
+    def __init__(self, wire: Wire, seed: int, stream: str) -> None:
+        """Send over a link with its `seed` and its name, `stream`."""
+        self._wire, self._seed, self._name = wire, seed, stream
+        self._way = OneWay(wire.profile, seed, wire.uplink, stream=stream)
+        self._size, self._cut, self._occupies = wire.size, wire.cut, wire.occupies
+        self.is_stream = wire.delivery == STREAM
+        # Largest message that is a packet with its own number.
+        self._plain = wire.packet_bytes if wire.is_plain else -1
         self.begin(0)
 
     def begin(self, episode: int) -> None:
         """Begin an episode without packets."""
         self._episode, self.queue = episode, PacketQueue()
-        self.sent = self._delays_ns = 0
+        self.sent = self._delays_ns = self._delivered = 0
+        self._more_sent = self._more_lost = 0  # packets beyond one of each message
+        if self.is_stream:
+            self._agenda = PacketQueue()
+            ways = self._medium(self._wire.uplink), self._medium(not self._wire.uplink)
+            self._stream = MessageStream(self._agenda, ways, episode, self._cut, self._deliver)
+
+    def _medium(self, uplink: bool) -> Medium:
+        profile = self._wire.link.uplink if uplink else self._wire.link.downlink
+        name, headers = self._name, HEADER_BYTES
+        return Medium(profile, self._seed, uplink, 0, stream=name, headers=headers)
 
     def send(self, number: int, now_ns: int, message: Any, more: int = 0) -> None:
         """Send a message at `now_ns` [ns] with `more` bytes than usual, or lose it."""
         self.sent += 1
-        arrivals = self._way.send(self._episode, number, self._size + more, now_ns)
-        if len(arrivals) > 1:
-            arrivals = (min(arrivals),)  # of two copies
+        size = self._size + more
+        if size <= self._plain:  # nearly all messages: save time
+            arrivals = self._way.send(self._episode, number, size, now_ns)
+            if len(arrivals) > 1:
+                arrivals = (min(arrivals),)  # of two copies
+        elif self.is_stream:
+            self._agenda.put(self._stream.send, (now_ns,), (number, size, (now_ns, message)))
+            return
+        else:
+            pieces = self._cut.pieces(number, size)
+            arrivals, lost = self._way.send_pieces(self._episode, pieces, now_ns)
+            self._more_sent += len(pieces) - 1
+            self._more_lost += lost - (not arrivals)
         if arrivals:
             self._delays_ns += arrivals[0] - now_ns
         self.queue.put(None, arrivals, message)
 
-    def summary(self, period: float) -> dict[str, float]:
-        """Return delay [s] and loss: asked by the profile, and measured in this episode.
+    def run(self, until_ns: int) -> None:
+        """Let a stream send, repair and deliver all that is due by `until_ns` [ns]."""
+        if self.is_stream:
+            run_due(self._agenda, until_ns)
 
-        One packet per `period` [s] is asked for.
+    def _deliver(self, sent: tuple[int, Any], now_ns: int) -> None:
+        """Take a message of the stream."""
+        sent_ns, message = sent
+        self._delays_ns += now_ns - sent_ns
+        self._delivered += 1
+        self.queue.put(None, (now_ns,), message)
+
+    @property
+    def arrived(self) -> int:
+        """Number of messages that arrive; of a stream, that have arrived."""
+        return self._delivered if self.is_stream else self.sent - self.queue.lost
+
+    def summary(self, period: float, asked: tuple[float, float] | None = None) -> dict[str, float]:
+        """Return delay [s] and loss of messages: asked by the profile, measured in this episode.
+
+        One message per `period` [s] is asked for, unless mean delay and loss are given as `asked`.
         """
-        arrived = self.sent - self.queue.lost
-        delay, loss = expected(self._way.profile, period, self._size)
+        lost, arrived = self.queue.lost, self.arrived
+        delay, loss = asked or expected(self._wire, period)
+        packets = self.sent + self._more_sent, lost + self._more_lost
+        if self.is_stream:
+            packets = self._stream.transmissions, self._stream.lost
         return {
             "delay_asked": delay,
             "delay_measured": self._delays_ns * 1e-9 / arrived if arrived else nan,
             "loss_asked": loss,
-            "loss_measured": self.queue.lost / self.sent if self.sent else nan,
+            "loss_measured": lost / self.sent if self.sent else nan,
             "sent": self.sent,
+            "packets_sent": packets[0],
+            "packets_lost": packets[1],
+            "bytes": self._size,
+            "on_link": self._occupies,
         }
 
 
@@ -135,10 +264,9 @@ class RemoteLoop:
         """
         self._settings, self._executor, self._judge = settings, executor, judge
         self.start = settings.start
-        link, seed = settings.link, settings.seed
         self._tick = -1  # before the first episode
-        self._up = Lane(OneWay(link.uplink, seed, True, stream=stream), settings.observation_bytes)
-        self._down = Lane(OneWay(link.downlink, seed, False, stream=stream), settings.action_bytes)
+        self._wires = settings.wires
+        self._up, self._down = (Lane(wire, settings.seed, stream) for wire in self._wires)
         self._stream, self._episode = stream, -1
         self._within_ns = round(settings.answer_within * 1e9)
         self.compute: Callable[[int], float] = self._draw_time
@@ -168,9 +296,8 @@ class RemoteLoop:
 
     def _ticks_late(self) -> int:
         """Return the expected age of the loop [ticks]."""
-        settings, link = self._settings, self._settings.link
-        up, _ = expected(link.uplink, settings.dt, settings.observation_bytes)
-        down, _ = expected(link.downlink, settings.dt, settings.action_bytes)
+        settings = self._settings
+        (up, _), (down, _) = (expected(wire, settings.dt) for wire in self._wires)
         late = float(np.nan_to_num(up + down)) + settings.compute[0] - settings.answer_within
         return max(0, ceil(late / settings.dt - 1e-6))
 
@@ -210,6 +337,8 @@ class RemoteLoop:
 
     def _receive(self, limit_ns: int) -> None:
         """Give the executor the answers that have arrived by `limit_ns` [ns]."""
+        if self._down.is_stream:
+            self._down.run(limit_ns)
         queue = self._down.queue
         while queue.next_ns <= limit_ns:
             _, _, chunk = queue.pop()
@@ -232,6 +361,8 @@ class RemoteLoop:
 
     def _ask(self, limit_ns: int) -> None:
         """Let the policy begin with the observations that have arrived by `limit_ns` [ns]."""
+        if self._up.is_stream:
+            self._up.run(limit_ns)
         queue, self.is_asked = self._up.queue, False
         while (begin_ns := max(queue.next_ns, self._free_ns)) <= limit_ns:
             before = self._seen_tick

@@ -62,8 +62,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         Args:
             env: The environment.
             link: Name of a shipped link profile, path of a file, or mapping with its keys.
-            seed: Seed of the network. `reset(seed=...)` seeds the environment, and selects the
-                episode of the network, too.
+            seed: Seed of the network, whose episode `reset(seed=...)` selects.
             compute: Time that the policy needs for an answer [s], in which it takes no other
                 observation; or a pair, mean and standard deviation of a gamma distribution.
             answer_within: Time for which the robot waits in a step for an answer [s]; None: 5 %.
@@ -74,8 +73,9 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             hold: Without an action it executes the last one, "repeat", or `start`, "start".
             start: Action before the first answer arrives; None: 0, or what is nearest to it;
                 "answer": the robot waits for the first answer, and the episode begins then.
-            observation_bytes: Size of an observation on the wire [bytes]; None: that of its arrays.
-            action_bytes: Size of an answer on the wire [bytes]; likewise.
+            observation_bytes, action_bytes: Sizes on the wire [bytes]; None: those of the arrays.
+            delivery: "datagrams": a lost packet loses its message; "stream": it makes it late.
+            packet_bytes: Most bytes of a packet; a larger message is several packets.
             dt: Time of a step [s]; None: that of the environment.
             stream: Name of the robot; robots with one seed and two names share no random numbers.
             observe_age: Whether the policy also observes the age of its observation.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypedDict, cast
@@ -11,20 +13,24 @@ import gymnasium
 from gymnasium.vector.utils import batch_space, iterate
 
 from cloudrc import plugins
+from cloudrc.gym.doubts import LinkWarning, doubts
 from cloudrc.gym.executors import Executor
-from cloudrc.gym.loop import RemoteLoop, Settings
+from cloudrc.gym.loop import DATAGRAMS, DELIVERIES, RemoteLoop, Settings
 from cloudrc.gym.values import checker, copied, neutral, size_of
-from cloudrc.link.library import LinkProfile, read_profile
+from cloudrc.link.library import PACKET_BYTES, LinkProfile, read_profile
 from cloudrc.outside.refusal import check_names, naming
 from cloudrc.outside.values import InvalidValueError, Quantity
 
 Profile = str | Path | Mapping[str, Any] | LinkProfile
 SIZE = Quantity("bytes", 0, 1_000_000_000, whole=True)
-"""Size of a packet."""
+"""Size of a message."""
+PACKET = replace(SIZE, ge=1)
+"""Most bytes of a packet."""
 COUNTS = {
     "chunk": (Quantity(ge=1, le=10_000, whole=True), "the number of actions in an answer"),
     "observation_bytes": (SIZE, "a number of bytes"),
     "action_bytes": (SIZE, "a number of bytes"),
+    "packet_bytes": (PACKET, "the most bytes of a packet"),
 }
 """Option -> which whole numbers it takes, and what they mean."""
 COMPUTE = Quantity("s", 0.0, 3600.0)
@@ -49,6 +55,8 @@ class Options(TypedDict, total=False):
     start: Any
     observation_bytes: int | None
     action_bytes: int | None
+    delivery: str
+    packet_bytes: int
 
 
 DEFAULTS: Options = {
@@ -61,6 +69,8 @@ DEFAULTS: Options = {
     "start": None,
     "observation_bytes": None,
     "action_bytes": None,
+    "delivery": DATAGRAMS,
+    "packet_bytes": PACKET_BYTES,
 }
 ARGUMENTS = ("env", "link", "seed", "dt", "stream", *DEFAULTS)
 """Names of the arguments of `Networked` and `NetworkedVector`."""
@@ -76,6 +86,7 @@ def read_options(what: str, given: Options, more: Sequence[str] = ()) -> Options
     check_names(f"argument of {what}", given, (*ARGUMENTS, *more))
     read: dict[str, Any] = {**DEFAULTS, **given}
     check_names("hold", [read["hold"]], ("repeat", "start"))
+    check_names("delivery", [read["delivery"]], DELIVERIES)
     for name, (quantity, wanted) in COUNTS.items():
         if read[name] is not None:
             with naming(name, f"None, or {wanted}"):
@@ -119,12 +130,21 @@ def connect(
         waits=waits,
         observation_bytes=size_of(observations.sample()) if size is None else size,
         action_bytes=size_of(start) * (chunk or 1) if answer is None else answer,
+        delivery=options["delivery"],
+        packet_bytes=options["packet_bytes"],
     )
     check, loops = checker(actions, "one action, or None"), list[RemoteLoop]()
     for stream in streams:
         own, is_ours = find_executor(options["executor"], chunked=chunk is not None)
         loops.append(RemoteLoop(settings, own, stream, judge=None if is_ours else check))
+    for text in doubts(settings.wires, dt, asks_always=asks_always(own)):
+        warnings.warn(text, LinkWarning, stacklevel=4)
     return loops
+
+
+def asks_always(executor: Executor) -> bool:
+    """Return whether a robot with this executor sends the observation of each step."""
+    return type(executor).asks is Executor.asks
 
 
 def _read_wait(given: float | None, dt: float) -> float:

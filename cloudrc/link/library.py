@@ -6,11 +6,11 @@ direction, stream, episode and number of the packet alone, so two policies meet 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -33,6 +33,10 @@ if TYPE_CHECKING:
 
 KIND = 128
 """Kind of the packets of other programs; smaller numbers are those of the testbed's datagrams."""
+BEYOND = 132
+"""Kind of the pieces that a message has beyond the usual number."""
+PACKET_BYTES = 1200
+"""Most bytes of a message that one packet carries, by default [bytes]."""
 SEED = Quantity(ge=0, le=2**53 - 1, whole=True)
 """Seed of a link, as in an experiment."""
 COUNT = Quantity(ge=0, le=2**63 - 1, whole=True)
@@ -41,7 +45,48 @@ PERIOD = Quantity("s", ge=1e-9, le=1e9)
 """Time between two packets."""
 _PACKETS = 10_000  # of which `expected` is computed
 _BYTE = b"\0"  # stands for the content of a packet
+_BEYOND = 1024  # counters of a message for its pieces beyond the usual number
 _CHUNK = 64  # number of blocks that are computed together; their arrays fit into the cache
+
+
+class Piece(NamedTuple):
+    """A packet with a part of a message."""
+
+    kind: int  # with the counter, it selects the random numbers
+    counter: int
+    size: int  # [bytes]
+
+
+@dataclass(frozen=True)
+class Cut:
+    """How the messages of one direction are cut into packets.
+
+    No two pieces of an episode share kind and counter, whatever the sizes of the messages: piece k
+    of message m has the counter m times `usual` plus k. The pieces beyond the usual number have a
+    kind of their own, with room for 1,024 of them.
+    """
+
+    packet_bytes: int = PACKET_BYTES  # most bytes of a piece
+    usual: int = 1  # number of pieces of a message of the usual size
+
+    def for_size(self, size: int) -> Cut:
+        """Return the cut for messages that usually have `size` bytes."""
+        return replace(self, usual=self.count(size))
+
+    def count(self, size: int) -> int:
+        """Return the number of pieces of a message of `size` bytes; an empty one is a packet."""
+        return max(1, -(-size // self.packet_bytes))
+
+    def piece(self, number: int, size: int, place: int) -> Piece:
+        """Return the piece in a place, from 0 on, of a message with its number and `size`."""
+        length = min(self.packet_bytes, size - place * self.packet_bytes)
+        if place < self.usual:
+            return Piece(KIND, number * self.usual + place, length)
+        return Piece(BEYOND, number * _BEYOND + place - self.usual, length)
+
+    def pieces(self, number: int, size: int) -> list[Piece]:
+        """Return all pieces of a message."""
+        return [self.piece(number, size, place) for place in range(self.count(size))]
 
 
 @dataclass(frozen=True)
@@ -110,10 +155,13 @@ class OneWay:
         self.profile = profile
         self._uplink, self._stream = uplink, stream
         self._episode = 0
+        self._usual: int | None = None  # size of the first message of the episode [bytes]
         self._link = self._new()
 
     def send(self, episode: int, number: int, size: int, now_ns: int) -> Fate:
-        """Send one packet; compute when it arrives.
+        """Send one packet, whatever its size; compute when it arrives.
+
+        `send_message` cuts what does not fit into a packet of a network.
 
         Args:
             episode: Number of the episode, at least 0.
@@ -130,7 +178,7 @@ class OneWay:
         """
         if episode != self._episode:
             (episode,) = _whole(episode=episode)
-            self._episode, self._link = episode, self._new()
+            self._begin(episode)
         try:  # takes less time than to check each packet
             if type(number) is not int or not (size >= 0 and now_ns >= 0):  # also NaN
                 raise TypeError
@@ -141,6 +189,60 @@ class OneWay:
         if self._link.corrupts and self._link.corrupted(episode, KIND, number, _BYTE) != _BYTE:
             return ()
         return arrivals
+
+    def send_message(
+        self,
+        episode: int,
+        number: int,
+        size: int,
+        now_ns: int,
+        *,
+        usual: int | None = None,
+        packet_bytes: int = PACKET_BYTES,
+    ) -> Fate:
+        """Send a message as packets that leave at one instant; compute when it is whole.
+
+        Each packet has a fate of its own; a message of one packet has that of `send`. Do not use
+        both in one episode.
+
+        Args:
+            episode: Number of the episode, at least 0.
+            number: Number of the message in its episode, at least 0.
+            size: Size of the message [bytes].
+            now_ns: Time of sending since the episode began [ns].
+            usual: Size of most messages [bytes], which decides the counters of packets. None: that
+                of the first message of the episode.
+            packet_bytes: Most bytes of a packet.
+
+        Returns:
+            When the last packet arrives [ns]; nothing if one is lost. Of two copies the first
+            counts.
+
+        Raises:
+            BadInputError: If an argument is negative or not whole, or `packet_bytes` is 0.
+        """
+        episode, number, size, now_ns = _whole(
+            episode=episode, number=number, size=size, now_ns=now_ns
+        )
+        with naming("packet_bytes"):
+            packet_bytes = COUNT.of(packet_bytes or -1)
+        if episode != self._episode:
+            self._begin(episode)
+        if usual is None:
+            usual = self._usual = size if self._usual is None else self._usual
+        (usual,) = _whole(usual=usual)
+        cut = Cut(packet_bytes).for_size(usual)
+        arrivals, _ = self.send_pieces(episode, cut.pieces(number, size), now_ns)
+        return arrivals
+
+    def send_pieces(self, episode: int, pieces: Sequence[Piece], now_ns: int) -> tuple[Fate, int]:
+        """Send the pieces of a message; return its fate, and how many pieces are lost.
+
+        All arguments are right, and the time is that of `send_message`.
+        """
+        if episode != self._episode:
+            self._begin(episode)
+        return self._link.send_pieces(episode, pieces, now_ns)
 
     def table(
         self,
@@ -190,6 +292,9 @@ class OneWay:
         )
         period_ns = _to_ns(period)
         return numbers(sample(link, KIND, range(0, _PACKETS * period_ns, period_ns), size))
+
+    def _begin(self, episode: int) -> None:
+        self._episode, self._link, self._usual = episode, self._new(), None
 
     def _new(self) -> LinkDirection:
         return LinkDirection(self.profile, self._seed, self._uplink, stream=self._stream)

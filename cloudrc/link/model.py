@@ -7,11 +7,13 @@ relay use the same model, so both get the same delays and losses.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 
 from cloudrc.link.draws import BLOCK, OVERTAKES, Fate, bit_flips, impairments, stream_key
 from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
 
 HEADER_BYTES = 28  # size of the IPv4 and UDP headers (RFC 791, RFC 768), also on the wire [bytes]
+_BYTE = b"\0"  # stands for the content of a packet
 _TABLES = 64  # number of blocks of impairments that are kept in memory
 
 
@@ -113,6 +115,32 @@ class LinkDirection:
             return () if arrival is None else (arrival,)
         arrivals = [self._arrival(entry, conditions, size, now_ns) for entry in fate]
         return tuple([arrival for arrival in arrivals if arrival is not None])
+
+    def send_pieces(
+        self, epoch: int, pieces: Iterable[tuple[int, int, int]], now_ns: int
+    ) -> tuple[Fate, int]:
+        """Send the packets of a message at `now_ns` [ns]: kind, counter and size [bytes] of each.
+
+        A damaged packet is lost. Of two copies the first counts.
+
+        Returns:
+            When the last packet arrives [ns], no time if one is lost; and how many are lost.
+        """
+        whole_ns, lost = now_ns, 0
+        for kind, counter, size in pieces:
+            arrivals = self.send_checked(epoch, kind, counter, size, now_ns)
+            if arrivals:
+                whole_ns = max(whole_ns, min(arrivals))
+            else:
+                lost += 1
+        return () if lost else (whole_ns,), lost
+
+    def send_checked(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
+        """Send a packet as `send` does; a damaged one is lost, as behind a checksum."""
+        arrivals = self.send(epoch, kind, counter, size, now_ns)
+        if arrivals and self.corrupts and self.corrupted(epoch, kind, counter, _BYTE) != _BYTE:
+            return ()
+        return arrivals
 
     @property
     def only(self) -> Conditions | None:

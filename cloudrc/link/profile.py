@@ -160,6 +160,19 @@ def mean_loss(loss: Loss) -> float:
     return bad * loss.loss_bad + (1.0 - bad) * loss.loss_good
 
 
+def whole_share(loss: Loss, count: int) -> float:
+    """Return the share of messages of `count` successive packets that lose none, in [0, 1]."""
+    if not isinstance(loss, GilbertElliott):
+        return (1.0 - loss) ** count
+    start, end = loss.bad_start, loss.bad_end
+    bad = start / (start + end) if start else 0.0
+    good = 1.0 - bad
+    for _ in range(count):
+        good, bad = good * (1.0 - loss.loss_good), bad * (1.0 - loss.loss_bad)
+        good, bad = good * (1.0 - start) + bad * end, good * start + bad * (1.0 - end)
+    return good + bad
+
+
 @dataclass(frozen=True, slots=True)
 class Trace:
     """Measured conditions over time: each row applies until the time of the next row.

@@ -109,6 +109,7 @@ def test_ages_and_the_worst_window_of_late_steps_and_of_steps_without_a_new_acti
     assert [env.summary(limit)["misses_in_10"] for limit in (1.0, None, 0.005)] == [2, 9, 10]
 
 
+@pytest.mark.filterwarnings("ignore::cloudrc.gym.doubts.LinkWarning")
 def test_a_bottleneck_sees_the_sizes_of_observations_and_answers():
     slow = both_ways(0, 0, rate_kbit=1000)
     env = Networked(Counter(), slow, observation_bytes=10_000 - 28, action_bytes=2_500 - 28)
@@ -174,6 +175,7 @@ def test_a_value_beyond_its_bounds_and_truth_values_are_actions(space, action):
     [
         {"compute": (0.02, 0.01)},
         {"chunk": 8, "executor": "prefix", "start": "answer"},
+        {"delivery": "stream", "observation_bytes": 5_000},
     ],
 )
 def test_a_copy_within_an_episode_continues_bit_by_bit(make_copy, options):

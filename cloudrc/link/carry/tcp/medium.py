@@ -1,4 +1,4 @@
-"""Compute when the segments of TCP connections cross one direction of the link.
+"""Compute when the segments of streams cross one direction of the link.
 
 All connections share one bottleneck. Its queue drops nothing: a sender that finds it full waits.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 
-from cloudrc.link.library import KIND
 from cloudrc.link.model import LinkDirection, enqueue
 from cloudrc.link.profile import Conditions, DirectionProfile, Timeline
 
@@ -22,11 +21,24 @@ _NO_LIMIT = 1 << 62  # number of packets: `room_ns` has looked at the queue befo
 class Medium:
     """One direction of the link, for all connections; its methods get the time in its order."""
 
-    def __init__(self, profile: DirectionProfile, seed: int, uplink: bool, origin_ns: int) -> None:
-        """Make the direction; its time line begins at `origin_ns` [ns]."""
+    def __init__(
+        self,
+        profile: DirectionProfile,
+        seed: int,
+        uplink: bool,
+        origin_ns: int,
+        *,
+        stream: str = "",
+        headers: int = HEADERS,
+    ) -> None:
+        """Make the direction; its time line begins at `origin_ns` [ns].
+
+        `stream` is the name of the link. Each segment has `headers` [bytes] on the wire.
+        """
         self._origin_ns: int | None = origin_ns
+        self._headers = headers
         self._departures = deque[int]()
-        self._link = LinkDirection(profile, seed, uplink, origin_ns)
+        self._link = LinkDirection(profile, seed, uplink, origin_ns, stream=stream)
         self.replace_profile(profile)
 
     def replace_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
@@ -51,12 +63,10 @@ class Medium:
             return now_ns
         return queue[len(queue) - self._queue_packets]
 
-    def cross(
-        self, connection: int, number: int, attempt: int, size: int, now_ns: int
-    ) -> int | None:
-        """Send `size` bytes of a connection at `now_ns` [ns], as its segment of this number.
+    def cross(self, epoch: int, counter: int, kind: int, size: int, now_ns: int) -> int | None:
+        """Send a segment of `size` bytes at `now_ns` [ns].
 
-        `attempt` is 1 for the first transmission.
+        Epoch, kind and counter select its random numbers; the epoch is that of its connection.
 
         Returns:
             When the segment arrives [ns]; None if it is lost.
@@ -64,10 +74,10 @@ class Medium:
         rate = self._at(now_ns).rate
         leaves_ns = now_ns
         if rate is not None:
-            size += HEADERS
-            leaves_ns = enqueue(self._departures, size, rate, _NO_LIMIT, now_ns) or now_ns
-        arrivals = self._link.send(connection, KIND + attempt, number, size, leaves_ns)
-        return arrivals[0] if arrivals else None
+            length = size + self._headers
+            leaves_ns = enqueue(self._departures, length, rate, _NO_LIMIT, now_ns) or now_ns
+        arrivals = self._link.send_checked(epoch, kind, counter, size, leaves_ns)
+        return min(arrivals) if arrivals else None
 
     def _at(self, now_ns: int) -> Conditions:
         if self._origin_ns is None:
